@@ -16,7 +16,7 @@ from orthonav.core.errors import ImageryError, OutputError
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import RegistrationCalibration
-from orthonav.ground.build.sheet import AHEAD, SheetReader, in_order
+from orthonav.ground.build.sheet import AHEAD, BlockCache, in_order
 
 BLOCKS = 9
 SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
@@ -42,13 +42,13 @@ def ortho(make_ortho, tmp_path_factory):
 @pytest.fixture
 def reads(monkeypatch):
     """Blocks that were read from imagery rather than taken from the cache."""
-    made, counted = SheetReader._read_block, []
+    made, counted = BlockCache.store, []
 
-    def counting(reader, raster, job):
-        counted.append((job.block.row, job.block.col))
-        return made(reader, raster, job)
+    def counting(cache, block, parts):
+        counted.append((block.row, block.col))
+        made(cache, block, parts)
 
-    monkeypatch.setattr(SheetReader, "_read_block", counting)
+    monkeypatch.setattr(BlockCache, "store", counting)
     return counted
 
 

@@ -103,14 +103,14 @@ class GreyLayerWriter:
         self._valid_px += int(np.count_nonzero(valid))
         self._add(0, row, col, grey, valid)
 
-    def finish(self, sheet: int = 0) -> tuple[GreyInfo, dict[str, NDArray[np.uint8 | np.int64]]]:
+    def finish(self) -> tuple[GreyInfo, Parts]:
         for level, pending in enumerate(self._pending):
             for place in sorted(pending):
                 self._complete(level, place)
         empty = (b"", b"")
         chunks = [self._encoded.get(number, empty) for number in range(self._table.count)]
-        names = part_names(sheet)
-        parts: dict[str, NDArray[np.uint8 | np.int64]] = {}
+        names = part_names(0)
+        parts: Parts = {}
         for index, kind in enumerate(("", "mask_")):
             blobs = [chunk[index] for chunk in chunks]
             ends = np.cumsum([0, *map(len, blobs)], dtype=np.int64)
@@ -172,13 +172,14 @@ def _jpeg(grey: NDArray[np.uint8]) -> bytes:
     return encoded
 
 
+CODES, SCALE, VALID = (f"sheet0/cells/{kind}" for kind in ("codes", "scale", "valid"))
 MIDDLE, LEVELS = 128, 127
 WHOLE = 255
 _ROWS_AT_ONCE = 256
 _SMALLEST = float(np.finfo(np.float16).tiny)
 
 
-def cell_parts(cells: CellSheet, sheet: int = 0) -> dict[str, NDArray[Any]]:
+def cell_parts(cells: CellSheet) -> Parts:
     """Valid shares only where not all are 1."""
     codes = np.full(cells.means.shape, MIDDLE, dtype=np.uint8)
     scale = np.zeros(cells.valid.shape, dtype=np.float16)
@@ -190,37 +191,30 @@ def cell_parts(cells: CellSheet, sheet: int = 0) -> dict[str, NDArray[Any]]:
         unit = np.maximum(scale[rows].astype(np.float32), _SMALLEST)[..., None]
         codes[rows] = np.clip(np.rint(means / unit) + MIDDLE, MIDDLE - LEVELS, WHOLE)
         valid[rows] = cells.valid[rows] * WHOLE + 1e-3  # truncated: only complete cells get 255
-    names = _names(sheet)
-    parts: dict[str, NDArray[Any]] = {names["codes"]: codes, names["scale"]: scale}
-    return parts if (valid == WHOLE).all() else {**parts, names["valid"]: valid}
+    parts: Parts = {CODES: codes, SCALE: scale}
+    return parts if (valid == WHOLE).all() else {**parts, VALID: valid}
 
 
 class StoredCells:
     """Cell means of a sheet in an opened map. May be shared between threads."""
 
-    def __init__(self, opened: MapFile, layout: CellLayout, channels: int, sheet: int = 0) -> None:
-        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
-        grid = opened.manifest.sheets[sheet].grid
-        names = _names(sheet)
-        self.layout = layout
+    def __init__(self, opened: MapFile, layout: CellLayout, channels: int) -> None:
+        """Raises `MapFileError` if the parts do not fit the manifest."""
+        grid = opened.manifest.sheets[0].grid
         self.shape = layout.samples(grid.height_px), layout.samples(grid.width_px)
-        self._codes = opened.array(names["codes"], np.uint8, 3)
-        self._scale = opened.array(names["scale"], np.float16, 2)
-        whole = names["valid"] not in opened.arrays
-        self._valid = None if whole else opened.array(names["valid"], np.uint8, 2)
-        shapes = [part.shape for part in (self._scale, self._valid) if part is not None]
-        if self._codes.shape != (*self.shape, channels) or set(shapes) != {self.shape}:
+        self._codes = opened.array(CODES, np.uint8, 3)
+        self._scale = opened.array(SCALE, np.float16, 2)
+        self._valid = opened.array(VALID, np.uint8, 2) if VALID in opened.arrays else None
+        shapes = {part.shape for part in (self._scale, self._valid) if part is not None}
+        if self._codes.shape != (*self.shape, channels) or shapes != {self.shape}:
             raise MapFileError(
                 f"map's cells must be {self.shape} of {channels} numbers, got "
                 f"{self._codes.shape}: {opened.path}"
             )
 
     @classmethod
-    def of(
-        cls, opened: MapFile, layout: CellLayout, channels: int, sheet: int = 0
-    ) -> "StoredCells | None":
-        there = _names(sheet)["codes"] in opened.arrays
-        return cls(opened, layout, channels, sheet) if there else None
+    def of(cls, opened: MapFile, layout: CellLayout, channels: int) -> "StoredCells | None":
+        return cls(opened, layout, channels) if CODES in opened.arrays else None
 
     def read(
         self, row: int, col: int, height: int, width: int
@@ -241,10 +235,6 @@ class StoredCells:
         if self._valid is not None:
             share[inside] = self._valid[part] / np.float32(WHOLE)
         return means, share
-
-
-def _names(sheet: int) -> dict[str, str]:
-    return {kind: f"sheet{sheet}/cells/{kind}" for kind in ("codes", "scale", "valid")}
 
 
 POSTING_M = 10.0

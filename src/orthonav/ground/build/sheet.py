@@ -110,6 +110,11 @@ class Block:
     height: int
     width: int
 
+    @property
+    def window(self) -> tuple[int, int, int, int]:
+        """First column and row, width and height."""
+        return self.col, self.row, self.width, self.height
+
     def may_matter(self, area: Area, grid: TileGrid) -> bool:
         """Whether a tile of the area may need the block; False only far from a route."""
         if area.route is None:
@@ -139,10 +144,6 @@ class Block:
         bottom = min(grid.height_px, self.row + self.height + margin_px)
         right = min(grid.width_px, self.col + self.width + margin_px)
         return Block(top, left, bottom - top, right - left)
-
-
-def read_block(raster: SheetRaster, outer: Block) -> GreyPixels:
-    return raster.read_grey(outer.col, outer.row, outer.width, outer.height)
 
 
 def blocks_of(area: Area, grid: TileGrid, side_px: int) -> list[Block]:
@@ -222,7 +223,14 @@ def _whole_cells(tile_px: int, overlap: float) -> float:
 
 def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
     """Grid rows and columns (N, 2) of the tiles in the area that have imagery."""
-    tiles = np.concatenate(_inside(area, grid))
+    reach_m = grid.stride_m * np.sqrt(0.5)
+    step = max(1, _TILES_AT_ONCE // grid.cols)
+    found = []
+    for first in range(0, grid.rows, step):  # a few rows at a time: the box may be mostly empty
+        rows, cols = np.mgrid[first : min(first + step, grid.rows), : grid.cols]
+        some = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
+        found.append(some[area.contains(grid.centres_en_m(some), reach_m)])
+    tiles = np.concatenate(found)
     share = cells.valid_share(tiles * grid.stride_px)
     if not (share >= MIN_TILE_VALID_SHARE).any():
         best = share.max(initial=0.0)
@@ -233,18 +241,6 @@ def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
             "ground resolution"
         )
     return tiles[share >= MIN_TILE_VALID_SHARE]
-
-
-def _inside(area: Area, grid: TileGrid) -> list[NDArray[np.intp]]:
-    """The tiles (N, 2) in the area, a few rows at a time: the box may be mostly empty."""
-    reach_m = grid.stride_m * np.sqrt(0.5)
-    step = max(1, _TILES_AT_ONCE // grid.cols)
-    found = []
-    for first in range(0, grid.rows, step):
-        rows, cols = np.mgrid[first : min(first + step, grid.rows), : grid.cols]
-        tiles = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
-        found.append(tiles[area.contains(grid.centres_en_m(tiles), reach_m)])
-    return found
 
 
 def is_per_tile(representation: Any) -> bool:
@@ -318,7 +314,7 @@ def read_pictures(
     with mosaic.grid_sheet(area.frame, grid) as raster:
         for done, block in enumerate(blocks):
             outer = block.with_margin(grid, representation.margin_px)
-            pixels = read_block(raster, outer)
+            pixels = raster.read_grey(*outer.window)
             if pixels.valid.any():
                 maps = sheet_maps(representation, pixels.grey, pixels.valid)
                 pictures.put(block, pictures.parts(pixels, maps, block.within(outer)))
@@ -378,12 +374,8 @@ class BlockCache:
         return self._folder / f"r{block.row}-c{block.col}-{self._request}.npz"
 
 
-@dataclass(frozen=True)
-class Job:
-    """A block to be read, and the positions (row, col) of crops in it."""
-
-    block: Block
-    places: tuple[tuple[int, int], ...]
+Job = tuple[Block, NDArray[np.intp]]
+"""A block to be read, and the positions (N, 2) of crops in it."""
 
 
 class SheetReader:
@@ -424,11 +416,12 @@ class SheetReader:
         @contextmanager
         def opened() -> Iterator[Callable[[Job], Parts]]:
             with self.mosaic.grid_sheet(self.area.frame, self.grid, threads=1) as raster:
-                yield lambda job: self._cached_or_read(raster, job, cache)
+                yield lambda job: self._read_block(raster, job, cache)
 
         with one_opencv_thread(), quiet():
             for done, parts in enumerate(in_order(self._jobs, opened, workers)):
-                self._take(self._jobs[done], parts)
+                if parts:
+                    self._take(self._jobs[done][0], parts)
                 progress("imagery", (done + 1) / len(self._jobs))
         if not self.cells.valid.any():
             raise AreaError(
@@ -456,45 +449,38 @@ class SheetReader:
         jobs = []
         for block in blocks:
             outer, share = self._outer(block), block.height * block.width / total_px
-            places = self.sampler.places(outer.height, outer.width, share)
-            jobs.append(Job(block, tuple((int(row), int(col)) for row, col in places)))
+            jobs.append((block, self.sampler.places(outer.height, outer.width, share)))
         return jobs
 
-    def _cached_or_read(self, raster: SheetRaster, job: Job, cache: BlockCache | None) -> Parts:
-        parts = None if cache is None else cache.load(job.block)
-        if parts is None:
-            parts = self._read_block(raster, job)
-            if cache is not None:
-                cache.store(job.block, parts)
-        return parts
-
-    def _read_block(self, raster: SheetRaster, job: Job) -> Parts:
+    def _read_block(self, raster: SheetRaster, job: Job, cache: BlockCache | None) -> Parts:
         """The result of a block; does not change the state of the reader."""
-        outer = self._outer(job.block)
-        pixels, part = read_block(raster, outer), job.block.within(outer)
+        block, places = job
+        cached = None if cache is None else cache.load(block)
+        if cached is not None:
+            return cached
+        outer = self._outer(block)
+        pixels, part = raster.read_grey(*outer.window), block.within(outer)
         grey, valid = pixels.grey, pixels.valid
-        if not valid.any():
-            return {}
-        maps = sheet_maps(self.representation, grey, valid)
-        more = job.block.within(outer, self._beyond_px)
-        means, share = cell_means(maps[:, more[0], more[1]], valid[more], self._layout)
-        parts: Parts = {
-            "means": means,
-            "share": share,
-            "preview": self.preview.small(job.block, grey[part]),
-        }
-        if self.pictures is not None:
-            parts |= self.pictures.parts(pixels, maps, part)
-        places = np.array(job.places, np.intp).reshape(-1, 2)
-        parts["crops"], parts["crop_places"] = self.sampler.cut(grey, valid, places)
-        if self.layer is not None:
-            parts |= layer_parts(self.area, self.grid, job.block, grey[part], valid[part])
+        parts: Parts = {}
+        if valid.any():
+            maps = sheet_maps(self.representation, grey, valid)
+            more = block.within(outer, self._beyond_px)
+            means, share = cell_means(maps[:, more[0], more[1]], valid[more], self._layout)
+            parts = {
+                "means": means,
+                "share": share,
+                "preview": self.preview.small(block, grey[part]),
+            }
+            parts["crops"], parts["crop_places"] = self.sampler.cut(grey, valid, places)
+            if self.pictures is not None:
+                parts |= self.pictures.parts(pixels, maps, part)
+            if self.layer is not None:
+                parts |= layer_parts(self.area, self.grid, block, grey[part], valid[part])
+        if cache is not None:
+            cache.store(block, parts)
         return parts
 
-    def _take(self, job: Job, parts: Parts) -> None:
-        if not parts:
-            return
-        block = job.block
+    def _take(self, block: Block, parts: Parts) -> None:
         self.cells.put(block.row, block.col, parts["means"], parts["share"])
         self.preview.put(block, parts["preview"])
         if self.pictures is not None:
@@ -513,7 +499,7 @@ class SheetReader:
             "area": repr(self.area),
             "grid": vars(self.grid),
             "layout": [vars(self._layout), self._margin_px, PREVIEW_PX, CHUNK_PX],
-            "jobs": [[*vars(job.block).values(), job.places] for job in self._jobs],
+            "jobs": [[*block.window, places.tolist()] for block, places in self._jobs],
             "crop_px": self.sampler.size_px,
             "parts": [self.layer is not None, self.pictures is not None],
             "imagery": [source.stamp for source in self.mosaic.sources],
@@ -533,7 +519,12 @@ def one_opencv_thread() -> Iterator[None]:
 
 
 def blocks_of_area(area: Area, grid: TileGrid, layout: CellLayout) -> list[Block]:
-    return blocks_of(area, grid, _block_side_px(grid.tile_px, layout.micro_px))
+    """Their side is a multiple of the micro-cell, and of the layer chunk if possible."""
+    least = max(BLOCK_PX, 2 * grid.tile_px)
+    step = math.lcm(layout.micro_px, CHUNK_PX)
+    if step > 1.5 * least:
+        step = layout.micro_px
+    return blocks_of(area, grid, -(-least // step) * step)
 
 
 def layer_parts(
@@ -546,12 +537,3 @@ def layer_parts(
             where = chunk.within(block)
             grey[where], valid[where] = 0, False
     return {"grey": grey, "valid": valid}
-
-
-def _block_side_px(tile_px: int, micro_px: int) -> int:
-    """A multiple of the micro-cell, and of the layer chunk if possible."""
-    least = max(BLOCK_PX, 2 * tile_px)
-    step = math.lcm(micro_px, CHUNK_PX)
-    if step > 1.5 * least:
-        step = micro_px
-    return -(-least // step) * step
