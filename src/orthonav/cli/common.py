@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MAX_THREADS = 64
 
 ROUTE_HELP = (
-    "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan or a waypoint "
+    "planned route: GeoJSON, CSV, KML or KMZ, GPX, a QGroundControl plan or a waypoint "
     "file (FILE#NAME or FILE#NUMBER selects one of several)"
 )
 
