@@ -20,7 +20,6 @@ from orthonav.ground.planning.spacing import (
     ViewPlan,
     estimate_map,
     profile,
-    rate_cautions,
     suited_map,
     suited_tile_px,
     terrain_cautions,
@@ -77,13 +76,6 @@ def test_what_speaks_against_a_map(agl_m, gsd_m, tile_px, expected):
     view = ViewPlan.of(CAMERA, agl_m)
     assert codes(view_cautions(view, gsd_m, tile_px)) == expected
     assert view.tile_share(gsd_m * tile_px) < LEAST_TILE_SHARE or "tile_too_large" not in expected
-
-
-def test_speed_asks_for_views():
-    view = ViewPlan.of(CAMERA, 50)
-    assert rate_cautions(view, 100) == []
-    (caution,) = rate_cautions(view, 400)
-    assert caution.code == "fast" and "21 views per second" in caution.text
 
 
 FRAME = LocalFrame(46.5, 2.5)

@@ -52,9 +52,9 @@ def polylines(least=1):
         HIGH_LINE,
         feature(LINE),
         collection(LINE),
-        collection(None, POINT, LINE, OTHER_LINE),
+        collection(None, POINT, LINE),
         {"type": "MultiLineString", "coordinates": [POINTS[:1], POINTS[1:]]},
-        {"type": "GeometryCollection", "geometries": [POINT, LINE, OTHER_LINE]},
+        {"type": "GeometryCollection", "geometries": [POINT, LINE]},
         feature({"type": "GeometryCollection", "geometries": [LINE]}),
     ],
 )
@@ -127,11 +127,12 @@ def test_properties_that_make_no_sense_are_refused(tmp_path, own, message):
         read_route(path)
 
 
-def test_lines_are_picked_by_name(tmp_path, caplog):
+def test_lines_are_picked_by_name(tmp_path):
     path = tmp_path / "a#b.geojson"
     both = collection(LINE, OTHER_LINE)
     path.write_text(json.dumps(both))
-    assert read_route(path).waypoints == WAYPOINTS and "2 unnamed lines" in caplog.text
+    with pytest.raises(RouteError, match=r"2 lines; .*: 1 \(no name\), 2 \(no name\)"):
+        read_route(path)
     both["features"][1]["properties"] = {"name": "x#/y"}
     path.write_text(json.dumps(both))
     assert read_route(Path(f"{path}#x#/y")).waypoints[0] == (9, 9)

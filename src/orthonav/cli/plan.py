@@ -67,7 +67,6 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.ground.planning.route import read_route, to_geojson
     from orthonav.ground.planning.spacing import (
         default_band_m,
-        rate_cautions,
         terrain_cautions,
         view_cautions,
     )
@@ -88,8 +87,6 @@ def run(options: argparse.Namespace) -> None:
     if route is not None and options.dem is not None:
         legs = _profile(options, route, view)
     cautions: list[Caution] = [] if view is None else view_cautions(view, gsd_m, tile_px)
-    if view is not None and options.speed_mps is not None:
-        cautions += rate_cautions(view, options.speed_mps)
     cautions += terrain_cautions(legs)
     plain: dict[str, Any] = {
         "route": None if route is None else _route_plain(route, options),
@@ -112,11 +109,10 @@ def _sheets(
     options: argparse.Namespace, route: "Route | None"
 ) -> "tuple[list[Route | Extent], list[Area]]":
     from orthonav.ground.planning.area import Area
-    from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
+    from orthonav.ground.planning.sheets import sheets_of_route
 
     if route is None:
-        boxes = sheets_of_bounds(options.bounds)
-        return [*boxes], [Area.from_bounds(box) for box in boxes]
+        return [options.bounds], [Area.from_bounds(options.bounds)]
     parts = sheets_of_route(route, options.band_m)
     return [*parts], [Area.from_route(part, options.band_m) for part in parts]
 

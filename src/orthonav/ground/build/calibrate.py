@@ -236,7 +236,7 @@ def _tile_calibration(
     weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
     if right.sum() < MIN_RIGHT:
         return TileCalibration(fit_few(features, right, weight, usual), grid.stride_m)
-    confidence = fit_logistic(features, right, weight)
+    confidence = LogisticConfidence(*fit_weights(features, right, weight))
     std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
     return TileCalibration(confidence, max(std_m, grid.gsd_m))
 
@@ -469,12 +469,6 @@ def fit_registered(
         return float(RIDGE * shift**2 - np.log(np.where(right, said, 1 - said)).mean())
 
     return shifted(float(minimize_scalar(loss, bounds=(-MAX_SHIFT, MAX_SHIFT)).x))
-
-
-def fit_logistic(
-    features: NDArray[np.float64], right: NDArray[np.bool_], sample_weight: NDArray[np.float64]
-) -> LogisticConfidence:
-    return LogisticConfidence(*fit_weights(features, right, sample_weight))
 
 
 def fit_few(

@@ -130,6 +130,6 @@ def _checked(extent: Extent) -> Extent:
         raise AreaError(
             f"area is {across / 1000:.1f} km across, a sheet holds at most "
             f"{MAX_SHEET_M / 1000:.0f} km; build it in parts with --bounds or --route "
-            "(orthonav plan cuts it into sheets)"
+            "(orthonav plan cuts a route into sheets), or as an atlas"
         )
     return extent

@@ -72,10 +72,6 @@ class Route:
                     "waypoint must have a latitude within 90 and a longitude within 360 degrees, "
                     f"got {lat}, {lon}{swapped_hint(lat, lon)}"
                 )
-        if self.heights and len(self.heights) != len(self.waypoints):
-            raise RouteError(
-                f"route has {len(self.heights)} heights for {len(self.waypoints)} waypoints"
-            )
         if not any(self.heights):
             object.__setattr__(self, "heights", ())
         if self.leg_bands_m and len(self.leg_bands_m) != self.legs:
@@ -86,10 +82,6 @@ class Route:
                     f"search band of a leg must be wider than 0 and at most {MAX_BAND_M:,.0f} m, "
                     f"got {band_m}"
                 )
-        if self.home_amsl_m is not None and not math.isfinite(self.home_amsl_m):
-            raise RouteError(
-                f"height of the take-off position must be finite, got {self.home_amsl_m}"
-            )
 
     @property
     def legs(self) -> int:

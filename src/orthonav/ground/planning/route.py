@@ -5,7 +5,6 @@ The file name suffix selects the format."""
 import csv
 import io
 import json
-import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -48,8 +47,6 @@ _BROKEN = (
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError),
     csv.Error,
 )
-
-log = logging.getLogger(__name__)
 
 """Properties of a GeoJSON feature (RFC 7946): `name`; `band_m`, a number or a list with one per leg
 (null: the default); `height_frame`, above what the third coordinate is ("agl", "home", "amsl",
@@ -235,7 +232,7 @@ def read_route(path: Path) -> Route:
         raise RouteError(f"route must be one of {', '.join(_READERS)}, got '{path.suffix}': {path}")
     try:
         found = _READERS[suffix](data)
-        route = _chosen(found, name, first=suffix in (".geojson", ".json"))
+        route = _chosen(found, name)
     except RouteError as error:
         raise RouteError(f"{error}: {path}") from error
     except _BROKEN as error:
@@ -267,9 +264,8 @@ def _name_apart(path: Path) -> tuple[Path, str | None]:
     return path, None
 
 
-def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
-    """The line of that name, else of that number, from 1; without a name the only one. With
-    `first`, the first of several unnamed lines, with a warning."""
+def _chosen(found: list[Route], name: str | None) -> Route:
+    """The line of that name, else of that number, from 1; without a name the only one."""
     if name is not None:
         named = [route for route in found if route.name == name]
         number = int(name) if re.fullmatch(r"[0-9]{1,9}", name) else 0
@@ -282,11 +278,9 @@ def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
             )
         return named[0]
     if len(found) > 1:
-        if not first or any(route.name for route in found):
-            raise RouteError(
-                f"file holds {len(found)} lines; give FILE#NAME or FILE#NUMBER: {_listed(found)}"
-            )
-        log.warning("route file holds %d unnamed lines: using the first", len(found))
+        raise RouteError(
+            f"file holds {len(found)} lines; give FILE#NAME or FILE#NUMBER: {_listed(found)}"
+        )
     return found[0]
 
 

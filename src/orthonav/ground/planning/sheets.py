@@ -7,76 +7,38 @@ The sheets of the Earth (`WorldSheets`) have names. Rows have equal height in la
 divided into the number of equal boxes its longest parallel requires. Rows are counted from the
 South Pole, columns from 180 deg west."""
 
-import itertools
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M
-from orthonav.core.geo.swapped import swapped_bounds_hint, swapped_hint
-from orthonav.ground.planning.area import Area, Extent, unwrapped
+from orthonav.core.geo.swapped import swapped_hint
+from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.route import Array, Height, Route, leg_lengths_m
 
-MAX_SHEETS = 10_000  # limit of the program; 2500 km2 each, so 25 million km2
 MAX_ROUTE_SHEETS = 500  # more than once around the Earth with bands of less than 10 km
-MOST_NORTHERN_DEG = 85.0
-BOX_SIDE_M = 0.98 * MAX_SHEET_M  # parallels are bent, by 1 % of it at 85 degrees
 _MERIDIAN_DEGREE_M = 111_695.0  # longest degree of latitude, at a pole (WGS84)
 _PARALLEL_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
 
 
-def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
-    """Boxes (west, south, east, north in degrees) that each fit a sheet: rows of equal height, from
-    south to north, each divided into equal boxes, from west to east."""
-    west, south, east, north = unwrapped(bounds_deg)
-    if max(abs(south), abs(north)) > MOST_NORTHERN_DEG or abs(west) > 360:
-        hint = swapped_bounds_hint((west, south, east, north))
-        raise AreaError(
-            f"bounds must lie within {MOST_NORTHERN_DEG:g} deg of the equator{hint}, "
-            f"got {','.join(map(str, bounds_deg))}"
-        )
-    if _fits(Area.from_bounds, bounds_deg):
-        return [bounds_deg]
-    sheets: list[Extent] = []
-    rows = math.ceil((north - south) * _MERIDIAN_DEGREE_M / BOX_SIDE_M)
-    for low, high in itertools.pairwise(np.linspace(south, north, rows + 1).tolist()):
-        count = _boxes_in_row(low, high, east - west, BOX_SIDE_M)
-        edges = [_wrapped(lon) for lon in np.linspace(west, east, count + 1).tolist()]
-        sheets += [(left, low, right, high) for left, right in itertools.pairwise(edges)]
-        if len(sheets) > MAX_SHEETS:
-            raise AreaError(f"area needs more sheets than the limit of {MAX_SHEETS:,}")
-    return sheets
-
-
-def _boxes_in_row(south_deg: float, north_deg: float, width_deg: float, side_m: float) -> int:
-    widest = 0.0 if south_deg <= 0 <= north_deg else min(abs(south_deg), abs(north_deg))
-    width_m = width_deg * _PARALLEL_DEGREE_M * math.cos(math.radians(widest))
-    return max(1, math.ceil(width_m / side_m))
-
-
-def _fits(area_of: Callable[..., Area], *arguments: Any) -> bool:
+def _fits(route: Route, band_m: float | None) -> bool:
     try:
-        area_of(*arguments)
+        Area.from_route(route, band_m)
     except AreaError:
         return False
     return True
-
-
-def _wrapped(lon_deg: float) -> float:
-    return lon_deg if abs(lon_deg) <= 180 else (lon_deg + 180) % 360 - 180
 
 
 def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
     """Parts of a route, in order, as long as their search bands fit a sheet. A leg too long for one
     is divided into equal pieces on the great circle."""
     bands_m = route.bands_m(band_m)
-    if bands_m is None or _fits(Area.from_route, route, band_m):
+    if bands_m is None or _fits(route, band_m):
         Area.from_route(route, band_m)  # raises if a band is missing
         return [route]
     if max(bands_m) >= MAX_SHEET_M:
@@ -100,7 +62,7 @@ def _last_that_fits(route: Route, first: int, band_m: float | None) -> int:
 
     def fits(last: int) -> bool:
         within = last < len(route.waypoints)
-        return within and _fits(Area.from_route, route.part(first, last), band_m)
+        return within and _fits(route.part(first, last), band_m)
 
     step, last = 1, first + 1
     while fits(last + step):
@@ -181,7 +143,10 @@ class WorldSheets:
         return math.ceil(180 * _MERIDIAN_DEGREE_M / self.side_m)
 
     def cols(self, row: int) -> int:
-        return _boxes_in_row(*self._parallels(row), 360, self.side_m)
+        south, north = self._parallels(row)
+        widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
+        around_m = 360 * _PARALLEL_DEGREE_M * math.cos(math.radians(widest))
+        return max(1, math.ceil(around_m / self.side_m))
 
     def name_at(self, lat_deg: float, lon_deg: float) -> str:
         if not (abs(lat_deg) <= 90 and math.isfinite(lon_deg)):

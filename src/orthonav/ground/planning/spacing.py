@@ -27,7 +27,6 @@ FINEST_IMAGERY_M = 0.2  # open orthophotos of whole countries are rarely finer (
 LOW_VIEW_M = 100.0  # below this a single field or wood can fill the view
 MOST_RELIEF = 0.05  # within a view, as a fraction of the height: the std of reported heights
 VIEW_OVERLAP = 0.6  # usual forward overlap of aerial photography
-TRACKED_PER_S = 10.0  # views per second while tracking on one desktop core: docs/benchmarks.md
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)  # 65 by 51 deg
 DEFAULT_PRIOR_STD_M = 150.0  # about 5 km of dead reckoning with an error of 3 %
 BAND_PRIORS = 4.0  # width of a band that is not given: two deviations of the prior to each side
@@ -142,17 +141,6 @@ def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
         text = f"orthophotos of {gsd_m:g} m are rare ({FINEST_IMAGERY_M:g} m is the usual minimum)"
         found.append(Caution("fine_imagery", text))
     return found
-
-
-def rate_cautions(view: ViewPlan, speed_mps: float) -> list[Caution]:
-    needed = speed_mps / view.spacing_m
-    if needed <= TRACKED_PER_S:
-        return []
-    text = (
-        f"{VIEW_OVERLAP:.0%} overlap at {speed_mps:g} m/s needs {needed:.0f} views per second; a "
-        f"desktop core tracks about {TRACKED_PER_S:.0f}"
-    )
-    return [Caution("fast", text)]
 
 
 TILE_BYTES = 273.0  # embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles
