@@ -128,7 +128,7 @@ def test_properties_that_make_no_sense_are_refused(tmp_path, own, message):
 
 
 def test_lines_are_picked_by_name(tmp_path):
-    path = tmp_path / "a#b.geojson"
+    path = tmp_path / "a.geojson"
     both = collection(LINE, OTHER_LINE)
     path.write_text(json.dumps(both))
     with pytest.raises(RouteError, match=r"2 lines; .*: 1 \(no name\), 2 \(no name\)"):

@@ -123,7 +123,6 @@ def test_interrupted_training_resumes(area, tmp_path):
         ("triplet:width=0", None, "width must be"),
         ("vlad", None, "unknown variant 'vlad'"),
         ("autoencoder", "sam", "weights"),
-        ("triplet", "sam:weights=there", "--other-date"),
     ],
 )
 def test_what_does_not_go_together_is_refused(area, tmp_path, method, edges, says):

@@ -42,7 +42,6 @@ from orthonav.ground.build.calibrate import (
 from orthonav.ground.build.encoders import (
     EncoderRecipe,
     check_device,
-    check_positives,
     learn_encoder,
     method_recipe,
     stored_representation,
@@ -71,26 +70,22 @@ class BuildRequest:
     - `band_m`: width of the search band for legs without a width of their own, metres, above 0.
     - `gsd_m`: ground resolution, metres per pixel, above 0; None: that of the finest orthophoto.
     - `tile_px`: width of a tile, pixels, 16 to 4096.
-    - `overlap`: overlap of neighbouring tiles as a fraction of their width, 0 to below 1; 0.875
-      gives a stride of 32 pixels at 256.
+    - `overlap`: of neighbouring tiles, as a fraction of their width, 0 to below 1.
     - `method`: embedding, `name:field=value,..`, a row of `embed.TABLE`.
     - `edges`: image representation, a row of `represent.TABLE`; None: the default of the method.
     - `seed`: of all random draws, 0 or more; equal requests give equal bytes.
     - `registration`: whether the map carries the grey layer that locates views below tile size.
     - `other_dates`: orthophotos of the same area at other dates, from which the confidence is
       calibrated, and a triplet network learns. They do not become part of the map.
-    - `calibration_views`: mirrored views of the reference that measure the scores of chance of
-      registration, 1 to 384; as many views of other dates are located.
-    - `work`: folder for finished blocks and checkpoints of networks, from which an interrupted
-      build resumes; None: blocks of a large map in `OUT.work` until it is written.
-    - `workers`: threads that read the imagery and make batches for a network, 1 to 64; None: one
-      per core that read, and 2 or, for a GPU, up to 16 that make batches.
+    - `calibration_views`: mirrored views, and views of other dates, that are located, 1 to 384.
+    - `work`: folder of blocks and checkpoints of networks, from which an interrupted build
+      resumes; None: blocks of a large map in `OUT.work` until it is written.
+    - `workers`: threads that read the imagery and make batches for a network, 1 to 64.
     - `device`: where a network is learnt, "auto" (a GPU if there is one), "cpu" or "cuda".
     - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
     - `dem_datum`: what its heights count from, where the file does not state it
       (`orthonav.ground.imagery.terrain.OPTION`).
-    - `dem_needed`: whether an area in which the model has no height is refused; else the map has
-      no terrain layer.
+    - `dem_needed`: whether an area in which the model has no height is refused.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
     """
@@ -132,8 +127,6 @@ class BuildResult:
 
 @dataclass(frozen=True, eq=False)
 class _Inputs:
-    """`recipe`: embedding to learn."""
-
     request: BuildRequest
     other_dates: tuple[Mosaic, ...]
     recipe: WhitenedRecipe | EncoderRecipe
@@ -145,8 +138,6 @@ class _Inputs:
         representation = make_variant(represent.TABLE, request.edges or usual_edges(request.method))
         recipe = method_recipe(request.method, representation)
         check_device(request.device)
-        if not request.other_dates:
-            check_positives(recipe, representation)
         mosaic = Mosaic.open(request.orthos, request.epoch)
         other_dates = tuple(Mosaic.open([path], request.epoch) for path in request.other_dates)
         inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]
@@ -366,7 +357,6 @@ def _registration(
 
 
 def _crops_of(mosaic: Mosaic, sheet: SheetReader, crops: Sequence[Crop]) -> list[Crop]:
-    """Crops of another date at the positions of the reference crops."""
     found = []
     with mosaic.grid_sheet(sheet.area.frame, sheet.grid) as raster:
         for crop in crops:

@@ -40,7 +40,6 @@ LEARNT_WITH = {
 }
 """Modules of the extra "train"."""
 USUAL_EDGES = {"autoencoder": "canny", "caevl": "canny", "triplet": "gray", "bovw": "gray"}
-DEVICES = ("auto", "cpu", "cuda")
 LOCAL_FIELDS = ("weights", "cache")
 
 
@@ -73,19 +72,10 @@ def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderR
 
 
 def check_device(name: str) -> None:
-    if name not in DEVICES:
-        raise VariantError(f"device must be {', '.join(DEVICES)}, got '{name}'")
+    if name not in ("auto", "cpu", "cuda"):
+        raise VariantError(f"device must be auto, cpu or cuda, got '{name}'")
     if name == "cuda" and not needed("torch", "train", "a GPU").cuda.is_available():
         raise VariantError("PyTorch sees no GPU; use --device auto or cpu")
-
-
-def check_positives(recipe: WhitenedRecipe | EncoderRecipe, representation: Any) -> None:
-    """A triplet network without other dates would need days with a slow representation."""
-    name = stored_representation(representation)["name"]
-    if isinstance(recipe, TripletRecipe) and not represent.TABLE[name].flies:
-        raise VariantError(
-            f"a triplet network on {name} edges needs orthophotos of other dates; give --other-date"
-        )
 
 
 def stored_representation(representation: Any) -> dict[str, Any]:

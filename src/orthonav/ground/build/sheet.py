@@ -103,8 +103,6 @@ def _serve(todo: _Jobs[Made, Item], opened: Callable[[], Worker[Item, Made]]) ->
 
 @dataclass(frozen=True)
 class Block:
-    """In pixels of a sheet."""
-
     row: int
     col: int
     height: int
@@ -112,7 +110,6 @@ class Block:
 
     @property
     def window(self) -> tuple[int, int, int, int]:
-        """First column and row, width and height."""
         return self.col, self.row, self.width, self.height
 
     def may_matter(self, area: Area, grid: TileGrid) -> bool:
@@ -172,7 +169,6 @@ class Preview:
             self._grey[y0:y1, x0:x1] = small
 
     def _edges(self, block: Block) -> tuple[int, int, int, int]:
-        """Top, bottom, left, right in the overview."""
         rows, cols = self._grey.shape
         y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
         x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
@@ -453,7 +449,6 @@ class SheetReader:
         return jobs
 
     def _read_block(self, raster: SheetRaster, job: Job, cache: BlockCache | None) -> Parts:
-        """The result of a block; does not change the state of the reader."""
         block, places = job
         cached = None if cache is None else cache.load(block)
         if cached is not None:
@@ -491,7 +486,6 @@ class SheetReader:
             self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
 
     def _request(self) -> str:
-        """Digest of everything that determines the blocks, program versions included."""
         everything = {
             "versions": [__version__, np.__version__, cv2.__version__, rasterio.__version__],
             "gdal": rasterio.__gdal_version__,

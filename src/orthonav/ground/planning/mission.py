@@ -194,7 +194,6 @@ def _simple(raw: dict[str, Any], item: int, where: str) -> MissionItem:
 
 
 def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]:
-    """Flight lines of a survey or corridor scan; the corridor width is the band of its legs."""
     inner = raw.get("TransectStyleComplexItem") or {}
     points = inner.get("VisualTransectPoints")
     if not points:

@@ -88,7 +88,6 @@ class Route:
         return max(1, len(self.waypoints) - 1)
 
     def points_en_m(self, frame: LocalFrame) -> NDArray[np.float64]:
-        """Waypoints as local `(N, 2)` metres of `frame`."""
         lat_lon = np.array(self.waypoints, dtype=np.float64)
         return frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
 

@@ -154,7 +154,6 @@ _Values = Callable[[str], list[float | None]]
 
 
 def _read_delimited(data: bytes) -> list[Route]:
-    """A table with comma, semicolon or tab, one waypoint a row."""
     stream = io.StringIO(decoded(data), newline=None)
     header = stream.readline(MAX_LINE_CHARS)
     stream.seek(0)
@@ -225,7 +224,10 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
 def read_route(path: Path) -> Route:
     """`FILE#NAME` selects a line by its name, or else its number from 1. Raises `MissingFileError`
     or `RouteError`."""
-    path, name = _name_apart(Path(path))
+    path, name = Path(path), ""
+    if "#" in str(path) and not path.exists():
+        file, _, name = str(path).partition("#")
+        path = Path(file)
     data = _bytes_of(path)
     suffix = path.suffix.lower()
     if suffix not in _READERS:
@@ -254,19 +256,9 @@ def _bytes_of(path: Path) -> bytes:
     return data
 
 
-def _name_apart(path: Path) -> tuple[Path, str | None]:
-    text = str(path)
-    if path.exists():
-        return path, None
-    for at, letter in enumerate(text):
-        if letter == "#" and Path(text[:at]).is_file():
-            return Path(text[:at]), text[at + 1 :]
-    return path, None
-
-
-def _chosen(found: list[Route], name: str | None) -> Route:
+def _chosen(found: list[Route], name: str) -> Route:
     """The line of that name, else of that number, from 1; without a name the only one."""
-    if name is not None:
+    if name:
         named = [route for route in found if route.name == name]
         number = int(name) if re.fullmatch(r"[0-9]{1,9}", name) else 0
         if not named and 1 <= number <= len(found):

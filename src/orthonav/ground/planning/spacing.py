@@ -137,9 +137,6 @@ def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
         found.append(Caution("tile_too_large", text))
     elif share < 0.999:
         found.append(Caution("part_of_tile", f"{covers} of {tile_m:.0f} m; best is a whole tile"))
-    if gsd_m < FINEST_IMAGERY_M * 0.999:
-        text = f"orthophotos of {gsd_m:g} m are rare ({FINEST_IMAGERY_M:g} m is the usual minimum)"
-        found.append(Caution("fine_imagery", text))
     return found
 
 
@@ -305,7 +302,6 @@ def _leg(
 def _flown_amsl_m(
     route: Route, leg: int, agl_m: float | None, shares: Array, below: Array, home_m: float
 ) -> Array:
-    """Flown heights above mean sea level at shares of a leg, over the terrain heights `below`."""
     ends = route.heights[leg : leg + 2]
     frames = {None if height is None else height.frame for height in ends}
     if not ends or not frames.isdisjoint({None, "hae"}) or len(frames) > 1:
