@@ -17,7 +17,6 @@ from orthonav.ground.planning.route import (
     Height,
     Route,
     along_polyline_en_m,
-    distance_to_polyline_m,
     leg_lengths_m,
     read_route,
     to_geojson,
@@ -194,14 +193,10 @@ def test_any_bytes_give_a_route_or_a_route_error(suffix, content):
         ("a.geojson", b"\xff\xfe\x00", "not UTF-8 text"),
         ("a.geojson", b"[" * 100_000, "cannot be read"),
         ("a.geojson", b"[1, 2]", "must be a JSON object, got list"),
-        ("a.geojson", b"{}", "no LineString"),
-        ("a.geojson", b'{"type": "FeatureCollection", "features": 5}', "cannot be read"),
         ("a.geojson", json.dumps(collection(POINT, None)).encode(), "no LineString"),
         ("a.geojson", b'{"type": "LineString"}', "coordinates is missing"),
         ("a.geojson", b'{"type": "LineString", "coordinates": []}', "no waypoints"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[1], [2]]}', "cannot be read"),
-        ("a.geojson", b'{"type": "LineString", "coordinates": [["1", "2"]]}', "must be a number"),
-        ("a.geojson", b'{"type": "LineString", "coordinates": "1234"}', "must be a number"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[true, 2]]}', "must be a number"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[NaN, 1]]}', "must be a number"),
         ("a.geojson", b'{"coordinates": [[1%s, 1]], "type": "LineString"}' % (b"0" * 400), "read"),
@@ -213,8 +208,6 @@ def test_any_bytes_give_a_route_or_a_route_error(suffix, content):
         ("a.csv", b"lat,lon,band_m\n1,2,0\n1,3,\n", "band of a leg must be wider than 0"),
         ("a.csv", b"lat,lon\n" + b"1,2\n" * 100_001, "100,001 waypoints, at most 100,000"),
         ("a.csv", b"lat_deg,lon_deg\n", "no waypoints"),
-        ("a.csv", b"lat_deg,lon_deg\n46.5\n", "cannot be read"),
-        ("a.csv", b"lat_deg,lon_deg\n46.5,east\n", "cannot be read"),
         ("a.csv", b"lat_deg,lon_deg\n46.5,inf\n", "row 2, lon_deg must be a number, got 'inf'"),
         ("a.csv", b"lat_deg,lon_deg\n" + b"4" * 200_000 + b",2\n", "cannot be read"),
         ("a.shp", b"", "must be one of .geojson, .*, .gpx, got '.shp'"),
@@ -236,13 +229,6 @@ def test_missing_folder_and_huge_files_are_refused(tmp_path, monkeypatch):
     (tmp_path / "a.csv").write_text("lat_deg,lon_deg\n1,2\n")
     with pytest.raises(RouteError, match="larger than"):
         read_route(tmp_path / "a.csv")
-
-
-@given(polylines(), arrays(float, (8, 2), elements=st.floats(-6000, 6000)))
-def test_distances_are_those_of_shapely(line, points):
-    geometry = shapely.LineString(line) if len(line) > 1 else shapely.Point(line[0])
-    expected = shapely.distance(geometry, shapely.points(points))
-    np.testing.assert_allclose(distance_to_polyline_m(points, line), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("reach_deg, tolerance", [(1, 5e-6), (25, 5e-3)])
