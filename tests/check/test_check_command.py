@@ -285,7 +285,6 @@ def test_heights_above_sea_need_a_terrain(run, unwritten, half_blank, frame, rou
         (["--other-date", "no.tif"], "no.tif"),
         (["--camera", "no.json"], "no.json"),
         (["--agl-m", "40000"], "do not fit on the map"),
-        (["--route", "paper:A@10,10"], "does not touch the map"),
     ],
     ids=lambda each: " ".join(each) if isinstance(each, list) else "",
 )

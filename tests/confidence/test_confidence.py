@@ -8,7 +8,7 @@ import pytest
 from orthonav.core.errors import VariantError
 from orthonav.core.localize.confidence import TILE_FEATURES, USUAL_TILES, LogisticConfidence
 from orthonav.core.localize.tiles import MAX_RATIO, lowe_ratio
-from orthonav.ground.build.fit import fit_few, fit_logistic
+from orthonav.ground.build.calibrate import fit_few, fit_weights
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def probabilities(model, features):
 def test_it_is_right_as_often_as_it_says():
     features, right = synthetic(4000, seed=1)
     fresh, fresh_right = synthetic(20_000, seed=2)
-    said = probabilities(fit_logistic(features, right, np.ones(4000)), fresh)
+    said = probabilities(LogisticConfidence(*fit_weights(features, right, np.ones(4000))), fresh)
     deciles = np.digitize(said, np.linspace(0.1, 0.9, 9))
     for decile in range(10):
         inside = deciles == decile
@@ -56,7 +56,7 @@ def test_it_is_right_as_often_as_it_says():
 @pytest.mark.parametrize("flip", [(-1, 1), (1, -1), (-1, -1)])
 def test_weights_are_never_negative(flip):
     features, right = synthetic(3000, seed=5)
-    found = fit_logistic(features * flip, right, np.ones(3000))
+    found = LogisticConfidence(*fit_weights(features * flip, right, np.ones(3000)))
     assert all(weight >= 0 for weight in found.weights)
     for weight, sign in zip(found.weights, flip, strict=True):
         assert (weight == 0) == (sign < 0)

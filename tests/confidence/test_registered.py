@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from orthonav.core.errors import VariantError
 from orthonav.core.localize.confidence import CHANCES, FEATURES, Chances, RegisteredConfidence
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.build.fit import fit_registered
+from orthonav.ground.build.calibrate import fit_registered
 
 CHANCE = Chances(total=25.0, look=15.0, fine=40.0)
 MODEL = RegisteredConfidence((-8.0, -3.0), (0.5, 11.0, 1.5, 2.0, 1.0, 2.0, 3.0), CHANCE)

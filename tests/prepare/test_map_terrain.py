@@ -20,7 +20,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix
-from orthonav.ground.build.terrain import terrain_of_dem
+from orthonav.ground.build.layer import terrain_of_dem
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_area, add_options, print_json, progress, reporter
+from orthonav.cli.common import add_area, add_options, print_json, progress
 
 if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
@@ -100,7 +100,7 @@ def run(options: argparse.Namespace) -> None:
         **recipe_of(options),
     )
     with progress(options) as shown:
-        result = build_map(request, shown, reporter(options))
+        result = build_map(request, shown)
     plates = _plates(result.manifest) if options.epoch is None else []
     plain = summary(result.manifest, result.size_bytes, options.out)
     plain["build_s"] = round(time.perf_counter() - start, 3)

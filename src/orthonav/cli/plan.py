@@ -34,13 +34,11 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.core.errors import RouteError
     from orthonav.core.files import write_text
     from orthonav.ground.planning.area import Area
-    from orthonav.ground.planning.route import read_route
-    from orthonav.ground.planning.routes.geojson import to_geojson
-    from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
+    from orthonav.ground.planning.route import read_route, to_geojson
+    from orthonav.ground.planning.sheets import sheets_of_route
     from orthonav.ground.planning.spacing import (
         default_band_m,
         profile,
-        rate_cautions,
         terrain_cautions,
         view_cautions,
     )
@@ -55,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
     cautions, legs = [], []
     sheets: list[Route | Extent]
     if route is None:
-        sheets = [*sheets_of_bounds(options.bounds)]
+        sheets = [options.bounds]
     else:
         if options.band_m is None:
             options.band_m = default_band_m(0.0 if view is None else view.side_m)
@@ -69,7 +67,6 @@ def run(options: argparse.Namespace) -> None:
     gsd_m, tile_px = _map_of(options, view)
     if view is not None:
         cautions += view_cautions(view, gsd_m, tile_px)
-        cautions += rate_cautions(view, options.speed_mps) if options.speed_mps else []
     if route is not None and dem is not None:
         agl_m, view_m = (options.agl_m, 0.0) if view is None else (view.agl_m, view.short_m)
         legs = profile(route, route.bands_m(options.band_m) or (), agl_m, view_m, dem)

@@ -31,7 +31,8 @@ from orthonav.ground.atlas.coarse import coarse_grid, write_coarse
 from orthonav.ground.atlas.cut import box_around, box_deg, turned
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.build.build import BuildRequest, build_map
-from orthonav.ground.build.sheet import digest, grid_of, rounded_gsd_m
+from orthonav.ground.build.layer import rounded_gsd_m
+from orthonav.ground.build.sheet import digest, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area
@@ -398,7 +399,7 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
         **recipe,
     )
     try:
-        info = build_map(request, announce=log.debug).manifest.sheets[0]
+        info = build_map(request).manifest.sheets[0]
     except AreaError as error:  # the recipe was tried when the task was made: no imagery
         log.info("%s is empty: %s", name, error)
         return None

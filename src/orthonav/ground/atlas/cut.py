@@ -50,7 +50,13 @@ from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import variant_from_recipe
 from orthonav.ground.atlas.catalog import Atlas, Sheet
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
-from orthonav.ground.build.layer import GreyLayerWriter, Parts, StoredCells
+from orthonav.ground.build.layer import (
+    GreyLayerWriter,
+    Parts,
+    StoredCells,
+    TerrainParts,
+    terrain_parts,
+)
 from orthonav.ground.build.sheet import (
     MIN_TILE_VALID_SHARE,
     PREVIEW_PX,
@@ -61,10 +67,8 @@ from orthonav.ground.build.sheet import (
     in_order,
     layer_parts,
     one_opencv_thread,
-    put_layer_parts,
     tiles_of,
 )
-from orthonav.ground.build.terrain import TerrainParts, terrain_parts
 from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.route import along_polyline_en_m
 from orthonav.ground.planning.sheets import in_box
@@ -551,7 +555,7 @@ class _MapCutter:
         part = np.s_[: rows - block.row // spacing, : cols - block.col // spacing]
         self.cells.put(block.row, block.col, parts["means"][part], parts["share"][part])
         self.preview.put(block, parts["preview"])
-        put_layer_parts(self.layer, block, parts)
+        self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
 
 
 def _learnt(

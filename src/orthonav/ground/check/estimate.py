@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.build.fit import fit_weights
+from orthonav.ground.build.calibrate import fit_weights
 
 if TYPE_CHECKING:
     from orthonav.ground.check.trials import Trial

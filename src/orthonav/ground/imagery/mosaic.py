@@ -254,11 +254,6 @@ class SheetRaster:
         values, valid = self._composed(Window(col, row, width_px, height_px), 1)
         return GreyPixels(values[..., 0], valid)
 
-    def stamps(self, col: int, row: int, width_px: int, height_px: int) -> list[Any]:
-        """Files that a window depends on, in order of precedence, each with size and time."""
-        near = self._near(col, row, col + width_px, row + height_px)
-        return [self._mosaic.sources[index].stamp for index in np.flatnonzero(near).tolist()]
-
     def _composed(
         self, window: Window, colours: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

@@ -1,0 +1,160 @@
+"""Routes in XML: GPX 1.0 and 1.1 (topografix.com/GPX/1/1), KML (OGC 07-147r2), and KMZ, which is
+KML in a zip archive.
+
+Files are of unknown origin: no DTD is read, hence no entities and no external files. defusedxml and
+gpxpy are not used: neither limits the number and depth of elements, and 20 MB of empty elements
+would take gigabytes."""
+
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
+
+from orthonav.core.errors import RouteError
+from orthonav.ground.planning.record import (
+    Height,
+    HeightFrame,
+    Route,
+    parsed,
+    require_few_waypoints,
+)
+
+MAX_ELEMENTS = 1_000_000
+MAX_DEPTH = 100
+MAX_KML_BYTES = 20_000_000
+MAX_MEMBERS = 10_000
+_KML_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
+"""With other altitude modes, or none, the altitude is ignored, as KML specifies."""
+_END = struct.Struct("<4s4H2LH")
+
+
+def read_markup(data: bytes, kind: str, root: str) -> Element:
+    """The root of a document, with namespaces removed from its tags. `kind`: of the document, for
+    messages."""
+    if not data.strip():
+        raise RouteError(f"{kind} file is empty")
+    parser = XMLParser(target=_Builder(kind))
+    try:
+        parser.feed(data)
+        found: Element = parser.close()
+    except ParseError as error:
+        raise RouteError(f"{kind} file is not well-formed XML ({error})") from error
+    except (ValueError, LookupError) as error:  # unknown encoding
+        raise RouteError(f"{kind} file cannot be read ({error})") from error
+    if found.tag != root:
+        raise RouteError(f"{kind} must begin with <{root}>, got <{found.tag:.40}>")
+    return found
+
+
+def text_of(element: Element, tag: str) -> str | None:
+    return (element.findtext(tag) or "").strip() or None
+
+
+class _Builder(TreeBuilder):
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self._kind = kind
+        self._count = self._depth = 0
+
+    def doctype(self, *_: object) -> None:
+        raise RouteError(f"{self._kind} file has a DOCTYPE, which is not read; remove it")
+
+    def start(self, tag: str, attributes: dict[str, str]) -> Element:
+        self._count += 1
+        self._depth += 1
+        if self._count > MAX_ELEMENTS or self._depth > MAX_DEPTH:
+            raise RouteError(
+                f"{self._kind} file has more than {MAX_ELEMENTS:,} elements or {MAX_DEPTH} levels"
+            )
+        return super().start(tag.rpartition("}")[2], attributes)
+
+    def end(self, tag: str) -> Element:
+        self._depth -= 1
+        return super().end(tag.rpartition("}")[2])
+
+
+def read_gpx(data: bytes) -> list[Route]:
+    """All routes (`rte`), else all tracks (`trk`), the segments of each joined. Heights are above
+    mean sea level."""
+    root = read_markup(data, "GPX", "gpx")
+    planned = [_gpx_route(each, "rtept") for each in root.iterfind("rte[rtept]")]
+    found = planned or [
+        _gpx_route(each, "trkseg/trkpt")
+        for each in root.iterfind("trk")
+        if each.find("trkseg/trkpt") is not None
+    ]
+    if not found:
+        raise RouteError("GPX holds no route (rte) and no track (trk) with positions")
+    return found
+
+
+def _gpx_route(element: Element, points: str) -> Route:
+    waypoints, heights = [], []
+    for point in element.iterfind(points):
+        lat, lon = (parsed(point.get(name) or "", f"GPX {name}") for name in ("lat", "lon"))
+        waypoints.append((lat, lon))
+        height = text_of(point, "ele")
+        heights.append(None if height is None else Height(parsed(height, "GPX ele"), "amsl"))
+    return Route(tuple(waypoints), tuple(heights), name=text_of(element, "name"))
+
+
+def read_kmz(data: bytes) -> list[Route]:
+    """Lines of the archive's `doc.kml`, else of its only KML file."""
+    _check_archive(data)
+    try:
+        with zipfile.ZipFile(BytesIO(data)) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
+            names = [name for name in names if name.lower() == "doc.kml"] or names
+            if len(names) != 1:
+                raise RouteError(f"KMZ must hold one KML file, got {len(names)}")
+            with archive.open(names[0]) as member:
+                text = member.read(MAX_KML_BYTES + 1)
+    except (
+        *(zipfile.BadZipFile, zlib.error, EOFError, OSError),
+        *(NotImplementedError, RuntimeError),  # encrypted, odd compression
+    ) as error:
+        raise RouteError(f"KMZ cannot be unpacked ({error})") from error
+    if len(text) > MAX_KML_BYTES:
+        raise RouteError(f"KML in the KMZ is larger than {MAX_KML_BYTES // 10**6} MB")
+    return read_kml(text)
+
+
+def read_kml(data: bytes) -> list[Route]:
+    """One route per placemark with lines, which are joined."""
+    root = read_markup(data, "KML", "kml")
+    found = []
+    for mark in root.iter("Placemark"):
+        if places := [place for line in mark.iter("LineString") for place in _line(line)]:
+            heights = tuple(height for _, _, height in places)
+            waypoints = tuple((lat, lon) for lat, lon, _ in places)
+            found.append(Route(waypoints, heights, name=text_of(mark, "name")))
+    if not found:
+        raise RouteError("KML holds no LineString")
+    return found
+
+
+def _line(element: Element) -> Iterator[tuple[float, float, Height | None]]:
+    frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
+    text = re.sub(r"\s+", " ", text_of(element, "coordinates") or "")  # linear, unlike \s*,\s*
+    text = text.replace(" ,", ",").replace(", ", ",")
+    for number, found in enumerate(re.finditer(r"\S+", text), 1):
+        require_few_waypoints(number)
+        values = found.group().split(",")
+        if not 2 <= len(values) <= 3:
+            raise RouteError(
+                f"KML position must be longitude,latitude[,altitude], got {found.group()!r:.60}"
+            )
+        lon, lat, *rest = (parsed(value, "KML position") for value in values)
+        yield lat, lon, Height(rest[0], frame) if rest and frame is not None else None
+
+
+def _check_archive(data: bytes) -> None:
+    at = data.rfind(b"PK\x05\x06")
+    if at < 0 or len(data) - at < _END.size:
+        raise RouteError("KMZ is not a complete zip archive (its end is missing)")
+    members = _END.unpack_from(data, at)[4]
+    if members > MAX_MEMBERS or data[max(0, at - 20) : at].startswith(b"PK\x06\x07"):
+        raise RouteError(f"KMZ has more than {MAX_MEMBERS:,} members")
