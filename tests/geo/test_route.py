@@ -91,6 +91,18 @@ def test_columns_say_heights_and_bands(tmp_path):
     assert read_route(path) == Route(((46.5, 2.5),), (Height(120),), (400,))
 
 
+def test_a_mission_of_litchi_states_what_its_heights_count_from(tmp_path):
+    path = tmp_path / "litchi.csv"
+    header = "latitude,longitude,altitude({}),heading(deg),altitudemode,poi_altitude(m)\n"
+    path.write_text(header.format("m") + "46.5,2.5,100,90,0,7\n46.51,2.53,120,90,1,7\n")
+    assert read_route(path).heights == (Height(100, "home"), Height(120, "agl"))
+    path.write_text(header.format("ft") + "46.5,2.5,100,90,0,7\n")
+    assert read_route(path).heights == (Height(30.48, "home"),)
+    path.write_text(header.format("m") + "46.5,2.5,100,90,2,7\n")
+    with pytest.raises(RouteError, match="altitudemode must be 0"):
+        read_route(path)
+
+
 def test_a_pointer_of_git_lfs_is_named(tmp_path):
     path = tmp_path / "a.kml"
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")

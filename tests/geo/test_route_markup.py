@@ -13,10 +13,14 @@ from orthonav.ground.planning.route import Height, read_route
 BAD_LATITUDE = "a latitude within 90"
 PLACES = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))
 LINE = "<coordinates>\n 2.5,46.5,120 2.53,46.51,130\n\t2.55,46.49,140 </coordinates>"
+TRACK = (
+    "<gx:Track><when>2024-01-01T00:00:00Z</when><gx:coord>2.5 46.5 120</gx:coord>"
+    "<gx:coord/><gx:coord>2.53 46.51 130</gx:coord><gx:coord>2.55 46.49 140</gx:coord></gx:Track>"
+)
 
 
 def kml_of(*marks, namespaces=True):
-    spaces = 'xmlns="http://www.opengis.net/kml/2.2"'
+    spaces = 'xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2"'
     inner = "".join(
         f"<Placemark><name>{name}</name>{geometry}</Placemark>" for name, geometry in marks
     )
@@ -57,10 +61,13 @@ def read(tmp_path):
         (line("clampToGround"), None),
         (line("relativeToGround"), "agl"),
         (line("absolute"), "amsl"),
+        (TRACK, None),
+        (TRACK.replace("<when>", "<altitudeMode>absolute</altitudeMode><when>"), "amsl"),
+        (f"<gx:MultiTrack>{TRACK}</gx:MultiTrack>", None),
     ],
 )
 @pytest.mark.parametrize("namespaces", [True, False])
-def test_lines_of_kml(read, geometry, frame, namespaces):
+def test_lines_and_tracks_of_kml(read, geometry, frame, namespaces):
     point = ("start", "<Point><coordinates>1,2,0</coordinates></Point>")
     route = read(kml_of(point, ("way", geometry), namespaces=namespaces), "a.kml")
     assert route.waypoints == PLACES and route.name == "way"
@@ -74,7 +81,9 @@ def test_lines_of_one_placemark_are_joined_and_placemarks_picked_by_name(read):
         "<coordinates>2.55,46.49</coordinates>",
     )
     both = "".join(line(coordinates=half) for half in halves)
-    text = kml_of(("way", f"<MultiGeometry>{both}</MultiGeometry>"), ("é &amp; b", line()))
+    text = kml_of(
+        ("way", f"<MultiGeometry>{both}</MultiGeometry>"), ("é & b".replace("&", "&amp;"), TRACK)
+    )
     assert read(text, "a.kml#way").waypoints == PLACES
     assert read(text, "a.kml#é & b").waypoints == PLACES
     with pytest.raises(RouteError, match=r"2 lines; give .*: 1 'way', 2 'é & b'"):
@@ -85,6 +94,66 @@ def test_kmz_is_kml_in_an_archive(read):
     text = kml_of(("way", line()))
     assert read(archive(("doc.kml", text), ("files/b.kml", "<x/>")), "a.kmz").waypoints == PLACES
     assert read(archive(("way.KML", text), ("a.png", "x")), "a.kmz").waypoints == PLACES
+
+
+WAYPOINT = """<Placemark><Point><coordinates>{lon},{lat},0</coordinates></Point>
+<wpml:index>{index}</wpml:index><wpml:executeHeight>{height}</wpml:executeHeight></Placemark>"""
+
+
+def wayline(mode="relativeToStartPoint", ident=0, order=(0, 1, 2)):
+    marks = "".join(
+        WAYPOINT.format(lat=PLACES[i][0], lon=PLACES[i][1], index=i, height=50 + i) for i in order
+    )
+    return (
+        f"<Folder><wpml:executeHeightMode>{mode}</wpml:executeHeightMode>"
+        f"<wpml:waylineId>{ident}</wpml:waylineId>{marks}</Folder>"
+    )
+
+
+def wpml_of(*folders):
+    spaces = 'xmlns="http://www.opengis.net/kml/2.2" xmlns:wpml="http://www.dji.com/wpmz/1.0.2"'
+    config = (
+        "<wpml:missionConfig><wpml:finishAction>goHome</wpml:finishAction></wpml:missionConfig>"
+    )
+    return f"<kml {spaces}><Document>{config}{''.join(folders)}</Document></kml>"
+
+
+@pytest.mark.parametrize(
+    "mode, frame",
+    [("relativeToStartPoint", "home"), ("WGS84", "hae"), ("realTimeFollowSurface", "agl")],
+)
+@pytest.mark.parametrize("packed", [False, True])
+def test_waylines_of_dji(read, mode, frame, packed):
+    content, name = wpml_of(wayline(mode, order=(2, 0, 1))), "a.wpml"
+    if packed:
+        template = wpml_of(wayline())
+        members = ("wpmz/template.kml", template), ("wpmz/waylines.wpml", content)
+        content, name = archive(*members), "a.kmz"
+    route = read(content, name)
+    assert route.waypoints == PLACES
+    assert route.heights == tuple(Height(50.0 + i, frame) for i in range(3))
+
+
+def test_several_waylines_are_picked_by_identifier_or_number(read):
+    both = wpml_of(wayline(ident=7), wayline(ident=8, order=(0, 1)))
+    with pytest.raises(RouteError, match=r"2 lines; .*: 1 '7', 2 '8'"):
+        read(both, "a.wpml")
+    assert len(read(both, "a.wpml#8").waypoints) == len(read(both, "a.wpml#2").waypoints) == 2
+
+
+@pytest.mark.parametrize(
+    "content, name, message",
+    [
+        (wpml_of(), "a.wpml", "no wayline with waypoints"),
+        (wpml_of(wayline("aboveTheMoon")), "a.wpml", "executeHeightMode must be relative"),
+        (wpml_of(wayline()).replace("<wpml:index>1", "<wpml:index>x"), "a.wpml", "WPML index"),
+        (wpml_of(wayline()).replace("2.5,46.5,0", "2.5"), "a.wpml", "cannot be read"),
+        ("<gpx/>", "a.wpml", "must begin with <kml>"),
+    ],
+)
+def test_waylines_that_are_none(read, content, name, message):
+    with pytest.raises(RouteError, match=message):
+        read(content, name)
 
 
 GPX = """<?xml version="1.0"?>

@@ -135,8 +135,8 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "--route": {
         "type": Path,
         "metavar": "FILE",
-        "help": "planned route: GeoJSON, CSV, KML or KMZ, GPX, a QGroundControl plan or a "
-        "waypoint file (FILE#NAME or FILE#NUMBER selects one of several)",
+        "help": "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan "
+        "or a waypoint file (FILE#NAME or FILE#NUMBER selects one of several)",
     },
     "--seed": {"type": int, "help": "seed of all random draws"},
     "--speed-mps": {"type": float, "help": "ground speed"},

@@ -1,5 +1,6 @@
-"""Routes in XML: GPX 1.0 and 1.1 (topografix.com/GPX/1/1), KML (OGC 07-147r2), and KMZ, which is
-KML in a zip archive.
+"""Routes in XML: GPX 1.0 and 1.1 (topografix.com/GPX/1/1), KML (OGC 07-147r2, and Google's
+gx:Track), KMZ, which is KML in a zip archive, and waylines of DJI's waypoint missions (WPML:
+https://developer.dji.com/doc/cloud-api-tutorial/en/api-reference/dji-wpml/waylines-wpml.html).
 
 Files are of unknown origin: no DTD is read, hence no entities and no external files. defusedxml and
 gpxpy are not used: neither limits the number and depth of elements, and 20 MB of empty elements
@@ -11,7 +12,8 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from io import BytesIO
-from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
 
 from orthonav.core.errors import RouteError
 from orthonav.ground.planning.record import (
@@ -29,21 +31,33 @@ MAX_MEMBERS = 10_000
 _KML_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
 """With other altitude modes, or none, the altitude is ignored, as KML specifies."""
 _END = struct.Struct("<4s4H2LH")
+_WPML_FRAMES: dict[str, HeightFrame] = {  # by `executeHeightMode`
+    "relativeToStartPoint": "home",
+    "WGS84": "hae",
+    "realTimeFollowSurface": "agl",
+}
+_Place = tuple[float, float, Height | None]
 
 
 def read_markup(data: bytes, kind: str, root: str) -> Element:
-    """The root of a document, with namespaces removed from its tags. `kind`: of the document, for
-    messages."""
+    """The root of a document, with namespaces removed from its tags: `gx:Track` is Track. `kind`:
+    of the document, for messages."""
     if not data.strip():
         raise RouteError(f"{kind} file is empty")
-    parser = XMLParser(target=_Builder(kind))
+    builder = _Builder(kind)
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartDoctypeDeclHandler = builder.doctype
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
     try:
-        parser.feed(data)
-        found: Element = parser.close()
-    except ParseError as error:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
         raise RouteError(f"{kind} file is not well-formed XML ({error})") from error
     except (ValueError, LookupError) as error:  # unknown encoding
         raise RouteError(f"{kind} file cannot be read ({error})") from error
+    found = builder.close()
     if found.tag != root:
         raise RouteError(f"{kind} must begin with <{root}>, got <{found.tag:.40}>")
     return found
@@ -69,11 +83,11 @@ class _Builder(TreeBuilder):
             raise RouteError(
                 f"{self._kind} file has more than {MAX_ELEMENTS:,} elements or {MAX_DEPTH} levels"
             )
-        return super().start(tag.rpartition("}")[2], attributes)
+        return super().start(tag.rpartition(":")[2], attributes)
 
     def end(self, tag: str) -> Element:
         self._depth -= 1
-        return super().end(tag.rpartition("}")[2])
+        return super().end(tag.rpartition(":")[2])
 
 
 def read_gpx(data: bytes) -> list[Route]:
@@ -102,15 +116,15 @@ def _gpx_route(element: Element, points: str) -> Route:
 
 
 def read_kmz(data: bytes) -> list[Route]:
-    """Lines of the archive's `doc.kml`, else of its only KML file."""
+    """Lines and tracks of the archive's `doc.kml`, else of its only KML file; of a mission of DJI
+    its waylines."""
     _check_archive(data)
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
-            names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
-            names = [name for name in names if name.lower() == "doc.kml"] or names
-            if len(names) != 1:
-                raise RouteError(f"KMZ must hold one KML file, got {len(names)}")
-            with archive.open(names[0]) as member:
+            chosen = _chosen_members(archive.namelist())
+            if len(chosen) != 1:
+                raise RouteError(f"KMZ must hold one KML file, got {len(chosen)}")
+            with archive.open(chosen[0]) as member:
                 text = member.read(MAX_KML_BYTES + 1)
     except (
         *(zipfile.BadZipFile, zlib.error, EOFError, OSError),
@@ -119,36 +133,61 @@ def read_kmz(data: bytes) -> list[Route]:
         raise RouteError(f"KMZ cannot be unpacked ({error})") from error
     if len(text) > MAX_KML_BYTES:
         raise RouteError(f"KML in the KMZ is larger than {MAX_KML_BYTES // 10**6} MB")
-    return read_kml(text)
+    return read_wpml(text) if chosen[0].lower().endswith(".wpml") else read_kml(text)
+
+
+def _chosen_members(members: list[str]) -> list[str]:
+    """The members with the route: waylines of DJI (beside a template in KML), else `doc.kml`."""
+    waylines = [name for name in members if name.lower().endswith(".wpml")]
+    names = [name for name in members if name.lower().endswith(".kml")]
+    return waylines or [name for name in names if name.lower() == "doc.kml"] or names
 
 
 def read_kml(data: bytes) -> list[Route]:
-    """One route per placemark with lines, which are joined."""
     root = read_markup(data, "KML", "kml")
-    found = []
-    for mark in root.iter("Placemark"):
-        if places := [place for line in mark.iter("LineString") for place in _line(line)]:
-            heights = tuple(height for _, _, height in places)
-            waypoints = tuple((lat, lon) for lat, lon, _ in places)
-            found.append(Route(waypoints, heights, name=text_of(mark, "name")))
+    found = [route for mark in root.iter("Placemark") for route in _kml_routes(mark)]
     if not found:
-        raise RouteError("KML holds no LineString")
+        raise RouteError("KML holds no LineString and no gx:Track")
     return found
 
 
-def _line(element: Element) -> Iterator[tuple[float, float, Height | None]]:
+def _kml_routes(mark: Element) -> list[Route]:
+    places = [
+        place
+        for element in mark.iter()
+        if element.tag in ("LineString", "Track")
+        for place in (_line(element) if element.tag == "LineString" else _track(element))
+    ]
+    if not places:
+        return []
+    heights = tuple(height for _, _, height in places)
+    waypoints = tuple((lat, lon) for lat, lon, _ in places)
+    return [Route(waypoints, heights, name=text_of(mark, "name"))]
+
+
+def _line(element: Element) -> Iterator[_Place]:
     frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
     text = re.sub(r"\s+", " ", text_of(element, "coordinates") or "")  # linear, unlike \s*,\s*
     text = text.replace(" ,", ",").replace(", ", ",")
     for number, found in enumerate(re.finditer(r"\S+", text), 1):
         require_few_waypoints(number)
-        values = found.group().split(",")
-        if not 2 <= len(values) <= 3:
-            raise RouteError(
-                f"KML position must be longitude,latitude[,altitude], got {found.group()!r:.60}"
-            )
-        lon, lat, *rest = (parsed(value, "KML position") for value in values)
-        yield lat, lon, Height(rest[0], frame) if rest and frame is not None else None
+        yield _kml_place(found.group().split(","), frame, found.group())
+
+
+def _track(element: Element) -> Iterator[_Place]:
+    frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
+    for coordinates in element.iter("coord"):
+        text = (coordinates.text or "").strip()
+        if text:  # the schema allows gaps
+            yield _kml_place(text.split(), frame, text)
+
+
+def _kml_place(values: list[str], frame: HeightFrame | None, text: str) -> _Place:
+    if not 2 <= len(values) <= 3:
+        raise RouteError(f"KML position must be longitude,latitude[,altitude], got {text!r:.60}")
+    lon, lat, *rest = (parsed(value, "KML position") for value in values)
+    height = Height(rest[0], frame) if rest and frame is not None else None
+    return lat, lon, height
 
 
 def _check_archive(data: bytes) -> None:
@@ -158,3 +197,39 @@ def _check_archive(data: bytes) -> None:
     members = _END.unpack_from(data, at)[4]
     if members > MAX_MEMBERS or data[max(0, at - 20) : at].startswith(b"PK\x06\x07"):
         raise RouteError(f"KMZ has more than {MAX_MEMBERS:,} members")
+
+
+def read_wpml(data: bytes) -> list[Route]:
+    """The waylines of a mission, one route per folder, their waypoints by index."""
+    root = read_markup(data, "WPML", "kml")
+    found = [route for folder in root.iter("Folder") for route in _waylines(folder)]
+    if not found:
+        raise RouteError("WPML holds no wayline with waypoints")
+    return found
+
+
+def _waylines(folder: Element) -> Iterator[Route]:
+    mode = text_of(folder, "executeHeightMode")
+    if mode is not None and mode not in _WPML_FRAMES:
+        raise RouteError(
+            f"WPML executeHeightMode must be {', '.join(_WPML_FRAMES)}, got {mode!r:.60}"
+        )
+    frame = None if mode is None else _WPML_FRAMES[mode]
+    marks = folder.findall("Placemark[Point]")
+    require_few_waypoints(len(marks))
+    marks.sort(key=lambda mark: parsed(text_of(mark, "index") or "", "WPML index"))
+    if marks:
+        heights = tuple(_wpml_height(mark, frame) for mark in marks)
+        yield Route(tuple(map(_wpml_latlon, marks)), heights, name=text_of(folder, "waylineId"))
+
+
+def _wpml_latlon(mark: Element) -> tuple[float, float]:
+    values = (mark.findtext("Point/coordinates") or "").strip().split(",")
+    lon, lat = (parsed(value, "WPML position") for value in values[:2])
+    return lat, lon
+
+
+def _wpml_height(mark: Element, frame: HeightFrame | None) -> Height | None:
+    """The height that is flown; the third coordinate of the point is not."""
+    text = text_of(mark, "executeHeight")
+    return None if text is None else Height(parsed(text, "WPML executeHeight"), frame)

@@ -17,7 +17,7 @@ from orthonav.core.errors import MissingFileError, RouteError, described, lfs_po
 from orthonav.core.extras import needed
 from orthonav.core.geo.frames import distances_m
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
-from orthonav.ground.planning.markup import read_gpx, read_kml, read_kmz
+from orthonav.ground.planning.markup import read_gpx, read_kml, read_kmz, read_wpml
 from orthonav.ground.planning.mission import is_wpl, plan_route, read_wpl
 from orthonav.ground.planning.record import (
     Height,
@@ -150,6 +150,10 @@ _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
     ("hae", ("hae_m",)),
     (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
 )
+_MODE = "altitudemode"  # column of Litchi
+_FRAME_OF_MODE: dict[float | None, HeightFrame] = {0: "home", 1: "agl"}
+_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
+_METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
 _Values = Callable[[str], list[float | None]]
 
 
@@ -160,7 +164,7 @@ def _read_delimited(data: bytes) -> list[Route]:
     delimiter = max(",;\t", key=header.count)
     try:
         table = TableRows(stream, delimiter=delimiter)
-        names = {name.strip().lower(): name for name in table.columns}
+        names = {_UNIT.sub("", name.strip().lower()): name for name in table.columns}
         rows = []
         for row in table:
             rows.append(row)
@@ -194,8 +198,21 @@ def _heights(names: dict[str, str], values: _Values) -> tuple[Height | None, ...
     frame, name = next(known, (None, None))
     if name is None:
         return ()
+    unit = _UNIT.search(names[name].strip().lower())
+    if unit is not None and unit[1] not in _METRES:
+        raise RouteError(f"heights must be in m or ft, got the column {names[name]!r:.60}")
+    factor = 1.0 if unit is None else _METRES[unit[1]]
     heights = values(name)
-    return tuple(None if height is None else Height(height, frame) for height in heights)
+    frames = [frame] * len(heights)
+    if frame is None and _MODE in names:
+        modes = values(_MODE)
+        if not {None, 0, 1}.issuperset(modes):
+            raise RouteError(f"{names[_MODE]} must be 0 (above take-off) or 1 (above ground)")
+        frames = [_FRAME_OF_MODE.get(mode) for mode in modes]
+    return tuple(
+        None if height is None else Height(factor * height, each)
+        for height, each in zip(heights, frames, strict=True)
+    )
 
 
 def _read_json(data: bytes) -> list[Route]:
@@ -217,6 +234,7 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
     ".plan": lambda data: [plan_route(json_object(data))],
     ".kml": read_kml,
     ".kmz": read_kmz,
+    ".wpml": read_wpml,
     ".gpx": read_gpx,
 }
 
