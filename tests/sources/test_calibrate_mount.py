@@ -11,7 +11,7 @@ from orthonav.core.flight.mount import Bias, Mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.core.track import Model
-from orthonav.ground.recordings.calibrate_mount import calibrate_mount
+from orthonav.ground.recordings.calibrate import calibrate_mount
 from orthonav.onboard.run import MountCorrected, model_of
 
 CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0)

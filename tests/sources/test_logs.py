@@ -21,8 +21,7 @@ from recorders import (
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.telemetry_track import angles_at
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.autopilot_logs import DAMAGED
-from orthonav.ground.recordings.logs import read_log
+from orthonav.ground.recordings.logs import DAMAGED, read_log
 
 DOWN = (0.0, 0.0, 0.0)
 WRITERS = {

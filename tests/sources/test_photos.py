@@ -28,8 +28,7 @@ from orthonav.core.geo.attitude import (
     GIMBAL_TILT_STD_DEG,
 )
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.exif import Xmp, read_photo
-from orthonav.ground.recordings.focal import FocalLength, Optics, focal_length
+from orthonav.ground.recordings.exif import FocalLength, Optics, Xmp, focal_length, read_photo
 from orthonav.ground.recordings.photos import UNKNOWN_YAW_STD_DEG, posed
 from orthonav.ground.recordings.recording import LEVEL_GROUND
 

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from orthonav.core.flight.recording import RecordedView
-    from orthonav.core.records import ViewResult
-    from orthonav.ground.recordings.calibrate_mount import MountCalibration
+    from orthonav.ground.recordings.calibrate import MountCalibration
 
 GNSS_STD_M = 5.0
 """Standard deviation of measured positions, per axis."""
@@ -64,28 +63,21 @@ def run(options: argparse.Namespace) -> None:
             raise FlightError("--latency uses the heights of the log: omit --dem")
         _run_latency(options)
         return
-    found, by_track = _calibrated(options)
+    found = _calibrated(options)
     write_mount(options.out, found.mount)
     with beside(options.out):
-        _print_mount(options, found, by_track)
+        if options.json:
+            print_json(_plain(found))
+            return
+        print(_table(found))
+        print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
+        if found.moved:
+            print("the camera moved in its mount before these views; earlier views are not used")
+        print(f"written to {options.out}")
 
 
-def _print_mount(options: argparse.Namespace, found: "MountCalibration", by_track: bool) -> None:
-    if options.json:
-        print_json(_plain(found))
-        return
-    print(_table(found))
-    print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
-    if not by_track:
-        print("the views do not form a track: this is the mean of single views")
-    if found.moved:
-        print("the camera moved in its mount before these views; earlier views are not used")
-    print(f"written to {options.out}")
-
-
-def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
-    """The mount by the smoothed track of the flight, and True; by its single views, and False,
-    where these make no track."""
+def _calibrated(options: argparse.Namespace) -> "MountCalibration":
+    """The mount by the smoothed track of the flight."""
     from orthonav.core.flight import read_truth
     from orthonav.core.flight.recording import WithTelemetry
     from orthonav.core.localize import Localizer
@@ -93,15 +85,8 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     from orthonav.core.records import Prior
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.evaluate.metrics import check_truth
-    from orthonav.ground.recordings.calibrate_mount import (
-        MIN_VIEWS,
-        RecordedSingleViews,
-        calibrate_mount,
-        calibrate_mount_by_views,
-        confident_views,
-    )
+    from orthonav.ground.recordings.calibrate import calibrate_mount
     from orthonav.ground.recordings.localize import localize_flight, smoothed_track
-    from orthonav.onboard.run import Locator
 
     dem, opened = dem_of(options), open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
@@ -111,41 +96,31 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
         frame = opened.manifest.sheets[0].frame
         check_truth(places, (), (frame.lat_deg, frame.lon_deg), options.gnss_positions)
     priors = {frame: Prior(*place, GNSS_STD_M) for frame, place in places.items()}
-    localizer, heading_known = Localizer(opened), options.heading == "known"
-
-    def located(locator: Locator, stage: str) -> "list[ViewResult]":
-        views = (
-            WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
-        )
-        heights = flight_heights(options, opened, flight, dem)
-        results = []
-        with progress(options) as shown:
-            for result in localize_flight(
-                locator, flight, skip_bad_images=True, views=views, heights=heights
-            ):
-                results.append(result)
-                if flight.expected:
-                    shown(stage, min(1.0, len(results) / flight.expected))
-        return results
-
     tracker = Tracker(
-        localizer,
-        heading_known=heading_known,
+        Localizer(opened),
+        heading_known=options.heading == "known",
         use_prior=bool(options.gnss_positions),
         every_prior=bool(options.gnss_positions),
         smooth=True,
     )
-    tracked = smoothed_track(tracker, located(tracker, "calibrate"), None)
-    if len(confident_views(tracked)) >= MIN_VIEWS:
-        return calibrate_mount(tracked), True
-    # Photographs far apart, for one.
-    alone = RecordedSingleViews(localizer, bool(priors), heading_known)
-    return calibrate_mount_by_views(located(alone, "single views"), alone.reported), False
+    views = (
+        WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
+    )
+    heights = flight_heights(options, opened, flight, dem)
+    results = []
+    with progress(options) as shown:
+        for result in localize_flight(
+            tracker, flight, skip_bad_images=True, views=views, heights=heights
+        ):
+            results.append(result)
+            if flight.expected:
+                shown("calibrate", min(1.0, len(results) / flight.expected))
+    return calibrate_mount(smoothed_track(tracker, results, None))
 
 
 def _run_latency(options: argparse.Namespace) -> None:
     from orthonav.core.flight.mount import write_latency
-    from orthonav.ground.recordings.calibrate_latency import arrivals_of, calibrate_latency
+    from orthonav.ground.recordings.calibrate import arrivals_of, calibrate_latency
 
     flight = open_source(options.flight, options)
     with progress(options) as shown:

@@ -31,8 +31,7 @@ from orthonav.ground.recordings.recording import (
     time_warnings,
     with_options,
 )
-from orthonav.ground.recordings.ros import open_ros
-from orthonav.ground.recordings.ros_files import METADATA, bag_suffix, storage_files
+from orthonav.ground.recordings.ros import METADATA, bag_suffix, open_ros, storage_files
 from orthonav.ground.recordings.video import open_video
 
 _VIDEO_STARTS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"FLV\1")

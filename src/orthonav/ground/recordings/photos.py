@@ -22,8 +22,7 @@ from orthonav.core.geo.attitude import (
 )
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
-from orthonav.ground.recordings.exif import Photo, PhotoPose, read_photo
-from orthonav.ground.recordings.focal import FocalLength, focal_length
+from orthonav.ground.recordings.exif import FocalLength, Photo, PhotoPose, focal_length, read_photo
 from orthonav.ground.recordings.image_table import (
     ImageRow,
     ImageTable,

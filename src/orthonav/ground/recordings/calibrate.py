@@ -1,10 +1,11 @@
-"""Latency of a camera, from exposure to arrival, estimated from a recorded flight.
+"""What `orthonav calibrate` estimates from a flight: constant errors of the telemetry, and latency.
 
-The motion between consecutive pictures is compared with the motion that follows from attitude,
-velocity and height reported at the times of arrival less a candidate of the latency, over windows
-of half a minute: a grid of candidates first, then refined. What is known only nearly (height,
-direction of the velocity, orientation of the camera) is estimated with it. A window in which many
-candidates fit, as in straight and level flight, gives no number.
+Latency is the time from the exposure of a picture to its arrival. The motion between consecutive
+pictures is compared with the motion that follows from attitude, velocity and height reported at the
+times of arrival less a candidate of the latency, over windows of half a minute: a grid of
+candidates first, then refined. What is known only nearly (height, direction of the velocity,
+orientation of the camera) is estimated with it. A window in which many candidates fit, as in
+straight and level flight, gives no number.
 
 For a latency d, the seen turn of a pair of pictures is the reported one, `turn(d)`, and the seen
 shift is
@@ -16,16 +17,22 @@ with J the rotation by 90 deg. These five linear parameters have Gaussian priors
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.mount import CameraLatency
+from orthonav.core.flight.mount import Bias, CameraLatency, Mount
 from orthonav.core.flight.recording import Flight, RecordedView
 from orthonav.core.geo.camera import Camera, enu_from_camera
+from orthonav.core.records import (
+    CONFIDENT,
+    Fix,
+    ViewResult,
+)
 from orthonav.ground.recordings.flightlog import LoggedFlight
 from orthonav.onboard.motion import (
     LONGEST_S,
@@ -38,6 +45,20 @@ from orthonav.onboard.motion import (
     varying,
 )
 
+MIN_VIEWS = 5
+MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
+"""A tilt that differs by more than both from that at the end shows that the camera moved."""
+MAD_TO_STD = 1.4826
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
+STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
+"""Lower bounds of the standard deviations of the estimated biases."""
+_LASTING = ("pitch_deg", "roll_deg")
+_EVIDENCE = {
+    "heading_deg": "heading_bias_deg",
+    "log_scale": "log_scale_bias",
+    "pitch_deg": "pitch_bias_deg",
+    "roll_deg": "roll_bias_deg",
+}
 GAP_S = 1.0  # longest interval between views over which telemetry is interpolated
 EVERY_S = 10.0  # interval of estimates
 LEAST = 3  # number of estimates that must agree
@@ -65,14 +86,10 @@ LARGEST_STD_S, FLOOR_S = 0.3, 0.025
 """Largest standard deviation of an answer; least one: half an interval of the stored states."""
 EXPLAINED, STANDS_OUT = 0.6, 2.0
 """Least fraction of motion of so many least standard deviations that the latency must explain."""
-UNEXPLAINED, MANY_PAIRS, STANDS_FAR_OUT = 0.3, 40, 4.0
-"""Pictures contradict the autopilot where so many pairs, with motion of so many least standard
-deviations, are explained by less than this share at any latency."""
-SCALES, ACROSS, CLEAR_STD = (0.5, 2.0), 0.6, 0.3
-"""Fitted scale and direction (rad) of the velocity beyond which pictures contradict the autopilot,
-and the standard deviation of the scale below which they can."""
+SCALES, ACROSS = (0.5, 2.0), 0.6
+"""Largest errors of scale and direction (rad) of the velocity of a latency that is believed."""
 LEAST_WEIGHT = 0.5  # least mean weight of the pairs: 1 without outliers
-OUTLIER, MAD_TO_STD = 3.0, 1.4826  # scale of the Cauchy weights, in standard deviations
+OUTLIER = 3.0  # scale of the Cauchy weights, in standard deviations
 ALIKE = 4.0
 """Differences of successive pairs are correlated: so many count as one. Chosen so that errors of
 the estimate are as large as stated (tests/onboard/test_calibrate_latency.py)."""
@@ -80,6 +97,90 @@ STEPS = 5
 CANDIDATES_S = np.arange(round((MOST_S - LEAST_S) / STEP_S) + 1) * STEP_S + LEAST_S
 _CANDIDATES_NS = np.round(CANDIDATES_S * 1e9).astype(np.int64)
 Array = NDArray[np.float64]
+Prior = tuple[Array, Array]
+"""Mean (5,) and precision (5, 5) of the linear parameters."""
+
+
+@dataclass(frozen=True)
+class MountCalibration:
+    """A mount calibration.
+
+    `mount`: estimated biases.
+    `first`, `last`: frames of the first and the last view used.
+    `moved`: whether the camera moved in its mount before `first`.
+    """
+
+    mount: Mount
+    first: str
+    last: str
+    moved: bool
+
+
+def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
+    """Mount at the end of a tracked flight, estimated from its confident views.
+
+    Views before a movement of the camera in its mount are excluded. Biases are medians; their
+    standard deviations account for the correlation of successive views. Raises `FlightError` where
+    fewer than `MIN_VIEWS` views are confident.
+    """
+    confident = confident_views(results)
+    if len(confident) < MIN_VIEWS:
+        raise FlightError(
+            f"{len(confident)} of {len(results)} views have a confidence of {CONFIDENT} or more; a "
+            f"calibration needs {MIN_VIEWS}: check the map, the camera and the reported height"
+        )
+    values, spreads = (
+        {
+            name: np.array([each.outcome.evidence[key.replace("bias", bias)] for each in confident])
+            for name, key in _EVIDENCE.items()
+        }
+        for bias in ("bias", "bias_std")
+    )
+    begin = max(_still_from(values[name], spreads[name]) for name in ("pitch_deg", "roll_deg"))
+    begin = min(begin, len(confident) - MIN_VIEWS)
+    used = slice(begin, None)
+    biases = {
+        name: _bias(values[name][used], spreads[name][used], STD_FLOOR[name], name in _LASTING)
+        for name in _EVIDENCE
+    }
+    mount = Mount(**biases, views=len(confident) - begin)
+    return MountCalibration(mount, confident[begin].frame, confident[-1].frame, begin > 0)
+
+
+def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
+    """Confident views of a track that state their biases."""
+    return [
+        each
+        for each in results
+        if isinstance(each.outcome, Fix)
+        and each.outcome.confidence >= CONFIDENT
+        and "pitch_bias_deg" in each.outcome.evidence
+    ]
+
+
+def _still_from(values: Array, spreads: Array) -> int:
+    """Index of the first view from which on a value stays close to that at the end."""
+    end = float(np.median(values[-MIN_VIEWS:]))
+    far = np.abs(values - end) > np.maximum(MOVED_SIGMAS * spreads, MOVED_DEG)
+    return int(np.flatnonzero(far)[-1]) + 1 if far.any() else 0
+
+
+def _bias(values: Array, spreads: Array, floor: float, lasting: bool) -> Bias:
+    """Median, its standard deviation, and the scatter around it.
+
+    The standard deviation of a `lasting` bias is that of the track. Otherwise it is that of the
+    mean of the views, their number reduced by the autocorrelation at lag one.
+    """
+    middle = float(np.median(values))
+    off = values - middle
+    scatter = MAD_TO_STD * float(np.median(np.abs(off)))
+    if lasting:
+        return Bias(middle, max(floor, float(np.median(spreads))), scatter)
+    energy = float(off @ off)
+    alike = float(off[1:] @ off[:-1]) / energy if energy > 0 else 0.0
+    alike = min(max(alike, 0.0), 0.99)
+    mean_std = scatter * math.sqrt((1 + alike) / (1 - alike) / len(values))
+    return Bias(middle, max(floor, mean_std), scatter)
 
 
 def arrivals_of(flight: Flight) -> Iterator[tuple[RecordedView, float]]:
@@ -105,7 +206,7 @@ def calibrate_latency(
     """
     history = StateHistory(GAP_S)
     odometry, estimator = PictureOdometry(), LatencyEstimator(heading_known=heading_known)
-    estimates: list[LatencyEstimate] = []
+    estimates: list[LatencyEstimate | None] = []
     due_ns: float = -math.inf
     intervals = []
     before_ns = None
@@ -136,37 +237,12 @@ def calibrate_latency(
     return _agreed(estimates, intervals)
 
 
-@dataclass(frozen=True)
-class LatencyEstimate:
-    """The latency in one window.
+class LatencyEstimate(NamedTuple):
+    """The latency (s) in one window, its standard deviation and the number of compared pairs."""
 
-    `delay_s`, `std_s`: exposure to arrival and its standard deviation; NaN where not observable.
-    `contradicted`: whether pictures do not move as the autopilot reports, at any latency.
-    `pairs`: number of compared pairs of pictures.
-    """
-
-    delay_s: float = math.nan
-    std_s: float = math.nan
-    contradicted: bool = False
-    pairs: int = 0
-
-    @property
-    def found(self) -> bool:
-        """Whether the latency was observable."""
-        return math.isfinite(self.delay_s)
-
-
-def explained_share(
-    seconds: Array, turn: Array, shift: Array, turn_off: Array, shift_off: Array, stands_out: float
-) -> float:
-    """Least fraction of the motion that is explained, of turn (N,) and of the varying part of shift
-    (N, 2), where it is at least `stands_out` least standard deviations; NaN where neither is.
-
-    `seconds` (N,): durations. `turn_off` (N,), `shift_off` (N, 2): seen less reported motion.
-    """
-    turned = explained_part(turn[:, None], turn_off[:, None], stands_out * TURN_STD_RAD)
-    shifted = explained_part(varying(shift, seconds), shift_off, stands_out * SHIFT_STD)
-    return float(np.fmin(turned, shifted))
+    delay_s: float
+    std_s: float
+    pairs: int
 
 
 class LatencyEstimator:
@@ -192,10 +268,10 @@ class LatencyEstimator:
             while self._pairs[0][0].start_ns < one.end_ns - WINDOW_S * 1e9:
                 self._pairs.popleft()
 
-    def estimate(self) -> LatencyEstimate:
-        """The latency in the window."""
+    def estimate(self) -> LatencyEstimate | None:
+        """The latency in the window, None where it is not observable."""
         if len(self._pairs) < LEAST_PAIRS:
-            return LatencyEstimate(pairs=len(self._pairs))
+            return None
         motions, reported = zip(*self._pairs, strict=True)
         pairs = _Pairs(
             np.array([each.seconds for each in motions]),
@@ -225,18 +301,13 @@ class _Pairs:
         size = np.sqrt(np.square(some).sum(axis=-1).mean())
         return np.array([TURN_STD_RAD, np.hypot(SHIFT_STD, SHARE_STD * size)])
 
-    def explained(self, fit: "_Fit", stands_out: float) -> float:
-        """`explained_share` of a fit."""
-        off = fit.turn_off, fit.shift_off
-        return explained_share(self.seconds, self.turn, self.shift, *off, stands_out)
-
-
-@dataclass(frozen=True, eq=False)
-class _Prior:
-    """Mean (5,) and precision (5, 5) of the linear parameters."""
-
-    mean: Array
-    precision: Array
+    def explained(self, fit: "_Fit") -> float:
+        """Least fraction of the motion that a fit explains, of turn and of the varying part of
+        shift, where it stands out; NaN where neither does."""
+        least = STANDS_OUT * TURN_STD_RAD, STANDS_OUT * SHIFT_STD
+        turned = explained_part(self.turn[:, None], fit.turn_off[:, None], least[0])
+        shifted = explained_part(varying(self.shift, self.seconds), fit.shift_off, least[1])
+        return float(np.fmin(turned, shifted))
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,48 +330,40 @@ class _Fit:
         return np.asarray(np.maximum(least, MAD_TO_STD * np.array(middle)))
 
 
-def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate:
-    count = len(pairs.turn)
-    nothing = LatencyEstimate(pairs=count)
-    contradicted = LatencyEstimate(contradicted=True, pairs=count)
+def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
     prior = _prior(pairs.reported, heading_known=heading_known)
-    noise, weights = pairs.least_noise(), np.ones(count)
+    noise, weights = pairs.least_noise(), np.ones(len(pairs.turn))
     least = noise
     for _ in range(3):  # robust: pairs that the best candidate does not explain count less
-        cost, linear, covariance = _coarse(pairs, weights, noise, prior)
+        cost = _costs(pairs, weights, noise, prior)
         best = int(np.argmin(cost))
         fit = _fitted(pairs, pairs.reported[:, best], noise, prior)
         noise, weights = fit.scatter(least), fit.weights
     if (np.isfinite(pairs.reported[..., :3]).all(axis=-1).mean(axis=0) < KNOWN_SHARE).any():
-        return nothing  # a latency that cannot be excluded
-    std = 2 * np.sqrt(np.diag(covariance[best])[:2])
-    if _contradicts(linear[best], std, heading_known=heading_known):
-        return contradicted
-    if count >= MANY_PAIRS and pairs.explained(fit, STANDS_FAR_OUT) < UNEXPLAINED:
-        return contradicted
-    if weights.mean() < LEAST_WEIGHT:
-        return nothing  # too many outliers
+        return None  # a latency that cannot be excluded
     chance = np.exp((cost[best] - cost) / (2 * ALIKE))
     near = np.abs(CANDIDATES_S - CANDIDATES_S[best]) <= NEAR_S
-    if chance[near].sum() < NEAR_MASS * chance.sum():
-        return nothing
-    if not _possible(fit.linear, heading_known=heading_known):
-        return nothing
+    ambiguous = chance[near].sum() < NEAR_MASS * chance.sum()
+    scale, across = fit.linear[:2].tolist()
+    turned = abs(math.atan2(across, scale)) if heading_known else 0.0
+    usual = SCALES[0] < math.hypot(scale, across) < SCALES[1] and turned < ACROSS
+    if weights.mean() < LEAST_WEIGHT or ambiguous or not usual:
+        return None
     delay_s, variance, fit = _refined(pairs, float(CANDIDATES_S[best]), noise, prior)
     std_s = math.hypot(FLOOR_S, math.sqrt(variance))
     lost = abs(delay_s - CANDIDATES_S[best]) > NEAR_S
-    if lost or std_s > LARGEST_STD_S or not pairs.explained(fit, STANDS_OUT) >= EXPLAINED:
-        return nothing
-    return LatencyEstimate(delay_s, std_s, pairs=count)
+    if lost or std_s > LARGEST_STD_S or not pairs.explained(fit) >= EXPLAINED:
+        return None
+    return LatencyEstimate(delay_s, std_s, len(pairs.turn))
 
 
-def _prior(reported: Array, *, heading_known: bool) -> _Prior:
+def _prior(reported: Array, *, heading_known: bool) -> Prior:
     unknown = ~np.isfinite(reported[..., 3]) & np.isfinite(reported[..., 0])
     constant = FREE_STD if unknown.any() else CONSTANT_STD
     gain = (SCALE_STD, ACROSS_STD) if heading_known else (ANY_STD, ANY_STD)
     mean = np.array([1.0 if heading_known else 0.0, 0.0, 0.0, 0.0, 0.0])
     std = np.array([*gain, MOUNT_STD_RAD, constant, constant])
-    return _Prior(mean, np.diag(1 / np.square(std)))
+    return mean, np.diag(1 / np.square(std))
 
 
 def _columns(seconds: Array, reported: Array) -> Array:
@@ -317,11 +380,9 @@ def _rotated(vectors: Array) -> Array:
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
-def _coarse(
-    pairs: _Pairs, weights: Array, noise: Array, prior: _Prior
-) -> tuple[Array, Array, Array]:
-    """Cost (C,), linear parameters (C, 5) and their covariance (C, 5, 5) of every candidate, with
-    `weights` (N,) of the pairs."""
+def _costs(pairs: _Pairs, weights: Array, noise: Array, prior: Prior) -> Array:
+    """Cost (C,) of every candidate, with `weights` (N,) of the pairs."""
+    mean, precision = prior
     known = np.isfinite(pairs.reported[..., :3]).all(axis=-1)
     reported = np.nan_to_num(pairs.reported)
     share = weights[:, None] * known
@@ -329,18 +390,17 @@ def _coarse(
     precise = share / noise[1] ** 2
     lines = _columns(pairs.seconds[:, None], reported)
     wanted = pairs.shift[:, None] - reported[..., 1:3]
-    normal = np.einsum("nc,ncij,ncik->cjk", precise, lines, lines, optimize=True) + prior.precision
+    normal = np.einsum("nc,ncij,ncik->cjk", precise, lines, lines, optimize=True) + precision
     right = np.einsum("nc,ncij,nci->cj", precise, lines, wanted, optimize=True)
-    right = right + prior.precision @ prior.mean
+    right = right + precision @ mean
     linear = np.linalg.solve(normal, right[..., None])[..., 0]
     squares = np.einsum("nc,nci,nci->c", precise, wanted, wanted, optimize=True)
     turned = np.einsum("nc,nc->c", share, np.square(pairs.turn[:, None] - reported[..., 0]))
-    least = squares + prior.mean @ prior.precision @ prior.mean
-    cost = least - (linear * right).sum(axis=1) + turned / noise[0] ** 2
-    return cost, linear, np.linalg.inv(normal) * ALIKE
+    least = squares + mean @ precision @ mean
+    return np.asarray(least - (linear * right).sum(axis=1) + turned / noise[0] ** 2)
 
 
-def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: _Prior) -> _Fit:
+def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: Prior) -> _Fit:
     """Fit for `reported` (N, 5), with standard deviations `noise` (2,) of turn and shift."""
     known = np.asarray(np.isfinite(reported[:, :3]).all(axis=1), np.float64)
     reported = np.nan_to_num(reported)
@@ -350,8 +410,8 @@ def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: _Prior) -> _Fit
     weights: Array = known
     for _ in range(3):
         flat = (lines * (weights / noise[1] ** 2)[:, None, None]).reshape(-1, 5)
-        normal = flat.T @ lines.reshape(-1, 5) + prior.precision
-        linear = np.linalg.solve(normal, flat.T @ wanted.reshape(-1) + prior.precision @ prior.mean)
+        normal = flat.T @ lines.reshape(-1, 5) + prior[1]
+        linear = np.linalg.solve(normal, flat.T @ wanted.reshape(-1) + prior[1] @ prior[0])
         shift_off = wanted - lines @ linear
         square: Array = np.square(turn_off / noise[0])
         square = square + np.square(shift_off / noise[1]).sum(axis=1)
@@ -370,11 +430,11 @@ def _at_delay(pairs: _Pairs, delay_s: float) -> tuple[Array, Array]:
 
 
 def _refined(
-    pairs: _Pairs, delay_s: float, noise: Array, prior: _Prior
+    pairs: _Pairs, delay_s: float, noise: Array, prior: Prior
 ) -> tuple[float, float, _Fit]:
     """Latency, its variance, and the fit, by Gauss-Newton steps from a latency."""
     precision = np.zeros((6, 6))
-    precision[0, 0], precision[1:, 1:] = 1e-6, prior.precision
+    precision[0, 0], precision[1:, 1:] = 1e-6, prior[1]
     for _ in range(STEPS):
         reported, slope = _at_delay(pairs, delay_s)
         fit, slope = _fitted(pairs, reported, noise, prior), np.nan_to_num(slope)
@@ -387,50 +447,26 @@ def _refined(
         off = np.concatenate([fit.turn_off[:, None], fit.shift_off], axis=1)
         precise = fit.weights[:, None] / np.square(noise[[0, 1, 1]]) / ALIKE
         flat = (design * precise[..., None]).reshape(-1, 6)
-        right = flat.T @ off.reshape(-1) - precision @ [0.0, *(fit.linear - prior.mean)]
+        right = flat.T @ off.reshape(-1) - precision @ [0.0, *(fit.linear - prior[0])]
         covariance = np.linalg.inv(flat.T @ design.reshape(-1, 6) + precision)
         delay_s += float(np.clip((covariance @ right)[0], -STEP_S, STEP_S))
     return delay_s, float(covariance[0, 0]), fit
 
 
-def _contradicts(linear: Array, std: Array, *, heading_known: bool) -> bool:
-    """Whether the fitted scale or direction of the velocity is impossible; `std` (2,): twice their
-    standard deviations."""
-    if not std.max() < 2 * CLEAR_STD:
-        return False
-    scale, across = linear[:2].tolist()
-    size = scale if heading_known else math.hypot(scale, across)
-    if not SCALES[0] - std[0] < size < SCALES[1] + std[0]:
-        return True
-    return heading_known and abs(across) > math.tan(ACROSS) * max(size, SCALES[0]) + std[1]
-
-
-def _possible(linear: Array, *, heading_known: bool) -> bool:
-    """Whether fitted scale and direction of the velocity are those of usual errors."""
-    scale, across = linear[:2].tolist()
-    turned = abs(math.atan2(across, scale)) if heading_known else 0.0
-    return SCALES[0] < math.hypot(scale, across) < SCALES[1] and turned < ACROSS
-
-
-def _agreed(estimates: list[LatencyEstimate], intervals: list[float]) -> CameraLatency:
+def _agreed(estimates: list[LatencyEstimate | None], intervals: list[float]) -> CameraLatency:
     if not intervals or float(np.median(intervals)) > LONGEST_S / 2:
         usual_s = float(np.median(intervals)) if intervals else math.inf
         raise FlightError(
             f"views are {usual_s:.1f} s apart; the latency of a camera needs views at most "
             f"{LONGEST_S / 2:g} s apart: {NEEDED}"
         )
-    found = [each for each in estimates if each.found]
-    contradicted = sum(each.contradicted for each in estimates)
-    if contradicted > len(found):
-        raise FlightError(
-            "images do not move as the telemetry reports: check --mount-deg, the height and the "
-            "heading"
-        )
+    found = [each for each in estimates if each is not None]
     if len(found) < LEAST:
         raise FlightError(
             f"the flight does not show the latency of the camera: {len(found)} of "
             f"{len(estimates)} windows give an estimate, {LEAST} are needed. "
-            f"{NEEDED[0].upper()}{NEEDED[1:]}"
+            f"{NEEDED[0].upper()}{NEEDED[1:]}. If it was flown so, images do not move as the "
+            "telemetry reports: check --mount-deg, the height and the heading"
         )
     delays = np.array([each.delay_s for each in found])
     stds = np.array([each.std_s for each in found])
