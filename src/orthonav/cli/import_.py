@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 from orthonav.cli.common import counted, print_json, progress
-from orthonav.cli.heights import dem_of, geoid_for
 from orthonav.cli.source import add_source, open_source
 
 log = logging.getLogger(__name__)
@@ -19,7 +18,6 @@ EVERYDAY = (
     "--mount-deg",
     "--rate-hz",
     "--agl-m",
-    "--dem",
     "--json",
 )
 
@@ -36,7 +34,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FLIGHT_DIR", help="folder to write"
     )
-    add_source(parser)
+    add_source(parser, dem=False)
     parser.add_argument(
         "--jpeg-quality",
         type=int,
@@ -50,26 +48,15 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.geo.headings import RADIANS
-    from orthonav.ground.recordings import OverTerrain, import_flight
+    from orthonav.ground.recordings import import_flight
 
-    dem = dem_of(options)
-    recording = open_source(options.source, options, over_terrain=dem is not None)
-    over = None
-    if dem is not None:
-        over = OverTerrain(dem, f"the terrain of {options.dem.name}", geoid_for(recording))
-        recording = over.recording(recording)
+    recording = open_source(options.source, options)
     with progress(options) as shown:
         done = import_flight(
             recording, options.out, options.jpeg_quality, lambda share: shown("import", share)
         )
     if done.broken:
         log.warning("%d views left out, the first: %s", done.broken, done.first_broken)
-    if over is not None and over.without:
-        log.warning(
-            "%d views have no height above ground: no height or no position was recorded, or it "
-            "lies over a hole of the terrain, or outside it",
-            over.without,
-        )
     if done.complete < done.views:
         log.warning(
             "%d of %d views lack heading, pitch, roll or height",

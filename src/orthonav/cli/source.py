@@ -25,7 +25,7 @@ def topic(text: str) -> tuple[str, str]:
     return role, name
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
+def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     """Add the options; see docs/flights.md."""
     group = parser.add_argument_group("reading the recording")
     group.add_argument(
@@ -98,7 +98,8 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         help="altitude of the ground, in the reference of the recorded altitudes, where no heights "
         "were recorded",
     )
-    add_dem(group, "for heights above ground where others were recorded")
+    if dem:
+        add_dem(group, "for heights above ground where others were recorded")
     group.add_argument(
         "--looks-down",
         action="store_true",

@@ -3,7 +3,6 @@
 from orthonav.ground.recordings.flightlog import LoggedFlight
 from orthonav.ground.recordings.opening import (
     Imported,
-    OverTerrain,
     import_flight,
     open_source,
     source_kind,
@@ -15,7 +14,6 @@ __all__ = [
     "ROLES",
     "Imported",
     "LoggedFlight",
-    "OverTerrain",
     "Recording",
     "SourceOptions",
     "SourceView",

@@ -258,7 +258,7 @@ def height_warnings(
     if options.ground_alt_m is None:
         return [
             "no height above ground was recorded, only altitudes, which are not taken for one; "
-            "give --ground-alt-m, in the same reference"
+            "give --ground-alt-m, in the same reference, or --dem to localize and calibrate"
         ]
     return [f"height above ground is the recorded altitude minus {options.ground_alt_m:g} m"]
 
