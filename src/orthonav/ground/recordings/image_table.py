@@ -1,15 +1,17 @@
-"""A table of images by file name: CSV, as people and programs write them beside a folder of images.
+"""A table of images by file name: a CSV beside a folder of images.
 
-Columns are found by their names, in many spellings. A pitch near -90 is that of a gimbal as DJI
+Columns are found by their names, case and units aside. A pitch near -90 is that of a gimbal as DJI
 counts it, where -90 looks straight down; any other is in the convention of orthonav.
 """
 
 import math
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -27,21 +29,18 @@ from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
 
 MAX_BYTES = 100_000_000
 _SYNONYMS = {
-    "file": "file filename image imagename imagefile img photo photoname picture sourcefile frame "
-    "label imagepath path name",
-    "yaw": "gimbalyaw camerayaw yaw cameraheading heading hdg azimuth compass flightyaw droneyaw",
-    "pitch": "gimbalpitch camerapitch pitch",
-    "roll": "gimbalroll cameraroll roll",
-    "agl": "agl heightagl aglheight altitudeagl altagl aglaltitude heightaboveground aboveground "
-    "height",
-    "home": "home relalt relativealtitude relativeheight heightabovetakeoff heightabovehome",
-    "amsl": "amsl msl altitudeamsl altamsl altitudemsl heightamsl",
-    "hae": "hae altitudehae ellipsoidalheight heightellipsoid",
-    "alt": "altitude alt gpsaltitude absolutealtitude absalt elevation z",
-    "lat": "lat latitude gpslatitude",
-    "lon": "lon lng long longitude gpslongitude",
-    "time": "timestamp datetime datetimeoriginal time utc utctime timeutc captured gpstime",
-    "date": "date day gpsdate",
+    "file": ("file", "filename", "image", "sourcefile", "frame"),
+    "yaw": ("gimbalyaw", "yaw", "heading"),
+    "pitch": ("gimbalpitch", "pitch"),
+    "roll": ("gimbalroll", "roll"),
+    "agl": ("agl", "height"),
+    "home": ("home", "relativealtitude"),
+    "amsl": ("amsl",),
+    "hae": ("hae",),
+    "alt": ("altitude",),
+    "lat": ("lat", "latitude"),
+    "lon": ("lon", "longitude"),
+    "time": ("time", "timestamp", "datetimeoriginal"),
 }
 _BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]")
 _FEET = ("ft", "feet", "foot")
@@ -50,9 +49,7 @@ _EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
 _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 _GIMBAL_DEG = -45.0
 """A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
-_DATE = re.compile(r"(\d{4})[:/](\d\d)[:/](\d\d)")
-_COMPACT = re.compile(r"(19|20)\d{12}")  # a date and time in 14 digits
-_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
+_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")  # as EXIF writes it
 _LARGEST_S = 9e9
 
 
@@ -86,20 +83,34 @@ class ImageRow:
 
 @dataclass(frozen=True)
 class ImageTable:
-    """The rows of a table by the names of images, and warnings about them."""
+    """The rows of a table by the paths of images as it writes them, and warnings about them."""
 
     path: Path
     rows: Mapping[str, ImageRow]
     warnings: tuple[str, ...]
 
     def row(self, name: str) -> ImageRow | None:
-        """The row of an image: by the end of its path below the folder, or by its name without a
-        suffix. An image without a folder is that of a row with one too."""
-        parts = PurePosixPath(name.lower()).parts
-        ends = ["/".join(parts[first:]) for first in range(len(parts))]
-        stem = PurePosixPath(parts[-1]).stem
-        keys = [*ends, stem] + [f"/{parts[-1]}", f"/{stem}"] * (len(parts) == 1)
-        return next((self.rows[key] for key in keys if key in self.rows), None)
+        """The row of an image by its path below the folder; None where there is none, or several.
+
+        Tables and folders begin at different levels, so the shorter path must be the end of the
+        other one.
+        """
+        image = f"/{name.lower()}"
+        fitting = [
+            path
+            for path in self._by_name.get(PurePosixPath(image).name, ())
+            if image.endswith(f"/{path}") or f"/{path}".endswith(image)
+        ]
+        if image[1:] in fitting:
+            return self.rows[image[1:]]
+        return self.rows[fitting[0]] if len(fitting) == 1 else None
+
+    @cached_property
+    def _by_name(self) -> Mapping[str, list[str]]:
+        found: defaultdict[str, list[str]] = defaultdict(list)
+        for path in self.rows:
+            found[PurePosixPath(path).name].append(path)
+        return found
 
 
 def is_image_table(path: Path) -> bool:
@@ -123,23 +134,30 @@ def read_image_table(path: Path) -> ImageTable:
             delimiter = max(",;\t", key=header.count)
             table = TableRows(stream, delimiter=delimiter)
             columns = _columns(table.columns)
+            named = list(columns.items())
             if "file" not in columns or len(columns) == 1:
                 held = ", ".join(table.columns)
                 raise FlightError(
                     "table needs a column of file names (file, image, filename) and others, such "
                     f"as yaw, pitch, roll, agl, lat, lon, time; it has {held:.200}: {path}"
                 )
-            lines = [(table.line, _texts(row, columns)) for row in table]
+            lines = [
+                (table.line, {key: (row.get(name) or "").strip() for key, (name, _) in named})
+                for row in table
+            ]
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
     comma = delimiter != ","
     numbers = [(line, texts, _numbers(texts, columns, line, comma, path)) for line, texts in lines]
     gimbal = _is_gimbal(columns, [values for _, _, values in numbers])
-    rows = [
-        (texts["file"], _row(order, values, _time_ns(_moment(texts), line, path), gimbal))
-        for order, (line, texts, values) in enumerate(numbers)
-        if texts["file"]
-    ]
+    rows: dict[str, ImageRow] = {}
+    for order, (line, texts, values) in enumerate(numbers):
+        name = str(PurePosixPath(texts["file"].replace("\\", "/").lower()))
+        if name in rows:
+            raise FlightError(f"table names {texts['file']!r:.80} twice: {path}")
+        if texts["file"]:
+            time_ns = _time_ns(texts.get("time", ""), line, path)
+            rows[name] = _row(order, values, time_ns, gimbal)
     if not rows:
         raise FlightError(f"table names no image: {path}")
     warnings = _missing(columns, path)
@@ -148,13 +166,7 @@ def read_image_table(path: Path) -> ImageTable:
             f"pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight "
             f"down: {path}"
         )
-    return ImageTable(path, _by_name(rows, path), tuple(warnings))
-
-
-def _texts(
-    row: Mapping[str, str | None], columns: Mapping[str, tuple[str, float]]
-) -> dict[str, str]:
-    return {field: (row.get(name) or "").strip() for field, (name, _) in columns.items()}
+    return ImageTable(path, rows, tuple(warnings))
 
 
 def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
@@ -162,7 +174,7 @@ def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
     spelt = {_plain(name): name for name in reversed(names)}
     found = {}
     for field, synonyms in _SYNONYMS.items():
-        name = next((spelt[each] for each in synonyms.split() if each in spelt), None)
+        name = next((spelt[each] for each in synonyms if each in spelt), None)
         if name is not None:
             found[field] = name, 0.3048 if _unit(name) in _FEET else 1.0
     return found
@@ -172,7 +184,7 @@ def _plain(name: str) -> str:
     words = re.findall(r"[a-z0-9]+", _BRACKETS.sub("", name.lower()))
     if len(words) > 1 and words[-1] in _UNITS:
         words.pop()
-    return re.sub(r"(?<=.)degrees?$", "", "".join(words))
+    return "".join(words).removesuffix("degree")
 
 
 def _unit(name: str) -> str:
@@ -191,7 +203,7 @@ def _numbers(
     values = {}
     for field, (name, metres) in columns.items():
         text = texts[field]
-        if field in ("file", "time", "date") or text.lower() in _EMPTY:
+        if field in ("file", "time") or text.lower() in _EMPTY:
             continue
         if comma and "." not in text:
             text = text.replace(",", ".")
@@ -236,28 +248,16 @@ def _row(order: int, values: Mapping[str, float], time_ns: int | None, gimbal: b
     )
 
 
-def _moment(texts: Mapping[str, str]) -> str:
-    """The time of a row, with the date where that is in a column of its own."""
-    time, date = texts.get("time", ""), texts.get("date", "")
-    return f"{date} {time}".strip() if _CLOCK.fullmatch(time) else time or date
-
-
 def _time_ns(text: str, line: int, path: Path) -> int | None:
-    """Nanoseconds of seconds, or of ms, us or ns since 1970, of a time of day, or of a date with
-    time; UTC where no zone."""
+    """Nanoseconds of seconds, of milliseconds since 1970, or of a date; UTC where no zone."""
     if text.lower() in _EMPTY:
         return None
-    if _COMPACT.fullmatch(text):
-        text = f"{text[:8]}T{text[8:]}"
     number = number_of(text)
     if math.isfinite(number):
         seconds = Decimal(text)
         while abs(seconds) > _LARGEST_S:
             seconds /= 1000
         return round(seconds * 10**9)
-    if clock := _CLOCK.fullmatch(text):
-        hours, minutes, seconds = map(Decimal, clock.groups())
-        return round((hours * 3600 + minutes * 60 + seconds) * 10**9)
     try:
         moment = datetime.fromisoformat(_DATE.sub(r"\1-\2-\3", text))
     except ValueError as error:
@@ -271,30 +271,6 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
 
 
 def _missing(columns: Mapping[str, tuple[str, float]], path: Path) -> list[str]:
-    lacks = [
-        f"{what} ({spelt})"
-        for what, spelt, fields in (
-            ("heading", "yaw or heading", ("yaw",)),
-            ("height", "agl or height", _HEIGHTS),
-        )
-        if not set(fields) & columns.keys()
-    ]
-    if not lacks:
-        return []
-    return [f"table has no column of {' and of '.join(lacks)}: {path}"]
-
-
-def _by_name(rows: Sequence[tuple[str, ImageRow]], path: Path) -> dict[str, ImageRow]:
-    """Rows by path, by name and by name without suffix, as far as these are of one row only; names
-    of rows with a folder begin with a slash."""
-    found: dict[str, ImageRow] = {}
-    short: dict[str, ImageRow | None] = {}
-    for text, row in rows:
-        pure = PurePosixPath(text.replace("\\", "/").lower())
-        if str(pure) in found:
-            raise FlightError(f"table names {text!r:.80} twice: {path}")
-        found[str(pure)] = row
-        slash = "/" if len(pure.parts) > 1 else ""
-        for name in {slash + pure.name, slash + pure.stem}:
-            short[name] = None if name in short else row
-    return {name: row for name, row in short.items() if row is not None} | found
+    lacks = [] if "yaw" in columns else ["heading (yaw or heading)"]
+    lacks += [] if set(_HEIGHTS) & columns.keys() else ["height (agl or height)"]
+    return [f"table has no column of {' and of '.join(lacks)}: {path}"] if lacks else []
