@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import math
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -58,29 +57,11 @@ def test_csv(tmp_path, terrain, height):
     assert (rows[0]["heading_deg"], rows[1]["heading_deg"]) == ("271.500", "")
 
 
-def test_geojson(tmp_path):
-    features = json.loads(written(tmp_path, "geojson", hill))["features"]
-    assert features[0]["geometry"] == {"type": "Point", "coordinates": [-2.25, 48.5, 425.0]}
-    assert features[0]["properties"]["std_m"] == 5.0
-    assert features[1]["properties"]["heading_deg"] is None
-    level = json.loads(written(tmp_path, "geojson", None))["features"]
-    assert level[0]["geometry"]["coordinates"] == [-2.25, 48.5]
-
-
 def test_opendronemap_takes_accuracy_only_after_a_height(tmp_path):
     lines = written(tmp_path, "odm-geo", hill).splitlines()
     assert lines[0] == "EPSG:4326"
     assert lines[1] == "a.jpg -2.25000000 48.50000000 425.000 0 0 0 5.000"
     assert written(tmp_path, "odm-geo", None).splitlines()[1] == "a.jpg -2.25000000 48.50000000"
-
-
-def test_exiftool_gets_references_of_both_hemispheres(tmp_path):
-    one, other = csv.DictReader(io.StringIO(written(tmp_path, "exif", hill)))
-    assert one["SourceFile"] == "a.jpg"
-    assert (one["GPSLatitudeRef"], one["GPSLongitudeRef"]) == ("North", "West")
-    assert (one["GPSAltitude"], one["GPSAltitudeRef"]) == ("425.000", "Above Sea Level")
-    assert (other["GPSLatitude"], other["GPSLatitudeRef"]) == ("33.00000000", "South")
-    assert other["GPSAltitudeRef"] == "Below Sea Level" and other["GPSImgDirection"] == ""
 
 
 def test_a_trajectory_for_evo(tmp_path):

@@ -187,9 +187,9 @@ def _add_outputs(group: argparse._ActionsContainer) -> None:
         action="append",
         default=[],
         metavar="FORMAT=PATH",
-        help="write the confident camera positions for other programs too: csv, geojson, kml, gpx, "
-        "tum (a trajectory for evo), odm-geo (OpenDroneMap's geo.txt) or exif (a table for "
-        "`exiftool -csv=PATH FOLDER`); heights above sea need a terrain; can be repeated",
+        help="write the confident camera positions for other programs too: csv, kml, gpx, "
+        "tum (a trajectory for evo) or odm-geo (OpenDroneMap's geo.txt); heights above sea need a "
+        "terrain; can be repeated",
     )
     add_report_changes(group)
 

@@ -5,7 +5,6 @@ Only confident positions are written: photogrammetry takes what it is given as m
 
 import csv
 import io
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -97,31 +96,14 @@ def _fixed(value: float, decimals: int = 3) -> str:
 
 
 def _csv(positions: Sequence[CameraPosition]) -> str:
-    rows: list[Sequence[str]] = [CSV_COLUMNS]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(CSV_COLUMNS)
     for each in positions:
         place = _fixed(each.fix.lat_deg, 8), _fixed(each.fix.lon_deg, 8)
         values = each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m
-        rows.append([each.frame, *place, *map(_fixed, values)])
-    return _table(rows)
-
-
-def _geojson(positions: Sequence[CameraPosition]) -> str:
-    features = []
-    for each in positions:
-        point = [round(each.fix.lon_deg, 8), round(each.fix.lat_deg, 8)]
-        if not math.isnan(each.height_m):
-            point.append(round(each.height_m, 3))
-        numbers = {
-            "agl_m": round(each.fix.agl_m, 3),
-            "heading_deg": round(each.fix.heading_deg, 3),
-            "std_m": round(each.std_m, 3),
-            "confidence": round(each.fix.confidence, 4),
-        }
-        known = {key: value if math.isfinite(value) else None for key, value in numbers.items()}
-        geometry = {"type": "Point", "coordinates": point}
-        about = {"frame": each.frame, **known}
-        features.append({"type": "Feature", "geometry": geometry, "properties": about})
-    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+        writer.writerow([each.frame, *place, *map(_fixed, values)])
+    return out.getvalue()
 
 
 def _odm_geo(positions: Sequence[CameraPosition]) -> str:
@@ -141,29 +123,6 @@ def _odm_geo(positions: Sequence[CameraPosition]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _exif(positions: Sequence[CameraPosition]) -> str:
-    """A table that ExifTool writes into photographs (`exiftool -csv=TABLE FOLDER`)."""
-    header = (
-        *("SourceFile", "GPSLatitude", "GPSLatitudeRef", "GPSLongitude", "GPSLongitudeRef"),
-        *("GPSAltitude", "GPSAltitudeRef", "GPSImgDirection", "GPSImgDirectionRef"),
-        *("GPSHPositioningError", "GPSMapDatum"),
-    )
-    rows: list[Sequence[str]] = [header]
-    for each in positions:
-        lat, lon, height_m = each.fix.lat_deg, each.fix.lon_deg, each.height_m
-        level = f"{'Below' if height_m < 0 else 'Above'} Sea Level"
-        heading = _fixed(each.fix.heading_deg, 2)
-        rows.append(
-            [
-                *(each.frame, _fixed(abs(lat), 8), "North" if lat >= 0 else "South"),
-                *(_fixed(abs(lon), 8), "East" if lon >= 0 else "West"),
-                *(_fixed(abs(height_m)), "" if math.isnan(height_m) else level),
-                *(heading, heading and "True North", _fixed(each.std_m), "WGS-84"),
-            ]
-        )
-    return _table(rows)
-
-
 def _tum(positions: Sequence[CameraPosition]) -> str:
     """A trajectory as evo reads it: `timestamp tx ty tz qx qy qz qw`, metres and a quaternion.
 
@@ -174,7 +133,7 @@ def _tum(positions: Sequence[CameraPosition]) -> str:
     if not positions:
         return ""
     origin = positions[0].fix.lat_deg, positions[0].fix.lon_deg
-    plane, above_sea = LocalFrame(*origin), _are_above_sea(positions)
+    plane, above_sea = LocalFrame(*origin), all(math.isfinite(each.height_m) for each in positions)
     lines = [f"# east, north, up (m) of {origin[0]:.8f}, {origin[1]:.8f} (WGS84)"]
     for each in positions:
         east, north = plane.en_from_latlon(each.fix.lat_deg, each.fix.lon_deg).tolist()
@@ -188,13 +147,9 @@ def _tum(positions: Sequence[CameraPosition]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _are_above_sea(positions: Sequence[CameraPosition]) -> bool:
-    return all(math.isfinite(each.height_m) for each in positions)
-
-
 def _kml(positions: Sequence[CameraPosition]) -> str:
     """The track and a place for each picture; heights are absolute where all are above sea."""
-    above_sea = _are_above_sea(positions)
+    above_sea = all(math.isfinite(each.height_m) for each in positions)
     mode = "absolute" if above_sea else "relativeToGround"
     heights_m = [each.height_m if above_sea else each.fix.agl_m for each in positions]
     points = [
@@ -240,17 +195,9 @@ def _gpx(positions: Sequence[CameraPosition]) -> str:
     )
 
 
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
-    return out.getvalue()
-
-
 FORMATS: dict[str, Callable[[Sequence[CameraPosition]], str]] = {
     "csv": _csv,
-    "geojson": _geojson,
     "odm-geo": _odm_geo,
-    "exif": _exif,
     "tum": _tum,
     "kml": _kml,
     "gpx": _gpx,
