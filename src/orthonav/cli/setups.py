@@ -112,7 +112,6 @@ class SetupAdvice:
             accept.accepts,
             use_prior=options.prior == "telemetry",
             heading_known=options.heading == "known",
-            tracked=bool(options.track or options.smooth),
             stop=lambda: time.monotonic() > end_s,
             progress=lambda share: shown("configurations", share),
         )
