@@ -1,12 +1,11 @@
 """Telemetry logs of all kinds, detected by content."""
 
-import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +41,6 @@ DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats
 MAVLINK_MAGICS = (0xFE, 0xFD)
 _DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _RANGE_IS_GOOD = 4
-_DAY_US, _LATEST_US = 86_400 * 10**6, 2**52
 _WANTED = {
     "ATTITUDE",
     "ATTITUDE_QUATERNION",
@@ -101,22 +99,12 @@ def read_dataflash(path: Path, mount_deg: Angles) -> RecordedTrack:
     reader = needed("pymavlink.DFReader", "ArduPilot logs")
     collected = _Collected(mount_deg)
     with reading("ArduPilot log", path, silent=True):
-        log = reader.DFReader_binary.__new__(reader.DFReader_binary)
-        try:
-            log.__init__(str(path))  # separately, so that its file is closed where this fails
+        with reader.DFReader_binary(str(path)) as log:
             base_ns = round(getattr(log.clock, "timebase", 0.0) * 1e6) * 1000
             while (message := log.recv_match(type=["ATT", "GPS", "POS", "RFND"])) is not None:
                 if hasattr(message, "TimeUS"):
                     _from_dataflash(collected, message, base_ns + int(message.TimeUS) * 1000)
-        finally:
-            _close(log)
     return collected.track("ArduPilot log", path)
-
-
-def _close(log: Any) -> None:
-    for name in ("data_map", "filehandle"):
-        with contextlib.suppress(AttributeError, BufferError):
-            getattr(log, name).close()
 
 
 def _from_dataflash(collected: _Collected, message: Any, time_ns: int) -> None:
@@ -142,53 +130,20 @@ def read_tlog(path: Path, mount_deg: Angles) -> RecordedTrack:
     Only the first vehicle that sends its attitude is read. Raises `FlightError` where there is no
     attitude, or no MAVLink message.
     """
-    dialect = needed("pymavlink.dialects.v20.ardupilotmega", "telemetry logs")
+    mavutil = needed("pymavlink.mavutil", "telemetry logs")
     collected = _Collected(mount_deg)
     vehicle = None
-    with reading("telemetry log", path), path.open("rb") as stream:
-        for time_ns, message in _messages(stream, dialect):
-            if vehicle is None and message.get_type().startswith("ATTITUDE"):
-                vehicle = message.get_srcSystem()
-            if message.get_srcSystem() == vehicle:
-                _from_tlog(collected, message, time_ns)
-    return collected.track("telemetry log", path)
-
-
-def _messages(stream: BinaryIO, dialect: Any) -> Iterator[tuple[int, Any]]:
-    """Time in ns and message of the wanted kinds; damaged bytes are skipped."""
-    decoder = dialect.MAVLink(None)
-    before_us = None
-    wanted = {number for number, kind in dialect.mavlink_map.items() if kind.msgname in _WANTED}
-    while len(head := stream.read(11)) == 11:
-        start = stream.tell() - 11
-        if (size := _frame_size(head[8:])) is None:
-            stream.seek(start + 1)
-            continue
-        frame = head[8:] + stream.read(size - 3)
-        if len(frame) < size:
-            return
-        number = frame[5] if frame[0] == 0xFE else int.from_bytes(frame[7:10], "little")
-        if number not in wanted:
-            continue
+    with reading("telemetry log", path, silent=True):
+        log = mavutil.mavlogfile(str(path), robust_parsing=True)
         try:
-            message = decoder.decode(bytearray(frame))
-        except dialect.MAVError:
-            stream.seek(start + 1)
-            continue
-        stamp_us = int.from_bytes(head[:8], "big")
-        near = before_us is None or abs(stamp_us - before_us) < _DAY_US
-        if stamp_us < _LATEST_US and near:  # otherwise the time stamp is damaged
-            before_us = stamp_us
-            yield stamp_us * 1000, message
-
-
-def _frame_size(head: bytes) -> int | None:
-    """Length of a MAVLink frame by its first three bytes, None where it is not one."""
-    if head[0] == 0xFE:
-        return head[1] + 8
-    if head[0] == 0xFD and head[2] in (0, 1):
-        return head[1] + (25 if head[2] & 1 else 12)
-    return None
+            while (message := log.recv_match(type=_WANTED)) is not None:
+                if vehicle is None and message.get_type().startswith("ATTITUDE"):
+                    vehicle = message.get_srcSystem()
+                if message.get_srcSystem() == vehicle:
+                    _from_tlog(collected, message, round(message._timestamp * 1e6) * 1000)
+        finally:
+            log.f.close()
+    return collected.track("telemetry log", path)
 
 
 def _from_tlog(collected: _Collected, message: Any, time_ns: int) -> None:
