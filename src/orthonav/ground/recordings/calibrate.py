@@ -2,8 +2,7 @@
 
 Latency is the time from the exposure of a picture to its arrival. The motion between consecutive
 pictures is compared with the motion that follows from attitude, velocity and height reported at the
-times of arrival less a candidate of the latency, over windows of half a minute: a grid of
-candidates first, then refined. What is known only nearly (height, direction of the velocity,
+times of arrival less candidates of the latency, over windows of half a minute. What is known only nearly (height, direction of the velocity,
 orientation of the camera) is estimated with it. A window in which many candidates fit, as in
 straight and level flight, gives no number.
 
@@ -93,7 +92,6 @@ OUTLIER = 3.0  # scale of the Cauchy weights, in standard deviations
 ALIKE = 4.0
 """Differences of successive pairs are correlated: so many count as one. Chosen so that errors of
 the estimate are as large as stated (tests/onboard/test_calibrate_latency.py)."""
-STEPS = 5
 CANDIDATES_S = np.arange(round((MOST_S - LEAST_S) / STEP_S) + 1) * STEP_S + LEAST_S
 _CANDIDATES_NS = np.round(CANDIDATES_S * 1e9).astype(np.int64)
 Array = NDArray[np.float64]
@@ -312,14 +310,13 @@ class _Pairs:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Fit of one latency: `linear` (5,), differences `turn_off` (N,) and `shift_off` (N, 2),
-    `weights` (N,), and derivatives `columns` (N, 2, 5)."""
+    """Fit of one latency: `linear` (5,), differences `turn_off` (N,) and `shift_off` (N, 2), and
+    `weights` (N,)."""
 
     linear: Array
     turn_off: Array
     shift_off: Array
     weights: Array
-    columns: Array
 
     def scatter(self, least: Array) -> Array:
         """Standard deviations (2,) of turn and shift by the differences."""
@@ -349,10 +346,15 @@ def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
     usual = SCALES[0] < math.hypot(scale, across) < SCALES[1] and turned < ACROSS
     if weights.mean() < LEAST_WEIGHT or ambiguous or not usual:
         return None
-    delay_s, variance, fit = _refined(pairs, float(CANDIDATES_S[best]), noise, prior)
-    std_s = math.hypot(FLOOR_S, math.sqrt(variance))
-    lost = abs(delay_s - CANDIDATES_S[best]) > NEAR_S
-    if lost or std_s > LARGEST_STD_S or not pairs.explained(fit) >= EXPLAINED:
+    # The minimum of a parabola through the least cost and its neighbours, and its curvature.
+    middle = min(max(best, 1), len(cost) - 2)
+    before, least_cost, after = cost[middle - 1 : middle + 2].tolist()
+    bend = before - 2 * least_cost + after
+    if not bend > 0:
+        return None
+    delay_s = float(CANDIDATES_S[middle]) + STEP_S * (before - after) / (2 * bend)
+    std_s = math.hypot(FLOOR_S, STEP_S * math.sqrt(2 * ALIKE / bend))
+    if std_s > LARGEST_STD_S or not pairs.explained(fit) >= EXPLAINED:
         return None
     return LatencyEstimate(delay_s, std_s, len(pairs.turn))
 
@@ -416,41 +418,7 @@ def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: Prior) -> _Fit:
         square: Array = np.square(turn_off / noise[0])
         square = square + np.square(shift_off / noise[1]).sum(axis=1)
         weights = known / (1 + square / OUTLIER**2)
-    return _Fit(linear, turn_off, shift_off, weights, lines)
-
-
-def _at_delay(pairs: _Pairs, delay_s: float) -> tuple[Array, Array]:
-    """Reported motion (N, 5) at a latency, and its derivative, by parabolas through candidates."""
-    place = (delay_s - LEAST_S) / STEP_S
-    middle = min(max(round(place), 1), len(CANDIDATES_S) - 2)
-    off = place - middle
-    before, at, after = (pairs.reported[:, middle + i] for i in (-1, 0, 1))
-    slope, bend = (after - before) / 2, (after - 2 * at + before) / 2
-    return at + off * slope + off**2 * bend, (slope + 2 * off * bend) / STEP_S
-
-
-def _refined(
-    pairs: _Pairs, delay_s: float, noise: Array, prior: Prior
-) -> tuple[float, float, _Fit]:
-    """Latency, its variance, and the fit, by Gauss-Newton steps from a latency."""
-    precision = np.zeros((6, 6))
-    precision[0, 0], precision[1:, 1:] = 1e-6, prior[1]
-    for _ in range(STEPS):
-        reported, slope = _at_delay(pairs, delay_s)
-        fit, slope = _fitted(pairs, reported, noise, prior), np.nan_to_num(slope)
-        tilt, velocity = slope[:, 1:3], slope[:, 3:5]
-        scale, across, mount = fit.linear[:3]
-        shifted = tilt + mount * _rotated(tilt) + scale * velocity + across * _rotated(velocity)
-        design = np.zeros((len(slope), 3, 6))
-        design[:, :, 0] = np.concatenate([slope[:, :1], shifted], axis=1)
-        design[:, 1:, 1:] = fit.columns
-        off = np.concatenate([fit.turn_off[:, None], fit.shift_off], axis=1)
-        precise = fit.weights[:, None] / np.square(noise[[0, 1, 1]]) / ALIKE
-        flat = (design * precise[..., None]).reshape(-1, 6)
-        right = flat.T @ off.reshape(-1) - precision @ [0.0, *(fit.linear - prior[0])]
-        covariance = np.linalg.inv(flat.T @ design.reshape(-1, 6) + precision)
-        delay_s += float(np.clip((covariance @ right)[0], -STEP_S, STEP_S))
-    return delay_s, float(covariance[0, 0]), fit
+    return _Fit(linear, turn_off, shift_off, weights)
 
 
 def _agreed(estimates: list[LatencyEstimate | None], intervals: list[float]) -> CameraLatency:

@@ -98,12 +98,11 @@ def read_dataflash(path: Path, mount_deg: Angles) -> RecordedTrack:
     """
     reader = needed("pymavlink.DFReader", "ArduPilot logs")
     collected = _Collected(mount_deg)
-    with reading("ArduPilot log", path, silent=True):
-        with reader.DFReader_binary(str(path)) as log:
-            base_ns = round(getattr(log.clock, "timebase", 0.0) * 1e6) * 1000
-            while (message := log.recv_match(type=["ATT", "GPS", "POS", "RFND"])) is not None:
-                if hasattr(message, "TimeUS"):
-                    _from_dataflash(collected, message, base_ns + int(message.TimeUS) * 1000)
+    with reading("ArduPilot log", path, silent=True), reader.DFReader_binary(str(path)) as log:
+        base_ns = round(getattr(log.clock, "timebase", 0.0) * 1e6) * 1000
+        while (message := log.recv_match(type=["ATT", "GPS", "POS", "RFND"])) is not None:
+            if hasattr(message, "TimeUS"):
+                _from_dataflash(collected, message, base_ns + int(message.TimeUS) * 1000)
     return collected.track("ArduPilot log", path)
 
 
