@@ -2,9 +2,9 @@
 
 Latency is the time from the exposure of a picture to its arrival. The motion between consecutive
 pictures is compared with the motion that follows from attitude, velocity and height reported at the
-times of arrival less candidates of the latency, over windows of half a minute. What is known only nearly (height, direction of the velocity,
-orientation of the camera) is estimated with it. A window in which many candidates fit, as in
-straight and level flight, gives no number.
+times of arrival less candidates of the latency, over windows of half a minute. What is known only
+nearly (height, direction of the velocity, orientation of the camera) is estimated with it. A window
+in which many candidates fit, as in straight and level flight, gives no number.
 
 For a latency d, the seen turn of a pair of pictures is the reported one, `turn(d)`, and the seen
 shift is
