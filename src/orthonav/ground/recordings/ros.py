@@ -8,7 +8,6 @@ import contextlib
 import io
 import logging
 import re
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -67,7 +66,28 @@ _SPLIT = re.compile(r"(.+)_(\d{1,9})")
 _END = b"\x0f" + (4).to_bytes(8, "little") + bytes(4)  # data end
 _END += b"\x02" + (20).to_bytes(8, "little") + bytes(20) + MAGIC  # footer without a summary
 
-
+TYPES: dict[str, tuple[str, ...]] = {
+    "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    "camera_info": ("sensor_msgs/msg/CameraInfo",),
+    "attitude": (
+        "sensor_msgs/msg/Imu",
+        "nav_msgs/msg/Odometry",
+        "geometry_msgs/msg/PoseStamped",
+    ),
+    "velocity": ("nav_msgs/msg/Odometry",),
+    "position": ("sensor_msgs/msg/NavSatFix",),
+    "height": (
+        "sensor_msgs/msg/Range",
+        "mavros_msgs/msg/Altitude",
+        "std_msgs/msg/Float64",
+        "std_msgs/msg/Float32",
+    ),
+}
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
+_PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
+_HOME_NAMES = ("rel_alt", "relative_altitude")
+_HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
 log = logging.getLogger(__name__)
 
 
@@ -117,7 +137,9 @@ def opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
 def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> Any:
     if path.is_file():
         require_file(path, "ROS recording")
-        return _reader([_whole(_named(path, stack), path, warnings)], path, stack)
+        if (suffix := bag_suffix(path)) not in (None, path.suffix):  # which selects the reader
+            raise FlightError(f"ROS recording needs the suffix {suffix}; rename it: {path}")
+        return _reader([_whole(path, warnings)], path, stack)
     doubt = None
     try:
         files = storage_files(path)
@@ -136,7 +158,7 @@ def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> An
         raise FlightError(f"folder holds no complete file of a bag (.mcap, .db3): {path}")
     if doubt:
         warnings.append(f"{METADATA} is not used ({doubt}); the files beside it are read")
-    return _reader([_whole(file, file, warnings) for file in files], path, stack)
+    return _reader([_whole(file, warnings) for file in files], path, stack)
 
 
 def _reader(paths: Sequence[Any], path: Path, stack: contextlib.ExitStack) -> Any:
@@ -206,17 +228,6 @@ def _is_parsable(connection: Any) -> bool:
     return parsable
 
 
-def _named(path: Path, stack: contextlib.ExitStack) -> Path:
-    """The file under a name with the suffix by which the library chooses its reader."""
-    suffix = bag_suffix(path)
-    if suffix in (None, path.suffix):
-        return path
-    folder = stack.enter_context(tempfile.TemporaryDirectory())
-    named = Path(folder) / f"recording{suffix}"
-    named.symlink_to(path.resolve())
-    return named
-
-
 def _is_cut(path: Path) -> bool:
     if path.suffix != ".mcap":
         return False
@@ -226,21 +237,21 @@ def _is_cut(path: Path) -> bool:
         return stream.read() != MAGIC
 
 
-def _whole(named: Path, path: Path, warnings: list[str]) -> "Path | _CutMcap":
-    journal = named.with_name(f"{named.name}-wal")
+def _whole(path: Path, warnings: list[str]) -> "Path | _CutMcap":
+    journal = path.with_name(f"{path.name}-wal")
     if journal.is_file() and journal.stat().st_size:
         warnings.append(
             f"bag was not closed, and data in {journal.name} are not read; write them into "
-            f"the bag first: sqlite3 {named.name} 'pragma wal_checkpoint(truncate)': {path}"
+            f"the bag first: sqlite3 {path.name} 'pragma wal_checkpoint(truncate)': {path}"
         )
-    if not _is_cut(named):
-        return named
-    complete = complete_bytes(named)
+    if not _is_cut(path):
+        return path
+    complete = complete_bytes(path)
     warnings.append(
         "recording was cut short: it is read up to its last complete message; `mcap recover` "
         f"repairs it for other programs: {path}"
     )
-    return _CutMcap(named, complete, partial_records(named, complete) + _END)
+    return _CutMcap(path, complete, partial_records(path, complete) + _END)
 
 
 @dataclass(frozen=True)
@@ -301,10 +312,29 @@ def bound_inflation() -> None:
     It decompresses a whole chunk before it compares its size with the stated one, so a small
     malicious file could exhaust memory. Violations raise `ValueError`, as damage does there.
     """
+    lz4 = needed("lz4.frame", WHAT).LZ4FrameDecompressor
+
+    def unpacked_zstd(data: bytes, size: int) -> bytes:
+        _require(size)
+        return inflated(b"zstd", data, size + 1)
+
+    def unpacked(decompressor: Any, data: bytes, size: int) -> bytes:
+        _require(size)
+        # One byte more than allowed, so that the end after exactly `size` bytes is seen.
+        plain: bytes = decompressor.decompress(data, max_length=size + 1)
+        if len(plain) > size or not decompressor.eof:
+            raise ValueError(f"a chunk is cut, or takes more than the {size} bytes it may")
+        return plain
+
     mcap = needed("rosbags.rosbag2.storage_mcap", WHAT)
-    mcap.DECOMPRESSORS.update(lz4=_lz4, zstd=_zstd)
+    mcap.DECOMPRESSORS.update(
+        zstd=unpacked_zstd, lz4=lambda data, size: unpacked(lz4(), data, size)
+    )
     bag = needed("rosbags.rosbag1.reader", WHAT)
-    bag.decompressors.update(lz4=lambda data: _lz4(data, MAX_CHUNK_BYTES), bz2=_bz2)
+    bag.decompressors.update(
+        lz4=lambda data: unpacked(lz4(), data, MAX_CHUNK_BYTES),
+        bz2=lambda data: unpacked(bz2.BZ2Decompressor(), data, MAX_CHUNK_BYTES),
+    )
 
 
 def check_held(readers: Iterable[Any]) -> None:
@@ -318,19 +348,16 @@ def check_held(readers: Iterable[Any]) -> None:
         for one in getattr(storage, "storages", [storage]):
             chunks = getattr(one, "chunks", [])
             _require(max((chunk.uncompressed_size for chunk in chunks), default=0))
-            if (held := _most_held(chunks)) > MAX_HELD_BYTES:
+            edges = [(each.message_start_time, 0, each.uncompressed_size) for each in chunks]
+            edges += [
+                (max(each.message_start_time, each.message_end_time), 1, -each.uncompressed_size)
+                for each in chunks
+            ]
+            held = max(accumulate(step for _, _, step in sorted(edges)), default=0)
+            if held > MAX_HELD_BYTES:
                 raise ValueError(
                     f"chunks of the same time state {held} bytes, more than {MAX_HELD_BYTES}"
                 )
-
-
-def _most_held(chunks: Sequence[Any]) -> int:
-    edges = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
-    edges += [
-        (max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size)
-        for chunk in chunks
-    ]
-    return max(accumulate(step for _, _, step in sorted(edges)), default=0)
 
 
 def _require(size: int) -> None:
@@ -338,70 +365,17 @@ def _require(size: int) -> None:
         raise ValueError(f"a chunk states {size} bytes, more than {MAX_CHUNK_BYTES}")
 
 
-def _zstd(data: bytes, size: int) -> bytes:
-    _require(size)
-    return inflated(b"zstd", data, size + 1)
-
-
-def _lz4(data: bytes, size: int) -> bytes:
-    _require(size)
-    return _decompressed(needed("lz4.frame", WHAT).LZ4FrameDecompressor(), data, size)
-
-
-def _bz2(data: bytes) -> bytes:
-    return _decompressed(bz2.BZ2Decompressor(), data, MAX_CHUNK_BYTES)
-
-
-def _decompressed(decompressor: Any, data: bytes, size: int) -> bytes:
-    """`data` decompressed; raises `ValueError` beyond `size` bytes or where it is incomplete.
-
-    One byte more than allowed is requested, so that the end after exactly `size` bytes is seen.
-    """
-    plain: bytes = decompressor.decompress(data, max_length=size + 1)
-    if len(plain) > size or not decompressor.eof:
-        raise ValueError(f"a chunk is cut, or takes more than the {size} bytes it may")
-    return plain
-
-
-TYPES: dict[str, tuple[str, ...]] = {
-    "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
-    "camera_info": ("sensor_msgs/msg/CameraInfo",),
-    "attitude": (
-        "sensor_msgs/msg/Imu",
-        "nav_msgs/msg/Odometry",
-        "geometry_msgs/msg/PoseStamped",
-    ),
-    "velocity": ("nav_msgs/msg/Odometry",),
-    "position": ("sensor_msgs/msg/NavSatFix",),
-    "height": (
-        "sensor_msgs/msg/Range",
-        "mavros_msgs/msg/Altitude",
-        "std_msgs/msg/Float64",
-        "std_msgs/msg/Float32",
-    ),
-}
-_COMPRESSED = "sensor_msgs/msg/CompressedImage"
-_ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
-_PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
-_HOME_NAMES = ("rel_alt", "relative_altitude")
-_HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
-
-
 @dataclass(frozen=True, eq=False)
 class Topics:
     """The connection of each role that was found, and all candidates for attitude."""
 
     roles: Mapping[str, Any]  # "image" first
-    attitudes: tuple[Any, ...]
-    connections: tuple[Any, ...]
+    attitudes: Sequence[Any]
 
-    def of(self, connection: Any) -> list[Any]:
-        """All connections on the topic of one (bags split or appended have several)."""
-        return [one for one in self.connections if one.topic == connection.topic]
 
-    def summary(self) -> str:
-        """Role and topic of each connection, for people."""
-        return ", ".join(f"{role} {one.topic}" for role, one in self.roles.items())
+def all_on(reader: Any, connection: Any) -> list[Any]:
+    """All connections on the topic of one (bags split or appended have several)."""
+    return [one for one in reader.connections if one.topic == connection.topic]
 
 
 def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
@@ -410,17 +384,21 @@ def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
     Raises `FlightError` where a requested topic is missing or has another type, and where there is
     no image topic, or more than one.
     """
-    connections = tuple(reader.connections)
-    counted = {one.topic: one for one in connections if one.msgcount}
+    counted = {one.topic: one for one in reader.connections if one.msgcount}
     found: dict[str, list[Any]] = {}
     for role, types in TYPES.items():
         if role in asked:
             found[role] = [_asked(role, asked[role], counted, path)]
-        else:
-            of_type = [one for one in counted.values() if _fits(one, role)]
-            found[role] = sorted(
-                of_type, key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic)
-            )
+            continue
+        of_type = [
+            one
+            for one in counted.values()
+            if one.msgtype in types
+            and (one.msgtype not in _PLAIN_NUMBERS or _last_name(one) in _HEIGHT_NAMES)
+        ]
+        found[role] = sorted(
+            of_type, key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic)
+        )
     images = found["image"]
     if len(images) != 1:
         found_names = ", ".join(sorted(one.topic for one in images))
@@ -434,7 +412,7 @@ def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
     near = [one for one in infos if images[0].topic.startswith(one.topic.rpartition("/")[0] + "/")]
     found["camera_info"] = near or (infos if len(infos) == 1 else [])
     roles = {role: ones[0] for role, ones in found.items() if ones}
-    return Topics(roles, tuple(found["attitude"]), connections)
+    return Topics(roles, found["attitude"])
 
 
 def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
@@ -450,9 +428,8 @@ def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
     return counted[name]
 
 
-def _fits(connection: Any, role: str) -> bool:
-    named = connection.topic.rpartition("/")[2] in _HEIGHT_NAMES
-    return connection.msgtype in TYPES[role] and (named or connection.msgtype not in _PLAIN_NUMBERS)
+def _last_name(connection: Any) -> str:
+    return str(connection.topic.rpartition("/")[2])
 
 
 def open_ros(path: Path, options: SourceOptions) -> Recording:
@@ -476,11 +453,12 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         if track.span_ns() is not None or options.telemetry is not None:
             offset = options.time_offset_ns
             check_overlap(track, first_ns + offset, last_ns + offset, options.telemetry or path)
+    used = ", ".join(f"{role} {one.topic}" for role, one in topics.roles.items())
     return Recording(
         kind="ros",
         path=path,
         camera=camera,
-        note=f"{path.name}: {topics.summary()}",
+        note=f"{path.name}: {used}",
         expected=image.msgcount,
         stream=lambda: with_mean_velocities(_views(path, image.topic, track, options), track),
         warnings=(*doubts, *warnings, *warnings_of(track, options)),
@@ -491,7 +469,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
 def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, int], int, int]:
     """Width and height of the first image that can be read, and times of the first and the last."""
     reason, image = "there is none", topics.roles["image"]
-    for _, time_ns, raw in reader.messages(connections=topics.of(image)):
+    for _, time_ns, raw in reader.messages(connections=all_on(reader, image)):
         try:
             message = reader.deserialize(raw, image.msgtype)
             grey = grey_of_message(message, "the last")
@@ -508,7 +486,7 @@ def _camera(reader: Any, topics: Topics, path: Path) -> Camera:
     info = topics.roles.get("camera_info")
     if info is None:
         raise CameraError(f"no camera_info for the images; give --camera FILE: {path}")
-    for _, _, raw in reader.messages(connections=topics.of(info)):
+    for _, _, raw in reader.messages(connections=all_on(reader, info)):
         try:
             return camera_of_info(reader.deserialize(raw, info.msgtype))
         except CameraError as error:
@@ -550,14 +528,14 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
     """
     attitude: TimeSeries | None = None
     for connection in topics.attitudes:
-        times, wxyz = _samples(reader, topics, connection, 4, attitude_of_message).arrays()
+        times, wxyz = _samples(reader, connection, 4, attitude_of_message).arrays()
         enu_from_flu, sound = rotations_of_wxyz(wxyz)
         attitude = attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
         if attitude is not None:
             break
     agl, home, amsl = _heights(reader, topics)
-    places = _samples(reader, topics, topics.roles.get("position"), 3, _position).positions()
-    velocity = _samples(reader, topics, topics.roles.get("velocity"), 2, _velocity)
+    places = _samples(reader, topics.roles.get("position"), 3, _position).positions()
+    velocity = _samples(reader, topics.roles.get("velocity"), 2, _velocity)
     return RecordedTrack(
         attitude=attitude,
         heights=() if agl is None else (agl,),
@@ -570,10 +548,10 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
     )
 
 
-def _messages(reader: Any, topics: Topics, connection: Any) -> Iterator[tuple[int, Any]]:
+def _messages(reader: Any, connection: Any) -> Iterator[tuple[int, Any]]:
     if connection is None:
         return
-    for one, recorded_ns, raw in reader.messages(connections=topics.of(connection)):
+    for one, recorded_ns, raw in reader.messages(connections=all_on(reader, connection)):
         try:
             message = reader.deserialize(raw, one.msgtype)
         except Exception:  # a damaged message is one sample less
@@ -583,13 +561,12 @@ def _messages(reader: Any, topics: Topics, connection: Any) -> Iterator[tuple[in
 
 def _samples(
     reader: Any,
-    topics: Topics,
     connection: Any,
     width: int,
     values_of: Callable[[Any], tuple[float, ...] | None],
 ) -> Samples:
     samples = Samples(width)
-    for time_ns, message in _messages(reader, topics, connection):
+    for time_ns, message in _messages(reader, connection):
         if (values := values_of(message)) is not None:
             samples.add(time_ns, *values)
     return samples
@@ -598,13 +575,13 @@ def _samples(
 def _heights(reader: Any, topics: Topics) -> tuple[TimeSeries | None, ...]:
     agl, home, amsl = (Samples(1) for _ in range(3))
     connection: Any = topics.roles.get("height")
-    for time_ns, message in _messages(reader, topics, connection):
+    for time_ns, message in _messages(reader, connection):
         if hasattr(message, "bottom_clearance"):
             agl.add(time_ns, message.bottom_clearance)
             home.add(time_ns, message.relative)
             amsl.add(time_ns, message.amsl)
         elif (height := height_of_message(message)) is not None:
-            above_home = connection.topic.rpartition("/")[2] in _HOME_NAMES
+            above_home = _last_name(connection) in _HOME_NAMES
             (home if above_home else agl).add(time_ns, height)
     return agl.series(), home.series(), amsl.series()
 
