@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from decimal import Decimal
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -55,30 +56,11 @@ _LARGEST_S = 9e9
 
 @dataclass(frozen=True)
 class ImageRow:
-    """What a table says of an image; NaN and None where it says nothing.
+    """What a table says of an image: fields of `Photo` and of its `PhotoPose` by their names."""
 
-    Angles are in the convention of orthonav. `order`: number of the row. `alt_m`: altitude whose
-    reference is not stated.
-    """
-
-    order: int
-    time_ns: int | None = None
-    yaw_deg: float = math.nan
-    pitch_deg: float = math.nan
-    roll_deg: float = math.nan
-    tilt_std_deg: float = AUTOPILOT_TILT_STD_DEG
-    agl_m: float = math.nan
-    home_m: float = math.nan
-    amsl_m: float = math.nan
-    hae_m: float = math.nan
-    alt_m: float = math.nan
-    latlon_deg: tuple[float, float] | None = None
-
-    @property
-    def has_height(self) -> bool:
-        """Whether it says any height."""
-        heights = (self.agl_m, self.home_m, self.amsl_m, self.hae_m, self.alt_m)
-        return any(map(math.isfinite, heights))
+    order: int  # number of the row
+    values: Mapping[str, Any]
+    pose: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -229,23 +211,26 @@ def _is_gimbal(
 
 
 def _row(order: int, values: Mapping[str, float], time_ns: int | None, gimbal: bool) -> ImageRow:
+    found: dict[str, Any] = {}
+    if time_ns is not None:
+        found |= {"time_ns": time_ns, "zone_known": True}
+    if "lat" in values and "lon" in values and (values["lat"] or values["lon"]):
+        found["latlon_deg"] = values["lat"], values["lon"]
+    if any(math.isfinite(values.get(name, math.nan)) for name in _HEIGHTS):
+        found |= {f"{name}_m": values.get(name, math.nan) for name in _HEIGHTS}
     yaw, pitch = values.get("yaw", math.nan), values.get("pitch", math.nan)
-    roll = values.get("roll", math.nan if math.isnan(pitch) else 0.0)
+    roll = values.get("roll", 0.0)
     if gimbal and math.isfinite(pitch):
         known = math.isfinite(yaw)
         turned = attitude_of(enu_from_gimbal_camera((yaw if known else 0.0, pitch, roll)))
         yaw, pitch, roll = (turned[0] if known else math.nan), turned[1], turned[2]
-    placed = "lat" in values and "lon" in values and (values["lat"] or values["lon"])
-    return ImageRow(
-        order,
-        time_ns,
-        yaw % 360,
-        pitch,
-        roll,
-        GIMBAL_TILT_STD_DEG if gimbal else AUTOPILOT_TILT_STD_DEG,
-        **{f"{name}_m": values.get(name, math.nan) for name in _HEIGHTS},
-        latlon_deg=(values["lat"], values["lon"]) if placed else None,
-    )
+    pose: dict[str, Any] = {}
+    if math.isfinite(pitch):
+        std_deg = GIMBAL_TILT_STD_DEG if gimbal else AUTOPILOT_TILT_STD_DEG
+        pose |= {"pitch_deg": pitch, "roll_deg": roll, "tilt_std_deg": std_deg}
+    if math.isfinite(yaw):
+        pose |= {"yaw_deg": yaw % 360, "yaw_std_deg": None}
+    return ImageRow(order, found, pose)
 
 
 def _time_ns(text: str, line: int, path: Path) -> int | None:

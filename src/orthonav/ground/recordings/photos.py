@@ -24,7 +24,6 @@ from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
 from orthonav.ground.recordings.exif import FocalLength, Photo, PhotoPose, focal_length, read_photo
 from orthonav.ground.recordings.image_table import (
-    ImageRow,
     ImageTable,
     is_image_table,
     read_image_table,
@@ -165,7 +164,7 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
     for number in edited:
         poses[number] = replace(poses[number], yaw_std_deg=UNKNOWN_YAW_STD_DEG)
     return [
-        replace(photo, pose=_pose_with_row(pose, photo.row))
+        replace(photo, pose=replace(pose, **(photo.row.pose if photo.row else {})))
         for photo, pose in zip(photos, poses, strict=True)
     ], warnings
 
@@ -179,15 +178,6 @@ def _pose(photo: Photo, gimbal_unrecorded: bool) -> PhotoPose:
     if photo.rotation is not None:
         return PhotoPose(*attitude_of(photo.rotation), tilt_std_deg=AUTOPILOT_TILT_STD_DEG)
     return PhotoPose(photo.body_yaw_deg % 360)
-
-
-def _pose_with_row(pose: PhotoPose, row: ImageRow | None) -> PhotoPose:
-    if row is not None and math.isfinite(row.pitch_deg):
-        tilt = {"pitch_deg": row.pitch_deg, "roll_deg": row.roll_deg}
-        pose = replace(pose, **tilt, tilt_std_deg=row.tilt_std_deg)
-    if row is not None and math.isfinite(row.yaw_deg):
-        pose = replace(pose, yaw_deg=row.yaw_deg, yaw_std_deg=None)
-    return pose
 
 
 def _is_unrecorded(photos: Sequence[Photo]) -> bool:
@@ -331,7 +321,11 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
     if table is None:
         return photos, []
     rows = [table.row(photo.path.relative_to(chosen.folder).as_posix()) for photo in photos]
-    known = [_with_row(photo, row) for photo, row in zip(photos, rows, strict=True) if row]
+    known = [
+        replace(photo, row=row, **row.values)
+        for photo, row in zip(photos, rows, strict=True)
+        if row
+    ]
     without = [photo.path for photo, row in zip(photos, rows, strict=True) if row is None]
     if not known:
         raise FlightError(
@@ -350,36 +344,25 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
     return known, warnings
 
 
-def _with_row(photo: Photo, row: ImageRow) -> Photo:
-    photo = replace(photo, row=row, latlon_deg=row.latlon_deg or photo.latlon_deg)
-    if row.time_ns is not None:
-        photo = replace(photo, time_ns=row.time_ns, zone_known=True)
-    if row.has_height:
-        names = ("agl_m", "home_m", "amsl_m", "hae_m", "alt_m")
-        photo = replace(photo, **{name: getattr(row, name) for name in names})
-    return photo
-
-
 def _in_time(
     photos: list[Photo], chosen: ChosenPhotos, options: SourceOptions
 ) -> tuple[list[Photo], list[Path], int]:
     """Photographs with a time, those without one that are left out, and the number of those that
     were given one by their order: where most have a pose but no time, and where they were named one
     by one and one of them has none."""
-    timed = [photo for photo in photos if photo.time_ns is not None]
     untimed = [photo for photo in photos if photo.time_ns is None]
-    ordered: list[Photo] = []
-    if untimed and options.telemetry is None and chosen.singly:
+    if not untimed or options.telemetry is not None:
+        ordered: list[Photo] = []
+    elif chosen.singly:
         ordered = sorted(photos, key=lambda photo: photo.row.order if photo.row else 0)
-    elif untimed and options.telemetry is None:
-        posed = [
-            each
-            for each in untimed
-            if not (each.gimbal_deg is None and each.rotation is None and each.latlon_deg is None)
+    else:
+        known = [
+            one for one in untimed if one.gimbal_deg or one.rotation is not None or one.latlon_deg
         ]
-        ordered = sorted(posed, key=lambda photo: _natural(photo.path))
-        ordered = ordered if len(ordered) > len(timed) else []
+        ordered = sorted(known, key=lambda photo: _natural(photo.path))
+        ordered = ordered if len(ordered) > len(photos) - len(untimed) else []
     if not ordered:
+        timed = [photo for photo in photos if photo.time_ns is not None]
         return timed, [photo.path for photo in untimed], 0
     left_out = [] if chosen.singly else [each.path for each in untimed if each not in ordered]
     spaced = [replace(each, time_ns=number * _BY_NAME_NS) for number, each in enumerate(ordered)]
