@@ -39,8 +39,8 @@ def written(tmp_path, name, terrain, results=RESULTS):
 
 def test_only_confident_positions_are_taken_with_heights_above_sea():
     one, other = camera_positions(RESULTS, hill)
-    assert (one.frame, one.height_m, one.std_m) == ("a.jpg", 425.0, 5.0)
-    assert other.frame == "b.jpg" and other.height_m == pytest.approx(420.0 - 810.0)
+    assert (one.view.frame, one.height_m, one.std_m) == ("a.jpg", 425.0, 5.0)
+    assert other.view.frame == "b.jpg" and other.height_m == pytest.approx(420.0 - 810.0)
     assert math.isnan(camera_positions(RESULTS, None)[0].height_m)
     tracked = replace(RESULTS[0], state="tracking")
     assert camera_positions([tracked], None)[0].std_m == 4.0

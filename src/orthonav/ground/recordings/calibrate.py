@@ -146,7 +146,6 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
 
 
 def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
-    """Confident views of a track that state their biases."""
     return [
         each
         for each in results
@@ -378,7 +377,6 @@ def _columns(seconds: Array, reported: Array) -> Array:
 
 
 def _rotated(vectors: Array) -> Array:
-    """Vectors (..., 2) turned by 90 deg, from right to down."""
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 

@@ -78,14 +78,11 @@ with their fields of view (docs/flights.md)."""
 
 @dataclass(frozen=True)
 class FocalLength:
-    """A focal length for pictures of one size."""
-
     px: float  # in pixels, above 0
     std: float  # its standard deviation, as a fraction of it
     source: str  # where it comes from, for people
 
     def field_deg(self, longer_px: int) -> float:
-        """Field of view along a side of so many pixels."""
         return math.degrees(2 * math.atan(longer_px / (2 * self.px)))
 
 
@@ -154,7 +151,6 @@ def _of_sensor(sensor: Sensor, optics: Optics, width_px: int, height_px: int) ->
 
 
 def _of_film(film_mm: float, width_px: int, height_px: int) -> FocalLength:
-    """Of the 35 mm equivalent, which compares diagonals (CIPA DCG-001)."""
     longer_px, shorter_px = max(width_px, height_px), min(width_px, height_px)
     cropped = longer_px / shorter_px >= _WIDE_ASPECT
     whole_px = longer_px / _FOUR_THIRDS if cropped else shorter_px
@@ -255,10 +251,7 @@ class Photo:
 
 
 def read_photo(path: Path) -> Photo:
-    """Metadata of the photograph at `path`; the image is not decoded.
-
-    Raises `FlightError` where it is not an image.
-    """
+    """Metadata of the photograph at `path`; the image is not decoded."""
     pillow = needed("PIL.Image", "photographs")
     with reading("photograph", path), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about large images and odd tags
@@ -360,7 +353,6 @@ def _offset(text: str) -> timedelta | None:
 
 
 def _gps_time(gps: dict[int, Any]) -> datetime | None:
-    """UTC of the GPS (tags 29 GPSDateStamp and 7 GPSTimeStamp)."""
     try:
         day = datetime.strptime(str(gps[29]).strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
         hours, minutes, seconds = (float(part) for part in gps[7])
@@ -431,7 +423,6 @@ class Xmp:
 
     @classmethod
     def of(cls, packet: str | bytes) -> "Xmp":
-        """The values in a packet, which may be empty."""
         text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
         texts = {f"{maker}:{name}": value for maker, name, value in _VALUE.findall(text)}
         found = {name: _stated(value) for name, value in texts.items()}
@@ -445,7 +436,6 @@ class Xmp:
         return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread)
 
     def first(self, *names: str) -> float:
-        """The first of these values that is there, else NaN."""
         return next((self.values[name] for name in names if name in self.values), math.nan)
 
     def latlon_deg(self) -> tuple[float, float] | None:
@@ -498,7 +488,6 @@ def _stated(text: str) -> float:
 
 
 def _exposed_ns(text: str) -> int | None:
-    """UTC in ns at exposure, as survey cameras of DJI and senseFly write it."""
     found = _EXPOSED.search(text)
     if found is None:
         return None

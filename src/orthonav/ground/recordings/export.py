@@ -41,11 +41,6 @@ class CameraPosition:
     height_m: float
     std_m: float
 
-    @property
-    def frame(self) -> str:
-        """Name of the picture."""
-        return self.view.frame
-
 
 def camera_positions(
     results: Sequence[ViewResult], terrain: TerrainHeights | None
@@ -67,7 +62,6 @@ def camera_positions(
 
 
 def export_of(text: str) -> tuple[str, Path]:
-    """Format and path of `FORMAT=PATH`; raises `VariantError`."""
     name, _, path = text.partition("=")
     if name not in FORMATS or not path:
         raise VariantError(
@@ -82,10 +76,7 @@ def export_all(
     results: Sequence[ViewResult],
     terrain: TerrainHeights | None,
 ) -> None:
-    """Write the camera positions of a flight in formats and to paths of `export_of`.
-
-    Existing files are replaced atomically.
-    """
+    """Write the camera positions of a flight in formats and to paths of `export_of`."""
     positions = camera_positions(results, terrain) if exports else []
     for name, path in exports:
         write_text(path, FORMATS[name](positions))
@@ -102,7 +93,7 @@ def _csv(positions: Sequence[CameraPosition]) -> str:
     for each in positions:
         place = _fixed(each.fix.lat_deg, 8), _fixed(each.fix.lon_deg, 8)
         values = each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m
-        writer.writerow([each.frame, *place, *map(_fixed, values)])
+        writer.writerow([each.view.frame, *place, *map(_fixed, values)])
     return out.getvalue()
 
 
@@ -114,9 +105,9 @@ def _odm_geo(positions: Sequence[CameraPosition]) -> str:
     """
     lines = ["EPSG:4326"]
     for each in positions:
-        if any(character.isspace() for character in each.frame):
-            raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.frame!r}")
-        line = f"{each.frame} {each.fix.lon_deg:.8f} {each.fix.lat_deg:.8f}"
+        if any(character.isspace() for character in each.view.frame):
+            raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.view.frame!r}")
+        line = f"{each.view.frame} {each.fix.lon_deg:.8f} {each.fix.lat_deg:.8f}"
         if not math.isnan(each.height_m):
             line += f" {each.height_m:.3f} 0 0 0 {each.std_m:.3f}"
         lines.append(line)
@@ -166,7 +157,7 @@ def _kml(positions: Sequence[CameraPosition]) -> str:
 
     marks = [placemark("track", f"{len(points)} positions", "LineString", " ".join(points))]
     marks += [
-        placemark(each.frame, f"std {each.std_m:.1f} m", "Point", point)
+        placemark(each.view.frame, f"std {each.std_m:.1f} m", "Point", point)
         for each, point in zip(positions, points, strict=True)
     ]
     body = "\n".join(marks)
@@ -187,7 +178,7 @@ def _gpx(positions: Sequence[CameraPosition]) -> str:
             )
             time = f"<time>{seconds}.{each.view.time_ns % 10**9 // 10**6:03d}Z</time>"
         place = f'lat="{each.fix.lat_deg:.8f}" lon="{each.fix.lon_deg:.8f}"'
-        lines.append(f"<trkpt {place}>{height}{time}<name>{escape(each.frame)}</name></trkpt>")
+        lines.append(f"<trkpt {place}>{height}{time}<name>{escape(each.view.frame)}</name></trkpt>")
     body = "\n".join(lines)
     return (
         f'{_XML}<gpx version="1.1" creator="orthonav" xmlns="http://www.topografix.com/GPX/1/1">'

@@ -68,8 +68,6 @@ class LoggedFlight(Recording):
 
 @dataclass
 class LogFile:
-    """A file of a log and how far it was read."""
-
     path: Path
     walk: Walk = field(default_factory=Walk)
     channels: dict[int, str] = field(default_factory=dict)
@@ -373,7 +371,6 @@ LOCALIZE_CHOICES = {
 
 
 def compare_with_flight(flight: Recording, results: Sequence[ViewResult]) -> None:
-    """Log how many results of a replay differ from those of the flight."""
     if not isinstance(flight, LoggedFlight):
         return
     logged = {result.frame: _comparable(result) for result in flight.results()}
@@ -387,7 +384,6 @@ def compare_with_flight(flight: Recording, results: Sequence[ViewResult]) -> Non
 
 
 def _comparable(result: ViewResult) -> str:
-    """A result as text, without its latency."""
     return result_to_json(replace(result, latency_ms=0.0))
 
 

@@ -152,7 +152,6 @@ def read_image_table(path: Path) -> ImageTable:
 
 
 def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
-    """Name of the column of each field that is there, and the metres of its unit."""
     spelt = {_plain(name): name for name in reversed(names)}
     found = {}
     for field, synonyms in _SYNONYMS.items():

@@ -92,10 +92,7 @@ class _Collected:
 
 
 def read_dataflash(path: Path, mount_deg: Angles) -> RecordedTrack:
-    """The track of a DataFlash log; times are UTC where it has a GPS fix, else since boot.
-
-    Raises `FlightError` where it is another file, damaged, or without attitude.
-    """
+    """The track of a DataFlash log; times are UTC where it has a GPS fix, else since boot."""
     reader = needed("pymavlink.DFReader", "ArduPilot logs")
     collected = _Collected(mount_deg)
     with reading("ArduPilot log", path, silent=True), reader.DFReader_binary(str(path)) as log:
@@ -126,8 +123,7 @@ def _from_dataflash(collected: _Collected, message: Any, time_ns: int) -> None:
 def read_tlog(path: Path, mount_deg: Angles) -> RecordedTrack:
     """The track of a telemetry log; times are UTC of the ground station at reception.
 
-    Only the first vehicle that sends its attitude is read. Raises `FlightError` where there is no
-    attitude, or no MAVLink message.
+    Only the first vehicle that sends its attitude is read.
     """
     mavutil = needed("pymavlink.mavutil", "telemetry logs")
     collected = _Collected(mount_deg)
@@ -171,10 +167,7 @@ def _from_tlog(collected: _Collected, message: Any, time_ns: int) -> None:
 
 
 def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
-    """The track of a ULog; times are UTC where the log has a GPS fix, else since boot.
-
-    Raises `FlightError` where it is not a ULog, damaged, or without attitude.
-    """
+    """The track of a ULog; times are UTC where the log has a GPS fix, else since boot."""
     core = needed("pyulog.core", "PX4 logs")
     with reading("PX4 log", path, silent=True), path.open("rb") as stream:
         log = core.ULog(stream, _TOPICS)
@@ -204,7 +197,6 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
 
 
 def _utc_shift_us(gps: Columns) -> int:
-    """Microseconds from the log's clock to UTC; 0 where the GPS never had the time."""
     if "time_utc_usec" not in gps:
         return 0
     utc, own = gps["time_utc_usec"].astype(np.int64), gps["timestamp"].astype(np.int64)
@@ -322,10 +314,7 @@ UNCLEAR_ORDER = (
 
 
 def log_kind(path: Path) -> str:
-    """`ulog`, `dataflash`, `tlog`, `srt` or `table`, by content.
-
-    Raises `MissingFileError`, or `FlightError` for any other file.
-    """
+    """`ulog`, `dataflash`, `tlog`, `srt` or `table`, by content."""
     path = require_file(path, "telemetry log")
     with path.open("rb") as stream:
         head = stream.read(4096)
@@ -349,7 +338,10 @@ def log_kind(path: Path) -> str:
 
 
 def read_log(path: Path, mount_deg: Angles) -> RecordedTrack:
-    """The track of a log. `mount_deg` applies where the log holds the attitude of the body."""
+    """The track of a log. `mount_deg` applies where the log holds the attitude of the body.
+
+    Raises `FlightError` where it is damaged, of another kind, or without attitude.
+    """
     kind = log_kind(path)
     if kind in ("srt", "table") and path.stat().st_size > MAX_BYTES:
         raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
@@ -378,10 +370,7 @@ class SubtitleBlock:
 
 
 def read_srt(path: Path) -> RecordedTrack:
-    """The track of an SRT file; times are those of its video.
-
-    Raises `FlightError` where it has no telemetry.
-    """
+    """The track of an SRT file; times are those of its video."""
     data = path.read_bytes()
     text = _decoded(data)
     doubtful = _GPS.search(text) is not None and _latitude_first(text) is None
@@ -407,7 +396,6 @@ def read_srt(path: Path) -> RecordedTrack:
 
 
 def end_ns(track: RecordedTrack) -> int:
-    """Last time of a track from subtitles or a table."""
     series = (track.attitude, track.position, track.home, *track.heights)
     return max(int(one.time_ns[-1]) for one in series if one is not None)
 

@@ -36,8 +36,6 @@ class MessageSpan:
 
 @dataclass
 class Walk:
-    """Progress through a file, and its damage."""
-
     next_offset: int = len(MAGIC)
     """Offset of the first record that was not read yet; reading a growing file continues there."""
     lost_bytes: int = 0  # bytes after the last complete record

@@ -146,8 +146,6 @@ def _flight_views(
 
 @dataclass(frozen=True)
 class Imported:
-    """Number of views that were written."""
-
     views: int  # all of them
     with_truth: int  # those with a true position
     complete: int  # those with all telemetry that a fix needs

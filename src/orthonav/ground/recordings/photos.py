@@ -64,7 +64,6 @@ _BY_NAME_NS = 10**9  # spacing of photographs without a time, which are ordered 
 
 
 def photo_paths(folder: Path) -> list[Path]:
-    """Photographs below a folder, hidden ones left out, by name."""
     found = folder.rglob("*")
     return sorted(
         path
@@ -75,7 +74,6 @@ def photo_paths(folder: Path) -> list[Path]:
 
 
 def is_photo(path: Path) -> bool:
-    """Whether a file begins as an image does."""
     with path.open("rb") as stream:
         return stream.read(8).startswith(_MAGICS)
 
@@ -95,7 +93,6 @@ class ChosenPhotos:
 
     @classmethod
     def of(cls, sources: Sequence[Path], options: SourceOptions) -> "ChosenPhotos":
-        """The images of a folder, of a table in it, or those named."""
         first, telemetry = sources[0], options.telemetry
         table = None
         if telemetry is not None and is_image_table(require_file(telemetry, "telemetry log")):
@@ -115,10 +112,7 @@ class ChosenPhotos:
 
 
 def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
-    """The table that lies in a folder and names some of these photographs below it.
-
-    Raises `FlightError` where there are several.
-    """
+    """The table that lies in a folder and names some of these photographs below it."""
     names = [path.relative_to(folder).as_posix() for path in photos]
     found = []
     for path in sorted(path for path in folder.iterdir() if is_image_table(path)):

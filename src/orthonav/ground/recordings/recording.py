@@ -91,7 +91,6 @@ class SourceOptions:
 
     @property
     def time_offset_ns(self) -> int:
-        """The offset in nanoseconds."""
         return round(self.time_offset_s * 1e9)
 
 
@@ -128,7 +127,6 @@ class Recording:
 
     @property
     def views(self) -> Iterator[SourceView]:
-        """The views in order; each is read when its turn comes."""
         return self.stream()
 
 
@@ -189,7 +187,6 @@ def with_mean_velocities(views: Iterable[SourceView], track: RecordedTrack) -> I
 def jump_warnings(
     positions: Sequence[tuple[int, tuple[float, float] | None]],
 ) -> list[str]:
-    """Warning about jumps of a recorded position, at times in ns; empty without one."""
     known = [(time_ns, place) for time_ns, place in positions if place is not None]
     if len(known) < 2:
         return []
@@ -207,7 +204,6 @@ def jump_warnings(
 
 
 def time_warnings(times_ns: Iterable[int]) -> list[str]:
-    """Warning about views that have the time of another one; empty without one."""
     counted = Counter(times_ns)
     equal = sum(count for count in counted.values() if count > 1)
     if not equal:
@@ -220,7 +216,6 @@ def time_warnings(times_ns: Iterable[int]) -> list[str]:
 
 
 def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
-    """Warnings about a track for people: its own, what its heights are, and jumps."""
     home, series = track.home is not None, track.position
     warnings = [
         *track.warnings,
@@ -266,10 +261,7 @@ def height_warnings(
 def given_camera(
     options: SourceOptions, width_px: int, height_px: int, where: str
 ) -> Camera | None:
-    """The camera of the options for images of this size: of a file, or of a field of view.
-
-    Raises `MissingFileError` or `CameraError`.
-    """
+    """The camera of the options for images of this size: of a file, or of a field of view."""
     if options.camera is not None:
         return fitted(read_camera_file(options.camera), width_px, height_px, where)
     if options.fov_deg is None:
@@ -278,7 +270,6 @@ def given_camera(
 
 
 def check_overlap(track: RecordedTrack, first_ns: int, last_ns: int, path: Path) -> None:
-    """Raise `FlightError` where images and track do not overlap in time."""
     span = track.span_ns()
     if span is None or first_ns > span[1] or last_ns < span[0]:
         recorded = "none" if span is None else f"{span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"

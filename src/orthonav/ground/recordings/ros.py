@@ -99,11 +99,7 @@ def bag_suffix(path: Path) -> str | None:
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """The files of a ROS 2 bag in a folder, by name and number.
-
-    Raises `FlightError` where they are of several recordings, `MissingFileError` for a pointer of
-    Git LFS.
-    """
+    """The files of a ROS 2 bag in a folder, by name and number."""
     found = [path for path in folder.iterdir() if path.is_file() and path.suffix in _ROS_2]
     found = [path for path in found if bag_suffix(require_file(path, "file of the bag")) in _ROS_2]
     found.sort(key=_order)
@@ -207,12 +203,10 @@ class ParsableReader:
 
     @cached_property
     def connections(self) -> list[Any]:
-        """The connections whose messages can be parsed, once the reader is open."""
         return [one for one in self._reader.connections if _is_parsable(one)]
 
 
 def _is_parsable(connection: Any) -> bool:
-    """Whether a topic carries messages whose definition is complete."""
     typesys = needed("rosbags.typesys", WHAT)
     parsable = "/msg/" in connection.msgtype
     if parsable and connection.msgdef.format.name == "MSG":
@@ -367,8 +361,6 @@ def _require(size: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Topics:
-    """The connection of each role that was found, and all candidates for attitude."""
-
     roles: Mapping[str, Any]  # "image" first
     attitudes: Sequence[Any]
 
@@ -379,11 +371,7 @@ def all_on(reader: Any, connection: Any) -> list[Any]:
 
 
 def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
-    """The topics of a recording by role.
-
-    Raises `FlightError` where a requested topic is missing or has another type, and where there is
-    no image topic, or more than one.
-    """
+    """The topics of a recording by role."""
     counted = {one.topic: one for one in reader.connections if one.msgcount}
     found: dict[str, list[Any]] = {}
     for role, types in TYPES.items():

@@ -42,7 +42,6 @@ class Setup:
     without_prior: bool = False
 
     def changed(self, view: View) -> View:
-        """The view with this change."""
         telemetry, camera, grey = view.telemetry, view.camera, view.grey
         if self.factor != 1.0:
             agl_m = self.factor * telemetry.agl_m
@@ -81,7 +80,6 @@ class Tried:
 
     @property
     def explains(self) -> bool:
-        """Whether this change makes the views confident."""
         return self.confident >= FEW * self.views and self.confident > 0
 
 
@@ -166,7 +164,6 @@ def try_setups(
 
 
 def mirrored_camera(camera: Camera) -> Camera:
-    """The camera of the images mirrored left to right."""
     lens = camera.distortion
     if camera.model == "brown" and lens:
         lens = (*lens[:3], -lens[3], *lens[4:])  # p2 is the tangential part along x
@@ -184,8 +181,6 @@ def _tried(setup: Setup, views: int, fixes: list[tuple[View, Fix]]) -> Tried:
 
 @dataclass(frozen=True)
 class Counts:
-    """Views of a run by what is known of their positions."""
-
     views: int
     confident: int
     low: int
@@ -210,7 +205,6 @@ class Counts:
 
     @property
     def few(self) -> bool:
-        """Whether so few views are confident that the configuration may be wrong."""
         return self.confident < FEW * self.views
 
 
