@@ -159,9 +159,6 @@ def test_doubtful_positions_are_named(recorded):
     subtitles(srt, ["GPS(2.5,42.5) G.PRY (-90.0, 0.0, 10.0)"] * 30)
     (warning,) = open_source(recorded, options(recorded)).warnings
     assert "begins with the latitude or the longitude: positions are left out" in warning
-    subtitles(srt, [dji_subtitle(n, lat=46.6 if n >= 20 else 46.5) for n in range(30)])
-    _, warning = open_source(recorded, options(recorded)).warnings
-    assert "jumps 1 times, the first by 11.1 km 2.0 s after the beginning" in warning
     subtitles(srt, ["GPS(50.5,2.5)"] * 29 + ["GPS(50.5,102.5)"])  # of the whole file
     first = next(blocks(srt.read_bytes()))
     assert (first.lat_deg, first.lon_deg) == (50.5, 2.5)

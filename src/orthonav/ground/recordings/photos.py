@@ -36,7 +36,6 @@ from orthonav.ground.recordings.recording import (
     check_overlap,
     given_camera,
     height_warnings,
-    jump_warnings,
     known_at,
     rounded,
     time_warnings,
@@ -223,19 +222,13 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
                 f"pitch and roll of {level} of {len(photos)} photographs are not known: a camera "
                 "that looks straight down is assumed"
             )
-        known = {
-            name: any(math.isfinite(getattr(photo, name)) for photo in photos)
+        heights = {
+            name
             for name in ("home_m", "amsl_m", "hae_m", "alt_m")
+            if any(math.isfinite(getattr(photo, name)) for photo in photos)
         }
         if any(math.isnan(photo.agl_m) for photo in photos):
-            warnings += height_warnings(
-                options,
-                above_ground=False,
-                above_home=known["home_m"],
-                above_sea=known["amsl_m"] or known["hae_m"],
-                altitudes=known["alt_m"],
-            )
-        warnings += jump_warnings([(_time_ns(photo), photo.latlon_deg) for photo in photos])
+            warnings += height_warnings(options, heights)
     doubted = [photo for photo in photos if photo.doubts]
     if doubted:
         warnings.append(
