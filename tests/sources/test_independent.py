@@ -129,10 +129,10 @@ def compare_pose(ours, tags):
     ahead = pitch + 90 if math.isfinite(pitch) else first(tags, "XMP-sensefly:PitchAngle")
     if heading == 0 == pitch:  # a gimbal that was not recorded
         heading, ahead = first(tags, "XMP-drone-dji:FlightYawDegree"), 0.0
-    assert turned(pose.yaw_deg, heading) == pytest.approx(0, abs=1e-3)
-    assert pose.pitch_deg == pytest.approx(ahead, abs=1e-3)
+    assert turned(pose["yaw_deg"], heading) == pytest.approx(0, abs=1e-3)
+    assert pose["pitch_deg"] == pytest.approx(ahead, abs=1e-3)
     roll = first(tags, "XMP-sensefly:RollAngle")
-    assert pose.roll_deg == pytest.approx(0 if math.isnan(roll) else roll, abs=1e-3)
+    assert pose["roll_deg"] == pytest.approx(0 if math.isnan(roll) else roll, abs=1e-3)
 
 
 @needs_exiftool

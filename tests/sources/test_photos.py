@@ -40,7 +40,7 @@ def attitude(photo):
     """Heading, pitch and roll of a photograph by itself."""
     (photo,), _ = posed([photo])
     pose = photo.pose
-    return pose.yaw_deg, pose.pitch_deg, pose.roll_deg
+    return pose["yaw_deg"], pose["pitch_deg"], pose["roll_deg"]
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import re
 import struct
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -208,18 +208,6 @@ _EXPOSED = re.compile(
 _WRITER = re.compile(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})")
 
 
-@dataclass(frozen=True)
-class PhotoPose:
-    """Attitude of a photograph in the convention of orthonav; NaN where it is unknown."""
-
-    yaw_deg: float = math.nan
-    pitch_deg: float = math.nan
-    roll_deg: float = math.nan
-    yaw_std_deg: float | None = None  # standard deviation of the heading, None for the usual one
-    tilt_std_deg: float | None = None
-    """Standard deviation of pitch and roll by what recorded them, None where they are unknown."""
-
-
 @dataclass(frozen=True, eq=False)
 class Photo:
     """Metadata of one photograph; NaN and None where it has none."""
@@ -247,7 +235,8 @@ class Photo:
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
     row: ImageRow | None = None  # what a table says of it
-    pose: PhotoPose = PhotoPose()  # its attitude, once all photographs of the flight are known
+    pose: Mapping[str, Any] = field(default_factory=dict)
+    """Its attitude as fields of `Telemetry`, once all photographs of the flight are known."""
 
 
 def read_photo(path: Path) -> Photo:

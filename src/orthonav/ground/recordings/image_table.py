@@ -56,7 +56,7 @@ _LARGEST_S = 9e9
 
 @dataclass(frozen=True)
 class ImageRow:
-    """What a table says of an image: fields of `Photo` and of its `PhotoPose` by their names."""
+    """What a table says of an image: fields of `Photo` and of its pose by their names."""
 
     order: int  # number of the row
     values: Mapping[str, Any]

@@ -3,9 +3,8 @@
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -354,19 +353,18 @@ def read_log(path: Path, mount_deg: Angles) -> RecordedTrack:
     return read_srt(path) if kind == "srt" else read_table(path)
 
 
-@dataclass(frozen=True)
-class SubtitleBlock:
+class SubtitleBlock(NamedTuple):
     """One subtitle; values it does not hold are NaN."""
 
     start_ns: int  # begin in the video
     end_ns: int  # end in the video
-    lat_deg: float = math.nan
-    lon_deg: float = math.nan
-    alt_m: float = math.nan  # altitude in the drone's own reference
-    height_m: float = math.nan  # height above take-off
-    yaw_deg: float = math.nan  # yaw of the gimbal, as are pitch and roll
-    pitch_deg: float = math.nan
-    roll_deg: float = math.nan
+    lat_deg: float
+    lon_deg: float
+    alt_m: float  # altitude in the drone's own reference
+    height_m: float  # height above take-off
+    yaw_deg: float  # yaw of the gimbal, as are pitch and roll
+    pitch_deg: float
+    roll_deg: float
 
 
 def read_srt(path: Path) -> RecordedTrack:
@@ -374,15 +372,14 @@ def read_srt(path: Path) -> RecordedTrack:
     data = path.read_bytes()
     text = _decoded(data)
     doubtful = _GPS.search(text) is not None and _latitude_first(text) is None
-    timed = [(block.start_ns, block) for block in blocks(data)]
-    if not timed:
+    found = list(blocks(data))
+    if not found:
         raise FlightError(f"subtitles hold no telemetry: {path}")
-    timed.append((timed[-1][1].end_ns, timed[-1][1]))
     attitude, position, height = Samples(3), Samples(3), Samples(1)
-    for time_ns, block in timed:
-        attitude.add(time_ns, block.yaw_deg, block.pitch_deg, block.roll_deg)
-        position.add(time_ns, block.lat_deg, block.lon_deg, block.alt_m)
-        height.add(time_ns, block.height_m)
+    for block in [*found, found[-1]._replace(start_ns=found[-1].end_ns)]:
+        attitude.add(block.start_ns, block.yaw_deg, block.pitch_deg, block.roll_deg)
+        position.add(block.start_ns, block.lat_deg, block.lon_deg, block.alt_m)
+        height.add(block.start_ns, block.height_m)
     track = RecordedTrack(
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
         home=height.series(),

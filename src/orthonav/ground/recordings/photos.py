@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from orthonav.core.errors import CameraError, FlightError, lfs_pointer
 from orthonav.core.files import require_file
@@ -22,7 +23,7 @@ from orthonav.core.geo.attitude import (
 )
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
-from orthonav.ground.recordings.exif import FocalLength, Photo, PhotoPose, focal_length, read_photo
+from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, read_photo
 from orthonav.ground.recordings.image_table import (
     ImageTable,
     is_image_table,
@@ -155,22 +156,26 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
             "the heading of these is taken as unknown"
         )
     for number in edited:
-        poses[number] = replace(poses[number], yaw_std_deg=UNKNOWN_YAW_STD_DEG)
+        poses[number]["yaw_std_deg"] = UNKNOWN_YAW_STD_DEG
     return [
-        replace(photo, pose=replace(pose, **(photo.row.pose if photo.row else {})))
+        replace(photo, pose={**pose, **(photo.row.pose if photo.row else {})})
         for photo, pose in zip(photos, poses, strict=True)
     ], warnings
 
 
-def _pose(photo: Photo, gimbal_unrecorded: bool) -> PhotoPose:
+def _pose(photo: Photo, gimbal_unrecorded: bool) -> dict[str, Any]:
+    std_deg = None
     if gimbal_unrecorded:
-        return PhotoPose(photo.body_yaw_deg % 360, 0.0, 0.0, tilt_std_deg=ASSUMED_TILT_STD_DEG)
-    if photo.gimbal_deg is not None:
-        rotation, tilt_std_deg = enu_from_gimbal_camera(photo.gimbal_deg), GIMBAL_TILT_STD_DEG
-        return PhotoPose(*attitude_of(rotation), tilt_std_deg=tilt_std_deg)
-    if photo.rotation is not None:
-        return PhotoPose(*attitude_of(photo.rotation), tilt_std_deg=AUTOPILOT_TILT_STD_DEG)
-    return PhotoPose(photo.body_yaw_deg % 360)
+        angles, std_deg = (photo.body_yaw_deg % 360, 0.0, 0.0), ASSUMED_TILT_STD_DEG
+    elif photo.gimbal_deg is not None:
+        angles, std_deg = attitude_of(enu_from_gimbal_camera(photo.gimbal_deg)), GIMBAL_TILT_STD_DEG
+    elif photo.rotation is not None:
+        angles, std_deg = attitude_of(photo.rotation), AUTOPILOT_TILT_STD_DEG
+    else:
+        angles = photo.body_yaw_deg % 360, math.nan, math.nan
+    return dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), angles, strict=True)) | {
+        "tilt_std_deg": std_deg
+    }
 
 
 def _is_unrecorded(photos: Sequence[Photo]) -> bool:
@@ -215,7 +220,7 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     else:
         photos, doubts = posed(photos)
         warnings += doubts
-        level = sum(math.isnan(photo.pose.pitch_deg) for photo in photos)
+        level = sum(math.isnan(photo.pose["pitch_deg"]) for photo in photos)
         if chosen.singly and level:
             options = replace(options, looks_down=True)
             warnings.append(
@@ -435,13 +440,5 @@ def _own_telemetry(photo: Photo, options: SourceOptions) -> Telemetry:
     heights = {name: getattr(photo, name) for name in ("home_m", "amsl_m", "hae_m")}
     known = {name: value for name, value in heights.items() if math.isfinite(value)}
     return Telemetry(
-        _time_ns(photo),
-        photo.pose.yaw_deg,
-        photo.pose.pitch_deg,
-        photo.pose.roll_deg,
-        height,
-        yaw_std_deg=photo.pose.yaw_std_deg,
-        tilt_std_deg=photo.pose.tilt_std_deg,
-        vel_en_mps=photo.vel_en_mps,
-        **known,
+        _time_ns(photo), agl_m=height, vel_en_mps=photo.vel_en_mps, **photo.pose, **known
     )
