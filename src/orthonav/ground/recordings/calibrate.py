@@ -309,41 +309,40 @@ class _Pairs:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Fit of one latency: `linear` (5,), differences `turn_off` (N,) and `shift_off` (N, 2), and
-    `weights` (N,)."""
+    """Fit of one latency: its `cost`, `linear` (5,), differences `turn_off` (N,) and `shift_off`
+    (N, 2), and `weights` (N,)."""
 
+    cost: float
     linear: Array
     turn_off: Array
     shift_off: Array
     weights: Array
 
-    def scatter(self, least: Array) -> Array:
+    def scatter(self) -> Array:
         """Standard deviations (2,) of turn and shift by the differences."""
         known = self.weights > 0
-        if not known.any():
-            return least
         middle = [np.median(np.abs(off[known])) for off in (self.turn_off, self.shift_off)]
-        return np.asarray(np.maximum(least, MAD_TO_STD * np.array(middle)))
+        return MAD_TO_STD * np.array(middle)
 
 
 def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
-    prior = _prior(pairs.reported, heading_known=heading_known)
-    noise, weights = pairs.least_noise(), np.ones(len(pairs.turn))
-    least = noise
-    for _ in range(3):  # robust: pairs that the best candidate does not explain count less
-        cost = _costs(pairs, weights, noise, prior)
-        best = int(np.argmin(cost))
-        fit = _fitted(pairs, pairs.reported[:, best], noise, prior)
-        noise, weights = fit.scatter(least), fit.weights
     if (np.isfinite(pairs.reported[..., :3]).all(axis=-1).mean(axis=0) < KNOWN_SHARE).any():
         return None  # a latency that cannot be excluded
+    prior = _prior(pairs.reported, heading_known=heading_known)
+    noise = least = pairs.least_noise()
+    for _ in range(2):  # the second time with the scatter of the first
+        fits = [_fitted(pairs, each, noise, prior) for each in np.moveaxis(pairs.reported, 1, 0)]
+        cost = np.array([each.cost for each in fits])
+        best = int(np.argmin(cost))
+        fit = fits[best]
+        noise = np.maximum(least, fit.scatter())
     chance = np.exp((cost[best] - cost) / (2 * ALIKE))
     near = np.abs(CANDIDATES_S - CANDIDATES_S[best]) <= NEAR_S
     ambiguous = chance[near].sum() < NEAR_MASS * chance.sum()
     scale, across = fit.linear[:2].tolist()
     turned = abs(math.atan2(across, scale)) if heading_known else 0.0
     usual = SCALES[0] < math.hypot(scale, across) < SCALES[1] and turned < ACROSS
-    if weights.mean() < LEAST_WEIGHT or ambiguous or not usual:
+    if fit.weights.mean() < LEAST_WEIGHT or ambiguous or not usual:
         return None
     # The minimum of a parabola through the least cost and its neighbours, and its curvature.
     middle = min(max(best, 1), len(cost) - 2)
@@ -380,26 +379,6 @@ def _rotated(vectors: Array) -> Array:
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
-def _costs(pairs: _Pairs, weights: Array, noise: Array, prior: Prior) -> Array:
-    """Cost (C,) of every candidate, with `weights` (N,) of the pairs."""
-    mean, precision = prior
-    known = np.isfinite(pairs.reported[..., :3]).all(axis=-1)
-    reported = np.nan_to_num(pairs.reported)
-    share = weights[:, None] * known
-    share = share * (weights.sum() / np.maximum(share.sum(axis=0), 1e-9))
-    precise = share / noise[1] ** 2
-    lines = _columns(pairs.seconds[:, None], reported)
-    wanted = pairs.shift[:, None] - reported[..., 1:3]
-    normal = np.einsum("nc,ncij,ncik->cjk", precise, lines, lines, optimize=True) + precision
-    right = np.einsum("nc,ncij,nci->cj", precise, lines, wanted, optimize=True)
-    right = right + precision @ mean
-    linear = np.linalg.solve(normal, right[..., None])[..., 0]
-    squares = np.einsum("nc,nci,nci->c", precise, wanted, wanted, optimize=True)
-    turned = np.einsum("nc,nc->c", share, np.square(pairs.turn[:, None] - reported[..., 0]))
-    least = squares + mean @ precision @ mean
-    return np.asarray(least - (linear * right).sum(axis=1) + turned / noise[0] ** 2)
-
-
 def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: Prior) -> _Fit:
     """Fit for `reported` (N, 5), with standard deviations `noise` (2,) of turn and shift."""
     known = np.asarray(np.isfinite(reported[:, :3]).all(axis=1), np.float64)
@@ -416,7 +395,11 @@ def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: Prior) -> _Fit:
         square: Array = np.square(turn_off / noise[0])
         square = square + np.square(shift_off / noise[1]).sum(axis=1)
         weights = known / (1 + square / OUTLIER**2)
-    return _Fit(linear, turn_off, shift_off, weights)
+    # Cauchy's loss; where pairs are not known, as if all were.
+    loss = float((known * np.log1p(square / OUTLIER**2)).sum()) * OUTLIER**2
+    off = linear - prior[0]
+    cost = loss * len(known) / max(known.sum(), 1.0) + float(off @ prior[1] @ off)
+    return _Fit(cost, linear, turn_off, shift_off, weights)
 
 
 def _agreed(estimates: list[LatencyEstimate | None], intervals: list[float]) -> CameraLatency:
