@@ -209,7 +209,8 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
         options = replace(options, telemetry=None)
     photos, warnings = _taken(chosen, options)
     if options.camera is None and options.fov_deg is None:
-        photos, zoomed = _of_one_focal_length(photos, options)
+        focal_px = [_focal_px(photo, options) for photo in photos]
+        photos, zoomed = _alike(photos, focal_px, "of another focal length than most")
         warnings += zoomed
     camera, note = _camera(photos[0], options)
     track = None
@@ -275,9 +276,10 @@ def _taken(chosen: ChosenPhotos, options: SourceOptions) -> tuple[list[Photo], l
             unread.append(path)
             with path.open("rb") as stream:
                 reason = reason or lfs_pointer(stream.read(64)) or ""
-    photos, odd = _of_one_size(photos)
     warnings = _left_out(paths, unread, reason or "not readable")
-    warnings += _left_out(paths, odd, "of another size than most")
+    sizes = [(photo.width_px, photo.height_px) for photo in photos]
+    photos, odd = _alike(photos, sizes, "of another size than most")
+    warnings += odd
     if photos:
         photos, lost = _with_rows(photos, chosen)
         photos, untimed, undated = _in_time(photos, chosen, options)
@@ -301,11 +303,17 @@ def _left_out(all_of_them: Sequence[Path | Photo], bad: Sequence[Path], reason: 
     return [f"{count}, {reason}, the first: {bad[0].name}"]
 
 
-def _of_one_size(photos: Sequence[Photo]) -> tuple[list[Photo], list[Path]]:
-    sizes = Counter((photo.width_px, photo.height_px) for photo in photos)
-    usual = max(sizes, key=lambda size: (sizes[size], size[0] * size[1]), default=None)
-    alike = [photo for photo in photos if (photo.width_px, photo.height_px) == usual]
-    return alike, [each.path for each in photos if (each.width_px, each.height_px) != usual]
+def _alike(photos: list[Photo], keys: Sequence[Any], reason: str) -> tuple[list[Photo], list[str]]:
+    """The photographs with the most frequent key or without one, and a warning about others, which
+    include those with NaN. All of them where none has a key."""
+    counted = Counter(key for key in keys if key is not None and key == key)
+    if not counted:
+        return photos, []
+    usual = max(counted, key=lambda key: (counted[key], key))
+    fits = [key is None or key == usual for key in keys]
+    odd = [photo.path for photo, fit in zip(photos, fits, strict=True) if not fit]
+    alike = [photo for photo, fit in zip(photos, fits, strict=True) if fit]
+    return alike, _left_out(photos, odd, reason)
 
 
 def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], list[str]]:
@@ -366,30 +374,13 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _of_one_focal_length(
-    photos: list[Photo], options: SourceOptions
-) -> tuple[list[Photo], list[str]]:
-    """The photographs of the most frequent focal length, and a warning about others.
-
-    Those that state none are used too, and all of them where no focal length can be used.
-    """
-    focal_px: list[float | None] = []
-    known: Counter[FocalLength] = Counter()
-    for photo in photos:
-        try:
-            found = _focal_length(photo, options)
-        except CameraError:
-            focal_px.append(math.nan)
-        else:
-            focal_px.append(None if found is None else found.px)
-            known.update([found] if found else [])
-    if not known:
-        return photos, []
-    usual = known.most_common(1)[0][0]
-    fits = [px is None or abs(px / usual.px - 1) <= usual.std for px in focal_px]
-    odd = [photo.path for photo, fit in zip(photos, fits, strict=True) if not fit]
-    warnings = _left_out(photos, odd, "of another focal length than most")
-    return [photo for photo, fit in zip(photos, fits, strict=True) if fit], warnings
+def _focal_px(photo: Photo, options: SourceOptions) -> float | None:
+    """The focal length, NaN for one that cannot be used, None for none."""
+    try:
+        found = _focal_length(photo, options)
+    except CameraError:
+        return math.nan
+    return None if found is None else found.px
 
 
 def _focal_length(photo: Photo, options: SourceOptions) -> FocalLength | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -359,8 +359,9 @@ def _require(size: int) -> None:
         raise ValueError(f"a chunk states {size} bytes, more than {MAX_CHUNK_BYTES}")
 
 
-@dataclass(frozen=True, eq=False)
-class Topics:
+class Topics(NamedTuple):
+    """The connection of each role that was found, and all candidates for attitude."""
+
     roles: Mapping[str, Any]  # "image" first
     attitudes: Sequence[Any]
 

@@ -38,25 +38,20 @@ class Setup:
     name: str
     any_heading: bool = False
     factor: float = 1.0
-    mirrored: bool = False
     without_prior: bool = False
 
     def changed(self, view: View) -> View:
-        telemetry, camera, grey = view.telemetry, view.camera, view.grey
-        if self.factor != 1.0:
-            agl_m = self.factor * telemetry.agl_m
-            telemetry = replace(telemetry, agl_m=agl_m, agl_std_m=MAX_AGL_STD * agl_m)
-        if self.mirrored:
-            camera, grey = mirrored_camera(camera), np.ascontiguousarray(grey[:, ::-1])
-            telemetry = replace(telemetry, roll_deg=-telemetry.roll_deg)
-        return View(grey, camera, telemetry)
+        if self.factor == 1.0:
+            return view
+        agl_m = self.factor * view.telemetry.agl_m
+        telemetry = replace(view.telemetry, agl_m=agl_m, agl_std_m=MAX_AGL_STD * agl_m)
+        return replace(view, telemetry=telemetry)
 
 
 _SETUPS = (
     Setup("any heading", any_heading=True),
     Setup("twice the height", factor=2.0),
     Setup("half the height", factor=0.5),
-    Setup("mirrored", mirrored=True, any_heading=True),
     Setup("four times the height", factor=4.0),
     Setup("a quarter of the height", factor=0.25),
     Setup("without the prior", without_prior=True),
@@ -136,7 +131,7 @@ def try_setups(
     setups = [
         setup
         for setup in _SETUPS
-        if (heading_known or setup.mirrored or not setup.any_heading)
+        if (heading_known or not setup.any_heading)
         and (not setup.without_prior or (use_prior and any(v.telemetry.prior for v in views)))
     ]
     found: list[Tried] = []
@@ -161,13 +156,6 @@ def try_setups(
             break
     progress(1.0)
     return found
-
-
-def mirrored_camera(camera: Camera) -> Camera:
-    lens = camera.distortion
-    if camera.model == "brown" and lens:
-        lens = (*lens[:3], -lens[3], *lens[4:])  # p2 is the tangential part along x
-    return replace(camera, cx_px=camera.width_px - camera.cx_px, distortion=lens)
 
 
 def _tried(setup: Setup, views: int, fixes: list[tuple[View, Fix]]) -> Tried:
@@ -229,8 +217,6 @@ def setup_text(tried: Sequence[Tried], *, on_map: bool) -> list[str]:
     off, ratio = last.heading_off_deg, last.height_ratio
     if last.setup.without_prior:
         cause = "without the prior; check the prior positions"
-    elif last.setup.mirrored:
-        cause = "if mirrored left to right, with any heading; check where the images come from"
     elif last.setup.any_heading:
         apart = "" if math.isnan(off) else f", {off:+.0f} deg from the reported one"
         cause = f"with any heading{apart}; check the heading column and the mounting of the camera"
