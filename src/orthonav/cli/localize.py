@@ -253,7 +253,7 @@ def _on_map(options: argparse.Namespace) -> None:
             compare_with_flight(flight, results)
         _write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
         export_all(exports, results, dem or TerrainLayer.of(opened))
-        advice, tried = advisor.advice(results, accept, shown)
+        advice, tried = advisor.advice(results, accept)
         seen_by = MountedFlight(flight, mount) if mount else flight
         changed = report_changes(options, opened, [(seen_by, results)], shown)
     with _beside_outputs(options):

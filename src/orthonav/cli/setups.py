@@ -10,7 +10,6 @@ from orthonav.cli.build import reporter
 from orthonav.cli.source import FAR_M, far_from_map, far_text
 
 if TYPE_CHECKING:
-    from orthonav.cli.common import Progress
     from orthonav.core.flight.heights import FlownHeights
     from orthonav.core.flight.mount import Mount
     from orthonav.core.localize import Localizer
@@ -64,7 +63,7 @@ class SetupAdvice:
         self._low.take(result)
 
     def advice(
-        self, results: "Sequence[ViewResult]", accept: "Acceptance", shown: "Progress"
+        self, results: "Sequence[ViewResult]", accept: "Acceptance"
     ) -> "tuple[list[str], list[dict[str, Any]]]":
         """Sentences on what to check, and the configurations that were tried as JSON values.
 
@@ -85,7 +84,7 @@ class SetupAdvice:
         if not self._low.views or not options.diagnosis:
             return lines, []
         try:
-            tried, ended = self._tried(accept, shown)
+            tried, ended = self._tried(accept)
         except KeyboardInterrupt:  # skips the search; the results are written
             return [*lines, "the search for another configuration was interrupted"], []
         if ended:
@@ -97,7 +96,7 @@ class SetupAdvice:
             for each in tried
         ]
 
-    def _tried(self, accept: "Acceptance", shown: "Progress") -> "tuple[list[Tried], bool]":
+    def _tried(self, accept: "Acceptance") -> "tuple[list[Tried], bool]":
         """The configurations that were tried, and whether the time for it ran out."""
         from orthonav.ground.recordings.setups import try_setups
 
@@ -113,7 +112,6 @@ class SetupAdvice:
             use_prior=options.prior == "telemetry",
             heading_known=options.heading == "known",
             stop=lambda: time.monotonic() > end_s,
-            progress=lambda share: shown("configurations", share),
         )
         return tried, time.monotonic() > end_s
 

@@ -51,7 +51,6 @@ MAD_TO_STD = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""
 STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
 """Lower bounds of the standard deviations of the estimated biases."""
-_LASTING = ("pitch_deg", "roll_deg")
 _EVIDENCE = {
     "heading_deg": "heading_bias_deg",
     "log_scale": "log_scale_bias",
@@ -101,24 +100,18 @@ Prior = tuple[Array, Array]
 
 @dataclass(frozen=True)
 class MountCalibration:
-    """A mount calibration.
-
-    `mount`: estimated biases.
-    `first`, `last`: frames of the first and the last view used.
-    `moved`: whether the camera moved in its mount before `first`.
-    """
+    """Estimated biases, and the views that they are of."""
 
     mount: Mount
-    first: str
-    last: str
-    moved: bool
+    first: str  # frame of the first view used
+    last: str  # frame of the last one
+    moved: bool  # whether the camera moved in its mount before `first`
 
 
 def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
-    """Mount at the end of a tracked flight, estimated from its confident views.
+    """Mount at the end of a tracked flight: medians over its confident views.
 
-    Views before a movement of the camera in its mount are excluded. Biases are medians; their
-    standard deviations account for the correlation of successive views. Raises `FlightError` where
+    Views before a movement of the camera in its mount are excluded. Raises `FlightError` where
     fewer than `MIN_VIEWS` views are confident.
     """
     confident = confident_views(results)
@@ -138,8 +131,7 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
     begin = min(begin, len(confident) - MIN_VIEWS)
     used = slice(begin, None)
     biases = {
-        name: _bias(values[name][used], spreads[name][used], STD_FLOOR[name], name in _LASTING)
-        for name in _EVIDENCE
+        name: _bias(values[name][used], spreads[name][used], STD_FLOOR[name]) for name in _EVIDENCE
     }
     mount = Mount(**biases, views=len(confident) - begin)
     return MountCalibration(mount, confident[begin].frame, confident[-1].frame, begin > 0)
@@ -162,22 +154,11 @@ def _still_from(values: Array, spreads: Array) -> int:
     return int(np.flatnonzero(far)[-1]) + 1 if far.any() else 0
 
 
-def _bias(values: Array, spreads: Array, floor: float, lasting: bool) -> Bias:
-    """Median, its standard deviation, and the scatter around it.
-
-    The standard deviation of a `lasting` bias is that of the track. Otherwise it is that of the
-    mean of the views, their number reduced by the autocorrelation at lag one.
-    """
+def _bias(values: Array, spreads: Array, floor: float) -> Bias:
+    """Median, its standard deviation by the track, and the scatter around it."""
     middle = float(np.median(values))
-    off = values - middle
-    scatter = MAD_TO_STD * float(np.median(np.abs(off)))
-    if lasting:
-        return Bias(middle, max(floor, float(np.median(spreads))), scatter)
-    energy = float(off @ off)
-    alike = float(off[1:] @ off[:-1]) / energy if energy > 0 else 0.0
-    alike = min(max(alike, 0.0), 0.99)
-    mean_std = scatter * math.sqrt((1 + alike) / (1 - alike) / len(values))
-    return Bias(middle, max(floor, mean_std), scatter)
+    scatter = MAD_TO_STD * float(np.median(np.abs(values - middle)))
+    return Bias(middle, max(floor, float(np.median(spreads))), scatter)
 
 
 def arrivals_of(flight: Flight) -> Iterator[tuple[RecordedView, float]]:

@@ -35,7 +35,7 @@ from orthonav.core.flight.logged import (
 from orthonav.core.flight.mount import logged_mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import ViewResult
-from orthonav.ground.recordings.mcap_files import Walk, chunk_at, chunks, messages, profile_of
+from orthonav.ground.recordings.mcap_files import McapFile, chunk_at, chunks, messages, profile_of
 from orthonav.ground.recordings.recording import (
     Grey,
     Recording,
@@ -64,13 +64,6 @@ class LoggedFlight(Recording):
     session: Mapping[str, Any] = field(default_factory=dict)
     results: Callable[[], list[ViewResult]] = list
     arrivals: Callable[[], Iterable[tuple[SourceView, float]]] = list
-
-
-@dataclass
-class LogFile:
-    path: Path
-    walk: Walk = field(default_factory=Walk)
-    channels: dict[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -105,14 +98,14 @@ class LogContent:
         self._chunk = b""
 
     def read(
-        self, file: LogFile, take: Callable[[str, bytes], None] = lambda topic, data: None
+        self, file: McapFile, take: Callable[[str, bytes], None] = lambda topic, data: None
     ) -> None:
         """Read what is new in a file; `take` gets topic and data of every message but images.
 
         Messages that are damaged, or for which `take` raises, are skipped. Raises `BrokenLogError`.
         """
-        for offset, data in chunks(file.path, file.walk):
-            for found in messages(data, file.channels):
+        for offset, data in chunks(file):
+            for found in messages(data, file):
                 if found.topic in (VIEW.name, THUMBNAIL.name):
                     whole = found.topic == VIEW.name
                     place = ImagePlace(file.path, offset, found.first, found.last, whole)
@@ -178,7 +171,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
         raise FlightError(f"a flight log has its own telemetry; omit --telemetry: {path}")
     files, content, warnings = files_of_run(path), LogContent(), list[str]()
     for file in files:
-        warnings += _warnings_of_file(LogFile(file), content)
+        warnings += _warnings_of_file(McapFile(file), content)
     if not content.session:
         raise FlightError(f"no chunk of the flight log is complete: {path}")
     try:
@@ -231,22 +224,22 @@ def _order(path: Path) -> tuple[str, int]:
 
 def run_of(path: Path) -> str | None:
     """The run that a file belongs to; None where no chunk states it."""
-    for _, data in chunks(path, Walk()):
-        for found in messages(data, {}):
+    for _, data in chunks(file := McapFile(path)):
+        for found in messages(data, file):
             if found.topic == SESSION.name:
                 return str(from_json(data[found.first : found.last]).get("run"))
     return None
 
 
-def _warnings_of_file(file: LogFile, content: LogContent) -> list[str]:
+def _warnings_of_file(file: McapFile, content: LogContent) -> list[str]:
     before, warnings = content.broken, []
     content.read(file)
-    damaged, broken = file.walk.damaged, content.broken - before
+    damaged, broken = file.damaged, content.broken - before
     if damaged or broken:
         warnings.append(f"{damaged} chunks and {broken} messages are damaged: {file.path}")
-    if not file.walk.ended:
+    if not file.ended:
         warnings.append(
-            f"flight log was cut short, {file.walk.lost_bytes} bytes after its last complete chunk "
+            f"flight log was cut short, {file.lost_bytes} bytes after its last complete chunk "
             f"are lost: {file.path}"
         )
     return warnings
@@ -349,7 +342,7 @@ def _results(files: list[Path]) -> list[ViewResult]:
             found.append(logged_result(data))
 
     for path in files:
-        LogContent().read(LogFile(path), take)
+        LogContent().read(McapFile(path), take)
     return found
 
 

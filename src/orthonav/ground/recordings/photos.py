@@ -91,24 +91,25 @@ class ChosenPhotos:
     table: ImageTable | None
     singly: bool
 
-    @classmethod
-    def of(cls, sources: Sequence[Path], options: SourceOptions) -> "ChosenPhotos":
-        first, telemetry = sources[0], options.telemetry
-        table = None
-        if telemetry is not None and is_image_table(require_file(telemetry, "telemetry log")):
-            table = read_image_table(telemetry)
-        if len(sources) == 1 and first.is_dir():
-            paths = photo_paths(first)
-            if table is None and telemetry is None:
-                table = image_table_in(first, paths)
-            return cls(first, paths, table, table is not None)
-        if len(sources) == 1 and is_image_table(first):
-            return cls(first.parent, photo_paths(first.parent), read_image_table(first), True)
-        for path in sources:
-            if not is_photo(require_file(path, "photograph")):
-                raise FlightError(f"expected photographs, where several files are given: {path}")
-        folder = Path(os.path.commonpath([path.resolve().parent for path in sources]))
-        return cls(folder, [path.resolve() for path in sources], table, True)
+
+def chosen_photos(sources: Sequence[Path], options: SourceOptions) -> ChosenPhotos:
+    first, telemetry, table = sources[0], options.telemetry, None
+    if telemetry is not None and is_image_table(require_file(telemetry, "telemetry log")):
+        table = read_image_table(telemetry)
+    if len(sources) == 1 and first.is_dir():
+        paths = photo_paths(first)
+        if table is None and telemetry is None:
+            table = image_table_in(first, paths)
+        return ChosenPhotos(first, paths, table, table is not None)
+    if len(sources) == 1 and is_image_table(first):
+        return ChosenPhotos(
+            first.parent, photo_paths(first.parent), read_image_table(first), singly=True
+        )
+    for path in sources:
+        if not is_photo(require_file(path, "photograph")):
+            raise FlightError(f"expected photographs, where several files are given: {path}")
+    folder = Path(os.path.commonpath([path.resolve().parent for path in sources]))
+    return ChosenPhotos(folder, [path.resolve() for path in sources], table, singly=True)
 
 
 def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
@@ -200,11 +201,10 @@ def _edited(photos: Sequence[Photo]) -> list[int]:
 def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     """The flight of photographs, by time: of a folder, of a table of images, or named one by one.
 
-    Raises `MissingFileError`, `FlightError`, `CameraError` or `MissingExtraError`. Photographs that
-    cannot be read, have no time, or another size or focal length than most, are left out, with a
-    warning.
+    Photographs that cannot be read, have no time, or another size or focal length than most, are
+    left out, with a warning.
     """
-    chosen = ChosenPhotos.of(sources, options)
+    chosen = chosen_photos(sources, options)
     if chosen.table is not None:
         options = replace(options, telemetry=None)
     photos, warnings = _taken(chosen, options)

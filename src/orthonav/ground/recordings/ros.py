@@ -425,7 +425,6 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
     """The flight of a recording of ROS messages.
 
     Telemetry is read first, in one pass over its topics; images are read on request.
-    Raises `FlightError`, `CameraError` or `MissingExtraError`.
     """
     with opened(path) as (reader, doubts):
         topics = find_topics(reader, options.topics, path)

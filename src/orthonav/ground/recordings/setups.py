@@ -120,7 +120,6 @@ def try_setups(
     use_prior: bool,
     heading_known: bool,
     stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[float], None] = lambda share: None,
 ) -> list[Tried]:
     """What each change of the configuration does to the views, in the order of the trials.
 
@@ -135,11 +134,10 @@ def try_setups(
         and (not setup.without_prior or (use_prior and any(v.telemetry.prior for v in views)))
     ]
     found: list[Tried] = []
-    for number, setup in enumerate(setups):
+    for setup in setups:
         fixes: list[tuple[View, Fix]] = []
         placed = 0
         for i, view in enumerate(views):
-            progress((number + i / len(views)) / len(setups))
             if stop() or (i == _GIVE_UP and not fixes):
                 break
             placed += 1
@@ -154,7 +152,6 @@ def try_setups(
             found.append(_tried(setup, placed if stop() else len(views), fixes))
         if stop() or found[-1].explains:
             break
-    progress(1.0)
     return found
 
 
