@@ -57,8 +57,6 @@ _EVIDENCE = {
     "pitch_deg": "pitch_bias_deg",
     "roll_deg": "roll_bias_deg",
 }
-GAP_S = 1.0  # longest interval between views over which telemetry is interpolated
-EVERY_S = 10.0  # interval of estimates
 LEAST = 3  # number of estimates that must agree
 AGREE_S, AGREE_SIGMAS = 0.1, 4.0
 NEEDED = (
@@ -72,21 +70,9 @@ MOST_PAIRS, LEAST_PAIRS = 300, 12
 PAIR_SHARE, KNOWN_SHARE = 0.9, 0.6
 """Fraction of candidates for which the motion of a pair must be known, and of pairs for one
 candidate."""
-SCALE_STD, ACROSS_STD, MOUNT_STD_RAD = 0.25, 0.2, 0.08
-"""Prior of errors: height (share), direction of the velocity, orientation of the camera (rad)."""
-ANY_STD = 1.5  # prior of scale and direction where the heading is not known
-CONSTANT_STD, FREE_STD = 0.01, 0.5
-"""Prior of a constant shift per second: by the tilt of the mount; by an unknown velocity."""
-SHARE_STD = 0.08
-"""Standard deviation of the shift by velocity as a fraction of it: relief, changes of height."""
 NEAR_S, NEAR_MASS = 0.35, 0.99  # a latency is found where this probability lies this close to it
 LARGEST_STD_S, FLOOR_S = 0.3, 0.025
 """Largest standard deviation of an answer; least one: half an interval of the stored states."""
-EXPLAINED, STANDS_OUT = 0.6, 2.0
-"""Least fraction of motion of so many least standard deviations that the latency must explain."""
-SCALES, ACROSS = (0.5, 2.0), 0.6
-"""Largest errors of scale and direction (rad) of the velocity of a latency that is believed."""
-LEAST_WEIGHT = 0.5  # least mean weight of the pairs: 1 without outliers
 OUTLIER = 3.0  # scale of the Cauchy weights, in standard deviations
 ALIKE = 4.0
 """Differences of successive pairs are correlated: so many count as one. Chosen so that errors of
@@ -182,7 +168,7 @@ def calibrate_latency(
     reported heading gives the direction of the velocity. Raises `FlightError` where the flight
     shows too little motion, or estimates disagree.
     """
-    history = StateHistory(GAP_S)
+    history = StateHistory(1.0)  # longest interval (s) over which telemetry is interpolated
     odometry, estimator = PictureOdometry(), LatencyEstimator(heading_known=heading_known)
     estimates: list[LatencyEstimate | None] = []
     due_ns: float = -math.inf
@@ -209,7 +195,7 @@ def calibrate_latency(
             continue
         estimator.add(odometry.motion(grey, camera, arrived_ns), history)
         if arrived_ns >= due_ns:
-            due_ns = arrived_ns + EVERY_S * 1e9
+            due_ns = arrived_ns + 10.0 * 1e9
             estimates.append(estimator.estimate())
     estimates.append(estimator.estimate())
     return _agreed(estimates, intervals)
@@ -277,14 +263,14 @@ class _Pairs:
         """Least standard deviations (2,) of turn and shift."""
         some = np.nan_to_num(self.reported[:, ::20, 3:])
         size = np.sqrt(np.square(some).sum(axis=-1).mean())
-        return np.array([TURN_STD_RAD, np.hypot(SHIFT_STD, SHARE_STD * size)])
+        # Relief and changes of height: 8 % of the shift by velocity.
+        return np.array([TURN_STD_RAD, np.hypot(SHIFT_STD, 0.08 * size)])
 
     def explained(self, fit: "_Fit") -> float:
         """Least fraction of the motion that a fit explains, of turn and of the varying part of
-        shift, where it stands out; NaN where neither does."""
-        least = STANDS_OUT * TURN_STD_RAD, STANDS_OUT * SHIFT_STD
-        turned = explained_part(self.turn[:, None], fit.turn_off[:, None], least[0])
-        shifted = explained_part(varying(self.shift, self.seconds), fit.shift_off, least[1])
+        shift, where it is twice the least standard deviation; NaN where neither is."""
+        turned = explained_part(self.turn[:, None], fit.turn_off[:, None], 2 * TURN_STD_RAD)
+        shifted = explained_part(varying(self.shift, self.seconds), fit.shift_off, 2 * SHIFT_STD)
         return float(np.fmin(turned, shifted))
 
 
@@ -322,8 +308,8 @@ def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
     ambiguous = chance[near].sum() < NEAR_MASS * chance.sum()
     scale, across = fit.linear[:2].tolist()
     turned = abs(math.atan2(across, scale)) if heading_known else 0.0
-    usual = SCALES[0] < math.hypot(scale, across) < SCALES[1] and turned < ACROSS
-    if fit.weights.mean() < LEAST_WEIGHT or ambiguous or not usual:
+    usual = 0.5 < math.hypot(scale, across) < 2.0 and turned < 0.6
+    if fit.weights.mean() < 0.5 or ambiguous or not usual:
         return None
     # The minimum of a parabola through the least cost and its neighbours, and its curvature.
     middle = min(max(best, 1), len(cost) - 2)
@@ -333,17 +319,19 @@ def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
         return None
     delay_s = float(CANDIDATES_S[middle]) + STEP_S * (before - after) / (2 * bend)
     std_s = math.hypot(FLOOR_S, STEP_S * math.sqrt(2 * ALIKE / bend))
-    if std_s > LARGEST_STD_S or not pairs.explained(fit) >= EXPLAINED:
+    if std_s > LARGEST_STD_S or not pairs.explained(fit) >= 0.6:
         return None
     return LatencyEstimate(delay_s, std_s, len(pairs.turn))
 
 
 def _prior(reported: Array, *, heading_known: bool) -> Prior:
     unknown = ~np.isfinite(reported[..., 3]) & np.isfinite(reported[..., 0])
-    constant = FREE_STD if unknown.any() else CONSTANT_STD
-    gain = (SCALE_STD, ACROSS_STD) if heading_known else (ANY_STD, ANY_STD)
+    # A constant shift per second: by an unknown velocity, else by the tilt of the mount.
+    constant = 0.5 if unknown.any() else 0.01
+    # Errors of height (fraction), direction of the velocity, orientation of the camera (rad).
+    errors = (0.25, 0.2, 0.08) if heading_known else (1.5, 1.5, 0.08)
     mean = np.array([1.0 if heading_known else 0.0, 0.0, 0.0, 0.0, 0.0])
-    std = np.array([*gain, MOUNT_STD_RAD, constant, constant])
+    std = np.array([*errors, constant, constant])
     return mean, np.diag(1 / np.square(std))
 
 
