@@ -70,16 +70,6 @@ def test_heights_are_of_the_distance_sensor_where_it_is_sound(kind, early, late,
     assert first.amsl_m == pytest.approx(400, abs=0.01) and first.hae_m is None
 
 
-def test_the_mount_turns_the_camera(log):
-    right = read_log(log, (90.0, 0.0, 0.0))
-    telemetry = angles_at(right.attitude, START_S * 10**9)
-    _, yaw, _, roll = next(flown())
-    assert turned(telemetry[0], yaw + 90) == pytest.approx(0, abs=0.1)
-    assert telemetry[1:] == pytest.approx(
-        (-roll, 0), abs=0.1
-    )  # right wing down: lower top of the image
-
-
 def test_newer_px4_names(tmp_path):
     topics = px4_topics()
     rows = [(row[0], row[1], 46.5, 2.5, 400.0, 3) for row in topics.pop("vehicle_gps_position")[1]]

@@ -7,12 +7,9 @@ import pytest
 from recorders import (
     AUTEL,
     DJI,
-    HEIGHT,
     PIX4D,
     SENSEFLY,
     START_S,
-    WIDTH,
-    camera_file,
     dji,
     maker_notes,
     packet,
@@ -83,27 +80,6 @@ def test_a_folder_of_dji(folder, tmp_path):
     copied = tmp_path / "flight/frames/sub/b.jpg"
     assert copied.read_bytes() == (folder / "sub/b.jpg").read_bytes()
     assert np.array_equal(read_image(copied), next(iter(recording.views)).grey()) is False
-
-
-def test_a_camera_file_replaces_exif(folder, tmp_path):
-    file = camera_file(tmp_path / "c.json", width_px=128, height_px=96, cx_px=66.0)
-    recording = open_source(folder, SourceOptions(camera=file))
-    assert (recording.camera.width_px, recording.camera.cx_px) == (WIDTH, 33.0)
-    assert recording.camera.focal_std == 0 and recording.warnings == (LEVEL_GROUND,)
-    wrong = camera_file(tmp_path / "d.json", width_px=128, height_px=72)
-    with pytest.raises(CameraError, match="another aspect ratio"):
-        open_source(folder, SourceOptions(camera=wrong))
-
-
-@pytest.mark.parametrize("as_elements", [False, True])
-@pytest.mark.parametrize(
-    "suffix, maker", [("jpg", DJI), ("jpg", AUTEL), ("png", DJI), ("tif", DJI)]
-)
-def test_xmp_in_every_form(tmp_path, suffix, maker, as_elements):
-    values = {"GimbalYawDegree": "-12.5", "GimbalPitchDegree": "-70.0", "GimbalRollDegree": "0.0"}
-    read = read_photo(photo(tmp_path / f"a.{suffix}", xmp=packet(maker, as_elements, **values)))
-    assert attitude(read) == pytest.approx((347.5, 20, 0)) and math.isnan(read.home_m)
-    assert (read.width_px, read.height_px) == (WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("make, roll", [("Sony", 4), ("senseFly", -4), ("Parrot", 4)])
@@ -370,13 +346,6 @@ def test_maker_notes_of_older_models(tmp_path, order):
     reported = views_of(tmp_path / "p")[0].telemetry
     assert (reported.yaw_deg, reported.pitch_deg) == pytest.approx((183.4, 10.0), abs=1e-4)
     assert reported.missing() == ["agl_m"]
-
-
-def test_the_heading_of_the_aircraft_without_a_gimbal(tmp_path):
-    photo(tmp_path / "p/a.jpg", more={MAKER_NOTE: maker_notes(yaw=-90.0)})
-    assert views_of(tmp_path / "p")[0].telemetry.missing() == ["pitch_deg", "roll_deg", "agl_m"]
-    level = views_of(tmp_path / "p", looks_down=True)[0].telemetry
-    assert (level.yaw_deg, level.pitch_deg) == (270, 0)
 
 
 @pytest.mark.parametrize(

@@ -285,9 +285,7 @@ _TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\
 _ENDS = (">", "]", ")")  # what blocks end with that are whole, besides the end of a line
 _TAG = re.compile(r"<[^<>]*>")
 _FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
-_GPS = re.compile(
-    rf"\b(?:GPS|RTK)\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)"
-)
+_GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)")
 _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
 _HOME = re.compile(r"\bHOME\s*\(")
 _HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
