@@ -47,6 +47,7 @@ from orthonav.core.localize.confidence import (
     RegisteredConfidence,
     features_of,
 )
+from orthonav.core.localize.fix import fix_of
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
@@ -182,7 +183,7 @@ def _placed(
         return None
     gsd_m = localizer.grid.gsd_m
     assert localizer.confidence is not None
-    fix, frame = localizer.fix(search, found, view.telemetry), localizer.sheet.frame
+    fix, frame = fix_of(search, found), localizer.sheet.frame
     off_m = frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - frame.en_from_latlon(*truth)
     error_m = float(np.hypot(*off_m))
     far_m = far_m_of(gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m

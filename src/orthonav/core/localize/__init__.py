@@ -13,8 +13,8 @@
    orthorectified on it first (`ground`).
 4. `camera` fits position, height, heading, pitch and roll to the blocks of the view there, with the
    reported ones as a prior. That gives their covariance too.
-5. `confidence` makes a probability of the scores: that the place is right.
-6. `localizer` makes the `Fix` of all that.
+5. `fix` states what was found; `confidence` is the probability that the place is right, from its
+   scores, and the error within a radius.
 
 Below them, `orthonav.core.register` compares a view with the map. Where a map has no registration
 layer, or with `registration=False`, `tiles.TileLocalizer` takes the place of steps 2 to 5: the view

@@ -160,6 +160,38 @@ class SearchedSheet:
         (east, north), grid = place_en_m, self.grid
         return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
 
+    def floor_m(self, view: PreparedView) -> float:
+        """Agreement of maps of two dates at the view's final level."""
+        # Coarse imagery of another date is displaced by more (benchmarks/pixel_ellipses.py).
+        return self.floor_px * self.grid.gsd_m * 2.0**view.levels.final
+
+    def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
+        """Of the camera (2,)."""
+        return self.relief.en_m(pose.map_px(view.camera_px))
+
+    def seen_from(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
+        """Of the camera (4,): m east and north, heading (rad), log scale."""
+        return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
+
+    def pose_of(self, view: PreparedView, seen_from: NDArray[np.float64]) -> Pose:
+        """The inverse of `seen_from`."""
+        x, y = self.px_of(seen_from[:2])
+        turn, log_scale = seen_from[2:].tolist()
+        moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
+        return Pose(x - float(moved[0]), y - float(moved[1]), turn, log_scale)
+
+    def camera_covariance(
+        self, view: PreparedView, pose: Pose, covariance: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Of `seen_from`, by the covariance of the pose."""
+        moved = pose.linear @ view.camera_px
+        camera_from_pose = np.eye(4)
+        camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
+        spread = camera_from_pose @ covariance @ camera_from_pose.T
+        spread[:2, :2] += np.eye(2) * self.floor_px**2
+        metres = np.diag([self.grid.gsd_m, -self.grid.gsd_m, 1.0, 1.0])
+        return np.asarray(metres @ spread @ metres)
+
 
 class ViewOverGround:
     def __init__(self, relief: Relief, view: PreparedView) -> None:

@@ -1,22 +1,18 @@
-"""A map, the method that places views on it, and the fix of a view."""
+"""A map, and the method that places views on it: registration, or tiles alone."""
 
 import math
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError, VariantError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.camera import CameraFound, tilt_std_deg
-from orthonav.core.localize.confidence import RegisteredConfidence, within
+from orthonav.core.localize.confidence import RegisteredConfidence
+from orthonav.core.localize.fix import fix_of
 from orthonav.core.localize.ground import SearchedSheet
-from orthonav.core.localize.place import Place
 from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.rectify import off_nadir_deg
 from orthonav.core.localize.search import Search
 from orthonav.core.localize.tiles import TileLocalizer, TileProposer
 from orthonav.core.localize.view import PreparedView, check_view, prepare
@@ -24,11 +20,9 @@ from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import TerrainLayer
-from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
-from orthonav.core.register.pose import Pose
+from orthonav.core.records import Fix, NoFix, Prior, View
 from orthonav.core.tiles.position import PositionRule
 
-ERROR_VARIANCE = 1.5  # their tails are heavier than a Gaussian's (docs/decisions/camera.md)
 WIDEST_M = 2e7  # half the Earth's circumference
 
 
@@ -171,7 +165,7 @@ class RegistrationLocalizer(SearchedSheet):
         if isinstance(search, NoFix):
             return search
         best = search.run()
-        return best if isinstance(best, NoFix) else self.fix(search, best, view.telemetry)
+        return best if isinstance(best, NoFix) else fix_of(search, best)
 
     def search(
         self, view: View, prior: Prior | None = None, heading_known: bool = True
@@ -186,145 +180,3 @@ class RegistrationLocalizer(SearchedSheet):
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
         return prepare(view, self.grid.gsd_m, self.pyramid.levels, heading_known)
-
-    def fix(self, search: Search, best: Place, telemetry: Telemetry) -> Fix:
-        camera, ground, pose = search.camera(best), search.ground, best.fit.pose
-        orientation, middle_en_m = ground.orientation(pose), None
-        if camera is not None:
-            found = self._by_camera(search.view, camera, telemetry)
-            middle_en_m = camera.middle_en_m
-        else:
-            found = self._by_similarity(search.view, best, telemetry)
-            if orientation is not None:
-                middle_en_m = ground.middle_en_m(orientation, pose)
-        radius_m = max(self.radius_m, RADIUS_SHARE * found.agl_m)
-        evidence = best.scores | found.stds
-        if found.middle_cov_en_m2 is not None:
-            widest = float(np.linalg.eigvalsh(found.middle_cov_en_m2)[-1])
-            evidence["middle_std_m"] = math.sqrt(widest)
-        if orientation is not None and not self.relief.is_level:
-            evidence["terrain_gain"] = best.gain or 1.0
-        lat, lon = self.sheet.frame.latlon_from_en(found.place_en_m)
-        middle = None
-        if middle_en_m is not None:
-            middle_deg = self.sheet.frame.latlon_from_en(np.array(middle_en_m))
-            middle = float(middle_deg[0]), float(middle_deg[1])
-        for each in (found.cov_en_m2, found.middle_cov_en_m2, found.pose_cov):
-            if each is not None:
-                each.flags.writeable = False
-        heading_deg, pitch_deg, roll_deg = found.attitude_deg
-        return Fix(
-            lat_deg=float(lat),
-            lon_deg=float(lon),
-            cov_en_m2=found.cov_en_m2,
-            confidence=self._confidence_within(best, found, radius_m),
-            radius_m=radius_m,
-            heading_deg=heading_deg % 360,
-            agl_m=found.agl_m,
-            evidence=MappingProxyType(evidence),
-            ground_latlon_deg=middle,
-            ground_cov_en_m2=None if middle is None else found.middle_cov_en_m2,
-            pitch_deg=pitch_deg,
-            roll_deg=roll_deg,
-            pose_cov=found.pose_cov,
-        )
-
-    def _confidence_within(self, best: Place, found: "_Exterior", radius_m: float) -> float:
-        """That the place is right and the error within the radius."""
-        if self.confidence is None:
-            return math.nan
-        covariance = ERROR_VARIANCE * found.cov_en_m2
-        return self.confidence(best.scores) * within(found.place_en_m, covariance, radius_m)
-
-    def _by_camera(
-        self, view: PreparedView, camera: CameraFound, telemetry: Telemetry
-    ) -> "_Exterior":
-        """From the blocks of the view."""
-        heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
-        _, _, up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)).tolist()
-        floor_m2, covariance = np.eye(2) * self.floor_m(view) ** 2, camera.covariance.copy()
-        covariance[:2, :2] += floor_m2
-        middle = camera.middle_covariance
-        return _Exterior(
-            camera.orientation.position_m[:2],
-            (heading_deg, pitch_deg, roll_deg),
-            camera.agl_m,
-            covariance[:2, :2].copy(),
-            None if middle is None else middle + floor_m2,
-            {
-                "heading_std_deg": heading,
-                "log_scale_std": up_m / camera.agl_m,
-                "pitch_bias_deg": pitch_deg - telemetry.pitch_deg,
-                "roll_bias_deg": roll_deg - telemetry.roll_deg,
-                "pitch_bias_std_deg": pitch,
-                "roll_bias_std_deg": roll,
-            },
-            covariance,
-        )
-
-    def _by_similarity(self, view: PreparedView, best: Place, telemetry: Telemetry) -> "_Exterior":
-        """Under the reported pitch and roll."""
-        pose, covariance = best.pose, best.fit.covariance
-        assert covariance is not None
-        spread = self.camera_covariance(view, pose, covariance)
-        agl_m = telemetry.agl_m * math.exp(pose.log_scale)
-        # A line of sight off nadir meets the ground farther out by 1 / cos^2.
-        cos = math.cos(math.radians(off_nadir_deg(telemetry)))
-        tilt_m = agl_m * math.radians(tilt_std_deg(telemetry)) / cos**2
-        floor_m2 = np.eye(2) * self.floor_m(view) ** 2
-        return _Exterior(
-            self.camera_en_m(view, pose),
-            (math.degrees(pose.turn_rad), telemetry.pitch_deg, telemetry.roll_deg),
-            agl_m,
-            spread[:2, :2] + np.eye(2) * tilt_m**2,
-            covariance[:2, :2] * self.grid.gsd_m**2 + floor_m2,
-            {
-                "heading_std_deg": math.degrees(math.sqrt(spread[2, 2])),
-                "log_scale_std": math.sqrt(spread[3, 3]),
-            },
-        )
-
-    def floor_m(self, view: PreparedView) -> float:
-        """Agreement of maps of two dates at the view's final level."""
-        # Coarse imagery of another date is displaced by more (benchmarks/pixel_ellipses.py).
-        return self.floor_px * self.grid.gsd_m * 2.0**view.levels.final
-
-    def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
-        """Of the camera (2,)."""
-        return self.relief.en_m(pose.map_px(view.camera_px))
-
-    def seen_from(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
-        """Of the camera (4,): m east and north, heading (rad), log scale."""
-        return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
-
-    def pose_of(self, view: PreparedView, seen_from: NDArray[np.float64]) -> Pose:
-        """The inverse of `seen_from`."""
-        x, y = self.px_of(seen_from[:2])
-        turn, log_scale = seen_from[2:].tolist()
-        moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
-        return Pose(x - float(moved[0]), y - float(moved[1]), turn, log_scale)
-
-    def camera_covariance(
-        self, view: PreparedView, pose: Pose, covariance: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Of `seen_from`, by the covariance of the pose."""
-        moved = pose.linear @ view.camera_px
-        camera_from_pose = np.eye(4)
-        camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
-        spread = camera_from_pose @ covariance @ camera_from_pose.T
-        spread[:2, :2] += np.eye(2) * self.floor_px**2
-        metres = np.diag([self.grid.gsd_m, -self.grid.gsd_m, 1.0, 1.0])
-        return np.asarray(metres @ spread @ metres)
-
-
-@dataclass(frozen=True, eq=False)
-class _Exterior:
-    """What a fix says of the camera; `stds` go into its evidence."""
-
-    place_en_m: NDArray[np.float64]
-    attitude_deg: tuple[float, float, float]
-    agl_m: float
-    cov_en_m2: NDArray[np.float64]
-    middle_cov_en_m2: NDArray[np.float64] | None
-    stds: dict[str, float]
-    pose_cov: NDArray[np.float64] | None = None

@@ -22,6 +22,7 @@ from orthonav.core.errors import AreaError, MapFileError, WorkerError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
+from orthonav.core.localize.fix import fix_of
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import level_shape
@@ -432,7 +433,7 @@ class Trier:
         best = search if isinstance(search, NoFix) else search.run()
         if isinstance(search, NoFix) or isinstance(best, NoFix):
             return Trial(here, math.nan, 0.0, expected)
-        fix = registration.fix(search, best, view.telemetry)
+        fix = fix_of(search, best)
         found = registration.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
         rivals = [
             each

@@ -1,0 +1,135 @@
+"""The fix of a place: position, attitude and height with covariance, and the confidence."""
+
+import math
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.localize.camera import CameraFound, tilt_std_deg
+from orthonav.core.localize.confidence import within
+from orthonav.core.localize.ground import SearchedSheet
+from orthonav.core.localize.place import Place
+from orthonav.core.localize.rectify import off_nadir_deg
+from orthonav.core.localize.search import Search
+from orthonav.core.localize.view import PreparedView
+from orthonav.core.records import RADIUS_SHARE, Fix
+
+ERROR_VARIANCE = 1.5  # their tails are heavier than a Gaussian's (docs/decisions/camera.md)
+
+
+def fix_of(search: Search, best: Place) -> Fix:
+    """From the camera that the picture shows, else from the place alone."""
+    sheet, ground, pose = search.sheet, search.ground, best.fit.pose
+    camera = search.camera(best)
+    orientation, middle_en_m = ground.orientation(pose), None
+    if camera is not None:
+        found = _by_camera(sheet, search.view, camera)
+        middle_en_m = camera.middle_en_m
+    else:
+        found = _by_similarity(sheet, search.view, best)
+        if orientation is not None:
+            middle_en_m = ground.middle_en_m(orientation, pose)
+    radius_m = max(sheet.radius_m, RADIUS_SHARE * found.agl_m)
+    evidence = best.scores | found.stds
+    if found.middle_cov_en_m2 is not None:
+        widest = float(np.linalg.eigvalsh(found.middle_cov_en_m2)[-1])
+        evidence["middle_std_m"] = math.sqrt(widest)
+    if orientation is not None and not sheet.relief.is_level:
+        evidence["terrain_gain"] = best.gain or 1.0
+    lat, lon = sheet.sheet.frame.latlon_from_en(found.place_en_m)
+    middle = None
+    if middle_en_m is not None:
+        middle_deg = sheet.sheet.frame.latlon_from_en(np.array(middle_en_m))
+        middle = float(middle_deg[0]), float(middle_deg[1])
+    for each in (found.cov_en_m2, found.middle_cov_en_m2, found.pose_cov):
+        if each is not None:
+            each.flags.writeable = False
+    heading_deg, pitch_deg, roll_deg = found.attitude_deg
+    return Fix(
+        lat_deg=float(lat),
+        lon_deg=float(lon),
+        cov_en_m2=found.cov_en_m2,
+        confidence=_confidence_within(sheet, best, found, radius_m),
+        radius_m=radius_m,
+        heading_deg=heading_deg % 360,
+        agl_m=found.agl_m,
+        evidence=MappingProxyType(evidence),
+        ground_latlon_deg=middle,
+        ground_cov_en_m2=None if middle is None else found.middle_cov_en_m2,
+        pitch_deg=pitch_deg,
+        roll_deg=roll_deg,
+        pose_cov=found.pose_cov,
+    )
+
+
+def _confidence_within(
+    sheet: SearchedSheet, best: Place, found: "_Exterior", radius_m: float
+) -> float:
+    """That the place is right and the error within the radius."""
+    if sheet.confidence is None:
+        return math.nan
+    covariance = ERROR_VARIANCE * found.cov_en_m2
+    return sheet.confidence(best.scores) * within(found.place_en_m, covariance, radius_m)
+
+
+def _by_camera(sheet: SearchedSheet, view: PreparedView, camera: CameraFound) -> "_Exterior":
+    """From the blocks of the view."""
+    heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
+    _, _, up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)).tolist()
+    floor_m2, covariance = np.eye(2) * sheet.floor_m(view) ** 2, camera.covariance.copy()
+    covariance[:2, :2] += floor_m2
+    middle = camera.middle_covariance
+    return _Exterior(
+        camera.orientation.position_m[:2],
+        (heading_deg, pitch_deg, roll_deg),
+        camera.agl_m,
+        covariance[:2, :2].copy(),
+        None if middle is None else middle + floor_m2,
+        {
+            "heading_std_deg": heading,
+            "log_scale_std": up_m / camera.agl_m,
+            "pitch_bias_deg": pitch_deg - view.telemetry.pitch_deg,
+            "roll_bias_deg": roll_deg - view.telemetry.roll_deg,
+            "pitch_bias_std_deg": pitch,
+            "roll_bias_std_deg": roll,
+        },
+        covariance,
+    )
+
+
+def _by_similarity(sheet: SearchedSheet, view: PreparedView, best: Place) -> "_Exterior":
+    """Under the reported pitch and roll."""
+    pose, covariance = best.pose, best.fit.covariance
+    assert covariance is not None
+    spread = sheet.camera_covariance(view, pose, covariance)
+    agl_m = view.telemetry.agl_m * math.exp(pose.log_scale)
+    # A line of sight off nadir meets the ground farther out by 1 / cos^2.
+    cos = math.cos(math.radians(off_nadir_deg(view.telemetry)))
+    tilt_m = agl_m * math.radians(tilt_std_deg(view.telemetry)) / cos**2
+    floor_m2 = np.eye(2) * sheet.floor_m(view) ** 2
+    return _Exterior(
+        sheet.camera_en_m(view, pose),
+        (math.degrees(pose.turn_rad), view.telemetry.pitch_deg, view.telemetry.roll_deg),
+        agl_m,
+        spread[:2, :2] + np.eye(2) * tilt_m**2,
+        covariance[:2, :2] * sheet.grid.gsd_m**2 + floor_m2,
+        {
+            "heading_std_deg": math.degrees(math.sqrt(spread[2, 2])),
+            "log_scale_std": math.sqrt(spread[3, 3]),
+        },
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Exterior:
+    """What a fix says of the camera; `stds` go into its evidence."""
+
+    place_en_m: NDArray[np.float64]
+    attitude_deg: tuple[float, float, float]
+    agl_m: float
+    cov_en_m2: NDArray[np.float64]
+    middle_cov_en_m2: NDArray[np.float64] | None
+    stds: dict[str, float]
+    pose_cov: NDArray[np.float64] | None = None
