@@ -22,7 +22,6 @@ from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.attitude import (
     ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
-    GIMBAL_TILT_STD_DEG,
 )
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.exif import FocalLength, Optics, Xmp, focal_length, read_photo
@@ -231,18 +230,6 @@ def test_a_gimbal_that_reports_zero_was_not_recorded(tmp_path):
     assert [each.yaw_deg for each in reported] == pytest.approx([152.0, 205.8, 0.0])
     assert all(each.pitch_deg == each.roll_deg == 0 for each in reported)
     assert all(each.tilt_std_deg == ASSUMED_TILT_STD_DEG for each in reported)
-
-
-@pytest.mark.parametrize("angles", [(0, 0, 0.1), (0, -30, 0), (90, 0, 0)])
-def test_one_angle_that_is_not_zero_was_recorded(tmp_path, angles):
-    photo(tmp_path / "p/a.jpg", xmp=gimbal(*angles, 152.0))
-    photo(tmp_path / "p/b.jpg", "2023:11:14 22:13:21", xmp=gimbal(0, 0, 0, 152.0))
-    recording = open_source(tmp_path / "p")
-    assert not any("gimbal" in warning for warning in recording.warnings)
-    first, second = recording.views
-    assert first.telemetry.pitch_deg == pytest.approx(90 + angles[1], abs=0.2)
-    assert second.telemetry.pitch_deg == pytest.approx(90)
-    assert first.telemetry.tilt_std_deg == second.telemetry.tilt_std_deg == GIMBAL_TILT_STD_DEG
 
 
 # Focal lengths.
