@@ -118,7 +118,7 @@ def _order(path: Path) -> tuple[str, int]:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
-    """A reader of the recording, whatever its file is called, and warnings about its files."""
+    """A reader of the recording, and warnings about its files."""
     bound_inflation()
     with contextlib.ExitStack() as stack:
         stack.enter_context(reading("ROS recording", path))

@@ -1,8 +1,8 @@
 """Other configurations, tried on views that are not confident, to find the wrong value.
 
-A wrong heading, height, focal length or a mirrored image lowers the confidence of every view, and
-so does a map of another area. A few of the views of low confidence are localized again with one
-value changed at a time. The change that makes them confident names the value to check.
+A wrong heading, height or focal length lowers the confidence of every view, and so does a map of
+another area. A few of the views of low confidence are localized again with one value changed at a
+time. The change that makes them confident names the value to check.
 """
 
 import math
