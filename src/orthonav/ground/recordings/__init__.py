@@ -7,11 +7,9 @@ from orthonav.ground.recordings.opening import (
     open_source,
     source_kind,
 )
-from orthonav.ground.recordings.recording import KINDS, ROLES, Recording, SourceOptions, SourceView
+from orthonav.ground.recordings.recording import Recording, SourceOptions, SourceView
 
 __all__ = [
-    "KINDS",
-    "ROLES",
     "Imported",
     "LoggedFlight",
     "Recording",

@@ -250,7 +250,8 @@ def _whole(path: Path, warnings: list[str]) -> "Path | _CutMcap":
 
 @dataclass(frozen=True)
 class _CutMcap:
-    """The path of a file of MCAP whose first `complete` bytes are followed by `end`."""
+    """The path of a file of MCAP whose first `complete` bytes are followed by `end`, with the methods
+    that `rosbags` uses."""
 
     path: Path
     complete: int
