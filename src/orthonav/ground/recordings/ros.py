@@ -250,8 +250,8 @@ def _whole(path: Path, warnings: list[str]) -> "Path | _CutMcap":
 
 @dataclass(frozen=True)
 class _CutMcap:
-    """The path of a file of MCAP whose first `complete` bytes are followed by `end`, with the methods
-    that `rosbags` uses."""
+    """The path of an MCAP file whose first `complete` bytes are followed by `end`, as far as `rosbags`
+    uses paths."""
 
     path: Path
     complete: int
