@@ -1,5 +1,6 @@
 """Telemetry logs of all kinds, detected by content."""
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -94,11 +95,18 @@ def read_dataflash(path: Path, mount_deg: Angles) -> RecordedTrack:
     """The track of a DataFlash log; times are UTC where it has a GPS fix, else since boot."""
     reader = needed("pymavlink.DFReader", "ArduPilot logs")
     collected = _Collected(mount_deg)
-    with reading("ArduPilot log", path, silent=True), reader.DFReader_binary(str(path)) as log:
-        base_ns = round(getattr(log.clock, "timebase", 0.0) * 1e6) * 1000
-        while (message := log.recv_match(type=["ATT", "GPS", "POS", "RFND"])) is not None:
-            if hasattr(message, "TimeUS"):
-                _from_dataflash(collected, message, base_ns + int(message.TimeUS) * 1000)
+    with reading("ArduPilot log", path, silent=True):
+        log = reader.DFReader_binary.__new__(reader.DFReader_binary)
+        try:
+            log.__init__(str(path))  # separately, so that its file is closed where this fails
+            base_ns = round(getattr(log.clock, "timebase", 0.0) * 1e6) * 1000
+            while (message := log.recv_match(type=["ATT", "GPS", "POS", "RFND"])) is not None:
+                if hasattr(message, "TimeUS"):
+                    _from_dataflash(collected, message, base_ns + int(message.TimeUS) * 1000)
+        finally:
+            with contextlib.suppress(AttributeError, BufferError):
+                log.filehandle.close()
+                log.data_map.close()
     return collected.track("ArduPilot log", path)
 
 

@@ -250,8 +250,7 @@ def _whole(path: Path, warnings: list[str]) -> "Path | _CutMcap":
 
 @dataclass(frozen=True)
 class _CutMcap:
-    """The path of an MCAP file whose first `complete` bytes are followed by `end`, as far as `rosbags`
-    uses paths."""
+    """The path, for `rosbags`, of an MCAP file whose first `complete` bytes `end` follows."""
 
     path: Path
     complete: int
