@@ -9,8 +9,7 @@ from orthonav.cli.common import add_options, beside, counted, print_json, progre
 from orthonav.cli.source import add_source, dem_of, flight_heights, located, open_source
 
 if TYPE_CHECKING:
-    from orthonav.core.records import ViewResult
-    from orthonav.ground.recordings.calibrate_mount import MountCalibration
+    from orthonav.ground.recordings.calibrate import MountCalibration
 
 GNSS_STD_M = 5.0
 """Standard deviation of measured positions, per axis."""
@@ -43,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
             raise FlightError("--latency uses the heights of the log: omit --dem")
         _run_latency(options)
         return
-    found, by_track = _calibrated(options)
+    found = _calibrated(options)
     write_mount(options.out, found.mount)
     with beside(options.out):
         if options.json:
@@ -60,16 +59,13 @@ def run(options: argparse.Namespace) -> None:
             value, std, scatter = (unit * each for each in (bias.value, bias.std, bias.scatter))
             print(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
         print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
-        if not by_track:
-            print("the views do not form a track: this is the mean of single views")
         if found.moved:
             print("the camera moved in its mount before these views; earlier views are not used")
         print(f"written to {options.out}")
 
 
-def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
-    """The mount by the smoothed track of the flight, and True; by its single views, and False,
-    where these make no track."""
+def _calibrated(options: argparse.Namespace) -> "MountCalibration":
+    """The mount by the smoothed track of the flight."""
     from orthonav.core.flight import read_truth
     from orthonav.core.flight.recording import WithTelemetry
     from orthonav.core.localize import Localizer
@@ -77,15 +73,8 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     from orthonav.core.records import Prior
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.evaluate.metrics import check_truth
-    from orthonav.ground.recordings.calibrate_mount import (
-        MIN_VIEWS,
-        RecordedSingleViews,
-        calibrate_mount,
-        calibrate_mount_by_views,
-        confident_views,
-    )
+    from orthonav.ground.recordings.calibrate import calibrate_mount
     from orthonav.ground.recordings.localize import smoothed_track
-    from orthonav.onboard.run import Locator
 
     dem, opened = dem_of(options), open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
@@ -95,34 +84,25 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
         frame = opened.manifest.sheets[0].frame
         check_truth(places, (), (frame.lat_deg, frame.lon_deg), options.gnss_positions)
     priors = {frame: Prior(*place, GNSS_STD_M) for frame, place in places.items()}
-    localizer, heading_known = Localizer(opened), options.heading == "known"
-
-    def results(locator: Locator) -> "list[ViewResult]":
-        views = (
-            WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
-        )
-        heights = flight_heights(options, opened, flight, dem)
-        with progress(options) as shown:
-            return located(options, locator, flight, views, shown, heights=heights)
-
     tracker = Tracker(
-        localizer,
-        heading_known=heading_known,
+        Localizer(opened),
+        heading_known=options.heading == "known",
         use_prior=bool(options.gnss_positions),
         every_prior=bool(options.gnss_positions),
         smooth=True,
     )
-    tracked = smoothed_track(tracker, results(tracker), None)
-    if len(confident_views(tracked)) >= MIN_VIEWS:
-        return calibrate_mount(tracked), True
-    # Photographs far apart, for one.
-    alone = RecordedSingleViews(localizer, bool(priors), heading_known)
-    return calibrate_mount_by_views(results(alone), alone.reported), False
+    views = (
+        WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
+    )
+    heights = flight_heights(options, opened, flight, dem)
+    with progress(options) as shown:
+        results = located(options, tracker, flight, views, shown, heights=heights)
+    return calibrate_mount(smoothed_track(tracker, results, None))
 
 
 def _run_latency(options: argparse.Namespace) -> None:
     from orthonav.core.flight.mount import write_latency
-    from orthonav.ground.recordings.calibrate_latency import arrivals_of, calibrate_latency
+    from orthonav.ground.recordings.calibrate import arrivals_of, calibrate_latency
 
     flight = open_source(options.flight, options)
     with progress(options) as shown:

@@ -64,9 +64,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "file to write (-: stdout, with the summary on stderr); without it the command prints "
     text += "the positions, if photographs are given one by one"
     add("--out", type=Path, metavar="fixes.jsonl", help=text)
-    text = "write the confident camera positions for other programs too: csv, geojson, kml, gpx, "
-    text += "tum (a trajectory for evo), odm-geo (OpenDroneMap's geo.txt) or exif (a table for "
-    text += "`exiftool -csv=PATH FOLDER`); heights above sea need a terrain; can be repeated"
+    text = "write the confident camera positions for other programs too: csv, kml, gpx, tum (a "
+    text += "trajectory for evo) or odm-geo (OpenDroneMap's geo.txt); heights above sea need a "
+    text += "terrain; can be repeated"
     add("--export", action="append", default=[], metavar="FORMAT=PATH", help=text)
     text = "write where the ground no longer looks like the map, by the confident views; `check "
     add("--report-changes", type=Path, metavar="FILE.geojson", help=f"{text}--changes` reads it")
@@ -172,7 +172,7 @@ def _on_map(options: argparse.Namespace) -> None:
             compare_with_flight(flight, results)
         _write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
         export_all(exports, results, dem or TerrainLayer.of(opened))
-        advice, tried = advisor.advice(results, accept, shown)
+        advice, tried = advisor.advice(results, accept)
         seen_by = MountedFlight(flight, mount) if mount else flight
         changed = report_changes(options, opened, seen_by, results, shown)
     _print_summary(options, results, accept, advice, tried, changed)
@@ -357,7 +357,7 @@ class SetupAdvice:
             yield view
 
     def advice(
-        self, results: "Sequence[ViewResult]", accept: "Acceptance", shown: Progress
+        self, results: "Sequence[ViewResult]", accept: "Acceptance"
     ) -> "tuple[list[str], list[dict[str, Any]]]":
         """Sentences on what to check, and the configurations that were tried as JSON values.
 
@@ -382,7 +382,7 @@ class SetupAdvice:
             return lines, []
         end_s = time.monotonic() + BUDGET_S
         try:
-            tried = self._tried(accept, shown, end_s)
+            tried = self._tried(accept, end_s)
         except KeyboardInterrupt:  # skips the search; the results are written
             return [*lines, "the search for another configuration was interrupted"], []
         if time.monotonic() > end_s:
@@ -394,7 +394,7 @@ class SetupAdvice:
             for each in tried
         ]
 
-    def _tried(self, accept: "Acceptance", shown: Progress, end_s: float) -> "list[Tried]":
+    def _tried(self, accept: "Acceptance", end_s: float) -> "list[Tried]":
         from orthonav.ground.recordings.setups import try_setups
 
         reporter(self._options)(
@@ -407,9 +407,7 @@ class SetupAdvice:
             accept.accepts,
             use_prior=self._options.prior == "telemetry",
             heading_known=self._options.heading == "known",
-            tracked=bool(self._options.track or self._options.smooth),
             stop=lambda: time.monotonic() > end_s,
-            progress=lambda share: shown("configurations", share),
         )
 
 

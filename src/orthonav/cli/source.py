@@ -39,7 +39,7 @@ def topic(text: str) -> tuple[str, str]:
     return role, name
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
+def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     """Add the options; see docs/flights.md."""
     group = parser.add_argument_group("reading the recording")
     add = group.add_argument
@@ -62,7 +62,8 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     add_options(group, "--agl-m", help="height above ground of all views, not the recorded one")
     text = "altitude of the ground, in the reference of the recorded altitudes, where no heights "
     add("--ground-alt-m", type=float, help=f"{text}were recorded")
-    add_options(group, "--dem", "--dem-datum")
+    if dem:
+        add_options(group, "--dem", "--dem-datum")
     text = "assume pitch and roll 0 where they were not recorded"
     add("--looks-down", action="store_true", help=text)
     text = "standard deviation of the prior position, per axis; the recorded position is then the "

@@ -20,7 +20,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "verify": ("signing",),
     "view": ("web",),
     # Only with these options or inputs; the part that needs it says so.
-    "plan, import, localize, calibrate --dem": ("geo",),
+    "plan, localize, calibrate --dem": ("geo",),
     "build --edges segments": ("segments",),
     "build --method autoencoder, caevl, triplet or bovw": ("train",),
     "atlas build, atlas index": ("atlas",),

@@ -30,12 +30,12 @@ from orthonav.core.records import Telemetry, ViewResult
 from orthonav.ground.recordings.flightlog import (
     BrokenLogError,
     LogContent,
-    LogFile,
     files_of_run,
     is_flight_log,
     logged_result,
     run_of,
 )
+from orthonav.ground.recordings.mcap_files import McapFile
 
 MAX_LINE_BYTES = 2**20
 MAX_VIEWS = 500_000
@@ -161,7 +161,7 @@ class LogReader:
         """
         self._path, self._live = Path(path), live
         self._lock = threading.Lock()
-        self._files: list[LogFile] = []
+        self._files: list[McapFile] = []
         self._names: set[Path] = set()
         self._run: str | None = None
         self._scanned_s = -RESCAN_S
@@ -184,7 +184,7 @@ class LogReader:
             if not self._files or (self._live and time.monotonic() - self._scanned_s >= RESCAN_S):
                 self._rescan(batch)
             for file in self._files:
-                if not file.walk.ended:
+                if not file.ended:
                     self._read(file, batch)
             return batch
 
@@ -211,15 +211,15 @@ class LogReader:
             self._reset()
         self._names, self._run = names, run or self._run
         known = {file.path for file in self._files}
-        self._files += [LogFile(path) for path in found if path not in known]
+        self._files += [McapFile(path) for path in found if path not in known]
 
-    def _read(self, file: LogFile, batch: Batch) -> None:
-        content, damaged, broken = self._content, file.walk.damaged, self._content.broken
+    def _read(self, file: McapFile, batch: Batch) -> None:
+        content, damaged, broken = self._content, file.damaged, self._content.broken
         with contextlib.suppress(FileNotFoundError):  # deleted to make room; what was read remains
             content.read(file, partial(self._take, batch))
         if content.broken > broken == 0:
             batch.problems.append(content.problem)
-        if file.walk.damaged > damaged == 0:
+        if file.damaged > damaged == 0:
             batch.problems.append(f"damaged chunks were skipped: {file.path}")
 
     def _take(self, batch: Batch, topic: str, data: bytes) -> None:
