@@ -117,7 +117,6 @@ def test_services_known_by_name_are_listed(command):
         (["--source", "file:///etc/passwd", "--out", "o.tif"], "write the protocol"),
         (["--bounds=3,46,3.1,46.1", "--source", "xyz:http://a/{z}/{x}/{y}", "--out", "o.jpg"],
          "must be a .tif"),
-        (["--source", "ign-package:3", "--out", "o"], "such as D003:2013"),
         (["--parallel", "99", "--source", "ign", "--out", "o.tif"], "--parallel is 1 to 16"),
         (["--bands", "r,g", "--source", "ign", "--out", "o.tif"], "--bands are numbers"),
         (["--gsd-m", "0", "--source", "ign", "--out", "o.tif"], "--gsd-m must be above 0"),

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from orthonav.ground.fetch.run import FetchRequest, FetchResult
     from orthonav.ground.planning.area import Area
 
-PACKAGE = "ign-package:"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
     *("--layer", "--time", "--date", "--key-env", "--cache", "--json"),
@@ -29,8 +28,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--source",
         metavar="NAME[:YEAR]|PROTOCOL:ADDRESS",
-        help="a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..., or "
-        "ign-package:D003:2013 for a whole department (--out is a folder then)",
+        help="a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://...",
     )
     parser.add_argument("--list", action="store_true", help="list the services known by name")
     parser.add_argument("--out", type=Path, metavar="ORTHO.tif", help="GeoTIFF to write")
@@ -148,9 +146,6 @@ def run(options: argparse.Namespace) -> None:
     if options.source is None or (options.out is None and not options.dry_run):
         raise FetchError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
-    if options.source.startswith(PACKAGE):
-        _run_package(options)
-        return
     from orthonav.ground.fetch.run import estimate_fetch, fetch
 
     request = _request(options)
@@ -234,40 +229,6 @@ def _area(options: argparse.Namespace) -> "Area":
     if box is not None:
         return Area.from_bounds(box)
     return Area.from_route(read_route(route), options.band_m)
-
-
-def _run_package(options: argparse.Namespace) -> None:
-    from orthonav.ground.fetch.package import (
-        ATTRIBUTION,
-        download_package,
-        find_package,
-        package_files,
-        parse_package,
-    )
-    from orthonav.ground.fetch.web import Web
-
-    zone, year, kind = parse_package(options.source.removeprefix(PACKAGE))
-    with Web() as web:
-        package = find_package(web, zone, year, kind)
-        files = package_files(web, package)
-        megabytes = sum(file.size_bytes or 0 for file in files) / 1e6
-        _say(options, f"{package.name}: {len(files)} files, {megabytes:.0f} MB")
-        paths = []
-        if not options.dry_run:
-            with progress(options) as shown:
-                paths = download_package(web, files, options.out, shown)
-    if options.json:
-        print_json(
-            {
-                "package": package.name,
-                "date": package.date,
-                "attribution": ATTRIBUTION,
-                "files": [str(path) for path in paths],
-                "megabytes": round(megabytes, 3),
-            }
-        )
-    elif paths:
-        print(f"{package.name} ({ATTRIBUTION}); unpack it with: 7z x {paths[0]}")
 
 
 def _say(options: argparse.Namespace, text: str) -> None:
