@@ -10,9 +10,8 @@ import terrain
 from pyproj import Transformer
 from rasterio.io import MemoryFile
 
-from orthonav.core.errors import AreaError, FetchError
-from orthonav.ground.fetch.options import ImageryOptions
-from orthonav.ground.fetch.presets import find_preset, parse_source
+from orthonav.core.errors import FetchError
+from orthonav.ground.fetch.presets import ImageryOptions, parse_source, presets
 from orthonav.ground.fetch.run import FetchRequest, fetch
 from orthonav.ground.imagery.source import open_sources
 from orthonav.ground.imagery.terrain import open_dem
@@ -152,13 +151,6 @@ def test_what_a_wmts_does_not_have_is_listed(mapproxy, take, options, words):
         take(f"wmts:{mapproxy}/service", **{"layer": "tiles"} | options)
 
 
-def test_swapped_bounds_are_named(mapproxy, take):
-    west, south, east, north = terrain.bounds(60)
-    area = Area.from_bounds((south, west, north, east))
-    with pytest.raises(AreaError, match="latitude and longitude seem to be swapped"):
-        take(f"wmts:{mapproxy}/service", layer="tiles", crs="EPSG:32631", area=area)
-
-
 CAPABILITIES = """<WMS_Capabilities version="1.3.0" xmlns="http://www.opengis.net/wms"
  xmlns:xlink="http://www.w3.org/1999/xlink"><Service><Name>WMS</Name><Title>t</Title></Service>
 <Capability><Request><GetMap><Format>image/jpeg</Format><Format>image/geotiff</Format>
@@ -197,8 +189,8 @@ def test_heights_of_a_wms(tmp_path, monkeypatch, broken):
     )
     with servers.serving(answer) as server:
         url.append(server.url)
-        known = replace(find_preset("ign-terrain"), url=server.url)
-        monkeypatch.setattr("orthonav.ground.fetch.presets.find_preset", lambda name: known)
+        known = replace(presets()["ign-terrain"], url=server.url)
+        monkeypatch.setattr("orthonav.ground.fetch.presets.presets", lambda: {"ign-terrain": known})
         area = Area.from_bounds(terrain.bounds(60))
         spec = parse_source("ign-terrain", ImageryOptions(tile_px=128))
         request = FetchRequest(spec, area, tmp_path / "dem.tif", margin_m=0, limits=servers.QUICK)

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ from orthonav.cli.needs import require_extras
 from orthonav.core.errors import FetchError
 
 if TYPE_CHECKING:
-    from orthonav.ground.fetch.options import ImageryOptions
+    from orthonav.ground.fetch.presets import ImageryOptions
     from orthonav.ground.fetch.run import FetchRequest, FetchResult
     from orthonav.ground.planning.area import Area
 
@@ -197,7 +198,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
 
 
 def _imagery(options: argparse.Namespace) -> "ImageryOptions":
-    from orthonav.ground.fetch.options import ImageryOptions
+    from orthonav.ground.fetch.presets import ImageryOptions
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
@@ -256,7 +257,7 @@ def _print_presets(as_json: bool) -> None:
     from orthonav.ground.fetch.presets import presets
 
     if as_json:
-        print_json([preset.describe() for preset in presets().values()])
+        print_json([asdict(preset) for preset in presets().values()])
         return
     for preset in presets().values():
         print(f"{preset.name}: {preset.title} ({preset.country})")

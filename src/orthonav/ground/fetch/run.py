@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -23,18 +23,14 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from orthonav import __version__
-from orthonav.core.errors import AreaError, FetchError, OutputError
+from orthonav.core.errors import FetchError, OutputError
 from orthonav.core.files import Progress, no_progress, not_written, replacing, with_paths
-from orthonav.core.geo.swapped import swapped_hint
-from orthonav.ground.fetch.cog import cog_source
+from orthonav.ground.fetch.files import cog_source, stac_source
 from orthonav.ground.fetch.grid import Selection, select
-from orthonav.ground.fetch.options import Provenance, SourceSpec
+from orthonav.ground.fetch.presets import Provenance, SourceSpec
 from orthonav.ground.fetch.service import CellPixels, CellReader, CellSource
-from orthonav.ground.fetch.stac import find_files
+from orthonav.ground.fetch.tiles import wms_cells, wmts_tiles, xyz_tiles
 from orthonav.ground.fetch.web import RequestLimits, Web
-from orthonav.ground.fetch.wms import wms_cells
-from orthonav.ground.fetch.wmts import wmts_tiles
-from orthonav.ground.fetch.xyz import xyz_tiles
 from orthonav.ground.planning.area import Area
 
 DEFAULT_MAX_TILES = 50_000
@@ -218,7 +214,7 @@ def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, Co
     if not (math.isfinite(request.margin_m) and request.margin_m >= 0):
         raise FetchError(f"margin must be 0 m or more, got {request.margin_m}")
     source = open_cells(web, request.spec, request.area)
-    selection = _selected(source, request)
+    selection = select(source.grid, request.area, request.margin_m)
     height, width = selection.shape_px
     tiles = len(selection.cells)
     size = tiles * source.cell_bytes
@@ -242,31 +238,7 @@ def open_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
         return xyz_tiles(spec, area)
     if spec.protocol == "cog":
         return cog_source(web, spec, area, [spec.url])
-    west, south, east, north = area.extent_en_m
-    corners = [(west, south), (west, north), (east, south), (east, north)]
-    lat, lon = area.frame.latlon_from_en(corners)
-    box = (float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max()))
-    urls, date = find_files(web, spec, box)
-    provenance = replace(spec.provenance, date=date or spec.provenance.date)
-    return cog_source(web, replace(spec, provenance=provenance), area, urls)
-
-
-def _selected(source: CellSource, request: FetchRequest) -> Selection:
-    frame = request.area.frame
-
-    def covered(lat_deg: float, lon_deg: float) -> bool:
-        west, south, east, north = lon_deg - 1e-4, lat_deg - 1e-4, lon_deg + 1e-4, lat_deg + 1e-4
-        try:
-            select(source.grid, Area.from_bounds((west, south, east, north)), 0.0)
-        except (AreaError, FetchError):
-            return False
-        return True
-
-    try:
-        return select(source.grid, request.area, request.margin_m)
-    except AreaError as error:
-        hint = swapped_hint(frame.lat_deg, frame.lon_deg, covered)
-        raise AreaError(f"{error}{hint}") from None
+    return stac_source(web, spec, area)
 
 
 def _check_out(out: Path) -> None:

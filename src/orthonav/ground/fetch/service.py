@@ -21,7 +21,7 @@ from rasterio.windows import Window
 from orthonav.core.errors import FetchError
 from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M
 from orthonav.ground.fetch.grid import CellGrid, Selection
-from orthonav.ground.fetch.options import HEIGHTS_FORMAT, Provenance, SourceSpec
+from orthonav.ground.fetch.presets import HEIGHTS_FORMAT, Provenance, SourceSpec
 from orthonav.ground.fetch.urls import checked_url, shown
 from orthonav.ground.fetch.web import CONNECT_S, READ_S, USER_AGENT, Web, is_temporary
 

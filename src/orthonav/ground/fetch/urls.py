@@ -66,21 +66,10 @@ def origin_of(url: str) -> str:
     return f"{scheme}://{(parts.hostname or '').lower()}:{port}"
 
 
-def without_literal_keys(url: str) -> tuple[str, str | None]:
-    """The address with `{key}` for a key written into its query, and that key.
-
-    Raises `FetchError` where several parameters look like keys.
-    """
-    parts = urlsplit(url)
-    query = parse_qsl(parts.query, keep_blank_values=True)
-    secret = {value for name, value in query if _SECRET_NAME.match(name) and "{" not in value}
-    secret -= {""}
-    if not secret:
-        return url, None
-    if len(secret) > 1 or KEY in url:
-        raise FetchError(f"address contains several keys; one is supported: {shown(url)}")
-    plain = [(name, KEY if value in secret else value) for name, value in query]
-    return urlunsplit(parts._replace(query=_encoded(plain))), secret.pop()
+def holds_key(url: str) -> bool:
+    """Whether a value in the query looks like a key, by the name of its parameter."""
+    query = parse_qsl(urlsplit(url).query)
+    return any(_SECRET_NAME.match(name) and "{" not in value for name, value in query)
 
 
 def shown(url: str) -> str:

@@ -1,15 +1,17 @@
-"""Cloud-optimized GeoTIFFs read by windows through GDAL's /vsicurl: one file, or several.
+"""Cloud-optimized GeoTIFFs, read by windows through GDAL's /vsicurl, and the search of a STAC API.
 
 Files on one pixel grid are read without resampling. A file off the grid of the first (another zone
-or phase) is resampled into it, and `Provenance.note` says so.
+or phase) is resampled into it, and `Provenance.note` says so. Documents of STAC 0.9 and 1.0 are
+read as plain JSON; pystac-client was tried instead (docs/decisions/dependencies.md).
 """
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rasterio
@@ -23,7 +25,14 @@ from rasterio.warp import transform_bounds
 from orthonav.core.errors import FetchError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.fetch.grid import CellGrid, Selection, mean_scale
-from orthonav.ground.fetch.options import ImageryOptions, SourceSpec, finest_fitting
+from orthonav.ground.fetch.presets import (
+    GSD_TOLERANCE,
+    ImageryOptions,
+    SourceSpec,
+    choose,
+    finest_fitting,
+    listed,
+)
 from orthonav.ground.fetch.service import (
     GDAL_OPTIONS,
     CellPixels,
@@ -31,12 +40,17 @@ from orthonav.ground.fetch.service import (
     CellSource,
     reason_of,
 )
-from orthonav.ground.fetch.urls import checked_url, shown
+from orthonav.ground.fetch.urls import TOKEN, Secret, checked_url, linked, origin_of, shown
 from orthonav.ground.fetch.web import Web
 from orthonav.ground.imagery.mosaic import WHOLLY_VALID
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 
+MAX_ITEMS = 500  # files of one fetch: an open dataset each, per thread
+PAGE = 100  # items per page; APIs allow at least this many
+MAX_PAGES = 200
+_TIFF = re.compile(r"image/(tiff|vnd\.stac\.geotiff)|\.tiff?$", re.IGNORECASE)
+_PREFERRED = ("visual", "image", "ortho", "data", "rgb")
 CELL_PX = 512  # GDAL's block size for COG, so a cell is usually one block
 MAX_BLOCK_BYTES = 64 * 2**20
 """Largest block, unpacked: one of a tiled file has at most a few megabytes."""
@@ -185,3 +199,124 @@ def _read(
                 alpha = placed.read(placed.count)
                 return pixels, alpha >= (WHOLLY_VALID if adds_alpha else 1)
             return pixels, (placed.read_masks(list(bands)) > 0).any(axis=0)
+
+
+class CatalogItem(NamedTuple):
+    """One file of a catalogue: its time (ISO 8601), name and address."""
+
+    time: str
+    name: str
+    url: str
+
+
+def stac_source(web: Web, spec: SourceSpec, area: Area) -> CellSource:
+    """The files that a STAC API finds in the area and time requested, newest on top.
+
+    Of items whose names differ by a year only the newest is taken. Raises `FetchError` where there
+    are none.
+    """
+    options = spec.options
+    items: list[CatalogItem] = []
+    for feature, where in _found(web, spec, area):
+        items.append(_item(feature, where, options))
+        if len(items) > MAX_ITEMS:
+            problem = f"more than {MAX_ITEMS} files; choose a smaller area or time"
+            raise FetchError(f"{problem}: {spec.url}")
+    if not items:
+        when = f" at {options.time}" if options.time else ""
+        raise FetchError(f"catalogue has no imagery of the area{when}: {spec.url}")
+    newest: dict[str, CatalogItem] = {}
+    for item in sorted(items, reverse=True):
+        newest.setdefault(re.sub(r"(?<!\d)(19|20)\d\d(?!\d)", "", item.name), item)
+    days = sorted({item.time[:10] for item in newest.values() if item.time})
+    if days:
+        date = "/".join(dict.fromkeys([days[0], days[-1]]))
+        spec = replace(spec, provenance=replace(spec.provenance, date=date))
+    urls = [item.url for item in newest.values()]
+    return cog_source(web, spec, area, _signed(web, spec.token_url, urls))
+
+
+def _signed(web: Web, token_url: str | None, urls: list[str]) -> list[str]:
+    """Addresses with `{token}`, for which a service issued a query string.
+
+    The token goes only to the origins of these addresses.
+    """
+    if token_url is None:
+        return urls
+    token = web.get_json(token_url).get("token")
+    if not isinstance(token, str) or not token:
+        raise FetchError(f"signing service returned no token: {token_url}")
+    for origin in {origin_of(url) for url in urls}:
+        web.secrets.append(Secret(TOKEN, origin, token.lstrip("?")))
+    return [f"{url}{'&' if '?' in url else '?'}{TOKEN}" for url in urls]
+
+
+def _found(web: Web, spec: SourceSpec, area: Area) -> Iterator[tuple[dict[str, Any], str]]:
+    """Items of a search, page by page, with the address of the page."""
+    west, south, east, north = area.extent_en_m
+    corners = [(west, south), (west, north), (east, south), (east, north)]
+    lat, lon = area.frame.latlon_from_en(corners)
+    box = [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]
+    query: dict[str, Any] | None = {"bbox": box, "limit": PAGE}
+    query |= {"datetime": spec.options.time} if spec.options.time else {}
+    query |= {"collections": [spec.options.collection]} if spec.options.collection else {}
+    search = _link(web.get_json(spec.url), "search")
+    if search is None:
+        raise FetchError(f"not a STAC API with a search: {spec.url}")
+    url = linked(spec.url, search["href"])
+    for _ in range(MAX_PAGES):
+        page = web.get_json(url, query)
+        features = page.get("features")
+        if not isinstance(features, list) or not all(isinstance(each, dict) for each in features):
+            raise FetchError(f"answer is not a list of items: {url}")
+        yield from ((feature, url) for feature in features)
+        following = _link(page, "next")
+        if following is None:
+            return
+        url = linked(url, following["href"])
+        if str(following.get("method", "GET")).upper() == "POST":
+            more, merged = following.get("body"), query if following.get("merge") else {}
+            query = {**(merged or {}), **(more if isinstance(more, dict) else {})}
+        else:
+            query = None
+    raise FetchError(f"list of items does not end: {spec.url}")
+
+
+def _link(document: dict[str, Any], kind: str) -> dict[str, Any] | None:
+    links = document.get("links")
+    for link in links if isinstance(links, list) else ():
+        if isinstance(link, dict) and link.get("rel") == kind:
+            return link | {"href": str(link.get("href", ""))}
+    return None
+
+
+def _item(feature: dict[str, Any], where: str, options: ImageryOptions) -> CatalogItem:
+    name, assets = str(feature.get("id", ""))[:200], feature.get("assets")
+    plain = assets if isinstance(assets, dict) else {}
+    known = {key: asset for key, asset in plain.items() if isinstance(asset, dict)}
+    asset = known[_asset(known, options, name)]
+    properties = feature.get("properties")
+    times = properties if isinstance(properties, dict) else {}
+    time = str(times.get("datetime") or times.get("start_datetime") or "")
+    return CatalogItem(time, name, linked(where, str(asset.get("href", ""))))
+
+
+def _asset(assets: dict[str, dict[str, Any]], options: ImageryOptions, name: str) -> str:
+    """The asset requested, else a GeoTIFF by name, or the coarsest that is fine enough."""
+    if options.asset is not None:
+        return choose(list(assets), options.asset, f"item {name} has no asset")
+    tiffs = {
+        key: float(asset.get("gsd") or asset.get("eo:gsd") or 0)
+        for key, asset in assets.items()
+        if _TIFF.search(str(asset.get("type") or asset.get("href")).partition("?")[0])
+        and not {"thumbnail", "metadata", "overview"} & set(asset.get("roles") or [])
+    }
+    if not tiffs:
+        raise FetchError(f"item {name} has no GeoTIFF; available: {listed(list(assets))}")
+    fitting = [
+        key for key, gsd_m in tiffs.items() if 0 < gsd_m <= options.wanted_gsd_m * GSD_TOLERANCE
+    ]
+    preferred = [key for key in _PREFERRED if key in tiffs] or (list(tiffs) * (len(tiffs) == 1))
+    if not preferred and not fitting:
+        raise FetchError(f"choose one with --asset; item {name} has {listed(list(tiffs))}")
+    return preferred[0] if preferred else max(fitting, key=lambda key: tiffs[key])

@@ -1,7 +1,7 @@
-"""WMTS 1.0.0 (OGC 07-057r7): a layer as its capabilities describe it, and the tiles of it.
+"""Tiles and images of services: by address template (XYZ, TMS), WMTS 1.0.0, WMS 1.1.1 and 1.3.0.
 
-Its tiles are read by address template, as those of XYZ: GDAL's own driver of WMTS takes the default
-time only, and resolutions as they are rounded in the document.
+Tiles of a WMTS (OGC 07-057r7) are read by address template, as those of XYZ: GDAL's own driver of
+WMTS takes the default time only, and resolutions as they are rounded in the document.
 """
 
 import math
@@ -16,11 +16,14 @@ from orthonav.ground.fetch.grid import (
     MERCATOR_HALF_M,
     CellGrid,
     epsg_name,
+    ground_scale,
     known_crs,
     mean_scale,
     north_first,
 )
-from orthonav.ground.fetch.options import (
+from orthonav.ground.fetch.presets import (
+    HEIGHTS_FORMAT,
+    TERRAIN_GSD_M,
     ImageryOptions,
     SourceSpec,
     choose,
@@ -34,10 +37,63 @@ from orthonav.ground.fetch.urls import linked, with_query
 from orthonav.ground.fetch.web import Web, texts
 from orthonav.ground.planning.area import Area
 
+MAX_ZOOM = 24  # finest zoom level, 9 mm per pixel at the equator: finer than any orthophoto
+_PARTS = {"z", "x", "y", "-y", "q", "s", "r", "key"}
 PIXEL_M = 0.28e-3  # width of the standardized pixel of scale denominators (OGC 07-057r7, 6.1)
 METRES_PER_DEGREE = 6378137.0 * math.pi / 180
 """At the equator of WGS84, as scale denominators are defined (OGC 07-057r7, 6.1)."""
 MAX_TILE_PX = 4096  # largest tile that is accepted; usual ones have 256 or 512 px
+CELL_PX = 1024  # width of the images requested: services render several per second at this size
+_MIN_CELL_PX = 64
+_VERSIONS = ("1.3.0", "1.1.1")
+
+
+def xyz_tiles(spec: SourceSpec, area: Area) -> CellSource:
+    """The tiles of a template with `{z}/{x}/{y}` in Web Mercator, as web maps use them.
+
+    `{-y}` counts rows from the south, as `{y}` of a TMS does; `{q}` is a quadkey, `{s}` one of the
+    hosts a, b and c (a is taken), `{r}` the `@2x` of tiles of 512 px. Raises `FetchError`.
+    """
+    template, options = spec.url, spec.options
+    parts = set(re.findall(r"\{([^{}]*)\}", template))
+    if parts - _PARTS or not (({"z", "x"} <= parts and parts & {"y", "-y"}) or "q" in parts):
+        raise FetchError(
+            "template needs {z}, {x} and {y} (or {-y}), or {q}, and may hold {s}, {r} and {key}; "
+            f"got: {template[:200]}"
+        )
+    tile_px = options.tile_px or (512 if "{r}" in template or "@2x" in template else 256)
+    if not 64 <= tile_px <= 4096:
+        raise FetchError(f"tiles must be 64 to 4096 px wide, got {tile_px}")
+    low, high = options.min_zoom or 0, min(MAX_ZOOM, options.max_zoom or MAX_ZOOM)
+    zooms = list(range(low, high + 1))
+    resolutions = [2 * MERCATOR_HALF_M / tile_px / 2.0**zoom for zoom in zooms]
+    if options.zoom is None:
+        scale = mean_scale("EPSG:3857", area.frame)
+        gsds_m = [res * scale for res in resolutions]
+        zoom = zooms[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {low} to {high}")]
+    elif options.zoom.isdecimal() and low <= int(options.zoom) <= high:
+        zoom = int(options.zoom)
+    else:
+        raise FetchError(f"no zoom {options.zoom}; available: {low} to {high}")
+    half, last, res = MERCATOR_HALF_M, 2**zoom - 1, resolutions[zoom - low]
+    grid = CellGrid("EPSG:3857", -half, half, res, res, tile_px, tile_px, (0, 0, last, last))
+    values = {
+        "{z}": str(zoom),
+        "{x}": "${x}",
+        "{y}": "${y}",
+        "{-y}": "${y}",
+        "{q}": "${quadkey}",
+        "{s}": "a",
+        "{r}": "@2x" if tile_px == 512 else "",
+    }
+    for part, value in values.items():
+        template = template.replace(part, value)
+    service = {"name": "VirtualEarth" if "q" in parts else "TMS", "ServerUrl": template}
+    path = template.partition("?")[0].lower()
+    formats = {".png": "image/png", ".webp": "image/webp"}
+    format_ = next((kind for end, kind in formats.items() if path.endswith(end)), "image/jpeg")
+    from_south = spec.protocol == "tms" or "-y" in parts
+    return service_source(spec, grid, format_, service, zoom, from_south=from_south)
 
 
 def wmts_tiles(web: Web, spec: SourceSpec, area: Area) -> CellSource:
@@ -89,8 +145,7 @@ def _id(element: Element) -> list[str]:
 def _style(layer: Element, name: str, options: ImageryOptions) -> str:
     elements = sorted(layer.iterfind("Style"), key=lambda each: each.get("isDefault") != "true")
     styles = [style for element in elements for style in _id(element)] or ["default"]
-    preferred = options.preferred_style if options.preferred_style in styles else None
-    return choose(styles, options.style or preferred, f"layer {name} has no style")
+    return choose(styles, options.style, f"layer {name} has no style")
 
 
 def _dimensions(layer: Element, name: str, options: ImageryOptions) -> dict[str, str]:
@@ -215,3 +270,104 @@ def _number(zoom: str) -> int | None:
 def _is_within(zoom: str, options: ImageryOptions) -> bool:
     number, low, high = _number(zoom), options.min_zoom, options.max_zoom
     return number is None or ((low or 0) <= number and (high is None or number <= high))
+
+
+def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
+    """Images of any box, requested as the cells of a fixed grid. Raises `FetchError`.
+
+    In 1.3.0 the order of coordinates is that of the coordinate system's authority, so northing
+    first in EPSG:4326 and in many national ones (OGC 06-042, 6.7.2); in 1.1.1 it is always x, y.
+    """
+    url, options, frame = spec.url, spec.options, area.frame
+    wanted = options.version or _VERSIONS[0]
+    if wanted not in _VERSIONS:
+        raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, not {wanted}")
+    url = with_query(url, {"SERVICE": "WMS", "REQUEST": "GetCapabilities", "VERSION": wanted})
+    root = web.get_xml(url)
+    version = root.get("version", "")
+    if version not in _VERSIONS:
+        found = version or root.tag
+        raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, got '{found}': {url}")
+    get_map = root.find("Capability/Request/GetMap")
+    address = root.find("Capability/Request/GetMap/DCPType/HTTP/Get/OnlineResource")
+    if get_map is None or address is None:
+        raise FetchError(f"WMS capabilities name no address of GetMap: {url}")
+    layers = _wms_layers(root)
+    name = choose_layer(list(layers), options.layer, url, named=True)
+    chain = layers[name]
+    styles = [style for each in chain for style in texts(each, "Style/Name")]
+    if options.style is not None:
+        choose(styles, options.style, f"layer {name} has no style")
+    names = _crs_names([crs for each in chain for crs in texts(each, "CRS") + texts(each, "SRS")])
+    crs = _crs(names, options.crs, frame, name)
+    format_ = choose_format(texts(get_map, "Format"), options, "service")
+    limits = [
+        int(side) or CELL_PX
+        for side in texts(root, "Service/MaxWidth") + texts(root, "Service/MaxHeight")
+        if side.isdecimal()
+    ]
+    cell_px = min(max(_MIN_CELL_PX, min([CELL_PX, *limits])), options.tile_px or CELL_PX)
+    gsd_m = options.wanted_gsd_m
+    if format_ == HEIGHTS_FORMAT and options.gsd_m is None:
+        gsd_m = TERRAIN_GSD_M
+    # Where the projection is true to scale within 1 %, so that a round number stays one.
+    scales = (
+        1.0 if math.isclose(scale, 1.0, rel_tol=0.01) else scale
+        for scale in ground_scale(crs, frame)
+    )
+    res_x, res_y = (gsd_m / scale for scale in scales)
+    map_url = linked(url, address.get("href", ""))
+    if options.time is not None:
+        map_url = with_query(map_url, {"TIME": choose_time(_times(chain), options.time, name)})
+    service = {
+        "name": "WMS",
+        "Version": version,
+        "ServerUrl": map_url,
+        "Layers": name,
+        "Styles": options.style or "",
+        "CRS" if version == "1.3.0" else "SRS": names[crs],
+        "ImageFormat": format_,
+        "Transparent": "FALSE" if format_ in ("image/jpeg", HEIGHTS_FORMAT) else "TRUE",
+    }
+    if version == "1.3.0" and not names[crs].startswith("CRS:") and north_first(crs):
+        service["BBoxOrder"] = "yxYX"
+    grid = CellGrid(crs, 0.0, 0.0, res_x, res_y, cell_px, cell_px)
+    return service_source(spec, grid, format_, service)
+
+
+def _wms_layers(root: Element) -> dict[str, list[Element]]:
+    found: dict[str, list[Element]] = {}
+    stack = [[layer] for layer in root.findall("Capability/Layer")]
+    while stack:
+        chain = stack.pop()
+        for name in texts(chain[0], "Name"):
+            found[name] = chain
+        stack += [[inner, *chain] for inner in reversed(chain[0].findall("Layer"))]
+    return found
+
+
+def _times(chain: list[Element]) -> list[str]:
+    """Times of the imagery; in 1.1.1 they stand in `Extent`."""
+    elements = [each for layer in chain for each in layer if each.tag in ("Dimension", "Extent")]
+    values = [each.text or "" for each in elements if each.get("name", "").lower() == "time"]
+    return [value.strip() for text in values for value in text.split(",") if value.strip()]
+
+
+def _crs_names(options: list[str]) -> dict[str, str]:
+    crs: dict[str, str] = {}
+    for option in (name for text in options for name in text.split()):
+        try:
+            epsg = epsg_name(option)
+        except FetchError:
+            continue
+        crs[epsg] = option if option == epsg else crs.get(epsg, option)
+    return crs
+
+
+def _crs(names: dict[str, str], wanted: str | None, frame: LocalFrame, layer: str) -> str:
+    """The coordinate system requested, else UTM, else Web Mercator, else the first."""
+    zone = int((frame.lon_deg + 180) % 360 // 6) + 1
+    utm = [f"EPSG:258{zone:02d}", f"EPSG:{326 if frame.lat_deg >= 0 else 327}{zone:02d}"]
+    preferred = (name for name in [*utm, "EPSG:3857", *names] if name in names)
+    wanted = wanted or next(preferred, "a known system")
+    return choose(list(names), wanted, f"layer {layer} does not come in")
