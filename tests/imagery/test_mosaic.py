@@ -115,29 +115,12 @@ def test_one_band_that_may_hold_heights_is_refused(tmp_path, dtype):
         Mosaic.open([path])
 
 
-def palette(path):
-    """SCENE[0] through a table of colours."""
-    with rasterio.open(write(path, SCENE[:1], nodata=0), "r+") as data:
+def test_a_palette_is_refused_with_the_command_that_writes_its_colours(tmp_path):
+    path = write(tmp_path / "ortho.tif", SCENE[:1])
+    with rasterio.open(path, "r+") as data:
         data.write_colormap(1, {value: (value, 255 - value, 7, 255) for value in range(256)})
-    return path
-
-
-def test_a_palette_becomes_its_colours(tmp_path):
-    pixels = read(palette(tmp_path / "ortho.tif"))
-    value = SCENE[0][INNER].astype(int)
-    expected = np.stack([value, 255 - value, np.full_like(value, 7)], axis=-1)
-    assert pixels.valid[INNER].all()
-    assert np.abs(pixels.rgb[INNER] - expected).max() <= 3
-
-
-def test_a_palette_is_thinned_by_its_colours(tmp_path):
-    """Neighbouring numbers of a palette may be opposite colours: checks of 0 and 1."""
-    checks = np.indices((SIZE, SIZE)).sum(axis=0)[None].astype(np.uint8) % 2
-    with rasterio.open(write(tmp_path / "ortho.tif", checks), "r+") as data:
-        data.write_colormap(1, {0: (200, 0, 40, 255), 1: (0, 100, 40, 255), 2: (9, 9, 9, 255)})
-    pixels = read(tmp_path / "ortho.tif", 19, gsd_m=6)
-    assert pixels.valid[1:-1, 1:-1].all()
-    assert np.abs(pixels.rgb[1:-1, 1:-1] - np.array([100.0, 50, 40])).max() <= 1
+    with pytest.raises(ImageryError, match=r"palette.*gdal_translate -expand rgb 'ortho\.tif'"):
+        Mosaic.open([path])
 
 
 @pytest.mark.parametrize("dtype, top", [("uint8", 255), ("uint16", 65_535)])
@@ -161,12 +144,6 @@ def test_a_mask_with_soft_edges_stays_a_mask(tmp_path, caplog):
     assert not caplog.text
 
 
-def palette_nodata(path):
-    with rasterio.open(write(path, np.where(HOLE, 0, SCENE[:1]), nodata=0), "r+") as data:
-        data.write_colormap(1, {value: (value, value, value, 255) for value in range(256)})
-    return path
-
-
 DEEP, UNIT = SCENE.astype(np.uint16) * 100, (SCENE / 255).astype(np.float32)
 WATER = np.where(np.arange(SIZE) < 40, 0, 255 - SCENE[0])
 """Near infrared, which is 0 over water; it is not missing for that."""
@@ -178,7 +155,6 @@ HOLED = {
     ),
     "grey nodata": lambda path: write(path, np.where(HOLE, 0, SCENE[:1]), nodata=0),
     "grey alpha": lambda path: write(path, with_band(SCENE[:1], MASK), alpha="YES"),
-    "grey palette": palette_nodata,
     "alpha": lambda path: write(path, with_band(SCENE, MASK), colours=[*RGB, ALPHA]),
     "deep alpha": lambda path: write(
         path, with_band(DEEP, MASK.astype(np.uint16) * 257), colours=[*RGB, ALPHA]

@@ -1,6 +1,9 @@
-"""One or several orthophotos as one image, resampled into a sheet's plane and read by windows."""
+"""One or several orthophotos as one image, resampled into a sheet's plane and read by windows.
 
-import logging
+GDAL's VRT joins files on one pixel lattice, such as the tiles of a producer, on their own pixels
+first. Resampled one by one, they would leave a line of invalid pixels between neighbours.
+"""
+
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -9,11 +12,13 @@ from functools import cached_property
 from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio.dtypes import dtype_rev, typename_fwd
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.transform import Affine
@@ -25,10 +30,8 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import ImageryError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.imagery.folder import sources_in
-from orthonav.ground.imagery.joined import Lattice, lattices_of
 from orthonav.ground.imagery.plates import at_epoch
-from orthonav.ground.imagery.source import Source, open_sources, quiet, unreadable
+from orthonav.ground.imagery.source import Source, open_sources, quiet, sources_in, unreadable
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
 WHOLLY_VALID = 250
@@ -43,7 +46,185 @@ _REACH_PX = 7
 SAMPLE_PX = 512
 """Side of the decimated image that percentiles are computed from."""
 SAMPLED_SOURCES = 12
-log = logging.getLogger(__name__)
+STRIP_PX = 4 * 2**20
+MAX_OFF_PX = 0.05
+"""Largest deviation of a tile from the lattice: far below the error of orthophotos."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Sources on one pixel lattice; where several overlap, the first wins.
+
+    `members`: indexes of the mosaic's sources. `boxes_px` (N, 4): left, top, right, bottom of each.
+    """
+
+    members: tuple[int, ...]
+    sources: tuple[Source, ...]
+    transform: Affine
+    boxes_px: NDArray[np.int64]
+
+    @property
+    def first(self) -> Source:
+        """All share its CRS, type and resolution."""
+        return self.sources[0]
+
+    @cached_property
+    def size_px(self) -> tuple[int, int]:
+        """Columns and rows."""
+        return int(self.boxes_px[:, 2].max()), int(self.boxes_px[:, 3].max())
+
+    def open(self, near: NDArray[np.bool_]) -> Any:
+        """The members that are `near` (N,) as one dataset."""
+        return rasterio.open(self._vrt(np.flatnonzero(near).tolist()))
+
+    def read(
+        self, dataset: Any, window: Window, gsd_m: float
+    ) -> tuple[NDArray[Any], NDArray[np.uint8], Affine]:
+        """Bands (C, h, w), mask (h, w), 0 (invalid) to 255, and transform of a window.
+
+        Averaged to about `gsd_m` where that is coarser, against aliasing, all windows alike.
+        """
+        factor = self._factor(max(1, round(gsd_m / self.first.gsd_m)))
+        (left, top), (width, height) = (window.col_off, window.row_off), self.size_px
+        left, top = left // factor * factor, top // factor * factor
+        right = min(-(-(window.col_off + window.width) // factor) * factor, width)
+        bottom = min(-(-(window.row_off + window.height) // factor) * factor, height)
+        # GDAL reads band by band: decoded tiles must stay in its cache
+        step = max(1, STRIP_PX // (factor * (right - left))) * factor
+        strips = [
+            self._read(dataset, Window(left, row, right - left, min(step, bottom - row)), factor)
+            for row in range(top, bottom, step)
+        ]
+        values = np.concatenate([strip[0] for strip in strips], axis=1)
+        mask = np.concatenate([strip[1] for strip in strips])
+        if values.dtype.kind == "f":  # NaN is nodata, whether the file declares it or not
+            mask = mask * np.isfinite(values).all(axis=0)
+        scale = Affine.scale((right - left) / mask.shape[1], (bottom - top) / mask.shape[0])
+        return values, mask, self.transform * Affine.translation(left, top) * scale
+
+    def _read(
+        self, dataset: Any, window: Window, factor: int
+    ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+        """Averaged over squares of `factor` pixels."""
+        shape = max(1, round(window.height / factor)), max(1, round(window.width / factor))
+        how: dict[str, Any] = {"window": window}
+        if factor > 1:
+            how["resampling"] = Resampling.average
+        values = dataset.read(out_shape=(dataset.count, *shape), **how)
+        return values, dataset.dataset_mask(out_shape=shape, **how)
+
+    def _factor(self, wanted: int) -> int:
+        """Pixels per side averaged: the largest with which squares end where tiles do, if any."""
+        if len(self.members) > 1:
+            for factor in range(wanted, max(1, (wanted + 1) // 2) - 1, -1):
+                if not (self.boxes_px % factor).any():
+                    return factor
+        return wanted
+
+    def _vrt(self, members: list[int]) -> str:
+        """XML that joins members, the first on top, each where it is valid."""
+        width, height = self.size_px
+        t = self.transform
+        dtype = _gdal_type(self.first.dtype)
+        bands = "".join(
+            f'<VRTRasterBand dataType="{dtype}" band="{band + 1}">'
+            + "".join(_values(*member, band) for member in self._placed(members))
+            + "</VRTRasterBand>"
+            for band in range(len(self.first.bands))
+        )
+        masks = "".join(_mask(*member) for member in self._placed(members))
+        return (
+            f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">'
+            f"<SRS>{escape(self.first.system.to_wkt())}</SRS>"
+            f"<GeoTransform>{t.c!r},{t.a!r},{t.b!r},{t.f!r},{t.d!r},{t.e!r}</GeoTransform>{bands}"
+            f'<MaskBand><VRTRasterBand dataType="Byte">{masks}</VRTRasterBand></MaskBand>'
+            "</VRTDataset>"
+        )
+
+    def _placed(self, members: list[int]) -> Iterator[tuple[Source, str]]:
+        """Members not covered by others, the last first, with the XML of file and place."""
+        shown, covered = [], set[tuple[int, ...]]()
+        for index in members:
+            box = tuple(self.boxes_px[index].tolist())
+            if box not in covered:
+                shown.append(index)
+            if not self.sources[index].masks:
+                covered.add(box)
+        for index in reversed(shown):
+            source, (left, top) = self.sources[index], self.boxes_px[index, :2].tolist()
+            size = f'xSize="{source.width_px}" ySize="{source.height_px}"'
+            dtype = _gdal_type(source.dtype)
+            yield (
+                source,
+                f'<SourceFilename relativeToVRT="0">{escape(source.name)}</SourceFilename>'
+                f'<SourceProperties RasterXSize="{source.width_px}" '
+                f'RasterYSize="{source.height_px}" DataType="{dtype}" BlockXSize="256" '
+                f'BlockYSize="256"/><SrcRect xOff="0" yOff="0" {size}/>'
+                f'<DstRect xOff="{left}" yOff="{top}" {size}/>',
+            )
+
+
+def _gdal_type(dtype: str) -> str:
+    return str(typename_fwd[dtype_rev[dtype]])
+
+
+def _values(source: Source, place: str, band: int) -> str:
+    kind, more = "SimpleSource", ""
+    if source.masks:
+        kind, more = "ComplexSource", "<UseMaskBand>true</UseMaskBand>"
+    return f"<{kind}>{place}<SourceBand>{source.bands[band]}</SourceBand>{more}</{kind}>"
+
+
+def _mask(source: Source, place: str) -> str:
+    """255 everywhere, or the union of the masks of a file."""
+    everywhere = "<ScaleOffset>255</ScaleOffset><ScaleRatio>0</ScaleRatio>"
+    valid = [(mask, "<NODATA>0</NODATA>") for mask in source.masks]
+    return "".join(
+        f"<ComplexSource>{place}<SourceBand>{band}</SourceBand>{more}</ComplexSource>"
+        for band, more in valid or [(str(source.bands[0]), everywhere)]
+    )
+
+
+def lattices_of(sources: Sequence[Source]) -> list[Lattice]:
+    """Only consecutive sources share one, so that earlier sources still cover later ones."""
+    runs: list[list[int]] = []
+    for index, source in enumerate(sources):
+        if runs and _offset_px(sources[runs[-1][0]], source) is not None:
+            runs[-1].append(index)
+        else:
+            runs.append([index])
+    return [_lattice(run, [sources[index] for index in run]) for run in runs]
+
+
+def _lattice(members: list[int], sources: list[Source]) -> Lattice:
+    offsets = np.array([_offset_px(sources[0], each) for each in sources], np.int64)
+    corner = offsets.min(axis=0)
+    sizes = np.array([(each.width_px, each.height_px) for each in sources], np.int64)
+    boxes = np.concatenate([offsets - corner, offsets - corner + sizes], axis=1)
+    transform = sources[0].transform * Affine.translation(int(corner[0]), int(corner[1]))
+    return Lattice(tuple(members), tuple(sources), transform, boxes)
+
+
+def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:
+    """Columns and rows from corner to corner; None where no lattice fits."""
+    alike = (
+        first.crs == other.crs
+        and len(first.bands) == len(other.bands)
+        and first.dtype == other.dtype
+    )
+    if not alike:
+        return None
+    col, row = ~first.transform * (other.transform.c, other.transform.f)
+    offset = round(col), round(row)
+    longest = max(other.width_px, other.height_px)
+    skew = np.array(other.transform[:6]) - np.array(first.transform[:6])
+    unit = min(
+        np.hypot(first.transform.a, first.transform.d),
+        np.hypot(first.transform.b, first.transform.e),
+    )
+    stretch_px = np.abs(skew[[0, 1, 3, 4]]).max() * longest / unit
+    off_px = max(abs(col - offset[0]), abs(row - offset[1])) + stretch_px
+    return offset if off_px <= MAX_OFF_PX else None
 
 
 @dataclass(frozen=True)
@@ -61,45 +242,30 @@ def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None,
     """None for 8 bit, else the 0.5 and 99.5 percentiles of all valid pixels of a product."""
     alike: dict[Any, list[int]] = {}
     for index, source in enumerate(sources):
-        if source.dtype != "uint8" and not source.has_palette:
-            kind = source.dtype, source.colours, round(source.gsd_m, 2), source.crs
+        if source.dtype != "uint8":
+            kind = source.dtype, len(source.bands), round(source.gsd_m, 2), source.crs
             alike.setdefault(kind, []).append(index)
     found: list[ContrastStretch | None] = [None] * len(sources)
     for members in alike.values():
-        stretch = _common([sources[index] for index in members])
+        some = members[:: max(1, -(-len(members) // SAMPLED_SOURCES))]
+        values = np.concatenate([_valid_values(sources[index]) for index in some])
+        if values.size == 0:
+            raise ImageryError("orthophotos have no valid pixel (all nodata)")
+        low, high = (float(value) for value in np.percentile(values, [0.5, 99.5]))
         for index in members:
-            found[index] = stretch
-    deep = sum(len(members) for members in alike.values())
-    if len(alike) > 1 or 0 < deep < len(sources):
-        log.warning(
-            "orthophotos have several pixel types; each kind is stretched to 8 bits separately"
-        )
+            found[index] = ContrastStretch(low, high if high > low else low + 1.0)
     return tuple(found)
-
-
-def _common(sources: list[Source]) -> ContrastStretch:
-    values = []
-    broken: ImageryError | None = None
-    for source in sources[:: max(1, -(-len(sources) // SAMPLED_SOURCES))]:
-        try:
-            values.append(_valid_values(source))
-        except RasterioError as error:  # it may not be needed; reported where it is
-            broken = broken or unreadable(source.path, error)
-    if broken is not None and not values:
-        raise broken
-    every = np.concatenate(values)
-    if every.size == 0:
-        raise ImageryError("orthophotos have no valid pixel (all nodata)")
-    low, high = (float(value) for value in np.percentile(every, [0.5, 99.5]))
-    return ContrastStretch(low, high if high > low else low + 1.0)
 
 
 def _valid_values(source: Source) -> NDArray[Any]:
     (lattice,) = lattices_of([source])
-    with quiet(), lattice.open(np.ones(1, np.bool_)) as data:
-        shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
-        pixels = data.read(lattice.bands, out_shape=(source.colours, *shape))
-        valid = data.dataset_mask(out_shape=shape) > 0
+    try:
+        with quiet(), lattice.open(np.ones(1, np.bool_)) as data:
+            shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
+            pixels = data.read(out_shape=(data.count, *shape))
+            valid = data.dataset_mask(out_shape=shape) > 0
+    except RasterioError as error:
+        raise unreadable(source.path, error) from error
     sampled = pixels[:, valid].ravel()
     return np.asarray(sampled[np.isfinite(sampled)])
 

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import ImageryError
+from orthonav.core.errors import ImageryError, MissingFileError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import require_file
 from orthonav.core.geo.frames import LocalFrame
@@ -35,10 +35,7 @@ except ImportError as error:
 
 OUTLINE_POINTS = 21
 """Per side, as rasterio's `transform_bounds` uses."""
-ALPHA_SAMPLE_PX = 512
-ALPHA_WINDOWS = 8
-ALPHA_CHECKS = 16
-"""Files of one kind that are checked; their producer writes all alike."""
+ALPHA_SAMPLE_PX = 64
 MAX_PARTLY_CLEAR = 0.05
 """Largest fraction of partly transparent pixels of a mask: its resampled edges."""
 HEIGHT_TYPES = ("float32", "float64", "int16", "int32")
@@ -53,6 +50,14 @@ TERMS = {
 }
 """Tags of a file that are copied into the map, by their key there."""
 MAX_TERM = 300
+RASTERS = {".tif", ".tiff", ".jp2", ".j2k", ".vrt", ".mbtiles", ".gpkg", ".img"}
+RASTERS |= {".png", ".jpg", ".jpeg", ".webp"}
+_SMALL_PICTURE = re.compile(
+    r"(?:^|[-_. ])(?:thumb(?:nail)?|quicklook|preview|browse|overview|assemblage|mask|msk|alpha)s?"
+    r"(?:[-_. ]|$)",
+    re.IGNORECASE,
+)
+NAMED = 5
 log = logging.getLogger(__name__)
 
 
@@ -72,28 +77,20 @@ class Source:
     is_named: bool
     """The system was taken from names because the file has none."""
     transform: Affine
-    """From column, row to coordinates, of the raster or of a sidecar."""
+    """From column, row to coordinates."""
     gsd_m: float
     """At the centre."""
     outline_latlon_deg: NDArray[np.float64]
     """The border (N, 2)."""
     date: str | None
     """Of acquisition, YYYY[-MM[-DD]]."""
-    has_palette: bool = False
-    marked_alpha: bool = False
     masks: tuple[str, ...] = ()
     """Bands that tell where it is valid, as GDAL's VRT names them; empty where it is everywhere."""
-    other_masks: tuple[str, ...] = ()
-    """The same where the alpha band is an image, such as near infrared."""
     folder: Path | None = None
     """Given by the user."""
     stamp: tuple[tuple[str, int, int], ...] = ()
     """Path, size and modification time in ns of its files."""
     terms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-
-    @property
-    def colours(self) -> int:
-        return 3 if self.has_palette else len(self.bands)
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -110,6 +107,40 @@ class Source:
 
 class UnfitError(ImageryError):
     """A raster that is not an orthophoto: a small image, heights, or not georeferenced."""
+
+
+def sources_in(folder: Path) -> list[Source]:
+    """The orthophotos of a folder, newest first, then the finest; other files are logged."""
+    if not folder.is_dir():
+        raise MissingFileError(f"folder of orthophotos does not exist: {folder}")
+    paths = (path for path in folder.rglob("*") if path.is_file() and path.name[0] != ".")
+    by_kind: dict[str, list[Path]] = {}
+    for path in sorted(paths):
+        kind = path.suffix.lower() or path.name
+        if kind in RASTERS and _SMALL_PICTURE.search(path.stem):
+            kind = "thumbnails, overviews or masks, by their names"
+        by_kind.setdefault(kind, []).append(path)
+    if not RASTERS.isdisjoint(by_kind.keys() - {".vrt"}):
+        skipped_vrts = by_kind.pop(".vrt", [])  # of the files that are there
+        by_kind |= {"virtual rasters (.vrt)": skipped_vrts} if skipped_vrts else {}
+    files = sorted(path for kind in RASTERS for path in by_kind.pop(kind, ()))
+    sources, unfit = open_sources(files, folder)
+    for reason in unfit[:NAMED]:
+        log.warning("skipped: %s", reason)
+    skipped = [f"{len(others)} {kind}" for kind, others in by_kind.items()]
+    skipped += [f"{len(unfit)} rasters that are not orthophotos"] if unfit else []
+    seen = ", ".join(skipped) or "nothing"
+    if not sources:
+        raise ImageryError(
+            f"folder holds no usable orthophotos (unpack archives first); seen: {seen}: {folder}"
+        )
+    log.info("%d orthophotos; skipped %s: %s", len(sources), seen, folder)
+    return sorted(sources, key=_preference)
+
+
+def _preference(source: Source) -> tuple[object, ...]:
+    date = tuple(-int(part) for part in (source.date or "0").split("-"))
+    return date, round(source.gsd_m, 3), source.crs, source.dtype, source.bands, str(source.path)
 
 
 def open_sources(
@@ -133,7 +164,6 @@ def open_sources(
                     unfit.append(str(error))
         finally:
             pool.shutdown(cancel_futures=True)
-        sources = _without_false_alpha(sources)
     named = Counter(source.crs for source in sources if source.is_named)
     for system, count in named.items():
         log.warning("files have no coordinate system; taken from their names: %d %s", count, system)
@@ -160,10 +190,10 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
     names = _names_of(path, folder)
     if reason := unwarped(path, dataset):
         raise UnfitError(f"orthophoto {reason}: {path}")
-    if folder is not None and dataset.crs is None and _transform(path, dataset).is_identity:
+    if folder is not None and dataset.crs is None and dataset.transform.is_identity:
         raise UnfitError(f"raster has no georeference: {path}")
     system = _system(path, dataset, names)
-    transform = _transform(path, dataset)
+    transform = dataset.transform
     if transform.is_identity or transform.determinant == 0:
         raise ImageryError(f"orthophoto has no georeference (geotransform or world file): {path}")
     if dataset.count < 1 or dataset.dtypes[0].startswith(("complex", "c")):
@@ -178,8 +208,12 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
             f"raster of one band of {dataset.dtypes[0]} may hold heights; an orthophoto has bands "
             f"of 8 or 16 bits without a sign: {path}"
         )
+    if dataset.colorinterp[0] == ColorInterp.palette:
+        raise ImageryError(
+            "orthophoto has a palette; write its colours first: gdal_translate -expand rgb "
+            f"'{path.name}' rgb.tif: {path}"
+        )
     outline, gsd_m = _outline(path, dataset, system, transform)
-    masks, other_masks = _masks(dataset, bands)
     return Source(
         path=path,
         name=str(dataset.name),
@@ -194,10 +228,7 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
         gsd_m=gsd_m,
         outline_latlon_deg=outline,
         date=date_of(dataset.tags(), names),
-        has_palette=dataset.colorinterp[0] == ColorInterp.palette,
-        marked_alpha=ColorInterp.alpha in dataset.colorinterp and dataset.count > 1,
-        masks=masks,
-        other_masks=other_masks,
+        masks=_masks(path, dataset, bands),
         folder=folder,
         stamp=_stamp(path, dataset),
         terms=_terms(dataset.tags()),
@@ -207,7 +238,7 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
 def unwarped(path: Path, dataset: Any) -> str | None:
     """What georeferences a raster, if not by a geotransform, and how to warp it; else None."""
     points = len(dataset.gcps[0])
-    if not _transform(path, dataset).is_identity or not (points or dataset.rpcs):
+    if not dataset.transform.is_identity or not (points or dataset.rpcs):
         return None
     found, option = ("rational polynomials", "-rpc")
     if points:
@@ -251,14 +282,6 @@ def _system(path: Path, dataset: Any, names: Sequence[str]) -> Any:
     return dataset.crs
 
 
-def _transform(path: Path, dataset: Any) -> Affine:
-    transform = dataset.transform
-    if transform.is_identity:
-        sidecar = tab_transform(path)
-        transform = transform if sidecar is None else Affine(*sidecar)
-    return transform
-
-
 def _stamp(path: Path, dataset: Any) -> tuple[tuple[str, int, int], ...]:
     """Of the file, and of those that a VRT refers to."""
     files = [path, *(dataset.files if dataset.driver == "VRT" else ())]
@@ -278,65 +301,43 @@ def _bands(dataset: Any) -> tuple[int, ...]:
     return tuple(colours[:3]) if len(colours) >= 3 else tuple(colours[:1])
 
 
-def _masks(dataset: Any, bands: tuple[int, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """`Source.masks` and `Source.other_masks`."""
+def _masks(path: Path, dataset: Any, bands: tuple[int, ...]) -> tuple[str, ...]:
+    """`Source.masks`; an alpha band that is an image, such as near infrared, is none."""
     flags = dataset.mask_flag_enums[bands[0] - 1]
-    if MaskFlags.per_dataset in flags:
-        masks = (f"mask,{bands[0]}",)
-        return masks, () if MaskFlags.alpha in flags else masks
-    others = () if MaskFlags.all_valid in flags else tuple(f"mask,{band}" for band in bands)
-    if dataset.count == 4 and ColorInterp.alpha in dataset.colorinterp:  # beside a nodata value
-        return (str(dataset.colorinterp.index(ColorInterp.alpha) + 1),), others
-    return others, others
+    has_alpha = ColorInterp.alpha in dataset.colorinterp and dataset.count > 1
+    is_image = has_alpha and not _is_mask(path, dataset)
+    if MaskFlags.per_dataset in flags and not (is_image and MaskFlags.alpha in flags):
+        return (f"mask,{bands[0]}",)
+    if has_alpha and not is_image and dataset.count == 4:  # beside a nodata value
+        return (str(dataset.colorinterp.index(ColorInterp.alpha) + 1),)
+    if MaskFlags.all_valid in flags or MaskFlags.alpha in flags:
+        return ()
+    return tuple(f"mask,{band}" for band in bands)
 
 
-def _without_false_alpha(sources: list[Source]) -> list[Source]:
-    """Without `masks` where these are an alpha band that is an image."""
-    verdicts: dict[Any, list[bool]] = {}
-    checked = []
-    for source in sources:
-        if source.marked_alpha:
-            alike = (source.folder, source.path.parent, source.bands, source.dtype, source.crs)
-            found = verdicts.setdefault(alike, [])
-            if len(found) < ALPHA_CHECKS:
-                found.append(_has_false_alpha(source))
-            if found[-1] if len(found) < ALPHA_CHECKS else any(found):
-                source = replace(source, masks=source.other_masks)
-        checked.append(source)
-    return checked
+def _is_mask(path: Path, dataset: Any) -> bool:
+    """GDAL marks the fourth of four bands by default; a mask has few values between its ends.
 
-
-def _has_false_alpha(source: Source) -> bool:
-    """GDAL marks the fourth of four bands by default; a mask has few values between its ends."""
-    try:
-        with rasterio.open(source.name) as dataset:
-            values = _sample(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1)
-    except RasterioError as error:
-        raise unreadable(source.path, error) from error
+    Windows all over the file are read: decimated reads may decode the whole file.
+    """
+    side, band = ALPHA_SAMPLE_PX, dataset.colorinterp.index(ColorInterp.alpha) + 1
+    cols = np.linspace(0, max(0, dataset.width - side), 4).astype(int).tolist()
+    rows = np.linspace(0, max(0, dataset.height - side), 4).astype(int).tolist()
+    windows = [
+        Window(col, row, min(side, dataset.width), min(side, dataset.height))
+        for row in rows
+        for col in cols
+    ]
+    values = np.concatenate([dataset.read(band, window=each).ravel() for each in windows])
     partly = float(((values != 0) & (values != values.max())).mean())
     if partly <= MAX_PARTLY_CLEAR:
-        return False
+        return True
     log.info(
         "alpha band is not a mask (%.0f %% of it is neither transparent nor opaque); ignored: %s",
         100 * partly,
-        source.path,
+        path,
     )
-    return True
-
-
-def _sample(dataset: Any, band: int) -> NDArray[Any]:
-    """Values (N,) of a small band, else of windows: decimated reads may decode the whole file."""
-    if max(dataset.width, dataset.height) <= ALPHA_SAMPLE_PX:
-        return np.asarray(dataset.read(band)).ravel()
-    side = ALPHA_SAMPLE_PX // ALPHA_WINDOWS
-    cols = np.linspace(0, max(0, dataset.width - side), ALPHA_WINDOWS).astype(int)
-    rows = np.linspace(0, max(0, dataset.height - side), ALPHA_WINDOWS).astype(int)
-    windows = [
-        Window(col, row, min(side, dataset.width), min(side, dataset.height))
-        for row in rows.tolist()
-        for col in cols.tolist()
-    ]
-    return np.concatenate([dataset.read(band, window=window).ravel() for window in windows])
+    return False
 
 
 def _outline(
@@ -419,11 +420,6 @@ _IGN_SYSTEM = re.compile(rf"(?<![A-Za-z0-9])({'|'.join(_IGN_SYSTEMS)})(?![A-Za-z
 _IGN_TILE = re.compile(r"^[0-9][0-9AB]{1,2}-((?:19|20)\d\d)-\d{4}-\d{4}-")
 """Of BD ORTHO: department, year, kilometres east and north, and more."""
 _IGN_PACKAGE = re.compile(r"_D\d?\d[0-9AB](?:_|-)((?:19|20)\d\d)(?![0-9])")
-_TAB_POINT = re.compile(
-    r"\(\s*([-+.\deE]+)\s*,\s*([-+.\deE]+)\s*\)\s*\(\s*([-+.\deE]+)\s*,\s*([-+.\deE]+)\s*\)"
-)
-_MAX_TAB_BYTES = 100_000
-MAX_TAB_OFF_PX = 0.2
 
 
 def date_of(tags: dict[str, str], names: Iterable[str]) -> str | None:
@@ -440,27 +436,3 @@ def date_of(tags: dict[str, str], names: Iterable[str]) -> str | None:
 def system_of(names: Iterable[str]) -> str | None:
     found = next(filter(None, map(_IGN_SYSTEM.search, names)), None)
     return None if found is None else _IGN_SYSTEMS[found.group(1)]
-
-
-def tab_transform(path: Path) -> tuple[float, ...] | None:
-    """Geotransform a..f of MapInfo's sidecar, which GDAL reads for TIFF, but not for JPEG 2000."""
-    for sidecar in (path.with_suffix(".tab"), path.with_suffix(".TAB")):
-        if sidecar.is_file() and sidecar.stat().st_size <= _MAX_TAB_BYTES:
-            return _affine(_TAB_POINT.findall(sidecar.read_text("latin-1")))
-    return None
-
-
-def _affine(points: list[tuple[str, str, str, str]]) -> tuple[float, ...] | None:
-    """Least squares of control points x, y, column, row; None where they are not affine."""
-    try:
-        x, y, col, row = np.array(points, dtype=np.float64).reshape(-1, 4).T
-    except ValueError:
-        return None
-    base = np.stack([col, row, np.ones_like(col)], axis=1)
-    if len(points) < 3 or np.linalg.matrix_rank(base) < 3:
-        return None
-    solved = np.linalg.lstsq(base, np.stack([x, y], axis=1), rcond=None)[0]
-    off = np.abs(base @ solved - np.stack([x, y], axis=1)).max()
-    if off > MAX_TAB_OFF_PX * np.hypot(*solved[0]):
-        return None
-    return tuple(solved.T.ravel().tolist())
