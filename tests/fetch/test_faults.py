@@ -97,7 +97,7 @@ def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name)
 def test_a_temporary_fault_is_overcome(take, name):
     with servers.serving(tiles_but(FAULTS[name], lasting=False)) as server:
         result, path = take(source(server))
-    assert not result.cells.failed and terrain.offset_px(path)[1] <= 1
+    assert not result.failed and terrain.offset_px(path)[1] <= 1
     assert terrain.offset_px(path)[2] == 1.0
 
 
@@ -107,7 +107,7 @@ def test_allowed_holes_are_masked(take, name, caplog):
         result, path = take(source(server), allow_holes=True)
         area = Area.from_bounds((10.0, 85.04, 10.02, 85.06))
         take(source(server), area=area, gsd_m=5.0, allow_holes=True, out="north.tif")
-    failed = result.cells.failed.total()
+    failed = result.failed.total()
     assert failed > 0 and f"{failed} failed" in caplog.text
     assert "outside what the service covers" in caplog.text
     shift, worst, valid = terrain.offset_px(path)

@@ -35,7 +35,7 @@ def test_wmts_by_parameters_and_by_templates(mapproxy, take, way):
     result, path = take(f"wmts:{mapproxy}{way}", layer="tiles")
     worst, valid = placed(path, "EPSG:3857")
     assert worst <= 1 and valid == 1.0
-    assert result.cells.images == result.estimate.tiles and not result.cells.failed
+    assert result.images == result.estimate.tiles and not result.failed
     assert result.estimate.gsd_m == pytest.approx(0.822, abs=0.01)  # zoom 17 at 46.5 N
 
 

@@ -243,7 +243,7 @@ def _summary(out: Path, result: "FetchResult") -> str:
         "file": out,
         "size": f"{estimate.width_px} x {estimate.height_px} px of {estimate.gsd_m:.4g} m",
         "tiles": estimate.tiles,
-        "missing": result.cells.holes() or "none",
+        "missing": result.holes() or "none",
         "layer": terms.layer,
         "date": terms.date or "unknown",
         "licence": terms.licence or "unknown: ask the service before you pass imagery on",
