@@ -193,8 +193,7 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
     if folder is not None and dataset.crs is None and dataset.transform.is_identity:
         raise UnfitError(f"raster has no georeference: {path}")
     system = _system(path, dataset, names)
-    transform = dataset.transform
-    if transform.is_identity or transform.determinant == 0:
+    if dataset.transform.is_identity or dataset.transform.determinant == 0:
         raise ImageryError(f"orthophoto has no georeference (geotransform or world file): {path}")
     if dataset.count < 1 or dataset.dtypes[0].startswith(("complex", "c")):
         raise ImageryError(f"orthophoto has no band of real numbers: {path}")
@@ -213,7 +212,7 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
             "orthophoto has a palette; write its colours first: gdal_translate -expand rgb "
             f"'{path.name}' rgb.tif: {path}"
         )
-    outline, gsd_m = _outline(path, dataset, system, transform)
+    outline = _outline(path, dataset, system)
     return Source(
         path=path,
         name=str(dataset.name),
@@ -224,8 +223,8 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
         crs=system.to_string(),
         system=system,
         is_named=dataset.crs is None or not (dataset.crs.is_projected or dataset.crs.is_geographic),
-        transform=transform,
-        gsd_m=gsd_m,
+        transform=dataset.transform,
+        gsd_m=ground_m(dataset, system),
         outline_latlon_deg=outline,
         date=date_of(dataset.tags(), names),
         masks=_masks(path, dataset, bands),
@@ -340,19 +339,13 @@ def _is_mask(path: Path, dataset: Any) -> bool:
     return False
 
 
-def _outline(
-    path: Path, dataset: Any, system: Any, transform: Affine
-) -> tuple[NDArray[np.float64], float]:
-    """The border (N, 2), degrees, and the ground resolution: root of the central pixel's area."""
+def _outline(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
+    """The border (N, 2), degrees."""
     share = np.linspace(0, 1, OUTLINE_POINTS)
     zero, one = np.zeros(OUTLINE_POINTS), np.ones(OUTLINE_POINTS)
-    middle_col, middle_row = dataset.width / 2, dataset.height / 2
     cols = np.concatenate([share, share, zero, one]) * dataset.width
     rows = np.concatenate([zero, one, share, share]) * dataset.height
-    x, y = transform * (
-        np.append(cols, middle_col + np.array([0, 1, 0])),
-        np.append(rows, middle_row + np.array([0, 0, 1])),
-    )
+    x, y = dataset.transform * (cols, rows)
     try:
         lon, lat = transform_coordinates(system, "EPSG:4326", x, y)[:2]
     except CPLE_BaseError as error:  # a local or engineering system
@@ -372,10 +365,17 @@ def _outline(
             "orthophoto in degrees lies beyond longitude 180, where GDAL reads one side only; "
             f"reproject it to metres, such as UTM (gdalwarp -t_srs EPSG:32760): {path}"
         )
-    frame = LocalFrame(float(latlon[-3, 0]), float(latlon[-3, 1]))
-    corner = frame.en_from_latlon(latlon[-3:, 0], latlon[-3:, 1])
+    return latlon
+
+
+def ground_m(dataset: Any, system: Any) -> float:
+    """The ground resolution, m: root of the area of the central pixel."""
+    col = dataset.width / 2 + np.array([0, 1, 0])
+    row = dataset.height / 2 + np.array([0, 0, 1])
+    lon, lat = transform_coordinates(system, "EPSG:4326", *(dataset.transform * (col, row)))[:2]
+    corner = LocalFrame(lat[0], lon[0]).en_from_latlon(np.array(lat), np.array(lon))
     right, down = corner[1] - corner[0], corner[2] - corner[0]
-    return latlon[:-3], float(np.sqrt(abs(right[0] * down[1] - right[1] * down[0])))
+    return float(np.sqrt(abs(right[0] * down[1] - right[1] * down[0])))
 
 
 @contextmanager
