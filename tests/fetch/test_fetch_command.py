@@ -45,7 +45,7 @@ def test_an_orthophoto_with_its_terms(command, area, tmp_path):
     assert tags["ORTHONAV_LICENCE"] == "CC BY 4.0" and tags["ACQUISITION_DATE"] == "2021-06"
     assert tags["ORTHONAV_SOURCE"].startswith(server.url) and "ORTHONAV_FETCHED" in tags
     assert "TIFFTAG_DATETIME" not in tags  # the day is not known
-    found = open_sources([out])[0][0]
+    found = open_sources([out])[0]
     assert found.date == "2021-06" and found.bands == (1, 2, 3) and found.gsd_m < 0.5
     with rasterio.open(out) as data:
         assert data.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"

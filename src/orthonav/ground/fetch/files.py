@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import rasterio
@@ -50,7 +50,6 @@ MAX_ITEMS = 500  # files of one fetch: an open dataset each, per thread
 PAGE = 100  # items per page; APIs allow at least this many
 MAX_PAGES = 200
 _TIFF = re.compile(r"image/(tiff|vnd\.stac\.geotiff)|\.tiff?$", re.IGNORECASE)
-_PREFERRED = ("visual", "image", "ortho", "data", "rgb")
 CELL_PX = 512  # GDAL's block size for COG, so a cell is usually one block
 MAX_BLOCK_BYTES = 64 * 2**20
 """Largest block, unpacked: one of a tiled file has at most a few megabytes."""
@@ -201,14 +200,6 @@ def _read(
             return pixels, (placed.read_masks(list(bands)) > 0).any(axis=0)
 
 
-class CatalogItem(NamedTuple):
-    """One file of a catalogue: its time (ISO 8601), name and address."""
-
-    time: str
-    name: str
-    url: str
-
-
 def stac_source(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     """The files that a STAC API finds in the area and time requested, newest on top.
 
@@ -216,7 +207,7 @@ def stac_source(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     are none.
     """
     options = spec.options
-    items: list[CatalogItem] = []
+    items: list[tuple[str, str, str]] = []  # time, name, address
     for feature, where in _found(web, spec, area):
         items.append(_item(feature, where, options))
         if len(items) > MAX_ITEMS:
@@ -225,14 +216,14 @@ def stac_source(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     if not items:
         when = f" at {options.time}" if options.time else ""
         raise FetchError(f"catalogue has no imagery of the area{when}: {spec.url}")
-    newest: dict[str, CatalogItem] = {}
-    for item in sorted(items, reverse=True):
-        newest.setdefault(re.sub(r"(?<!\d)(19|20)\d\d(?!\d)", "", item.name), item)
-    days = sorted({item.time[:10] for item in newest.values() if item.time})
+    newest: dict[str, tuple[str, str]] = {}
+    for time, name, url in sorted(items, reverse=True):
+        newest.setdefault(re.sub(r"(?<!\d)(19|20)\d\d(?!\d)", "", name), (time, url))
+    days = sorted({time[:10] for time, _ in newest.values() if time})
     if days:
         date = "/".join(dict.fromkeys([days[0], days[-1]]))
         spec = replace(spec, provenance=replace(spec.provenance, date=date))
-    urls = [item.url for item in newest.values()]
+    urls = [url for _, url in newest.values()]
     return cog_source(web, spec, area, _signed(web, spec.token_url, urls))
 
 
@@ -290,7 +281,8 @@ def _link(document: dict[str, Any], kind: str) -> dict[str, Any] | None:
     return None
 
 
-def _item(feature: dict[str, Any], where: str, options: ImageryOptions) -> CatalogItem:
+def _item(feature: dict[str, Any], where: str, options: ImageryOptions) -> tuple[str, str, str]:
+    """Time (ISO 8601), name and address of the file of an item."""
     name, assets = str(feature.get("id", ""))[:200], feature.get("assets")
     plain = assets if isinstance(assets, dict) else {}
     known = {key: asset for key, asset in plain.items() if isinstance(asset, dict)}
@@ -298,11 +290,11 @@ def _item(feature: dict[str, Any], where: str, options: ImageryOptions) -> Catal
     properties = feature.get("properties")
     times = properties if isinstance(properties, dict) else {}
     time = str(times.get("datetime") or times.get("start_datetime") or "")
-    return CatalogItem(time, name, linked(where, str(asset.get("href", ""))))
+    return time, name, linked(where, str(asset.get("href", "")))
 
 
 def _asset(assets: dict[str, dict[str, Any]], options: ImageryOptions, name: str) -> str:
-    """The asset requested, else a GeoTIFF by name, or the coarsest that is fine enough."""
+    """The asset requested, else the only GeoTIFF, or the coarsest that is fine enough."""
     if options.asset is not None:
         return choose(list(assets), options.asset, f"item {name} has no asset")
     tiffs = {
@@ -316,7 +308,6 @@ def _asset(assets: dict[str, dict[str, Any]], options: ImageryOptions, name: str
     fitting = [
         key for key, gsd_m in tiffs.items() if 0 < gsd_m <= options.wanted_gsd_m * GSD_TOLERANCE
     ]
-    preferred = [key for key in _PREFERRED if key in tiffs] or (list(tiffs) * (len(tiffs) == 1))
-    if not preferred and not fitting:
+    if len(tiffs) > 1 and not fitting:
         raise FetchError(f"choose one with --asset; item {name} has {listed(list(tiffs))}")
-    return preferred[0] if preferred else max(fitting, key=lambda key: tiffs[key])
+    return max(fitting or tiffs, key=lambda key: tiffs[key])

@@ -154,8 +154,6 @@ def fetch(
                 "(--gsd-m), a part of the area, or raise the limit"
             )
         started(estimate)
-        if selection.is_cut:
-            log.warning("part of the area lies outside what the service covers")
         try:
             cache.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix="mosaic-", dir=cache) as folder:

@@ -99,7 +99,7 @@ def service_source(
 
     def reader(web: Web, selection: Selection, cache: Path) -> CellReader:
         (row0, col0), (rows_px, cols_px) = selection.first, selection.shape_px
-        west, north = grid.corner(row0, col0)
+        west, north = grid.transform(row0, col0) * (0, 0)
         tile_row = rows_px // height - 2**level + row0 if from_south else row0
         # Blocks without content are filled with it, and `_heights` refuses it.
         no_data = {f'DataValues NoData="{NO_HEIGHT_M}"': None} if heights else {}

@@ -299,7 +299,8 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     if options.style is not None:
         choose(styles, options.style, f"layer {name} has no style")
     names = _crs_names([crs for each in chain for crs in texts(each, "CRS") + texts(each, "SRS")])
-    crs = _crs(names, options.crs, frame, name)
+    wanted_crs = options.crs or ("EPSG:3857" if "EPSG:3857" in names else None)
+    crs = choose(list(names), wanted_crs, f"layer {name} does not come in")
     format_ = choose_format(texts(get_map, "Format"), options, "service")
     limits = [
         int(side) or CELL_PX
@@ -310,12 +311,7 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     gsd_m = options.wanted_gsd_m
     if format_ == HEIGHTS_FORMAT and options.gsd_m is None:
         gsd_m = TERRAIN_GSD_M
-    # Where the projection is true to scale within 1 %, so that a round number stays one.
-    scales = (
-        1.0 if math.isclose(scale, 1.0, rel_tol=0.01) else scale
-        for scale in ground_scale(crs, frame)
-    )
-    res_x, res_y = (gsd_m / scale for scale in scales)
+    res_x, res_y = (gsd_m / scale for scale in ground_scale(crs, frame))
     map_url = linked(url, address.get("href", ""))
     if options.time is not None:
         map_url = with_query(map_url, {"TIME": choose_time(_times(chain), options.time, name)})
@@ -362,12 +358,3 @@ def _crs_names(options: list[str]) -> dict[str, str]:
             continue
         crs[epsg] = option if option == epsg else crs.get(epsg, option)
     return crs
-
-
-def _crs(names: dict[str, str], wanted: str | None, frame: LocalFrame, layer: str) -> str:
-    """The coordinate system requested, else UTM, else Web Mercator, else the first."""
-    zone = int((frame.lon_deg + 180) % 360 // 6) + 1
-    utm = [f"EPSG:258{zone:02d}", f"EPSG:{326 if frame.lat_deg >= 0 else 327}{zone:02d}"]
-    preferred = (name for name in [*utm, "EPSG:3857", *names] if name in names)
-    wanted = wanted or next(preferred, "a known system")
-    return choose(list(names), wanted, f"layer {layer} does not come in")

@@ -156,7 +156,7 @@ class Lattice:
             dtype = _gdal_type(source.dtype)
             yield (
                 source,
-                f'<SourceFilename relativeToVRT="0">{escape(source.name)}</SourceFilename>'
+                f'<SourceFilename relativeToVRT="0">{escape(str(source.path))}</SourceFilename>'
                 f'<SourceProperties RasterXSize="{source.width_px}" '
                 f'RasterYSize="{source.height_px}" DataType="{dtype}" BlockXSize="256" '
                 f'BlockYSize="256"/><SrcRect xOff="0" yOff="0" {size}/>'
@@ -285,17 +285,11 @@ class Mosaic:
         sources: list[Source] = []
         for are_folders, group in groupby(map(Path, paths), Path.is_dir):
             some = list(group)
-            found = map(sources_in, some) if are_folders else [open_sources(some)[0]]
-            sources += chain.from_iterable(found)
+            sources += chain(*map(sources_in, some)) if are_folders else open_sources(some)
         if epoch is not None:
             sources = at_epoch(sources, epoch)
         with rasterio.Env(**GDAL_OPTIONS):
             return cls(tuple(sources), sample_stretches(sources))
-
-    @property
-    def stretch(self) -> ContrastStretch | None:
-        """Of the first source with more than 8 bits."""
-        return next((each for each in self.stretches if each is not None), None)
 
     @property
     def gsd_m(self) -> float:
@@ -356,7 +350,7 @@ def _described(sources: Sequence[Source]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """`rgb` (H, W, 3) uint8 and `valid` (H, W) bool."""
+    """`rgb` (H, W, 3) uint8, or (H, W, 1) of `read_grey`, and `valid` (H, W) bool."""
 
     rgb: NDArray[np.uint8]
     valid: NDArray[np.bool_]
@@ -364,15 +358,9 @@ class Pixels:
     @cached_property
     def grey(self) -> NDArray[np.uint8]:
         """ITU-R BT.601 weights; 0 where not valid."""
+        if self.rgb.shape[2] == 1:
+            return self.rgb[..., 0]
         return np.asarray(cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class GreyPixels:
-    """`grey` (H, W) uint8, 0 where not valid, and `valid` (H, W) bool."""
-
-    grey: NDArray[np.uint8]
-    valid: NDArray[np.bool_]
 
 
 class SheetRaster:
@@ -412,13 +400,11 @@ class SheetRaster:
 
     def read(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
         """Pixels of a window; outside all imagery they are 0 and invalid."""
-        values, valid = self._composed(Window(col, row, width_px, height_px), 3)
-        return Pixels(values, valid)
+        return Pixels(*self._composed(Window(col, row, width_px, height_px), 3))
 
-    def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> GreyPixels:
+    def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
         """Converted before resampling: within one level of `read`, and faster."""
-        values, valid = self._composed(Window(col, row, width_px, height_px), 1)
-        return GreyPixels(values[..., 0], valid)
+        return Pixels(*self._composed(Window(col, row, width_px, height_px), 1))
 
     def stamps(self, col: int, row: int, width_px: int, height_px: int) -> list[Any]:
         """Files that a window depends on, in order of precedence, each with size and time."""

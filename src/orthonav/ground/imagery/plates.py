@@ -7,9 +7,7 @@ converts them to the ITRF of an epoch, with which WGS 84 agrees within some cent
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -43,8 +41,10 @@ def plate_shift_deg(
     frame = next((code for pattern, code in _FRAMES if re.search(pattern, name)), None)
     if frame is None:
         return None
-    lon, lat, *_ = _to_itrf(frame).transform(lon_deg, lat_deg, 0.0, year)
-    read_lon, read_lat = _as_read(frame).transform(lon_deg, lat_deg)
+    to_itrf = pyproj.Transformer.from_crs(pyproj.CRS(frame).to_3d(), _ITRF, always_xy=True)
+    as_read = pyproj.Transformer.from_crs(frame, "EPSG:4326", always_xy=True)
+    lon, lat, *_ = to_itrf.transform(lon_deg, lat_deg, 0.0, year)
+    read_lon, read_lat = as_read.transform(lon_deg, lat_deg)
     return float(lat - read_lat), float(lon - read_lon)
 
 
@@ -94,13 +94,3 @@ def _name(crs: str) -> str:
         return crs
     geodetic = system.geodetic_crs
     return system.name if geodetic is None else geodetic.name
-
-
-@cache
-def _to_itrf(frame: str) -> Any:
-    return pyproj.Transformer.from_crs(pyproj.CRS(frame).to_3d(), _ITRF, always_xy=True)
-
-
-@cache
-def _as_read(frame: str) -> Any:
-    return pyproj.Transformer.from_crs(frame, "EPSG:4326", always_xy=True)

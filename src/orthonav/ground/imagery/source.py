@@ -57,15 +57,12 @@ _SMALL_PICTURE = re.compile(
     r"(?:[-_. ]|$)",
     re.IGNORECASE,
 )
-NAMED = 5
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
     path: Path
-    name: str
-    """What GDAL opens: the path, or a table in the file."""
     bands: tuple[int, ...]
     """Bands that are used, from 1: one for grey, three for red, green, blue."""
     dtype: str
@@ -124,15 +121,12 @@ def sources_in(folder: Path) -> list[Source]:
         skipped_vrts = by_kind.pop(".vrt", [])  # of the files that are there
         by_kind |= {"virtual rasters (.vrt)": skipped_vrts} if skipped_vrts else {}
     files = sorted(path for kind in RASTERS for path in by_kind.pop(kind, ()))
-    sources, unfit = open_sources(files, folder)
-    for reason in unfit[:NAMED]:
-        log.warning("skipped: %s", reason)
-    skipped = [f"{len(others)} {kind}" for kind, others in by_kind.items()]
-    skipped += [f"{len(unfit)} rasters that are not orthophotos"] if unfit else []
-    seen = ", ".join(skipped) or "nothing"
+    sources = open_sources(files, folder)
+    seen = ", ".join(f"{len(others)} {kind}" for kind, others in by_kind.items()) or "nothing"
     if not sources:
         raise ImageryError(
-            f"folder holds no usable orthophotos (unpack archives first); seen: {seen}: {folder}"
+            f"folder holds no usable orthophotos (unpack archives first); beside {len(files)} "
+            f"other rasters it holds {seen}: {folder}"
         )
     log.info("%d orthophotos; skipped %s: %s", len(sources), seen, folder)
     return sorted(sources, key=_preference)
@@ -143,50 +137,43 @@ def _preference(source: Source) -> tuple[object, ...]:
     return date, round(source.gsd_m, 3), source.crs, source.dtype, source.bands, str(source.path)
 
 
-def open_sources(
-    paths: Sequence[Path], folder: Path | None = None
-) -> tuple[list[Source], list[str]]:
-    """Inspect orthophotos, several at a time; a file may hold several.
-
-    In a `folder` of the user, other rasters are left out, with a reason in the second list.
-    """
+def open_sources(paths: Sequence[Path], folder: Path | None = None) -> list[Source]:
+    """Inspect orthophotos, several at a time; in a `folder` of the user, skip other rasters."""
     sources: list[Source] = []
-    unfit: list[str] = []
+    skipped = 0
     with quiet(), ThreadPoolExecutor(OPENED_AT_ONCE) as pool:
         found = [pool.submit(_opened, Path(path), folder) for path in paths]
         try:
             for each in found:
                 try:
-                    sources += each.result()
+                    sources.append(each.result())
                 except UnfitError as error:
                     if folder is None:
                         raise
-                    unfit.append(str(error))
+                    skipped += 1
+                    log.info("skipped: %s", error)
         finally:
             pool.shutdown(cancel_futures=True)
+    if skipped:
+        log.warning("skipped %d rasters that are not orthophotos (-v names them)", skipped)
     named = Counter(source.crs for source in sources if source.is_named)
     for system, count in named.items():
         log.warning("files have no coordinate system; taken from their names: %d %s", count, system)
-    return sources, unfit
+    return sources
 
 
-def _opened(path: Path, folder: Path | None) -> list[Source]:
+def _opened(path: Path, folder: Path | None) -> Source:
     require_file(path, "orthophoto")
     try:
         with rasterio.open(path) as dataset:
-            tables = list(dataset.subdatasets) if dataset.count == 0 else []
-            if not tables:
-                return [_inspect(path, dataset, folder)]
-        found = []
-        for table in tables:
-            with rasterio.open(table) as dataset:
-                found.append(_inspect(path, dataset, folder))
-        return found
+            return _inspect(path, dataset, folder)
     except RasterioError as error:
         raise unreadable(path, error) from error
 
 
 def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
+    if dataset.count < 1 or dataset.dtypes[0].startswith(("complex", "c")):
+        raise ImageryError(f"orthophoto has no band of real numbers: {path}")
     names = _names_of(path, folder)
     if reason := unwarped(path, dataset):
         raise UnfitError(f"orthophoto {reason}: {path}")
@@ -195,8 +182,6 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
     system = _system(path, dataset, names)
     if dataset.transform.is_identity or dataset.transform.determinant == 0:
         raise ImageryError(f"orthophoto has no georeference (geotransform or world file): {path}")
-    if dataset.count < 1 or dataset.dtypes[0].startswith(("complex", "c")):
-        raise ImageryError(f"orthophoto has no band of real numbers: {path}")
     if dataset.width < MIN_SIDE_PX or dataset.height < MIN_SIDE_PX:
         raise UnfitError(
             f"orthophoto is only {dataset.width} x {dataset.height} px, too small to use: {path}"
@@ -215,7 +200,6 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
     outline = _outline(path, dataset, system)
     return Source(
         path=path,
-        name=str(dataset.name),
         bands=bands,
         dtype=str(dataset.dtypes[bands[0] - 1]),
         width_px=dataset.width,
