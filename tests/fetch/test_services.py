@@ -106,7 +106,6 @@ def test_a_band_around_a_route_leaves_the_rest_out(take):
     "options, words",
     [
         ({"layer": "orto"}, "no layer orto; available: ortho"),
-        ({"layer": None}, "choose one with --layer"),
         ({"style": "winter"}, "no style winter"),
         ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; available:"),
         ({"format": "image/webp"}, "no format image/webp; available: image/jpeg, image/png"),

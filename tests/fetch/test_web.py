@@ -55,12 +55,12 @@ def test_large_bodies_and_redirects_to_files_are_errors():
 
 def test_failed_connections_are_named():
     once = replace(QUICK, attempts=1)
-    with Web(once) as web, pytest.raises(FetchError, match="no connection; is this machine online"):
+    with Web(once) as web, pytest.raises(FetchError, match="ConnectionError"):
         web.get("http://127.0.0.1:1/x")
     with (
         servers.serving(lambda _: servers.Answer(b"")) as server,
         Web(once) as web,
-        pytest.raises(FetchError, match="no secure connection"),
+        pytest.raises(FetchError, match="SSLError"),
     ):
         web.get(server.url.replace("http://", "https://"))
 

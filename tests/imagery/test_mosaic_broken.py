@@ -59,22 +59,10 @@ def test_ground_control_points_only(ortho, assigned):
         ({"transform": Affine.identity()}, "no georeference"),
         ({"crs": 'LOCAL_CS["mine",UNIT["metre",1]]'}, "system cannot be converted to latitude"),
         ({"crs": "EPSG:4326"}, "border cannot be converted to latitude"),
-        *(
-            (
-                {"crs": "EPSG:4326", "transform": Affine(1e-4, 0, west_deg, 0, -1e-4, -17)},
-                "beyond longitude 180",
-            )
-            for west_deg in (179.999, -180.001, 200.0)
-        ),
     ],
 )
 def test_places_that_cannot_be_used(ortho, profile, message):
     refused(write(ortho, SCENE, **profile), message)
-
-
-@pytest.mark.parametrize("shape", [(15, 60), (60, 15), (1, 1)])
-def test_too_small(ortho, shape):
-    refused(write(ortho, np.ones((3, *shape), np.uint8)), f"only {shape[1]} x {shape[0]} px")
 
 
 @pytest.mark.parametrize("dtype, nodata", [("uint16", 0), ("float32", -1), ("float32", np.nan)])

@@ -1,11 +1,10 @@
 """Cloud-optimized GeoTIFFs, read by windows through GDAL's /vsicurl, and the search of a STAC API.
 
-Files on one pixel grid are read without resampling. A file off the grid of the first (another zone
-or phase) is resampled into it, and `Provenance.note` says so. Documents of STAC 0.9 and 1.0 are
-read as plain JSON; pystac-client was tried instead (docs/decisions/dependencies.md).
+Files keep their pixels on one grid; those off the grid of the first (another zone or phase) are
+resampled into it. Documents of STAC 0.9 and 1.0 are read as plain JSON; pystac-client was tried
+instead (docs/decisions/dependencies.md).
 """
 
-import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -53,8 +52,6 @@ _TIFF = re.compile(r"image/(tiff|vnd\.stac\.geotiff)|\.tiff?$", re.IGNORECASE)
 CELL_PX = 512  # GDAL's block size for COG, so a cell is usually one block
 MAX_BLOCK_BYTES = 64 * 2**20
 """Largest block, unpacked: one of a tiled file has at most a few megabytes."""
-ALIGNED_PX = 0.02
-"""Grids that differ by less count as one: a fiftieth of a pixel is below any error of imagery."""
 _PACKED_SHARE = 0.35  # size of a usual JPEG block relative to its pixels, for the estimate
 _DTYPES = ("uint8", "uint16", "int16", "float32")
 
@@ -71,17 +68,6 @@ class CogLevel:
     dtype: str
     count: int
 
-    def is_aligned(self, grid: CellGrid) -> bool:
-        """Whether its pixels are those of a grid."""
-        if self.crs != grid.crs or not (
-            math.isclose(self.transform.a, grid.res_x, rel_tol=1e-9)
-            and math.isclose(-self.transform.e, grid.res_y, rel_tol=1e-9)
-        ):
-            return False
-        col = (grid.west - self.transform.c) / grid.res_x
-        row = (self.transform.f - grid.north) / grid.res_y
-        return bool(max(abs(col - round(col)), abs(row - round(row))) <= ALIGNED_PX)
-
 
 def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellSource:
     """The files as one source, on the grid of the first at the level that fits the options.
@@ -89,7 +75,7 @@ def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellS
     Where they overlap, the first valid pixel counts. Raises `FetchError` where one cannot be read
     or they differ in pixel type or bands.
     """
-    options, provenance = spec.options, spec.provenance
+    options = spec.options
     files = [_inspect(web, url, options, area.frame) for url in urls]
     first = files[0]
     bands = options.bands or ((1,) if first.count < 3 else (1, 2, 3))
@@ -101,11 +87,6 @@ def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellS
             )
     origin, res_x, res_y = first.transform, first.transform.a, -first.transform.e
     grid = CellGrid(first.crs, origin.c, origin.f, res_x, res_y, CELL_PX, CELL_PX)
-    off_grid = sum(not file.is_aligned(grid) for file in files)
-    if off_grid:
-        note = f"{off_grid} of {len(files)} files resampled (bilinear)"
-        note = "; ".join(part for part in (provenance.note, note) if part)
-        provenance = replace(provenance, note=note)
     placed = [(file, transform_bounds(file.crs, grid.crs, *file.bounds)) for file in files]
 
     def reader(web: Web, _: Selection, __: Path) -> CellReader:
@@ -126,7 +107,7 @@ def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellS
         return read
 
     cell_bytes = CELL_PX**2 * np.dtype(first.dtype).itemsize * len(bands) * _PACKED_SHARE
-    return CellSource(provenance, grid, len(bands), first.dtype, cell_bytes, reader)
+    return CellSource(spec.provenance, grid, len(bands), first.dtype, cell_bytes, reader)
 
 
 @contextmanager
@@ -190,7 +171,7 @@ def _read(
             transform=grid.transform(*cell),
             width=grid.cell_w_px,
             height=grid.cell_h_px,
-            resampling=Resampling.nearest if file.is_aligned(grid) else Resampling.bilinear,
+            resampling=Resampling.bilinear,
             add_alpha=adds_alpha,
         ) as placed:
             pixels = placed.read(list(bands))

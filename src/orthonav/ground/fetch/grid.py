@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 from rasterio.transform import Affine, array_bounds
+from rasterio.warp import transform_bounds
 
 from orthonav.core.errors import AreaError, FetchError
 from orthonav.core.geo.frames import LocalFrame
@@ -21,8 +22,6 @@ MAX_CANDIDATES = 40_000_000
 """Cells of the box around an area that are examined: some hundred megabytes at one row a time."""
 log = logging.getLogger(__name__)
 _ROUND = 1.02  # allowance for the change of scale across an area
-_EDGE = np.linspace(0, 1, 21)
-"""Points along an edge that are projected, as rasterio's `transform_bounds` does."""
 
 
 @dataclass(frozen=True)
@@ -115,16 +114,13 @@ def select(grid: CellGrid, area: Area, margin_m: float) -> Selection:
 
 def _box(grid: CellGrid, area: Area, margin_m: float) -> tuple[int, int, int, int]:
     west, south, east, north = area.extent_en_m
-    u = (west - margin_m) + _EDGE * (east - west + 2 * margin_m)
-    v = (south - margin_m) + _EDGE * (north - south + 2 * margin_m)
-    points = np.stack([m.ravel() for m in np.meshgrid(u, v)], axis=1)
-    lat, lon = area.frame.latlon_from_en(points)
-    x, y = (np.asarray(values) for values in transformers(grid.crs)[0].transform(lon, lat))
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+    wide = west - margin_m, south - margin_m, east + margin_m, north + margin_m
+    box = transform_bounds(area.frame.proj4, grid.crs, *wide)
+    if not all(map(math.isfinite, box)):
         raise AreaError(f"area lies outside the coordinate system {grid.crs}")
     across, down = grid.cell_w_px * grid.res_x, grid.cell_h_px * grid.res_y
-    col0, col1 = (math.floor((edge - grid.west) / across) for edge in (x.min(), x.max()))
-    row0, row1 = (math.floor((grid.north - edge) / down) for edge in (y.max(), y.min()))
+    col0, col1 = (math.floor((edge - grid.west) / across) for edge in box[::2])
+    row0, row1 = (math.floor((grid.north - edge) / down) for edge in box[:0:-2])
     return row0, col0, row1, col1
 
 

@@ -48,7 +48,6 @@ class ImageryOptions:
     gsd_m: float | None = None  # metres on the ground per pixel
     time: str | None = None  # ISO 8601; for STAC an interval with a slash
     tile_px: int | None = None  # width of tiles (XYZ) or of the images requested (WMS)
-    min_zoom: int | None = None  # coarsest zoom level, where the service does not say
     max_zoom: int | None = None  # finest zoom level, where the service does not say
     empty: str | None = None  # colour of missing imagery: "black" or "white"
     collection: str | None = None  # of a STAC API
@@ -116,14 +115,11 @@ def choose(names: Sequence[str], wanted: str | None, what: str) -> str:
     raise FetchError(f"{what} {wanted}; available: {listed(names, wanted or '')}")
 
 
-def choose_layer(names: list[str], wanted: str | None, url: str, *, named: bool = False) -> str:
-    """The layer of that name; without a name, unless one is required (`named`), the only one.
-
-    Raises `FetchError` with the available ones.
-    """
+def choose_layer(names: list[str], wanted: str | None, url: str) -> str:
+    """The layer of that name; without a name the only one. Raises `FetchError` with the choices."""
     if not names:
         raise FetchError(f"document lists no layer: {url}")
-    if wanted is None and (named or len(names) > 1):
+    if wanted is None and len(names) > 1:
         raise FetchError(f"choose one with --layer; available: {listed(names, 'ortho')}")
     return choose(names, wanted, "no layer")
 

@@ -24,7 +24,7 @@ from rasterio.windows import Window
 
 from orthonav import __version__
 from orthonav.core.errors import FetchError, OutputError
-from orthonav.core.files import Progress, no_progress, not_written, replacing, with_paths
+from orthonav.core.files import Progress, no_progress, not_written, replacing
 from orthonav.ground.fetch.files import cog_source, stac_source
 from orthonav.ground.fetch.grid import Selection, select
 from orthonav.ground.fetch.presets import Provenance, SourceSpec
@@ -56,9 +56,6 @@ class FetchRequest:
     max_mb: float = 4000.0  # likewise, as estimated
     allow_holes: bool = False  # whether the file is written although tiles failed
     limits: RequestLimits = field(default_factory=RequestLimits)
-
-    def __post_init__(self) -> None:
-        with_paths(self, "out", "cache")
 
 
 @dataclass(frozen=True)

@@ -64,18 +64,17 @@ def xyz_tiles(spec: SourceSpec, area: Area) -> CellSource:
     tile_px = options.tile_px or (512 if "{r}" in template or "@2x" in template else 256)
     if not 64 <= tile_px <= 4096:
         raise FetchError(f"tiles must be 64 to 4096 px wide, got {tile_px}")
-    low, high = options.min_zoom or 0, min(MAX_ZOOM, options.max_zoom or MAX_ZOOM)
-    zooms = list(range(low, high + 1))
-    resolutions = [2 * MERCATOR_HALF_M / tile_px / 2.0**zoom for zoom in zooms]
+    high = min(MAX_ZOOM, options.max_zoom or MAX_ZOOM)
+    resolutions = [2 * MERCATOR_HALF_M / tile_px / 2.0**zoom for zoom in range(high + 1)]
     if options.zoom is None:
         scale = mean_scale("EPSG:3857", area.frame)
         gsds_m = [res * scale for res in resolutions]
-        zoom = zooms[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {low} to {high}")]
-    elif options.zoom.isdecimal() and low <= int(options.zoom) <= high:
+        zoom = finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom 0 to {high}")
+    elif options.zoom.isdecimal() and int(options.zoom) <= high:
         zoom = int(options.zoom)
     else:
-        raise FetchError(f"no zoom {options.zoom}; available: {low} to {high}")
-    half, last, res = MERCATOR_HALF_M, 2**zoom - 1, resolutions[zoom - low]
+        raise FetchError(f"no zoom {options.zoom}; available: 0 to {high}")
+    half, last, res = MERCATOR_HALF_M, 2**zoom - 1, resolutions[zoom]
     grid = CellGrid("EPSG:3857", -half, half, res, res, tile_px, tile_px, (0, 0, last, last))
     values = {
         "{z}": str(zoom),
@@ -189,18 +188,15 @@ def _grids(
     else:
         wanted = options.crs or ("EPSG:3857" if "EPSG:3857" in by_crs else None)
         set_name = by_crs[choose(list(by_crs), wanted, f"layer {name} does not come in")]
-    limits = {
-        zoom: each
-        for each in links[set_name].iterfind("TileMatrixSetLimits/TileMatrixLimits")
-        for zoom in texts(each, "TileMatrix")
-    }
+    limits = texts(links[set_name], "TileMatrixSetLimits/TileMatrixLimits/TileMatrix")
+    finest = math.inf if options.max_zoom is None else options.max_zoom
     crs_name = texts(known[set_name], "SupportedCRS")[0]
     grids = {}
     for element in known[set_name].iterfind("TileMatrix"):
         for zoom in _id(element):
-            if zoom in limits or (not limits and _is_within(zoom, options)):
+            if zoom in limits or (not limits and (_number(zoom) or 0) <= finest):
                 try:
-                    grids[zoom] = _grid(element, limits.get(zoom), crs_name)
+                    grids[zoom] = _grid(element, crs_name)
                 except (ValueError, IndexError, OverflowError):
                     problem = f"tile matrix {zoom} of {set_name} cannot be read"
                     raise FetchError(problem) from None
@@ -209,7 +205,7 @@ def _grids(
     return set_name, grids
 
 
-def _grid(matrix: Element, limits: Element | None, crs_name: str) -> CellGrid:
+def _grid(matrix: Element, crs_name: str) -> CellGrid:
     """The grid of a tile matrix. Raises `ValueError` and `IndexError` for a malformed one."""
     crs = epsg_name(crs_name)
     known = known_crs(crs)
@@ -230,15 +226,7 @@ def _grid(matrix: Element, limits: Element | None, crs_name: str) -> CellGrid:
         west, north, whole = -MERCATOR_HALF_M, MERCATOR_HALF_M, 2 * MERCATOR_HALF_M / width
         exact = whole / 2.0 ** round(math.log2(whole / res))
         res = exact if math.isclose(res, exact, rel_tol=1e-4) else res
-    last_row, last_col = (_whole(matrix, tag) - 1 for tag in ("MatrixHeight", "MatrixWidth"))
-    edges = 0, 0, last_row, last_col
-    if limits is not None:
-        edges = (
-            max(0, _whole(limits, "MinTileRow")),
-            max(0, _whole(limits, "MinTileCol")),
-            min(last_row, _whole(limits, "MaxTileRow")),
-            min(last_col, _whole(limits, "MaxTileCol")),
-        )
+    edges = 0, 0, _whole(matrix, "MatrixHeight") - 1, _whole(matrix, "MatrixWidth") - 1
     return CellGrid(crs, west, north, res, res, width, height, edges)
 
 
@@ -267,11 +255,6 @@ def _number(zoom: str) -> int | None:
     return int(number) if number.isdecimal() else None
 
 
-def _is_within(zoom: str, options: ImageryOptions) -> bool:
-    number, low, high = _number(zoom), options.min_zoom, options.max_zoom
-    return number is None or ((low or 0) <= number and (high is None or number <= high))
-
-
 def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     """Images of any box, requested as the cells of a fixed grid. Raises `FetchError`.
 
@@ -293,7 +276,7 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     if get_map is None or address is None:
         raise FetchError(f"WMS capabilities name no address of GetMap: {url}")
     layers = _wms_layers(root)
-    name = choose_layer(list(layers), options.layer, url, named=True)
+    name = choose_layer(list(layers), options.layer, url)
     chain = layers[name]
     styles = [style for each in chain for style in texts(each, "Style/Name")]
     if options.style is not None:

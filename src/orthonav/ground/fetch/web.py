@@ -22,13 +22,6 @@ USER_AGENT = f"orthonav/{__version__} (fetches orthophotos for one area; +orthon
 CONNECT_S, READ_S = 10.0, 30.0
 MAX_DOCUMENT_BYTES = 64 * 2**20
 """The capabilities of a national service list a thousand layers in some ten megabytes."""
-_FAILURES = {
-    requests.exceptions.ProxyError: "the proxy refused",
-    requests.exceptions.SSLError: "no secure connection: the certificate is not accepted",
-    requests.exceptions.ConnectTimeout: "no connection in time",
-    requests.exceptions.Timeout: "no answer in time",
-    requests.exceptions.ConnectionError: "no connection; is this machine online?",
-}
 log = logging.getLogger(__name__)
 
 
@@ -141,8 +134,7 @@ class Web:
                             )
                     return bytes(body)
             except requests.RequestException as error:
-                kinds = (words for kind, words in _FAILURES.items() if isinstance(error, kind))
-                failure = next(kinds, "the answer was cut short")
+                failure = f"no whole answer ({type(error).__name__})"
         raise FetchError(self.redacted(f"{failure}: {shown(url)}"))
 
     def _excerpt(self, body: bytes) -> str:

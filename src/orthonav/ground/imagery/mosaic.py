@@ -384,7 +384,7 @@ class SheetRaster:
         self._threads = threads or usable_cores()
         self.width_px, self.height_px = width_px, height_px
         self._boxes_px = self._boxes()
-        self._open: dict[int, Any] = {}
+        self._opened: dict[int, Any] = {}
         self._env = ExitStack()
 
     def __enter__(self) -> "SheetRaster":
@@ -394,8 +394,6 @@ class SheetRaster:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for dataset in self._open.values():
-            dataset.close()
         self._env.close()
 
     def read(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
@@ -552,10 +550,11 @@ class SheetRaster:
 
     def _dataset(self, lattice: Lattice) -> Any:
         key = lattice.members[0]
-        if key not in self._open:
+        if key not in self._opened:
             near = self._near(0, 0, self.width_px, self.height_px)
-            self._open[key] = lattice.open(near[list(lattice.members)])
-        return self._open[key]
+            opened = lattice.open(near[list(lattice.members)])
+            self._opened[key] = self._env.enter_context(opened)
+        return self._opened[key]
 
     def _boxes(self) -> NDArray[np.int64]:
         """Left, top, right, bottom pixel (N, 4) of the sources in this raster, with a margin."""

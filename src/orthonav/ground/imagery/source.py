@@ -39,7 +39,6 @@ ALPHA_SAMPLE_PX = 64
 MAX_PARTLY_CLEAR = 0.05
 """Largest fraction of partly transparent pixels of a mask: its resampled edges."""
 HEIGHT_TYPES = ("float32", "float64", "int16", "int32")
-MIN_SIDE_PX = 16
 OPENED_AT_ONCE = 8
 TERMS = {
     "attribution": ("ORTHONAV_ATTRIBUTION", "TIFFTAG_COPYRIGHT"),
@@ -103,7 +102,7 @@ class Source:
 
 
 class UnfitError(ImageryError):
-    """A raster that is not an orthophoto: a small image, heights, or not georeferenced."""
+    """A raster that is not an orthophoto: heights, or not georeferenced."""
 
 
 def sources_in(folder: Path) -> list[Source]:
@@ -182,10 +181,6 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
     system = _system(path, dataset, names)
     if dataset.transform.is_identity or dataset.transform.determinant == 0:
         raise ImageryError(f"orthophoto has no georeference (geotransform or world file): {path}")
-    if dataset.width < MIN_SIDE_PX or dataset.height < MIN_SIDE_PX:
-        raise UnfitError(
-            f"orthophoto is only {dataset.width} x {dataset.height} px, too small to use: {path}"
-        )
     bands = _bands(dataset)
     if len(bands) == 1 and dataset.dtypes[0] in HEIGHT_TYPES:
         raise UnfitError(
@@ -343,11 +338,6 @@ def _outline(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
             "orthophoto's border cannot be converted to latitude, longitude: x of "
             f"{x.min():g} to {x.max():g} and y of {y.min():g} to {y.max():g} do not fit its "
             f"coordinate system; assign the correct one: {path}"
-        )
-    if system.is_geographic and max(-float(x.min()), float(x.max())) > 180 + 1e-6:
-        raise ImageryError(
-            "orthophoto in degrees lies beyond longitude 180, where GDAL reads one side only; "
-            f"reproject it to metres, such as UTM (gdalwarp -t_srs EPSG:32760): {path}"
         )
     return latlon
 

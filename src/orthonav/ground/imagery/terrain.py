@@ -259,20 +259,17 @@ class Dem:
         """Positions of each window that holds some, its first column and row, and its heights."""
         which = np.flatnonzero(inside)
         blocks = np.stack([col[which], row[which]], axis=1) // BLOCK_PX
-        for left, top in np.unique(blocks.astype(np.intp), axis=0).tolist():
-            some = which[(blocks == (left, top)).all(axis=1)]
-            first_col, first_row = max(0, left * BLOCK_PX - 1), max(0, top * BLOCK_PX - 1)
-            yield some, first_col, first_row, self._block(left, top, first_col, first_row)
-
-    def _block(self, left: int, top: int, first_col: int, first_row: int) -> Array:
-        last_col = min((left + 1) * BLOCK_PX + 1, self._data.width)
-        last_row = min((top + 1) * BLOCK_PX + 1, self._data.height)
-        window = Window(first_col, first_row, last_col - first_col, last_row - first_row)
-        try:
-            raw = self._data.read(1, window=window, masked=True)
-        except (RasterioError, CPLE_BaseError) as error:
-            raise _unreadable(self.path, error) from error
-        return self._metres(raw)
+        for corner in np.unique(blocks.astype(np.intp), axis=0).tolist():
+            some = which[(blocks == corner).all(axis=1)]
+            left, top = (max(0, at * BLOCK_PX - 1) for at in corner)
+            right, bottom = ((at + 1) * BLOCK_PX + 1 for at in corner)
+            right, bottom = min(right, self._data.width), min(bottom, self._data.height)
+            window = Window(left, top, right - left, bottom - top)
+            try:
+                raw = self._data.read(1, window=window, masked=True)
+            except (RasterioError, CPLE_BaseError) as error:
+                raise _unreadable(self.path, error) from error
+            yield some, left, top, self._metres(raw)
 
 
 def open_dem(path: Path, datum: str | None = None) -> Dem:
