@@ -109,7 +109,6 @@ def test_a_band_around_a_route_leaves_the_rest_out(take):
         ({"style": "winter"}, "no style winter"),
         ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; available:"),
         ({"format": "image/webp"}, "no format image/webp; available: image/jpeg, image/png"),
-        ({"version": "1.0.0"}, "supported versions of WMS are 1.1.1 and 1.3.0"),
         ({"time": "2021"}, "no time 2021"),
     ],
 )

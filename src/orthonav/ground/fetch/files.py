@@ -229,7 +229,7 @@ def _found(web: Web, spec: SourceSpec, area: Area) -> Iterator[tuple[dict[str, A
     corners = [(west, south), (west, north), (east, south), (east, north)]
     lat, lon = area.frame.latlon_from_en(corners)
     box = [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]
-    query: dict[str, Any] | None = {"bbox": box, "limit": PAGE}
+    query: Any = {"bbox": box, "limit": PAGE}
     query |= {"datetime": spec.options.time} if spec.options.time else {}
     query |= {"collections": [spec.options.collection]} if spec.options.collection else {}
     search = _link(web.get_json(spec.url), "search")

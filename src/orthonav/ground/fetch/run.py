@@ -222,11 +222,7 @@ def _write_mosaic(
     result: FetchResult,
     progress: Progress,
 ) -> None:
-    """Read the cells and write them as one GeoTIFF, with missing ones masked.
-
-    The raw mosaic is written into `folder` first. Raises `FetchError` where cells failed, unless
-    holes are allowed, and where no pixel is valid; `OutputError` where it cannot be written.
-    """
+    """The raw mosaic is written into `folder` first; missing cells are masked."""
     raw = folder / "mosaic.tif"
     try:
         with rasterio.Env(GDAL_TIFF_INTERNAL_MASK="YES", GDAL_CACHEMAX=128 * 2**20):
@@ -357,11 +353,7 @@ def _pack(raw: Path, out: Path, request: FetchRequest) -> None:
 
 
 def _tags(provenance: Provenance, selection: Selection) -> dict[str, str]:
-    """Origin, terms and dates as tags of the file, without keys.
-
-    ACQUISITION_DATE is the date of the imagery as far as it is known; TIFFTAG_DATETIME exists only
-    where the day is known, because that tag has no shorter form.
-    """
+    """TIFFTAG_DATETIME exists only where the day is known: that tag has no shorter form."""
     tags = {
         "ORTHONAV_SOURCE": provenance.source,
         "ORTHONAV_LAYER": provenance.layer,

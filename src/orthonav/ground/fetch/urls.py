@@ -42,19 +42,17 @@ def checked_url(url: str) -> str:
     """
     try:
         parts = urlsplit(url)
-        named = bool(parts.hostname)
-        port_is_number = parts.port is None or parts.port > 0
+        is_http = parts.scheme.lower() in ("http", "https") and parts.port != 0
     except ValueError as error:
         raise FetchError(f"invalid address: {shown(url)}") from error
-    if parts.scheme.lower() not in ("http", "https") or not named or not port_is_number:
+    is_plain = len(url) <= MAX_URL and re.search(r"[\x00-\x20\x7f]", url) is None
+    if not (is_http and parts.hostname and is_plain):
         raise FetchError(f"only http:// and https:// addresses are fetched, got: {shown(url)}")
     if parts.username is not None or parts.password is not None:
         raise FetchError(
             "an address must not contain a user name or password; write the key as {key} and give "
             f"it with --key-env: {parts.scheme}://{parts.hostname}"
         )
-    if len(url) > MAX_URL or any(ord(letter) <= 32 or ord(letter) == 127 for letter in url):
-        raise FetchError(f"address is too long or contains blanks: {shown(url)}")
     return url
 
 

@@ -468,10 +468,9 @@ class SheetRaster:
         """A lattice resampled into a window of the sheet: values (H, W, C) and mask (H, W)."""
         shape = (window.height, window.width)
         target = self._transform * Affine.translation(window.col_off, window.row_off)
-        needed = self._source_window(lattice, target, shape)
-        if needed is None:
+        part = self._source_window(lattice, target, shape)
+        if part is None:
             return np.zeros((*shape, colours), np.uint8), np.zeros(shape, np.uint8)
-        part, is_inside = needed
         try:
             values, mask, transform = lattice.read(self._dataset(lattice), part, self._gsd_m)
         except RasterioError as error:
@@ -480,10 +479,6 @@ class SheetRaster:
             raise unreadable(next(named, lattice.first.path), error) from error
         stretch = self._mosaic.stretches[lattice.members[0]]
         picture = _in_colours(values if stretch is None else stretch.apply(values), colours)
-        if is_inside and mask.all() and mask.min() == 255:
-            return self._resampled(lattice, picture, transform, target, shape, True), np.full(
-                shape, 255, np.uint8
-            )
         _fill_holes(picture, mask)
         warped = self._resampled(lattice, picture, transform, target, shape, True)
         warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
@@ -522,8 +517,8 @@ class SheetRaster:
 
     def _source_window(
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]
-    ) -> tuple[Window, bool] | None:
-        """Pixels of a lattice that a window needs, and whether all of them exist; None for none."""
+    ) -> Window | None:
+        """Pixels of a lattice that a window needs; None for none."""
         share = np.linspace(0, 1, 9)
         zero, one = np.zeros(9), np.ones(9)
         cols = np.concatenate([share, share, zero, one]) * shape[1]
@@ -535,18 +530,13 @@ class SheetRaster:
         if not (np.isfinite(col).all() and np.isfinite(row).all()):
             return None
         margin = _MARGIN_PX * max(1.0, self._gsd_m / lattice.first.gsd_m)
-        wanted = [
-            (math.floor(each.min() - margin), math.floor(each.max() + margin) + 1)
-            for each in (col, row)
-        ]
-        had = [
-            (max(0, low), min(size, high))
-            for (low, high), size in zip(wanted, lattice.size_px, strict=True)
-        ]
-        (left, right), (top, bottom) = had
+        low = np.floor([col.min() - margin, row.min() - margin]).astype(int)
+        high = np.floor([col.max() + margin, row.max() + margin]).astype(int) + 1
+        left, top = np.maximum(low, 0).tolist()
+        right, bottom = np.minimum(high, lattice.size_px).tolist()
         if left >= right or top >= bottom:
             return None
-        return Window(left, top, right - left, bottom - top), had == wanted
+        return Window(left, top, right - left, bottom - top)
 
     def _dataset(self, lattice: Lattice) -> Any:
         key = lattice.members[0]

@@ -141,18 +141,12 @@ def open_sources(paths: Sequence[Path], folder: Path | None = None) -> list[Sour
     sources: list[Source] = []
     skipped = 0
     with quiet(), ThreadPoolExecutor(OPENED_AT_ONCE) as pool:
-        found = [pool.submit(_opened, Path(path), folder) for path in paths]
-        try:
-            for each in found:
-                try:
-                    sources.append(each.result())
-                except UnfitError as error:
-                    if folder is None:
-                        raise
-                    skipped += 1
-                    log.info("skipped: %s", error)
-        finally:
-            pool.shutdown(cancel_futures=True)
+        for found in pool.map(lambda path: _opened(Path(path), folder), paths):
+            if isinstance(found, Source):
+                sources.append(found)
+            else:
+                skipped += 1
+                log.info("skipped: %s", found)
     if skipped:
         log.warning("skipped %d rasters that are not orthophotos (-v names them)", skipped)
     named = Counter(source.crs for source in sources if source.is_named)
@@ -161,11 +155,15 @@ def open_sources(paths: Sequence[Path], folder: Path | None = None) -> list[Sour
     return sources
 
 
-def _opened(path: Path, folder: Path | None) -> Source:
+def _opened(path: Path, folder: Path | None) -> "Source | UnfitError":
     require_file(path, "orthophoto")
     try:
         with rasterio.open(path) as dataset:
             return _inspect(path, dataset, folder)
+    except UnfitError as error:
+        if folder is None:
+            raise
+        return error
     except RasterioError as error:
         raise unreadable(path, error) from error
 

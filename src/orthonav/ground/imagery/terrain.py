@@ -245,13 +245,9 @@ class Dem:
     def _pixels(self, lat_deg: Array, lon_deg: Array) -> tuple[Array, Array]:
         """Columns and rows from the outer corner of the first pixel; not finite where none."""
         x, y = self._system_from_world.transform(lon_deg, lat_deg)
-        inverse = ~self._data.transform
-        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         with np.errstate(invalid="ignore"):
-            return (
-                inverse.a * x + inverse.b * y + inverse.c,
-                inverse.d * x + inverse.e * y + inverse.f,
-            )
+            col, row = ~self._data.transform * (np.asarray(x), np.asarray(y))
+        return col, row
 
     def _blocks_of(
         self, col: Array, row: Array, inside: NDArray[np.bool_]
