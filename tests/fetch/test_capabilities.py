@@ -148,13 +148,11 @@ def test_ign_wms_in_lambert(tmp_path):
     }  # fmt: skip
 
 
-def test_an_old_wms_with_times(tmp_path):
-    options = ImageryOptions(layer="ortho", time="2018", crs="EPSG:25832", gsd_m=0.5)
+def test_an_old_wms(tmp_path):
+    options = ImageryOptions(layer="ortho", crs="EPSG:25832", gsd_m=0.5)
     asked, _ = requested(tmp_path, "old_wms", options, "wms", "wms")
     assert asked.query["MAP"] == "/srv/ortho.map" and asked.query["VERSION"] == "1.1.1"
-    assert asked.query["SRS"] == "EPSG:25832" and asked.query["TIME"] == "2018"
-    with pytest.raises(FetchError, match="no time 2019; available: 2015, 2018, 2021"):
-        requested(tmp_path, "old_wms", ImageryOptions(layer="ortho", time="2019"), "wms", "wms")
+    assert asked.query["SRS"] == "EPSG:25832"
 
 
 NESTED = b"<Layer>" * 5000 + b"</Layer>" * 5000

@@ -109,7 +109,7 @@ def test_a_band_around_a_route_leaves_the_rest_out(take):
         ({"style": "winter"}, "no style winter"),
         ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; available:"),
         ({"format": "image/webp"}, "no format image/webp; available: image/jpeg, image/png"),
-        ({"time": "2021"}, "no time 2021"),
+        ({"time": "2021"}, "--time was 2021"),
     ],
 )
 def test_what_a_wms_does_not_have_is_listed(mapproxy, take, options, words):

@@ -57,7 +57,7 @@ def test_ground_control_points_only(ortho, assigned):
     [
         ({"crs": None}, "no coordinate reference system.*gdal_edit.py"),
         ({"transform": Affine.identity()}, "no georeference"),
-        ({"crs": 'LOCAL_CS["mine",UNIT["metre",1]]'}, "system cannot be converted to latitude"),
+        ({"crs": 'LOCAL_CS["mine",UNIT["metre",1]]'}, "border cannot be converted to latitude"),
         ({"crs": "EPSG:4326"}, "border cannot be converted to latitude"),
     ],
 )

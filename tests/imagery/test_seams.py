@@ -6,7 +6,6 @@ from geotiffs import FRAME, LAMBERT, placed, read, sheet_of, smooth_scene, write
 from rasterio.transform import Affine
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.imagery.mosaic import Mosaic
 
 BREST = LocalFrame(48.39, -4.49)  # Lambert-93 is turned by -5.4 degrees here
 
@@ -136,16 +135,3 @@ def test_a_file_named_between_two_of_one_lattice_covers_the_second(tmp_path):
     ]
     pixels = read(paths, 60)
     assert (pixels.rgb[5:8, 3:8] == 150).all() and (pixels.rgb[20:-10, 20:-10] == 100).all()
-
-
-def test_files_that_others_hide_are_not_read(tmp_path):
-    """Two years of the same tiles."""
-    for year in ("2021", "2015"):
-        older = cut(tmp_path / year, smooth_scene(120), placed(size=120), 30)
-    mosaic = Mosaic.open([tmp_path / "2021", tmp_path / "2015"])
-    for path in older:
-        path.unlink()
-    with mosaic.sheet(
-        FRAME, west_m=-45, north_m=45, width_px=90, height_px=90, gsd_m=1.0, threads=1
-    ) as sheet:
-        assert sheet.read(0, 0, 90, 90).valid.all()

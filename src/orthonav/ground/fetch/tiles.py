@@ -44,7 +44,6 @@ METRES_PER_DEGREE = 6378137.0 * math.pi / 180
 """At the equator of WGS84, as scale denominators are defined (OGC 07-057r7, 6.1)."""
 MAX_TILE_PX = 4096  # largest tile that is accepted; usual ones have 256 or 512 px
 CELL_PX = 1024  # width of the images requested: services render several per second at this size
-_MIN_CELL_PX = 64
 _VERSIONS = ("1.3.0", "1.1.1")
 
 
@@ -262,6 +261,8 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     first in EPSG:4326 and in many national ones (OGC 06-042, 6.7.2); in 1.1.1 it is always x, y.
     """
     url, options, frame = spec.url, spec.options, area.frame
+    if options.time is not None:
+        raise FetchError(f"times of a WMS cannot be chosen, --time was {options.time}")
     wanted = options.version or _VERSIONS[0]
     url = with_query(url, {"SERVICE": "WMS", "REQUEST": "GetCapabilities", "VERSION": wanted})
     root = web.get_xml(url)
@@ -283,23 +284,15 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     wanted_crs = options.crs or ("EPSG:3857" if "EPSG:3857" in names else None)
     crs = choose(list(names), wanted_crs, f"layer {name} does not come in")
     format_ = choose_format(texts(get_map, "Format"), options, "service")
-    limits = [
-        int(side) or CELL_PX
-        for side in texts(root, "Service/MaxWidth") + texts(root, "Service/MaxHeight")
-        if side.isdecimal()
-    ]
-    cell_px = min(max(_MIN_CELL_PX, min([CELL_PX, *limits])), options.tile_px or CELL_PX)
+    cell_px = options.tile_px or CELL_PX
     gsd_m = options.wanted_gsd_m
     if format_ == HEIGHTS_FORMAT and options.gsd_m is None:
         gsd_m = TERRAIN_GSD_M
     res_x, res_y = (gsd_m / scale for scale in ground_scale(crs, frame))
-    map_url = linked(url, address.get("href", ""))
-    if options.time is not None:
-        map_url = with_query(map_url, {"TIME": choose_time(_times(chain), options.time, name)})
     service = {
         "name": "WMS",
         "Version": version,
-        "ServerUrl": map_url,
+        "ServerUrl": linked(url, address.get("href", "")),
         "Layers": name,
         "Styles": options.style or "",
         "CRS" if version == "1.3.0" else "SRS": names[crs],
@@ -321,13 +314,6 @@ def _wms_layers(root: Element) -> dict[str, list[Element]]:
             found[name] = chain
         stack += [[inner, *chain] for inner in reversed(chain[0].findall("Layer"))]
     return found
-
-
-def _times(chain: list[Element]) -> list[str]:
-    """Times of the imagery; in 1.1.1 they stand in `Extent`."""
-    elements = [each for layer in chain for each in layer if each.tag in ("Dimension", "Extent")]
-    values = [each.text or "" for each in elements if each.get("name", "").lower() == "time"]
-    return [value.strip() for text in values for value in text.split(",") if value.strip()]
 
 
 def _crs_names(options: list[str]) -> dict[str, str]:

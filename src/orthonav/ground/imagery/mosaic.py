@@ -142,15 +142,8 @@ class Lattice:
         )
 
     def _placed(self, members: list[int]) -> Iterator[tuple[Source, str]]:
-        """Members not covered by others, the last first, with the XML of file and place."""
-        shown, covered = [], set[tuple[int, ...]]()
-        for index in members:
-            box = tuple(self.boxes_px[index].tolist())
-            if box not in covered:
-                shown.append(index)
-            if not self.sources[index].masks:
-                covered.add(box)
-        for index in reversed(shown):
+        """Members, the last first, with the XML of file and place."""
+        for index in reversed(members):
             source, (left, top) = self.sources[index], self.boxes_px[index, :2].tolist()
             size = f'xSize="{source.width_px}" ySize="{source.height_px}"'
             dtype = _gdal_type(source.dtype)

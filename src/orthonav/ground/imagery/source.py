@@ -325,17 +325,14 @@ def _outline(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
     x, y = dataset.transform * (cols, rows)
     try:
         lon, lat = transform_coordinates(system, "EPSG:4326", x, y)[:2]
-    except CPLE_BaseError as error:  # a local or engineering system
-        raise ImageryError(
-            "orthophoto's coordinate system cannot be converted to latitude, longitude; assign the "
-            f"correct one (for example: gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
-        ) from error
+    except CPLE_BaseError:  # a local or engineering system
+        lon = lat = np.full(len(x), np.nan)
     latlon = np.stack([np.asarray(lat, dtype=float), np.asarray(lon, dtype=float)], axis=1)
     if not np.isfinite(latlon).all() or np.abs(latlon[:, 0]).max() > 90:
         raise ImageryError(
             "orthophoto's border cannot be converted to latitude, longitude: x of "
             f"{x.min():g} to {x.max():g} and y of {y.min():g} to {y.max():g} do not fit its "
-            f"coordinate system; assign the correct one: {path}"
+            f"coordinate system; assign the correct one (gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
         )
     return latlon
 
