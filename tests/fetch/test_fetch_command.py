@@ -1,8 +1,6 @@
 """`orthonav fetch` from end to end: its output, its file, and the map built from it."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 import rasterio
@@ -128,17 +126,3 @@ def test_wrong_usage_is_reported_on_one_line(command, arguments, words, tmp_path
     assert code == 1 and not stdout and stderr.count("\n") == 1
     assert pytest.approx(1) == len(__import__("re").findall(words, stderr))
     assert not list(tmp_path.iterdir())
-
-
-CORE = """
-import sys
-for name in ("rasterio", "requests", "pyproj", "shapely"):
-    sys.modules[name] = None  # as if it were not installed
-from orthonav.cli import main
-sys.exit(main(["fetch", "--list"]))
-"""
-
-
-def test_services_are_listed_without_the_extra():
-    found = subprocess.run([sys.executable, "-c", CORE], capture_output=True, text=True)
-    assert found.returncode == 0 and "ign: IGN" in found.stdout, found.stderr

@@ -16,7 +16,6 @@ from orthonav.ground.fetch.run import FetchRequest, fetch
 from orthonav.ground.imagery.source import open_sources
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Route
 
 MAX_OFF_PX = 0.05
 
@@ -87,34 +86,6 @@ def test_tiles_rows_from_the_south_quadkeys_and_large_tiles(take, source):
         _, path = take(source.replace("URL", server.url), half_m=60)
         assert {"@2x" in asked.path for asked in server.log} == {"{r}" in source}
     assert placed(path, "EPSG:3857")[0] <= 1
-
-
-def test_a_band_around_a_route_leaves_the_rest_out(take):
-    west, south, east, north = terrain.bounds(500)
-    area = Area.from_route(Route(((south, west), (north, east))), 60.0)
-    with servers.serving(servers.tiles) as server:
-        result, path = take(f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png", area=area)
-    assert 0.1 < terrain.offset_px(path)[2] < 0.6 and result.valid_share == 1.0
-    to_crs = Transformer.from_crs("EPSG:4326", "EPSG:3857", always_xy=True)
-    with rasterio.open(path) as data:
-        line = np.linspace((west, south), (east, north), 50)
-        valid = [data.dataset_mask()[data.index(*to_crs.transform(*each))] for each in line]
-    assert set(valid) == {255}
-
-
-@pytest.mark.parametrize(
-    "options, words",
-    [
-        ({"layer": "orto"}, "no layer orto; available: ortho"),
-        ({"style": "winter"}, "no style winter"),
-        ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; available:"),
-        ({"format": "image/webp"}, "no format image/webp; available: image/jpeg, image/png"),
-        ({"time": "2021"}, "--time was 2021"),
-    ],
-)
-def test_what_a_wms_does_not_have_is_listed(mapproxy, take, options, words):
-    with pytest.raises(FetchError, match=words):
-        take(f"wms:{mapproxy}/service", **{"layer": "ortho"} | options)
 
 
 @pytest.mark.parametrize(

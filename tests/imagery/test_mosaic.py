@@ -118,14 +118,6 @@ def test_a_band_marked_alpha_that_is_a_picture_masks_nothing(tmp_path, caplog, d
         assert pixels.valid[INNER].all() and pixels.rgb[..., 0][INNER].std() > 30
 
 
-def test_a_mask_with_soft_edges_stays_a_mask(tmp_path, caplog):
-    soft = np.where(np.arange(SIZE) == 50, 128, MASK)  # 1 % of all
-    path = write(tmp_path / "ortho.tif", with_band(SCENE, soft), colours=[*RGB, ALPHA])
-    with caplog.at_level("INFO"):
-        assert not read(path).valid[HOLE].any()
-    assert not caplog.text
-
-
 DEEP, UNIT = SCENE.astype(np.uint16) * 100, (SCENE / 255).astype(np.float32)
 WATER = np.where(np.arange(SIZE) < 40, 0, 255 - SCENE[0])
 """Near infrared, which is 0 over water; it is not missing for that."""
@@ -193,16 +185,6 @@ def test_first_named_wins_and_gaps_stay_gaps(tmp_path):
         assert not valid[left + 203 : left + 217].any()
         assert (line[left + 223 : left + 337] == 200).all()
         assert valid[left + 3 : left + 197].all()
-
-
-def test_a_later_file_fills_the_holes_of_the_first(tmp_path):
-    below = shifted(tmp_path / "below.tif", 0, 222)
-    pixels = read([HOLED["nodata"](tmp_path / "holed.tif"), below])
-    assert pixels.valid[INNER].all()
-    assert (pixels.rgb[22:48, 32:68] == 222).all()
-    clear = ~binary_dilation(HOLE, iterations=3)[INNER]
-    off = np.abs(pixels.rgb[INNER].astype(int) - SCENE.transpose(1, 2, 0)[INNER])
-    assert off[clear].max() <= 3
 
 
 @pytest.mark.parametrize(

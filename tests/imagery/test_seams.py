@@ -75,20 +75,6 @@ def test_holes_and_bit_depths_survive_the_seams(tmp_path, window, side):
     assert off.mean() < 1.5  # files are not stretched alike: fewer pixels are sampled
 
 
-def test_false_alpha_is_cut_too(tmp_path):
-    size = 400
-    transform = placed(LAMBERT, 0.25, size, frame=BREST)
-    scene = rough_scene(size)
-
-    def infrared(path, part, **more):  # GDAL calls the fourth band alpha
-        return write(path, np.concatenate([part, 255 - part[:1]]), **more)
-
-    whole = read(infrared(tmp_path / "whole.tif", scene, transform=transform), 80, 1.0, BREST)
-    parts = read(cut(tmp_path / "cut", scene, transform, 100, infrared), 80, 1.0, BREST)
-    assert whole.valid.all() and parts.valid.all()
-    assert np.abs(parts.rgb.astype(int) - whole.rgb).max() <= 2
-
-
 @pytest.mark.parametrize("shift_px", [0.5, 0.25])
 @pytest.mark.parametrize("frame", [FRAME, BREST], ids=["straight", "turned"])
 def test_no_gap_between_files_that_share_no_lattice(tmp_path, frame, shift_px):
@@ -105,33 +91,3 @@ def test_no_gap_between_files_that_share_no_lattice(tmp_path, frame, shift_px):
     values = pixels.rgb[2:-2, 2:-2]
     assert set(np.unique(values[:, :20])) == {90} and set(np.unique(values[:, -20:])) == {180}
     assert values.min() >= 80 and values.max() <= 190
-
-
-def test_resolutions_and_systems_meet_without_a_gap(tmp_path):
-    """Lambert-93 at 1 m beside UTM at 0.5 m, which covers a little of it."""
-    grey = np.full((3, 130, 130), 90, np.uint8)
-    left = placed(size=130, frame=FRAME) * Affine.translation(-65, 0)
-    fine = np.full((3, 300, 300), 180, np.uint8)
-    utm = placed("EPSG:32631", 0.5, 300, frame=FRAME) * Affine.translation(140, 0)
-    paths = [
-        write(tmp_path / "a.tif", grey, transform=left),
-        write(tmp_path / "b.tif", fine, crs="EPSG:32631", transform=utm),
-    ]
-    for order in (paths, paths[::-1]):
-        pixels = read(order, 90)
-        assert pixels.valid[2:-2, 2:-2].all()
-        assert set(np.unique(pixels.rgb[:, :25])) == {90}
-        assert set(np.unique(pixels.rgb[:, -25:])) == {180}
-
-
-def test_a_file_named_between_two_of_one_lattice_covers_the_second(tmp_path):
-    paths = [
-        write(
-            tmp_path / f"{level}.tif",
-            np.full((3, 100, 100), level, np.uint8),
-            transform=placed(size=100) * Affine.translation(shift, shift),
-        )
-        for level, shift in ((100, 30), (150, 0.5), (50, 0))
-    ]
-    pixels = read(paths, 60)
-    assert (pixels.rgb[5:8, 3:8] == 150).all() and (pixels.rgb[20:-10, 20:-10] == 100).all()

@@ -263,7 +263,6 @@ def _link(document: dict[str, Any], kind: str) -> dict[str, Any] | None:
 
 
 def _item(feature: dict[str, Any], where: str, options: ImageryOptions) -> tuple[str, str, str]:
-    """Time (ISO 8601), name and address of the file of an item."""
     name, assets = str(feature.get("id", ""))[:200], feature.get("assets")
     plain = assets if isinstance(assets, dict) else {}
     known = {key: asset for key, asset in plain.items() if isinstance(asset, dict)}

@@ -134,13 +134,6 @@ def choose_format(offered: Sequence[str], options: ImageryOptions, what: str) ->
     return found
 
 
-def choose_time(values: Sequence[str], wanted: str, layer: str) -> str:
-    """The time requested, if the layer has it; one with an interval (A/B) may have any."""
-    if any("/" in value for value in values):
-        return wanted
-    return choose(values, wanted, f"layer {layer} has no time")
-
-
 def listed(names: Sequence[str], wanted: str = "", most: int = 12) -> str:
     """Names for an error: if there are many, those that resemble the wanted one."""
     chosen = get_close_matches(wanted, names, most, cutoff=0.0) if wanted else names

@@ -95,13 +95,10 @@ class FetchResult:
 
     def holes(self) -> str:
         """Cells without imagery by reason, on one line; empty where there are none."""
-        numbers = {
-            "failed": self.failed.total(),
-            "not covered": self.not_covered,
-            "blank": self.blank,
-            "placeholders": self.placeholders,
-        }
-        return ", ".join(f"{number} {name}" for name, number in numbers.items() if number)
+        names = ("not_covered", "blank", "placeholders")
+        numbers = {"failed": self.failed.total()} | {name: getattr(self, name) for name in names}
+        named = (f"{number} {name.replace('_', ' ')}" for name, number in numbers.items() if number)
+        return ", ".join(named)
 
     def describe(self) -> dict[str, Any]:
         """Plain values for JSON."""

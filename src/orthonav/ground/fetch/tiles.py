@@ -29,7 +29,6 @@ from orthonav.ground.fetch.presets import (
     choose,
     choose_format,
     choose_layer,
-    choose_time,
     finest_fitting,
 )
 from orthonav.ground.fetch.service import CellSource, service_source
@@ -154,7 +153,9 @@ def _dimensions(layer: Element, name: str, options: ImageryOptions) -> dict[str,
         for dimension in map(str.lower, _id(element) if values else []):
             found[dimension] = values[0]
             if dimension == "time" and options.time is not None:
-                found[dimension] = choose_time(values, options.time, name)
+                any_time = any("/" in value for value in values)  # of an interval
+                known = [options.time] if any_time else values
+                found[dimension] = choose(known, options.time, f"layer {name} has no time")
     if options.time is not None and "time" not in found:
         raise FetchError(f"layer {name} has no time to choose, --time was {options.time}")
     return found

@@ -11,8 +11,7 @@ from orthonav.core.errors import FetchError
 
 KEY = "{key}"
 TOKEN = "{token}"  # placeholder of a query string that a signing service issued for a file server
-MAX_URL = 4096
-"""Longest address, characters: half of what servers accept by default (8 KB of header)."""
+MAX_URL = 4096  # characters: half of what servers accept by default (8 KB of header)
 _SECRET_NAME = re.compile(
     r"^(api[-_]?key|key|token|access[-_]?token|apikey|auth|authkey|password|pwd|sig|signature"
     r"|subscription-key|ocp-apim-subscription-key)$",

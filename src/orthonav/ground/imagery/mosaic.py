@@ -70,7 +70,6 @@ class Lattice:
 
     @cached_property
     def size_px(self) -> tuple[int, int]:
-        """Columns and rows."""
         return int(self.boxes_px[:, 2].max()), int(self.boxes_px[:, 3].max())
 
     def open(self, near: NDArray[np.bool_]) -> Any:
@@ -105,7 +104,6 @@ class Lattice:
     def _read(
         self, dataset: Any, window: Window, factor: int
     ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-        """Averaged over squares of `factor` pixels."""
         shape = max(1, round(window.height / factor)), max(1, round(window.width / factor))
         how: dict[str, Any] = {"window": window}
         if factor > 1:

@@ -332,7 +332,8 @@ def _outline(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
         raise ImageryError(
             "orthophoto's border cannot be converted to latitude, longitude: x of "
             f"{x.min():g} to {x.max():g} and y of {y.min():g} to {y.max():g} do not fit its "
-            f"coordinate system; assign the correct one (gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
+            "coordinate system; assign the correct one (for example: gdal_edit.py -a_srs EPSG:2154 "
+            f"FILE): {path}"
         )
     return latlon
 
