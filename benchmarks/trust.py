@@ -52,7 +52,7 @@ from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
 from orthonav.ground.build.fit import LEAST
-from orthonav.ground.evaluate.calibration import calibrate
+from orthonav.ground.evaluate.statistics import calibrate
 
 Task = tuple[Pair, Sequence[Pair], int, int, Path]
 """Pair, all pairs, number of views, seed, and folder of work."""

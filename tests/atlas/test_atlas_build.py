@@ -342,7 +342,6 @@ def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (["--no-coarse", "--coarse-gsd-m", "4"], "remove the other --coarse"),
         (["--sheet-km", "0.001"], "must be 0.2 to"),
         (["--cluster", "local", "--workers", "0"], "workers must be 1 or more"),
     ],

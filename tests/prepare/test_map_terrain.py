@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from helpers import write_dem
-from orthonav.cli.heights import map_heights
+from orthonav.cli.source import map_heights
 from orthonav.core.errors import AreaError
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame
@@ -232,7 +232,7 @@ def test_terrain_is_flown_without_gdal_and_proj(hill_map, flown):
     script = f"""
 import sys
 for name in ("rasterio", "pyproj", "torch"): sys.modules[name] = None
-from orthonav.cli.heights import map_heights
+from orthonav.cli.source import map_heights
 from orthonav.core.flight import open_flight
 from orthonav.core.mapfile import open_map, write_map
 heights = map_heights(open_map({str(hill_map)!r}))

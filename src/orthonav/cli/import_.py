@@ -5,47 +5,28 @@ import logging
 from dataclasses import asdict
 from pathlib import Path
 
-from orthonav.cli.common import counted, print_json, progress
-from orthonav.cli.heights import dem_of, geoid_for
-from orthonav.cli.source import add_source, open_source
+from orthonav.cli.common import add_options, counted, print_json, progress
+from orthonav.cli.source import add_source, dem_of, geoid_for, open_source
 
 log = logging.getLogger(__name__)
 
+EXAMPLE = "photos/ --out flight"
 EVERYDAY = (
-    "--kind",
-    "--camera",
-    "--telemetry",
-    "--time-offset-s",
-    "--mount-deg",
-    "--rate-hz",
-    "--agl-m",
-    "--dem",
-    "--json",
+    *("--kind", "--camera", "--telemetry", "--time-offset-s", "--mount-deg", "--rate-hz"),
+    *("--agl-m", "--dem", "--json"),
 )
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "source",
-        type=Path,
-        nargs="+",
-        metavar="SOURCE",
-        help="photographs (a folder, files, or a CSV of images by file name), video, ROS 1 or 2 "
-        "bag, MCAP file, or flight folder",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FLIGHT_DIR", help="folder to write"
-    )
+    text = "photographs (a folder, files, or a CSV of images by file name), video, ROS 1 or 2 bag, "
+    text += "MCAP file, or flight folder"
+    parser.add_argument("source", type=Path, nargs="+", metavar="SOURCE", help=text)
+    parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR", help="to write")
     add_source(parser)
-    parser.add_argument(
-        "--jpeg-quality",
-        type=int,
-        choices=range(1, 101),
-        metavar="1..100",
-        help="quality of JPEG images; raw images and frames of a video are then stored as JPEG "
-        "(default: PNG, lossless)",
-    )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    text = "quality of JPEG images, 1 to 100; raw images and frames of a video are then stored as "
+    text += "JPEG (default: PNG, lossless)"
+    parser.add_argument("--jpeg-quality", type=int, choices=range(1, 101), metavar="N", help=text)
+    add_options(parser, "--json")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -70,17 +51,11 @@ def run(options: argparse.Namespace) -> None:
             "lies over a hole of the terrain, or outside it",
             over.without,
         )
-    if done.complete < done.views:
-        log.warning(
-            "%d of %d views lack heading, pitch, roll or height",
-            done.views - done.complete,
-            done.views,
-        )
     if done.radians:
         log.warning("%s", RADIANS)
     if options.json:
         plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
-        print_json({**plain, **asdict(done)})
+        print_json(plain | asdict(done))
     else:
         print(
             f"{counted(done.views, 'view')}, {done.complete} with heading, tilt and height, "

@@ -95,10 +95,10 @@ class FetchResult:
 
     def holes(self) -> str:
         """Cells without imagery by reason, on one line; empty where there are none."""
-        names = ("not_covered", "blank", "placeholders")
-        numbers = {"failed": self.failed.total()} | {name: getattr(self, name) for name in names}
-        named = (f"{number} {name.replace('_', ' ')}" for name, number in numbers.items() if number)
-        return ", ".join(named)
+        names = ("failed", "not covered", "blank", "placeholders")
+        numbers = (self.failed.total(), self.not_covered, self.blank, self.placeholders)
+        counted = zip(numbers, names, strict=True)
+        return ", ".join(f"{number} {name}" for number, name in counted if number)
 
     def describe(self) -> dict[str, Any]:
         """Plain values for JSON."""

@@ -282,6 +282,17 @@ def profile(
     ]
 
 
+def flown_agl_m(route: Route, terrain: TerrainHeights | None) -> list[float]:
+    """Known heights above ground along a route, without take-off and landing: as planned, or where
+    not all are planned so, over a terrain."""
+    heights = [height for height in route.heights if height is not None]
+    planned = [height.height_m for height in heights if height.frame == "agl"]
+    if heights and len(planned) < len(heights) and terrain is not None:
+        legs = profile(route, (0.0,) * route.legs, None, 0.0, terrain)
+        planned = [height for leg in legs for height in leg.agl_m]
+    return [height for height in planned if height >= LANDING_M]
+
+
 def _leg_m(route: Route, leg: int) -> tuple[LocalFrame, float, Array]:
     ends = route.part(leg, min(leg + 1, len(route.waypoints) - 1))
     frame = LocalFrame(*ends.waypoints[0])

@@ -25,8 +25,8 @@ from orthonav.core.flight.mount import Mount, read_mount
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
-from orthonav.ground.evaluate.calibration import is_covariance
 from orthonav.ground.evaluate.metrics import FAR_M, check_truth, warn_of_another_run
+from orthonav.ground.evaluate.statistics import is_covariance
 from orthonav.ground.recordings.flightlog import is_flight_log
 from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 from orthonav.ground.report.imagery import (
