@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,10 +11,9 @@ from orthonav.cli.version import require_extras
 from orthonav.core.errors import FetchError
 
 if TYPE_CHECKING:
-    from orthonav.ground.fetch.options import ImageryOptions
+    from orthonav.ground.fetch.presets import ImageryOptions
     from orthonav.ground.fetch.run import FetchRequest, FetchResult
 
-PACKAGE = "ign-package:"
 EXAMPLE = "--route route.kml --source ign --out ortho.tif"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
@@ -22,8 +22,7 @@ EVERYDAY = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    text = "a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..., or "
-    text += "ign-package:D003:2013 for a whole department (--out is a folder then)"
+    text = "a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..."
     parser.add_argument("--source", metavar="NAME[:YEAR]|PROTOCOL:ADDRESS", help=text)
     parser.add_argument("--list", action="store_true", help="list the services known by name")
     parser.add_argument("--out", type=Path, metavar="ORTHO.tif", help="GeoTIFF to write")
@@ -93,9 +92,6 @@ def run(options: argparse.Namespace) -> None:
     if options.source is None or (options.out is None and not options.dry_run):
         raise FetchError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
-    if options.source.startswith(PACKAGE):
-        _run_package(options)
-        return
     from orthonav.ground.fetch.run import estimate_fetch, fetch
 
     request = _request(options)
@@ -147,7 +143,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
 
 
 def _imagery(options: argparse.Namespace) -> "ImageryOptions":
-    from orthonav.ground.fetch.options import ImageryOptions
+    from orthonav.ground.fetch.presets import ImageryOptions
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
@@ -156,34 +152,6 @@ def _imagery(options: argparse.Namespace) -> "ImageryOptions":
         raise FetchError(f"--bands are numbers from 1, such as 1,2,3, got '{options.bands}'")
     named = {name: getattr(options, name) for name in vars(ImageryOptions()) if name in options}
     return ImageryOptions(**named | {"bands": bands and tuple(map(int, bands))})
-
-
-def _run_package(options: argparse.Namespace) -> None:
-    from orthonav.ground.fetch.package import (
-        ATTRIBUTION,
-        download_package,
-        find_package,
-        package_files,
-        parse_package,
-    )
-    from orthonav.ground.fetch.web import Web
-
-    zone, year, kind = parse_package(options.source.removeprefix(PACKAGE))
-    with Web() as web:
-        package = find_package(web, zone, year, kind)
-        files = package_files(web, package)
-        megabytes = sum(file.size_bytes or 0 for file in files) / 1e6
-        _say(options, f"{package.name}: {len(files)} files, {megabytes:.0f} MB")
-        paths = []
-        if not options.dry_run:
-            with progress(options) as shown:
-                paths = download_package(web, files, options.out, shown)
-    if options.json:
-        plain = {"package": package.name, "date": package.date, "attribution": ATTRIBUTION}
-        names = [str(path) for path in paths]
-        print_json(plain | {"files": names, "megabytes": round(megabytes, 3)})
-    elif paths:
-        print(f"{package.name} ({ATTRIBUTION}); unpack it with: 7z x {paths[0]}")
 
 
 def _say(options: argparse.Namespace, text: str) -> None:
@@ -197,7 +165,7 @@ def _summary(out: Path, result: "FetchResult") -> str:
         "file": out,
         "size": f"{estimate.width_px} x {estimate.height_px} px of {estimate.gsd_m:.4g} m",
         "tiles": estimate.tiles,
-        "missing": result.cells.holes() or "none",
+        "missing": result.holes() or "none",
         "layer": terms.layer,
         "date": terms.date or "unknown",
         "licence": terms.licence or "unknown: ask the service before you pass imagery on",
@@ -211,7 +179,7 @@ def _print_presets(as_json: bool) -> None:
     from orthonav.ground.fetch.presets import presets
 
     if as_json:
-        print_json([preset.describe() for preset in presets().values()])
+        print_json([asdict(preset) for preset in presets().values()])
         return
     for preset in presets().values():
         print(f"{preset.name}: {preset.title} ({preset.country})")

@@ -230,10 +230,9 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
 
 
 def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
-    """What a worker needs to read the same pixels: all files where the stretch to 8 bits, or
-    whether a fourth band is a mask, was derived from many together."""
-    common = any(each is not None for each in mosaic.stretches)
-    if common or any(source.marked_alpha for source in mosaic.sources):
+    """What a worker needs to read the same pixels: all files where the stretch to 8 bits was
+    derived from many together."""
+    if any(each is not None for each in mosaic.stretches):
         return tuple(orthos)
     needed = {source.path for source in part.sources if source.folder is None}
     folders = {source.folder for source in part.sources if source.folder is not None}

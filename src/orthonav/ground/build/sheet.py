@@ -38,7 +38,7 @@ from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.variants import variant_recipe
 from orthonav.ground.build.calibrate import CropSampler
 from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, rounded_gsd_m
-from orthonav.ground.imagery.mosaic import GreyPixels, Mosaic, SheetRaster
+from orthonav.ground.imagery.mosaic import Mosaic, Pixels, SheetRaster
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 from orthonav.research.tiles import SheetTiles
@@ -261,7 +261,7 @@ class SheetPictures:
         self._grey = None if self.is_grey else np.zeros(shape, np.uint8)
 
     def parts(
-        self, pixels: GreyPixels, maps: NDArray[np.float32], part: tuple[slice, slice]
+        self, pixels: Pixels, maps: NDArray[np.float32], part: tuple[slice, slice]
     ) -> dict[str, NDArray[Any]]:
         """`pixels` and their representation `maps` (1, H, W) of a block that is a part of them."""
         parts: dict[str, NDArray[Any]] = {
