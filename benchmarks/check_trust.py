@@ -38,7 +38,7 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
 from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration, expit, logit
 from orthonav.ground.check.findings import GO_LOW, NARROW_PX
-from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.records import CheckRequest
 from orthonav.ground.check.run import check_map
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 from orthonav.onboard.run import SingleViews, locate_view
@@ -151,7 +151,6 @@ def _measured(task: tuple[Pair, int, bool, int, argparse.Namespace]) -> dict[str
         relief_m=0.0,
         tilt_std_deg=0.0,
         effort=EFFORT,
-        extras=False,
         workers=1,
         recalibration=PLAIN,
     )

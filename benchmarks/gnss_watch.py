@@ -27,9 +27,8 @@ from orthonav.ground.simulate.receiver import (
     samples_of,
     solutions,
 )
-from orthonav.onboard.gnss.biases import Biases, design
-from orthonav.onboard.gnss.monitor import GnssMonitor
-from orthonav.onboard.gnss.records import Fault, GnssState, GnssStatus, MapPosition
+from orthonav.onboard.gnss.biases import Biases, Fault, design
+from orthonav.onboard.gnss.monitor import GnssMonitor, GnssState, GnssStatus, MapPosition
 
 NAME = "gnss_watch"
 FRAME = LocalFrame(48.0, 2.0)

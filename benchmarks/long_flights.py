@@ -1,4 +1,4 @@
-"""Long flights followed over a map of another date: wind, drift, biases, clouds, kidnapping.
+"""Long flights followed over a map of another date: drift, biases, clouds, kidnapping.
 
 `python -m benchmarks.long_flights [--flights 20] [--km 50] [--quick] [--only N ..]` flies over a
 generated area and follows every flight with `Tracker` from no prior. Rerun to resume; with
@@ -41,17 +41,16 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import ViewResult
 from orthonav.core.track.tracker import Tracker
-from orthonav.ground.evaluate.calibration import nees_bound, normalized_squared
+from orthonav.ground.evaluate.statistics import nees_bound, normalized_squared
 from orthonav.ground.recordings.localize import localize_flight
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.motion import Wind
 
 NAME = "long_flights"
 CAMERA = Camera(640, 480, 1000.0, 1000.0, 320.0, 240.0)
 AGL_M, GSD_M, SPACING_M, SPEED_MPS, TURN_RADIUS_M = 2000.0, 2.5, 100.0, 25.0, 400.0
 AREA_M, QUICK_AREA_M, BORDER_M = 12_000, 6_000, 1300.0
 LEG_M, SHARPEST_DEG = (3000.0, 9000.0), 120.0
-WIND_MPS, DRIFT, CLOUD_SHARE = 8.0, 0.02, 0.15
+DRIFT, CLOUD_SHARE = 0.02, 0.15
 YAW_BIAS_DEG, AGL_BIAS = 3.0, 0.05
 SCATTER = Errors(
     yaw_std_deg=1.0, agl_std=0.01, tilt_std_deg=0.2, attitude_std_deg=2.0, velocity_drift=DRIFT
@@ -119,7 +118,6 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> tuple[P
     rng = plan.rng()
     line = random_legs(rng, plan.km * 1000, plan.area_m / 2 - BORDER_M)
     yaw_bias, agl_bias = rng.normal(0, 1, 2) * [YAW_BIAS_DEG, AGL_BIAS]
-    wind = Wind(WIND_MPS, float(rng.uniform(0, 360)))
     errors = replace(SCATTER, yaw_bias_deg=float(yaw_bias), agl_bias=float(agl_bias))
     if not folder.is_dir():
         request = SimulateRequest(
@@ -132,7 +130,6 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> tuple[P
             camera=CAMERA,
             errors=errors,
             seed=SEED + plan.number,
-            wind=wind,
             turn_radius_m=TURN_RADIUS_M,
             cloud_share=CLOUD_SHARE,
         )
@@ -293,7 +290,7 @@ def _section(outcomes: Sequence[dict[str, Any]], km: float) -> Section:
     half = 1.96 * float(np.std(means, ddof=1)) / math.sqrt(len(means)) if len(means) > 1 else 0.0
     notes = (
         f"{km:g} km of random legs over another date than the map's, {AGL_M:g} m high, a view "
-        f"every {SPACING_M:g} m, wind, biases drawn per flight, clouds over {CLOUD_SHARE:.0%}; "
+        f"every {SPACING_M:g} m, biases drawn per flight, clouds over {CLOUD_SHARE:.0%}; "
         "no prior, whole map; kidnapped: gap: the clock runs on, jump: it does not",
         "median, 95 %, max, NEES: of tracking views; false: confident, more than "
         f"{FAR_M:g} m and the stated radius off; diverged: more than {DIVERGED_VIEWS} tracking "

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from benchmarks.faults import middle_of
 from benchmarks.record import Section, Table, percent, quantiles, run, say
 from benchmarks.scenes import DATA, PAST, PRESENT, SCENES, Pair, area, map_of
-from orthonav.cli.heights import map_heights
+from orthonav.cli.source import map_heights
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
@@ -28,7 +28,7 @@ from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.simulate.perspective import Raster
+from orthonav.ground.simulate.render import Raster
 
 NAME = "over_terrain"
 PARTS = ("slopes", "wrong", "oblique")

@@ -51,8 +51,8 @@ from orthonav.core.localize.fix import fix_of
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
-from orthonav.ground.build.fit import LEAST
-from orthonav.ground.evaluate.calibration import calibrate
+from orthonav.ground.build.calibrate import LEAST
+from orthonav.ground.evaluate.statistics import calibrate
 
 NAME = "trust"
 RIDGE = 1e-5

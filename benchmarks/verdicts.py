@@ -11,7 +11,7 @@ from benchmarks.placing import FlownView, row_of
 from benchmarks.scenes import FAR_M
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.evaluate.calibration import calibrate, check_covariance
+from orthonav.ground.evaluate.statistics import calibrate, check_covariance
 from orthonav.onboard.run import Locator, locate_view
 
 Array = NDArray[np.float64]

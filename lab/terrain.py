@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera
-from orthonav.ground.simulate.perspective import Array, Raster, coloured, met, rays_enu
+from orthonav.ground.simulate.render import Array, Raster, coloured, met, rays_enu
 
 
 def seen_view(

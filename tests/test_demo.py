@@ -3,8 +3,6 @@
 import functools
 import json
 import re
-import shlex
-import sys
 from pathlib import Path
 
 import pytest
@@ -21,7 +19,7 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr(demo, "WAYPOINTS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 200.0)
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
-    monkeypatch.setattr("orthonav.ground.check.places.FEWEST_TRIALS", 24)
+    monkeypatch.setattr("orthonav.ground.check.run.FEWEST_TRIALS", 24)
     monkeypatch.setattr("orthonav.ground.check.run.usable_cores", lambda: 1)
     monkeypatch.setattr("orthonav.ground.report.drawing.DPI", 30)
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
@@ -50,21 +48,6 @@ def test_the_demo(small_demo, tmp_path, capsys, names_in):
     linked = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?([^"\'>)\s]{1,40})', page)
     assert linked and all(link.startswith(("data:", "#")) for link in linked)
     assert "<script src" not in page and "@import" not in page
-
-
-@pytest.mark.parametrize("is_on_the_path", [True, False])
-def test_the_last_hint_calls_this_program(is_on_the_path, tmp_path, monkeypatch):
-    program = tmp_path / "bin" / "orthonav"
-    program.parent.mkdir()
-    program.touch(mode=0o755)
-    monkeypatch.setenv("PATH", str(program.parent if is_on_the_path else tmp_path))
-    monkeypatch.setattr(sys, "argv", [str(program), "demo"])
-    words = shlex.split(demo._how_to_view(Path("a demo")).splitlines()[-1])
-    assert words[0] == ("orthonav" if is_on_the_path else str(program))
-    assert words[1:4] == ["view", "a demo/fixes.jsonl", "--map"]
-    assert words[4:] == ["a demo/area.onav", "--flight", "a demo/flight"]
-    monkeypatch.setattr(sys, "argv", ["/src/orthonav/__main__.py", "demo"])
-    assert demo._this_program() == [sys.executable, "-m", "orthonav"]
 
 
 @pytest.mark.slow

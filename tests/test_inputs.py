@@ -151,7 +151,6 @@ def test_thresholds_that_make_no_sense_name_the_option(run, few, map_path, tmp_p
     for command in (
         ["localize", map_path, few, "--out", tmp_path / "f.jsonl"],
         ["fly", map_path, few, "--recorded-telemetry", "--dry-run"],
-        ["check", map_path, "--out", tmp_path / "check"],
     ):
         done = run(*command, "--accept", text)
         assert done.code == 1 and "--accept" in done.err and not any(tmp_path.iterdir())

@@ -39,7 +39,7 @@ def test_an_interrupt_of_the_search_for_another_set_up_skips_it(
 
 
 def test_the_search_for_another_set_up_ends_in_time(run, map_path, turned, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.cli.setups.BUDGET_S", 0.0)
+    monkeypatch.setattr("orthonav.cli.localize.BUDGET_S", 0.0)
     done = run("localize", map_path, turned, "--out", tmp_path / "fixes.jsonl")
     assert (
         done.code == 0 and "! the search for another configuration was ended after 0 s" in done.out

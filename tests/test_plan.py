@@ -96,51 +96,51 @@ def test_a_plan_for_programs(run, camera, table, dem):
     assert [each["code"] for each in plain["cautions"]] == ["relief"]
 
 
-def test_the_height_is_that_of_the_route_over_terrain(run, camera, table, dem):
-    sizes = ["--band-m", 500, "--camera", camera, "--json"]
+def test_the_height_is_that_of_the_route_over_terrain(run, camera, table, dem, tmp_path):
+    sizes = ["--camera", camera, "--json"]
     plain = json.loads(
         run("plan", "--route", table, "--dem", dem, "--dem-datum", "msl", *sizes).out
     )
     assert plain["view"]["agl_m"] == pytest.approx(325, abs=1)
     assert run("plan", "--route", table, *sizes).code == 1  # above the sea says nothing alone
-    plain = json.loads(run("plan", "--route", "paper:A@46.5,2.5", *sizes).out)
+    low = tmp_path / "low.csv"
+    low.write_text("lat,lon,agl_m\n46.5,2.5,40\n46.5,2.502,40\n")
+    plain = json.loads(run("plan", "--route", low, *sizes).out)
     assert plain["view"]["agl_m"] == 40 and plain["map"]["tile_px"] == 128
     assert [each["code"] for each in plain["cautions"]] == ["low"]
 
 
 def test_a_large_area_is_cut_into_sheets(run, camera, tmp_path):
-    out = tmp_path / "c.geojson"
-    done = run("plan", "--route", "paper:C@46.6,1.9", "--camera", camera, "--out", out)
+    out, route = tmp_path / "c.geojson", tmp_path / "long.csv"
+    route.write_text("lat,lon,agl_m,band_m\n46.6,1.574,4000,5000\n46.6,2.227,4000,\n")
+    done = run("plan", "--route", route, "--camera", camera, "--out", out)
     assert done.code == 0 and f"--route {out}#sheet-2" in done.out
     assert read_route(f"{out}#sheet-2").heights == (Height(4000, "agl"),) * 2
-    done = run("plan", "--bounds=-1,46,1,47", "--gsd-m", 2, "--json")
-    sheets = json.loads(done.out)["map"]["sheets"]
-    assert len(sheets) == 12 and sheets[0]["bounds_deg"] == [-1, 46, -0.5, 46.333333]
-    text = run("plan", "--bounds=-1,46,2,47", "--gsd-m", 2, "--no-registration").out
-    assert "--bounds=-1,46,-0.4,46.333333" in text and "and 3 more (--json)" in text
+    done = run("plan", "--bounds=2,46,2.5,46.3", "--gsd-m", 2, "--json")
+    (sheet,) = json.loads(done.out)["map"]["sheets"]
+    assert sheet["bounds_deg"] == [2, 46, 2.5, 46.3]
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
         (["--route", "TABLE"], "resolution of the map is unknown"),
-        (["--route", "none.kml", "--gsd-m", 1], "does not exist: none.kml"),
+        (["--bounds", "1,46,2,47", "--gsd-m", 1], "or as an atlas"),
         (["--bounds", "1,46,2,47", "--gsd-m", 1, "--band-m", 5], "need a route"),
-        (["--bounds", "1,46,2,47", "--gsd-m", 0], "ground resolution must be above 0"),
-        (["--bounds", "2,46,1,47", "--gsd-m", 1], "west < east"),
+        (["--bounds", "1,46,1.5,46.3", "--gsd-m", 0], "ground resolution must be above 0"),
         (["--route", "TABLE", "--band-m", 99, "--camera", "CAMERA"], "needs a height above"),
-        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--speed-mps", 0], "speed must be above"),
-        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "none.tif"], "none.tif"),
-        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM"], "give --dem-datum"),
-        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem-datum", "msl"], "give --dem too"),
+        (["--route", "TABLE", "--gsd-m", 1, "--speed-mps", 0], "speed must be above"),
+        (["--route", "TABLE", "--gsd-m", 1, "--dem-datum", "msl"], "give --dem too"),
         (
-            ["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM", "--dem-datum", "msl"],
+            ["--route", "FAR", "--gsd-m", 1, "--dem", "DEM", "--dem-datum", "msl"],
             "outside the terrain",
         ),
     ],
 )
-def test_impossible_plans_are_refused(run, table, camera, dem, arguments, message):
-    files = {"TABLE": table, "CAMERA": camera, "DEM": dem}
+def test_impossible_plans_are_refused(run, table, camera, dem, tmp_path, arguments, message):
+    far = tmp_path / "far.csv"
+    far.write_text(table.read_text().replace("46.", "40."))
+    files = {"TABLE": table, "CAMERA": camera, "DEM": dem, "FAR": far}
     done = run("plan", *(files.get(argument, argument) for argument in arguments))
     assert done.code == 1 and message in done.err and done.out == ""
 

@@ -14,7 +14,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.terrain import terrain_of_dem
+from orthonav.ground.build.layer import terrain_of_dem
 from orthonav.ground.evaluate.metrics import compare
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area

@@ -64,7 +64,7 @@ def test_tables_of_a_flight_have_at_most_so_many_rows(tmp_path, monkeypatch):
     ],
 )
 def test_routes_of_too_many_waypoints_take_little_memory(tmp_path, monkeypatch, name, text):
-    monkeypatch.setattr("orthonav.ground.planning.routes.record.MAX_WAYPOINTS", 5_000)
+    monkeypatch.setattr("orthonav.ground.planning.record.MAX_WAYPOINTS", 5_000)
     path = tmp_path / name
     path.write_text(text)
     with (

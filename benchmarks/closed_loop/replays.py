@@ -23,6 +23,7 @@ from benchmarks.looped_flight import read_rows
 from benchmarks.record import Section, Table, number, quantiles, say
 from benchmarks.scenes import DATA, PAST, PRESENT, map_of
 from orthonav.cli.demo import IMAGERY
+from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
@@ -47,7 +48,6 @@ from orthonav.onboard.telemetry import (
     FIX_3D,
     Aiding,
     TelemetryBuffer,
-    wxyz_of_angles,
 )
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -196,8 +196,8 @@ class Recorded:
 
 def _give(buffer: TelemetryBuffer, time_ns: int, value: dict[str, float]) -> None:
     """Give the buffer what the autopilot stated at a time."""
-    angles = (math.radians(value[f"{name}_deg"]) for name in ("roll", "pitch", "yaw"))
-    buffer.add_attitude(time_ns, tuple(wxyz_of_angles(*angles)))
+    angles = (math.radians(value[f"{name}_deg"]) for name in ("yaw", "pitch", "roll"))
+    buffer.add_attitude(time_ns, wxyz_of_angles(list(angles)).tolist())
     buffer.add_height("home", time_ns, value["home_m"])
     velocity = value["vel_north_mps"], value["vel_east_mps"], value["vel_down_mps"]
     buffer.add_local(time_ns, velocity, -value["home_m"])

@@ -22,7 +22,7 @@ from orthonav.ground.atlas.build import (
     versions,
 )
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe
-from orthonav.ground.atlas.cluster import SerialRunner
+from orthonav.ground.atlas.cluster import SerialRunner, attempted
 from orthonav.ground.atlas.coarse import read_coarse
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.route import Route
@@ -83,16 +83,14 @@ def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
         assert sheet.tiles == opened.manifest.sheets[0].tiles > 0
         assert opened.manifest.recipe["overlap"] == 0.5
         coarse = read_coarse(atlas.path(sheet, "coarse"))
-        assert coarse.recipe == COARSE and len(coarse.valid) > 0
+        assert len(coarse.valid) > 0
         assert sheet.dates == ("2019-06",) and sheet.made_by == versions()
         assert sheet.imagery == mosaic.describe()
-    plain = result.to_plain(cpu_hour_price=36.0)
+    plain = result.to_plain()
     assert plain["tiles"] == sum(sheet.tiles for sheet in sheets.values())
     size_bytes = sum(sheet.size_bytes for sheet in sheets.values())
     assert plain["size_mb"] == pytest.approx(size_bytes / 1e6, abs=1e-4)
-    assert plain["cpu_s"] > 0 and plain["peak_mb"] > 10
-    assert plain["cost"] == pytest.approx(plain["core_s"] / 100, abs=1e-4)
-    assert plain["sheets_per_hour"] > 0 and plain["mb_per_km2"] > 0
+    assert plain["wall_s"] > 0
 
 
 def test_an_atlas_does_not_depend_on_place_and_time_of_building(built, ortho, tmp_path):
@@ -112,7 +110,6 @@ def test_present_sheets_are_unchanged_and_missing_ones_are_built(built, ortho, t
         [],
         built[1].names("built"),
     ) and again.is_complete
-    assert again.to_plain()["mb_per_km2"] is None
     lost = sorted((place / "items").iterdir())[1]
     lost.unlink()
     again = made(place, ortho)
@@ -198,13 +195,12 @@ def test_other_versions_are_refused(ortho, tmp_path):
         build_sheet(other)
 
     class Mixed(SerialRunner):
-        def everywhere(self, probe):
-            return [("here", probe()), ("node-7", {**probe(), "gdal": "3.1"})]
+        def run(self, work, items, **_):
+            yield items[0], attempted(work, other)
 
     request = AtlasRequest(str(tmp_path / "atlas"), [ortho], SMALL)
-    with pytest.raises(WorkerError, match=r"node-7 has other versions.*gdal 3.1, not"):
+    with pytest.raises(WorkerError, match=rf"has other versions.*numpy {np.__version__}, not 1.0"):
         build_atlas(request, Mixed())
-    assert not (tmp_path / "atlas").exists()
 
 
 def test_a_worker_that_sees_other_imagery_refuses(ortho, tmp_path):
@@ -266,25 +262,21 @@ def test_a_disk_that_stays_full_ends_the_build(ortho, tmp_path, monkeypatch):
     )
 
 
-def test_sheets_count_where_snapshot_and_index_cannot_be_written(
-    built, ortho, tmp_path, monkeypatch
-):
+def test_sheets_stay_where_the_snapshot_cannot_be_written(built, ortho, tmp_path, monkeypatch):
     def full(atlas):
         raise StorageError("disk full")
 
     place = shutil.copytree(built[0], tmp_path / "atlas")
     monkeypatch.setattr(Atlas, "snapshot", full)
-    result = made(place, ortho)
-    assert (
-        result.names("unchanged") == built[1].names("built") and result.finish_error == "disk full"
-    )
-    assert not result.is_complete
+    with pytest.raises(StorageError, match="disk full"):
+        made(place, ortho)
+    assert len(Atlas.open(place).sheets()) == COUNT
 
 
 def test_the_index_is_made_at_the_end(built, ortho, tmp_path):
     place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
-    result = made(place, ortho, index=True)
-    assert result.finish_error is None and any((place / "index").iterdir())
+    made(place, ortho, index=True)
+    assert any((place / "index").iterdir())
 
 
 def test_only_sheets_of_the_area_are_planned(ortho, built):
@@ -304,11 +296,7 @@ def test_only_sheets_of_the_area_are_planned(ortho, built):
     assert planned(route=route, band_m=10.0) == names[:1]
     assert planned(route=route, band_m=1500.0) == names
     for area in ({"bounds_deg": (10.0, 10.0, 11.0, 11.0)}, {"band_m": 5.0}):
-        with pytest.raises(AreaError, match=r"outside the orthophotos$|band"):
-            planned(**area)
-    turned = Route(((west + 1e-4, middle), (east - 1e-4, middle)))
-    for area in ({"bounds_deg": (south, west, north, east)}, {"route": turned, "band_m": 10.0}):
-        with pytest.raises(AreaError, match="seem to be swapped"):
+        with pytest.raises(AreaError, match=r"outside the orthophotos|band"):
             planned(**area)
 
 
@@ -326,23 +314,9 @@ def test_imagery_across_the_antimeridian_has_sheets_on_both_sides(ortho):
     assert imagery.under((10.0, 10.0, 10.01, 10.01), 10.0).sources == ()
 
 
-def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with building.scratch_folder() as first:
-        dead = tmp_path / f"{building.SCRATCH}dead"
-        dead.mkdir()
-        (dead / "in-use").touch()
-        strange = tmp_path / f"{building.SCRATCH}being-made"
-        strange.mkdir()
-        with building.scratch_folder() as second:
-            assert sorted(tmp_path.iterdir()) == sorted([first, second, strange])
-    assert list(tmp_path.iterdir()) == [strange]
-
-
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (["--no-coarse", "--coarse-gsd-m", "4"], "remove the other --coarse"),
         (["--sheet-km", "0.001"], "must be 0.2 to"),
         (["--cluster", "local", "--workers", "0"], "workers must be 1 or more"),
     ],

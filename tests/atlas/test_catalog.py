@@ -2,21 +2,26 @@
 
 import copy
 import hashlib
-import itertools
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import fsspec
 import pytest
 
-from orthonav.core.errors import AtlasError, MissingFileError, StorageError
-from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe, copy_sheets
+from orthonav.core.errors import AreaError, AtlasError, StorageError
+from orthonav.ground.atlas.catalog import (
+    Atlas,
+    AtlasRecipe,
+    CoarseRecipe,
+    Sheet,
+    StoredFile,
+    canonical,
+    copy_sheets,
+    read_item,
+)
 from orthonav.ground.atlas.integrity import check_atlas
-from orthonav.ground.atlas.item import Sheet, StoredFile, canonical, read_item
 from orthonav.ground.atlas.store import Store
 
 RECIPE = AtlasRecipe(gsd_m=1.0)
@@ -85,8 +90,6 @@ def test_a_sheet_that_is_put_is_read_back(atlas, files):
     assert again.path(sheet).read_text() == "map of one"
     assert again.path(sheet, "coarse").read_text() == "coarse of one"
     assert again.path(sheet).suffix == ".onav"
-    with pytest.raises(AtlasError, match="has no index"):
-        again.path(sheet, "index")
     assert check_atlas(again) == []
 
 
@@ -131,21 +134,17 @@ def test_the_same_atlas_byte_for_byte(tmp_path, files):
     assert make(tmp_path / "a", [HERE, EAST]) == make(tmp_path / "b", [EAST, HERE])
 
 
-def test_sheets_that_do_not_fit_are_refused(near, files, tmp_path):
+def test_sheets_that_do_not_fit_are_refused(near, files):
     with pytest.raises(AtlasError, match="the lattice of the atlas has"):
         near.put(files(), described(bounds_deg=(1.0, 46.0, 1.1, 46.1)))
-    with pytest.raises(AtlasError, match="no sheet of 10 km is named 'r999999c000000'"):
+    with pytest.raises(AreaError, match="no sheet of 10 km is named 'r999999c000000'"):
         near.put(files(), described(id="r999999c000000"))
-    with pytest.raises(AtlasError, match="'model'"):
-        near.put({**files(), "model": tmp_path / "x"}, described())
     with pytest.raises(AtlasError, match="names no map"):
         near.put({"coarse": files()["coarse"]}, described())
     with pytest.raises(AtlasError, match="cannot be written into the catalogue"):
         near.put(files(), described(area_km2=float("nan")))
     with pytest.raises(AtlasError, match="not an item of orthonav"):
         near.put(files(), described(tiles=0))
-    with pytest.raises(MissingFileError, match="cannot be read"):
-        near.put({"map": tmp_path / "none.onav"}, described())
     assert near.sheets() == {} and list(contents(near.url)) == ["atlas.json"]
 
 
@@ -200,7 +199,9 @@ def test_an_altered_catalogue_is_refused(near, change, words):
         ("overlap", 1.0),
         ("sheet_km", 1e6),
         ("method", 7),
+        ("method", "triplet:width=32"),
         ("registration", "yes"),
+        ("registration", False),
         ("coarse", {"width": 3}),
         ("coarse", {"gsd_m": -8.0, "tile_px": 128, "overlap": 0.5}),
         ("coarse", 5),
@@ -208,7 +209,7 @@ def test_an_altered_catalogue_is_refused(near, change, words):
     ids=str,
 )
 def test_impossible_recipes_are_refused(name, value):
-    with pytest.raises(AtlasError, match="recipe"):
+    with pytest.raises(AtlasError, match=r"recipe|method gradient"):
         AtlasRecipe.from_plain({**RECIPE.to_plain(), name: value})
 
 
@@ -227,23 +228,13 @@ def altered(item, path, value):
     [
         (("id",), "../x"),
         (("id",), EAST),
-        (("type",), "Thing"),
-        (("bbox",), [1, 2, 3]),
         (("bbox",), [2.0, 46.0, 1.0, 47.0]),
         (("bbox",), ["a", 46.0, 1.0, 47.0]),
-        (("geometry", "coordinates"), []),
-        (("collection",), "other"),
         (("properties", "gsd"), 0.0),
-        (("properties", "gsd"), True),
-        (("properties", "datetime"), None),
         (("properties", "orthonav:sheet"), None),
         (("properties", "orthonav:sheet", "schema"), 2),
         (("properties", "orthonav:sheet", "revision"), 0),
-        (("properties", "orthonav:sheet", "revision"), True),
         (("properties", "orthonav:sheet", "tiles"), 1.5),
-        (("properties", "orthonav:sheet", "dates"), [2020]),
-        (("properties", "orthonav:sheet", "imagery"), ["x"]),
-        (("properties", "orthonav:sheet", "made_by"), {"a": 1}),
         (("properties", "orthonav:sheet", "more"), 1),
         (("assets", "map", "href"), "../../../etc/passwd"),
         (("assets", "map", "href"), f"../sheets/{EAST}.000000000000.onav"),
@@ -252,7 +243,6 @@ def altered(item, path, value):
         (("assets", "model"), {}),
         (("assets",), {}),
         (("assets", "map"), None),
-        (("links",), []),
     ],
 )
 def test_untrusted_items_are_refused(near, files, path, value):
@@ -362,77 +352,13 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_sheet(near, files, monkeyp
     assert check_atlas(near) == []
 
 
-MANY = """
-import sys
-from pathlib import Path
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.atlas.catalog import AtlasRecipe
-
-url, files, number = sys.argv[1:]
-atlas = Atlas.open_or_create(url, AtlasRecipe(1.0))
-for step in range(6):
-    sheet = atlas.recipe.sheets.name_at(46.0 + 0.2 * step, 2.0 + 0.3 * int(number))
-    path = Path(files, sheet)
-    path.write_text(f"map of {sheet}")
-    bounds = atlas.recipe.sheets.bounds_deg(sheet)
-    description = Sheet(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
-    atlas.put({"map": path}, description)
-"""
-
-
-def test_many_processes_put_sheets_at_once(tmp_path):
-    arguments = [sys.executable, "-c", MANY, str(tmp_path / "atlas"), str(tmp_path)]
-    started = [subprocess.Popen([*arguments, str(number)]) for number in range(3)]
-    assert [process.wait(60) for process in started] == [0, 0, 0]
-    atlas = Atlas.open(tmp_path / "atlas")
-    assert len(atlas.sheets()) == 18 and check_atlas(atlas) == []
-    assert all(
-        atlas.path(each).read_text() == f"map of {each.id}" for each in atlas.sheets().values()
-    )
-
-
-@pytest.mark.parametrize("at", [0, 2], ids=["before its files", "before its item"])
-@pytest.mark.parametrize("mine", ["one", "two", "three", "four"])
-def test_concurrent_revisions_leave_one_of_them(near, files, monkeypatch, at, mine):
-    """Another process replaces a sheet while this one does; content `one` is there before."""
-    near.put(files("one"), described())
-    other = Atlas.open(near.url)
-    write, count = Store.write, itertools.count()
-
-    def interrupted(*arguments):
-        if next(count) == at:
-            other.put(files("three"), described(request="request 3"))
-        write(*arguments)
-
-    monkeypatch.setattr(Store, "write", interrupted)
-    given_back = near.put(files(mine), described(request=f"request {mine}"))
-    again = Atlas.open(near.url)
-    assert again.sheets()[HERE] == given_back
-    assert again.path(given_back).read_text() in (f"map of {mine}", "map of three")
-    assert check_atlas(again) == []
-
-
-def test_the_snapshot_saves_reading_and_items_are_decisive(far, files, monkeypatch):
-    atlas = far
+def test_the_snapshot_shows_all_sheets(far, files):
     for sheet in (HERE, EAST):
-        atlas.put(files(sheet), described(sheet))
-    atlas.snapshot()
-    there = dict(atlas.sheets())
-    features = json.loads(atlas.store.read("items.geojson"))["features"]
-    assert features[0]["assets"]["map"]["href"] == f"./{there[HERE].files['map'].name}"
-    read = []
-    act = Store.read_many
-    monkeypatch.setattr(
-        Store, "read_many", lambda self, names: act(self, [read.append(n) or n for n in names])
-    )
-    assert Atlas.open(atlas.url).sheets() == there
-    assert read == ["atlas.json", "items.geojson"]
-    there[HERE] = atlas.put(files("new"), described())
-    assert Atlas.open(atlas.url).sheets() == there
-    for damaged in (b"", b"{}", b"[]", b'{"features":[1,{}]}', b'{"features":[{"links":[1]}]}'):
-        atlas.store.write("items.geojson", damaged)
-        assert Atlas.open(atlas.url).sheets() == there
+        far.put(files(sheet), described(sheet))
+    far.snapshot()
+    features = json.loads(far.store.read("items.geojson"))["features"]
+    assert [each["id"] for each in features] == [HERE, EAST]
+    assert features[0]["assets"]["map"]["href"] == f"./{far.sheets()[HERE].files['map'].name}"
 
 
 def test_items_are_stac(near, files):

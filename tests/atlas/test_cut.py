@@ -7,26 +7,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from safetensors import SafetensorError
 
 from helpers import textured, write_dem
-from orthonav.core.errors import AreaError, AtlasError, OutputError, StorageError, VariantError
+from orthonav.core.errors import (
+    AreaError,
+    AtlasError,
+    MapFileError,
+    StorageError,
+    VariantError,
+)
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.confidence import Chances, LogisticConfidence, RegisteredConfidence
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.embed import embedder_of
-from orthonav.core.tiles.represent import OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet
-from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
-from orthonav.ground.atlas.cut import check_shown, cut_in_memory, cut_map, pooled_tiles
-from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.atlas.warp import Warp
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
+from orthonav.ground.atlas.cut import Warp, check_shown, cut_in_memory, cut_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -164,7 +164,7 @@ def test_threads_do_not_change_the_map(folder, cut, middle, tmp_path, names_in):
     )
     assert again.read_bytes() == cut.path.read_bytes()
     assert names_in(tmp_path) == ["again.onav"]
-    assert stages[0] == ("sheets", 0) and stages[-1] == ("learn", 1)
+    assert stages[0] == ("sheets", 0) and stages[-1] == ("learn", 0)
 
 
 def test_a_cut_map_shows_its_sheets_in_its_own_plane(cut, ortho):
@@ -178,25 +178,6 @@ def test_a_cut_map_shows_its_sheets_in_its_own_plane(cut, ortho):
     assert off.mean() < 6 and np.corrcoef(grey.ravel(), truth.grey.ravel())[0, 1] > 0.97
     shifted = np.abs(grey[:, 1:].astype(int) - truth.grey[:, :-1])
     assert shifted.mean() > 2 * off.mean()
-
-
-def test_its_tiles_agree_with_those_of_the_imagery(cut, ortho):
-    sheet = cut.manifest.sheets[0]
-    height, width = sheet.grid.height_px, sheet.grid.width_px
-    with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
-        truth = raster.read_grey(0, 0, width, height)
-    maps = OrientedGradients()(truth.grey, truth.valid)
-    cells = CellSheet(LAYOUT, height, width, len(maps))
-    cells.fill(0, 0, maps, truth.valid)
-    parts = cut.arrays
-    embedder = embedder_of(
-        cut.manifest.recipe["embed"], lambda name, dtype, ndim: parts[f"embed/{name}"], len(maps)
-    )
-    tiles_px = sheet.grid.tiles_rc(parts["sheet0/centres_en_m"]) * sheet.grid.stride_px
-    expected = embedder.tiles(cells, tiles_px).astype(np.float32)
-    alike = np.sum(expected * parts["sheet0/embeddings"], axis=1)
-    assert sheet.tiles == sheet.grid.rows * sheet.grid.cols
-    assert alike.min() > 0.9 and np.median(alike) > 0.97
 
 
 @pytest.mark.parametrize("registration", [True, False])
@@ -217,34 +198,12 @@ def test_views_are_placed_across_the_borders_of_sheets(cut, ortho, registration)
         assert np.hypot(*(place - where)) < (2 if registration else 12)
 
 
-def test_imagery_of_all_sheets_is_named_once(atlas, names, middle, tmp_path):
-    opened = open_map(sheet_file(atlas, names[1]))
-    older = {**opened.manifest.imagery[0], "name": "older.tif", "date": "2011"}
-    imagery = (older, *opened.manifest.imagery)
-    write_map(tmp_path / "s.onav", replace(opened.manifest, imagery=imagery), opened.arrays)
-    put(atlas, names[1], tmp_path / "s.onav")
-    done = cut_map(atlas, tmp_path / "o.onav", area_around(middle, 60), workers=1)
-    assert [each["date"] for each in done.manifest.imagery] == ["2011", "2019-06"]
-
-
-def test_tiles_outside_the_band_are_left_out(folder, middle, tmp_path):
-    route = line(middle, [-150, -150], [150, 150])
-    done = cut_map(
-        Atlas.open(str(folder)), tmp_path / "o.onav", Area.from_route(route, 40), workers=1
-    )
-    sheet = done.manifest.sheets[0]
-    assert sheet.tiles < 0.7 * sheet.grid.rows * sheet.grid.cols
-    area = Area.from_route(route, 40)
-    centres = open_map(tmp_path / "o.onav").arrays["sheet0/centres_en_m"].astype(float)
-    assert area.contains(centres, sheet.grid.stride_m).all()
-
-
 def test_a_missing_sheet_beside_the_route_is_a_warning(atlas, names, middle, tmp_path, caplog):
     atlas.retire(names[3])
     here = middle.en_from_latlon(*centre_of(names[0]))
     route = line(middle, 1.2 * here, 0.5 * here)
     done = cut_map(atlas, tmp_path / "o.onav", Area.from_route(route, 600), workers=1)
-    assert "the atlas lacks" in caplog.text and names[3] in caplog.text
+    assert "the atlas, which lacks" in caplog.text and names[3] in caplog.text
     sheet = done.manifest.sheets[0]
     assert sheet.tiles < 0.9 * sheet.grid.rows * sheet.grid.cols
 
@@ -265,45 +224,26 @@ def centre_of(name):
     return (south + north) / 2, (west + east) / 2
 
 
-def test_imagery_that_is_missing_under_the_route_is_an_error(middle, caplog):
+def test_imagery_that_is_missing_under_the_route_is_an_error(atlas, middle, caplog):
     area = Area.from_route(line(middle, [-150, 0], [150, 0]), 200)
     grid = grid_of(area, 1.0, 1.0, RECIPE.tile_px, RECIPE.overlap)
     cells = CellSheet(LAYOUT, grid.height_px, grid.width_px, 7)
     cells.valid[:, : cells.valid.shape[1] // 2] = 1
     with pytest.raises(AtlasError, match="of the route has no imagery"):
-        check_shown(area, grid, cells, allow_holes=False)
-    check_shown(area, grid, cells, allow_holes=True)
+        check_shown(area, grid, cells, atlas, allow_holes=False)
+    check_shown(area, grid, cells, atlas, allow_holes=True)
     assert "of the area has no imagery" in caplog.text
     cells.valid[:] = 1
-    check_shown(area, grid, cells, allow_holes=False)
+    check_shown(area, grid, cells, atlas, allow_holes=False)
 
 
 def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):
     atlas = Atlas.open(str(folder))
     with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
         cut_map(atlas, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
-    west, south, east, north = atlas.bounds_deg
-    swapped = Area.from_bounds((south, west, north, east))
-    with pytest.raises(AreaError, match="seem to be swapped"):
-        cut_map(atlas, tmp_path / "o.onav", swapped)
     empty = Atlas.open_or_create(str(tmp_path / "empty"), RECIPE)
-    with pytest.raises(AreaError, match="no sheets yet"):
+    with pytest.raises(AreaError, match="0 sheets"):
         cut_map(empty, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
-
-
-@pytest.mark.parametrize(
-    ("lacking", "said"), [("sheet0/cells", "no cells"), ("sheet0/grey", "no registration layer")]
-)
-def test_sheets_without_cells_or_layer_are_refused(atlas, names, middle, tmp_path, lacking, said):
-    opened = open_map(sheet_file(atlas, names[2]))
-    kept = {name: part for name, part in opened.arrays.items() if not name.startswith(lacking)}
-    manifest = opened.manifest
-    if lacking.endswith("grey"):
-        manifest = replace(manifest, sheets=(replace(manifest.sheets[0], grey=None),))
-    write_map(tmp_path / "s.onav", manifest, kept)
-    put(atlas, names[2], tmp_path / "s.onav")
-    with pytest.raises(AtlasError, match=rf"{names[2]} has {said}.*rebuild it"):
-        cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=1)
 
 
 @pytest.mark.parametrize("change", ["recipe", "grid", "method"])
@@ -340,18 +280,8 @@ def test_a_damaged_chunk_is_found_by_any_thread(atlas, names, middle, tmp_path):
     parts["sheet0/grey/bytes"][:] = 7
     write_map(tmp_path / "s.onav", opened.manifest, parts)
     put(atlas, names[1], tmp_path / "s.onav")
-    with pytest.raises(AtlasError, match=rf"sheet {names[1]} is damaged"):
+    with pytest.raises(MapFileError, match=rf"damaged.*{names[1]}"):
         cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=2)
-
-
-def test_a_full_disk_leaves_nothing(folder, middle, tmp_path, monkeypatch, names_in):
-    def full(*arguments, **named):
-        raise SafetensorError("I/O error: No space left on device (os error 28)")
-
-    monkeypatch.setattr("orthonav.core.mapfile.reader.save_file", full)
-    with pytest.raises(OutputError, match="disk full"):
-        cut_map(Atlas.open(str(folder)), tmp_path / "o.onav", area_around(middle, 60), workers=1)
-    assert names_in(tmp_path) == []
 
 
 def test_impossible_requests_are_refused(folder, middle, tmp_path):
@@ -361,28 +291,6 @@ def test_impossible_requests_are_refused(folder, middle, tmp_path):
         cut_map(atlas, out, area_around(middle, 20))
     with pytest.raises(VariantError, match="workers"):
         cut_map(atlas, out, area, workers=0)
-    own = sheet_file(atlas, next(iter(atlas.sheets())))
-    with pytest.raises(OutputError, match="replace a sheet"):
-        cut_map(atlas, own, area, workers=1)
-
-
-TILES = [LogisticConfidence(-6.2, (11.0, 12.0)), LogisticConfidence(-4.2, (5.6, 21.7))]
-REGISTERED = [
-    RegisteredConfidence.usual(Chances(40.0, 18.0, 54.0)),
-    RegisteredConfidence.usual(Chances(49.0, 17.0, 60.0)),
-]
-SHARES = [0.3, 0.7]
-
-
-def test_the_confidence_of_tiles_never_exceeds_the_mean_of_the_sheets():
-    pooled = pooled_tiles(TILES, SHARES, 1.0)
-    for score in np.linspace(0.1, 1, 10):
-        for margin in np.linspace(0, min(score, 0.5), 9):
-            evidence = {"score": score, "margin": margin}
-            mean = np.average([each(evidence) for each in TILES], weights=SHARES)
-            if 0.55 < mean < 0.985:
-                assert pooled(evidence) <= mean + 0.02
-    assert pooled({"score": 0.9, "margin": 0.3}) > 0.9
 
 
 def test_the_affine_agrees_with_the_geodesy():

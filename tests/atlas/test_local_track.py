@@ -12,8 +12,8 @@ from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.records import NoFix, View
 from orthonav.core.track import State
 from orthonav.ground.atlas import locate
-from orthonav.ground.atlas.agreement import Placement
 from orthonav.ground.atlas.locate import FoundPlace, LocalTrack
+from orthonav.ground.atlas.search import Placement
 
 STD_M = 12.5
 BEGUN = 3

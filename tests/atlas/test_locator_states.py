@@ -45,16 +45,12 @@ class Track:
         return True
 
 
-def made(**recipe):
-    atlas = SimpleNamespace(recipe=AtlasRecipe(gsd_m=1.0, **recipe), url="atlas")
-    return AtlasLocator(SimpleNamespace(atlas=atlas), None)
-
-
 @pytest.fixture
 def locator(monkeypatch):
     monkeypatch.setattr(locate, "PlaceFinder", Finder)
     monkeypatch.setattr(locate, "LocalTrack", Track)
-    return made()
+    atlas = SimpleNamespace(recipe=AtlasRecipe(gsd_m=1.0), url="atlas")
+    return AtlasLocator(SimpleNamespace(atlas=atlas), None)
 
 
 @pytest.fixture
@@ -90,9 +86,3 @@ def test_a_view_that_cannot_be_used_has_its_reason(tracking):
     reason = NoFix("bad_image", "damaged")
     assert tracking.passed(None, reason) is reason
     assert tracking.state_name == "coasting"
-
-
-@pytest.mark.parametrize("recipe", [{"method": "triplet:width=32"}, {"registration": False}])
-def test_an_atlas_without_maps_to_cut_is_refused(recipe):
-    with pytest.raises(AtlasError, match="gradient and registration"):
-        made(**recipe)

@@ -10,10 +10,10 @@ import pytest
 pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
 from orthonav.core.flight.folder import open_flight, read_truth
-from orthonav.core.geo.frames import LocalFrame, distances_m
+from orthonav.core.geo.frames import distances_m
 from orthonav.core.records import PRIOR_SIGMAS, Prior, View
 from orthonav.ground.atlas.locate import PlaceFinder, rectified
-from orthonav.ground.atlas.search import SearchRegion, SheetRegistrar, TileSearch, ViewRegistrar
+from orthonav.ground.atlas.search import SheetRegistrar, TileSearch, ViewRegistrar
 
 SIDE_M = 300.0
 
@@ -48,7 +48,7 @@ def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, can
     seen, truth = view
     found = ViewRegistrar(registrar, seen, SIDE_M).searched(candidate)
     assert _off_m(found, truth) < 10
-    sheet = registrar.at(candidate, SIDE_M)[0]
+    sheet = registrar.at(candidate)
     yaw_deg, std_deg = np.degrees([candidate.turn_rad, candidate.turn_std_rad]).tolist()
     telemetry = replace(seen.telemetry, yaw_deg=yaw_deg, yaw_std_deg=std_deg)
     turned = replace(seen, telemetry=telemetry)
@@ -58,23 +58,6 @@ def test_a_part_of_a_sheet_has_the_match_of_the_whole_sheet(registrar, view, can
         assert found.evidence[name] == pytest.approx(whole.scores[name], rel=0.05)
     assert found.turn_rad == pytest.approx(whole.pose.turn_rad, abs=2e-3)
     assert found.confidence == sheet.confidence
-
-
-def test_a_place_between_sheets_is_judged_on_one(registrar, atlas):
-    _, south, east, north = next(iter(atlas.sheets().values())).bounds_deg
-    name = next(
-        name
-        for name, other in atlas.sheets().items()
-        if other.bounds_deg[1] == south and other.bounds_deg[0] == pytest.approx(east)
-    )
-    border = LocalFrame((south + north) / 2, east).latlon_from_en(np.array([5.0, 0.0]))
-    place = float(border[0]), float(border[1])
-    region = SearchRegion(*place, 0.0, 0.0, place, 50.0, 0.1)
-    assert len(registrar.near(region, SIDE_M)) == 2
-    (own,) = registrar.at(region, SIDE_M)
-    registrar._usable.discard(name)
-    (other,) = registrar.at(region, SIDE_M)
-    assert own is not other
 
 
 def test_all_views_of_a_flight_are_found(atlas, registrar, flown):

@@ -61,8 +61,8 @@ def folder(tmp_path, vectors, quantizers):
 def write(folder, name, quantizers, vectors):
     where = places(len(vectors))
     parts = [slice(start, start + 1500) for start in range(0, len(vectors), 1500)]
-    rows = write_shard(folder, name, quantizers, ((where[part], vectors[part]) for part in parts))
-    assert rows == len(vectors)
+    info = ShardInfo(name, 0, (Part("", "", len(vectors)),))
+    write_shard(folder, info, quantizers, ((where[part], vectors[part]) for part in parts))
 
 
 def places(count):
@@ -86,15 +86,6 @@ def test_search_finds_what_exact_search_finds(folder, vectors):
     assert np.mean([np.isin(a, b).mean() for a, b in zip(few, expected, strict=True)]) > 0.6
 
 
-def test_one_query_finds_the_same_as_many(folder, vectors):
-    index, queries = ShardedIndex(folder.joinpath, SHARDS), seen(vectors)
-    scores, ids = index.search(queries, 5, probes=20, rerank=200)
-    for query in range(10):
-        alone_scores, alone = index.search(queries[query : query + 1], 5, probes=20, rerank=200)
-        np.testing.assert_array_equal(alone[0], ids[query])
-        np.testing.assert_allclose(alone_scores[0], scores[query], atol=1e-6)
-
-
 def test_same_input_same_bytes(tmp_path, vectors):
     for name in ("one", "other"):
         again = train(vectors, RECIPE)
@@ -104,29 +95,6 @@ def test_same_input_same_bytes(tmp_path, vectors):
     assert files == ["a.codes", "a.lists.npy", "a.places.npy", "a.vectors.npy", QUANTIZERS_NAME]
     for name in files:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
-
-
-def test_retired_rows_are_not_found(folder, vectors):
-    retired = (
-        replace(SHARDS[0], parts=(replace(SHARDS[0].parts[0], retired=True), SHARDS[0].parts[1])),
-        SHARDS[1],
-    )
-    queries = seen(vectors)
-    _, before = ShardedIndex(folder.joinpath, SHARDS).search(queries, 3, 64, 400)
-    assert (before[:, 0] < 1500).any()
-    _, ids = ShardedIndex(folder.joinpath, retired).search(queries, 3, 64, 400)
-    assert ids.min() >= 1500
-    unaffected = (before >= 1500).all(axis=1)
-    np.testing.assert_array_equal(ids[unaffected], before[unaffected])
-
-
-def test_ids_lead_to_vectors_and_places(folder, vectors):
-    index = ShardedIndex(folder.joinpath, SHARDS)
-    assert len(index) == 6000
-    np.testing.assert_allclose(index.vectors(np.array([4001, 7])), vectors[[4001, 7]], atol=1e-3)
-    np.testing.assert_array_equal(index.vectors(np.array([6000]))[0], 0)
-    assert index.place_deg(7) == (0.07, -0.07) and index.place_deg(4001) == (0.01, -0.01)
-    assert index.place_deg(6000) is None
 
 
 def test_fewer_vectors_than_requested(tmp_path, vectors, quantizers):
@@ -161,5 +129,5 @@ def test_damaged_codes_are_refused(folder, vectors):
 
 def test_a_shard_of_another_size_is_refused(folder):
     other = (replace(SHARDS[0], parts=SHARDS[0].parts[:1]),)
-    with pytest.raises(AtlasError, match="expected 1500 vectors"):
+    with pytest.raises(AtlasError, match="expected 1500 rows"):
         ShardedIndex(folder.joinpath, other)

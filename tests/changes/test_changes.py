@@ -166,9 +166,9 @@ def shares(found: ChangedGround, crs, corners):
 
 
 @pytest.mark.long
-def test_localize_and_evaluate_report_what_was_built(run, built_over, map_path, tmp_path):
+def test_localize_reports_what_was_built(run, built_over, map_path, tmp_path):
     folder, crs, corners = built_over
-    fixes, out, again = (tmp_path / name for name in ("fixes.jsonl", "a.geojson", "b.geojson"))
+    fixes, out = tmp_path / "fixes.jsonl", tmp_path / "a.geojson"
     done = run(
         "localize", map_path, folder / "flight", "--out", fixes, "--report-changes", out, "--json"
     )
@@ -177,16 +177,10 @@ def test_localize_and_evaluate_report_what_was_built(run, built_over, map_path, 
     found = read_changes(out)
     built, elsewhere = shares(found, crs, corners)
     assert built > 0.6 and elsewhere < 0.03
-    done = run(
-        *("evaluate", fixes, "--truth", folder / "flight" / "truth.csv", "--map", map_path),
-        *("--flight", folder / "flight", "--report-changes", again),
-    )
-    assert done.code == 0 and "no longer looks like the map" in done.out
-    assert again.read_bytes() == out.read_bytes()
 
 
 @pytest.mark.long
-def test_changes_need_views_and_a_map_that_shows_the_ground(run, built_over, map_path, tmp_path):
+def test_changes_need_a_map_that_shows_the_ground(run, built_over, map_path, tmp_path):
     folder, _, _ = built_over
     out = tmp_path / "changes.geojson"
     flight = folder / "flight"
@@ -195,8 +189,4 @@ def test_changes_need_views_and_a_map_that_shows_the_ground(run, built_over, map
         *("--registration", "off", "--report-changes", out),
     )
     assert done.code == 1 and "registration layer" in done.err
-    fixes = tmp_path / "fixes.jsonl"
-    fixes.write_text("")
-    done = run("evaluate", fixes, "--truth", flight / "truth.csv", "--report-changes", out)
-    assert done.code == 1 and "--map and --flight" in done.err
     assert not out.exists()

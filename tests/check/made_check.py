@@ -5,21 +5,19 @@ import math
 import numpy as np
 
 from orthonav.ground.check.findings import blind_stretches, expected_drift
-from orthonav.ground.check.outcome import (
+from orthonav.ground.check.records import (
     Along,
-    Alternative,
     Cells,
     CheckedInputs,
     CheckResult,
     Conditions,
-    Envelope,
     Lookalike,
     Reason,
     Verdict,
     Word,
 )
 
-FILES = {"index.html", "check.json", "check.tif", "check.geojson", "figures"}
+FILES = {"index.html", "check.json", "check.tif", "check.geojson"}
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
 DIGEST = "0123456789abcdef" * 4
 CONDITIONS = Conditions(
@@ -75,7 +73,8 @@ def lost_in(cells, mask):
     values = {name: getattr(cells, name) * hole for name in names}
     values["trials"] = np.where(mask, 0, cells.trials).astype(np.int32)
     values["changed"] = np.where(mask, 0.0, cells.changed)
-    return Cells(cells.west_m, cells.north_m, cells.side_m, **values)
+    corner = {"west_m": cells.west_m, "north_m": cells.north_m, "side_m": cells.side_m}
+    return Cells(**corner, **values)
 
 
 def along_of(cells, waypoints, step_m=25.0):
@@ -96,21 +95,16 @@ def along_of(cells, waypoints, step_m=25.0):
         high=cells.high[rows, cols],
         across_low=np.maximum(probability - 0.15, 0),
         error_m=cells.error_m[rows, cols],
+        wrong=cells.wrong[rows, cols],
+        persistence=cells.persistence[rows, cols],
         drift_m=expected_drift(distance, probability, cells.error_m[rows, cols], 0.02, 100.0),
     )
-
-
-def envelope():
-    yaw, agl = np.arange(-20, 21, 5.0), np.array([-0.2, -0.1, -0.05, 0, 0.05, 0.1, 0.2])
-    share = 0.9 * np.exp(-((yaw[:, None] / 14) ** 2) - (agl / 0.13) ** 2)
-    share[0, 0] = np.nan
-    return Envelope(yaw, agl, share, 5.0, -0.05, 0.05)
 
 
 def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", route="", **changed):
     """A check of cells, along a route where there is one."""
     along = None if waypoints is None else along_of(cells, waypoints)
-    stretches = () if along is None else blind_stretches(along, CONDITIONS, 25.0)
+    stretches = () if along is None else blind_stretches(along, CONDITIONS)
     known = np.isfinite(cells.probability)
     here = frame.latlon_from_en(np.array([[0.0, 0.0], [400.0, 250.0], [-300.0, 100.0]]))
     places = list(zip(*here, strict=True))
@@ -140,14 +134,6 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
         "band_m": band_m,
         "stretches": stretches,
         "lookalikes": lookalikes,
-        "envelope": envelope(),
-        "alternatives": (
-            Alternative("agl_m", 120.0, 0.71),
-            Alternative("agl_m", 200.0, 0.83, True),
-            Alternative("agl_m", 300.0, 0.9),
-            Alternative("band_m", 500.0, 0.84),
-            Alternative("band_m", 1000.0, 0.83, True),
-        ),
     }
     return CheckResult(frame=frame, cells=cells, **{**parts, **changed})
 
@@ -172,4 +158,4 @@ def nearly_empty(frame):
     cells = made_cells(20, 20, 50.0)
     mask = np.ones((20, 20), dtype=bool)
     mask[3, 4:6] = False
-    return made_check(frame, lost_in(cells, mask), envelope=None, lookalikes=(), alternatives=())
+    return made_check(frame, lost_in(cells, mask), lookalikes=())

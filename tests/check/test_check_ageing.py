@@ -86,26 +86,3 @@ def test_the_more_lasts_the_more_is_kept():
 
 
 LASTING = (0.01, 0.3, 0.6, 0.95)
-
-
-def test_what_lasts_is_kept_where_it_does():
-    grey = textured((SIDE, SIDE), 5)
-    lasting = np.where(np.arange(SIDE) < SIDE // 2, 0.9, 0.02).astype(np.float32)
-    persistence = [np.broadcast_to(lasting, (SIDE, SIDE))] * 3
-    donor = textured((SIDE, SIDE), 6)
-    made = another_year(np.random.default_rng(2), grey, donor, persistence)
-    west, east = np.s_[:, : SIDE // 2], np.s_[:, SIDE // 2 :]
-    assert kept(grey[west], made[west]) > 0.3 > 0.15 > kept(grey[east], made[east])
-
-
-def test_what_comes_instead_stays_mirrored():
-    """It is turned, never flipped again: then it would be found where it is from."""
-    ground = textured((SIDE, SIDE), 7)
-    made = changed(0.005, donor=ground[:, ::-1])
-    turned = [np.rot90(ground, times) for times in range(4)]
-    mirrored = [np.rot90(ground[:, ::-1], times) for times in range(4)]
-    assert max(kept(each, made) for each in turned) < 0.1
-    assert max(kept(each, made) for each in mirrored) > 0.4
-
-
-SHARES = np.linspace(0.02, 0.98, 25)

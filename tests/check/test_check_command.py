@@ -1,7 +1,6 @@
 """The whole check of a small map with real and synthetic trials, and as a command."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.signature import map_digest
 from orthonav.ground.changes.record import ChangedGround, ChangeGrid, write_changes
 from orthonav.ground.check import run as check_run
-from orthonav.ground.check.outcome import Verdict, Word
-from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.records import CheckRequest, Verdict, Word
 from orthonav.ground.check.run import check_map
 from orthonav.ground.check.write.plain import to_json
 from orthonav.ground.planning.route import Route
@@ -63,7 +61,6 @@ def tried(half_blank):
         agl_m=130.0,
         prior_std_m=50.0,
         effort=0.05,
-        extras=False,
         workers=1,
     )
     result, _ = check_map(request, lambda what, share: said.append((what, share)))
@@ -82,23 +79,19 @@ def test_the_half_that_shows_something_is_where_views_are_placed(tried):
 # With synthetic trials.
 
 
-def made_up(work, workers, progress):
+def made_up(request, conditions, places, workers, progress):
     """Views of the west are placed, those of the east and of a second date are not."""
-    found = []
-    for plan, places in work:
-        west = [place[0] < 0 and not plan.second_date for place in places]
-        found.append(
-            [
-                (right if good else lost)(tuple(place), expected=0.6 if good else 0.1)
-                for i, (place, good) in enumerate(zip(places, west, strict=True))
-            ]
-        )
-    return found
+    own = [
+        right(tuple(place), expected=0.6) if place[0] < 0 else lost(tuple(place), expected=0.1)
+        for place in places
+    ]
+    other = [] if request.other_date is None else [lost(tuple(place)) for place in places]
+    return own, other
 
 
 @pytest.fixture
 def untried(monkeypatch):
-    monkeypatch.setattr(check_run, "run_many", made_up)
+    monkeypatch.setattr(check_run, "run_trials", made_up)
 
 
 @pytest.fixture
@@ -153,38 +146,6 @@ def test_odd_routes(checked, frame, points, changed):
     json.loads(to_json(result))
 
 
-def test_holes_of_the_map_are_unknown(untried, half_blank, opened, tmp_path, monkeypatch):
-    """The map covers a strip: around it nothing is known, and in a band the probability is 0."""
-    whole = check_run.MapCoverage.of
-
-    def holed(layer, grid):
-        ground = whole(layer, grid)
-        valid = ground.valid.copy()
-        valid[: len(valid) // 2] = False
-        return replace(ground, valid=valid)
-
-    monkeypatch.setattr(check_run.MapCoverage, "of", holed)
-    request = CheckRequest(half_blank.map, camera=CAMERA, agl_m=130.0, prior_std_m=50.0)
-    cells = check_map(request)[0].cells
-    assert cells.north_m < 30 and np.nanmax(cells.probability) > 0.8
-    frame = opened.manifest.sheets[0].frame
-    banded = replace(request, route=route_of(frame, [[-200, -200], [-200, 200]]), band_m=100.0)
-    result = check_map(banded)[0]
-    assert result.along.probability[0] > 0.8 and result.along.probability[-1] == 0
-    middle = result.cells.probability[:, result.cells.probability.shape[1] // 2]
-    assert (middle[:4] == 0).all() and (middle[-4:] > 0.5).all()
-
-
-def test_envelope_and_heights(checked):
-    result = checked()
-    assert result.envelope is not None and result.envelope.share.max() == 1.0
-    assert [each.chosen for each in result.alternatives] == [False, False, True, False, False]
-    without = checked(extras=False)
-    assert without.envelope is None and without.alternatives == ()
-    assert to_json(without) != to_json(result)
-    np.testing.assert_array_equal(without.cells.probability, result.cells.probability)
-
-
 def test_views_that_fit_on_no_map(checked, frame):
     with pytest.raises(AreaError, match="do not fit on the map"):
         checked(agl_m=50_000.0)
@@ -233,7 +194,7 @@ def test_command(run, untried, half_blank, route_path, tmp_path):
     assert done.code in (0, 3, 4) and done.err == ""
     assert f"report: {out / 'index.html'}" in done.out
     names = {path.name for path in out.iterdir()}
-    assert {"index.html", "check.json", "check.tif", "check.geojson", "figures"} == names
+    assert {"index.html", "check.json", "check.tif", "check.geojson"} == names
     plain = json.loads((out / "check.json").read_text())
     assert plain["verdict"]["exit_code"] == done.code
     assert plain["about"]["other_date"] == half_blank.present.name
@@ -302,7 +263,7 @@ def test_heights_above_sea_need_a_terrain(run, unwritten, half_blank, frame, rou
     route.write_text("\n".join(line + add for line, add in rows) + "\n")
     check = ("check", half_blank.map, "--route", route, "--out", out)
     done = run(*check)
-    assert done.code == 1 and "above home, not above ground: give the terrain (--dem" in done.err
+    assert done.code == 1 and "not above ground: give the terrain (--dem" in done.err
     assert "Checked at 160 m above ground, as given." in run(*check, "--agl-m", 160).out
     # The ground falls by 100 m from the first waypoint to the second.
     dem = write_dem(tmp_path / "dem.tif", frame, lambda east, north: 300 - 0.4 * east + 0 * north)
@@ -320,13 +281,10 @@ def test_heights_above_sea_need_a_terrain(run, unwritten, half_blank, frame, rou
 @pytest.mark.parametrize(
     "options, said",
     [
-        (["--accept", "confidence:1.5"], "--accept confidence: the threshold must be 0.01"),
-        (["--seed", "-3"], "seed must be"),
         (["--workers", "0"], "workers must be"),
         (["--other-date", "no.tif"], "no.tif"),
         (["--camera", "no.json"], "no.json"),
         (["--agl-m", "40000"], "do not fit on the map"),
-        (["--route", "paper:A@10,10"], "does not touch the map"),
     ],
     ids=lambda each: " ".join(each) if isinstance(each, list) else "",
 )
@@ -341,7 +299,7 @@ def test_an_interrupt_writes_nothing(run, half_blank, tmp_path, names_in, monkey
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(check_run, "run_many", interrupted)
+    monkeypatch.setattr(check_run, "run_trials", interrupted)
     done = run("check", half_blank.map, *VIEWS, "--out", tmp_path / "report")
     assert (done.code, done.err) == (1, "orthonav: error: interrupted; nothing was written\n")
     assert names_in(tmp_path) == []

@@ -61,29 +61,6 @@ def test_all_is_in_order_whatever_the_trials(count, kinds, expected, view_side_m
     assert (found.error_m >= 0).all() and (found.wrong >= 0).all() and (found.wrong <= 1).all()
 
 
-def test_far_from_trials_what_lasts_there_tells():
-    """Trials of two kinds of ground: kinds, not places, decide what succeeds."""
-    rng = np.random.default_rng(4)
-    trials = []
-    for en in places(400):
-        lasting = 0.6 if en[1] > SIDE_M / 2 else 0.05
-        succeeds = rng.random() < (0.9 if lasting > 0.3 else 0.1)
-        trials.append(right(en, expected=lasting) if succeeds else lost(en, expected=lasting))
-    found = predictor(trials, view_side_m=20.0, spacing_m=10.0)
-    above, below = found.at(np.array([[500.0, 1100.0], [500.0, -100.0]])).probability
-    assert above > 0.7 and below < 0.3
-
-
-def test_more_trials_narrow_the_interval():
-    widths = []
-    for count in (20, 2000):
-        found = predictor([right(en) if i % 2 else lost(en) for i, en in enumerate(places(count))])
-        found = found.at(np.array([[500.0, 500.0]]))
-        widths.append(found.high[0] - found.low[0])
-    assert widths[1] < 0.7 * widths[0]
-    assert widths[1] > 0.15  # years differ, however many trials there are
-
-
 def test_another_date_outweighs_the_map_itself():
     at = places(200)
     own, other = [right(en) for en in at], [lost(en, expected=np.nan) for en in at]

@@ -1,72 +1,23 @@
-"""How far heading and height may be off, from trials."""
+"""Ambiguous places, from trials."""
 
 import math
-from pathlib import Path
+from dataclasses import replace
 
-import numpy as np
 import pytest
-from made_trials import lost, misplaced, right
+from made_trials import CONDITIONS, lost, misplaced, right
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.check.findings import (
-    AGL_OFF,
-    HEIGHTS,
-    SIMILAR,
-    TOLERATED,
-    YAW_OFF_DEG,
-    envelope_of,
-    found_lookalikes,
-    heights_of,
-    heights_work,
-)
-from orthonav.ground.check.request import CheckRequest
-from orthonav.ground.check.trials import TrialPlan
-
-PLAN = TrialPlan(CheckRequest(Path("a.onav")), 100.0)
-PLACES = np.zeros((20, 2))
-MIDDLE = AGL_OFF.index(0.0)
-
-
-def trials(share):
-    """20 trials of which so many are right."""
-    count = round(20 * share)
-    return [right((0, 0))] * count + [lost((0, 0))] * (20 - count)
-
-
-def envelope(shares):
-    shares = np.broadcast_to(shares, (len(YAW_OFF_DEG), len(AGL_OFF)))
-    return envelope_of([trials(each) for each in shares.ravel()])
-
-
-def test_errors_are_fine_up_to_the_first_that_is_not():
-    shares = np.full((len(YAW_OFF_DEG), len(AGL_OFF)), 0.9)
-    shares[2, MIDDLE] = 0.9 * TOLERATED - 0.1
-    shares[0, -1] = shares[0, 0] = 0.1
-    found = envelope(shares)
-    assert found.tolerated_yaw_deg == YAW_OFF_DEG[1]
-    assert (found.tolerated_agl_low, found.tolerated_agl_high) == (AGL_OFF[1], AGL_OFF[-2])
-    np.testing.assert_allclose(found.share, shares, atol=0.03)
-
-
-def test_heights():
-    work = heights_work(PLAN, PLACES)
-    assert [plan.agl_m for plan, _ in work] == [100.0 * part for part in HEIGHTS]
-    shares = [0.1 * (i + 1) for i in range(len(HEIGHTS))]
-    found = heights_of(PLAN, trials(0.7), [trials(each) for each in shares])
-    assert [each.value for each in found] == sorted([100.0, *(100.0 * part for part in HEIGHTS)])
-    chosen = [each for each in found if each.chosen]
-    assert [(each.value, each.probability) for each in chosen] == [(100.0, 0.7)]
-    assert found[0].probability == pytest.approx(0.1)
-
+from orthonav.ground.check.findings import SIMILAR, found_lookalikes
 
 FRAME = LocalFrame(46.0, 3.0)
 HERE, THERE = (0.0, 0.0), (800.0, 300.0)
 
 
 def found(trials, prior_std_m=None):
-    return found_lookalikes(
-        trials, FRAME, view_side_m=100.0, radius_m=20.0, prior_std_m=prior_std_m
+    conditions = replace(
+        CONDITIONS, width_m=100.0, height_m=100.0, radius_m=20.0, prior_std_m=prior_std_m
     )
+    return found_lookalikes(trials, FRAME, conditions)
 
 
 def near(place, east, north=0.0):

@@ -1,9 +1,7 @@
 """The page of a check is complete, requests nothing, and works in a real browser."""
 
-import base64
 import hashlib
 import json
-import math
 import re
 from dataclasses import replace
 
@@ -13,41 +11,22 @@ import pytest
 from made_check import EVIL, FILES, small_route
 
 from html_page import Page
-from orthonav.ground.check.outcome import CELL_VALUES
+from orthonav.ground.check.records import CELL_VALUES
 from orthonav.ground.check.write import write_check
-from orthonav.ground.check.write.page import ZERO_IF_UNKNOWN
 from orthonav.ground.check.write.plain import check_to_plain
-from orthonav.ground.check.write.wording import probability_text
-from orthonav.ground.report.drawing import Drawing
-from orthonav.ground.report.numbers import metres_text
-from orthonav.ground.report.page import static_text
 
-UNDRAWN = Drawing(
-    base64.b64decode(
-        "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNoAAAAggCBd81ytgAAAABJRU5ErkJggg=="
-    ),
-    "<svg/>",
-    (1.0, 1.0),
-)
-"""A figure of one pixel."""
 KINDS = {"tiny", "small_route", "nearly_empty", "evil"}
-TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 
 
 @pytest.fixture(scope="module")
 def folder(opened, frame, tmp_path_factory):
     """Checks of all kinds, and one whose names are markup, by name."""
     root = tmp_path_factory.mktemp("checks")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.report.drawing.DPI", 20)
-        path = write_check(small_route(frame), opened, root / "small_route")
-        assert path == root / "small_route" / "index.html"
-        for name in ("draw_axes", "draw_figure"):  # drawing takes longest
-            patch.setattr(f"orthonav.ground.check.write.figures.{name}", lambda *_: UNDRAWN)
-        for kind in ("tiny", "nearly_empty"):
-            write_check(getattr(made_check, kind)(frame), opened, root / kind)
-        about = replace(made_check.tiny(frame).about, map_name=EVIL, route_name=EVIL)
-        write_check(small_route(frame, about=about), opened, root / "evil")
+    for kind in ("tiny", "small_route", "nearly_empty"):
+        path = write_check(getattr(made_check, kind)(frame), opened, root / kind)
+        assert path == root / kind / "index.html"
+    about = replace(made_check.tiny(frame).about, map_name=EVIL, route_name=EVIL)
+    write_check(small_route(frame, about=about), opened, root / "evil")
     return root
 
 
@@ -83,7 +62,7 @@ def all_cells(cells):
     """The cells of the page as in `check.json`: unknown ones are None, or 0 of what was counted."""
     known = cells.pop("known")
     for name in CELL_VALUES:
-        grid = [0 if name in ZERO_IF_UNKNOWN else None] * (cells["rows"] * cells["cols"])
+        grid = [0 if name in ("trials", "changed") else None] * (cells["rows"] * cells["cols"])
         for number, value in zip(known, cells[name], strict=True):
             grid[number] = value
         starts = range(0, len(grid), cells["cols"])
@@ -100,7 +79,6 @@ def test_the_script_is_given_the_json_of_the_check(folder, frame):
             assert plain == json.loads(json.dumps(check_to_plain(getattr(made_check, name)(frame))))
         assert (drawn["route"] is None) == (name in ("tiny", "nearly_empty"))
         assert len(drawn["lookalikes"]) == len(plain["lookalikes"])
-        assert len(drawn["blind"]) == len(plain["stretches"])
 
 
 def test_who_signs_sees_what_was_checked(folder):
@@ -163,27 +141,14 @@ def test_the_page_comes_alive(visit, name):
 
 
 @pytest.mark.long
-def test_profile_and_map_are_linked(visit):
+def test_the_printed_page_has_map_and_profile(visit):
     page = visit("small_route")
-    page.locator("#profile").scroll_into_view_if_needed()
-    box = page.locator("#profile").bounding_box()
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 50)
-    assert "along the route" in page.locator("#figures").inner_text()
-    assert page.locator("#announcement").inner_text() == ""  # hovering is not announced
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 50)
-    assert "along the route" in page.locator("#announcement").inner_text()
-    before = page.locator("#along").input_value()
-    page.locator("#along").press("ArrowRight")
-    assert int(page.locator("#along").input_value()) == int(before) + 1
-    assert "probability" in page.locator("#along").get_attribute("aria-valuetext")
-    # And from the map to the profile.
-    page.locator("#map").scroll_into_view_if_needed()
-    dot = page.locator("#map path[fill='#1a1a1a']").bounding_box()
-    there = page.locator("#along").input_value()
-    page.locator("#along").fill("0")
-    page.locator("#map").scroll_into_view_if_needed()
-    page.mouse.move(dot["x"] + dot["width"] / 2, dot["y"] + dot["height"] / 2)
-    assert abs(int(page.locator("#along").input_value()) - int(there)) <= 1
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    for part in ("#map", "#profile", ".sign"):
+        assert page.locator(part).is_visible()
+    assert not page.locator(".tools").is_visible()
+    assert page.locator("#map").bounding_box()["width"] < 700
 
 
 def test_the_panel_says_what_is_in_the_cell(visit, frame):
@@ -197,31 +162,6 @@ def test_the_panel_says_what_is_in_the_cell(visit, frame):
     assert np.abs(middle - shown).min() < 0.008
     lat, lon = map(float, re.search(r"place: ([-\d.]+), ([-\d.]+)", said).groups())
     assert np.abs(frame.en_from_latlon(lat, lon)).max() < 15
-
-
-@pytest.mark.parametrize(
-    "options",
-    [TABLET, pytest.param({"viewport": {"width": 390, "height": 800}}, marks=pytest.mark.slow)],
-    ids=["tablet", "phone"],
-)
-def test_other_screens(visit, options):
-    page = visit("small_route", **options)
-    assert page.locator("html.live").count() == 1
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-def test_scripts_write_numbers_as_python_does(browser):
-    numbers = [0, 0.04, 3.26, 9.96, 35, 50.04, 99.94, 99.97, 120.4, 9999.6, 12_345, -7.5, math.nan]
-    script = static_text("format.js").replace("export ", "")
-    page = browser.new_page()
-    texts = page.evaluate(f"() => {{ {script}; return {json.dumps(numbers)}.map(metres); }}")
-    shares = [0, 0.004, 0.126, 0.996, 0.9996, 1]
-    percents = page.evaluate(f"() => {{ {script}; return {shares}.map(percent); }}")
-    page.close()
-    assert [text.replace("\N{EN DASH}", "-") for text in texts] == [
-        metres_text(each) for each in numbers
-    ]
-    assert percents == [probability_text(each) for each in shares]
 
 
 @pytest.mark.long

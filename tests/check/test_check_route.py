@@ -3,27 +3,28 @@
 import math
 from dataclasses import replace
 
+import made_trials
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_trials import CONDITIONS
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.findings import BLIND, blind_stretches, expected_drift, predicted_along
-from orthonav.ground.check.outcome import Along
+from orthonav.ground.check.records import Along
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 
 FRAME = LocalFrame(46.0, 3.0)
 SIDE_M = 100.0
+CONDITIONS = replace(made_trials.CONDITIONS, width_m=SIDE_M, height_m=SIDE_M)
 
 
-def area_of(points_en_m, band_m=200.0):
+def area_of(points_en_m, bands_m=()):
     lat, lon = FRAME.latlon_from_en(np.array(points_en_m, float))
-    route = Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
-    return Area(FRAME, (-5000.0, -5000.0, 5000.0, 5000.0), route, band_m)
+    route = Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
+    return Area(FRAME, (-5000.0, -5000.0, 5000.0, 5000.0), route, 200.0)
 
 
 def of_many_flights(chances, errors_m, drift, side_m):
@@ -66,26 +67,24 @@ def test_the_worst_over_the_width_of_every_leg():
         bad |= (points[:, 0] > 1080) & (points[:, 1] > 250)
         return predicted(np.where(bad, 0.1, 0.9), np.full(len(points), 3.0))
 
-    area = area_of([[0, 0], [1000, 0], [1000, 800]])
     early = slice(4, 20)
     for bands, first, last in (
         ((200, 100), 0.1, 0.9),
         ((100, 200), 0.9, 0.1),
         ((90, 90), 0.9, 0.9),
     ):
-        along = predicted_along(area, bands, SIDE_M, CONDITIONS, predict)
+        area = area_of([[0, 0], [1000, 0], [1000, 800]], bands)
+        along = predicted_along(area, CONDITIONS, predict)
         late = along.distance_m > 1400
         assert (along.across_low[early] == first).all() and (along.across_low[late] == last).all()
         assert (along.probability[early] == 0.9).all()
 
 
 def test_the_route_ends_at_its_last_waypoint():
-    along = predicted_along(
-        area_of([[0, 0], [100, 0], [100, 60]]), [200.0] * 2, SIDE_M, CONDITIONS, even
-    )
+    along = predicted_along(area_of([[0, 0], [100, 0], [100, 60]]), CONDITIONS, even)
     assert along.distance_m == pytest.approx([0, 25, 50, 75, 100, 125, 150, 160], abs=1e-3)
     np.testing.assert_allclose(along.points_en_m[-1], [100, 60], atol=0.01)
-    whole = predicted_along(area_of([[0, 0], [100, 0]]), [200.0], SIDE_M, CONDITIONS, even)
+    whole = predicted_along(area_of([[0, 0], [100, 0]]), CONDITIONS, even)
     assert along.drift_m.shape == (8,) and len(whole.distance_m) in (5, 6)
 
 
@@ -95,7 +94,9 @@ def along_of(probability, step_m=25.0):
     distance = np.arange(len(probability)) * step_m
     points = np.stack([distance, np.zeros_like(distance)], axis=1)
     error = np.full_like(distance, 3.0)
-    return Along(distance, points, *[probability] * 4, error, error)
+    place = predicted(probability, error)
+    extra = {"across_low": probability, "drift_m": error}
+    return Along(distance_m=distance, points_en_m=points, **extra, **vars(place))
 
 
 GOOD, BAD = [0.9] * 8, [0.2] * 12
@@ -103,7 +104,7 @@ GOOD, BAD = [0.9] * 8, [0.2] * 12
 
 def test_blind_stretches():
     along = along_of(GOOD + BAD + GOOD + BAD + [0.9])
-    first, second = blind_stretches(along, CONDITIONS, SIDE_M)
+    first, second = blind_stretches(along, CONDITIONS)
     assert (first.start_m, first.end_m) == (200, 500) and (second.start_m, second.end_m) == (
         700,
         1000,
@@ -127,17 +128,17 @@ def test_blind_stretches():
     ids=["none", "shorter than a view", "a view", "at first", "at last", "all", "on the border"],
 )
 def test_where_stretches_begin_and_end(probability, expected):
-    found = blind_stretches(along_of(probability), CONDITIONS, SIDE_M)
+    found = blind_stretches(along_of(probability), CONDITIONS)
     assert [(each.start_m, each.end_m, each.ends_lost) for each in found] == expected
 
 
 def test_what_dead_reckoning_bears():
     far = along_of(GOOD + [0.1] * 100 + GOOD)
-    (stretch,) = blind_stretches(far, CONDITIONS, SIDE_M)
+    (stretch,) = blind_stretches(far, CONDITIONS)
     assert stretch.drift_m == pytest.approx(75) and not stretch.recoverable
-    (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=80.0), SIDE_M)
+    (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=80.0))
     assert stretch.recoverable
-    (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=None), SIDE_M)
+    (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=None))
     assert stretch.recoverable and math.isinf(stretch.allowed_m)
-    (stretch,) = blind_stretches(along_of(GOOD + BAD), CONDITIONS, SIDE_M)
+    (stretch,) = blind_stretches(along_of(GOOD + BAD), CONDITIONS)
     assert not stretch.recoverable

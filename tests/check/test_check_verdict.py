@@ -6,18 +6,20 @@ import numpy as np
 import pytest
 
 from orthonav.ground.check.findings import Findings, verdict_of
-from orthonav.ground.check.outcome import Along, BlindStretch, Word
+from orthonav.ground.check.records import Along, BlindStretch, Word
 
 ZEROS = np.zeros(11)
 ALONG = Along(
-    np.linspace(0, 5000, 11),
-    np.zeros((11, 2)),
+    distance_m=np.linspace(0, 5000, 11),
+    points_en_m=np.zeros((11, 2)),
     probability=ZEROS + 0.9,
     low=ZEROS + 0.8,
     high=ZEROS + 0.95,
     across_low=ZEROS + 0.8,
     error_m=ZEROS + 3,
     drift_m=ZEROS + 8,
+    wrong=ZEROS,
+    persistence=ZEROS + 0.5,
 )
 FINE = dict(
     mean=0.9,

@@ -13,9 +13,9 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only worst views are drawn."""
+    """Nothing is drawn."""
     monkeypatch.setattr("orthonav.ground.report.drawing.DPI", 20)
     for name in ("draw_axes", "draw_figure"):
         monkeypatch.setattr(
-            f"orthonav.ground.evaluate.plots.{name}", lambda *_: Drawing(b"", "", (1.0, 1.0))
+            f"orthonav.ground.evaluate.report.{name}", lambda *_: Drawing(b"", "", (1.0, 1.0))
         )

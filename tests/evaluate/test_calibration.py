@@ -12,18 +12,17 @@ from scipy.stats import chi2
 from orthonav.core.flight.fixes import result_from_json, result_to_json
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.evaluate.calibration import (
+from orthonav.ground.evaluate.metrics import Comparison, compare, measure
+from orthonav.ground.evaluate.statistics import (
     N_BINS,
-    NEES_LEVELS,
     ConfidenceCalibration,
     calibrate,
     check_covariance,
     is_covariance,
-    nees_bound,
+    nees_mean_bounds,
     normalized_squared,
+    wilson,
 )
-from orthonav.ground.evaluate.figures import wilson
-from orthonav.ground.evaluate.metrics import Comparison, compare, measure
 from orthonav.ground.evaluate.tables import metrics_to_json
 
 RADIUS_M = 20.0
@@ -57,18 +56,15 @@ def test_bins_cover_0_to_1_and_hold_their_lower_edge() -> None:
     assert [b.n_fixes for b in below.bins] == [1] * N_BINS
 
 
-def test_fixes_without_a_confidence_are_left_out() -> None:
+def test_fixes_without_a_confidence_are_left_out_and_a_bad_one_is_refused() -> None:
     stated = np.array([0.8, math.nan, 0.8, math.nan, 0.8])
     errors_m = np.array([RIGHT_M, RIGHT_M, WRONG_M, WRONG_M, math.nan])  # the last has no fix
     found = calibrate(stated, errors_m, np.full(5, RADIUS_M), 15.0)
     assert (found.n_fixes, found.share_right) == (2, 0.5)
     assert found.ece == pytest.approx(0.3)
-
-
-@pytest.mark.parametrize("bad", [-0.01, 1.01, math.inf, -math.inf])
-def test_a_confidence_beyond_0_to_1_is_refused(bad: float) -> None:
-    with pytest.raises(ValueError, match="confidence must be 0 to 1"):
-        calibrate(np.array([0.5, bad]), np.ones(2), np.ones(2), 15.0)
+    for bad in (-0.01, 1.01, math.inf):
+        with pytest.raises(ValueError, match="confidence must be 0 to 1"):
+            calibrate(np.array([0.5, bad]), np.ones(2), np.ones(2), 15.0)
 
 
 def test_right_is_within_the_radius_a_fix_states_itself() -> None:
@@ -97,11 +93,6 @@ def test_wilson_against_known_values() -> None:
     assert wilson(1, 29) == pytest.approx((0.0061, 0.1718), abs=1e-4)
     assert wilson(29, 29) == pytest.approx((0.8830, 1.0), abs=1e-4)
     assert all(map(math.isnan, wilson(0, 0)))
-
-
-def test_nees_bounds_are_those_of_chi_square() -> None:
-    expected = chi2.ppf(NEES_LEVELS, 2)
-    assert [nees_bound(level) for level in NEES_LEVELS] == pytest.approx(expected)
 
 
 def test_nees_against_an_inverse() -> None:
@@ -236,3 +227,9 @@ def test_the_command_evaluates_several_flights(tmp_path, run) -> None:
     flights = values["flights"]
     assert flights["two"]["calibration"]["ece"] is None
     assert flights["one"]["covariance"]["nees_mean"] == pytest.approx(1.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [0.4, 1.0, 17.3, 5000.0])
+def test_the_interval_of_the_mean_nees_is_that_of_chi_square(n):
+    expected = chi2.ppf([0.025, 0.975], 2 * n) / n
+    assert nees_mean_bounds(n) == pytest.approx(tuple(expected), rel=1e-8)

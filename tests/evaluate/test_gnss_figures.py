@@ -6,7 +6,6 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from orthonav.core.flight.fixes import write_results
 from orthonav.core.flight.gnss import BIASES, FAULTS
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, ViewResult
@@ -44,6 +43,8 @@ RESULTS = [
 
 
 def test_errors_differences_and_alarms_are_measured():
+    without = [result(i) for i in range(3)]
+    assert measure_gnss(compare(truth(3), without, FRAME), without) is None
     found = measure_gnss(compare(truth(10), RESULTS, FRAME), RESULTS)
     assert found.errors_m[:6] == pytest.approx([4, 4, 4, 4, 4, 40], abs=1e-3)
     assert found.differences_m[:6] == pytest.approx([5] * 5 + [np.hypot(40, 3)], abs=1e-3)
@@ -72,21 +73,3 @@ def test_what_was_learnt_is_that_of_the_last_view_that_knows_it():
     assert rows["learnt displacement of the map"] == "12.0 +- 1.0 m east, -4.0 +- 1.0 m north"
     assert rows["learnt error of the mount"] == "0.50 +- 0.25 deg pitch, -0.50 +- 0.25 deg roll"
     assert rows["learnt latency"] == "120 +- 30 ms"
-
-
-def test_without_gnss_there_are_no_figures():
-    results = [result(i) for i in range(3)]
-    assert measure_gnss(compare(truth(3), results, FRAME), results) is None
-
-
-@pytest.mark.long
-def test_the_report_has_the_figure(tmp_path, run, no_plots):
-    fixes, true = tmp_path / "fixes.jsonl", tmp_path / "truth.csv"
-    write_results(fixes, RESULTS)
-    rows = [f"{name},{lat:.9f},{lon:.9f}" for name, (lat, lon) in truth(10).items()]
-    true.write_text("\n".join(["frame,lat_deg,lon_deg", *rows]))
-    done = run("evaluate", fixes, "--truth", true, "--report", tmp_path / "report")
-    assert done.code == 0, done.err
-    assert "error of GNSS: median" in done.out and "GNSS alarms: 1: gnss_step" in done.out
-    assert (tmp_path / "report" / "figures" / "gnss.svg").is_file()
-    assert "GNSS alarms" in (tmp_path / "report" / "index.html").read_text()

@@ -5,23 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import binom
 
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, ViewResult
-from orthonav.ground.evaluate.figures import upper_bound
 from orthonav.ground.evaluate.metrics import (
     CRITERIA,
     Comparison,
     compare,
-    criterion_curve,
     measure,
     pool,
     worst_views,
 )
+from orthonav.ground.evaluate.statistics import standard_figures, upper_bound
 from orthonav.ground.evaluate.tables import verdict
 
 CENTRE = LocalFrame(48.0, -4.5)
@@ -42,28 +39,27 @@ def fix(frame: str, offset_en_m: tuple[float, float], latency_ms: float = 10.0, 
 
 
 def no_fix(frame: str, reason: str = "blank") -> ViewResult:
-    return ViewResult(frame, 0, NoFix(reason, "", {"peak_ratio": 9.0}), 50.0)
+    return ViewResult(frame, 0, NoFix(reason, "", {"lowe_ratio": 9.0}), 50.0)
 
 
 def three_fixes() -> Comparison:
     """Errors 5, 10 and 500 m and one view without a fix."""
     results = [
-        fix("a", (3.0, 4.0), 10.0, confidence=0.95, peak_ratio=2.0, lowe_ratio=1.2),
-        fix("b", (-6.0, 8.0), 20.0, confidence=0.6, peak_ratio=1.2, lowe_ratio=1.0),
+        fix("a", (3.0, 4.0), 10.0, confidence=0.95, lowe_ratio=1.2),
+        fix("b", (-6.0, 8.0), 20.0, confidence=0.6, lowe_ratio=1.0),
         no_fix("c"),
-        fix("d", (300.0, -400.0), 30.0, confidence=0.6, peak_ratio=1.1),
+        fix("d", (300.0, -400.0), 30.0, confidence=0.6),
     ]
     return compare(truth_of(TRUTH_EN_M), results)
 
 
 def test_shares_are_of_all_views_or_of_fixes() -> None:
-    metrics = measure(three_fixes(), 15.0, [6.0, 1000.0])
+    metrics = measure(three_fixes(), 6.0)
     assert (metrics.n_views, metrics.n_fixes) == (4, 3)
     assert metrics.coverage == 0.75
-    assert dict(metrics.acc_at_m) == {6.0: 0.25, 15.0: 0.5, 1000.0: 0.75}
-    assert dict(metrics.acc_fixes_at_m) == {6.0: 1 / 3, 15.0: 2 / 3, 1000.0: 1.0}
-    assert metrics.accuracy == 0.5
-    assert metrics.accuracy_of_fixes == 2 / 3
+    assert (metrics.acc_at_m[6.0], metrics.acc_at_m[15.0]) == (0.25, 0.5)
+    assert (metrics.acc_fixes_at_m[6.0], metrics.acc_fixes_at_m[15.0]) == (1 / 3, 2 / 3)
+    assert (metrics.accuracy, metrics.accuracy_of_fixes) == (0.25, 1 / 3)
     assert metrics.reasons == {"blank": 1}
 
 
@@ -72,9 +68,6 @@ def test_criteria_keep_views_at_or_above_a_threshold() -> None:
     assert len(rows) == sum(map(len, CRITERIA.values()))
     kept = {key: (row.share_accepted, row.accuracy) for key, row in rows.items()}
     assert kept["lowe_ratio", 1.13] == (0.25, 1.0)
-    assert kept["peak_ratio", 1.05] == (0.75, 2 / 3)
-    assert kept["peak_ratio", 1.13] == (0.5, 1.0)
-    assert kept["peak_ratio", 1.3] == (0.25, 1.0)
     assert kept["confidence", 0.5] == (0.75, 2 / 3)
     assert kept["confidence", 0.9] == (0.25, 1.0)
     share, accuracy = kept["confidence", 0.99]
@@ -123,31 +116,6 @@ def test_an_impossible_radius_is_refused(radius_m: float) -> None:
         measure(three_fixes(), radius_m)
 
 
-@given(
-    st.lists(
-        st.tuples(st.floats(0, 200), st.floats(1, 3).map(lambda v: round(v, 1)) | st.none()),
-        min_size=1,
-        max_size=30,
-    )
-)
-def test_curves_and_rows_agree_and_shares_grow(views: list[tuple[float, float | None]]) -> None:
-    n = len(views)
-    values = np.array([math.nan if v is None else v for _, v in views])
-    base = compare({"a": (48.0, -4.5)}, [fix("a", (0.0, 0.0))])
-    fields = {**vars(base), "errors_m": np.array([e for e, _ in views])}
-    nothing = np.full(n, math.nan)
-    fields["criteria"] = {"peak_ratio": values, "lowe_ratio": nothing, "confidence": nothing}
-    comparison = Comparison(**fields)
-    curve = criterion_curve(comparison, "peak_ratio", 15.0)
-    assert np.all(np.diff(curve.share_accepted) > 0) and np.all(np.diff(curve.thresholds) < 0)
-    for threshold, share, accuracy in zip(
-        curve.thresholds, curve.share_accepted, curve.accuracy, strict=True
-    ):
-        kept = [error for error, value in views if value is not None and value >= threshold]
-        assert share == pytest.approx(len(kept) / n)
-        assert accuracy == pytest.approx(sum(error <= 15.0 for error in kept) / len(kept))
-
-
 def test_confident_and_wrong_is_distinguished_from_a_wrong_guess() -> None:
     """Wrong is above 35 m, the radius of the evaluation and the radius that the fix states."""
     guess = measure(three_fixes())
@@ -184,3 +152,35 @@ def test_confident_fixes_and_gaps_have_figures_of_their_own() -> None:
     assert found.gap.seconds_s == pytest.approx(2.0)
     assert found.gap.path_m == pytest.approx(math.hypot(100, 50) + 100, rel=1e-3)
     assert measure(pool([comparison, comparison])).gap.seconds_s == pytest.approx(2.0)
+
+
+# APE, RPE, CEP.
+
+
+PATH = np.array([[0.0, 0.0], [60.0, 0.0], [120.0, 0.0], [180.0, 0.0], [240.0, 0.0]])
+ERRORS = np.array([[3.0, 4.0], [0.0, 0.0], [np.nan, np.nan], [0.0, 10.0], [0.0, -5.0]])
+"""Errors of 5, 0, none, 10 and 5 m."""
+
+
+def test_pose_errors_of_the_example() -> None:
+    """From fix to fix errors differ by (-3, -4), (0, 10), (0, -15). The fixes lie at 0, 60, 180 and
+    240 m: 100 m are reached at 180 m, and no second time; at twice the scale at 120, 360, 480 m."""
+    found = standard_figures(PATH, PATH + ERRORS)
+    far = standard_figures(2 * PATH, 2 * PATH + ERRORS).rpe_distance
+    expected = {  # n, RMSE, mean, median, std, max
+        found.ape: (4, math.sqrt(37.5), 5.0, 5.0, math.sqrt(12.5), 10.0),
+        found.rpe_frames: (3, math.sqrt(350 / 3), 10.0, 10.0, math.sqrt(50 / 3), 15.0),
+        far: (2, math.sqrt(325 / 2), 12.5, 12.5, 2.5, 15.0),
+    }
+    for statistics, values in expected.items():
+        assert tuple(vars(statistics).values()) == pytest.approx(values)
+    assert found.rpe_distance.n == 0
+    assert (found.cep50_m, found.cep95_m) == pytest.approx((5.0, 5 + 0.85 * (10 - 5)))
+
+
+def test_relative_errors_do_not_cross_flights() -> None:
+    two = np.concatenate([PATH, PATH]), np.concatenate([PATH, PATH + np.array([1000.0, 0.0])])
+    assert standard_figures(*two).rpe_frames.max_m == pytest.approx(1000.0)
+    apart = standard_figures(*two, starts=(0, 5))
+    assert (apart.rpe_frames.n, apart.rpe_frames.max_m) == (8, pytest.approx(0.0))
+    assert apart.rpe_distance.n == 2 and apart.ape.n == 10

@@ -1,5 +1,6 @@
-"""The report page, its pictures, the table and the JSON values."""
+"""The report: its page, its pictures as files, the table and the JSON values."""
 
+import itertools
 import json
 import re
 import subprocess
@@ -21,11 +22,11 @@ from orthonav.ground.evaluate.tables import (
     table,
     total,
 )
-from orthonav.ground.report.numbers import measure_text
+from orthonav.ground.report import measure_text
+from orthonav.ground.report.page import LIST
 
 CENTRE = LocalFrame(48.0, -4.5)
-PICTURES_PER_FLIGHT = 6
-PICTURES_OF_ALL = 4
+FIGURES = {"map", "error-over-time", "reliability"}
 
 
 def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: int = 3):
@@ -43,7 +44,7 @@ def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: in
             at = truth_en_m[i] + random.normal(0.0, 600.0 if wrong else 3.0, 2)
             fix_lat, fix_lon = (float(value) for value in CENTRE.latlon_from_en(at))
             ratio = 1.05 + random.random() * (0.2 if wrong else 2.0)
-            known = {"peak_ratio": ratio, "lowe_ratio": 1.0 + random.random() / 5}
+            known = {"lowe_ratio": 1.0 + random.random() / 5}
             confidence = min(ratio / 3, 1.0)
             confidence = 0.95 if wrong and i % 2 else confidence
             outcome = Fix(fix_lat, fix_lon, np.eye(2), confidence, 15.0, 0.0, 100.0, known)
@@ -52,18 +53,31 @@ def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: in
     return FlightReport(name, comparison, measure(comparison))
 
 
-def test_the_page_needs_nothing_from_outside(tmp_path: Path, no_plots) -> None:
+def stems(folder: Path) -> set[str]:
+    found = {path.name for path in (folder / "figures").iterdir()} - {LIST}
+    pairs = {Path(name).stem for name in found}
+    assert found == {f"{stem}.{kind}" for stem in pairs for kind in ("svg", "png")}
+    return pairs
+
+
+def test_the_page_needs_nothing_from_outside_and_is_reproducible(tmp_path: Path, coarse) -> None:
     path = write_report(tmp_path / "report", [made_flight(40)])
     html = path.read_text(encoding="utf-8")
     page = Page(html)
     images = [found for tag, found in page.elements if tag == "img"]
     assert path == tmp_path / "report" / "index.html"
     assert sorted(p.name for p in path.parent.iterdir()) == ["figures", "index.html"]
+    assert stems(path.parent) == FIGURES and len(images) == len(FIGURES)
     assert not re.search(r"https?:|url\(|@import|//www", html)
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in page.elements}
-    assert len(images) == PICTURES_PER_FLIGHT
     assert all(image["src"].startswith("data:image/png;base64,") for image in images)
-    assert all(image["alt"] for image in images)
+    assert all(image["alt"].startswith("flight: ") for image in images)
+    write_report(tmp_path / "again", [made_flight(40)])
+    first, second = (
+        {each.name: each.read_bytes() for each in (tmp_path / name).rglob("*.*")}
+        for name in ("report", "again")
+    )
+    assert first == second
 
 
 def test_the_page_holds_metrics_and_provenance(tmp_path: Path, no_plots) -> None:
@@ -73,21 +87,40 @@ def test_the_page_holds_metrics_and_provenance(tmp_path: Path, no_plots) -> None
     metrics, worst = flight.metrics, int(np.nanargmax(flight.comparison.errors_m))
     assert f"<b>{100 * metrics.availability:.1f} %</b>" in html
     assert f'<b class="bad">{metrics.n_confident_wrong} of {metrics.n_confident}</b>' in html
-    shown = [measure_text(each.cep50_m) for each in (metrics.of_confident, metrics.standard)]
-    for cell in (*shown, flight.comparison.frames[worst], "too_dark"):
+    median = measure_text(metrics.standard.cep50_m)
+    for cell in (median, flight.comparison.frames[worst], "too_dark"):
         assert f"<td>{cell}</td>" in html
     for said in vars(made_from).values():
         assert said in html
 
 
-def test_several_flights_have_a_total(tmp_path: Path, no_plots) -> None:
-    flights = [made_flight(30, name="one"), made_flight(20, name="two", seed=4)]
+def test_several_flights_have_a_total_and_files_of_their_own(tmp_path: Path, no_plots) -> None:
+    flights = [made_flight(n, name=name) for n, name in ((30, "../x"), (20, "a b"), (10, "a: b"))]
     whole = total(flights)
-    assert whole.n_views == 50
+    assert whole.n_views == 60
     assert whole.n_fixes == sum(flight.metrics.n_fixes for flight in flights)
-    html = write_report(tmp_path, flights).read_text("utf-8")
-    assert html.count("<img ") == 2 * PICTURES_PER_FLIGHT + PICTURES_OF_ALL
-    assert '<tr class="total"><td>total</td><td>50</td>' in html
+    page = write_report(tmp_path / "report", flights).read_text("utf-8")
+    assert page.count("<img ") == 3 * len(FIGURES) and "Evaluation of 3 flights" in page
+    assert '<tr class="total"><td>total</td><td>60</td>' in page
+    assert stems(tmp_path / "report") == {
+        f"{name}--{figure}" for name in ("x", "a-b", "a-b-2") for figure in FIGURES
+    }
+    assert [path.name for path in tmp_path.iterdir()] == ["report"]
+    assert page.count('href="#') == 3
+    for place in re.findall(r'href="#([^"]+)"', page):
+        assert page.count(f'id="{place}"') == 1
+    levels = [int(level) for level in re.findall(r"<h(\d)", page)]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(after - before <= 1 for before, after in itertools.pairwise(levels))
+    assert page.count("<table>") == page.count("aria-label") - 1
+
+
+def test_a_rerun_leaves_no_stale_figures_and_all_other_files(tmp_path: Path, no_plots) -> None:
+    write_report(tmp_path, [made_flight(12, name="one"), made_flight(12, name="two")])
+    (tmp_path / "notes.txt").write_text("mine")
+    write_report(tmp_path, [made_flight(12)])
+    assert stems(tmp_path) == FIGURES
+    assert {each.name for each in tmp_path.iterdir()} == {"figures", "index.html", "notes.txt"}
 
 
 def test_flights_at_different_radii_have_no_total() -> None:
@@ -114,10 +147,10 @@ def test_matplotlib_is_imported_for_drawing_and_pyplot_never() -> None:
         "import sys, orthonav.ground.evaluate.report\n"
         "unwanted = {'matplotlib', 'jinja2', 'PIL', 'torch', 'rasterio', 'pyproj'}\n"
         "assert not unwanted & set(sys.modules)\n"
-        "from orthonav.ground.evaluate import metrics, plots\n"
+        "from orthonav.ground.evaluate import metrics, report\n"
         "from orthonav.core.records import NoFix, ViewResult\n"
         "result = ViewResult('a', 0, NoFix('blank', ''), 1.0)\n"
-        "plots.map_picture(metrics.compare({'a': (48.0, -4.5)}, [result]), 15.0)\n"
+        "report.map_picture(metrics.compare({'a': (48.0, -4.5)}, [result]), 15.0)\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,8 +11,7 @@ import servers
 import terrain
 from servers import QUICK
 
-from orthonav.ground.fetch.options import ImageryOptions
-from orthonav.ground.fetch.presets import parse_source
+from orthonav.ground.fetch.presets import ImageryOptions, parse_source
 from orthonav.ground.fetch.run import FetchRequest, fetch
 from orthonav.ground.planning.area import Area
 

@@ -1,6 +1,5 @@
 """No fault of a service may become a wrong pixel: each ends in an error, a mask, or both."""
 
-import io
 import os
 import signal
 import subprocess
@@ -13,7 +12,6 @@ import pytest
 import rasterio
 import servers
 import terrain
-from PIL import Image
 
 from orthonav.core.errors import FetchError, OutputError
 from orthonav.ground.planning.area import Area
@@ -97,7 +95,7 @@ def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name)
 def test_a_temporary_fault_is_overcome(take, name):
     with servers.serving(tiles_but(FAULTS[name], lasting=False)) as server:
         result, path = take(source(server))
-    assert not result.cells.failed and terrain.offset_px(path)[1] <= 1
+    assert not result.failed and terrain.offset_px(path)[1] <= 1
     assert terrain.offset_px(path)[2] == 1.0
 
 
@@ -107,7 +105,7 @@ def test_allowed_holes_are_masked(take, name, caplog):
         result, path = take(source(server), allow_holes=True)
         area = Area.from_bounds((10.0, 85.04, 10.02, 85.06))
         take(source(server), area=area, gsd_m=5.0, allow_holes=True, out="north.tif")
-    failed = result.cells.failed.total()
+    failed = result.failed.total()
     assert failed > 0 and f"{failed} failed" in caplog.text
     assert "outside what the service covers" in caplog.text
     shift, worst, valid = terrain.offset_px(path)
@@ -237,34 +235,6 @@ def test_an_interrupt_leaves_no_half_file(tmp_path):
             message = process.stderr.read()
     assert process.returncode == 1 and "interrupted" in message and "Traceback" not in message
     assert not (tmp_path / "o.tif").exists()
-
-
-def _saved(image, **options):
-    stream = io.BytesIO()
-    image.save(stream, "PNG", **options)
-    return stream.getvalue()
-
-
-GREY = Image.fromarray(NOISE[..., 0])
-GREYS = np.repeat(NOISE[..., :1], 3, axis=2)
-CLEAR = np.dstack([NOISE, np.repeat([[0], [255]], [100, 156], axis=0).repeat(256, axis=1)])
-PICTURES = {
-    "grey": (_saved(GREY), GREYS, 0),
-    "palette with a clear colour": (_saved(GREY.convert("P"), transparency=0), GREYS, 0),
-    "transparent": (terrain.encoded(CLEAR.astype(np.uint8)), NOISE, 100),
-    "WebP": (terrain.encoded(NOISE, "WEBP", lossless=True), NOISE, 0),
-}
-
-
-@pytest.mark.parametrize("name", PICTURES)
-def test_every_kind_of_picture_is_read(take, name):
-    body, expected, clear_rows = PICTURES[name]
-    with servers.serving(lambda asked: servers.Answer(body, kind="text/plain")) as server:
-        _, path = take(f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png", half_m=5)
-    with rasterio.open(path) as data:
-        assert (data.read().transpose(1, 2, 0)[clear_rows:] == expected[clear_rows:]).all()
-        assert not data.dataset_mask()[:clear_rows].any()
-        assert data.dataset_mask()[clear_rows:].all()
 
 
 @pytest.mark.parametrize("colour, level", [("black", 0), ("white", 255)])

@@ -15,21 +15,6 @@ def test_invalid_addresses_are_rejected(url):
         urls.checked_url(url)
 
 
-@pytest.mark.parametrize(
-    "url, plain, key",
-    [
-        ("https://a/x?token=abcd", "https://a/x?token={key}", "abcd"),
-        ("https://a/x?Layer=1&ApiKey=abcd&z=2", "https://a/x?Layer=1&ApiKey={key}&z=2", "abcd"),
-        ("https://a/x?token={key}", "https://a/x?token={key}", None),
-        ("https://a/{z}/{x}/{y}?key=abcd", "https://a/{z}/{x}/{y}?key={key}", "abcd"),
-        ("https://a/x?layer=key", "https://a/x?layer=key", None),
-        ("https://a/x?token=", "https://a/x?token=", None),
-    ],
-)
-def test_keys_in_an_address_are_extracted(url, plain, key):
-    assert urls.without_literal_keys(url) == (plain, key)
-
-
 def test_shown_addresses_hold_no_keys():
     shown = urls.shown("https://me:pw@a.example:8080/x?layer=a&subscription-key=abcd&sig=1234#part")
     assert shown == "https://a.example:8080/x?layer=a&subscription-key={key}&sig={key}"

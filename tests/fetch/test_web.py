@@ -2,7 +2,6 @@
 
 import gzip
 import logging
-from dataclasses import replace
 
 import pytest
 import servers
@@ -51,18 +50,6 @@ def test_large_bodies_and_redirects_to_files_are_errors():
         get(lambda _: servers.Answer(bomb, headers={"Content-Encoding": "gzip"}))
     with pytest.raises(FetchError):
         get(lambda _: servers.Answer(status=302, headers={"Location": "file:///etc/passwd"}))
-
-
-def test_failed_connections_are_named():
-    once = replace(QUICK, attempts=1)
-    with Web(once) as web, pytest.raises(FetchError, match="no connection; is this machine online"):
-        web.get("http://127.0.0.1:1/x")
-    with (
-        servers.serving(lambda _: servers.Answer(b"")) as server,
-        Web(once) as web,
-        pytest.raises(FetchError, match="no secure connection"),
-    ):
-        web.get(server.url.replace("http://", "https://"))
 
 
 def test_a_proxy_of_the_environment_is_used(monkeypatch):

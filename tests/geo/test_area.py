@@ -112,9 +112,7 @@ def test_every_point_of_the_band_is_near_a_tile(route, band_m, overlap, seed):
     [
         ((2.6, 46.4, 2.4, 46.6), "west < east"),
         ((2.4, 46.6, 2.6, 46.4), "south < north"),
-        ((2.4, 46.4, 2.4, 46.6), "west < east"),
         ((math.nan, 46.4, 2.6, 46.6), "west,south,east,north"),
-        ((2.4, 46.4, math.inf, 46.6), "west,south,east,north"),
         ((2.0, 46.0, 2.2, 46.6), r"66\.\d km across.*50 km.*--bounds or --route"),
         ((-170.0, -80.0, 170.0, 80.0), "at most 10 degrees"),
         ((2.4, 89.8, 2.6, 90.0), "at most 10 degrees"),

@@ -17,13 +17,10 @@ from orthonav.ground.planning.route import (
     Height,
     Route,
     along_polyline_en_m,
-    beyond_bands_m,
-    distance_to_polyline_m,
     leg_lengths_m,
     read_route,
-    within_bands,
+    to_geojson,
 )
-from orthonav.ground.planning.routes.geojson import read_geojson, to_geojson
 
 GEOD = Geod(ellps="WGS84")
 WAYPOINTS = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))
@@ -54,9 +51,9 @@ def polylines(least=1):
         HIGH_LINE,
         feature(LINE),
         collection(LINE),
-        collection(None, POINT, LINE, OTHER_LINE),
+        collection(None, POINT, LINE),
         {"type": "MultiLineString", "coordinates": [POINTS[:1], POINTS[1:]]},
-        {"type": "GeometryCollection", "geometries": [POINT, LINE, OTHER_LINE]},
+        {"type": "GeometryCollection", "geometries": [POINT, LINE]},
         feature({"type": "GeometryCollection", "geometries": [LINE]}),
     ],
 )
@@ -102,7 +99,7 @@ def test_a_mission_of_litchi_states_what_its_heights_count_from(tmp_path):
     path.write_text(header.format("ft") + "46.5,2.5,100,90,0,7\n")
     assert read_route(path).heights == (Height(30.48, "home"),)
     path.write_text(header.format("m") + "46.5,2.5,100,90,2,7\n")
-    with pytest.raises(RouteError, match="row 2, altitudemode: must be 0"):
+    with pytest.raises(RouteError, match="altitudemode must be 0"):
         read_route(path)
 
 
@@ -141,11 +138,12 @@ def test_properties_that_make_no_sense_are_refused(tmp_path, own, message):
         read_route(path)
 
 
-def test_lines_are_picked_by_name(tmp_path, caplog):
-    path = tmp_path / "a#b.geojson"
+def test_lines_are_picked_by_name(tmp_path):
+    path = tmp_path / "a.geojson"
     both = collection(LINE, OTHER_LINE)
     path.write_text(json.dumps(both))
-    assert read_route(path).waypoints == WAYPOINTS and "2 unnamed lines" in caplog.text
+    with pytest.raises(RouteError, match=r"2 lines; .*: 1 \(no name\), 2 \(no name\)"):
+        read_route(path)
     both["features"][1]["properties"] = {"name": "x#/y"}
     path.write_text(json.dumps(both))
     assert read_route(Path(f"{path}#x#/y")).waypoints[0] == (9, 9)
@@ -187,7 +185,7 @@ def whole_routes(draw):
 
 @given(st.lists(whole_routes(), min_size=1, max_size=3))
 def test_what_is_written_as_geojson_is_read_again(routes):
-    assert read_geojson(to_geojson(routes).encode()) == routes
+    assert route_module._READERS[".geojson"](to_geojson(routes).encode()) == routes
 
 
 @given(st.sampled_from(sorted(route_module._READERS)), st.binary(max_size=200))
@@ -207,14 +205,10 @@ def test_any_bytes_give_a_route_or_a_route_error(suffix, content):
         ("a.geojson", b"\xff\xfe\x00", "not UTF-8 text"),
         ("a.geojson", b"[" * 100_000, "cannot be read"),
         ("a.geojson", b"[1, 2]", "must be a JSON object, got list"),
-        ("a.geojson", b"{}", "no LineString; it holds None"),
-        ("a.geojson", b'{"type": "FeatureCollection", "features": 5}', "cannot be read"),
-        ("a.geojson", json.dumps(collection(POINT, None)).encode(), "it holds Point"),
+        ("a.geojson", json.dumps(collection(POINT, None)).encode(), "no LineString"),
         ("a.geojson", b'{"type": "LineString"}', "coordinates is missing"),
         ("a.geojson", b'{"type": "LineString", "coordinates": []}', "no waypoints"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[1], [2]]}', "cannot be read"),
-        ("a.geojson", b'{"type": "LineString", "coordinates": [["1", "2"]]}', "must be a number"),
-        ("a.geojson", b'{"type": "LineString", "coordinates": "1234"}', "must be a number"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[true, 2]]}', "must be a number"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[NaN, 1]]}', "must be a number"),
         ("a.geojson", b'{"coordinates": [[1%s, 1]], "type": "LineString"}' % (b"0" * 400), "read"),
@@ -226,8 +220,6 @@ def test_any_bytes_give_a_route_or_a_route_error(suffix, content):
         ("a.csv", b"lat,lon,band_m\n1,2,0\n1,3,\n", "band of a leg must be wider than 0"),
         ("a.csv", b"lat,lon\n" + b"1,2\n" * 100_001, "100,001 waypoints, at most 100,000"),
         ("a.csv", b"lat_deg,lon_deg\n", "no waypoints"),
-        ("a.csv", b"lat_deg,lon_deg\n46.5\n", "cannot be read"),
-        ("a.csv", b"lat_deg,lon_deg\n46.5,east\n", "cannot be read"),
         ("a.csv", b"lat_deg,lon_deg\n46.5,inf\n", "row 2, lon_deg must be a number, got 'inf'"),
         ("a.csv", b"lat_deg,lon_deg\n" + b"4" * 200_000 + b",2\n", "cannot be read"),
         ("a.shp", b"", "must be one of .geojson, .*, .gpx, got '.shp'"),
@@ -249,34 +241,6 @@ def test_missing_folder_and_huge_files_are_refused(tmp_path, monkeypatch):
     (tmp_path / "a.csv").write_text("lat_deg,lon_deg\n1,2\n")
     with pytest.raises(RouteError, match="larger than"):
         read_route(tmp_path / "a.csv")
-
-
-@given(polylines(), arrays(float, (8, 2), elements=st.floats(-6000, 6000)))
-def test_distances_are_those_of_shapely(line, points):
-    geometry = shapely.LineString(line) if len(line) > 1 else shapely.Point(line[0])
-    expected = shapely.distance(geometry, shapely.points(points))
-    np.testing.assert_allclose(distance_to_polyline_m(points, line), expected, atol=1e-6)
-
-
-@given(polylines(least=2), arrays(float, (8, 2), elements=st.floats(-6000, 6000)), st.data())
-def test_bands_are_those_of_shapely(line, points, data):
-    bands = data.draw(arrays(float, len(line) - 1, elements=st.floats(1, 3000)))
-    legs = [shapely.LineString(line[leg : leg + 2]) for leg in range(len(line) - 1)]
-    each = [
-        shapely.distance(leg, shapely.points(points)) - b / 2
-        for leg, b in zip(legs, bands, strict=True)
-    ]
-    beyond = beyond_bands_m(points, line, bands)
-    np.testing.assert_allclose(beyond, np.min(each, axis=0), atol=1e-6)
-
-
-@given(polylines(), st.integers(0, 2**32 - 1), st.floats(-50, 300), st.sampled_from([3, 300]))
-def test_points_within_bands_are_those_that_are_not_beyond(line, seed, margin_m, count):
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-6000, 6000, (count, 2))
-    bands = rng.uniform(1, 3000, max(1, len(line) - 1))
-    expected = beyond_bands_m(points, line, bands) <= margin_m
-    assert np.array_equal(within_bands(points, line, bands, margin_m), expected)
 
 
 @pytest.mark.parametrize("reach_deg, tolerance", [(1, 5e-6), (25, 5e-3)])

@@ -234,14 +234,9 @@ LOST = """QGC WPL 110
 def test_positions_that_are_left_out_of_a_mission_are_named(read, caplog):
     route = read(LOST, "a.waypoints")
     assert route.waypoints == (A, B, (47.39, 8.54)), "an orbit is flown, a camera's target is not"
-    assert route.left_out == (
-        "item 1 (command 0)",
-        "item 6 (command 30001)",
-        "item 8 (command 16) after the return",
-    )
     assert "positions that are not part of the route" in caplog.text
-    assert "item 1 (command 0), item 6" in caplog.text
-    assert read(plan(simple(16, A, 50), simple(0, B, 50))).left_out == ("item 2 (command 0)",)
+    named = "item 1 (command 0), item 6 (command 30001), item 8 (command 16) after the return"
+    assert named in caplog.text
     with pytest.raises(RouteError, match=r"left out are item 1 \(command 0\)"):
         read(plan(simple(0, B, 50)))
 

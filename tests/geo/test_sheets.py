@@ -11,61 +11,13 @@ from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import MAX_SHEET_M
 from orthonav.ground.planning import sheets as sheets_module
 from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Height, Route, leg_lengths_m, read_route
-from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
+from orthonav.ground.planning.route import Height, Route, leg_lengths_m
+from orthonav.ground.planning.sheets import sheets_of_route
 
 
 def across_m(area):
     west, south, east, north = area.extent_en_m
     return max(east - west, north - south)
-
-
-@settings(max_examples=40)
-@given(
-    st.floats(-80, 78),
-    st.floats(-180, 178),
-    st.floats(0.01, 2),
-    st.floats(0.01, 3),
-    st.floats(0, 1),
-    st.floats(0, 1),
-)
-def test_boxes_fit_and_hold_every_place(south, west, height, width, up, right):
-    sheets = sheets_of_bounds((west, south, west + width, south + height))
-    assert max(across_m(Area.from_bounds(sheet)) for sheet in sheets) <= MAX_SHEET_M
-    lat, lon = south + up * height, west + right * width
-    lon = lon - 360 if lon > 180 else lon
-    inside = [
-        low - 1e-9 <= lat <= high + 1e-9
-        and left - 1e-9 <= lon + 360 * (lon < left - 180) <= right + 360 * (right < left) + 1e-9
-        for left, low, right, high in sheets
-    ]
-    assert any(inside)
-    size_deg2 = sum((e - w) % 360 * (n - s) for w, s, e, n in sheets)
-    assert size_deg2 == pytest.approx(width * height, rel=1e-6)
-
-
-def test_a_box_that_fits_stays_as_it_is():
-    assert sheets_of_bounds((2.4, 46.4, 2.6, 46.6)) == [(2.4, 46.4, 2.6, 46.6)]
-    assert len(sheets_of_bounds((2.0, 46.0, 3.0, 47.0))) == 6
-    sheets = sheets_of_bounds((179.5, -17.5, -179.5, -17.0))
-    edges = np.array([(west, east) for west, _, east, _ in sheets[:3]])
-    third = 179.5 + 1 / 3
-    np.testing.assert_allclose(edges, [(179.5, third), (third, -third), (-third, -179.5)])
-
-
-@pytest.mark.parametrize(
-    "bounds, message",
-    [
-        ((3, 1, 2, 2), "west < east"),
-        ((1, 2, 2, 1), "south < north"),
-        ((1, 1, np.nan, 2), "bounds must be"),
-        ((1, 89, 2, 90), "within 89.5 deg"),
-        ((-180, -80, 180, 80), "limit of 10,000"),
-    ],
-)
-def test_bounds_that_cannot_be_cut_are_refused(bounds, message):
-    with pytest.raises(AreaError, match=message):
-        sheets_of_bounds(bounds)
 
 
 steps = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
@@ -99,14 +51,15 @@ def test_parts_of_a_route_fit_and_follow_each_other(lat, lon, turns, data):
 
 
 def test_a_leg_longer_than_a_sheet_is_cut():
-    parts = sheets_of_route(read_route("paper:C@46.6,1.9"), None)
+    route = Route(((46.6, 1.574), (46.6, 2.227)), (Height(4000, "agl"),) * 2, (5000,))
+    parts = sheets_of_route(route, None)
     assert [part.name for part in parts] == ["sheet-1", "sheet-2"]
     assert [leg_lengths_m(part).sum() for part in parts] == pytest.approx(
         [25_000, 25_000], rel=1e-3
     )
     assert {height for part in parts for height in part.heights} == {Height(4000, "agl")}
-    whole = sheets_of_route(read_route("paper:C@46.6,1.9,45"), None)  # its corners are nearer
-    assert len(whole) == 1
+    diagonal = Route(((46.44, 1.67), (46.76, 2.13)), leg_bands_m=(5000,))
+    assert len(sheets_of_route(diagonal, None)) == 1  # its corners are nearer
 
 
 @pytest.mark.parametrize(
@@ -132,10 +85,8 @@ def test_routes_that_cannot_be_cut_are_refused(route, band_m, message):
 )
 def test_routes_of_too_many_sheets_are_refused_before_the_work(route, monkeypatch):
     monkeypatch.setattr(Area, "contains", None)
-    fits, tried = sheets_module._route_fits, []
-    monkeypatch.setattr(
-        sheets_module, "_route_fits", lambda *each: tried.append(each) or fits(*each)
-    )
+    fits, tried = sheets_module._fits, []
+    monkeypatch.setattr(sheets_module, "_fits", lambda *each: tried.append(each) or fits(*each))
     with pytest.raises(AreaError, match="at most 500 are planned"):
         sheets_of_route(route, 500.0)
     assert len(tried) <= 1000

@@ -39,23 +39,6 @@ def test_names_round_trip(side_m, up, along):
     assert sheets.name_at((south + north) / 2, (west + east) / 2) == name
 
 
-@pytest.mark.parametrize("side_m", SIDES_M)
-@settings(max_examples=40)
-@given(up=st.floats(0, 1))
-def test_rows_and_columns_leave_no_gaps(side_m, up):
-    """Neighbours share an edge, the first begins at 180 deg west and the last ends there."""
-    sheets = WorldSheets(side_m)
-    row = min(sheets.rows - 2, int(up * sheets.rows))
-    last = sheets.cols(row) - 1
-    boxes = [sheets.bounds_deg(f"r{row:06d}c{col:06d}") for col in (0, min(1, last), last)]
-    above = sheets.bounds_deg(f"r{row + 1:06d}c000000")
-    assert boxes[0][0] == -180 and boxes[-1][2] == pytest.approx(180, abs=1e-9)
-    assert last == 0 or boxes[0][2] == pytest.approx(boxes[1][0], abs=1e-9)
-    assert above[1] == pytest.approx(boxes[0][3], abs=1e-9)
-    assert sheets.bounds_deg("r000000c000000")[1] == -90
-    assert sheets.bounds_deg(f"r{sheets.rows - 1:06d}c000000")[3] == pytest.approx(90, abs=1e-9)
-
-
 @pytest.mark.parametrize("side_m", [SMALLEST_SIDE_M, 10_000.0, LARGEST_SIDE_M])
 @pytest.mark.parametrize("lat", [-87.0, -75.0, -30.0, -0.01, 0.01, 46.6, 60.0, 85.0, 87.0])
 def test_every_sheet_fits_a_map(side_m, lat):

@@ -19,7 +19,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from orthonav.cli.demo import IMAGERY
-from orthonav.cli.heights import map_heights
+from orthonav.cli.source import map_heights
 from orthonav.core.flight import open_flight
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame

@@ -123,16 +123,6 @@ def test_a_window_that_starts_in_the_middle_of_the_sheet(tmp_path, gsd_m):
     assert np.abs(quarter.rgb.astype(int) - whole.rgb[50:, 50:]).max() <= 2
 
 
-@pytest.mark.parametrize("turn_deg", [0, 5, 45, 90])
-def test_narrow_windows_are_as_sharp_as_wide_ones(tmp_path, turn_deg):
-    scene = rich_scene(200, 1.0)
-    path = write(tmp_path / "ortho.tif", scene, transform=placed(size=200, turn_deg=turn_deg))
-    with sheet_of(path, 100) as sheet:
-        whole, strip = sheet.read(0, 0, 100, 100), sheet.read(0, 48, 100, 3)
-    assert np.abs(strip.rgb.astype(int) - whole.rgb[48:51]).max() <= 2
-    assert whole.grey.std() == pytest.approx(scene.mean(axis=0).std(), rel=0.3)
-
-
 @pytest.mark.parametrize("coarser", [2, 3, 4, 5, 8, 2.5, 3.4])
 @pytest.mark.parametrize("deep", [False, True], ids=["8 bit", "16 bit"])
 def test_a_fine_chequerboard_comes_out_grey(tmp_path, coarser, deep):

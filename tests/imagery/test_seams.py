@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-import rasterio
 from geotiffs import FRAME, LAMBERT, placed, read, sheet_of, smooth_scene, write
 from rasterio.transform import Affine
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.imagery.mosaic import Mosaic
 
 BREST = LocalFrame(48.39, -4.49)  # Lambert-93 is turned by -5.4 degrees here
 
@@ -77,26 +75,6 @@ def test_holes_and_bit_depths_survive_the_seams(tmp_path, window, side):
     assert off.mean() < 1.5  # files are not stretched alike: fewer pixels are sampled
 
 
-def test_palettes_and_false_alpha_are_cut_too(tmp_path):
-    size = 400
-    transform = placed(LAMBERT, 0.25, size, frame=BREST)
-    scene = rough_scene(size)
-
-    def palette(path, part, **more):
-        with rasterio.open(write(path, part[:1], **more), "r+") as data:
-            data.write_colormap(1, {value: (value, 255 - value, 9, 255) for value in range(256)})
-        return path
-
-    def infrared(path, part, **more):  # GDAL calls the fourth band alpha
-        return write(path, np.concatenate([part, 255 - part[:1]]), **more)
-
-    for make in (palette, infrared):
-        whole = read(make(tmp_path / "whole.tif", scene, transform=transform), 80, 1.0, BREST)
-        parts = read(cut(tmp_path / make.__name__, scene, transform, 100, make), 80, 1.0, BREST)
-        assert whole.valid.all() and parts.valid.all()
-        assert np.abs(parts.rgb.astype(int) - whole.rgb).max() <= 2
-
-
 @pytest.mark.parametrize("shift_px", [0.5, 0.25])
 @pytest.mark.parametrize("frame", [FRAME, BREST], ids=["straight", "turned"])
 def test_no_gap_between_files_that_share_no_lattice(tmp_path, frame, shift_px):
@@ -113,46 +91,3 @@ def test_no_gap_between_files_that_share_no_lattice(tmp_path, frame, shift_px):
     values = pixels.rgb[2:-2, 2:-2]
     assert set(np.unique(values[:, :20])) == {90} and set(np.unique(values[:, -20:])) == {180}
     assert values.min() >= 80 and values.max() <= 190
-
-
-def test_resolutions_and_systems_meet_without_a_gap(tmp_path):
-    """Lambert-93 at 1 m beside UTM at 0.5 m, which covers a little of it."""
-    grey = np.full((3, 130, 130), 90, np.uint8)
-    left = placed(size=130, frame=FRAME) * Affine.translation(-65, 0)
-    fine = np.full((3, 300, 300), 180, np.uint8)
-    utm = placed("EPSG:32631", 0.5, 300, frame=FRAME) * Affine.translation(140, 0)
-    paths = [
-        write(tmp_path / "a.tif", grey, transform=left),
-        write(tmp_path / "b.tif", fine, crs="EPSG:32631", transform=utm),
-    ]
-    for order in (paths, paths[::-1]):
-        pixels = read(order, 90)
-        assert pixels.valid[2:-2, 2:-2].all()
-        assert set(np.unique(pixels.rgb[:, :25])) == {90}
-        assert set(np.unique(pixels.rgb[:, -25:])) == {180}
-
-
-def test_a_file_named_between_two_of_one_lattice_covers_the_second(tmp_path):
-    paths = [
-        write(
-            tmp_path / f"{level}.tif",
-            np.full((3, 100, 100), level, np.uint8),
-            transform=placed(size=100) * Affine.translation(shift, shift),
-        )
-        for level, shift in ((100, 30), (150, 0.5), (50, 0))
-    ]
-    pixels = read(paths, 60)
-    assert (pixels.rgb[5:8, 3:8] == 150).all() and (pixels.rgb[20:-10, 20:-10] == 100).all()
-
-
-def test_files_that_others_hide_are_not_read(tmp_path):
-    """Two years of the same tiles."""
-    for year in ("2021", "2015"):
-        older = cut(tmp_path / year, smooth_scene(120), placed(size=120), 30)
-    mosaic = Mosaic.open([tmp_path / "2021", tmp_path / "2015"])
-    for path in older:
-        path.unlink()
-    with mosaic.sheet(
-        FRAME, west_m=-45, north_m=45, width_px=90, height_px=90, gsd_m=1.0, threads=1
-    ) as sheet:
-        assert sheet.read(0, 0, 90, 90).valid.all()

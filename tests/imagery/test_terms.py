@@ -20,7 +20,7 @@ TAGS = {
 def ortho(path, tags):
     with rasterio.open(write(path, smooth_scene()), "r+") as data:
         data.update_tags(**tags)
-    return open_sources([path])[0][0].describe()
+    return open_sources([path])[0].describe()
 
 
 def test_terms_of_a_fetched_file(tmp_path):

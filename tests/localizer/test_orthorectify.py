@@ -9,7 +9,7 @@ from lab.terrain import random_relief, seen_view
 
 from orthonav.core.localize.rectify import Orientation, hidden, node_px, orthorectified
 from orthonav.core.records import Telemetry, View
-from orthonav.ground.simulate.perspective import Raster
+from orthonav.ground.simulate.render import Raster
 
 PIXEL_M, POSTING_M, SIDE_M = 1.0, 10.0, 800.0
 MIDDLE_M = SIDE_M / 2

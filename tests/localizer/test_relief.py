@@ -13,7 +13,7 @@ from orthonav.core.localize import Localizer
 from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
-from orthonav.ground.simulate.perspective import Raster
+from orthonav.ground.simulate.render import Raster
 
 SIDE_M, POSTING_M = 700.0, 10.0
 PLACE = np.array([30.0, -40.0])

@@ -40,9 +40,10 @@ class ComputedOdometry:
         seconds = flight.exposed_s - start[1]
         (begin, from_m), (end, to_m) = flight.truth(start[1]), flight.truth(flight.exposed_s)
         velocity, height = np.append((to_m - from_m) / seconds, 0.0), flight.flown.agl_m
-        seen = reported_motion(begin[None], end[None], velocity[None], np.array([height]), seconds)
-        turn = seen.turn_rad[0] + flight.rng.normal(0, 5e-4)
-        shift = (seen.tilt_shift + seen.velocity_shift)[0] + flight.rng.normal(0, 1.5e-3, 2)
+        moved = reported_motion(begin[None], end[None], velocity[None], np.array([height]), seconds)
+        turn, tilt, by_velocity = (each[0] for each in moved)
+        turn = turn + flight.rng.normal(0, 5e-4)
+        shift = tilt + by_velocity + flight.rng.normal(0, 1.5e-3, 2)
         if np.hypot(*shift) > FARTHEST:
             return None
         wrong = flight.wrong(flight.exposed_s)

@@ -693,7 +693,7 @@ def test_a_camera_error_of_the_locator_is_a_wrong_camera(flight):
 def test_inputs_that_are_missing_come_and_go_are_said(flight):
     flight.views(30)  # four seconds more
     said = flight.said.lines
-    assert "autopilot 1/1 PX4 heard on udpin:1" in said and "camera 320x240, 10.0 Hz" in said
+    assert "autopilot 1/1 PX4 heard on udpin:1" in said and "camera 320x240" in said
     assert not flight.said.with_word("waiting")
     status = flight.said.with_word("; health OK")[-1]
     assert status.startswith("tracking 48.000000, 2.000000 +- 2.0 m; ")
@@ -708,7 +708,7 @@ def test_inputs_that_are_missing_come_and_go_are_said(flight):
     flight.talks = True
     flight.views(60)
     assert len(flight.said.with_word("autopilot 1/1 PX4 heard")) == 2
-    assert len(flight.said.with_word("camera 320x240, 10.0 Hz")) == 2
+    assert len(flight.said.with_word("camera 320x240")) == 2
 
 
 def test_states_and_faults_are_said_with_their_reason_and_a_summary_ends_it(flight):
@@ -997,7 +997,7 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
         ((), 1, "--autopilot"),
         (("--autopilot", "udpin:0", "--signing-key", "KEY"), 1, "32 bytes"),
         (("--autopilot", "carrier-pigeon:1"), 1, "udpin"),
-        (("--autopilot", "udpin:0", "--nmea", "x:1"), 1, "tcp-listen"),
+        (("--autopilot", "udpin:0", "--nmea", "x:1"), 1, "udp:HOST:PORT"),
         (("--autopilot", "udpin:0", "--start", "1,2"), 2, "LAT,LON,STD_M"),
     ],
 )
@@ -1040,8 +1040,8 @@ def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_st
     views = [each for each in map(json.loads, done.out.splitlines()) if "frame" in each]
     assert done.code == 0 and views
     texts = [line[12:] for line in done.err.splitlines()]
-    plan = [text.partition(":")[0] for text in texts[:6]]
-    assert plan == ["map", "autopilot", "sends", "start", "GNSS", "camera"]
+    plan = [text.partition(":")[0] for text in texts[:3]]
+    assert plan == ["map", "sends", "camera"]
     assert any(text.startswith("searching -> tracking: 46.") for text in texts)
     found = sum(each["withheld"] is None for each in views)
     end = f"end: {len(views)} views, {found} with a position (none is sent)"

@@ -15,7 +15,6 @@ from orthonav.onboard.gnss.biases import (
     Biases,
     BiasLearner,
     Difference,
-    DifferenceModel,
     Resumed,
     Rolling,
     at_start,
@@ -25,7 +24,6 @@ from orthonav.onboard.gnss.biases import (
     unknown,
 )
 
-MODEL = DifferenceModel()
 TRUE = np.array([20.0, -10.0, math.radians(1.0), math.radians(-0.5), 0.2])
 NORTH, EAST, SOUTH, WEST = np.radians([0.0, 90.0, 180.0, 270.0])
 
@@ -39,7 +37,7 @@ def difference(second, heading=0.0, speed=20.0, agl_m=300.0, true=TRUE, off_m=(0
 
 def learnt(values, start=None):
     """The biases learnt from values, all of them past quarantine."""
-    learner = BiasLearner(start or unknown(), MODEL)
+    learner = BiasLearner(start or unknown())
     values = list(values)
     for each in values:
         learner.add(each)
@@ -104,17 +102,18 @@ def test_constant_airspeed_does_not_separate_mount_and_latency():
 
 @pytest.mark.long
 def test_stated_deviations_are_those_of_the_errors():
-    """Correlated errors, two flights: errors squared over their covariance are about 1."""
-    nees = []
-    for seed in range(2):
+    """Correlated errors, four flights: errors squared over their covariance are about 1."""
+    nees, stds_rad = [], []
+    for seed in range(4):
         ((off, found),) = recovered(seed, (12.0, 30.0), (12,))
         nees.append(off @ np.linalg.solve(found.cov, off) / 5)
+        stds_rad.append(found.stds[2])
     assert 0.2 < np.mean(nees) < 2
-    assert math.degrees(found.stds[2]) < 0.4 * PITCH_DEG
+    assert math.degrees(np.median(stds_rad)) < 0.4 * PITCH_DEG
 
 
 def test_values_wait_in_quarantine_and_an_alarm_discards_them():
-    learner = BiasLearner(unknown(), MODEL)
+    learner = BiasLearner(unknown())
     for second in range(int(QUARANTINE_S)):
         learner.add(difference(second, true=2 * TRUE))
     assert learner.learnt.agreed_s == 0 and not learner.learnt.mean.any()
@@ -139,7 +138,7 @@ def test_biases_are_bounded():
 
 def test_a_slow_change_is_undone_to_the_reference():
     start = replace(unknown(), agreed_s=SETTLED_S)
-    learner = BiasLearner(start, MODEL)
+    learner = BiasLearner(start)
     for second in range(400):
         learner.add(difference(second))
     assert learner.learnt.agreed_s > SETTLED_S and learner.reference is start
@@ -148,7 +147,7 @@ def test_a_slow_change_is_undone_to_the_reference():
 
 
 def test_the_reference_of_an_unknown_map_is_what_was_learnt_first():
-    learner = BiasLearner(replace(unknown(), agreed_s=SETTLED_S - 100), MODEL)
+    learner = BiasLearner(replace(unknown(), agreed_s=SETTLED_S - 100))
     for second in range(250):
         learner.add(difference(second))
     assert learner.reference.agreed_s < SETTLED_S
@@ -183,23 +182,16 @@ def test_many_flights_that_show_nothing_are_no_damage():
     assert known.stds == pytest.approx(unknown().stds)
 
 
-def test_a_measured_latency_is_not_learnt():
-    """What was learnt belongs to the stated one."""
-    values = [replace(each, as_stated=False) for each in legs((NORTH, SOUTH), (12.0, 30.0))]
-    found = learnt(values)
-    assert found.mean[4] == 0 and found.stds[4] >= unknown().stds[4]
-
-
 def test_an_interrupted_flight_keeps_its_reference():
     """A drag-off that was learnt before the restart is undone after it."""
     start = replace(unknown(), agreed_s=SETTLED_S)
-    learner = BiasLearner(start, MODEL)
+    learner = BiasLearner(start)
     for second in range(400):
         learner.add(difference(second))
     saved = Resumed(learner.learnt, learner.reference).to_plain(None)
     before, resumed = before_flight(saved)
     assert before is None
-    again = BiasLearner(unknown(), MODEL, resumed)
+    again = BiasLearner(unknown(), resumed)
     assert again.learnt.mean == pytest.approx(learner.learnt.mean)
     again.restore()
     assert not again.learnt.mean.any() and again.learnt.agreed_s == SETTLED_S

@@ -15,13 +15,19 @@ from orthonav.ground.simulate.receiver import receiver_of, solutions
 from orthonav.onboard.gnss.biases import (
     Biases,
     Difference,
-    DifferenceModel,
     DifferenceWindow,
+    Fault,
     _Filter,
     unknown,
 )
-from orthonav.onboard.gnss.monitor import RETURN_S, SILENCE_S, GnssMonitor, Receiver
-from orthonav.onboard.gnss.records import Fault, GnssState, MapPosition
+from orthonav.onboard.gnss.monitor import (
+    RETURN_S,
+    SILENCE_S,
+    GnssMonitor,
+    GnssState,
+    MapPosition,
+    Receiver,
+)
 
 S = 10**9
 KNOWN = Biases(np.zeros(5), np.diag([1.5, 1.5, 0.01, 0.01, 0.1]) ** 2, 3600.0)
@@ -131,9 +137,7 @@ def test_a_drag_off_that_was_learnt_is_named_and_undone():
     air = Air(KNOWN)
     air.fly(120)
     poisoned = air.monitor.learnt.mean + np.array([25.0, 0, 0, 0, 0])
-    air.monitor._learner._filter = _Filter(
-        replace(air.monitor.learnt, mean=poisoned), DifferenceModel()
-    )
+    air.monitor._learner._filter = _Filter(replace(air.monitor.learnt, mean=poisoned))
     status = air.fly(3)
     assert (status.state, status.fault) == (GnssState.ALARM, Fault.OFFSET)
     assert status.fault_en_m == pytest.approx([25, 0], abs=1)
@@ -276,12 +280,12 @@ def value(second, en_m, std_m=3.0):
 
 def test_the_covariance_is_that_of_the_simulated_errors():
     """Whitened differences of the model's own errors have unit variance: the test is consistent."""
-    model, rng = DifferenceModel(), np.random.default_rng(3)
+    rng = np.random.default_rng(3)
     path = lawnmower(60)
     values = [
         replace(value(t, (0.0, 0.0)), heading_rad=float(path.heading_rad[t])) for t in range(60)
     ]
-    window = DifferenceWindow(model)
+    window = DifferenceWindow()
     for each in values:
         window.add(each)
     used = window.values
@@ -289,7 +293,7 @@ def test_the_covariance_is_that_of_the_simulated_errors():
     found = 0
     for _ in range(200):
         offset = rng.normal(0, 1.5, 2)
-        window = DifferenceWindow(model)
+        window = DifferenceWindow()
         for each in values:
             window.add(replace(each, en_m=offset + rng.normal(0, 1.0, 2)))
         found += window.finding(KNOWN) is not None
@@ -300,7 +304,7 @@ def test_the_covariance_is_that_of_the_simulated_errors():
 def test_size_and_direction_of_a_step_are_estimated(bearing):
     angle = math.radians(bearing)
     step = 40 * np.array([math.sin(angle), math.cos(angle)])
-    window = DifferenceWindow(DifferenceModel())
+    window = DifferenceWindow()
     for second in range(40):
         window.add(value(second, step if second >= 35 else (0.0, 0.0)))
     found = window.finding(unknown())

@@ -18,20 +18,23 @@ from orthonav.onboard.health import (
     Health,
     HealthReporter,
     Level,
-    Snapshot,
     TelemetryDiagnosis,
     judge,
     mismatch,
     notify,
 )
 
-GOOD = Snapshot(60.0, {"taken": 50, "processed": 50, "confident": 50}, latency_s=0.1)
+COUNTS = {"taken": 50, "processed": 50, "confident": 50}
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 REPORTED = Telemetry(0, 10.0, 0.0, 0.0, 100.0)
 
 
 def counted(**counts):
-    return {"counts": {**GOOD.counts, **counts}}
+    return {"counts": {**COUNTS, **counts}}
+
+
+def judged(running_s=60.0, **seen):
+    return judge(running_s, **{"counts": COUNTS, "latency_s": 0.1, **seen})
 
 
 FAILED = {
@@ -43,8 +46,8 @@ FAILED = {
     "map_file_changed": {"map_unchanged": False, "map_intact": False},
 }
 DEGRADED = {
-    "heading_mismatch": {"heading_mismatch_deg": -170.0},
-    "height_mismatch": {"log_scale_mismatch": math.log(0.5)},
+    "heading_mismatch": {"mismatch": (-170.0, 0.0)},
+    "height_mismatch": {"mismatch": (0.0, math.log(0.5))},
     "lost": {"state": "lost"},
     "searching": {"state": "searching"},
     "low_confidence": {"low_confidence_s": 11.0},
@@ -67,7 +70,7 @@ DEGRADED = {
 
 
 def test_without_faults_health_is_ok():
-    assert judge(GOOD) == Health(Level.OK)
+    assert judged() == Health(Level.OK)
 
 
 @pytest.mark.parametrize(
@@ -79,24 +82,23 @@ def test_without_faults_health_is_ok():
     ],
 )
 def test_every_fault_has_a_reason(level, reason, seen):
-    assert judge(replace(GOOD, **seen)) == Health(level, (reason,))
+    assert judged(**seen) == Health(level, (reason,))
 
 
 def test_reasons_of_failed_come_first():
-    seen = replace(GOOD, image_age_s=4.0, state="lost", map_unchanged=False)
-    assert judge(seen) == Health(Level.FAILED, ("no_camera", "lost", "map_file_changed"))
+    seen = judged(image_age_s=4.0, state="lost", map_unchanged=False)
+    assert seen == Health(Level.FAILED, ("no_camera", "lost", "map_file_changed"))
 
 
 def test_few_faults_are_ok():
     few = counted(frozen=5, bad_image=5, late=5, no_telemetry=5)
-    assert judge(replace(GOOD, **few)).level is Level.OK
+    assert judged(**few).level is Level.OK
 
 
 def test_missing_inputs_are_no_reason_right_after_the_start():
-    young = replace(GOOD, running_s=2.0, image_age_s=9.0, telemetry_age_s=math.inf)
-    young = replace(young, link_age_s=math.inf, synced=False)
-    assert judge(young).level is Level.OK
-    old = judge(replace(young, running_s=6.0))
+    missing = {"image_age_s": 9.0, "telemetry_age_s": math.inf, "link_age_s": math.inf}
+    assert judged(2.0, **missing, synced=False).level is Level.OK
+    old = judged(6.0, **missing, synced=False)
     assert old.reasons == ("no_camera", "link_down", "no_telemetry")
 
 

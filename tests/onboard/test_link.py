@@ -12,9 +12,8 @@ from fake_autopilot import MS, UTC_NS, Autopilot, Port, S, Time
 from orthonav.core.errors import VariantError
 from orthonav.onboard.link import RETRY_S, AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
-from orthonav.onboard.messages.mavlink import Signing, Target, dialect, signing_timestamp
-from orthonav.onboard.messages.mavlink_local import Autopilot as Kind
-from orthonav.onboard.messages.mavlink_local import Origin
+from orthonav.onboard.messages.mavlink import Autopilot as Kind
+from orthonav.onboard.messages.mavlink import Origin, Signing, Target, dialect, signing_timestamp
 from orthonav.onboard.ports import Descriptor, open_serial, transport_opener
 from orthonav.onboard.telemetry import TelemetryBuffer
 from wire import decode

@@ -45,7 +45,7 @@ from orthonav.onboard.ros2.arguments import ros_arguments
 from orthonav.onboard.ros2.graph import Definitions
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
-from orthonav.onboard.ros2.reader import LostImages, Ros2Reader
+from orthonav.onboard.ros2.reader import Ros2Reader
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
 
 S = 10**9
@@ -366,31 +366,6 @@ def test_a_publisher_that_leaves_is_no_message(peer, reading):
     assert not flying.node.undecodable
 
 
-@pytest.mark.parametrize(
-    ("arrive", "is_lost"),
-    [
-        (lambda n: True, False),
-        (lambda n: n % 10 != 3, False),  # a tenth
-        (lambda n: n % 3 == 0, False),  # a node passes every third one on
-        (lambda n: n % 10 in (0, 1, 5, 9), True),
-        (lambda n: n in (0, 40, 41, 75, 90), True),
-    ],
-)
-def test_lost_images_are_a_problem_of_their_topic(arrive, is_lost):
-    lost, order = LostImages(), np.random.default_rng(0).permutation(100)
-    for number in order:  # what arrives first does not matter
-        lost.infos.append(int(number) * S // 10)
-        if arrive(number):
-            lost.images.append(int(number) * S // 10)
-    assert (lost.reason() is not None) is is_lost
-
-
-def test_images_without_camera_info_are_not_lost():
-    lost = LostImages()
-    lost.images.extend(range(0, 100 * S, S))
-    assert lost.reason() is None
-
-
 def test_stamps_that_go_back(peer, reading, caplog):
     flying = joined(peer, reading, *SEEN)
     now_ns = time.time_ns()
@@ -520,7 +495,6 @@ class Publishing:
             f"{self.node.arguments.full_name}/fix": ros.NavSatFix,
             f"{self.node.arguments.full_name}/pose": ros.PoseWithCovarianceStamped,
             "/diagnostics": ros.DiagnosticArray,
-            "/tf": ros.TFMessage,
         }.items():
             peer.subscribe(topic, kind)
         wait_for(self.matched, "discovery")
@@ -669,16 +643,6 @@ def test_the_origin_is_latched_for_later_subscribers(peer, publishing):
     (found,) = wait_for(lambda: peer.heard("/orthonav/origin"))
     assert (found.position.latitude, found.position.longitude) == (47.0, 8.0)
     assert math.isnan(found.position.altitude) and found.header.frame_id == "map"
-
-
-def test_a_transform_on_request(peer, publishing):
-    flying = publishing("-p", "publish_tf:=true", "-p", "base_frame:=drone")
-    assert flying.publish(fix(lat_deg=47.001, lon_deg=8.0))[-1] == "TFMessage"
-    (found,) = wait_for(lambda: peer.heard("/tf"))
-    (moved,) = found.transforms
-    assert (moved.header.frame_id, moved.child_frame_id) == ("map", "drone")
-    assert moved.transform.translation.y == pytest.approx(111.18, abs=0.1)
-    assert moved.transform.rotation.w == 1.0
 
 
 def test_health_is_a_diagnostic(peer, publishing):

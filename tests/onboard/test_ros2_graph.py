@@ -159,29 +159,3 @@ def test_signals_end_the_wait_for_a_camera(flown, env, tmp_path, distribution, n
         time.sleep(0.1)
     flying.process.send_signal(number)
     assert flying.process.wait(LONGEST_S) == 0, flying.said()
-
-
-def test_parameters_of_a_sourced_node(flown, env, tmp_path, distribution):
-    """By the entry point and the file of the ROS package, with the arguments of a launch file."""
-    parameters = PACKAGE / "config" / "params.yaml"
-    asked = tmp_path / "asked.yaml"
-    asked.write_text(parameters.read_text().replace("map_frame: map", "map_frame: earth"))
-    words = [PACKAGE / "orthonav_ros" / "node.py", flown[0]]
-    words += ["--ros-args", "--log-level", "error"]
-    words += ["--ros-args", "-r", "__node:=orthonav", "-r", "__ns:=/uav1", "--params-file", asked]
-    flying = Flying(env, tmp_path, distribution, True, *words, "-r", "image:=/cam/image_raw")
-    get = (
-        "import rclpy, sys; from rcl_interfaces.srv import GetParameters as G; rclpy.init(); "
-        "n = rclpy.create_node('asks'); c = n.create_client(G, '/uav1/orthonav/get_parameters'); "
-        "assert c.wait_for_service(60); f = c.call_async(G.Request(names=['map_frame'])); "
-        "rclpy.spin_until_future_complete(n, f, timeout_sec=60); "
-        "print(f.result().values[0].string_value)"
-    )
-    try:
-        done = subprocess.run(
-            [distribution[1], "-c", get], env=env, capture_output=True, text=True, timeout=120
-        )
-    finally:
-        code = flying.interrupt()
-    assert done.stdout.strip() == "earth", done.stderr + flying.said()
-    assert code == 0 and flying.said() == ""

@@ -1,7 +1,5 @@
 """Maps of the paper's methods: built, carried, flown like any other."""
 
-import functools
-
 import numpy as np
 import pytest
 
@@ -81,40 +79,6 @@ def test_registration_works_on_maps_of_other_methods(built, flight_path):
     assert np.median(errors) < 15
 
 
-@pytest.mark.slow  # as in tests/neural, with imagery
-def test_interrupted_training_resumes(area, tmp_path):
-    class Killed(Exception):
-        pass
-
-    def kill(stage, share):
-        if stage == "learn" and share >= 0.5:
-            raise Killed
-
-    method = "autoencoder:width=16,dims=32,epochs=4"
-    request = BuildRequest(
-        [area.past],
-        tmp_path / "a.onav",
-        method=method,
-        registration=False,
-        work=tmp_path / "work",
-        **SMALL,
-    )
-    from orthonav.research import training
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
-        often = functools.partial(training.Means, save_every_s=0.0)
-        patch.setattr("orthonav.research.training.Means", often)
-        with pytest.raises(Killed):
-            build_map(request, kill)
-        assert not (tmp_path / "a.onav").exists()
-        learnt = []
-        build_map(request, lambda stage, share: learnt.append(share) if stage == "learn" else None)
-    # What was learnt before is not learnt again.
-    assert min(share for share in learnt if share > 0) > 0.25
-    assert (tmp_path / "a.onav").exists() and (tmp_path / "work" / "loss.png").exists()
-
-
 @pytest.mark.parametrize(
     "method, edges, says",
     [
@@ -123,7 +87,6 @@ def test_interrupted_training_resumes(area, tmp_path):
         ("triplet:width=0", None, "width must be"),
         ("vlad", None, "unknown variant 'vlad'"),
         ("autoencoder", "sam", "weights"),
-        ("triplet", "sam:weights=there", "--other-date"),
     ],
 )
 def test_what_does_not_go_together_is_refused(area, tmp_path, method, edges, says):

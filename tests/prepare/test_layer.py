@@ -96,13 +96,10 @@ def noise(kind, shape=(700, 600)):
     rng = np.random.default_rng(0)
     if kind == "black and white":
         return (rng.integers(0, 2, shape) * 255).astype(np.uint8)
-    if kind == "grains of two pixels":
-        coarse = rng.integers(0, 2, (shape[0] // 2, shape[1] // 2)) * 255
-        return np.kron(coarse, np.ones((2, 2))).astype(np.uint8)
     return rng.integers(0, 256, shape).astype(np.uint8)
 
 
-@pytest.mark.parametrize("kind", ["even", "black and white", "grains of two pixels"])
+@pytest.mark.parametrize("kind", ["even", "black and white"])
 def test_noise_cannot_make_it_large(kind):
     grey = noise(kind)
     parts = written(grey, np.ones(grey.shape, bool))[1]
@@ -179,11 +176,3 @@ def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
     for east_m, north_m in opened.array("sheet0/centres_en_m", np.float32, 2)[::9]:
         row, col = int(sheet.grid.north_m - north_m), int(east_m - sheet.grid.west_m)
         assert layer.read(0, row - half, col - half, 2 * half, 2 * half)[1].mean() > 0.4
-
-
-def test_without_a_layer(ortho, small_map, tmp_path):
-    with_it, without = small_map, built(ortho, tmp_path, registration=False)
-    assert GreyLayer.of(without) is None
-    assert set(with_it.arrays) - set(without.arrays) == set(NAMES.values())
-    for name, part in without.arrays.items():
-        np.testing.assert_array_equal(part, with_it.arrays[name])

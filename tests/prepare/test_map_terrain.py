@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from helpers import write_dem
-from orthonav.cli.heights import map_heights
+from orthonav.cli.source import map_heights
 from orthonav.core.errors import AreaError
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame
@@ -20,7 +20,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix
-from orthonav.ground.build.terrain import terrain_of_dem
+from orthonav.ground.build.layer import terrain_of_dem
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
@@ -193,46 +193,11 @@ def test_a_flight_is_located_with_heights_above_the_ground_where_it_is(flown, hi
     assert abs(off[1:]).mean() < 0.3 * abs(250 / expected - 1).mean()
 
 
-def test_import_writes_heights_above_ground(run, flown, dem, tmp_path):
-    done = run("import", flown, "--dem", dem, "--dem-datum", "msl", "--out", tmp_path / "imported")
-    assert (done.code, done.err) == (0, "")
-    before, after = rows(flown), rows(tmp_path / "imported")
-    with (flown / "truth.csv").open() as stream:
-        places = [(float(row["lat_deg"]), float(row["lon_deg"])) for row in csv.DictReader(stream)]
-    below = open_dem(dem, "msl")(*np.array(places).T)
-    expected = np.array([float(row["amsl_m"]) for row in before]) - below
-    np.testing.assert_allclose([float(row["agl_m"]) for row in after], expected, atol=0.01)
-    assert [row["home_m"] for row in before] == [row["home_m"] for row in after]
-    note = json.loads((tmp_path / "imported/flight.json").read_text())["note"]
-    assert "above sea level minus the terrain of hill.tif" in note
-
-
-def test_an_unknown_place_of_take_off_is_not_taken_for_level_ground(run, flown, frame, tmp_path):
-    flight = shutil.copytree(flown, tmp_path / "flight")
-    changed = [{**row, "amsl_m": "nan", "agl_m": row["home_m"]} for row in rows(flight)]
-    with (flight / "telemetry.csv").open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, changed[0])
-        writer.writeheader()
-        writer.writerows(changed)
-    with (flight / "truth.csv").open() as stream:
-        first = next(csv.DictReader(stream))
-    east, north = frame.en_from_latlon(float(first["lat_deg"]), float(first["lon_deg"]))
-
-    def holed(east_m, north_m):
-        near = np.hypot(east_m - east, north_m - north) < 40
-        return np.where(near, np.nan, hill(east_m, north_m))
-
-    path = write_dem(tmp_path / "holed.tif", frame, holed)
-    done = run("import", flight, "--dem", path, "--dem-datum", "msl", "--out", tmp_path / "out")
-    assert done.code == 0
-    assert {row["agl_m"] for row in rows(tmp_path / "out")} == {"nan"}
-
-
 def test_terrain_is_flown_without_gdal_and_proj(hill_map, flown):
     script = f"""
 import sys
 for name in ("rasterio", "pyproj", "torch"): sys.modules[name] = None
-from orthonav.cli.heights import map_heights
+from orthonav.cli.source import map_heights
 from orthonav.core.flight import open_flight
 from orthonav.core.mapfile import open_map, write_map
 heights = map_heights(open_map({str(hill_map)!r}))

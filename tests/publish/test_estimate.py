@@ -138,12 +138,6 @@ def test_a_confident_estimate_is_of_high_confidence_and_tracking(
         ({"lat_deg": 90.01}, "latitude"),
         ({"lat_deg": math.nan}, "latitude"),
         ({"lon_deg": -180.5}, "longitude"),
-        ({"cov_en_m2": np.eye(3)}, "cov_en_m2"),
-        ({"vel_cov_en": np.ones(2)}, "vel_cov_en"),
-        ({"confidence": 1.5}, "confidence"),
-        ({"processing_s": math.inf}, "processing_s"),
-        ({"alt_std_m": -1.0}, "alt_std_m"),
-        ({"reset_counter": 256}, "reset_counter"),
         ({"utc_ns": None}, "time of exposure"),
     ],
 )

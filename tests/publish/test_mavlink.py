@@ -17,6 +17,9 @@ from scipy.spatial.transform import Rotation
 from orthonav.core.errors import MissingExtraError
 from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.onboard.messages.mavlink import (
+    Autopilot,
+    LocalPose,
+    Origin,
     Packer,
     Signing,
     Target,
@@ -24,16 +27,11 @@ from orthonav.onboard.messages.mavlink import (
     external_position_estimate,
     global_position_sensor,
     gps_input,
-    signing_timestamp,
-    status_texts,
-)
-from orthonav.onboard.messages.mavlink_local import (
-    Autopilot,
-    LocalPose,
-    Origin,
     north_east_m,
     odometry,
     set_gps_global_origin,
+    signing_timestamp,
+    status_texts,
     vision_position_estimate,
 )
 from wire import SIZES, TABLES, decode, layout

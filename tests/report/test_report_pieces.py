@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import MissingExtraError, OutputError
+from orthonav.ground.report import metres_text
 from orthonav.ground.report.drawing import Background, Drawing, draw_axes, draw_map, map_size_in
-from orthonav.ground.report.numbers import measure_text, metres_text
 from orthonav.ground.report.page import (
     LIST,
     Figure,
@@ -175,13 +175,6 @@ def test_scripts_of_a_page_are_joined_without_module_syntax() -> None:
     text = joined_scripts(("format.js", "plane.js", "chart.js"), "orthonav.ground.report", ())
     assert text.startswith("(() => {") and "function metres(" in text
     assert not re.search(r"^(export|import)\b", text, re.MULTILINE)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(1.26, "1.3 m"), (99.96, "100.0 m"), (123.4, "123 m"), (np.nan, "-")]
-)
-def test_measures_have_their_significant_decimals(value: float, text: str) -> None:
-    assert measure_text(value, " m") == text
 
 
 @pytest.mark.parametrize(

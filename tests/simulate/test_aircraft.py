@@ -1,18 +1,19 @@
-"""Simulated flights of a real aircraft: wind, odometry, biases, clouds, ground beyond the map."""
-
-import math
+"""Simulated flights of a real aircraft: biases, clouds, corners as arcs, odometry off as stated."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from test_flight import PLAIN, SMALL, plane_of, route_of
 
 from helpers import textured
-from orthonav.core.errors import AreaError, FlightError
+from orthonav.core.errors import FlightError
 from orthonav.core.flight import open_flight, read_image, read_truth
-from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.ground.simulate.motion import Wind
+from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
 from orthonav.ground.simulate.render import Clouds
 
 SEEN = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
@@ -49,8 +50,7 @@ def pictures(flight):
     return [read_image(view.path) for view in flight.views]
 
 
-def test_a_flight_without_the_new_options_is_what_it_was(area, tmp_path):
-    """Numbers of the simulator as it was before it had wind, biases and clouds."""
+def test_a_seed_gives_the_numbers_of_earlier_versions(area, tmp_path):
     request = SimulateRequest(
         [area.past],
         tmp_path / "f",
@@ -68,22 +68,6 @@ def test_a_flight_without_the_new_options_is_what_it_was(area, tmp_path):
     assert lines[4] == "0004.jpg,6,353.495,2.995,0.282,106.121,5,5,48.86032265,2.34959257,40,1"
 
 
-def test_in_wind_the_aircraft_keeps_its_route_and_crabs(fly, frame):
-    flight, truth = fly(wind=Wind(10.0, 270.0), spacing_m=25.0, errors=Errors(velocity_drift=0.0))
-    places = np.array([frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
-    assert distance_to_polyline_m(places, CORNERS).max() < 0.05
-    seconds = reported(flight, "time_ns")[:, 0] / 1e9
-    assert np.diff(seconds) == pytest.approx(1.0)
-    north = places[:, 1] < 99
-    yaw = (reported(flight, "yaw_deg")[:, 0] + 180) % 360 - 180
-    assert yaw[north].mean() == pytest.approx(-math.degrees(math.asin(0.4)), abs=6)
-    assert yaw[~north] == pytest.approx(90, abs=15)
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    assert steps[~north[1:]][1:].min() > 29 and steps[north[1:]].max() < 25
-    velocity = reported(flight, "vel_en_mps")[:, 0]
-    assert velocity[1:] == pytest.approx(np.diff(places, axis=0), abs=0.01)
-
-
 def test_biases_are_constant(fly):
     exact, truth = fly("exact", errors=ALL, spacing_m=100.0, seed=3)
     bias = Errors(*[5.0, 0.05, 1.0, 2.0, 40.0], yaw_bias_deg=-4.0, agl_bias=0.08)
@@ -96,6 +80,15 @@ def test_biases_are_constant(fly):
     assert (reported(erring, *rest) == reported(exact, *rest)).all()
     for a, b in zip(pictures(exact), pictures(erring), strict=True):
         assert (a == b).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.77, 1.0])
+@pytest.mark.parametrize("count", [1, 7, 500])
+def test_the_share_of_views_with_clouds(count, share):
+    clouds = Clouds(count, share, 0)
+    degree = np.array([clouds.degree(number) for number in range(count)])
+    assert (degree > 0).sum() == round(share * count)
+    assert degree.min() >= 0 and degree.max() <= 1
 
 
 def test_clouds_hide_some_views_and_leave_the_others(fly):
@@ -114,48 +107,13 @@ def test_clouds_hide_some_views_and_leave_the_others(fly):
     assert spread[(degree > 0.3) & (degree < 0.7)].min() > 15
 
 
-OUT = [[0.0, 0.0], [700.0, 40.0]]
-
-
-def test_beyond_the_imagery_the_ground_is_mirrored(fly, frame):
-    flight, _ = fly(corners=OUT, beyond=True, camera=SEEN, spacing_m=90.0)
-    views = pictures(flight)
-    assert len(views) == 8
-    for view in views:
-        assert view.std() > 4 and (view == 0).mean() < 0.03
-    with pytest.raises(AreaError, match=r"view \d of the route, .* completely within"):
-        fly("not", corners=OUT, camera=SEEN, spacing_m=90.0)
-    inside, _ = fly("inside", corners=[[0.0, 0.0], [280.0, 16.0]], camera=SEEN, spacing_m=90.0)
-    for a, b in zip(views, pictures(inside), strict=False):
-        assert np.abs(a.astype(int) - b).mean() < 0.5
-
-
-REFUSED = {
-    "gale": ({"wind": Wind(25.0)}, r"too strong .* airspeed of 25 m/s"),
-    "turn": ({"turn_radius_m": -1.0}, "turn radius"),
-    "cloud nan": ({"cloud_share": math.nan}, "cloud_share must be 0 to 1"),
-    "spacing": ({"spacing_m": 0.0}, "above 0"),
-    "far": ({"spacing_m": math.inf}, "above 0"),
-    "speed": ({"airspeed_mps": math.nan}, "above 0"),
-}
-
-
-@pytest.mark.parametrize("request_, message", REFUSED.values(), ids=REFUSED.keys())
-def test_flights_that_cannot_be(fly, tmp_path, names_in, request_, message):
-    with pytest.raises(FlightError, match=message):
-        fly(**request_)
-    assert names_in(tmp_path) == []
-
-
 @pytest.mark.parametrize(
     "request_",
     [
-        {"wind": Wind(5.0)},
         {"turn_radius_m": 10.0},
-        {"beyond": True},
         {"errors": Errors(velocity_drift=0.0)},
     ],
-    ids=["wind", "turn_radius_m", "beyond", "velocity_drift"],
+    ids=["turn_radius_m", "velocity_drift"],
 )
 def test_random_positions_refuse_route_options(fly, request, request_):
     with pytest.raises(FlightError, match=f"{request.node.callspec.id}: only along a route"):
@@ -163,21 +121,75 @@ def test_random_positions_refuse_route_options(fly, request, request_):
 
 
 def test_the_command(run, ortho, frame, tmp_path):
-    points = route_of(frame, *OUT).waypoints
+    points = route_of(frame, (0.0, 0.0), (100.0, 40.0)).waypoints
     lines = ["lat_deg,lon_deg", *(f"{lat},{lon}" for lat, lon in points)]
     (tmp_path / "route.csv").write_text("\n".join(lines))
     fly = ["simulate", "--ortho", ortho, "--route", tmp_path / "route.csv", "--agl-m", "100"]
-    biases = ["--yaw-bias-deg", "-3", "--agl-bias", "0.05", "--pitch-bias-deg", "1"]
-    wind = ["--wind-mps", "8", "--wind-from-deg", "200", "--turn-radius-m", "50"]
-    rest = ["--velocity-drift", "0.02", "--cloud-share", "0.2", "--roll-bias-deg", "-1"]
-    done = run(
-        *fly, *biases, *wind, *rest, "--beyond", "--spacing-m", "300", "--out", tmp_path / "f"
-    )
+    errors = ["--agl-std", "0.05", "--velocity-drift", "0.02", "--turn-radius-m", "50"]
+    done = run(*fly, *errors, "--spacing-m", "50", "--out", tmp_path / "f")
     assert done.code == 0 and "views written" in done.out
     telemetry = open_flight(tmp_path / "f").views[0].telemetry
-    assert telemetry.vel_en_mps is not None and telemetry.agl_m == pytest.approx(105)
-    done = run(*fly, "--wind-mps", "30", "--out", tmp_path / "g")
-    assert done.code == 1 and "too strong for an airspeed of 25 m/s" in done.err
-    done = run(*fly, "--wind-from-deg", "30", "--out", tmp_path / "g")
-    assert done.code == 1 and "--wind-mps" in done.err
-    assert not (tmp_path / "g").exists()
+    assert telemetry.vel_en_mps is not None and telemetry.agl_m != 100
+
+
+# Motion along a route.
+
+
+LINE = np.array([[0.0, 0.0], [0.0, 4000.0], [3000.0, 4000.0], [2000.0, 0.0]])
+AIRSPEED = 25.0
+
+
+def test_velocities_integrate_to_the_path():
+    way = steady_path(LINE, 70.0, AIRSPEED)
+    assert np.diff(way.times_s) == pytest.approx(70.0 / AIRSPEED)
+    steps = way.velocities_en_mps[1:] * np.diff(way.times_s)[:, None]
+    assert steps.sum(axis=0) == pytest.approx(way.places_en_m[-1] - way.places_en_m[0])
+    assert way.velocities_en_mps[0] == pytest.approx([0, AIRSPEED], abs=1e-9)
+
+
+def test_dead_reckoning_drifts_by_the_stated_share_of_the_path():
+    true, times = np.tile([15.0, -20.0], (100, 1)), np.arange(100) * 1.0
+    way = true.sum(axis=0)
+    ends = [drifting(true, times, 0.02, np.random.default_rng(n)).sum(axis=0) for n in range(300)]
+    along = (ends - way) @ way / (way @ way)
+    across = (ends - way) @ [-way[1], way[0]] / (way @ way)
+    assert along.std() == pytest.approx(0.02, rel=0.15)
+    assert across.std() == pytest.approx(0.02, rel=0.15)
+    assert drifting(true, times, 0.0, np.random.default_rng(0)) == pytest.approx(true)
+
+
+corners = st.tuples(st.floats(-5000, 5000), st.floats(-5000, 5000))
+
+
+@given(st.lists(corners, min_size=3, max_size=8), st.floats(1, 1000))
+def test_rounded_corners_stay_near_the_route(points, radius_m):
+    line = np.array(points)
+    made = rounded(line, radius_m)
+    assert np.isfinite(made).all()
+    assert (made[0] == line[0]).all() and (made[-1] == line[-1]).all()
+    legs = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    assert distance_to_polyline_m(made, line).max() <= legs.max() / 2 + 1e-6
+    assert np.linalg.norm(np.diff(made, axis=0), axis=1).sum() <= legs.sum() + 1e-6
+
+
+def test_a_rounded_corner_is_an_arc_of_the_radius():
+    made = rounded(LINE, 400.0)
+    steps = np.diff(made, axis=0)
+    turns = np.diff(np.unwrap(np.arctan2(steps[:, 0], steps[:, 1])))
+    assert np.degrees(np.abs(turns)).max() <= 2.01
+    first = made[1:48]  # 90 deg in steps of 2
+    assert first[0] == pytest.approx([0, 3600]) and first[-1] == pytest.approx([400, 4000])
+    assert np.linalg.norm(first - [400, 3600], axis=1) == pytest.approx(400)
+
+
+angles = st.floats(-180, 180), st.floats(-30, 30), st.floats(-30, 30)
+
+
+@given(st.tuples(*angles), st.tuples(st.floats(-10, 10), st.floats(-10, 10)))
+def test_the_mount_tilts_in_the_aircraft(attitude, tilt):
+    """Against SciPy's rotations."""
+    aircraft = Rotation.from_euler("ZYX", attitude, degrees=True)
+    camera = Rotation.from_euler("ZYX", (0, *tilt), degrees=True)
+    axis_ned = (aircraft * camera).apply([0, 0, 1])
+    axis_enu = enu_from_camera(*mounted(attitude, *tilt))[:, 2]
+    assert axis_enu == pytest.approx([axis_ned[1], axis_ned[0], -axis_ned[2]], abs=1e-9)

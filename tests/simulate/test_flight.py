@@ -186,39 +186,14 @@ def test_the_folder(area, tmp_path, names_in):
     assert header == "frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m,tilt_std_deg"
 
 
-def test_the_defaults_are_a_view_a_second_that_covers_a_tile(area, plane, tmp_path):
-    route, shares = route_of(plane.frame, [-100.0, 0.0], [100.0, 0.0]), []
-    request = SimulateRequest([area.past], tmp_path / "f", route, camera=SMALL, airspeed_mps=40.0)
-    assert simulate_flight(request, shares.append) == 6 and shares[-1] == 1.0
-    telemetry = [view.telemetry for view in open_flight(tmp_path / "f").views]
-    assert [each.time_ns for each in telemetry] == [n * 10**9 for n in range(6)]
-    assert 48 * SMALL.gsd_m(telemetry[0].agl_m) == pytest.approx(256, rel=0.01)
-
-
-def test_effects_change_the_picture_as_stated(area, tmp_path):
-    seen = {}
-    for name, effects in {
-        "plain": PLAIN,
-        "noise": ViewEffects(0.0, 0.0, 6.0, 100),
-        "blur": ViewEffects(0.0, 2.0, 0.0, 100),
-        "exposure": ViewEffects(0.5, 0.0, 0.0, 100),
-    }.items():
-        flight, _ = flown(area, tmp_path / name, effects=effects, camera=SEEN, random=2)
-        seen[name] = np.stack([read_image(v.path) for v in flight.views]).astype(float)
-    difference = (seen["noise"] - seen["plain"])[seen["plain"] < 200]
-    assert difference.std() == pytest.approx(6, rel=0.15)
-    sharp = [np.abs(np.diff(seen[name], axis=2)).mean() for name in ("plain", "blur")]
-    assert sharp[1] < 0.8 * sharp[0]
-    gains = seen["exposure"].mean(axis=(1, 2)) / seen["plain"].mean(axis=(1, 2))
-    assert np.ptp(np.log(gains)) > 0.1
-
-
 REFUSED = {
     "too high": ({"agl_m": 5000.0}, AreaError, "fly lower"),
     "too low": ({"agl_m": 0.1}, FlightError, "1 to 50,000"),
     "nan": ({"agl_m": math.nan}, FlightError, "1 to 50,000"),
     "none": ({"random": 0}, FlightError, "number of random positions"),
     "neither": ({"random": None}, FlightError, "either a route or"),
+    "turn": ({"turn_radius_m": -1.0}, FlightError, "turn radius"),
+    "cloud nan": ({"cloud_share": math.nan}, FlightError, "cloud_share must be 0 to 1"),
 }
 
 
@@ -229,11 +204,24 @@ def test_flights_that_cannot_be(area, tmp_path, names_in, request_, error, messa
     assert [name for name in names_in(tmp_path) if name != "out"] == []
 
 
-def test_too_many_views_are_refused_before_they_are_placed(area, plane, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "request_, message",
+    [
+        ({"spacing_m": 1e-6}, "with a view every 1e-06 m has more than"),
+        *(
+            ({name: value}, "above 0")
+            for name in ("spacing_m", "airspeed_mps")
+            for value in (0.0, math.inf, math.nan)
+        ),
+    ],
+)
+def test_routes_that_cannot_be_are_refused_before_views_are_placed(
+    area, plane, tmp_path, monkeypatch, request_, message
+):
     monkeypatch.setattr(flight_module, "steady_path", None)
     route = route_of(plane.frame, [0.0, 0.0], [100.0, 0.0])
-    with pytest.raises(FlightError, match="with a view every 1e-06 m has more than"):
-        flown(area, tmp_path / "f", random=None, route=route, spacing_m=1e-6)
+    with pytest.raises(FlightError, match=message):
+        flown(area, tmp_path / "f", random=None, route=route, **request_)
 
 
 def test_views_keep_off_missing_imagery(make_ortho, tmp_path):

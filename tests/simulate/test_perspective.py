@@ -15,8 +15,7 @@ from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
-from orthonav.ground.simulate.perspective import Raster, met, rays_enu
-from orthonav.ground.simulate.render import render_view
+from orthonav.ground.simulate.render import Raster, met, rays_enu, render_view
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
 AUTUMN = DEFAULT_DATES[1]

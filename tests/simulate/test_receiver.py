@@ -6,8 +6,7 @@ from test_flight import plane_of, route_of
 
 from orthonav.core.errors import FlightError, VariantError
 from orthonav.core.flight.gnss import read_gnss
-from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.simulate.receiver import RATE_HZ, RECEIVERS, receiver_of, samples_of, solutions
+from orthonav.ground.simulate.receiver import RATE_HZ, receiver_of, solutions
 
 TIMES = np.arange(0.0, 301.0)
 PLACES = np.stack([20.0 * TIMES, 0.0 * TIMES], axis=1)
@@ -51,13 +50,6 @@ def test_faults_begin_in_time():
     assert len(solved("jam:at_s=100,for_s=20,silent=1").times_s) == len(times) - 20 * RATE_HZ
     jumping = np.hypot(*off("jumping:at_s=100,metres=40,every_s=5").T)
     assert {*np.round(jumping[begun])} == {0.0, 40.0}
-
-
-@pytest.mark.parametrize("name", sorted(RECEIVERS))
-def test_samples_have_the_order_of_arrival(name):
-    samples = list(samples_of(solved(name), LocalFrame(48.0, 2.0)))
-    arrived = [each.arrived_ns for each in samples]
-    assert arrived == sorted(arrived) and samples[0].has_fix
 
 
 def test_invalid_receivers_are_refused():

@@ -6,14 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from orthonav.core.geo.attitude import (
     enu_from_body_camera,
     enu_from_gimbal_camera,
     enu_from_ros_camera,
+    matrices_of_wxyz,
     ned_from_angles,
+    ned_wxyz_from_ros,
+    ros_xyzw_from_ned,
     rotations_of_wxyz,
+    slerp,
+    wxyz_of_angles,
+    wxyz_of_matrices,
 )
 from orthonav.core.geo.camera import attitude_of, enu_from_camera
 
@@ -33,6 +39,52 @@ def level(heading_deg, up=0.0):
         math.cos(heading) * math.cos(rise),
         math.sin(rise),
     ]
+
+
+quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
+
+
+def scipys(wxyz):
+    return Rotation.from_quat(np.asarray(wxyz)[..., [1, 2, 3, 0]])
+
+
+@given(st.lists(st.tuples(angles, angles, angles), min_size=1, max_size=3))
+def test_rotations_of_angles_are_those_of_scipy(all_angles):
+    expected = Rotation.from_euler("ZYX", all_angles, degrees=True).as_matrix()
+    np.testing.assert_allclose(ned_from_angles(all_angles), expected, atol=1e-12)
+    made = wxyz_of_angles(np.radians(all_angles))
+    np.testing.assert_allclose(scipys(made).as_matrix(), expected, atol=1e-12)
+
+
+@given(st.lists(quaternions, min_size=1, max_size=3))
+def test_quaternions_are_those_of_scipy(wxyz):
+    expected = scipys(wxyz).as_matrix()
+    np.testing.assert_allclose(matrices_of_wxyz(wxyz), expected, atol=1e-12)
+    found = wxyz_of_matrices(expected)
+    np.testing.assert_allclose(scipys(found).as_matrix(), expected, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1)
+
+
+@pytest.mark.parametrize("wxyz", [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+def test_half_turns_have_their_quaternion(wxyz):
+    np.testing.assert_allclose(wxyz_of_matrices(matrices_of_wxyz(wxyz)), wxyz, atol=1e-12)
+
+
+@given(quaternions, quaternions, st.floats(0, 1))
+def test_interpolation_is_that_of_scipy(before, after, weight):
+    ends = np.array([before, after]) / np.linalg.norm([before, after], axis=1, keepdims=True)
+    turns = scipys(ends)
+    if (turns[0].inv() * turns[1]).magnitude() > 3.1:
+        return  # half a turn: both ways are shortest
+    expected = Slerp([0, 1], turns)(weight).as_matrix()
+    np.testing.assert_allclose(matrices_of_wxyz(slerp(*ends, weight)), expected, atol=1e-6)
+
+
+@given(angles, st.floats(-80, 80), angles)
+def test_attitudes_of_ros_and_back(yaw, pitch, roll):
+    ned = ned_from_angles([yaw, pitch, roll])
+    back = ned_wxyz_from_ros(np.roll(ros_xyzw_from_ned(ned), 1))
+    np.testing.assert_allclose(matrices_of_wxyz(back), ned, atol=1e-12)
 
 
 @given(angles, st.floats(-90, 30))

@@ -11,7 +11,7 @@ from orthonav.core.flight.mount import Bias, Mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.core.track import Model
-from orthonav.ground.recordings.calibrate_mount import calibrate_mount
+from orthonav.ground.recordings.calibrate import calibrate_mount
 from orthonav.onboard.run import MountCorrected, model_of
 
 CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0)
@@ -46,17 +46,6 @@ def test_biases_are_estimated(seed):
     assert mount.pitch_deg.value == pytest.approx(6.0, abs=0.4)
     assert mount.heading_deg.scatter == pytest.approx(1.5, rel=0.5)
     assert (mount.views, found.first, found.last, found.moved) == (40, "000.jpg", "039.jpg", False)
-
-
-def test_fewer_and_correlated_views_give_a_larger_standard_deviation():
-    few, many = (calibrate_mount(flight(count)).mount.heading_deg.std for count in (6, 200))
-    assert 0.2 <= many < few
-    rng = np.random.default_rng(1)
-    slow = np.repeat(rng.normal(0, 1.5, 8), 10)
-    lasting = [view(n, {**TRUE, "heading_bias": 4 + slow[n]}) for n in range(80)]
-    independent = [view(n, {**TRUE, "heading_bias": 4 + rng.normal(0, 3.0)}) for n in range(80)]
-    stds = [calibrate_mount(each).mount.heading_deg.std for each in (lasting, independent)]
-    assert stds[0] / 1.5 > 1.5 * stds[1] / 3.0
 
 
 def test_outliers_and_views_of_low_confidence_do_not_count():

@@ -1,6 +1,5 @@
 """A flight log is flown again bit for bit, and what is broken or crafted is one line at most."""
 
-import json
 import math
 import struct
 import tracemalloc
@@ -20,7 +19,6 @@ from orthonav.core.flight.fixes import read_results, result_to_json
 from orthonav.core.flight.logged import (
     HEALTH,
     PROFILE,
-    RESULT,
     SESSION,
     TELEMETRY,
     VIEW,
@@ -38,7 +36,7 @@ from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.signature import map_digest
-from orthonav.core.records import NoFix, Prior, Telemetry, View, ViewResult
+from orthonav.core.records import Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings import SourceOptions, open_source, source_kind
 from orthonav.ground.recordings import flightlog as flightlog_module
@@ -466,26 +464,3 @@ def test_only_flight_logs_are_detected_as_logs(tmp_path, content):
     empty.write_bytes(b"")
     with pytest.raises(FlightError):
         open_source(empty)
-
-
-def test_options_of_a_log(tmp_path, content):
-    path = tmp_path / "flight_0001.mcap"
-    path.write_bytes(content[0])
-    with pytest.raises(FlightError, match="omit --telemetry"):
-        open_source(path, SourceOptions(telemetry=path))
-    camera = tmp_path / "camera.json"
-    camera.write_text(json.dumps({"camera": {**camera_plain(CAMERA), "fx_px": 77.0}}))
-    opened = open_source(path, SourceOptions(camera=camera, looks_down=True))
-    assert opened.camera.fx_px == 77.0
-    assert next(iter(opened.views)).telemetry.pitch_deg == 0.0
-
-
-def test_results_that_are_broken_are_passed_over(tmp_path):
-    log = FlightLog(tmp_path / "flight.mcap", CAMERA, {})
-    log.view(0, "0.png", picture(0), telemetry(0))
-    log.result(ViewResult("0.png", 5, NoFix("blank", "nothing"), math.nan))
-    log.close()
-    (result,) = open_source(tmp_path / "flight_0001.mcap").results()
-    assert result.outcome.reason == "blank"
-    messages = [session(), reported(), shown(), (RESULT, 0, b"{}")]
-    assert list(open_source(crafted(tmp_path / "a.mcap", messages)).results()) == []

@@ -1,4 +1,4 @@
-"""Units, signs, time bases and heights beside independent readers: ExifTool, pymavlink, pyulog.
+"""Units, signs, time bases and heights beside independent readers: ExifTool, pyulog.
 
 Over small files made here and, where they are there, over real recordings.
 """
@@ -14,18 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pymavlink import mavutil
 from pyulog import ULog
 from recorders import (
     SENSEFLY,
-    dataflash,
     dji,
     maker_notes,
     packet,
     photo,
     place,
     px4_topics,
-    tlog,
     ulog,
 )
 
@@ -129,10 +126,10 @@ def compare_pose(ours, tags):
     ahead = pitch + 90 if math.isfinite(pitch) else first(tags, "XMP-sensefly:PitchAngle")
     if heading == 0 == pitch:  # a gimbal that was not recorded
         heading, ahead = first(tags, "XMP-drone-dji:FlightYawDegree"), 0.0
-    assert turned(pose.yaw_deg, heading) == pytest.approx(0, abs=1e-3)
-    assert pose.pitch_deg == pytest.approx(ahead, abs=1e-3)
+    assert turned(pose["yaw_deg"], heading) == pytest.approx(0, abs=1e-3)
+    assert pose["pitch_deg"] == pytest.approx(ahead, abs=1e-3)
     roll = first(tags, "XMP-sensefly:RollAngle")
-    assert pose.roll_deg == pytest.approx(0 if math.isnan(roll) else roll, abs=1e-3)
+    assert pose["roll_deg"] == pytest.approx(0 if math.isnan(roll) else roll, abs=1e-3)
 
 
 @needs_exiftool
@@ -149,38 +146,6 @@ def test_recorded_photographs_have_a_believable_camera(path, tmp_path):
     field = math.degrees(2 * math.atan(camera.width_px / (2 * camera.fx_px)))
     assert 30 < field < 85 and 0 < camera.focal_std <= 0.06
     assert not {"yaw_deg", "pitch_deg", "roll_deg"} & set(view.telemetry.missing())
-
-
-# Logs of ArduPilot and pymavlink's own reader of whole logs, with its own time base.
-
-
-@pytest.mark.parametrize("write", [tlog, dataflash])
-def test_logs_say_the_same_to_pymavlink(tmp_path, write):
-    path = write(tmp_path / ("a.tlog" if write is tlog else "a.bin"))
-    track, seen = read_log(path, DOWN), set()
-    theirs = mavutil.mavlink_connection(str(path))
-    while (message := theirs.recv_match()) is not None:
-        kind, plain = message.get_type(), message.to_dict()
-        reported = track.telemetry(round(message._timestamp * 1e6) * 1000)
-        seen.add(kind)
-        if kind in ("ATT", "ATTITUDE"):
-            names = ("Yaw", "Pitch", "Roll")
-            if kind == "ATT":
-                angles = [plain[name] for name in names]
-            else:
-                angles = [math.degrees(plain[name.lower()]) for name in names]
-            assert turned(reported.yaw_deg, angles[0]) == pytest.approx(0, abs=0.02)
-            assert (reported.pitch_deg, reported.roll_deg) == pytest.approx(angles[1:], abs=0.02)
-        elif kind == "POS":
-            assert reported.home_m == pytest.approx(plain["RelHomeAlt"], abs=1e-3)
-        elif kind == "GLOBAL_POSITION_INT":
-            assert reported.home_m == pytest.approx(plain["relative_alt"] / 1000, abs=1e-3)
-            assert reported.vel_en_mps == pytest.approx((plain["vy"] / 100, plain["vx"] / 100))
-        elif kind in ("GPS", "GPS_RAW_INT"):
-            altitude = plain["Alt"] if kind == "GPS" else plain["alt"] / 1000
-            assert reported.amsl_m == pytest.approx(altitude, abs=1e-3)
-    theirs.close()
-    assert len(seen & {"ATT", "POS", "GPS", "ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"}) == 3
 
 
 # Logs of PX4: pyulog's values, with angles and times worked out here.

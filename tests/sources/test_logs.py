@@ -21,8 +21,7 @@ from recorders import (
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.telemetry_track import angles_at
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.autopilot_logs import DAMAGED
-from orthonav.ground.recordings.logs import read_log
+from orthonav.ground.recordings.logs import DAMAGED, read_log
 
 DOWN = (0.0, 0.0, 0.0)
 WRITERS = {
@@ -69,16 +68,6 @@ def test_heights_are_of_the_distance_sensor_where_it_is_sound(kind, early, late,
     first, last = (track.telemetry((START_S + t) * 10**9) for t in (3, 9))
     assert (first.agl_m, last.agl_m, first.home_m) == pytest.approx((early, late, home), abs=0.01)
     assert first.amsl_m == pytest.approx(400, abs=0.01) and first.hae_m is None
-
-
-def test_the_mount_turns_the_camera(log):
-    right = read_log(log, (90.0, 0.0, 0.0))
-    telemetry = angles_at(right.attitude, START_S * 10**9)
-    _, yaw, _, roll = next(flown())
-    assert turned(telemetry[0], yaw + 90) == pytest.approx(0, abs=0.1)
-    assert telemetry[1:] == pytest.approx(
-        (-roll, 0), abs=0.1
-    )  # right wing down: lower top of the image
 
 
 def test_newer_px4_names(tmp_path):

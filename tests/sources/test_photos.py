@@ -7,12 +7,9 @@ import pytest
 from recorders import (
     AUTEL,
     DJI,
-    HEIGHT,
     PIX4D,
     SENSEFLY,
     START_S,
-    WIDTH,
-    camera_file,
     dji,
     maker_notes,
     packet,
@@ -25,11 +22,9 @@ from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.attitude import (
     ASSUMED_TILT_STD_DEG,
     AUTOPILOT_TILT_STD_DEG,
-    GIMBAL_TILT_STD_DEG,
 )
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.exif import Xmp, read_photo
-from orthonav.ground.recordings.focal import FocalLength, Optics, focal_length
+from orthonav.ground.recordings.exif import FocalLength, Optics, Xmp, focal_length, read_photo
 from orthonav.ground.recordings.photos import UNKNOWN_YAW_STD_DEG, posed
 from orthonav.ground.recordings.recording import LEVEL_GROUND
 
@@ -41,7 +36,7 @@ def attitude(photo):
     """Heading, pitch and roll of a photograph by itself."""
     (photo,), _ = posed([photo])
     pose = photo.pose
-    return pose.yaw_deg, pose.pitch_deg, pose.roll_deg
+    return pose["yaw_deg"], pose["pitch_deg"], pose["roll_deg"]
 
 
 @pytest.fixture
@@ -84,27 +79,6 @@ def test_a_folder_of_dji(folder, tmp_path):
     copied = tmp_path / "flight/frames/sub/b.jpg"
     assert copied.read_bytes() == (folder / "sub/b.jpg").read_bytes()
     assert np.array_equal(read_image(copied), next(iter(recording.views)).grey()) is False
-
-
-def test_a_camera_file_replaces_exif(folder, tmp_path):
-    file = camera_file(tmp_path / "c.json", width_px=128, height_px=96, cx_px=66.0)
-    recording = open_source(folder, SourceOptions(camera=file))
-    assert (recording.camera.width_px, recording.camera.cx_px) == (WIDTH, 33.0)
-    assert recording.camera.focal_std == 0 and recording.warnings == (LEVEL_GROUND,)
-    wrong = camera_file(tmp_path / "d.json", width_px=128, height_px=72)
-    with pytest.raises(CameraError, match="another aspect ratio"):
-        open_source(folder, SourceOptions(camera=wrong))
-
-
-@pytest.mark.parametrize("as_elements", [False, True])
-@pytest.mark.parametrize(
-    "suffix, maker", [("jpg", DJI), ("jpg", AUTEL), ("png", DJI), ("tif", DJI)]
-)
-def test_xmp_in_every_form(tmp_path, suffix, maker, as_elements):
-    values = {"GimbalYawDegree": "-12.5", "GimbalPitchDegree": "-70.0", "GimbalRollDegree": "0.0"}
-    read = read_photo(photo(tmp_path / f"a.{suffix}", xmp=packet(maker, as_elements, **values)))
-    assert attitude(read) == pytest.approx((347.5, 20, 0)) and math.isnan(read.home_m)
-    assert (read.width_px, read.height_px) == (WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("make, roll", [("Sony", 4), ("senseFly", -4), ("Parrot", 4)])
@@ -258,18 +232,6 @@ def test_a_gimbal_that_reports_zero_was_not_recorded(tmp_path):
     assert all(each.tilt_std_deg == ASSUMED_TILT_STD_DEG for each in reported)
 
 
-@pytest.mark.parametrize("angles", [(0, 0, 0.1), (0, -30, 0), (90, 0, 0)])
-def test_one_angle_that_is_not_zero_was_recorded(tmp_path, angles):
-    photo(tmp_path / "p/a.jpg", xmp=gimbal(*angles, 152.0))
-    photo(tmp_path / "p/b.jpg", "2023:11:14 22:13:21", xmp=gimbal(0, 0, 0, 152.0))
-    recording = open_source(tmp_path / "p")
-    assert not any("gimbal" in warning for warning in recording.warnings)
-    first, second = recording.views
-    assert first.telemetry.pitch_deg == pytest.approx(90 + angles[1], abs=0.2)
-    assert second.telemetry.pitch_deg == pytest.approx(90)
-    assert first.telemetry.tilt_std_deg == second.telemetry.tilt_std_deg == GIMBAL_TILT_STD_DEG
-
-
 # Focal lengths.
 
 
@@ -371,13 +333,6 @@ def test_maker_notes_of_older_models(tmp_path, order):
     reported = views_of(tmp_path / "p")[0].telemetry
     assert (reported.yaw_deg, reported.pitch_deg) == pytest.approx((183.4, 10.0), abs=1e-4)
     assert reported.missing() == ["agl_m"]
-
-
-def test_the_heading_of_the_aircraft_without_a_gimbal(tmp_path):
-    photo(tmp_path / "p/a.jpg", more={MAKER_NOTE: maker_notes(yaw=-90.0)})
-    assert views_of(tmp_path / "p")[0].telemetry.missing() == ["pitch_deg", "roll_deg", "agl_m"]
-    level = views_of(tmp_path / "p", looks_down=True)[0].telemetry
-    assert (level.yaw_deg, level.pitch_deg) == (270, 0)
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.flight.ros_messages import camera_of_info, grey_of_image
-from orthonav.ground.recordings import SourceOptions, import_flight, open_source, ros_files
-from orthonav.ground.recordings.ros_files import bound_inflation
+from orthonav.ground.recordings import SourceOptions, import_flight, open_source, ros
+from orthonav.ground.recordings.ros import bound_inflation
 
 MIDDLE = (START_S * 2 + 1) * 5 * 10**8  # of the first image: half a second
 
@@ -453,7 +453,7 @@ def test_chunks_of_ros_1(monkeypatch):
     bound_inflation()
     from rosbags.rosbag1 import reader
 
-    monkeypatch.setattr(ros_files, "MAX_CHUNK_BYTES", MB)
+    monkeypatch.setattr(ros, "MAX_CHUNK_BYTES", MB)
     for name, pack in (("bz2", bz2.compress), ("lz4", lz4.frame.compress)):
         assert reader.decompressors[name](pack(bytes(MB))) == bytes(MB)
         for bad, words in (
@@ -468,6 +468,6 @@ def test_a_recording_whose_chunks_are_too_large(tmp_path, monkeypatch):
     messages = Messages()
     path = record(tmp_path / "flight", flight(messages), messages, "file")
     assert import_flight(open_source(path), tmp_path / "out").views == 4
-    monkeypatch.setattr(ros_files, "MAX_HELD_BYTES", 1000)
+    monkeypatch.setattr(ros, "MAX_HELD_BYTES", 1000)
     with pytest.raises(FlightError, match=r"more than 1000\): .*mcap"):
         open_source(path)

@@ -12,9 +12,6 @@ from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
 from orthonav.ground.recordings.setups import (
     SAMPLE,
     LowConfidenceViews,
-    Setup,
-    Tried,
-    mirrored_camera,
     setup_text,
     try_setups,
 )
@@ -49,7 +46,7 @@ def test_a_wrong_heading_is_found(registering, views):
     turned = [reported(view, yaw_deg=(view.telemetry.yaw_deg + 180) % 360) for view in views]
     (found,) = tried(registering, turned)
     assert found.setup.name == "any heading" and found.explains
-    assert abs(abs(found.heading_off_deg) - 180) < 12 and found.heading_std_deg < 20
+    assert abs(abs(found.heading_off_deg) - 180) < 12
     (said,) = setup_text([found], on_map=True)
     assert (
         f"{found.confident} of 2 views of low confidence become confident with any heading" in said
@@ -68,18 +65,8 @@ def test_a_wrong_height_is_found_with_its_ratio(registering, views):
     assert others == f"also tried: twice the height ({failed[0].confident} of 1)"
 
 
-@pytest.mark.long
-def test_mirrored_images_are_found(registering, views):
-    flipped = [
-        View(np.ascontiguousarray(v.grey[:, ::-1]), mirrored_camera(v.camera), v.telemetry)
-        for v in views[1:]
-    ]
-    found = tried(registering, flipped)[-1]
-    assert found.setup.mirrored and found.confident == 1
-
-
 def test_a_map_of_another_area_is_not_explained(views):
-    """At most ten set-ups are tried, and those of an unknown heading once."""
+    """Every set-up is tried, and those of an unknown heading once."""
 
     class Elsewhere:
         asked = 0
@@ -91,8 +78,8 @@ def test_a_map_of_another_area_is_not_explained(views):
     prior = Prior(46.0, 3.0, 30.0)
     many = [reported(views[0], prior=prior, yaw_deg=0.7 * number) for number in range(SAMPLE)]
     found = tried(elsewhere := Elsewhere(), many)
-    assert len(found) == 10 and elsewhere.asked == 40 and not any(e.explains for e in found)
-    assert len(tried(Elsewhere(), many, heading_known=False, use_prior=False)) == 5
+    assert len(found) == 6 and elsewhere.asked == 24 and not any(e.explains for e in found)
+    assert len(tried(Elsewhere(), many, heading_known=False, use_prior=False)) == 4
     (said,) = setup_text(found, on_map=False)
     assert (
         "at most 0 of 8 views of low confidence" in said
@@ -115,22 +102,3 @@ def test_a_sample_of_the_doubted_views_is_kept(views):
     times = [view.telemetry.time_ns for view in doubted.views]
     assert SAMPLE // 2 <= len(times) <= SAMPLE and max(times) < 90  # those above are confident
     assert len(set(np.diff(times))) == 1
-
-
-def test_a_constant_and_a_varying_heading_read_differently():
-    found = Tried(Setup("any heading", any_heading=True), 8, 7, 12.0, 60.0, 1.0)
-    equal = replace(found, heading_off_deg=0.3, heading_std_deg=8.0)
-    for each, words in (
-        (found, "from view to view; check the heading column"),
-        (equal, "with any heading (standard deviation 8 deg); check"),
-        (replace(found, setup=Setup("as reported")), "the configuration is right"),
-    ):
-        assert words in setup_text([each], on_map=True)[0]
-
-
-def test_the_search_ends_when_it_is_told_to(registering, views):
-    turned = [reported(view, yaw_deg=(view.telemetry.yaw_deg + 180) % 360) for view in views]
-    assert tried(registering, turned, stop=lambda: True) == []
-    asked = iter([False, True, True, True])
-    (found,) = tried(registering, turned, stop=lambda: next(asked))
-    assert (found.setup.name, found.views) == ("any heading", 1)

@@ -2,10 +2,7 @@
 
 import math
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.telemetry_track import (
@@ -21,7 +18,6 @@ from orthonav.core.geo.attitude import (
     enu_from_body_camera,
     ned_from_angles,
 )
-from orthonav.core.geo.camera import enu_from_camera
 from orthonav.ground.recordings.recording import (
     SourceOptions,
     SourceView,
@@ -48,20 +44,6 @@ def test_headings_turn_the_short_way(first, last, middle):
     series = attitudes((0, first, 0, 0), (1, last, 0, 0))
     assert angles_at(series, S // 2) == pytest.approx((middle, 0, 0), abs=1e-9)
     assert angles_at(series, 0)[0] == pytest.approx(first)
-
-
-@given(*[st.floats(-180, 180)] * 2, *[st.floats(-40, 40)] * 4, st.floats(0, 1))
-def test_the_turn_between_samples_is_even(yaw1, yaw2, pitch1, pitch2, roll1, roll2, share):
-    """Slerp: the angle turned from the first sample is the share of the whole angle."""
-    series = attitudes((0, yaw1, pitch1, roll1), (1, yaw2, pitch2, roll2))
-    first, last = enu_from_camera(yaw1, pitch1, roll1), enu_from_camera(yaw2, pitch2, roll2)
-    between = enu_from_camera(*angles_at(series, round(share * S)))
-
-    def angle(a, b):
-        return math.acos(max(-1.0, min(1.0, (np.trace(a.T @ b) - 1) / 2)))
-
-    if angle(first, last) < 3.1:  # half a turn may go either way
-        assert angle(first, between) == pytest.approx(share * angle(first, last), abs=1e-6)
 
 
 def test_a_heading_that_is_not_known_is_not_made_up():

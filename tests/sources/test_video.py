@@ -90,12 +90,6 @@ def test_a_table_beside_the_video(tmp_path):
 
 DIALECTS = {
     "rel_alt and gimbal": (dji_subtitle(0), (46.5, 2.5, 120.0, 402.125, 10.0, -90.0, 0.0)),
-    "SrtCnt and altitude": (
-        '<font size="36">SrtCnt : 1, DiffTime : 16ms\n2023-01-06 18:56:48,380,821\n'
-        "[iso : 3200] [shutter : 1/60.0] [fnum : 280] [ev : 0] [ct : 3925] [color_md : default] "
-        "[focal_len : 240] [latitude: -12.25] [longitude: 77.5] [altitude: 512.375] </font>",
-        (-12.25, 77.5, math.nan, 512.375, *[math.nan] * 3),
-    ),
     "longtitude": (
         "[latitude : 12.5] [longtitude : -77.5] [rel_alt: 5 abs_alt: 6]",
         (12.5, -77.5, 5, 6, *[math.nan] * 3),
@@ -113,30 +107,16 @@ DIALECTS = {
         "HOME(149.0251,-20.2532) 2017.8.5 14:11:51\nGPS(49.0251,-20.2533,16) Hb:1.9 Hs:2.9",
         (-20.2533, 49.0251, 1.9, math.nan, *[math.nan] * 3),
     ),
-    "RTK": (
-        "F/6.3, SS 60, RTK (20.083799, 30.213635, 28), HOME (20.084146, 30.214243, 103.55m), "
-        "D 75.04m, H 76.19m, G.PRY (-40.0°, 0.0°, 28.2°)",
-        (30.213635, 20.083799, 76.19, math.nan, 28.2, -40.0, 0.0),
-    ),
     "marks of both orders": (
         "HOME(2.5,42.5)\nGPS(2.5,42.5,0.0M) BAROMETER:36.5M",
         (math.nan, math.nan, 36.5, *[math.nan] * 4),
     ),
     "no mark": ("GPS(2.5,42.5)", (math.nan,) * 7),
     "latitude first": ("GPS(-20.25,149.5,16)", (-20.25, 149.5, *[math.nan] * 5)),
-    "one line": (
-        "F/2.8, SS 206.14, ISO 150, EV 0, GPS (-82.6669, 27.7716, 10), D 2.80m, H 41.50m, "
-        "H.S 0.00m/s, V.S 0.00m/s",
-        (27.7716, -82.6669, 41.5, math.nan, *[math.nan] * 3),
-    ),
     "gimbal in one line": (
         "F/2.8, SS 400, ISO 100, EV 0, DZOOM 1.0, GPS (77.6, 12.9, 21), D 80.50m, H 45.00m, "
         "H.S 3.20m/s, V.S 0.00m/s, F.PRY (1.2°, -0.5°, 88.0°), G.PRY (-60.0°, 0.5°, 90.0°)",
         (12.9, 77.6, 45.0, math.nan, 90.0, -60.0, 0.5),
-    ),
-    "separate brackets": (
-        "[latitude: 45.5] [longitude: -121.5] [gb_yaw: 1.0] [gb_pitch: -89.9] [gb_roll: 0.5]",
-        (45.5, -121.5, math.nan, math.nan, 1.0, -89.9, 0.5),
     ),
     "no place on Earth": ("[latitude: 145.5] [longitude: 1.5]", (math.nan,) * 7),
 }
@@ -159,9 +139,6 @@ def test_doubtful_positions_are_named(recorded):
     subtitles(srt, ["GPS(2.5,42.5) G.PRY (-90.0, 0.0, 10.0)"] * 30)
     (warning,) = open_source(recorded, options(recorded)).warnings
     assert "begins with the latitude or the longitude: positions are left out" in warning
-    subtitles(srt, [dji_subtitle(n, lat=46.6 if n >= 20 else 46.5) for n in range(30)])
-    _, warning = open_source(recorded, options(recorded)).warnings
-    assert "jumps 1 times, the first by 11.1 km 2.0 s after the beginning" in warning
     subtitles(srt, ["GPS(50.5,2.5)"] * 29 + ["GPS(50.5,102.5)"])  # of the whole file
     first = next(blocks(srt.read_bytes()))
     assert (first.lat_deg, first.lon_deg) == (50.5, 2.5)

@@ -8,7 +8,6 @@ import numpy as np
 from playwright.sync_api import expect
 
 LAPTOP = {"viewport": {"width": 1366, "height": 768}}
-TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True, "is_mobile": True}
 NEAR = 40
 """Of a colour, in levels: marks are drawn with soft edges."""
 

@@ -21,7 +21,7 @@ from orthonav.ground.view.server import Pages, Server, load_assets
 FRAME = LocalFrame(46.5, 2.5)
 WEST_M, NORTH_M, GSD_M = -180.0, 160.0, 0.5
 HEIGHT_PX, WIDTH_PX, CHUNK_PX = 620, 700, 256
-AGL_M, RADIUS_M = 60.0, 15.0
+AGL_M = 60.0
 COV_EN_M2 = np.array([[9.0, 4.0], [4.0, 16.0]])
 PLACES_EN_M = [(-60.0, 20.0), (-30.0, 25.0), (0.0, 30.0), (30.0, 25.0), (60.0, 20.0), (80.0, 0.0)]
 ATTITUDES = [(40.0 + 10 * i, 4.0, -3.0) for i in range(len(PLACES_EN_M))]

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
-from browsing import LAPTOP, TABLET, Visit, painted
+from browsing import LAPTOP, Visit, painted
 from playwright.sync_api import expect
-from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
+from small_run import CHUNK_PX, GSD_M, PLACES_EN_M, WRONG, result, serving
 
 from orthonav.core.flight.fixes import result_to_json, write_results
-from orthonav.ground.report.numbers import metres_text
 from orthonav.ground.view.run import ViewRequest, open_run
 
 pytestmark = pytest.mark.long
@@ -122,63 +121,6 @@ def test_two_runs_enlarged_images_and_coordinates(visit, small, tmp_path):
         )
 
 
-def test_the_worst_view_with_its_images_and_values(page, small, ask):
-    page.select_option("#order", "error")
-    page.chosen(WRONG, COUNT)
-    first = page.locator("#list button").first
-    expect(first).to_contain_text(name(WRONG)) and expect(first).to_contain_text("60 m confident!")
-    show_wrong(page)
-    assert page.locator("#list button").count() == 1
-    assert page.locator("#shown-count").inner_text() == f"1 of {COUNT} views"
-    fix = json.loads(small.fixes.read_text().splitlines()[WRONG])
-    said = page.locator("#sentence").inner_text()
-    spread_m = np.sqrt(np.linalg.eigvalsh(fix["cov_en_m2"])[-1])
-    east_m, north_m = FRAME.en_from_latlon(fix["lat_deg"], fix["lon_deg"])
-    error_m = np.hypot(east_m - PLACES_EN_M[WRONG][0], north_m - PLACES_EN_M[WRONG][1])
-    for part in (
-        f"tracking, confident, error {metres_text(error_m)}, FALSE FIX",
-        f"confidence {fix['confidence']:.3f} within {metres_text(fix['radius_m'])}",
-        f"\N{GREEK SMALL LETTER SIGMA} {metres_text(spread_m)}, heading {fix['heading_deg']:.1f}°",
-        f"{metres_text(fix['agl_m'])} above ground",
-    ):
-        assert part in said
-    page.click("#more summary")
-    known = page.locator("#known").inner_text()
-    assert f"{fix['lat_deg']:.7f}, {fix['lon_deg']:.7f}" in known and fix["time_s"] == 103
-    side_px = json.loads(ask(f"/api/views/{WRONG}")[2])["window"]["size_px"]
-    for shown in ("view", "fix", "over", "truth"):
-        width = page.js(f"document.querySelector('#img-{shown}').naturalWidth")
-        assert width == side_px, shown
-
-
-def test_the_view_lies_over_the_map(page):
-    """A right view looks as the map below it, a wrong one does not."""
-    page.locator("#opacity").fill("100")
-    over = page.locator(".leaflet-views-pane img")
-    for i, low, high in ((2, 0.7, 1.0), (WRONG, -1.0, 0.5)):
-        page.locator(f"#list [data-view='{i}']").click()
-        page.pictured(i)
-        page.keyboard.press("z")
-        page.settled()
-        expect(over).to_have_css("opacity", "1")
-        with_view = page.picture(clip=below_the_middle(over)).mean(axis=-1)
-        clip = below_the_middle(over)
-        page.keyboard.press("o")
-        expect(over).to_have_count(0)
-        page.settled()
-        without = page.picture(clip=clip).mean(axis=-1)
-        page.keyboard.press("o")
-        alike = np.corrcoef(with_view.ravel(), without.ravel())[0, 1]
-        assert low < alike < high and np.abs(with_view - without).max() > 2, i
-
-
-def below_the_middle(over):
-    """A part of the view where no marks are."""
-    box = over.bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    return {"x": x - 60, "y": y + 30, "width": 120, "height": 60}
-
-
 def test_stepping_by_keys_is_seen_and_announced(page):
     said = page.locator("#sentence")
     assert said.get_attribute("aria-live") == "polite"
@@ -198,68 +140,6 @@ def test_stepping_by_keys_is_seen_and_announced(page):
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "true")
     page.chosen(COUNT - 1, COUNT)  # plays to the end and stops
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
-
-
-def test_dragging_over_the_course_and_clicking_on_the_map(page, columns):
-    box = page.locator("#chart").bounding_box()
-    left, middle = box["x"] + 52, box["y"] + box["height"] / 2
-    wide = box["width"] - 60
-    page.mouse.move(left + 0.42 * wide, middle)
-    page.mouse.down()
-    page.chosen(2, COUNT)
-    page.mouse.move(left + 0.78 * wide, middle, steps=4)
-    page.chosen(4, COUNT)
-    page.mouse.up()
-    page.mouse.move(left + 0.2 * wide, middle)
-    page.chosen(4, COUNT)
-    page.mouse.click(*page.on_screen((columns["x"][1], columns["y"][1]), CHUNK_PX))
-    page.chosen(1, COUNT)
-    page.click("#zoom-in")
-    page.keyboard.press("End")  # brought into the part of the time that is seen
-    page.chosen(COUNT - 1, COUNT)
-
-
-def fits(page):
-    """Nothing is wider than the screen or than its box (newer Chromiums count the border too)."""
-    wide = page.js(
-        """() => [...document.querySelectorAll(
-          "body, header, main, aside, section, button, select, .row, dl, p, h2")]
-        .filter((each) => each.checkVisibility() && !each.closest("#map"))
-        .filter((each) => each.getBoundingClientRect().right > innerWidth + 0.5
-          || each.clientWidth > 0 && each.scrollWidth > each.clientWidth + 2)
-        .map((each) => each.id || each.outerHTML.slice(0, 80))"""
-    )
-    assert wide == [] and page.js("document.documentElement.scrollWidth <= innerWidth")
-
-
-def test_on_a_tablet_by_touch(visit, server, columns):
-    page = visit(server, **TABLET)
-    page.chosen(0, COUNT)
-    page.select_option("#order", "error")
-    page.locator(f"#list [data-view='{WRONG}']").tap()
-    page.chosen(WRONG, COUNT)
-    expect(page.locator("#img-truth")).to_be_visible()
-    page.settled()
-    fits(page)
-    screen = TABLET["viewport"]["height"]
-    for part in ("#time-part", "#chosen", "#map-part"):
-        page.locator(part).scroll_into_view_if_needed()
-        assert page.locator("#time-part").bounding_box()["y"] < screen - 100
-    small = page.js(
-        """() => [...document.querySelectorAll(
-          "button, select, input:not([type=checkbox]), .check, .leaflet-bar a")]
-        .filter((each) => each.checkVisibility() && each.getBoundingClientRect().height < 43.5)
-        .map((each) => each.id || each.outerHTML.slice(0, 80))"""
-    )
-    assert small == []
-    page.js("scrollTo(0, 0)")
-    box = page.locator("#chart").bounding_box()
-    page.touchscreen.tap(box["x"] + 52 + 0.4 * (box["width"] - 60), box["y"] + 40)
-    page.chosen(2, COUNT)
-    page.touchscreen.tap(*page.on_screen((columns["x"][1], columns["y"][1]), CHUNK_PX))
-    page.chosen(1, COUNT)
-    page.locator("#after").tap()
-    page.chosen(2, COUNT)
 
 
 def test_by_the_rules_of_axe(page):

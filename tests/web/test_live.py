@@ -1,9 +1,7 @@
 """A run is followed while it is flown, whatever its file goes through."""
 
 import json
-import math
 import time
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -12,12 +10,9 @@ from small_run import result
 
 from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.flight.fixes import result_to_json
-from orthonav.core.flight.mount import Bias, Mount, write_mount
 from orthonav.core.records import Telemetry
 from orthonav.ground.view import feed as feed_module
-from orthonav.ground.view import logs as logs_module
-from orthonav.ground.view.feed import LineFeed
-from orthonav.ground.view.logs import LogReader
+from orthonav.ground.view.feed import LineFeed, LogReader
 from orthonav.ground.view.run import ViewRequest, open_run
 from orthonav.onboard.log import FlightLog
 
@@ -35,7 +30,7 @@ def fixes(tmp_path):
 
 @pytest.fixture(autouse=True)
 def no_waiting(monkeypatch):
-    monkeypatch.setattr(logs_module, "RESCAN_S", 0.0)
+    monkeypatch.setattr(feed_module, "RESCAN_S", 0.0)
 
 
 def test_a_file_that_grows(fixes):
@@ -90,15 +85,6 @@ def test_a_run_tells_news_and_begins_anew(fixes, small):
     fixes.write_text("")
     fixes.write_text("\n")
     assert run.news(after["generation"], 1, 0)["count"] == 0
-
-
-def test_a_file_that_disappears_is_reported(fixes, small):
-    fixes.write_text(line(0))
-    run = open_run(ViewRequest(fixes, small.map_path, live=True))
-    fixes.unlink()
-    fixes.mkdir()
-    news = run.news(1, 0, 0)
-    assert news["count"] == 1 and "is a folder" in news["problems"][0]
 
 
 def telemetry(i):
@@ -181,38 +167,11 @@ def test_images_of_a_log_for_fixes_of_a_file(tmp_path, small):
     assert run.detail(5)["why_no_window"] == "this view is not in the log"
 
 
-def mount_of(pitch_deg):
-    none = Bias(0.0, 0.1, 0.1)
-    return Mount(none, none, Bias(pitch_deg, 0.1, 0.1), none, 20)
-
-
 def write_mounted_log(folder, mount):
     log = FlightLog(folder / "flight.mcap", CAMERA, {"name": "x"})
     log.options({"mount": mount})
     fly(log, range(2))
     log.close()
-
-
-def test_a_run_is_shown_with_its_mount(tmp_path, small):
-    """That of the command, else of the flight log that is the run."""
-    write_mounted_log(tmp_path, asdict(mount_of(2.0)))
-    write_mount(tmp_path / "mount.json", mount_of(5.0))
-
-    def north_m(run_path, **given):
-        run = open_run(ViewRequest(run_path, small.map_path, **given))
-        assert run.detail(0)["telemetry"]["pitch_deg"] == 4.0  # as recorded
-        east, north = run.detail(0)["window"]["offset_en_m"]
-        return math.hypot(east, north)
-
-    ahead = [
-        north_m(small.fixes, flight=small.flight),
-        north_m(tmp_path),
-        north_m(tmp_path, mount=tmp_path / "mount.json"),
-    ]
-    assert ahead == sorted(ahead) and ahead[1] - ahead[0] > 1 and ahead[2] - ahead[1] > 1
-    assert north_m(small.fixes, flight=tmp_path) == pytest.approx(ahead[0])
-    given = north_m(small.fixes, flight=small.flight, mount=tmp_path / "mount.json")
-    assert given == pytest.approx(ahead[2])
 
 
 def test_an_invalid_mount_of_a_log_is_reported(tmp_path, small):

@@ -10,7 +10,6 @@ import pytest
 from small_run import NO_FIX, WRONG, result
 
 from orthonav.core.flight.fixes import Identity, write_results
-from orthonav.core.records import Fix, ViewResult
 from orthonav.ground.view.run import ViewRequest, open_run
 
 
@@ -82,11 +81,6 @@ def test_what_is_probably_a_mistake_is_warned_about(run, small, served, tmp_path
     truth.write_text("frame,lat_deg,lon_deg\nother.png,46.5,2.5\n")
     done = run("view", small.fixes, "--map", small.map_path, "--truth", truth)
     assert done.code == 0 and "no view of the run has a true position" in done.err
-    away = tmp_path / "away.jsonl"
-    cov = [[4.0, 0.0], [0.0, 4.0]]
-    write_results(away, [ViewResult("a.png", 0, Fix(10.0, 10.0, cov, 0.9, 35.0, 0.0, 9.0), 1.0)])
-    done = run("view", away, "--map", small.map_path)
-    assert done.code == 0 and "no position of the run lies on this map" in done.err
 
 
 def test_a_real_one_serves_until_it_is_ended(small):

@@ -74,7 +74,6 @@ def _draw(folder: Path) -> None:
     _figure("evidence.jpg", (9, 6.5), lambda figure: _draw_evidence(figure, folder))
     _figure("fix.jpg", (9, 9.2), lambda figure: _draw_fix(figure, folder))
     _shrink(folder / "report" / "figures" / "reliability.png", FIGURES / "reliability.png")
-    _shrink(folder / "tracked" / "figures" / "worst-views.png", FIGURES / "worst-views.jpg")
 
 
 def _figure(name: str, size_in: tuple[float, float], draw: Callable[[Any], None]) -> None:
@@ -87,11 +86,8 @@ def _shrink(source: Path, out: Path) -> None:
     """A copy of a picture of few bytes, because the repository keeps every version of it."""
     picture = Image.open(source).convert("RGB")
     picture.thumbnail((WIDEST_PX, WIDEST_PX))
-    if out.suffix == ".jpg":
-        picture.save(out, **JPEG)
-    else:
-        few = picture.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        few.save(out, optimize=True)
+    few = picture.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few.save(out, optimize=True)
 
 
 def _read(path: Path, left: float, top: float, side: float) -> np.ndarray:

@@ -15,10 +15,11 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
-from orthonav.cli.needs import require_extras
+from orthonav.cli.version import require_extras, show_version
 from orthonav.core.errors import OrthonavError
 
 UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
@@ -29,75 +30,33 @@ _CLOCK_S = 0.01
 
 GROUPS = {
     "prepare a map": {
-        "plan": (
-            "recommend a map for a route, a camera and a height",
-            "--route route.kml --agl-m 120",
-        ),
-        "fetch": (
-            "download orthophotos of an area from open services",
-            "route.kml --source ign --out ortho.tif",
-        ),
-        "build": (
-            "build a map from orthophotos",
-            "--ortho ortho.tif --route route.kml --band-m 600 --out area.onav",
-        ),
-        "check": (
-            "predict before the flight where views will be localized",
-            "area.onav --route route.kml --agl-m 120 --out check",
-        ),
-        "info": ("print the contents of a map", "area.onav"),
-        "sign": ("sign a map, or create a signing key", "area.onav --key keys/private.pem"),
-        "verify": (
-            "check the signature and the contents of a map",
-            "area.onav --public-key keys/public.pem",
-        ),
-        "atlas": (
-            "build, inspect, check and cut an atlas of many sheets",
-            "build ATLAS --ortho orthos/",
-        ),
+        "plan": "recommend a map for a route, a camera and a height",
+        "fetch": "download orthophotos of an area from open services",
+        "build": "build a map from orthophotos",
+        "check": "predict before the flight where views will be localized",
+        "info": "print the contents of a map",
+        "sign": "sign a map, or create a signing key",
+        "verify": "check the signature and the contents of a map",
+        "atlas": "build, inspect, check and cut an atlas of many sheets",
     },
     "fly": {
-        "fly": (
-            "send position fixes from a live camera to an autopilot",
-            "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550",
-        ),
+        "fly": "send position fixes from a live camera to an autopilot",
     },
     "analyse a recorded flight": {
-        "import": (
-            "convert photographs, a video or a ROS recording to a flight folder",
-            "photos/ --out flight",
-        ),
-        "localize": (
-            "find the positions of the views of a flight",
-            "area.onav flight --out fixes.jsonl",
-        ),
-        "evaluate": (
-            "compare fixes with the ground truth",
-            "fixes.jsonl --flight flight --map area.onav --report report",
-        ),
-        "view": (
-            "show a run in the browser: track, views beside the map, health",
-            "fixes.jsonl --map area.onav --flight flight",
-        ),
-        "locate-pixel": (
-            "find the coordinates of a pixel of a localized view",
-            "fixes.jsonl 0001.jpg 640 480 --flight flight",
-        ),
-        "calibrate": (
-            "estimate constant errors of mount, compass and height from a flight",
-            "area.onav flight --out mount.json",
-        ),
+        "import": "convert photographs, a video or a ROS recording to a flight folder",
+        "localize": "find the positions of the views of a flight",
+        "evaluate": "compare fixes with the ground truth",
+        "view": "show a run in the browser: track, views beside the map, health",
+        "locate-pixel": "find the coordinates of a pixel of a localized view",
+        "calibrate": "estimate constant errors of mount, compass and height from a flight",
     },
     "try it without data": {
-        "demo": ("build a map, simulate a flight over other imagery, localize it and report", ""),
-        "simulate": (
-            "simulate a flight over an orthophoto of another year",
-            "--ortho other-year.tif --route route.kml --agl-m 120 --out flight",
-        ),
+        "demo": "build a map, simulate a flight over other imagery, localize it and report",
+        "simulate": "simulate a flight over an orthophoto of another year",
     },
 }
-"""By group and command: what it does, and the arguments of an example."""
-COMMANDS = {name: text for group in GROUPS.values() for name, (text, _) in group.items()}
+"""What the commands do, by group."""
+COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -115,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verbose, options, started_s = False, argparse.Namespace(), time.time()
     try:
         if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
-            return int(importlib.import_module("orthonav.cli.version").show_version(arguments))
+            return show_version(arguments)
         options = parse(arguments)
         verbose = options.verbose
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
@@ -189,14 +148,10 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def _overview() -> str:
-    """The commands by group, each with an example."""
     lines = []
     for group, commands in GROUPS.items():
-        lines.append(f"{group}:")
-        for name, (text, example) in commands.items():
-            lines += [f"  {name:<13} {text}", f"{'':16}orthonav {name} {example}".rstrip()]
-        lines.append("")
-    return "\n".join([*lines, "options of a command: orthonav COMMAND --help"])
+        lines += [f"{group}:", *(f"  {name:<13} {text}" for name, text in commands.items()), ""]
+    return "\n".join([*lines, "options and an example of a command: orthonav COMMAND --help"])
 
 
 def _parser(arguments: list[str]) -> argparse.ArgumentParser:
@@ -215,9 +170,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         help="print the version; with --verbose (or --json) also the installed packages, the "
         "extras that commands lack, and the abilities of the processor",
     )
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("-v", "--verbose", action="store_true", help="say more, on stderr")
-    common.add_argument("-q", "--quiet", action="store_true", help="errors only, no progress")
+    common = verbosity(default=False)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, description=text, parents=[common], allow_abbrev=False)
@@ -225,8 +178,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         if name in arguments:
             module = module_of(name)
             module.add(command)
-            example = next(group[name][1] for group in GROUPS.values() if name in group)
-            notes = (command.epilog, f"example: orthonav {name} {example}".rstrip())
+            notes = (command.epilog, f"example: orthonav {name} {module.EXAMPLE}".rstrip())
             command.epilog = "; ".join(filter(None, notes))
             _name_units(command)
             everyday = getattr(module, "EVERYDAY", ())
@@ -234,6 +186,15 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
             for action, part in {"": command, **_actions(command)}.items():
                 options = by_action.get(action, ())
                 _add_help_all(part, options, show_all="--help-all" in arguments)
+    return parser
+
+
+def verbosity(default: bool | str) -> argparse.ArgumentParser:
+    """Parent parser of commands and of their actions."""
+    parser = argparse.ArgumentParser(add_help=False)
+    add = partial(parser.add_argument, action="store_true", default=default)
+    add("-v", "--verbose", help="say more, on stderr")
+    add("-q", "--quiet", help="errors only, no progress")
     return parser
 
 
@@ -266,20 +227,15 @@ def _add_help_all(
     """
     help_all = "show all options and exit" if everyday else argparse.SUPPRESS
     command.add_argument("--help-all", action="help", help=help_all)
-    if not everyday:
+    if not everyday or show_all:
         return
     shown = {*everyday, "--help", "--help-all", "--verbose", "--quiet"}
-    hidden = [
-        action
-        for action in command._actions
-        if action.option_strings and not action.required and shown.isdisjoint(action.option_strings)
-    ]
-    if show_all:
-        return
+    optional = [each for each in command._actions if each.option_strings and not each.required]
+    hidden = [each for each in optional if shown.isdisjoint(each.option_strings)]
     for action in hidden:
         action.help = argparse.SUPPRESS
     more = f"{len(hidden)} more options: {command.prog} --help-all"
-    command.epilog = f"{command.epilog}; {more}" if command.epilog else more
+    command.epilog = "; ".join(filter(None, (command.epilog, more)))
 
 
 def module_of(command: str) -> ModuleType:

@@ -1,14 +1,14 @@
 """`orthonav atlas`: build, inspect, check, change and index an atlas, and cut maps out of it."""
 
 import argparse
-import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.build import add_recipe, recipe_of, reporter
-from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progress
+from orthonav.cli import verbosity
+from orthonav.cli.build import add_recipe, asked, recipe_of
+from orthonav.cli.common import add_area, add_options, area_of, print_json, progress
 
 if TYPE_CHECKING:
     from orthonav.ground.atlas.catalog import Atlas
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 NOT_WHOLE = 3
 SHOWN_FAILURES = 20
-COARSE = ("gsd_m", "tile_px", "overlap")
+EXAMPLE = "build ATLAS --ortho orthos/"
 EVERYDAY = {
     "build": (
         *("--route", "--bounds", "--band-m", "--gsd-m", "--sheet-km"),
@@ -27,12 +27,7 @@ EVERYDAY = {
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    common = argparse.ArgumentParser(add_help=False)
-    for flags, text in (
-        (("-v", "--verbose"), "say more, on stderr"),
-        (("-q", "--quiet"), "errors only, no progress"),
-    ):
-        common.add_argument(*flags, action="store_true", default=argparse.SUPPRESS, help=text)
+    common = verbosity(default=argparse.SUPPRESS)
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     def action(name: str, text: str) -> argparse.ArgumentParser:
@@ -43,64 +38,54 @@ def add(parser: argparse.ArgumentParser) -> None:
         return found
 
     _add_build(action("build", "build the missing sheets of an atlas, which is created first"))
-    info = action("info", "print the contents of an atlas")
-    info.add_argument("--json", action="store_true", help="print as JSON")
-    check = action(
-        "check", "check whether an atlas is complete: exit 0, or 3 and a list of problems"
-    )
-    check.add_argument(
-        "--deep", action="store_true", help="read every file, verify its checksum and its recipe"
-    )
-    check.add_argument(
-        "--clean", action="store_true", help="remove leftovers of interrupted builds"
-    )
-    check.add_argument(
-        "--min-age-h",
-        type=_hours,
-        default=24.0,
-        metavar="H",
-        help="least age of the leftovers that --clean removes; younger files may belong to a "
-        "running build (default %(default)g)",
-    )
-    check.add_argument("--json", action="store_true", help="print as JSON")
+    add_options(action("info", "print the contents of an atlas"), "--json")
+    text = "check whether an atlas is complete: exit 0, or 3 and a list of problems"
+    check = action("check", text)
+    text = "read every file and verify its checksum"
+    check.add_argument("--deep", action="store_true", help=text)
+    text = "remove leftovers of interrupted builds that are older than 24 hours"
+    check.add_argument("--clean", action="store_true", help=text)
+    add_options(check, "--json")
     copied = action("add", "copy sheets of another atlas of the same recipe into this one")
     copied.add_argument("source", metavar="FROM", help="folder or URL of the other atlas")
-    copied.add_argument("--sheets", nargs="+", metavar="SHEET", help="only these sheets")
-    copied.add_argument(
-        "--replace", action="store_true", help="replace sheets that differ from those of FROM"
-    )
+    text = "replace sheets that differ from those of FROM"
+    copied.add_argument("--replace", action="store_true", help=text)
     retire = action("retire", "take sheets out of an atlas")
-    retire.add_argument(
-        "sheets", nargs="+", metavar="SHEET", help="name of a sheet, such as r001526c001392"
-    )
+    text = "name of a sheet, such as r001526c001392"
+    retire.add_argument("sheets", nargs="+", metavar="SHEET", help=text)
     index = action("index", "build or update the index that is searched without a prior")
     index.add_argument("--rebuild", action="store_true", help="rebuild the whole index")
     cut = action("cut", "cut the map of a route or of bounds out of an atlas")
-    add_area(cut, cut.add_mutually_exclusive_group(required=True))
-    cut.add_argument(
-        "--out", type=Path, required=True, metavar="MAP.onav", help="map file to write"
-    )
-    cut.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="number of parallel workers: threads that read sheets (default: one per core)",
-    )
-    cut.add_argument(
-        "--allow-holes",
-        action="store_true",
-        help="write the map even if sheets under the route are missing",
-    )
+    add_area(cut, required=True)
+    text = "map file to write"
+    cut.add_argument("--out", type=Path, required=True, metavar="MAP.onav", help=text)
+    add_options(cut, "--workers", "--allow-holes")
 
 
-def _hours(text: str) -> float:
-    try:
-        hours = float(text)
-    except ValueError:
-        hours = math.nan
-    if not (math.isfinite(hours) and hours >= 0):
-        raise argparse.ArgumentTypeError(f"expected hours of 0 or more, got '{text}'")
-    return hours
+def _add_build(parser: argparse.ArgumentParser) -> None:
+    add_options(parser, "--ortho", "--json")
+    add_area(parser.add_argument_group("area (default: all imagery)"))
+    group = parser.add_argument_group("sheets (set by the first build of an atlas)")
+    text = "greatest width of a sheet (default 10)"
+    group.add_argument("--sheet-km", type=float, help=text)
+    add_recipe(group)
+    add_options(group, "--dem", "--dem-datum")
+    text = "rebuild sheets that have other imagery or versions"
+    group.add_argument("--replace", action="store_true", help=text)
+    add = parser.add_argument_group("coarse tiles, for views without a prior").add_argument
+    text = "ground resolution of coarse tiles, metres per pixel (default 8)"
+    add("--coarse-gsd-m", type=float, help=text)
+    add("--coarse-tile-px", type=int, help="width of a coarse tile (default 128)")
+    text = "overlap of coarse tiles, as a fraction of their width (default 0.875)"
+    add("--coarse-overlap", type=float, metavar="FRACTION", help=text)
+    text = "do not update the search index at the end"
+    add("--no-index", dest="index", action="store_false", help=text)
+    group = parser.add_argument_group("workers")
+    text = "sheets that are built at a time (default: 1; with --cluster one per core)"
+    add_options(group, "--workers", help=text)
+    text = "build with Ray, on the cores of this machine (local) or on the cluster at HOST:PORT "
+    text += "(default: one sheet after the other in this process)"
+    group.add_argument("--cluster", metavar="local|ADDRESS", help=text)
 
 
 def run(options: argparse.Namespace) -> int | None:
@@ -115,115 +100,40 @@ def run(options: argparse.Namespace) -> int | None:
     return actions[options.action](options, Atlas.open(options.atlas))
 
 
-def _add_build(parser: argparse.ArgumentParser) -> None:
-    add_orthos(parser, "orthophoto (any georeferenced raster that GDAL reads)")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    area = parser.add_argument_group("area (default: all imagery)")
-    add_area(area, area.add_mutually_exclusive_group())
-    sheets = parser.add_argument_group("sheets (set by the first build of an atlas)")
-    sheets.add_argument(
-        "--sheet-km", type=float, metavar="KM", help="greatest width of a sheet (default 10)"
-    )
-    add_recipe(sheets)
-    add_dem(sheets, "which gives sheets a terrain layer, and maps that are cut out of them")
-    sheets.add_argument(
-        "--replace", action="store_true", help="rebuild sheets that have other imagery or versions"
-    )
-    coarse = parser.add_argument_group("coarse tiles, for views without a prior")
-    coarse.add_argument(
-        "--coarse-gsd-m",
-        type=float,
-        help="ground resolution of coarse tiles, metres per pixel (default 8)",
-    )
-    coarse.add_argument("--coarse-tile-px", type=int, help="width of a coarse tile (default 128)")
-    coarse.add_argument(
-        "--coarse-overlap",
-        type=float,
-        metavar="FRACTION",
-        help="overlap of neighbouring coarse tiles, as a fraction of their width (default 0.875)",
-    )
-    coarse.add_argument(
-        "--no-coarse",
-        dest="coarse",
-        action="store_false",
-        help="omit the coarse tiles, from which the search index is made",
-    )
-    coarse.add_argument(
-        "--no-index",
-        dest="index",
-        action="store_false",
-        help="do not update the search index at the end",
-    )
-    cluster = parser.add_argument_group("workers")
-    cluster.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="number of parallel workers: sheets that are built at a time (default: 1; with "
-        "--cluster one per core)",
-    )
-    cluster.add_argument(
-        "--cluster",
-        metavar="local|ADDRESS",
-        help="build with Ray, on the cores of this machine (local) or on the cluster at HOST:PORT "
-        "(default: one sheet after the other in this process)",
-    )
-    cluster.add_argument(
-        "--cpu-hour-price",
-        type=float,
-        metavar="PRICE",
-        help="price of a core for an hour: the summary then shows the cost of the sheets",
-    )
-
-
 def _build(options: argparse.Namespace) -> int:
     from orthonav.ground.atlas.build import AtlasRequest, build_atlas
-    from orthonav.ground.planning.route import read_route
 
+    recipe = recipe_of(options)
+    if options.sheet_km is not None:
+        recipe["sheet_km"] = options.sheet_km
+    coarse = {name: getattr(options, f"coarse_{name}") for name in ("gsd_m", "tile_px", "overlap")}
+    if given := {name: value for name, value in coarse.items() if value is not None}:
+        recipe["coarse"] = given
     request = AtlasRequest(
         url=options.atlas,
         orthos=options.ortho,
-        recipe=_recipe(options),
-        bounds_deg=options.bounds,
-        route=read_route(options.route) if options.route else None,
-        band_m=options.band_m,
+        recipe=recipe,
         replace=options.replace,
         index=options.index,
-        dem=options.dem,
-        dem_datum=options.dem_datum,
+        **asked(options),
     )
     try:
         with _runner(options) as runner, progress(options) as shown:
-            result = build_atlas(request, runner, shown, reporter(options))
+            result = build_atlas(request, runner, shown)
     except KeyboardInterrupt:
         print(
             "orthonav: error: interrupted; finished sheets are stored, rerun to resume",
             file=sys.stderr,
         )
         return 1
-    plain = result.to_plain(options.cpu_hour_price)
+    plain = result.to_plain()
     if options.json:
         print_json(plain)
     else:
-        print(_build_text(plain))
+        _print_rows(plain, "failed")
     for line in _failures(plain):
         print(f"orthonav: error: {line}", file=sys.stderr)
     return 0 if result.is_complete else 1
-
-
-def _recipe(options: argparse.Namespace) -> dict[str, Any]:
-    from orthonav.core.errors import AtlasError
-
-    given = recipe_of(options)
-    if options.sheet_km is not None:
-        given["sheet_km"] = options.sheet_km
-    values = {name: getattr(options, f"coarse_{name}") for name in COARSE}
-    coarse = {name: value for name, value in values.items() if value is not None}
-    if coarse and not options.coarse:
-        raise AtlasError("--no-coarse leaves out the coarse tiles: remove the other --coarse-..")
-    if coarse or not options.coarse:
-        given["coarse"] = coarse or None
-    return given
 
 
 def _runner(options: argparse.Namespace) -> "TaskRunner":
@@ -235,24 +145,10 @@ def _runner(options: argparse.Namespace) -> "TaskRunner":
     return RayRunner(address, options.workers)
 
 
-def _build_text(plain: Mapping[str, Any]) -> str:
-    lines = [
-        f"atlas        {plain['atlas']}",
-        f"sheets       {plain['built']} built, {plain['unchanged']} unchanged, "
-        f"{plain['empty']} empty, {len(plain['failed'])} failed"
-        + (f", {plain['untried']} not tried" * bool(plain["untried"])),
-    ]
-    if plain["built"]:
-        lines += [
-            f"area         {plain['area_km2']:.1f} km2 in {plain['tiles']:,} tiles",
-            f"size         {plain['size_mb']:.1f} MB, {plain['mb_per_km2']:.2f} MB per km2",
-            f"time         {plain['wall_s']:.0f} s: {plain['km2_per_hour']:,.0f} km2 per hour, "
-            f"{plain['cpu_s_per_km2']:.2f} CPU s per km2",
-            f"memory       {plain['peak_mb']:.0f} MB at most in a process",
-        ]
-        if "cost" in plain:
-            lines.append(f"cost         {plain['cost']:.4g}, {plain['cost_per_km2']:.4g} per km2")
-    return "\n".join(lines)
+def _print_rows(plain: Mapping[str, Any], *left_out: str) -> None:
+    for name, value in plain.items():
+        if name not in left_out:
+            print(f"{name:<17}{'unknown' if value is None else value}")
 
 
 def _failures(plain: Mapping[str, Any]) -> list[str]:
@@ -260,8 +156,6 @@ def _failures(plain: Mapping[str, Any]) -> list[str]:
     if len(lines) > SHOWN_FAILURES:
         more = f"and {len(lines) - SHOWN_FAILURES} more sheets, see --json"
         lines = [*lines[:SHOWN_FAILURES], more]
-    if plain["finish_error"]:
-        lines.append(f"snapshot and index could not be written: {plain['finish_error']}")
     return lines
 
 
@@ -269,8 +163,12 @@ def _info(options: argparse.Namespace, atlas: "Atlas") -> None:
     plain = summary(atlas)
     if options.json:
         print_json(plain)
-    else:
-        print(summary_text(plain))
+        return
+    _print_rows(plain, "recipe", "imagery", "names")
+    recipe = ((name, value) for name, value in plain["recipe"].items() if value is not None)
+    print(f"{'recipe':<17}{', '.join(f'{name} {value}' for name, value in recipe)}")
+    for terms in plain["imagery"]:
+        print(f"{'imagery':<17}{', '.join(str(value) for value in terms.values() if value)}")
 
 
 def summary(atlas: "Atlas") -> dict[str, Any]:
@@ -299,52 +197,15 @@ def summary(atlas: "Atlas") -> dict[str, Any]:
     }
 
 
-def summary_text(plain: dict[str, Any]) -> str:
-    recipe = dict(plain["recipe"])
-    coarse = recipe.pop("coarse")
-    values = ", ".join(f"{name} {value}" for name, value in recipe.items() if value is not None)
-    lines = [
-        f"atlas      {plain['atlas']}",
-        f"sheets     {plain['sheets']} of {recipe['sheet_km']:g} km, {plain['tiles']} tiles",
-        f"area       {plain['area_km2']:.2f} km2 of tile centres",
-        f"size       {plain['bytes'] / 1e6:.3f} MB, {plain['mb_per_km2'] or 0:.3f} MB per km2",
-        f"recipe     {values}",
-    ]
-    if coarse:
-        of_coarse = ", ".join(f"{name} {value}" for name, value in coarse.items())
-        lines.append(f"coarse     {of_coarse}")
-    if plain["bounds_deg"]:
-        west, south, east, north = plain["bounds_deg"]
-        lines.append(
-            f"bounds     {west:.4f},{south:.4f},{east:.4f},{north:.4f} (W,S,E,N in degrees)"
-        )
-    dates = dict.fromkeys(str(plain[key]) for key in ("date_from", "date") if plain[key])
-    lines.append(f"dates      {' to '.join(dates) or 'unknown'}")
-    for source in plain["imagery"][:20]:
-        terms = [str(source[key]) for key in ("attribution", "licence") if source[key]]
-        lines.append(f"imagery    {', '.join([str(source['name']), *terms])}")
-    if len(plain["imagery"]) > 20:
-        lines.append(f"           and {len(plain['imagery']) - 20} more (--json lists all)")
-    return "\n".join(lines)
-
-
 def _check(options: argparse.Namespace, atlas: "Atlas") -> int:
     from orthonav.ground.atlas.integrity import check_atlas
 
     with progress(options) as shown:
-        found = check_atlas(
-            atlas, options.deep, shown, clean=options.clean, min_age_s=options.min_age_h * 3600
-        )
+        found = check_atlas(atlas, options.deep, shown, clean=options.clean)
     left = [problem for problem in found if not problem.removed]
     if options.json:
-        print_json(
-            {
-                "atlas": str(atlas.store),
-                "whole": not left,
-                "deep": options.deep,
-                "problems": [vars(problem) for problem in found],
-            }
-        )
+        plain = {"atlas": str(atlas.store), "whole": not left, "deep": options.deep}
+        print_json(plain | {"problems": [vars(problem) for problem in found]})
     else:
         for problem in found:
             done = " (fixed)" if problem.removed else ""
@@ -360,7 +221,7 @@ def _add(options: argparse.Namespace) -> None:
     source = Atlas.open(options.source)
     atlas = Atlas.open_or_create(options.atlas, source.recipe)
     with progress(options) as shown:
-        copied, unchanged = copy_sheets(source, atlas, options.sheets, options.replace, shown)
+        copied, unchanged = copy_sheets(source, atlas, None, options.replace, shown)
     print(f"{len(copied)} sheets added, {len(unchanged)} unchanged: {atlas.store}")
 
 
@@ -379,7 +240,7 @@ def _index(options: argparse.Namespace, atlas: "Atlas") -> None:
     if made is None:
         print(f"no sheet has coarse tiles, nothing to index: {atlas.store}")
         return
-    rows = sum(part.rows for shard in made.shards for part in shard.parts if not part.retired)
+    rows = sum(part.rows for shard in made.shards for part in shard.parts)
     size = sum(file.size_bytes for file in made.files.values())
     print(f"{rows} tiles of {len(made.sheets)} sheets, {size / 1e6:.3f} MB: {atlas.store}")
 
@@ -388,19 +249,12 @@ def _cut(options: argparse.Namespace, atlas: "Atlas") -> None:
     from orthonav.cli.info import summary as map_summary
     from orthonav.cli.info import summary_text as map_text
     from orthonav.ground.atlas.cut import cut_map
-    from orthonav.ground.planning.area import Area, require_one_area
-    from orthonav.ground.planning.route import read_route
 
-    if options.route is None:
-        require_one_area(None, options.band_m, options.bounds)
-        area = Area.from_bounds(options.bounds)
-    else:
-        area = Area.from_route(read_route(options.route), options.band_m)
     with progress(options) as shown:
         result = cut_map(
             atlas,
             options.out,
-            area,
+            area_of(options),
             workers=options.workers,
             allow_holes=options.allow_holes,
             progress=shown,

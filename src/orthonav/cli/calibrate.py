@@ -3,56 +3,34 @@
 import argparse
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from orthonav.cli.common import beside, counted, print_json, progress
-from orthonav.cli.heights import dem_of, flight_heights
-from orthonav.cli.source import add_source, open_source
+from orthonav.cli.common import add_options, beside, counted, print_json, progress, watched
+from orthonav.cli.source import add_source, dem_of, flight_heights, located, open_source
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from orthonav.core.flight.recording import RecordedView
-    from orthonav.core.records import ViewResult
-    from orthonav.ground.recordings.calibrate_mount import MountCalibration
+    from orthonav.ground.recordings.calibrate import MountCalibration
 
 GNSS_STD_M = 5.0
 """Standard deviation of measured positions, per axis."""
-EVERYDAY = (
-    *("--latency", "--gnss-positions", "--heading", "--camera", "--telemetry"),
-    "--json",
-)
+EXAMPLE = "area.onav flight --out mount.json"
+EVERYDAY = ("--latency", "--gnss-positions", "--heading", "--camera", "--telemetry", "--json")
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("map", type=Path, metavar="MAP.onav", help="map of the area")
-    parser.add_argument(
-        "flight", type=Path, metavar="SOURCE", help="flight to calibrate with, as for `localize`"
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="mount.json", help="file to write"
-    )
-    parser.add_argument(
-        "--latency",
-        action="store_true",
-        help="estimate the time from exposure to arrival of the camera instead, from a flight log "
-        "of `fly --log` with turns; --out is then a file for `fly --camera-latency-ms`",
-    )
-    parser.add_argument(
-        "--gnss-positions",
-        type=Path,
-        metavar="positions.csv",
-        help="measured positions of some or all views (frame,lat_deg,lon_deg), 5 m per axis; they "
-        "make pitch and roll observable from positions, not from the perspective alone",
-    )
-    parser.add_argument(
-        "--heading",
-        choices=("known", "unknown"),
-        default="known",
-        help="known: from telemetry (default); unknown: all headings are tried",
-    )
+    add = parser.add_argument
+    add("map", type=Path, metavar="MAP.onav", help="map of the area")
+    text = "flight to calibrate with, as for `localize`"
+    add("flight", type=Path, metavar="SOURCE", help=text)
+    add("--out", type=Path, required=True, metavar="mount.json", help="file to write")
+    text = "estimate the time from exposure to arrival of the camera instead, from a flight log of "
+    text += "`fly --log` with turns; --out is then a file for `fly --camera-latency-ms`"
+    add("--latency", action="store_true", help=text)
+    text = "measured positions of some or all views (frame,lat_deg,lon_deg), 5 m per axis; they "
+    text += "make pitch and roll observable from positions, not from the perspective alone"
+    add("--gnss-positions", type=Path, metavar="positions.csv", help=text)
+    add_options(parser, "--heading", "--json")
     add_source(parser)
-    parser.add_argument("--json", action="store_true", help="print the mount as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -64,28 +42,30 @@ def run(options: argparse.Namespace) -> None:
             raise FlightError("--latency uses the heights of the log: omit --dem")
         _run_latency(options)
         return
-    found, by_track = _calibrated(options)
+    found = _calibrated(options)
     write_mount(options.out, found.mount)
     with beside(options.out):
-        _print_mount(options, found, by_track)
+        if options.json:
+            more = {"first": found.first, "last": found.last, "moved": found.moved}
+            print_json(asdict(found.mount) | more)
+            return
+        print(f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}")
+        for name, bias, unit in (
+            ("heading, deg", found.mount.heading_deg, 1.0),
+            ("height (or focal), %", found.mount.log_scale, 100.0),
+            ("pitch, deg", found.mount.pitch_deg, 1.0),
+            ("roll, deg", found.mount.roll_deg, 1.0),
+        ):
+            value, std, scatter = (unit * each for each in (bias.value, bias.std, bias.scatter))
+            print(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
+        print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
+        if found.moved:
+            print("the camera moved in its mount before these views; earlier views are not used")
+        print(f"written to {options.out}")
 
 
-def _print_mount(options: argparse.Namespace, found: "MountCalibration", by_track: bool) -> None:
-    if options.json:
-        print_json(_plain(found))
-        return
-    print(_table(found))
-    print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
-    if not by_track:
-        print("the views do not form a track: this is the mean of single views")
-    if found.moved:
-        print("the camera moved in its mount before these views; earlier views are not used")
-    print(f"written to {options.out}")
-
-
-def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
-    """The mount by the smoothed track of the flight, and True; by its single views, and False,
-    where these make no track."""
+def _calibrated(options: argparse.Namespace) -> "MountCalibration":
+    """The mount by the smoothed track of the flight."""
     from orthonav.core.flight import read_truth
     from orthonav.core.flight.recording import WithTelemetry
     from orthonav.core.localize import Localizer
@@ -93,15 +73,8 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
     from orthonav.core.records import Prior
     from orthonav.core.track.tracker import Tracker
     from orthonav.ground.evaluate.metrics import check_truth
-    from orthonav.ground.recordings.calibrate_mount import (
-        MIN_VIEWS,
-        RecordedSingleViews,
-        calibrate_mount,
-        calibrate_mount_by_views,
-        confident_views,
-    )
-    from orthonav.ground.recordings.localize import localize_flight, smoothed_track
-    from orthonav.onboard.run import Locator
+    from orthonav.ground.recordings.calibrate import calibrate_mount
+    from orthonav.ground.recordings.localize import smoothed_track
 
     dem, opened = dem_of(options), open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
@@ -111,52 +84,30 @@ def _calibrated(options: argparse.Namespace) -> "tuple[MountCalibration, bool]":
         frame = opened.manifest.sheets[0].frame
         check_truth(places, (), (frame.lat_deg, frame.lon_deg), options.gnss_positions)
     priors = {frame: Prior(*place, GNSS_STD_M) for frame, place in places.items()}
-    localizer, heading_known = Localizer(opened), options.heading == "known"
-
-    def located(locator: Locator, stage: str) -> "list[ViewResult]":
-        views = (
-            WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
-        )
-        heights = flight_heights(options, opened, flight, dem)
-        results = []
-        with progress(options) as shown:
-            for result in localize_flight(
-                locator, flight, skip_bad_images=True, views=views, heights=heights
-            ):
-                results.append(result)
-                if flight.expected:
-                    shown(stage, min(1.0, len(results) / flight.expected))
-        return results
-
     tracker = Tracker(
-        localizer,
-        heading_known=heading_known,
+        Localizer(opened),
+        heading_known=options.heading == "known",
         use_prior=bool(options.gnss_positions),
         every_prior=bool(options.gnss_positions),
         smooth=True,
     )
-    tracked = smoothed_track(tracker, located(tracker, "calibrate"), None)
-    if len(confident_views(tracked)) >= MIN_VIEWS:
-        return calibrate_mount(tracked), True
-    # Photographs far apart, for one.
-    alone = RecordedSingleViews(localizer, bool(priors), heading_known)
-    return calibrate_mount_by_views(located(alone, "single views"), alone.reported), False
+    views = (
+        WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
+    )
+    heights = flight_heights(options, opened, flight, dem)
+    with progress(options) as shown:
+        results = located(options, tracker, flight, views, shown, heights=heights)
+    return calibrate_mount(smoothed_track(tracker, results, None))
 
 
 def _run_latency(options: argparse.Namespace) -> None:
     from orthonav.core.flight.mount import write_latency
-    from orthonav.ground.recordings.calibrate_latency import arrivals_of, calibrate_latency
+    from orthonav.ground.recordings.calibrate import arrivals_of, calibrate_latency
 
     flight = open_source(options.flight, options)
     with progress(options) as shown:
-
-        def views() -> "Iterator[tuple[RecordedView, float]]":
-            for number, view in enumerate(arrivals_of(flight), 1):
-                yield view
-                if flight.expected:
-                    shown("latency", min(1.0, number / flight.expected))
-
-        found = calibrate_latency(flight.camera, views(), heading_known=options.heading == "known")
+        views = watched(arrivals_of(flight), flight.expected, "latency", shown)
+        found = calibrate_latency(flight.camera, views, heading_known=options.heading == "known")
     write_latency(options.out, found)
     with beside(options.out):
         if options.json:
@@ -164,25 +115,3 @@ def _run_latency(options: argparse.Namespace) -> None:
             return
         print(f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms")
         print(f"from {found.pairs} pairs of images; written to {options.out}")
-
-
-def _plain(found: "MountCalibration") -> dict[str, Any]:
-    return asdict(found.mount) | {
-        "first": found.first,
-        "last": found.last,
-        "moved": found.moved,
-    }
-
-
-def _table(found: "MountCalibration") -> str:
-    lines = [f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}"]
-    rows = (
-        ("heading, deg", found.mount.heading_deg, 1.0),
-        ("height (or focal), %", found.mount.log_scale, 100.0),
-        ("pitch, deg", found.mount.pitch_deg, 1.0),
-        ("roll, deg", found.mount.roll_deg, 1.0),
-    )
-    for name, bias, unit in rows:
-        value, std, scatter = (unit * each for each in (bias.value, bias.std, bias.scatter))
-        lines.append(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
-    return "\n".join(lines)

@@ -1,27 +1,202 @@
-"""Shared by several commands: argument types, progress bars, JSON output."""
+"""Shared by several commands: options, what they ask for, progress bars, JSON output."""
 
 import argparse
 import json
+import logging
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
+from orthonav.core.errors import AreaError, VariantError
+
 if TYPE_CHECKING:
     from orthonav.core.localize.policy import SearchPlan
+    from orthonav.core.mapfile.signature import Signature
+    from orthonav.ground.planning.area import Area
 
+T = TypeVar("T")
 MAX_THREADS = 64
+NADIR_DEG = (0.0, 0.0, 0.0)
+log = logging.getLogger(__name__)
 
-ROUTE_HELP = (
-    "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan or a waypoint "
-    "file (FILE#NAME or FILE#NUMBER selects one of several), or a trajectory of the paper: "
-    "paper:B@46.6,1.9[,BEARING]"
-)
+
+def bounds(text: str) -> tuple[float, float, float, float]:
+    """West, south, east, north in degrees, from `W,S,E,N`."""
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"expected W,S,E,N in degrees, got '{text}'") from error
+    return west, south, east, north
+
+
+OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "--accept": {
+        "default": "confidence:0.9",
+        "metavar": "NAME:MIN",
+        "help": "criterion of a confident fix and its threshold: confidence:0.9 (default) or "
+        "peak_ratio:1.3",
+    },
+    "--agl-m": {"type": float, "help": "height above ground"},
+    "--allow-holes": {"action": "store_true", "help": "write the file even if imagery is missing"},
+    "--band-m": {
+        "type": float,
+        "help": "width of the search band for legs without a width of their own",
+    },
+    "--bounds": {
+        "type": bounds,
+        "metavar": "W,S,E,N",
+        "help": "area: west, south, east, north in degrees; write --bounds=W,S,E,N if W is "
+        "negative",
+    },
+    "--budget-ms": {
+        "type": float,
+        "help": "time limit per view (default: none); a search that would exceed it is not "
+        "started, and the result is the best position so far",
+    },
+    "--camera": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
+    },
+    "--dem": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "terrain model (any raster that GDAL reads) for heights above ground",
+    },
+    "--dem-datum": {
+        "metavar": "NAME",
+        "help": "vertical datum of the terrain model, where the file does not state it: egm96, "
+        "egm2008, msl, ellipsoid or EPSG:NUMBER of a vertical system",
+    },
+    "--gsd-m": {
+        "type": float,
+        "help": "ground resolution, metres per pixel (default: suited to imagery or view)",
+    },
+    "--heading": {
+        "choices": ("known", "unknown"),
+        "default": "known",
+        "help": "known: from telemetry (default); unknown: all headings are tried",
+    },
+    "--json": {"action": "store_true", "help": "print as JSON"},
+    "--mount": {
+        "type": Path,
+        "metavar": "mount.json",
+        "help": "calibration by `orthonav calibrate`, which corrects heading, height and tilt",
+    },
+    "--mount-deg": {
+        "type": float,
+        "nargs": 3,
+        "default": NADIR_DEG,
+        "metavar": ("YAW", "PITCH", "ROLL"),
+        "help": "orientation of the camera in the aircraft; 0 0 0 (default) looks straight down "
+        "with the top of the image forward",
+    },
+    "--not-before": {
+        "metavar": "DATE|SERIAL",
+        "help": "refuse a map signed before this date (2026-05-31, UTC) or with a lower serial "
+        "number",
+    },
+    "--ortho": {
+        "action": "extend",
+        "nargs": "+",
+        "required": True,
+        "type": Path,
+        "metavar": "FILE",
+        "help": "orthophoto (any georeferenced raster that GDAL reads), or a folder of them, "
+        "where newer files take precedence; may be repeated, earlier ones take precedence",
+    },
+    "--overlap": {
+        "type": float,
+        "metavar": "FRACTION",
+        "help": "overlap of neighbouring tiles, as a fraction of their width (default 0.875)",
+    },
+    "--prior": {
+        "choices": ("telemetry", "none"),
+        "default": "telemetry",
+        "help": "telemetry: search around the prior position, if any (default); none: search the "
+        "whole map",
+    },
+    "--radius-m": {
+        "type": float,
+        "default": 15.0,
+        "help": "largest error of a correct fix (default 15)",
+    },
+    "--require-signed": {
+        "type": Path,
+        "metavar": "public.pem",
+        "help": "refuse a map that was not signed with this key (see `orthonav sign`)",
+    },
+    "--route": {
+        "type": Path,
+        "metavar": "FILE",
+        "help": "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan "
+        "or a waypoint file (FILE#NAME or FILE#NUMBER selects one of several)",
+    },
+    "--seed": {"type": int, "help": "seed of all random draws"},
+    "--speed-mps": {"type": float, "help": "ground speed"},
+    "--threads": {
+        "type": int,
+        "default": 1,
+        "help": "threads that search for one view (default 1); positions do not depend on them",
+    },
+    "--tile-px": {"type": int, "help": "width of a tile (default 256, or suited to the view)"},
+    "--workers": {"type": int, "help": "number of parallel workers (default: one per core)"},
+}
+"""Options of several commands, with what `argparse` needs to know."""
+
+
+def add_options(group: argparse._ActionsContainer, *names: str, **changes: Any) -> None:
+    """Add shared options; `changes` replace what `OPTIONS` says of each."""
+    for name in names:
+        group.add_argument(name, **{**OPTIONS[name], **changes})
+
+
+def add_area(parser: argparse._ActionsContainer, *, required: bool = False) -> None:
+    where = parser.add_mutually_exclusive_group(required=required)
+    add_options(where, "--route", "--bounds")
+    add_options(parser, "--band-m")
+
+
+def area_of(options: argparse.Namespace) -> "Area":
+    """The area that the options of `add_area` name; raises `AreaError` or `RouteError`."""
+    from orthonav.ground.planning.area import Area, require_one_area
+    from orthonav.ground.planning.route import read_route
+
+    if options.route is None and options.bounds is None:
+        raise AreaError("give one area: --route FILE, or --bounds W,S,E,N in degrees")
+    if options.route is None:
+        require_one_area(None, options.band_m, options.bounds)
+        return Area.from_bounds(options.bounds)
+    return Area.from_route(read_route(options.route), options.band_m)
+
+
+def search_plan(options: argparse.Namespace) -> "SearchPlan":
+    """The plan of the search with `--budget-ms` and `--threads`; raises `VariantError`."""
+    from orthonav.core.localize.policy import DEFAULT_PLAN
+
+    budget_ms = math.inf if options.budget_ms is None else options.budget_ms
+    if not budget_ms > 0:
+        raise VariantError(f"--budget-ms must be above 0, got {budget_ms:g}")
+    if not 1 <= options.threads <= MAX_THREADS:
+        raise VariantError(f"--threads must be 1 to {MAX_THREADS}, got {options.threads}")
+    return replace(DEFAULT_PLAN, budget_ms=budget_ms, threads=options.threads)
+
+
+def checked_signature(options: argparse.Namespace) -> "Signature | None":
+    """The signature of the map that `--require-signed` and `--not-before` ask for."""
+    from orthonav.core.mapfile.signature import require_signature
+
+    if options.require_signed is not None:
+        return require_signature(options.map, options.require_signed, options.not_before)
+    if options.not_before is not None:
+        raise VariantError("--not-before needs --require-signed")
+    return None
 
 
 class Progress:
@@ -39,18 +214,22 @@ class Progress:
         if stage != self._stage:
             self.close()
             self._stage = stage
-            self._bar = tqdm(
-                total=1000,
-                desc=stage,
-                delay=1,
-                bar_format="{desc:>10} {percentage:3.0f}%|{bar}| {remaining}",
-            )
+            bar = "{desc:>10} {percentage:3.0f}%|{bar}| {remaining}"
+            self._bar = tqdm(total=1000, desc=stage, delay=1, bar_format=bar)
         self._bar.update(round(share * 1000) - self._bar.n)
 
     def close(self) -> None:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def watched(items: Iterable[T], expected: int | None, stage: str, shown: Progress) -> Iterator[T]:
+    """The same items; the share of those expected that were used is shown."""
+    for number, item in enumerate(items, 1):
+        yield item
+        if expected:
+            shown(stage, min(1.0, number / expected))
 
 
 @contextmanager
@@ -63,77 +242,11 @@ def progress(options: argparse.Namespace) -> Iterator[Progress]:
         shown.close()
 
 
-def bounds(text: str) -> tuple[float, float, float, float]:
-    """West, south, east, north in degrees, from `W,S,E,N`."""
-    try:
-        west, south, east, north = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"expected W,S,E,N in degrees, got '{text}'") from error
-    return west, south, east, north
-
-
-def add_area(
-    parser: argparse._ActionsContainer, group: argparse._ActionsContainer, band: str = ""
-) -> None:
-    """Add `--route` and `--bounds` to a group (or the parser), and `--band-m` to the parser, with
-    its default `band` as text."""
-    group.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
-    group.add_argument(
-        "--bounds",
-        type=bounds,
-        metavar="W,S,E,N",
-        help="area: west, south, east, north in degrees; write --bounds=W,S,E,N if W is negative",
-    )
-    parser.add_argument(
-        "--band-m",
-        type=float,
-        help=f"width of the search band for legs without a width of their own{band}",
-    )
-
-
-def add_dem(parser: argparse._ActionsContainer, effect: str) -> None:
-    parser.add_argument(
-        "--dem",
-        type=Path,
-        metavar="FILE",
-        help=f"terrain model (any raster that GDAL reads), {effect}",
-    )
-    parser.add_argument(
-        "--dem-datum",
-        metavar="NAME",
-        help="vertical datum of the terrain model, where the file does not state it: egm96, "
-        "egm2008, msl, ellipsoid or EPSG:NUMBER of a vertical system",
-    )
-
-
-def add_search(parser: argparse._ActionsContainer) -> None:
-    parser.add_argument(
-        "--budget-ms",
-        type=float,
-        metavar="MS",
-        help="time limit per view (default: none); a search that would exceed it is not started, "
-        "and the result is the best position so far",
-    )
-    parser.add_argument(
-        "--threads",
-        type=int,
-        default=1,
-        metavar="N",
-        help="threads that search for one view (default 1); positions do not depend on them",
-    )
-
-
-def search_plan(options: argparse.Namespace) -> "SearchPlan":
-    """The plan of the search with `--budget-ms` and `--threads`; raises `VariantError`."""
-    from orthonav.core.errors import VariantError
-    from orthonav.core.localize.policy import DEFAULT_PLAN
-
-    budget_ms = math.inf if options.budget_ms is None else options.budget_ms
-    if not budget_ms > 0:
-        raise VariantError(f"--budget-ms must be above 0, got {budget_ms:g}")
-    if not 1 <= options.threads <= MAX_THREADS:
-        raise VariantError(f"--threads must be 1 to {MAX_THREADS}, got {options.threads}")
-    return replace(DEFAULT_PLAN, budget_ms=budget_ms, threads=options.threads)
+def reporter(options: argparse.Namespace) -> Callable[[str], None]:
+    """Prints lines about the work to a person at a terminal, else logs them."""
+    if options.quiet or not sys.stderr.isatty():
+        return log.info
+    return lambda line: print(line, file=sys.stderr)
 
 
 @contextmanager
@@ -153,17 +266,3 @@ def counted(number: int, noun: str) -> str:
 
 def print_json(plain: Any) -> None:
     print(json.dumps(plain, indent=1, allow_nan=False))
-
-
-def add_orthos(parser: argparse._ActionsContainer, what: str) -> None:
-    """Add `--ortho FILE|FOLDER ...`, which may be repeated."""
-    parser.add_argument(
-        "--ortho",
-        action="extend",
-        nargs="+",
-        required=True,
-        type=Path,
-        metavar="FILE",
-        help=f"{what}, or a folder of them, where newer files take precedence; may be repeated, "
-        "earlier ones take precedence",
-    )

@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import io
 import json
-import os
 import shlex
 import shutil
 import sys
@@ -12,8 +11,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from orthonav.cli.common import print_json
+from orthonav.cli.common import add_options, print_json
 
+EXAMPLE = ""
 IMAGERY = Path(__file__).parents[1] / "ground" / "demo_data"
 """Two dates of a generated area of 2 x 2 km; `lab/demo_imagery.py` makes them."""
 MARKER = "demo.json"
@@ -38,55 +38,31 @@ WAYPOINTS_EN_M = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("orthonav-demo"),
-        metavar="DIR",
-        help="folder to write (default ./orthonav-demo)",
-    )
-    parser.add_argument("--seed", type=int, default=1, help="seed of the flight (default 1)")
-    parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
+    text = "folder to write (default ./orthonav-demo)"
+    parser.add_argument("--out", type=Path, default=Path("orthonav-demo"), metavar="DIR", help=text)
+    add_options(parser, "--json")
 
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.files import replacing_folder
 
-    start = time.perf_counter()
-    with replacing_folder(options.out, _is_earlier_demo) as folder:
+    start, out = time.perf_counter(), options.out
+    with replacing_folder(out, _is_earlier_demo) as folder:
         plain, text = _demo(folder, options)
         plain["made_by"] = "orthonav demo"
         (folder / MARKER).write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
     if options.json:
         print_json(plain)
         return
-    print(f"{text}\ndone in {time.perf_counter() - start:.0f} s")
-    print(_how_to_view(options.out))
-
-
-def _how_to_view(out: Path) -> str:
-    """A picture, the reports, and the command that shows the flight."""
     files = [f"{out}/fixes.jsonl", "--map", f"{out}/area.onav", "--flight", f"{out}/flight"]
-    command = shlex.join([*_this_program(), "view", *files])
-    return "\n".join(
-        (
-            "look at:",
-            f"  {out}/report/figures/map.png   picture: fixes and true positions on the map",
-            f"  {out}/check/index.html         before the flight: where fixes are expected",
-            f"  {out}/report/index.html        after the flight: errors, confidence, worst views",
-            f"step through the views in a browser:\n  {command}",
-        )
+    print(f"{text}\ndone in {time.perf_counter() - start:.0f} s")
+    print(
+        "look at:\n"
+        f"  {out}/report/figures/map.png   picture: fixes and true positions on the map\n"
+        f"  {out}/check/index.html         before the flight: where fixes are expected\n"
+        f"  {out}/report/index.html        after the flight: errors, confidence, worst views\n"
+        f"step through the views in a browser:\n  {shlex.join(['orthonav', 'view', *files])}"
     )
-
-
-def _this_program() -> list[str]:
-    """The words that call this program again: its name, if the shell finds it, else its path."""
-    called = Path(sys.argv[0])
-    if called.name != "orthonav":
-        return [sys.executable, "-m", "orthonav"]
-    found = shutil.which("orthonav")
-    is_found = found is not None and os.path.realpath(found) == os.path.realpath(called)
-    return ["orthonav" if is_found else str(called)]
 
 
 def _is_earlier_demo(out: Path) -> bool:
@@ -114,14 +90,14 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
         _write_route(Path("route.geojson"), frame.latlon_from_en(WAYPOINTS_EN_M))
         flown = ("--route", "route.geojson", "--agl-m", HEIGHT_M)
         _say(options, f"2/4 checking from {past} alone where along the route fixes are expected")
-        trials = ("--band-m", CHECKED_BAND_M, "--effort", CHECK_EFFORT, "--quick")
+        trials = ("--band-m", CHECKED_BAND_M, "--effort", CHECK_EFFORT)
         checked = _run(options, "check", "area.onav", *flown, *trials, "--out", "check")
         _say(
             options,
             f"3/4 simulating a flight over {present}, heading error 5 deg, height error 5 %, "
             "unreported tilt of mount and horizon 1 deg each",
         )
-        errors = ("--yaw-std-deg", 5, "--agl-std", 0.05, "--seed", options.seed)
+        errors = ("--yaw-std-deg", 5, "--agl-std", 0.05, "--seed", 1)
         spaced = ("--spacing-m", SPACING_M, "--out", "flight")
         _run(options, "simulate", "--ortho", present, *flown, *errors, *spaced)
         _say(options, "4/4 localizing every view, searching the whole map")
@@ -135,7 +111,6 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
 
 
 def _run(options: argparse.Namespace, *words: object) -> str:
-    """Run another command; returns what it printed."""
     from orthonav import cli
 
     quiet = ["--quiet"] if options.quiet else []

@@ -6,67 +6,37 @@ import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.changed import add_report_changes, changes_text, changes_to_plain, report_changes
-from orthonav.cli.common import beside, print_json, progress
-from orthonav.cli.needs import require_extras
+from orthonav.cli.common import add_options, beside, print_json
+from orthonav.cli.version import require_extras
 
 if TYPE_CHECKING:
     from orthonav.core.flight import FlightFolder
     from orthonav.core.mapfile.reader import MapFile
-    from orthonav.ground.changes.record import ChangedGround
-    from orthonav.ground.evaluate.contact_sheet import Row
     from orthonav.ground.evaluate.metrics import Metrics
     from orthonav.ground.evaluate.tables import FlightReport
 
+EXAMPLE = "fixes.jsonl --flight flight --map area.onav --report report"
+
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "fixes",
-        type=Path,
-        nargs="+",
-        metavar="fixes.jsonl",
-        help="fixes of a flight, as written by localize or fly --jsonl; several files are compared",
-    )
-    parser.add_argument(
-        "--truth",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="truth.csv",
-        help="ground truth: the true positions (default: truth.csv of --flight); one for all files "
-        "of fixes, or one for each in the same order",
-    )
-    parser.add_argument(
-        "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
-    )
-    parser.add_argument(
-        "--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file"
-    )
-    parser.add_argument(
-        "--json", action="store_true", help="print the metrics as JSON instead of the table"
-    )
-    parser.add_argument(
-        "--report",
-        type=Path,
-        metavar="REPORT/",
-        help="write an HTML report with its figures as SVG and PNG",
-    )
-    parser.add_argument(
-        "--map", type=Path, metavar="MAP.onav", help="map of the flight: background of the report"
-    )
-    parser.add_argument(
-        "--flight",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FLIGHT_DIR",
-        help="flight folder with the true positions, and with the images for the worst views in "
-        "the report (with --map and --report) and for --report-changes; one for all files of "
-        "fixes, or one for each in the same order",
-    )
-    add_report_changes(parser)
+    add = parser.add_argument
+    text = "fixes of a flight, as written by localize or fly --jsonl; several files are compared"
+    add("fixes", type=Path, nargs="+", metavar="fixes.jsonl", help=text)
+    each: dict[str, Any] = {"type": Path, "action": "append", "default": []}
+    text = "ground truth: the true positions (default: truth.csv of --flight); one for all files "
+    text += "of fixes, or one for each in the same order"
+    add("--truth", **each, metavar="truth.csv", help=text)
+    add_options(parser, "--radius-m", "--json")
+    add("--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file")
+    text = "write an HTML report with its figures as SVG and PNG"
+    add("--report", type=Path, metavar="REPORT/", help=text)
+    text = "map of the flight: background of the report"
+    add("--map", type=Path, metavar="MAP.onav", help=text)
+    text = "flight folder with the true positions; one for all files of fixes, or one for each in "
+    text += "the same order"
+    add("--flight", **each, metavar="FLIGHT_DIR", help=text)
     parser.set_defaults(wrong_usage=parser.error)
 
 
@@ -88,19 +58,17 @@ def run(options: argparse.Namespace) -> None:
     whole = total(flights)
     if options.report:
         _write_report(options.report, flights, whole, opened)
-    changed = _changed(options, opened)
-    plain = flights_to_json(flights, whole) | changes_to_plain(options, changed)
+    plain = flights_to_json(flights, whole)
     if options.metrics:
         write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    with beside(options.metrics, options.report_changes):
+    with beside(options.metrics):
         if options.json:
             print_json(plain)
-        else:
-            print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
-            print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
-            report = [f"report: {options.report / 'index.html'}"] if options.report else []
-            for line in (*changes_text(options, changed), *report):
-                print(line)
+            return
+        print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
+        print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
+        if options.report:
+            print(f"report: {options.report / 'index.html'}")
 
 
 def _check_options(options: argparse.Namespace) -> None:
@@ -117,10 +85,6 @@ def _check_options(options: argparse.Namespace) -> None:
         raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
     if options.report:
         require_extras("evaluate --report")
-    if options.report_changes and not (options.map and options.flight):
-        raise FlightError(
-            "--report-changes compares views with the map; give --map and --flight too"
-        )
 
 
 def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
@@ -136,56 +100,37 @@ def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
     return given
 
 
-def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedGround | None":
-    from orthonav.core.flight import open_flight
-    from orthonav.core.flight.fixes import read_results
-
-    if options.report_changes is None or opened is None:
-        return None
-    flights = [
-        (open_flight(folder, images_needed=False), read_results(fixes))
-        for folder, fixes in zip(options.flight, options.fixes, strict=True)
-    ]
-    with progress(options) as shown:
-        return report_changes(options, opened, flights, shown)
-
-
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
     from orthonav.core.flight import open_flight, read_truth
     from orthonav.core.flight.fixes import read_results
     from orthonav.core.mapfile.layer import preview
-    from orthonav.ground.evaluate.contact_sheet import worst_rows
     from orthonav.ground.evaluate.metrics import check_truth, compare, measure, warn_of_another_run
     from orthonav.ground.evaluate.tables import FlightReport
     from orthonav.ground.evaluate.track import measure_gnss, measure_track
     from orthonav.ground.report.drawing import Background
-    from orthonav.ground.report.imagery import SheetImagery
 
-    sheet = SheetImagery(opened) if opened else None
-    local = sheet.frame if sheet else None
-    background = None
+    local, background, place = None, None, None
     if opened:
-        background = Background(preview(opened), opened.manifest.sheets[0].grid.extent_en_m)
+        sheet = opened.manifest.sheets[0]
+        local, place = sheet.frame, (sheet.frame.lat_deg, sheet.frame.lon_deg)
+        background = Background(preview(opened), sheet.grid.extent_en_m)
     folders = [open_flight(path, images_needed=False) for path in options.flight]
+    names = [path.stem for path in options.fixes]
+    if len(set(names)) < len(names):
+        names = [str(path) for path in options.fixes]
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
-        results = read_results(fixes)
-        known = read_truth(truth)
+        results, known = read_results(fixes), read_truth(truth)
         comparison = compare(known, results, local)
-        check_truth(known, results, (local.lat_deg, local.lon_deg) if local else None, truth)
+        check_truth(known, results, place, truth)
         warn_of_another_run(fixes, opened, folders[i] if folders else _flight_of(truth))
-        worst: tuple[Row, ...] = ()
-        if sheet and folders and options.report:
-            worst = tuple(worst_rows(comparison, results, folders[i], sheet))
-        metrics = measure(comparison, options.radius_m)
         flights.append(
             FlightReport(
-                _names(options.fixes)[i],
+                names[i],
                 comparison,
-                metrics,
+                measure(comparison, options.radius_m),
                 background,
                 measure_track(comparison, results, options.radius_m),
-                worst,
                 measure_gnss(comparison, results),
                 _view_command(options, i),
             )
@@ -194,7 +139,6 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
 
 
 def _flight_of(truth: Path) -> "FlightFolder | None":
-    """The flight folder that holds the ground truth, if any."""
     from orthonav.core.errors import OrthonavError
     from orthonav.core.flight import open_flight
 
@@ -202,15 +146,6 @@ def _flight_of(truth: Path) -> "FlightFolder | None":
         if (truth.parent / "telemetry.csv").is_file():
             return open_flight(truth.parent, images_needed=False)
     return None
-
-
-def _names(paths: list[Path]) -> list[str]:
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
-    if len(set(names)) < len(names):
-        names = [str(path) for path in paths]
-    return names
 
 
 def _write_report(
@@ -235,10 +170,6 @@ def _view_command(options: argparse.Namespace, i: int) -> str:
     if options.map is None:
         return ""
     words = ["orthonav", "view", str(options.fixes[i]), "--map", str(options.map)]
-    if options.flight:
-        words += ["--flight", str(options.flight[i])]
-    if not options.flight or options.truth[i] != options.flight[i] / "truth.csv":
-        words += ["--truth", str(options.truth[i])]
-    if options.radius_m != 15.0:
-        words += ["--radius-m", f"{options.radius_m:g}"]
+    words += ["--flight", str(options.flight[i])] if options.flight else []
+    words += ["--truth", str(options.truth[i]), "--radius-m", f"{options.radius_m:g}"]
     return shlex.join(words)

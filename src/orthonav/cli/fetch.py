@@ -2,19 +2,19 @@
 
 import argparse
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_area, bounds, print_json, progress
-from orthonav.cli.needs import require_extras
+from orthonav.cli.common import add_area, add_options, area_of, print_json, progress
+from orthonav.cli.version import require_extras
 from orthonav.core.errors import FetchError
 
 if TYPE_CHECKING:
-    from orthonav.ground.fetch.options import ImageryOptions
+    from orthonav.ground.fetch.presets import ImageryOptions
     from orthonav.ground.fetch.run import FetchRequest, FetchResult
-    from orthonav.ground.planning.area import Area
 
-PACKAGE = "ign-package:"
+EXAMPLE = "--route route.kml --source ign --out ortho.tif"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
     *("--layer", "--time", "--date", "--key-env", "--cache", "--json"),
@@ -22,135 +22,76 @@ EVERYDAY = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    parser.add_argument(
-        "area", nargs="?", metavar="ROUTE|W,S,E,N", help="planned route, or an area in degrees"
-    )
-    parser.add_argument(
-        "--source",
-        metavar="NAME[:YEAR]|PROTOCOL:ADDRESS",
-        help="a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..., or "
-        "ign-package:D003:2013 for a whole department (--out is a folder then)",
-    )
+    text = "a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..."
+    parser.add_argument("--source", metavar="NAME[:YEAR]|PROTOCOL:ADDRESS", help=text)
     parser.add_argument("--list", action="store_true", help="list the services known by name")
     parser.add_argument("--out", type=Path, metavar="ORTHO.tif", help="GeoTIFF to write")
-    parser.add_argument(
-        "--dry-run", action="store_true", help="print the estimated cost and fetch nothing"
-    )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    area = parser.add_argument_group("area")
-    add_area(area, area)
-    area.add_argument(
-        "--margin-m",
-        type=float,
-        default=200.0,
-        help="width of the margin that is fetched around the area (default 200)",
-    )
+    text = "print the estimated cost and fetch nothing"
+    parser.add_argument("--dry-run", action="store_true", help=text)
+    add_options(parser, "--json")
+    group = parser.add_argument_group("area")
+    add_area(group)
+    text = "width of the margin that is fetched around the area (default 200)"
+    group.add_argument("--margin-m", type=float, default=200.0, help=text)
     _add_imagery(parser)
-    _add_file(parser)
-    _add_requests(parser)
+
+    add = parser.add_argument_group("output file").add_argument
+    add("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
+    add("--licence", help="licence of the imagery")
+    add("--attribution", help="attribution that the licence requires")
+    formats = ("jpeg", "deflate")
+    text = "compression of the GeoTIFF (default jpeg)"
+    add("--compress", choices=formats, default="jpeg", help=text)
+    add("--quality", type=int, default=90, help="quality of JPEG, 1 to 100 (default 90)")
+
+    group = parser.add_argument_group("requests")
+    add_options(group, "--allow-holes")
+    add = group.add_argument
+    add("--key-env", metavar="VARIABLE", help="environment variable with the key for {key}")
+    add("--parallel", type=int, default=4, help="most requests at the same time (default 4)")
+    text = "most repetitions of a failed request (default 5)"
+    add("--retries", type=int, default=5, help=text)
+    text = "refuse to fetch more tiles than this (default 50000)"
+    add("--max-tiles", type=int, default=50_000, help=text)
+    text = "refuse to fetch more than this (default 4000)"
+    add("--max-mb", type=float, default=4000.0, help=text)
+    text = "folder that stores fetched tiles (default: beside --out, removed at the end)"
+    add("--cache", type=Path, metavar="DIR", help=text)
 
 
 def _add_imagery(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("imagery")
-    group.add_argument(
-        "--gsd-m",
-        type=float,
-        help="ground resolution, metres per pixel: the service's next finer one, or exactly this "
-        "from a WMS (default 0.5; the files' own from stac and cog)",
-    )
-    group.add_argument("--zoom", help="zoom level or tile matrix instead of --gsd-m")
-    group.add_argument("--layer", help="layer of the service")
-    group.add_argument("--style", help="style of the layer")
-    group.add_argument("--format", help="media type, such as image/jpeg or image/png")
-    group.add_argument("--crs", help="coordinate system, such as EPSG:2154, if there is a choice")
-    group.add_argument("--matrix-set", help="tile matrix set of a WMTS")
-    group.add_argument("--time", help="ISO 8601 time, or interval A/B of a STAC")
-    group.add_argument(
-        "--wms-version",
-        dest="version",
-        choices=("1.1.1", "1.3.0"),
-        help="version of WMS (default 1.3.0)",
-    )
-    group.add_argument(
-        "--service-tile-px",
-        dest="tile_px",
-        type=int,
-        help="width of the service's tiles (xyz, tms) or images (wms)",
-    )
-    group.add_argument("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
-    group.add_argument("--collection", help="collection of a STAC")
-    group.add_argument("--asset", help="asset of each STAC item")
-    group.add_argument("--bands", help="bands of files, such as 1,2,3 (stac, cog)")
-    group.add_argument(
-        "--nodata-colour",
-        dest="empty",
-        choices=("black", "white"),
-        help="colour of missing imagery: large patches of exactly this colour are masked",
-    )
-
-
-def _add_file(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("output file")
-    group.add_argument("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
-    group.add_argument("--licence", help="licence of the imagery")
-    group.add_argument("--attribution", help="attribution that the licence requires")
-    group.add_argument(
-        "--compress",
-        choices=("jpeg", "deflate"),
-        default="jpeg",
-        help="compression of the GeoTIFF (default jpeg)",
-    )
-    group.add_argument(
-        "--quality", type=int, default=90, help="quality of JPEG, 1 to 100 (default 90)"
-    )
-    group.add_argument(
-        "--allow-holes", action="store_true", help="write the file even if tiles failed"
-    )
-
-
-def _add_requests(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("requests")
-    group.add_argument(
-        "--key-env", metavar="VARIABLE", help="environment variable with the key for {key}"
-    )
-    group.add_argument(
-        "--parallel", type=int, default=4, help="most requests at the same time (default 4)"
-    )
-    group.add_argument(
-        "--retries", type=int, default=5, help="most repetitions of a failed request (default 5)"
-    )
-    group.add_argument(
-        "--max-tiles",
-        type=int,
-        default=50_000,
-        help="refuse to fetch more tiles than this (default 50000)",
-    )
-    group.add_argument(
-        "--max-mb",
-        type=float,
-        default=4000.0,
-        help="refuse to fetch more than this (default 4000)",
-    )
-    group.add_argument(
-        "--cache",
-        type=Path,
-        metavar="DIR",
-        help="folder that stores fetched tiles (default: beside --out, removed at the end)",
-    )
+    text = "ground resolution, metres per pixel: the service's next finer one, or exactly this "
+    text += "from a WMS (default 0.5; the files' own from stac and cog)"
+    add_options(group, "--gsd-m", help=text)
+    add = group.add_argument
+    add("--zoom", help="zoom level or tile matrix instead of --gsd-m")
+    add("--layer", help="layer of the service")
+    add("--style", help="style of the layer")
+    add("--format", help="media type, such as image/jpeg or image/png")
+    add("--crs", type=str.upper, help="coordinate system, such as EPSG:2154, if there is a choice")
+    add("--matrix-set", help="tile matrix set of a WMTS")
+    add("--time", help="ISO 8601 time, or interval A/B of a STAC")
+    versions = ("1.1.1", "1.3.0")
+    text = "version of WMS (default 1.3.0)"
+    add("--wms-version", dest="version", choices=versions, help=text)
+    text = "width of the service's tiles (xyz, tms) or images (wms)"
+    add("--service-tile-px", dest="tile_px", type=int, help=text)
+    add("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
+    add("--collection", help="collection of a STAC")
+    add("--asset", help="asset of each STAC item")
+    add("--bands", help="bands of files, such as 1,2,3 (stac, cog)")
+    text = "colour of missing imagery: large patches of exactly this colour are masked"
+    add("--nodata-colour", dest="empty", choices=("black", "white"), help=text)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Fetch and print a summary, or list the known services."""
     if options.list:
         _print_presets(options.json)
         return
     if options.source is None or (options.out is None and not options.dry_run):
         raise FetchError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
-    if options.source.startswith(PACKAGE):
-        _run_package(options)
-        return
     from orthonav.ground.fetch.run import estimate_fetch, fetch
 
     request = _request(options)
@@ -188,7 +129,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
     )
     return FetchRequest(
         spec=spec,
-        area=_area(options),
+        area=area_of(options),
         out=options.out or Path("none.tif"),
         margin_m=options.margin_m,
         compress=options.compress,
@@ -202,7 +143,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
 
 
 def _imagery(options: argparse.Namespace) -> "ImageryOptions":
-    from orthonav.ground.fetch.options import ImageryOptions
+    from orthonav.ground.fetch.presets import ImageryOptions
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
@@ -210,64 +151,7 @@ def _imagery(options: argparse.Namespace) -> "ImageryOptions":
     if bands and not all(part.strip().isdecimal() and int(part) > 0 for part in bands):
         raise FetchError(f"--bands are numbers from 1, such as 1,2,3, got '{options.bands}'")
     named = {name: getattr(options, name) for name in vars(ImageryOptions()) if name in options}
-    crs = options.crs.upper() if options.crs else None
-    return ImageryOptions(**named | {"crs": crs, "bands": bands and tuple(map(int, bands))})
-
-
-def _area(options: argparse.Namespace) -> "Area":
-    from orthonav.ground.planning.area import Area
-    from orthonav.ground.planning.route import read_route
-
-    route, box = options.route, options.bounds
-    if options.area is not None:
-        if route is not None or box is not None:
-            raise FetchError("give the area once: as ROUTE or W,S,E,N, --route or --bounds")
-        if options.area.count(",") == 3 and not Path(options.area).exists():
-            try:
-                box = bounds(options.area)
-            except argparse.ArgumentTypeError as error:
-                raise FetchError(str(error)) from None
-        else:
-            route = Path(options.area)
-    if (route is None) == (box is None):
-        raise FetchError("give one area: a route file, or W,S,E,N in degrees")
-    if box is not None:
-        return Area.from_bounds(box)
-    return Area.from_route(read_route(route), options.band_m)
-
-
-def _run_package(options: argparse.Namespace) -> None:
-    from orthonav.ground.fetch.package import (
-        ATTRIBUTION,
-        download_package,
-        find_package,
-        package_files,
-        parse_package,
-    )
-    from orthonav.ground.fetch.web import Web
-
-    zone, year, kind = parse_package(options.source.removeprefix(PACKAGE))
-    with Web() as web:
-        package = find_package(web, zone, year, kind)
-        files = package_files(web, package)
-        megabytes = sum(file.size_bytes or 0 for file in files) / 1e6
-        _say(options, f"{package.name}: {len(files)} files, {megabytes:.0f} MB")
-        paths = []
-        if not options.dry_run:
-            with progress(options) as shown:
-                paths = download_package(web, files, options.out, shown)
-    if options.json:
-        print_json(
-            {
-                "package": package.name,
-                "date": package.date,
-                "attribution": ATTRIBUTION,
-                "files": [str(path) for path in paths],
-                "megabytes": round(megabytes, 3),
-            }
-        )
-    elif paths:
-        print(f"{package.name} ({ATTRIBUTION}); unpack it with: 7z x {paths[0]}")
+    return ImageryOptions(**named | {"bands": bands and tuple(map(int, bands))})
 
 
 def _say(options: argparse.Namespace, text: str) -> None:
@@ -281,7 +165,7 @@ def _summary(out: Path, result: "FetchResult") -> str:
         "file": out,
         "size": f"{estimate.width_px} x {estimate.height_px} px of {estimate.gsd_m:.4g} m",
         "tiles": estimate.tiles,
-        "missing": result.cells.holes() or "none",
+        "missing": result.holes() or "none",
         "layer": terms.layer,
         "date": terms.date or "unknown",
         "licence": terms.licence or "unknown: ask the service before you pass imagery on",
@@ -295,7 +179,7 @@ def _print_presets(as_json: bool) -> None:
     from orthonav.ground.fetch.presets import presets
 
     if as_json:
-        print_json([preset.describe() for preset in presets().values()])
+        print_json([asdict(preset) for preset in presets().values()])
         return
     for preset in presets().values():
         print(f"{preset.name}: {preset.title} ({preset.country})")

@@ -6,26 +6,13 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from orthonav.cli.common import add_search
-from orthonav.cli.signed import add_signature
+from orthonav.cli.common import add_options
 
+EXAMPLE = "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550"
 EVERYDAY = (
-    "--camera",
-    "--camera-latency-ms",
-    "--mount",
-    "--autopilot",
-    "--recorded-telemetry",
-    "--ros2",
-    "--send",
-    "--nmea",
-    "--jsonl",
-    "--accept",
-    "--dry-run",
-    "--heading",
-    "--start",
-    "--state",
-    "--gnss",
-    "--log",
+    *("--camera", "--camera-latency-ms", "--mount", "--autopilot", "--recorded-telemetry"),
+    *("--ros2", "--send", "--nmea", "--jsonl", "--accept", "--dry-run", "--heading", "--start"),
+    *("--state", "--gnss", "--log"),
 )
 SEND = ("global-position", "gps-input", "odometry", "vision", "external-position")
 HEIGHTS = ("distance", "terrain", "amsl", "home", "relative")
@@ -59,16 +46,11 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_inputs(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("camera").add_argument
-    text = "camera file: flight.json, or of OpenCV, ROS or Kalibr (default: of the flight folder)"
-    add("--camera", type=Path, metavar="FILE", help=text)
+    group = parser.add_argument_group("camera")
+    add = group.add_argument
+    add_options(group, "--camera", "--mount-deg", "--mount")
     text = "live cameras: time from exposure to arrival; without it nothing is sent"
     add("--camera-latency-ms", metavar="MS|FILE", help=f"{text} (`orthonav calibrate --latency`)")
-    text = "camera in the aircraft; 0 0 0 (default): straight down, top of the image forward"
-    triple = ("YAW", "PITCH", "ROLL")
-    add("--mount-deg", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=triple, help=text)
-    text = "correct heading, height and tilt with a calibration by `orthonav calibrate`"
-    add("--mount", type=Path, metavar="mount.json", help=text)
 
     add = parser.add_argument_group("playback of recordings").add_argument
     text = "use the telemetry of the flight folder; no autopilot is needed"
@@ -97,18 +79,17 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("outputs").add_argument
+    group = parser.add_argument_group("outputs")
+    add = group.add_argument
     text = "message to send to the autopilot (default global-position); can be repeated"
     add("--send", action="append", choices=SEND, help=text)
-    text = "NMEA to udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD; can be repeated"
+    text = "NMEA to udp:HOST:PORT or serial:DEVICE:BAUD; can be repeated"
     add("--nmea", action="append", default=[], metavar="URL", help=text)
     text = "append one line of JSON per view to a file, or to stdout (-); can be repeated"
     add("--jsonl", action="append", default=[], metavar="FILE|-", help=text)
     text = "maximum rate of each message (default: one per view)"
     add("--send-rate-hz", type=float, metavar="HZ", help=text)
-    text = "criterion of a confident fix and its threshold: confidence:0.9 (default), or "
-    text += "peak_ratio:1.3 in addition; other fixes are not sent"
-    add("--accept", default="confidence:0.9", metavar="NAME:MIN", help=text)
+    add_options(group, "--accept")
     text = "largest standard deviation of a position that is sent (default 50)"
     add("--max-std-m", type=float, default=50.0, metavar="M", help=text)
     text = "also send dead-reckoned positions, as GLOBAL_POSITION_SENSOR with the flag UNHEALTHY"
@@ -138,8 +119,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
 def _add_flight(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("flight")
     add = group.add_argument
-    text = "known: from telemetry (default); unknown: all headings are tried"
-    add("--heading", choices=("known", "unknown"), default="known", help=text)
+    add_options(group, "--heading", "--budget-ms", "--threads", "--require-signed", "--not-before")
     text = "start position and its standard deviation per axis (default: anywhere on the map); "
     text += "over a map with terrain also the take-off position"
     triple = "LAT,LON,STD_M"
@@ -156,8 +136,6 @@ def _add_flight(parser: argparse.ArgumentParser) -> None:
     add("--deadline-ms", type=float, default=500.0, metavar="MS", help=text)
     text = "height above ground from which views are located (default: 60 pixels of the map across)"
     add("--min-agl-m", type=float, metavar="M", help=text)
-    add_search(group)
-    add_signature(group)
 
     add = parser.add_argument_group("flight log").add_argument
     text = "write a flight log that can be replayed"

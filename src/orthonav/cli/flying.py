@@ -2,9 +2,9 @@
 
 import argparse
 import hashlib
-import importlib
 import logging
 import math
+import os
 import sys
 import threading
 from collections import deque
@@ -14,10 +14,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import search_plan
-from orthonav.cli.heights import map_heights
-from orthonav.cli.signed import checked_signature
-from orthonav.cli.source import FAR_M, distance_from_map, far_text
+from orthonav.cli.common import checked_signature, search_plan
+from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
 from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
@@ -33,41 +31,21 @@ from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Prior
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard import cameras
+from orthonav.onboard import cameras, outputs, state
 from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases, Resumed
-from orthonav.onboard.gnss.watch import GnssSource, GnssWatch, LiveSolutions, RecordedSolutions
+from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
 from orthonav.onboard.health import TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.messages.mavlink import Signing, signing_timestamp
-from orthonav.onboard.messages.mavlink_local import Origin
+from orthonav.onboard.messages.mavlink import Origin, Signing, signing_timestamp
 from orthonav.onboard.messages.nmea import Quality
-from orthonav.onboard.outputs import (
-    KINDS,
-    LOCAL,
-    PX4_VISION_S,
-    JsonOut,
-    MessageOptions,
-    Messenger,
-    NmeaOut,
-    Publisher,
-    open_sink,
-)
 from orthonav.onboard.ports import transport_opener
 from orthonav.onboard.run import Locator, MountCorrected, model_of
-from orthonav.onboard.state import (
-    before_the_flight,
-    boot_id,
-    learnt_biases,
-    load,
-    prior_of,
-    require_newest,
-)
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 
 if TYPE_CHECKING:
@@ -103,9 +81,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     if options.ros2:
-        ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
-        frame = localizer.sheet.frame
-        source, graph = ros2.joined(options, clocks, stopping, stack, frame, least)
+        source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, least)
     else:
         source, graph = _source(options, clocks, link, camera, stopping), None
     console.quiet |= logging.getLogger("orthonav").level >= logging.WARNING  # --log-level of ROS
@@ -120,8 +96,9 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
         gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, least, clocks)
     newest = NewestImage()
+    wanted = None if options.ros2 else f"images from {options.source}"  # ROS 2 has its own text
     narrator = Narrator(
-        *(console, clocks, newest, _wanted(options), link, options.autopilot),
+        *(console, clocks, newest, wanted, link, options.autopilot),
         is_live=options.ros2 or cameras.is_live(options.source),
         sends=not options.dry_run and (link is not None or graph is not None),
     )
@@ -169,20 +146,55 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     )
 
 
+def _ros2(
+    options: argparse.Namespace,
+    clocks: Clocks,
+    stopping: threading.Event,
+    stack: ExitStack,
+    frame: LocalFrame,
+    min_confidence: float,
+) -> "tuple[Any, Ros2Publisher]":
+    """Reader and publisher of a new node, which `stack` closes. The centre of `frame` is the origin
+    of the ROS map frame unless `--origin` is given."""
+    from orthonav.onboard.ros2.arguments import ros_arguments
+    from orthonav.onboard.ros2.graph import Rosout
+    from orthonav.onboard.ros2.node import joined_graph
+    from orthonav.onboard.ros2.publisher import Ros2Publisher
+    from orthonav.onboard.ros2.reader import Ros2Reader
+
+    node = joined_graph(ros_arguments(options.ros_args, os.environ), os.environ)
+    stack.callback(node.close)
+    rosout, logger = Rosout(node), logging.getLogger("orthonav")
+    logger.addHandler(rosout)
+    stack.callback(logger.removeHandler, rosout)
+    reader = Ros2Reader(
+        node,
+        TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
+        clocks,
+        stopping.is_set,
+        mount_deg=tuple(options.mount_deg),
+    )
+    publisher = Ros2Publisher(
+        node,
+        LocalFrame(*options.origin[:2]) if options.origin else frame,
+        reader.now_ns,
+        origin_alt_m=options.origin[2] if options.origin else math.nan,
+        min_std_m=options.min_std_m,
+        min_confidence=min_confidence,
+        silent=options.dry_run,
+    )
+    reader.report_wait = lambda why: publisher.health(
+        {"health": "FAILED", "reasons": ["no_camera"], "waiting": why}
+    )
+    return reader, publisher
+
+
 def _opened(options: argparse.Namespace) -> MapFile:
     signature = checked_signature(options)
     opened = open_map(options.map, signature.manifest_sha256 if signature else None)
     if signature is not None and options.state is not None:
-        require_newest(options.state, signature, options.map)
+        state.require_newest(options.state, signature, options.map)
     return opened
-
-
-def _wanted(options: argparse.Namespace) -> str | None:
-    """The images that are waited for; None for those of ROS 2, whose reader says so."""
-    if options.ros2:
-        return None
-    clock = " (times of the autopilot's clock)" if options.file_clock == "autopilot" else ""
-    return f"images from {options.source}{clock}"
 
 
 def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLog | None":
@@ -279,7 +291,7 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
             raise VariantError(
                 f"signing key: expected 32 bytes or 64 hexadecimal digits: {options.signing_key}"
             ) from None
-    saved = load(options.state) if options.state else None
+    saved = state.load(options.state) if options.state else None
     stamp = signing_timestamp(clocks.utc_ns())
     return Signing(key, max(stamp, saved.signing_timestamp_10us + 1 if saved else 0))
 
@@ -292,18 +304,15 @@ def _publisher(
     graph: "Ros2Publisher | None",
     narrator: Narrator,
     digest: str,
-) -> Publisher:
-    interval = {}
-    if options.send_rate_hz is not None:
-        if not options.send_rate_hz > 0:
-            raise VariantError("--send-rate-hz must be above 0")
-        interval = dict.fromkeys([*KINDS.values(), "NMEA", "ROS2"], 1 / options.send_rate_hz)
-    _warn_of_a_low_rate(options)
+) -> outputs.Publisher:
     rules = GateRules(
-        least, options.max_std_m, min_interval_s=interval, send_coasting=options.send_coasting
+        least,
+        options.max_std_m,
+        min_interval_s=_intervals_s(options),
+        send_coasting=options.send_coasting,
     )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
-    chosen = MessageOptions(
+    chosen = outputs.MessageOptions(
         kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
         clock=Clock(options.stamp),
         sensor_id=options.sensor_id,
@@ -316,15 +325,15 @@ def _publisher(
     )
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
-        nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
+        nmea = [outputs.NmeaOut(outputs.open_sink(url), quality=quality) for url in options.nmea]
         lines: list[Any] = [
-            JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
+            outputs.JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
             for each in options.jsonl
         ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
-    messenger = None if link is None else Messenger(chosen, gate, link, clocks)
-    return Publisher(
+    messenger = None if link is None else outputs.Messenger(chosen, gate, link, clocks)
+    return outputs.Publisher(
         gate,
         clocks,
         messenger=messenger,
@@ -336,16 +345,19 @@ def _publisher(
     )
 
 
-def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
-    local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
-    if local and options.send_rate_hz is not None and options.send_rate_hz * PX4_VISION_S <= 1:
+def _intervals_s(options: argparse.Namespace) -> dict[str, float]:
+    rate_hz = options.send_rate_hz
+    if rate_hz is None:
+        return {}
+    if not rate_hz > 0:
+        raise VariantError("--send-rate-hz must be above 0")
+    local = [outputs.KINDS[kind] for kind in options.send or () if kind in outputs.LOCAL]
+    if local and rate_hz * outputs.PX4_VISION_S <= 1:
         log.warning(
-            "PX4 fuses %s only at more than %g Hz, got %g Hz: send global-position to PX4, or "
-            "raise the rate",
-            " and ".join(local),
-            1 / PX4_VISION_S,
-            options.send_rate_hz,
+            f"PX4 fuses {' and '.join(local)} only at more than {1 / outputs.PX4_VISION_S:g} Hz, "
+            f"got {rate_hz:g} Hz: send global-position to PX4, or raise the rate"
         )
+    return dict.fromkeys([*outputs.KINDS.values(), "NMEA", "ROS2"], 1 / rate_hz)
 
 
 def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
@@ -371,32 +383,18 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
     terrain, ground = sheet.terrain, "level ground"
     if terrain is not None:
         ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
-    recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
-    telemetry = ", ".join(each for each in (options.autopilot, recorded) if each)
     kinds = dict.fromkeys(options.send or ["global-position"])
-    sent = [KINDS[kind] for kind in kinds] if options.autopilot else []
+    sent = [outputs.KINDS[kind] for kind in kinds] if options.autopilot else []
     sent += ["ROS 2 topics"] if options.ros2 else []
     if options.dry_run and sent:
         sent = ["nothing to the autopilot (--dry-run)"]
     sent += [f"NMEA to {url}" for url in options.nmea]
     sent += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
     confident = f"; positions of confidence {least:g} or more"
-    start = "anywhere on the map"
-    if options.start:
-        lat_deg, lon_deg, std_m = options.start
-        start = f"{lat_deg:.6f}, {lon_deg:.6f} +- {std_m:g} m"
-    if options.state is not None:
-        start = f"position saved in {options.state}, if it is recent, else {start}"
-    lines = [
+    return [
         f"map: {options.map}, {area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}",
-        f"autopilot: {'telemetry from ROS 2' if options.ros2 else telemetry}",
         f"sends: {', '.join(sent) + confident if sent else 'nothing'}",
-        f"start: {start}",
-        f"GNSS: {'not used' if options.gnss == 'off' else options.gnss}",
     ]
-    if options.log is not None:
-        lines.append(f"log: {options.log}, views: {options.log_views}")
-    return lines
 
 
 def camera_line(options: argparse.Namespace, camera: Camera) -> str:
@@ -404,14 +402,9 @@ def camera_line(options: argparse.Namespace, camera: Camera) -> str:
     fisheye = camera.model == "fisheye"
     angles = [each if fisheye else 2 * math.atan(each / 2) for each in camera.extent]
     width_deg, height_deg = map(math.degrees, angles)
+    size = f"{camera.width_px}x{camera.height_px} px, {width_deg:.0f} x {height_deg:.0f} deg"
     given = options.camera or ("camera_info" if options.ros2 else "flight.json")
-    source, pace = "ROS 2" if options.ros2 else str(options.source), ""
-    if not options.ros2 and not cameras.is_live(source):
-        pace = f", played at {options.pace:g} times real time" if options.pace != 1 else ", played"
-    return (
-        f"camera: {camera.width_px}x{camera.height_px} px, {width_deg:.0f} x {height_deg:.0f} deg "
-        f"({given}); images from {source}{pace}"
-    )
+    return f"camera: {size} ({given}); images from {'ROS 2' if options.ros2 else options.source}"
 
 
 def gnss_watch(
@@ -428,13 +421,12 @@ def gnss_watch(
     if options.gnss == "correct" and options.state is None:
         raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
     recorded = options.recorded_telemetry and not options.ros2
-    source: GnssSource
     if recorded:
-        source = RecordedSolutions(read_gnss(Path(options.source) / FILE))
+        source = recorded_solutions(read_gnss(Path(options.source) / FILE))
     elif queue is None:
         raise VariantError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
     else:
-        source = LiveSolutions(queue)
+        source = live_solutions(queue)
 
     known, resumed = _learnt_before(options, digest, clocks)
     return GnssWatch(
@@ -458,12 +450,12 @@ def _learnt_before(
     stopped at most `--state-max-age-s` ago, or at an unknown time."""
     if options.state is None:
         return {}, None
-    saved = load(options.state)
+    saved = state.load(options.state)
     if saved is not None:
-        stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
         if stopped_s > options.state_max_age_s:
-            return learnt_biases(options.state), None
-    return before_the_flight(options.state, digest)
+            return state.learnt_biases(options.state), None
+    return state.before_the_flight(options.state, digest)
 
 
 def start_of(
@@ -471,14 +463,14 @@ def start_of(
 ) -> Callable[[], Prior | None]:
     """Gives the first prior: a recent saved position, but once only, else `--start`, else None."""
     given = given_start(options, localizer)
-    saved = [load(options.state)] if options.state else []
+    saved = [state.load(options.state)] if options.state else []
 
     def prior() -> Prior | None:
         last = saved.pop() if saved else None
         if last is None:
             return given
-        age_s = last.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
-        return prior_of(last, age_s, options.state_max_age_s) or given
+        age_s = last.age_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
+        return state.prior_of(last, age_s, options.state_max_age_s) or given
 
     return prior
 

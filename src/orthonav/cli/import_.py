@@ -5,82 +5,46 @@ import logging
 from dataclasses import asdict
 from pathlib import Path
 
-from orthonav.cli.common import counted, print_json, progress
-from orthonav.cli.heights import dem_of, geoid_for
+from orthonav.cli.common import add_options, counted, print_json, progress
 from orthonav.cli.source import add_source, open_source
 
 log = logging.getLogger(__name__)
 
+EXAMPLE = "photos/ --out flight"
 EVERYDAY = (
-    "--kind",
-    "--camera",
-    "--telemetry",
-    "--time-offset-s",
-    "--mount-deg",
-    "--rate-hz",
-    "--agl-m",
-    "--dem",
-    "--json",
+    *("--kind", "--camera", "--telemetry", "--time-offset-s", "--mount-deg", "--rate-hz"),
+    *("--agl-m", "--json"),
 )
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "source",
-        type=Path,
-        nargs="+",
-        metavar="SOURCE",
-        help="photographs (a folder, files, or a CSV of images by file name), video, ROS 1 or 2 "
-        "bag, MCAP file, or flight folder",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FLIGHT_DIR", help="folder to write"
-    )
-    add_source(parser)
-    parser.add_argument(
-        "--jpeg-quality",
-        type=int,
-        choices=range(1, 101),
-        metavar="1..100",
-        help="quality of JPEG images; raw images and frames of a video are then stored as JPEG "
-        "(default: PNG, lossless)",
-    )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    text = "photographs (a folder, files, or a CSV of images by file name), video, ROS 1 or 2 bag, "
+    text += "MCAP file, or flight folder"
+    parser.add_argument("source", type=Path, nargs="+", metavar="SOURCE", help=text)
+    parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR", help="to write")
+    add_source(parser, dem=False)
+    text = "quality of JPEG images, 1 to 100; raw images and frames of a video are then stored as "
+    text += "JPEG (default: PNG, lossless)"
+    parser.add_argument("--jpeg-quality", type=int, choices=range(1, 101), metavar="N", help=text)
+    add_options(parser, "--json")
 
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.geo.headings import RADIANS
-    from orthonav.ground.recordings import OverTerrain, import_flight
+    from orthonav.ground.recordings import import_flight
 
-    dem = dem_of(options)
-    recording = open_source(options.source, options, over_terrain=dem is not None)
-    over = None
-    if dem is not None:
-        over = OverTerrain(dem, f"the terrain of {options.dem.name}", geoid_for(recording))
-        recording = over.recording(recording)
+    recording = open_source(options.source, options)
     with progress(options) as shown:
         done = import_flight(
             recording, options.out, options.jpeg_quality, lambda share: shown("import", share)
         )
     if done.broken:
         log.warning("%d views left out, the first: %s", done.broken, done.first_broken)
-    if over is not None and over.without:
-        log.warning(
-            "%d views have no height above ground: no height or no position was recorded, or it "
-            "lies over a hole of the terrain, or outside it",
-            over.without,
-        )
-    if done.complete < done.views:
-        log.warning(
-            "%d of %d views lack heading, pitch, roll or height",
-            done.views - done.complete,
-            done.views,
-        )
     if done.radians:
         log.warning("%s", RADIANS)
     if options.json:
         plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
-        print_json({**plain, **asdict(done)})
+        print_json(plain | asdict(done))
     else:
         print(
             f"{counted(done.views, 'view')}, {done.complete} with heading, tilt and height, "

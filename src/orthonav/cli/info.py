@@ -2,30 +2,25 @@
 
 import argparse
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import beside, print_json
+from orthonav.cli.common import add_options, beside, print_json
 
 if TYPE_CHECKING:
     from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 
+EXAMPLE = "area.onav"
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to describe")
-    parser.add_argument("--json", action="store_true", help="print as JSON")
-    parser.add_argument(
-        "--footprint",
-        type=Path,
-        metavar="FILE.geojson",
-        help="write the outline of the area with imagery as GeoJSON; -: stdout",
-    )
-    parser.add_argument(
-        "--preview",
-        type=Path,
-        metavar="FILE.png",
-        help="write the imagery as a grey .png or .tif for QGIS, georeferenced by FILE.aux.xml",
-    )
+    add_options(parser, "--json")
+    text = "write the outline of the area with imagery as GeoJSON; -: stdout"
+    parser.add_argument("--footprint", type=Path, metavar="FILE.geojson", help=text)
+    text = "write the imagery as a grey .png or .tif for QGIS, georeferenced by FILE.aux.xml"
+    parser.add_argument("--preview", type=Path, metavar="FILE.png", help=text)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -47,8 +42,14 @@ def run(options: argparse.Namespace) -> None:
 
 
 def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]:
-    area_km2 = manifest.area_km2
-    size_mb = size_bytes / 1e6
+    area_km2, size_mb = manifest.area_km2, size_bytes / 1e6
+    registered = manifest.registration
+    radius_m: Any = manifest.radius_m
+    calibrated = manifest.confidence is not None
+    tile_level = {"tile_radius_m": radius_m, "tiles_calibrated": calibrated}
+    if registered is not None:
+        radius_m, calibrated = registered.get("radius_m"), registered.get("confidence") is not None
+    terrain = manifest.sheets[0].terrain
     return {
         "map": str(path),
         "created_by": manifest.created_by,
@@ -57,9 +58,11 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         "size_mb": round(size_mb, 4),
         "mb_per_km2": round(size_mb / area_km2, 4) if area_km2 > 0 else None,
         "recipe": manifest.recipe,
-        **_confidence(manifest),
+        "radius_m": radius_m if isinstance(radius_m, int | float) else None,
+        "calibrated": calibrated,
+        **tile_level,
         "registration": _registration(manifest),
-        "terrain": _terrain(manifest),
+        "terrain": None if terrain is None else asdict(terrain),
         "sheets": [
             {
                 "centre_lat_deg": sheet.frame.lat_deg,
@@ -74,85 +77,29 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
             for sheet in manifest.sheets
         ],
         "imagery": list(manifest.imagery),
-        "parts_mb": {
-            name: round(_part_bytes(part) / 1e6, 4) for name, part in manifest.parts.items()
-        },
     }
-
-
-def _confidence(manifest: "Manifest") -> dict[str, Any]:
-    tiles = {
-        "tile_radius_m": manifest.radius_m,
-        "tiles_calibrated": manifest.confidence is not None,
-    }
-    registered = manifest.registration
-    if registered is None:
-        return {"radius_m": manifest.radius_m, "calibrated": tiles["tiles_calibrated"], **tiles}
-    radius_m = registered.get("radius_m")
-    return {
-        "radius_m": radius_m if isinstance(radius_m, int | float) else None,
-        "calibrated": registered.get("confidence") is not None,
-        **tiles,
-    }
-
-
-def _confidence_text(plain: Mapping[str, Any]) -> str:
-    radius = "-" if plain["radius_m"] is None else f"{plain['radius_m']:g}"
-    text = f"{'probability of an error below' if plain['calibrated'] else 'none, for'} {radius} m"
-    if plain["registration"] is None:
-        return text
-    tiles = f"{'' if plain['tiles_calibrated'] else 'none, for '}{plain['tile_radius_m']:g} m"
-    return f"{text}; with --registration off, {tiles}"
 
 
 def _registration(manifest: "Manifest") -> dict[str, Any] | None:
-    """`ground_km2` extends beyond the tile centres; `raw_bytes` is that of uncompressed RGB."""
+    """`ground_km2` extends beyond the tile centres."""
     from orthonav.core.mapfile.layer import part_names
 
-    size, raw, ground_km2 = 0, 0, 0.0
-    infos = [sheet.grey for sheet in manifest.sheets if sheet.grey is not None]
-    for number, sheet in enumerate(manifest.sheets):
-        if sheet.grey is not None:
-            found = [manifest.parts.get(name) for name in part_names(number).values()]
-            size += sum(_part_bytes(part) for part in found if part is not None)
-            raw += sheet.grey.raw_bytes
-            ground_km2 += sheet.grey.valid_px * sheet.grid.gsd_m**2 / 1e6
-    if not infos:
+    sheet = manifest.sheets[0]
+    if sheet.grey is None:
         return None
+    parts = [manifest.parts.get(name) for name in part_names(0).values()]
+    size = sum(_part_bytes(part) for part in parts if part is not None)
+    ground_km2 = sheet.grey.valid_px * sheet.grid.gsd_m**2 / 1e6
     return {
-        "levels": max(info.levels for info in infos),
-        "quality": max(info.quality for info in infos),
+        "levels": sheet.grey.levels,
+        "quality": sheet.grey.quality,
         "bytes": size,
-        "raw_bytes": raw,
-        "raw_ratio": round(raw / size, 2) if size else None,
         "ground_km2": round(ground_km2, 4),
         "mb_per_km2": round(size / 1e6 / ground_km2, 4) if ground_km2 > 0 else None,
     }
 
 
-def _terrain(manifest: "Manifest") -> dict[str, Any] | None:
-    from orthonav.core.mapfile.terrain import terrain_part_names
-
-    info = manifest.sheets[0].terrain
-    if info is None:
-        return None
-    parts = [manifest.parts[name] for name in terrain_part_names(0) if name in manifest.parts]
-    size = sum(_part_bytes(part) for part in parts)
-    ground_km2 = info.known * info.posting_m**2 / 1e6
-    return {
-        "low_m": info.low_m,
-        "high_m": info.high_m,
-        "posting_m": info.posting_m,
-        "name": info.name,
-        "datum": info.datum,
-        "bytes": size,
-        "ground_km2": round(ground_km2, 4),
-        "mb_per_km2": round(size / 1e6 / ground_km2, 5) if ground_km2 > 0 else None,
-    }
-
-
 def _bounds_deg(sheet: "SheetInfo") -> list[float]:
-    """West, south, east, north of the outer tile centres."""
     import numpy as np
 
     grid = sheet.grid
@@ -181,44 +128,31 @@ def summary_text(plain: dict[str, Any]) -> str:
             f"{sheet['centre_lon_deg']:.6f}"
         )
         lines.append(f"bounds     {','.join(f'{each:.6f}' for each in sheet['bounds_deg'])}")
-    lines.append(f"grey       {_registration_text(plain['registration'])}")
-    lines += _terrain_lines(plain["terrain"])
+    grey, terrain = plain["registration"], plain["terrain"]
+    said = "no registration layer: positions at tile level only"
+    if grey is not None:
+        said = f"registration layer of {grey['bytes'] / 1e6:.3f} MB, {grey['levels']} levels"
+    lines.append(f"grey       {said}")
+    if terrain is not None:
+        heights = f"{terrain['low_m']:.0f} to {terrain['high_m']:.0f} m above the sea"
+        named = "".join(c for c in f"{terrain['name']}, {terrain['datum']}" if c.isprintable())
+        lines.append(f"terrain    {heights} every {terrain['posting_m']:g} m ({named})")
     for source in plain["imagery"]:
-        dates = [source[key] for key in ("date_from", "date") if source.get(key)]
         files = f"{source['files']} files  " if source.get("files") else ""
+        dates = " to ".join(texts(source, "date_from", "date")) or "date unknown"
         lines.append(
-            f"imagery    {source.get('name')}  {files}{' to '.join(dates) or 'date unknown'}  "
-            f"{source.get('gsd_m')} m  {source.get('crs')}"
+            f"imagery    {source.get('name')}  {files}{dates}  {source.get('gsd_m')} m  "
+            f"{source.get('crs')}"
         )
-        terms = [source[key] for key in ("attribution", "licence") if source.get(key)]
-        if terms:
-            lines.append(f"           {', '.join(map(str, terms))}")
-    lines.append(f"confidence {_confidence_text(plain)}")
+        if terms := texts(source, "attribution", "licence"):
+            lines.append(f"           {', '.join(terms)}")
+    known = "probability of an error below" if plain["calibrated"] else "none, for"
+    radius = "-" if plain["radius_m"] is None else f"{plain['radius_m']:g}"
+    lines.append(f"confidence {known} {radius} m")
     if "build_s" in plain:
         speed = plain["area_km2"] / plain["build_s"]
         lines.append(f"built in   {plain['build_s']:.1f} s, {speed:.2f} km2/s")
     return "\n".join(lines)
-
-
-def _registration_text(layer: dict[str, Any] | None) -> str:
-    if layer is None:
-        return "no registration layer: positions at tile level only"
-    return (
-        f"registration layer of {layer['bytes'] / 1e6:.3f} MB, {layer['mb_per_km2'] or 0:.2f} MB "
-        f"per km2 of ground, {layer['levels']} levels, 1/{layer['raw_ratio'] or 0:.0f} of the raw "
-        "orthophoto"
-    )
-
-
-def _terrain_lines(layer: dict[str, Any] | None) -> list[str]:
-    if layer is None:
-        return []
-    printable = "".join(c for c in f"{layer['name']}, {layer['datum']}" if c.isprintable())
-    return [
-        f"terrain    {layer['low_m']:.0f} to {layer['high_m']:.0f} m above the sea every "
-        f"{layer['posting_m']:g} m, {layer['bytes'] / 1e6:.3f} MB, {layer['mb_per_km2'] or 0:.4f} "
-        f"MB per km2 ({printable})"
-    ]
 
 
 def recipe_text(recipe: dict[str, Any]) -> str:
@@ -238,8 +172,11 @@ def recipe_text(recipe: dict[str, Any]) -> str:
 def imagery_text(imagery: Iterable[Mapping[str, Any]]) -> str:
     parts = []
     for source in imagery:
-        dates = [str(source[key]) for key in ("date_from", "date") if source.get(key)]
-        terms = [str(source[key]) for key in ("attribution", "licence") if source.get(key)]
-        said = " ".join([str(source.get("name")), *dates])
+        said = " ".join([str(source.get("name")), *texts(source, "date_from", "date")])
+        terms = texts(source, "attribution", "licence")
         parts.append(f"{said} ({', '.join(terms)})" if terms else said)
     return "; ".join(parts[:20])
+
+
+def texts(source: Mapping[str, Any], *keys: str) -> list[str]:
+    return [str(source[key]) for key in keys if source.get(key)]

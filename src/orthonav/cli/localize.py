@@ -4,194 +4,107 @@ import argparse
 import json
 import logging
 import math
-from collections.abc import Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.changed import (
-    add_report_changes,
-    changes_text,
-    changes_to_plain,
-    check_comparable,
-    report_changes,
-)
 from orthonav.cli.common import (
     Progress,
-    add_search,
+    add_options,
     beside,
+    checked_signature,
     counted,
     print_json,
     progress,
+    reporter,
     search_plan,
 )
-from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
-from orthonav.cli.needs import require_extras
-from orthonav.cli.setups import SetupAdvice
-from orthonav.cli.signed import add_signature, checked_signature
-from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
+from orthonav.cli.source import (
+    FAR_M,
+    add_source,
+    dem_of,
+    far_from_map,
+    far_text,
+    flight_heights,
+    located,
+    open_source,
+    say_assumed_heights,
+    warn_if_far_from_map,
+)
+from orthonav.cli.version import require_extras
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
     from orthonav.core.flight.fixes import Identity
-    from orthonav.core.flight.heights import FlownHeights
     from orthonav.core.flight.mount import Mount
+    from orthonav.core.flight.recording import Flight
     from orthonav.core.localize import Localizer
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile import MapFile
-    from orthonav.core.records import Fix, ViewResult
-    from orthonav.ground.changes.record import ChangedGround
+    from orthonav.core.records import Fix, Telemetry, ViewResult
     from orthonav.ground.recordings import Recording, SourceView
-    from orthonav.onboard.run import Locator
+    from orthonav.ground.recordings.setups import Tried
 
+EXAMPLE = "area.onav flight --out fixes.jsonl"
 EVERYDAY = (
-    "--heading",
-    "--prior",
-    "--track",
-    "--smooth",
-    "--accept",
-    "--mount",
-    "--atlas",
-    "--camera",
-    "--fov-deg",
-    "--agl-m",
-    "--dem",
-    "--json",
+    *("--heading", "--prior", "--track", "--smooth", "--accept", "--mount", "--atlas"),
+    *("--camera", "--fov-deg", "--agl-m", "--dem", "--json"),
 )
-
+BUDGET_S = 15.0
+"""After so long no further view is localized: the search for the cause takes at most 20 s."""
 log = logging.getLogger(__name__)
-
-_HINTS = (
-    ("yaw_deg", "give --heading unknown"),
-    ("agl_m", "give --agl-m"),
-    ("pitch_deg", "give --looks-down"),
-)
-"""What to do about a value that is missing."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("map", metavar="MAP.onav", help="map, or with --atlas an atlas")
-    parser.add_argument(
-        "flight",
-        type=Path,
-        nargs="+",
-        metavar="SOURCE",
-        help="flight folder, photographs, video or ROS recording, as for `orthonav import`",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="fixes.jsonl",
-        help="file to write (-: stdout, with the summary on stderr); without it the command prints "
-        "the positions, if photographs are given one by one",
-    )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    parser.add_argument(
-        "--no-diagnosis",
-        dest="diagnosis",
-        action="store_false",
-        help="if few views are confident, do not try other headings and heights to find the cause",
-    )
-    _add_views(parser.add_argument_group("placing views"))
-    _add_track(parser.add_argument_group("tracking"))
-    _add_outputs(parser.add_argument_group("further outputs"))
-    add_signature(parser.add_argument_group("signed maps"))
+    add = parser.add_argument
+    add("map", metavar="MAP.onav", help="map, or with --atlas an atlas")
+    text = "flight folder, photographs, video or ROS recording, as for `orthonav import`"
+    add("flight", type=Path, nargs="+", metavar="SOURCE", help=text)
+    text = "file to write (-: stdout, with the summary on stderr); without it the command prints "
+    text += "the positions, if photographs are given one by one"
+    add("--out", type=Path, metavar="fixes.jsonl", help=text)
+    text = "write the confident camera positions for other programs too: csv, kml, gpx, tum (a "
+    text += "trajectory for evo) or odm-geo (OpenDroneMap's geo.txt); heights above sea need a "
+    text += "terrain; can be repeated"
+    add("--export", action="append", default=[], metavar="FORMAT=PATH", help=text)
+    text = "write where the ground no longer looks like the map, by the confident views; `check "
+    add("--report-changes", type=Path, metavar="FILE.geojson", help=f"{text}--changes` reads it")
+    add_options(parser, "--json")
+    text = "if few views are confident, do not try other headings and heights to find the cause"
+    add("--no-diagnosis", dest="diagnosis", action="store_false", help=text)
+
+    group = parser.add_argument_group("placing views")
+    add = group.add_argument
+    add_options(group, "--heading", "--prior")
+    text = "criterion of a confident fix and its threshold: confidence:0.9 (default), "
+    text += "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (with --registration off); other fixes "
+    text += 'are written too, marked "confident": false'
+    add_options(group, "--accept", help=text)
+    text = "the first argument is an atlas (folder or URL); no prior is used, and a fix needs the "
+    add("--atlas", action="store_true", help=f"{text}agreement of several views")
+    text = "on: positions within a pixel, where the map has a registration layer (default); off: "
+    text += "positions at tile level, as in the paper"
+    add("--registration", choices=("on", "off"), default="on", help=text)
+    text = "with --registration off, how scores become a position: interpolated peak (default), "
+    text += "best tile (the paper), mean of the best tile and its neighbours, or weighted mean of "
+    rules = ("peak", "best", "neighbours", "weighted")
+    add("--position", choices=rules, default="peak", help=f"{text}all")
+    add_options(group, "--budget-ms", "--threads", "--require-signed", "--not-before")
+    text = "write images that are missing or cannot be decoded as no_fix instead of stopping"
+    add("--skip-bad-images", action="store_true", help=text)
+
+    group = parser.add_argument_group("tracking")
+    add = group.add_argument
+    text = "track the aircraft: every position also uses the views before it"
+    add("--track", action="store_true", help=text)
+    text = "track, then smooth: every position uses all views of the flight"
+    add("--smooth", action="store_true", help=text)
+    text = "with --smooth: number of later views that a position uses (default: all)"
+    add("--lag", type=int, metavar="VIEWS", help=text)
+    add_options(group, "--mount")
+    add("--as-flown", action="store_true", help="flight log: use the options of the flight")
     add_source(parser)
-
-
-def _add_views(group: argparse._ActionsContainer) -> None:
-    """How each view is searched for, and which fixes count as confident."""
-    group.add_argument(
-        "--heading",
-        choices=("known", "unknown"),
-        default="known",
-        help="known: from telemetry (default); unknown: all headings are tried",
-    )
-    group.add_argument(
-        "--prior",
-        choices=("telemetry", "none"),
-        default="telemetry",
-        help="telemetry: search around the prior position in the telemetry, if any (default); "
-        "none: search the whole map",
-    )
-    group.add_argument(
-        "--accept",
-        metavar="NAME:MIN",
-        default="confidence:0.9",
-        help="criterion of a confident fix and its threshold: confidence:0.9 (default), "
-        "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (with --registration off); other fixes are "
-        'written too, marked "confident": false',
-    )
-    group.add_argument(
-        "--atlas",
-        action="store_true",
-        help="the first argument is an atlas (folder or URL); no prior is used, and a fix needs "
-        "the agreement of several views",
-    )
-    group.add_argument(
-        "--registration",
-        choices=("on", "off"),
-        default="on",
-        help="on: positions within a pixel, where the map has a registration layer (default); off: "
-        "positions at tile level, as in the paper",
-    )
-    group.add_argument(
-        "--position",
-        choices=("peak", "best", "neighbours", "weighted"),
-        default="peak",
-        help="with --registration off, how scores become a position: interpolated peak (default), "
-        "best tile (the paper), mean of the best tile and its neighbours, or weighted mean of all",
-    )
-    add_search(group)
-    group.add_argument(
-        "--skip-bad-images",
-        action="store_true",
-        help="write images that are missing or cannot be decoded as no_fix instead of stopping",
-    )
-
-
-def _add_track(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--track",
-        action="store_true",
-        help="track the aircraft: every position also uses the views before it",
-    )
-    group.add_argument(
-        "--smooth",
-        action="store_true",
-        help="track, then smooth: every position uses all views of the flight",
-    )
-    group.add_argument(
-        "--lag",
-        type=int,
-        metavar="VIEWS",
-        help="with --smooth: number of later views that a position uses (default: all)",
-    )
-    group.add_argument(
-        "--mount",
-        type=Path,
-        metavar="mount.json",
-        help="correct heading, height and tilt with a calibration by `orthonav calibrate`",
-    )
-    group.add_argument(
-        "--as-flown",
-        action="store_true",
-        help="flight log: use the options of the flight",
-    )
-
-
-def _add_outputs(group: argparse._ActionsContainer) -> None:
-    group.add_argument(
-        "--export",
-        action="append",
-        default=[],
-        metavar="FORMAT=PATH",
-        help="write the confident camera positions for other programs too: csv, geojson, kml, gpx, "
-        "tum (a trajectory for evo), odm-geo (OpenDroneMap's geo.txt) or exif (a table for "
-        "`exiftool -csv=PATH FOLDER`); heights above sea need a terrain; can be repeated",
-    )
-    add_report_changes(group)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -227,7 +140,6 @@ def _on_map(options: argparse.Namespace) -> None:
     mount = _take_flown(options, flight)
     accept = Acceptance.parse(options.accept)
     localizer = _localizer(options, opened, accept)
-    check_comparable(options, localizer.registration, opened)
     warn_if_far_from_map(flight, localizer)
     how = {
         "use_prior": options.prior == "telemetry",
@@ -243,26 +155,55 @@ def _on_map(options: argparse.Namespace) -> None:
     if mount:
         locator = MountCorrected(locator, mount)
     heights = flight_heights(options, opened, flight, dem)
-    advisor, digest = SetupAdvice(options, flight, localizer, mount, heights), FlightDigest()
+
+    def corrected(telemetry: "Telemetry") -> "Telemetry":
+        made = telemetry if heights is None else heights.corrected(telemetry)
+        return mount.corrected(made) if mount else made
+
+    advisor = SetupAdvice(options, flight, localizer, corrected)
+    digest = FlightDigest()
     with progress(options) as shown:
         views = digest.watching(advisor.watching())
-        results = _located(options, locator, flight, accept, views, shown, heights, advisor.take)
+        how_shown = (accept, heights, advisor.take)
+        results = located(options, locator, flight, views, shown, *how_shown)
         if tracker is not None and options.smooth:
             results = smoothed_track(tracker, results, accept)
         else:
             compare_with_flight(flight, results)
         _write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
         export_all(exports, results, dem or TerrainLayer.of(opened))
-        advice, tried = advisor.advice(results, accept, shown)
+        advice, tried = advisor.advice(results, accept)
         seen_by = MountedFlight(flight, mount) if mount else flight
-        changed = report_changes(options, opened, [(seen_by, results)], shown)
-    with _beside_outputs(options):
-        _print_summary(options, results, accept, advice, tried, changed)
+        changed = report_changes(options, opened, seen_by, results, shown)
+    _print_summary(options, results, accept, advice, tried, changed)
+
+
+def report_changes(
+    options: argparse.Namespace,
+    opened: "MapFile",
+    flight: "Flight",
+    results: "Sequence[ViewResult]",
+    shown: Progress,
+) -> tuple[dict[str, Any], list[str]]:
+    """Write the changed ground that `--report-changes` asks for; JSON values and lines about it."""
+    from orthonav.ground.changes.ground import changes_of_flight
+    from orthonav.ground.changes.record import write_changes
+
+    path = options.report_changes
+    if path is None:
+        return {}, []
+    found = changes_of_flight(opened, flight, results, lambda share: shown("changes", share))
+    if found is None:
+        return {"changes": None}, ["changes: no view is confident; nothing was written"]
+    write_changes(path, found)
+    areas = {"seen_m2": round(found.seen_m2), "changed_m2": round(found.changed_m2)}
+    lines = [f"changes: {found.text()}; written to {path}"]
+    return {"changes": {"file": str(path), **areas}}, lines
 
 
 def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptance") -> "Localizer":
     """The localizer of a map; raises `VariantError` where the criterion does not fit it."""
-    from orthonav.core.errors import VariantError
+    from orthonav.core.errors import MapFileError, VariantError
     from orthonav.core.localize import Localizer
     from orthonav.core.tiles.position import check_rule
 
@@ -274,6 +215,11 @@ def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptan
     )
     if made.registration is not None and accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
+    if made.registration is None and options.report_changes:
+        raise MapFileError(
+            "--report-changes needs a map with a registration layer, and not --registration off: "
+            f"{opened.path}"
+        )
     if made.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions are at tile level")
     return made
@@ -321,49 +267,10 @@ def _on_atlas(options: argparse.Namespace) -> None:
             SheetRegistrar(search.atlas), search, heading_known=options.heading == "known"
         )
         views = digest.watching(flight.views)
-        results = _located(options, locator, flight, accept, views, shown)
+        results = located(options, locator, flight, views, shown, accept)
     _write_positions(options, results, Identity(flight_sha256=digest.sha256))
     export_all(exports, results, None)
-    with _beside_outputs(options):
-        _print_summary(options, results, accept)
-
-
-def _located(
-    options: argparse.Namespace,
-    locator: "Locator",
-    flight: "Recording",
-    accept: "Acceptance",
-    views: "Iterable[SourceView]",
-    shown: Progress,
-    heights: "FlownHeights | None" = None,
-    take: "Callable[[ViewResult], None]" = lambda result: None,
-) -> "list[ViewResult]":
-    """Results of the views; `take` gets each."""
-    from orthonav.ground.recordings.localize import localize_flight
-
-    results = []
-    for result in localize_flight(
-        locator,
-        flight,
-        skip_bad_images=options.skip_bad_images,
-        accept=accept,
-        heights=heights,
-        views=views,
-    ):
-        results.append(result)
-        take(result)
-        if flight.expected:
-            shown("localize", min(1.0, len(results) / flight.expected))
-    return results
-
-
-@contextmanager
-def _beside_outputs(options: argparse.Namespace) -> "Iterator[None]":
-    """What is printed goes to stderr where an output is stdout."""
-    outputs = [options.out, options.report_changes]
-    outputs += [Path(each.partition("=")[2]) for each in options.export]
-    with beside(*outputs):
-        yield
+    _print_summary(options, results, accept)
 
 
 def _print_summary(
@@ -372,19 +279,22 @@ def _print_summary(
     accept: "Acceptance",
     advice: Sequence[str] = (),
     tried: Sequence[dict[str, Any]] = (),
-    changed: "ChangedGround | None" = None,
+    changed: tuple[dict[str, Any], list[str]] = ({}, []),
 ) -> None:
+    """Print, on stderr where an output is stdout, how many views have positions and why not."""
     import numpy as np
 
     from orthonav.core.files import is_stdout
+    from orthonav.core.flight.fixes import result_to_json
     from orthonav.ground.recordings.setups import Counts
 
-    counts = Counts.of(results)
+    counts, out = Counts.of(results), options.out
+    exported = [Path(each.partition("=")[2]) for each in options.export]
     latencies = np.array([result.latency_ms for result in results])
     latencies = latencies[np.isfinite(latencies)]
     median_ms = float(np.median(latencies)) if latencies.size else None
     plain = {
-        "fixes": None if options.out is None else str(options.out),
+        "fixes": None if out is None else str(out),
         "views": counts.views,
         "n_confident": counts.confident,
         "n_low_confidence": counts.low,
@@ -394,28 +304,111 @@ def _print_summary(
         "median_latency_ms": None if median_ms is None else round(median_ms, 3),
         "advice": list(advice),
         "setups": list(tried),
-        **changes_to_plain(options, changed),
+        **changed[0],
     }
-    if options.json:
-        print_json(plain | _positions_to_plain(options, results))
-        return
-    least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
-    named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
-    why = f" ({named})" if named else ""
-    print(
-        f"{counted(counts.views, 'view')}: {counts.confident} confident ({least}), "
-        f"{counts.low} of low confidence, {counts.none} without a position{why}; "
-        f"median {median_ms or 0:.1f} ms per view"
-    )
-    for line in advice:
-        print(f"! {line}")
-    for each in options.export:
-        print(f"{counted(counts.confident, 'camera position')}: {each.partition('=')[2]}")
-    guesses = "; positions of low confidence are best guesses, marked as such" * bool(counts.low)
-    if options.out is not None:
-        print(f"written to {'stdout' if is_stdout(options.out) else options.out}{guesses}")
-    for line in changes_text(options, changed):
-        print(line)
+    if out is None:
+        plain["positions"] = [json.loads(result_to_json(result)) for result in results]
+    with beside(out, options.report_changes, *exported):
+        if options.json:
+            print_json(plain)
+            return
+        least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
+        named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
+        why = f" ({named})" if named else ""
+        print(
+            f"{counted(counts.views, 'view')}: {counts.confident} confident ({least}), "
+            f"{counts.low} of low confidence, {counts.none} without a position{why}; "
+            f"median {median_ms or 0:.1f} ms per view"
+        )
+        lines = [f"! {line}" for line in advice]
+        lines += [f"{counted(counts.confident, 'camera position')}: {path}" for path in exported]
+        if out is not None:
+            where = "stdout" if is_stdout(out) else out
+            guesses = "; positions of low confidence are best guesses, marked as such"
+            lines.append(f"written to {where}{guesses * bool(counts.low)}")
+        for line in (*lines, *changed[1]):
+            print(line)
+
+
+class SetupAdvice:
+    """Views of low confidence of a run, from which its summary advises what to check."""
+
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        flight: "Recording",
+        localizer: "Localizer",
+        corrected: "Callable[[Telemetry], Telemetry]",
+    ) -> None:
+        from orthonav.ground.recordings.setups import LowConfidenceViews
+
+        self._options, self._flight, self._localizer = options, flight, localizer
+        self._low = LowConfidenceViews(flight.camera, corrected)
+        self.take = self._low.take
+        self._nearest: tuple[float, str] | None = None
+        self._yaw_deg: list[float] = []
+
+    def watching(self) -> "Iterator[SourceView]":
+        for view in self._low.watching(self._flight.views):
+            found = far_from_map(view, self._localizer)
+            if found is not None and (self._nearest is None or found < self._nearest):
+                self._nearest = found
+            self._yaw_deg.append(view.telemetry.yaw_deg)
+            yield view
+
+    def advice(
+        self, results: "Sequence[ViewResult]", accept: "Acceptance"
+    ) -> "tuple[list[str], list[dict[str, Any]]]":
+        """Sentences on what to check, and the configurations that were tried as JSON values.
+
+        Both are empty where enough views are confident.
+        """
+        from orthonav.core.geo.headings import RADIANS, seem_radians
+        from orthonav.ground.recordings.setups import Counts, setup_text
+
+        counts, known = Counts.of(results), self._options.heading == "known"
+        lines = [RADIANS] if known and seem_radians(self._yaw_deg) else []
+        if not counts.few:
+            return lines, []
+        if self._nearest is not None and self._nearest[0] > FAR_M:
+            return [*lines, far_text("the recorded positions are", *self._nearest)], []
+        # Whether the number that the criterion compares is known of any view.
+        any_value = replace(accept, threshold=-math.inf)
+        if counts.low and not any(any_value.accepts(result.outcome) for result in results):
+            silent = f"no fix states the criterion {accept.criterion}, so none can be confident; "
+            silent += "build the map from a larger or more varied area, or give --accept "
+            return [*lines, f"{silent}peak_ratio:1.3"], []
+        if not self._low.views or not self._options.diagnosis:
+            return lines, []
+        end_s = time.monotonic() + BUDGET_S
+        try:
+            tried = self._tried(accept, end_s)
+        except KeyboardInterrupt:  # skips the search; the results are written
+            return [*lines, "the search for another configuration was interrupted"], []
+        if time.monotonic() > end_s:
+            lines.append(f"the search for another configuration was ended after {BUDGET_S:.0f} s")
+        if tried:
+            lines += setup_text(tried, on_map=self._nearest is not None)
+        return lines, [
+            {"setup": each.setup.name, "views": each.views, "confident": each.confident}
+            for each in tried
+        ]
+
+    def _tried(self, accept: "Acceptance", end_s: float) -> "list[Tried]":
+        from orthonav.ground.recordings.setups import try_setups
+
+        reporter(self._options)(
+            "few views are confident: trying other configurations on some of them for up to "
+            f"{BUDGET_S:.0f} s (Ctrl-C or --no-diagnosis skips this)"
+        )
+        return try_setups(
+            self._localizer,
+            self._low.views,
+            accept.accepts,
+            use_prior=self._options.prior == "telemetry",
+            heading_known=self._options.heading == "known",
+            stop=lambda: time.monotonic() > end_s,
+        )
 
 
 def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | None":
@@ -426,6 +419,7 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
     """
     from orthonav.core.errors import FlightError
     from orthonav.core.flight.mount import read_mount
+    from orthonav.core.mapfile.signature import map_digest
     from orthonav.ground.recordings import LoggedFlight
     from orthonav.ground.recordings.flightlog import LOCALIZE_CHOICES, logged_options
 
@@ -434,38 +428,29 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
         if options.as_flown:
             raise FlightError(f"--as-flown needs a flight log: {flight.path}")
         return mount
-    _check_map(options, flight.session.get("map"))
+    logged = flight.session.get("map")
+    logged = logged if isinstance(logged, dict) else {}
+    if logged.get("manifest_sha256") not in (None, map_digest(options.map)):
+        name = logged.get("name")
+        log.warning("the log was flown with another map (%.80s): %s", name, options.map)
     flown = logged_options(flight.session.get("options"))
-    chosen: dict[str, Any] = {
-        name: getattr(options, name) for name in (*LOCALIZE_CHOICES, "accept")
-    }
-    chosen["track"] = options.track or options.smooth
-    chosen["mount"] = mount
-    if flown.get("accept") is None:  # the runner logs every fix, so the default applies
-        flown.pop("accept", None)
-        chosen.pop("accept")
-    differ = [name for name in chosen if name in flown and flown[name] != chosen[name]]
     if options.as_flown:
-        for name in (*LOCALIZE_CHOICES, "accept", "track"):
+        for name in (*LOCALIZE_CHOICES, "track"):
             setattr(options, name, flown.get(name, getattr(options, name)))
+        options.accept = flown.get("accept") or options.accept
         options.skip_bad_images = True  # a flight continues after an image that cannot be decoded
         return flown.get("mount", mount)
+    chosen = {name: getattr(options, name) for name in (*LOCALIZE_CHOICES, "accept")}
+    chosen |= {"track": options.track or options.smooth, "mount": mount}
+    if flown.get("accept") is None:  # the runner logs every fix, so the default applies
+        flown.pop("accept", None)
+    differ = [name for name in chosen if name in flown and flown[name] != chosen[name]]
     if differ:
         log.warning(
             "options differ from those of the flight (%s); --as-flown uses the logged ones",
             ", ".join(differ),
         )
     return mount
-
-
-def _check_map(options: argparse.Namespace, logged: Any) -> None:
-    from orthonav.core.mapfile.signature import map_digest
-
-    flown = logged.get("manifest_sha256") if isinstance(logged, dict) else None
-    if flown is not None and flown != map_digest(options.map):
-        log.warning(
-            "the log was flown with another map (%.80s): %s", logged.get("name"), options.map
-        )
 
 
 def _check_destination(options: argparse.Namespace) -> None:
@@ -495,40 +480,32 @@ def _write_positions(
             print(_position_text(result))
 
 
-def _positions_to_plain(
-    options: argparse.Namespace, results: "Sequence[ViewResult]"
-) -> dict[str, Any]:
-    """The positions as JSON values, where they are written nowhere else."""
-    from orthonav.core.flight.fixes import result_to_json
-
-    if options.out is not None:
-        return {}
-    return {"positions": [json.loads(result_to_json(result)) for result in results]}
-
-
 def _position_text(result: "ViewResult") -> str:
-    """The position of one view in words, over several lines."""
     from orthonav.core.records import Fix
 
     outcome = result.outcome
     if isinstance(outcome, Fix):
         lines = _lines(outcome, result.is_confident)
     else:
-        hints = [f"; {hint}" for name, hint in _HINTS if name in outcome.detail]
-        lines = [("position", f"none: {outcome.detail} ({outcome.reason}){''.join(hints)}")]
-    return "\n".join([result.frame, *(f"  {name:<11}{text}" for name, text in lines)])
+        hints = {
+            "yaw_deg": "give --heading unknown",
+            "agl_m": "give --agl-m",
+            "pitch_deg": "give --looks-down",
+        }
+        advice = "".join(f"; {hint}" for name, hint in hints.items() if name in outcome.detail)
+        lines = {"position": f"none: {outcome.detail} ({outcome.reason}){advice}"}
+    return "\n".join([result.frame, *(f"  {name:<11}{text}" for name, text in lines.items())])
 
 
-def _lines(fix: "Fix", confident: bool) -> list[tuple[str, str]]:
+def _lines(fix: "Fix", confident: bool) -> dict[str, str]:
     east_m, north_m = (math.sqrt(float(fix.cov_en_m2[i, i])) for i in (0, 1))
     judged = "confident" if confident else "low confidence: this is a best guess"
-    confidence = judged
     if math.isfinite(fix.confidence):
-        confidence = f"{fix.confidence:.2f} that the error is below {fix.radius_m:.0f} m ({judged})"
-    return [
-        ("position", f"{fix.lat_deg:.7f}, {fix.lon_deg:.7f} (latitude, longitude, WGS 84)"),
-        ("deviation", f"{east_m:.1f} m east, {north_m:.1f} m north (1 sigma)"),
-        ("confidence", confidence),
-        ("heading", f"{fix.heading_deg:.1f} deg from true north, of the top of the image"),
-        ("height", f"{fix.agl_m:.1f} m above ground"),
-    ]
+        judged = f"{fix.confidence:.2f} that the error is below {fix.radius_m:.0f} m ({judged})"
+    return {
+        "position": f"{fix.lat_deg:.7f}, {fix.lon_deg:.7f} (latitude, longitude, WGS 84)",
+        "deviation": f"{east_m:.1f} m east, {north_m:.1f} m north (1 sigma)",
+        "confidence": judged,
+        "heading": f"{fix.heading_deg:.1f} deg from true north, of the top of the image",
+        "height": f"{fix.agl_m:.1f} m above ground",
+    }

@@ -6,13 +6,14 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import print_json
+from orthonav.cli.common import add_options, print_json
 
 if TYPE_CHECKING:
     from orthonav.core.flight import FlightFolder, FlightView
     from orthonav.core.geo.camera import Camera
     from orthonav.core.mapfile.terrain import TerrainLayer
 
+EXAMPLE = "fixes.jsonl 0001.jpg 640 480 --flight flight"
 log = logging.getLogger(__name__)
 
 
@@ -21,32 +22,17 @@ def add(parser: argparse.ArgumentParser) -> None:
         "The 95 % ellipse is conservative. It excludes errors of the terrain and the height of "
         "buildings and trees."
     )
-    parser.add_argument(
-        "fixes", type=Path, metavar="fixes.jsonl", help="fixes, as written by `orthonav localize`"
-    )
-    parser.add_argument("frame", metavar="FRAME", help="name of the view, as in the file")
-    parser.add_argument("x", type=float, metavar="X", help="pixels from the left border")
-    parser.add_argument("y", type=float, metavar="Y", help="pixels from the upper border")
-    parser.add_argument(
-        "--flight",
-        type=Path,
-        required=True,
-        metavar="FLIGHT_DIR",
-        help="flight folder that was localized, for camera, pitch and roll",
-    )
-    parser.add_argument(
-        "--map",
-        type=Path,
-        metavar="MAP.onav",
-        help="map of the flight, whose terrain is the ground (default: level ground)",
-    )
-    parser.add_argument(
-        "--mount",
-        type=Path,
-        metavar="mount.json",
-        help="calibration by `orthonav calibrate` with which the flight was localized",
-    )
-    parser.add_argument("--json", action="store_true", help="print the point as JSON")
+    add = parser.add_argument
+    text = "fixes, as written by `orthonav localize`"
+    add("fixes", type=Path, metavar="fixes.jsonl", help=text)
+    add("frame", metavar="FRAME", help="name of the view, as in the file")
+    add("x", type=float, metavar="X", help="pixels from the left border")
+    add("y", type=float, metavar="Y", help="pixels from the upper border")
+    text = "flight folder that was localized, for camera, pitch and roll"
+    add("--flight", type=Path, required=True, metavar="FLIGHT_DIR", help=text)
+    text = "map of the flight, whose terrain is the ground (default: level ground)"
+    add("--map", type=Path, metavar="MAP.onav", help=text)
+    add_options(parser, "--mount", "--json")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -80,21 +66,19 @@ def run(options: argparse.Namespace) -> None:
         log.warning("fixes are of %s: %s", other, options.fixes)
     found = locate_pixel(_camera(flight, view), telemetry, fix, (options.x, options.y), terrain)
     ellipse = ellipse_95(found.cov_en_m2)
-    height_m = None if math.isnan(found.height_m) else round(found.height_m, 2)
+    plain = {
+        "lat_deg": round(found.lat_deg, 9),
+        "lon_deg": round(found.lon_deg, 9),
+        "height_m": None if math.isnan(found.height_m) else round(found.height_m, 2),
+        "range_m": round(found.range_m, 2),
+        "cov_en_m2": found.cov_en_m2.tolist(),
+        "ellipse_95": ellipse,
+        "confident": result.is_confident,
+    }
     if options.json:
-        print_json(
-            {
-                "lat_deg": round(found.lat_deg, 9),
-                "lon_deg": round(found.lon_deg, 9),
-                "height_m": height_m,
-                "range_m": round(found.range_m, 2),
-                "cov_en_m2": found.cov_en_m2.tolist(),
-                "ellipse_95": ellipse,
-                "confident": result.is_confident,
-            }
-        )
+        print_json(plain)
         return
-    above = "" if height_m is None else f", {height_m:.1f} m above sea"
+    above = "" if math.isnan(found.height_m) else f", {found.height_m:.1f} m above sea"
     print(f"{found.lat_deg:.8f}, {found.lon_deg:.8f}{above}")
     axes = "unknown"
     if ellipse is not None:
@@ -117,7 +101,6 @@ def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
 
 
 def _terrain(path: Path) -> "tuple[TerrainLayer, str]":
-    """The terrain of a map, and its digest; raises `FlightError` without one."""
     from orthonav.core.errors import FlightError
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer

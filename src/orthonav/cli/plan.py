@@ -1,12 +1,13 @@
 """`orthonav plan`: derive map requirements from a route, a camera and a height."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_area, add_dem, beside, counted, print_json
+from orthonav.cli.common import add_area, add_options, beside, counted, print_json
+from orthonav.cli.source import dem_of
 
+EXAMPLE = "--route route.kml --agl-m 120"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
     *("--out", "--json"),
@@ -16,88 +17,66 @@ MAX_SHOWN = 12  # sheets and legs named in the text
 if TYPE_CHECKING:
     from orthonav.ground.planning.area import Area, Extent
     from orthonav.ground.planning.route import Route
-    from orthonav.ground.planning.spacing import Caution, LegProfile, ViewPlan
+    from orthonav.ground.planning.spacing import ViewPlan
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    number = partial(parser.add_argument, type=float)
-    add_area(
-        parser,
-        parser.add_mutually_exclusive_group(required=True),
-        " (default: 600 m, at least half a view)",
-    )
-    parser.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE",
-        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: 1280 x "
-        "960 px, 65 by 51 deg",
-    )
-    number("--agl-m", help="height above ground (default: from the route)")
-    number("--speed-mps", help="ground speed")
-    number("--gsd-m", help="ground resolution, metres per pixel (default: from the view)")
-    parser.add_argument("--tile-px", type=int, help="width of a tile (default: from the view)")
-    number(
-        "--overlap",
-        default=0.875,
-        metavar="FRACTION",
-        help="overlap of neighbouring tiles, as a fraction of their width (default 0.875)",
-    )
-    parser.add_argument(
-        "--no-registration",
-        dest="registration",
-        action="store_const",
-        const=False,
-        default=True,
-        help="plan a map without the registration layer",
-    )
-    add_dem(parser, "to report height above ground and relief by leg")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="ROUTE.geojson",
-        help="write the route as GeoJSON, one line per sheet: build --route ROUTE.geojson#sheet-1",
-    )
-    parser.add_argument("--json", action="store_true", help="print the plan as JSON")
+    add_area(parser, required=True)
+    add_options(parser, "--camera", "--speed-mps", "--gsd-m", "--tile-px", "--dem", "--dem-datum")
+    add_options(parser, "--agl-m", help="height above ground (default: from the route)")
+    add_options(parser, "--overlap", default=0.875)
+    text = "write the route as GeoJSON, one line per sheet: build --route ROUTE.geojson#sheet-1"
+    parser.add_argument("--out", type=Path, metavar="ROUTE.geojson", help=text)
+    add_options(parser, "--json")
 
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.errors import RouteError
     from orthonav.core.files import write_text
-    from orthonav.ground.planning.route import read_route
-    from orthonav.ground.planning.routes.geojson import to_geojson
+    from orthonav.ground.planning.area import Area
+    from orthonav.ground.planning.route import read_route, to_geojson
+    from orthonav.ground.planning.sheets import sheets_of_route
     from orthonav.ground.planning.spacing import (
         default_band_m,
-        rate_cautions,
+        profile,
         terrain_cautions,
         view_cautions,
     )
 
     route = read_route(options.route) if options.route else None
-    if options.dem_datum is not None and options.dem is None:
-        raise RouteError("--dem-datum needs a terrain model: give --dem too")
     if route is None and (options.band_m is not None or options.dem or options.out):
         raise RouteError("--band-m, --dem and --out need a route (--route)")
     if options.speed_mps is not None and not 0 < options.speed_mps < 10_000:
         raise RouteError(f"ground speed must be above 0 m/s, got {options.speed_mps}")
-    view = _view(options, route)
-    if route is not None and options.band_m is None:
-        options.band_m = default_band_m(0.0 if view is None else view.side_m)
-    sheets, areas = _sheets(options, route)
+    dem = dem_of(options, route)
+    view = _view(options, route, dem)
+    cautions, legs = [], []
+    sheets: list[Route | Extent]
+    if route is None:
+        sheets = [options.bounds]
+    else:
+        if options.band_m is None:
+            options.band_m = default_band_m(0.0 if view is None else view.side_m)
+        sheets = [*sheets_of_route(route, options.band_m)]
+    areas = [
+        Area.from_bounds(sheet)
+        if isinstance(sheet, tuple)
+        else Area.from_route(sheet, options.band_m)
+        for sheet in sheets
+    ]
     gsd_m, tile_px = _map_of(options, view)
-    legs: list[LegProfile] = []
-    if route is not None and options.dem is not None:
-        legs = _profile(options, route, view)
-    cautions: list[Caution] = [] if view is None else view_cautions(view, gsd_m, tile_px)
-    if view is not None and options.speed_mps is not None:
-        cautions += rate_cautions(view, options.speed_mps)
-    cautions += terrain_cautions(legs)
+    if view is not None:
+        cautions += view_cautions(view, gsd_m, tile_px)
+    if route is not None and dem is not None:
+        agl_m, view_m = (options.agl_m, 0.0) if view is None else (view.agl_m, view.short_m)
+        legs = profile(route, route.bands_m(options.band_m) or (), agl_m, view_m, dem)
+        cautions += terrain_cautions(legs)
     plain: dict[str, Any] = {
         "route": None if route is None else _route_plain(route, options),
         "view": None if view is None else _view_plain(view, gsd_m, options.speed_mps),
-        "map": _map_plain(options, areas, sheets, gsd_m, tile_px),
-        "terrain": [_leg_plain(leg) for leg in legs] if options.dem else None,
-        "cautions": [{"code": each.code, "text": each.text} for each in cautions],
+        "map": _map_plain(options.overlap, areas, sheets, gsd_m, tile_px),
+        "terrain": None if dem is None else [vars(leg) for leg in legs],
+        "cautions": [vars(each) for each in cautions],
     }
     if options.out is not None:
         write_text(options.out, to_geojson([x for x in sheets if not isinstance(x, tuple)]))
@@ -109,27 +88,14 @@ def run(options: argparse.Namespace) -> None:
             print(plan_text(plain))
 
 
-def _sheets(
-    options: argparse.Namespace, route: "Route | None"
-) -> "tuple[list[Route | Extent], list[Area]]":
-    from orthonav.ground.planning.area import Area
-    from orthonav.ground.planning.sheets import sheets_of_bounds, sheets_of_route
-
-    if route is None:
-        boxes = sheets_of_bounds(options.bounds)
-        return [*boxes], [Area.from_bounds(box) for box in boxes]
-    parts = sheets_of_route(route, options.band_m)
-    return [*parts], [Area.from_route(part, options.band_m) for part in parts]
-
-
-def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | None":
+def _view(options: argparse.Namespace, route: "Route | None", dem: Any) -> "ViewPlan | None":
     from orthonav.core.errors import CameraError
     from orthonav.core.geo.camera_files import read_camera_file
-    from orthonav.ground.planning.spacing import DEFAULT_CAMERA, ViewPlan
+    from orthonav.ground.planning.spacing import DEFAULT_CAMERA, ViewPlan, flown_agl_m
 
     agl_m = options.agl_m
     if agl_m is None and route is not None:
-        agl_m = _lowest_agl_m(options, route)
+        agl_m = min(flown_agl_m(route, dem), default=None)
     if agl_m is None and options.camera is None:
         return None
     if agl_m is None:
@@ -141,47 +107,21 @@ def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | Non
     return ViewPlan.of(camera, agl_m)
 
 
-def _lowest_agl_m(options: argparse.Namespace, route: "Route") -> float | None:
-    """Lowest height above ground along the route, without take-off and landing; None: unknown."""
-    from orthonav.ground.planning.spacing import LANDING_M
-
-    if options.dem is not None and route.heights:
-        heights_m = [height for leg in _profile(options, route, None) for height in leg.agl_m]
-    else:
-        found = [height for height in route.heights if height is not None]
-        heights_m = [height.height_m for height in found if height.frame == "agl"]
-    return min((height for height in heights_m if height >= LANDING_M), default=None)
-
-
 def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float, int]:
     from orthonav.core.errors import AreaError
     from orthonav.ground.planning.spacing import suited_map, suited_tile_px
 
+    if view is None and options.gsd_m is None:
+        raise AreaError(
+            "the ground resolution of the map is unknown; give --agl-m, a route with heights "
+            "above ground, or --gsd-m"
+        )
     if view is None:
-        if options.gsd_m is None:
-            raise AreaError(
-                "the ground resolution of the map is unknown; give --agl-m, a route with heights "
-                "above ground, or --gsd-m"
-            )
         return options.gsd_m, 256 if options.tile_px is None else options.tile_px
     gsd_m, tile_px = suited_map(view)
     if options.gsd_m is not None:
         gsd_m, tile_px = options.gsd_m, suited_tile_px(view, options.gsd_m)
     return gsd_m, tile_px if options.tile_px is None else options.tile_px
-
-
-def _profile(
-    options: argparse.Namespace, route: "Route", view: "ViewPlan | None"
-) -> list["LegProfile"]:
-    from orthonav.cli.heights import dem_for_route
-    from orthonav.ground.planning.spacing import profile
-
-    bands_m = route.bands_m(options.band_m) or ()
-    view_m = 0.0 if view is None else view.short_m
-    agl_m = options.agl_m if view is None else view.agl_m
-    ground = dem_for_route(options, route)
-    assert ground is not None
-    return profile(route, bands_m, agl_m, view_m, ground)
 
 
 def _route_plain(route: "Route", options: argparse.Namespace) -> dict[str, Any]:
@@ -213,31 +153,22 @@ def _view_plain(view: "ViewPlan", gsd_m: float, speed_mps: float | None) -> dict
 
 
 def _map_plain(
-    options: argparse.Namespace,
-    areas: list["Area"],
-    sheets: list["Route | Extent"],
+    overlap: float,
+    areas: "list[Area]",
+    sheets: "list[Route | Extent]",
     gsd_m: float,
     tile_px: int,
 ) -> dict[str, Any]:
     from orthonav.ground.planning.spacing import estimate_map
 
+    sizes = {"gsd_m": gsd_m, "tile_px": tile_px, "overlap": overlap}
     made = [
-        estimate_map(
-            area,
-            gsd_m=gsd_m,
-            tile_px=tile_px,
-            overlap=options.overlap,
-            registration=options.registration,
-            maps=len(areas),
-        )
+        estimate_map(area, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap, maps=len(areas))
         for area in areas
     ]
     return {
-        "gsd_m": gsd_m,
-        "tile_px": tile_px,
+        **sizes,
         "tile_m": round(gsd_m * tile_px, 3),
-        "overlap": options.overlap,
-        "registration": options.registration,
         "area_km2": round(sum(each.area_km2 for each in made), 3),
         "imagery_km2": round(sum(each.imagery_km2 for each in made), 3),
         "tiles": sum(each.tiles for each in made),
@@ -246,9 +177,7 @@ def _map_plain(
         "sheets": [
             {
                 "name": None if isinstance(sheet, tuple) else sheet.name,
-                "bounds_deg": [round(value, 6) for value in sheet]
-                if isinstance(sheet, tuple)
-                else None,
+                "bounds_deg": [round(x, 6) for x in sheet] if isinstance(sheet, tuple) else None,
                 "area_km2": round(each.area_km2, 3),
                 "map_mb": [round(size, 2) for size in each.map_mb],
             }
@@ -257,78 +186,63 @@ def _map_plain(
     }
 
 
-def _leg_plain(leg: "LegProfile") -> dict[str, Any]:
-    return {
-        "leg": leg.leg,
-        "length_m": round(leg.length_m, 1),
-        "ground_m": [round(each, 1) for each in leg.ground_m],
-        "agl_m": [round(each, 1) for each in leg.agl_m],
-        "relief": round(leg.relief, 4),
-    }
-
-
 def plan_text(plain: dict[str, Any]) -> str:
-    lines = []
-    if plain["route"] is not None:
-        lines.append(_row("route", _route_text(plain["route"])))
-    if plain["view"] is not None:
-        lines += _view_lines(plain["view"])
-    out = None if plain.get("out") == "-" else plain.get("out")
-    lines += _map_lines(plain["map"], None if plain["route"] is None else out or "FILE")
+    """Lines of a name, empty where it is that of the line before, and a text."""
+    rows = [] if plain["route"] is None else [("route", _route_text(plain["route"]))]
+    if (view := plain["view"]) is not None:
+        rows.append(
+            (
+                "view",
+                f"{view['width_m']:.0f} x {view['height_m']:.0f} m from {view['agl_m']:.0f} m, "
+                f"{view['gsd_m']:.3g} m per pixel, {view['across_px']:.0f} map pixels across",
+            )
+        )
+        rate = "" if view["rate_hz"] is None else f": {view['rate_hz']:.2g} views per second"
+        rows.append(("", f"overlapping views at most {view['spacing_m']:.0f} m apart{rate}"))
+    rows += _map_rows(plain["map"], plain)
     if plain["terrain"] is not None:
-        lines += _leg_lines(plain["terrain"])
-    for caution in plain["cautions"]:
-        lines.append(_row("caution", caution["text"]))
+        rows.append(("terrain", "leg  length m   ground m      above ground m  relief in a view"))
+        for leg in plain["terrain"][:MAX_SHOWN]:
+            ground = "{:.0f}..{:.0f}".format(*leg["ground_m"])
+            over = "{:.0f}..{:.0f}".format(*leg["agl_m"])
+            text = f"{leg['leg']:>3}  {leg['length_m']:>8.0f}   {ground:<12}  {over:<14}"
+            rows.append(("", f"{text}  {leg['relief']:.1%}"))
+        rows += _more(plain["terrain"])
+    rows += [("caution", caution["text"]) for caution in plain["cautions"]]
     if "out" in plain:
-        lines.append(_row("written", out or "to stdout"))
-    return "\n".join(lines)
+        rows.append(("written", "to stdout" if plain["out"] == "-" else plain["out"]))
+    return "\n".join(f"{name:<9}{text}" for name, text in rows)
 
 
-def _row(name: str, text: str) -> str:
-    return f"{name:<9}{text}"
+def _more(rows: list[Any]) -> list[tuple[str, str]]:
+    return [("", f"and {len(rows) - MAX_SHOWN} more (--json)")] if len(rows) > MAX_SHOWN else []
 
 
 def _route_text(route: dict[str, Any]) -> str:
-    name = f"{route['name']}, " if route["name"] else ""
-    text = f"{name}{counted(route['waypoints'], 'waypoint')}, {route['length_m'] / 1000:.2f} km"
-    if route["duration_s"] is not None:
-        seconds = route["duration_s"]
-        text += f", {seconds:.0f} s" if seconds < 300 else f", {seconds / 60:.0f} min"
-    if route["heights_above"]:
-        text += f", heights above {' and '.join(map(_reference, route['heights_above']))}"
-    if route["legs_with_own_band"]:
-        text += f", {counted(route['legs_with_own_band'], 'leg')} with a band of its own"
-    if route["legs_with_own_band"] < max(1, route["waypoints"] - 1):
-        text += f", search band {route['band_m']:.0f} m"
-    return text
+    parts = [route["name"]] if route["name"] else []
+    parts += [counted(route["waypoints"], "waypoint"), f"{route['length_m'] / 1000:.2f} km"]
+    if (seconds := route["duration_s"]) is not None:
+        parts.append(f"{seconds:.0f} s" if seconds < 300 else f"{seconds / 60:.0f} min")
+    if above := route["heights_above"]:
+        names = {"agl": "ground", "unknown": "an unknown reference"}
+        parts.append(f"heights above {' and '.join(names.get(name, name) for name in above)}")
+    if own := route["legs_with_own_band"]:
+        parts.append(f"{counted(own, 'leg')} with a band of its own")
+    if own < max(1, route["waypoints"] - 1):
+        parts.append(f"search band {route['band_m']:.0f} m")
+    return ", ".join(parts)
 
 
-def _reference(name: str) -> str:
-    return {"agl": "ground", "unknown": "an unknown reference"}.get(name, name)
-
-
-def _view_lines(view: dict[str, Any]) -> list[str]:
-    first = (
-        f"{view['width_m']:.0f} x {view['height_m']:.0f} m from {view['agl_m']:.0f} m, "
-        f"{view['gsd_m']:.3g} m per pixel, {view['across_px']:.0f} map pixels across"
-    )
-    second = f"overlapping views at most {view['spacing_m']:.0f} m apart"
-    if view["rate_hz"] is not None:
-        second += f": {view['rate_hz']:.2g} views per second"
-    return [_row("view", first), _row("", second)]
-
-
-def _map_lines(made: dict[str, Any], route: str | None) -> list[str]:
+def _map_rows(made: dict[str, Any], plain: dict[str, Any]) -> list[tuple[str, str]]:
     low, high = made["map_mb"]
     size = f"{low:.1f} to {high:.1f} MB" if high - low > 0.05 else f"{high:.1f} MB"
-    lines = [
-        _row(
+    rows = [
+        (
             "build",
-            f"--gsd-m {made['gsd_m']:g} --tile-px {made['tile_px']} --overlap {made['overlap']:g}"
-            f"{'' if made['registration'] else ' --no-registration'} "
+            f"--gsd-m {made['gsd_m']:g} --tile-px {made['tile_px']} --overlap {made['overlap']:g} "
             f"(a tile is {made['tile_m']:g} m wide)",
         ),
-        _row(
+        (
             "map",
             f"{made['area_km2']:,.2f} km2, {made['tiles']:,} tiles, {size}, "
             f"built in about {made['build_minutes']:,.0f} min on one core; "
@@ -336,33 +250,15 @@ def _map_lines(made: dict[str, Any], route: str | None) -> list[str]:
         ),
     ]
     sheets = made["sheets"]
-    if len(sheets) > 1:
-        lines.append(
-            _row("sheets", f"{len(sheets)}: a map holds one sheet; build one map per sheet")
-        )
-        if route == "FILE":
-            lines.append(_row("", "write the sheets with --out FILE"))
-        for sheet in sheets[:MAX_SHOWN]:
-            where = f"--route {route}#{sheet['name']}"
-            if route is None:
-                where = f"--bounds={','.join(map(_degrees, sheet['bounds_deg']))}"
-            lines.append(_row("", f"{where}  {sheet['area_km2']:,.0f} km2"))
-        if len(sheets) > MAX_SHOWN:
-            lines.append(_row("", f"and {len(sheets) - MAX_SHOWN} more (--json)"))
-    return lines
-
-
-def _leg_lines(legs: list[dict[str, Any]]) -> list[str]:
-    lines = [_row("terrain", "leg  length m   ground m      above ground m  relief in a view")]
-    for leg in legs[:MAX_SHOWN]:
-        ground = "{:.0f}..{:.0f}".format(*leg["ground_m"])
-        over = "{:.0f}..{:.0f}".format(*leg["agl_m"])
-        text = f"{leg['leg']:>3}  {leg['length_m']:>8.0f}   {ground:<12}  {over:<14}"
-        lines.append(_row("", f"{text}  {leg['relief']:.1%}"))
-    if len(legs) > MAX_SHOWN:
-        lines.append(_row("", f"and {len(legs) - MAX_SHOWN} more (--json)"))
-    return lines
-
-
-def _degrees(value: float) -> str:
-    return f"{value:.6f}".rstrip("0").rstrip(".")
+    if len(sheets) == 1:
+        return rows
+    rows.append(("sheets", f"{len(sheets)}: a map holds one sheet; build one map per sheet"))
+    out = plain.get("out", "-")
+    if plain["route"] is not None and out == "-":
+        rows.append(("", "write the sheets with --out FILE"))
+    for sheet in sheets[:MAX_SHOWN]:
+        where = f"--route {'FILE' if out == '-' else out}#{sheet['name']}"
+        if sheet["bounds_deg"] is not None:
+            where = f"--bounds={','.join(f'{each:.8g}' for each in sheet['bounds_deg'])}"
+        rows.append(("", f"{where}  {sheet['area_km2']:,.0f} km2"))
+    return rows + _more(sheets)

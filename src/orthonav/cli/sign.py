@@ -3,23 +3,17 @@
 import argparse
 from pathlib import Path
 
+EXAMPLE = "area.onav --key keys/private.pem"
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", nargs="?", help="map to sign")
     how = parser.add_mutually_exclusive_group(required=True)
     how.add_argument("--key", type=Path, metavar="private.pem", help="Ed25519 private key (PEM)")
-    how.add_argument(
-        "--new-key",
-        type=Path,
-        metavar="DIR",
-        help="create private.pem and public.pem in this folder, and sign the map if one is given",
-    )
-    parser.add_argument(
-        "--serial",
-        type=int,
-        metavar="N",
-        help="serial number in the signature (default: seconds since 1970, which increase)",
-    )
+    text = "create private.pem and public.pem in this folder, and sign the map if one is given"
+    how.add_argument("--new-key", type=Path, metavar="DIR", help=text)
+    text = "serial number in the signature (default: seconds since 1970, which increase)"
+    parser.add_argument("--serial", type=int, help=text)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -29,11 +23,8 @@ def run(options: argparse.Namespace) -> None:
     key = options.key
     if options.new_key is not None:
         made = new_key(options.new_key)
-        print(
-            f"key {made}: keep {options.new_key / PRIVATE_NAME} secret, give "
-            f"{options.new_key / PUBLIC_NAME} to those who fly"
-        )
-        key = options.new_key / PRIVATE_NAME
+        key, public = options.new_key / PRIVATE_NAME, options.new_key / PUBLIC_NAME
+        print(f"key {made}: keep {key} secret, give {public} to those who fly")
     if options.map is not None:
         print(f"written to {sign_map(options.map, key, options.serial)}")
     elif options.key is not None:

@@ -5,157 +5,56 @@ from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
-from orthonav.cli.common import ROUTE_HELP, add_dem, add_orthos, counted, print_json, progress
-from orthonav.cli.heights import dem_of
+from orthonav.cli.common import add_options, counted, print_json, progress
+from orthonav.cli.source import dem_of
 
+EXAMPLE = "--ortho other-year.tif --route route.kml --agl-m 120 --out flight"
 EVERYDAY = (
     *("--route", "--random", "--agl-m", "--spacing-m", "--airspeed-mps", "--camera"),
     *("--yaw-std-deg", "--agl-std", "--mount-std-deg", "--horizon-std-deg", "--prior-std-m"),
     *("--seed", "--json"),
 )
-MOUNT_STD_DEG = HORIZON_STD_DEG = 1.0
-"""Usual unreported tilt. Real mounts lean by 1 to 5 deg, and horizons of autopilots err by 0.5 to
-6 deg."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    number = partial(parser.add_argument, type=float)
-    add_orthos(parser, "orthophoto to fly over, of another year than the map")
     where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
-    where.add_argument(
-        "--random", type=int, metavar="N", help="fly N views at random positions and headings"
-    )
-    number(
-        "--agl-m",
-        help="height above ground (default: the shorter image side covers 256 px of imagery); with "
-        "--dem the height at the first view of a route, which is flown at a constant altitude",
-    )
-    add_dem(
-        parser,
-        "which the views show in perspective (a surface model also shows houses and trees "
-        "standing up); telemetry then reports heights above sea level and take-off instead of "
-        "heights above ground",
-    )
-    number(
-        "--camera-pitch-deg",
-        default=0.0,
-        help="angle by which the camera looks ahead of straight down, 0 to 65; reported "
-        "(default 0)",
-    )
+    add_options(where, "--route")
+    text = "fly N views at random positions and headings"
+    where.add_argument("--random", type=int, metavar="N", help=text)
+    add_options(parser, "--ortho", "--camera", "--dem", "--dem-datum", "--agl-m", "--json")
+    add_options(parser, "--seed", default=0)
+    parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR", help="to write")
+    number = partial(parser.add_argument, type=float)
+    text = "angle by which the camera looks ahead of straight down, 0 to 65; reported (default 0)"
+    number("--camera-pitch-deg", default=0.0, help=text)
     number("--spacing-m", help="distance between views on a route (default: flown in one second)")
     number("--airspeed-mps", default=25.0, help="airspeed (default 25)")
-    number(
-        "--turn-radius-m",
-        default=0.0,
-        help="radius of the arcs at the corners of the route (default 0: sharp corners)",
-    )
-    number(
-        "--wind-mps",
-        help="speed of the mean wind, with gusts; the aircraft crabs along its route (default: no "
-        "wind)",
-    )
-    number("--wind-from-deg", help="direction the wind comes from (default 270, west)")
-    parser.add_argument(
-        "--beyond",
-        action="store_true",
-        help="let the route leave the imagery, which is mirrored at its border",
-    )
-    parser.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE",
-        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON); default: "
-        "1280 x 960 px, 65 deg wide",
-    )
+    text = "radius of the arcs at the corners of the route (default 0: sharp corners)"
+    number("--turn-radius-m", default=0.0, help=text)
+    text = "write gnss.csv of a GNSS receiver along the route: good, step, drag, drift, frozen, "
+    text += "jumping or jam (docs/reference/formats.md), such as drag:at_s=60,mps=1"
+    parser.add_argument("--receiver", metavar="NAME[:KEY=VALUE,..]", help=text)
     _add_errors(parser)
-    parser.add_argument(
-        "--receiver",
-        metavar="NAME[:KEY=VALUE,..]",
-        help="write gnss.csv of a GNSS receiver along the route: good, step, drag, drift, frozen, "
-        "jumping or jam (docs/reference/formats.md), such as drag:at_s=60,mps=1",
-    )
-    effects = parser.add_argument_group("image degradation")
-    effects.add_argument(
-        "--cloud-share",
-        type=float,
-        default=0.0,
-        metavar="FRACTION",
-        help="fraction of the views with clouds, 0 to 1 (default 0)",
-    )
-    effects.add_argument(
-        "--jpeg-quality",
-        type=int,
-        default=90,
-        choices=range(1, 101),
-        metavar="1..100",
-        help="quality of JPEG images (default 90)",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of all random draws (default 0)")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FLIGHT_DIR", help="flight folder to write"
-    )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def _add_errors(parser: argparse.ArgumentParser) -> None:
-    def option(
-        flag: str, text: str, default: float | None = 0.0, metavar: str | None = None
-    ) -> None:
-        group.add_argument(flag, type=float, default=default, help=text, metavar=metavar)
-
-    group = parser.add_argument_group("telemetry noise")
-    option("--yaw-std-deg", "standard deviation of the reported heading (default 0)")
-    option(
-        "--agl-std",
-        "standard deviation of the reported height, as a fraction of it (default 0)",
-        metavar="FRACTION",
-    )
-    option(
-        "--tilt-std-deg",
-        "standard deviation of the error of the reported pitch and roll from view to view, which "
-        "the telemetry states (default 0)",
-    )
-    option("--attitude-std-deg", "standard deviation of the true pitch and roll (default 0)")
-    option(
-        "--prior-std-m",
-        "standard deviation of the prior position, per axis (default: no prior is reported)",
-        None,
-    )
-    option(
-        "--velocity-drift",
-        "standard deviation of the scale error (a fraction) and the direction error (rad) of the "
-        "reported velocity (default: no velocity is reported)",
-        None,
-        metavar="FRACTION",
-    )
-    group = parser.add_argument_group("unreported tilt")
-    option(
-        "--mount-std-deg",
-        "standard deviation of pitch and roll of the camera mount, constant in a flight "
-        f"(default {MOUNT_STD_DEG:g})",
-        MOUNT_STD_DEG,
-    )
-    option(
-        "--horizon-std-deg",
-        "standard deviation of the error of the autopilot's horizon, pitch and roll; on a route it "
-        f"changes within 15 s (default {HORIZON_STD_DEG:g})",
-        HORIZON_STD_DEG,
-    )
-    group = parser.add_argument_group("constant telemetry biases")
-    option("--yaw-bias-deg", "reported heading minus true heading")
-    option(
-        "--agl-bias",
-        "reported height minus true height, as a fraction of it: 0.05 is 5 %%",
-        metavar="FRACTION",
-    )
-    added = "to which --mount-std-deg adds"
-    option("--pitch-bias-deg", f"unreported pitch of the camera mount, {added}")
-    option("--roll-bias-deg", f"unreported roll of the camera mount, {added}")
+    group = parser.add_argument_group("standard deviations of errors of the telemetry")
+    number = partial(group.add_argument, type=float)
+    number("--yaw-std-deg", default=0.0, help="reported heading (default 0)")
+    text = "reported height, as a fraction of it (default 0)"
+    number("--agl-std", default=0.0, metavar="FRACTION", help=text)
+    text = "reported pitch and roll from view to view, which the telemetry states (default 0)"
+    number("--tilt-std-deg", default=0.0, help=text)
+    number("--prior-std-m", help="prior position, per axis (default: no prior is reported)")
+    text = "scale (a fraction) and direction (rad) of the reported velocity (default: not reported)"
+    number("--velocity-drift", metavar="FRACTION", help=text)
+    text = "unreported pitch and roll of the camera mount, constant in a flight (default 1)"
+    number("--mount-std-deg", default=1.0, help=text)
+    text = "unreported pitch and roll of the autopilot's horizon; on a route it changes within "
+    number("--horizon-std-deg", default=1.0, help=f"{text}15 s (default 1)")
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import FlightError
     from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.simulate.flight import (
@@ -164,14 +63,9 @@ def run(options: argparse.Namespace) -> None:
         SimulateRequest,
         simulate_flight,
     )
-    from orthonav.ground.simulate.motion import Wind
     from orthonav.ground.simulate.receiver import receiver_of
-    from orthonav.ground.simulate.render import ViewEffects
 
-    if options.wind_from_deg is not None and options.wind_mps is None:
-        raise FlightError("--wind-from-deg needs the speed of the wind (--wind-mps)")
-    from_deg = 270.0 if options.wind_from_deg is None else options.wind_from_deg
-    dem = dem_of(options)
+    dem, given = dem_of(options), vars(options)
     request = SimulateRequest(
         orthos=options.ortho,
         out=options.out,
@@ -181,16 +75,14 @@ def run(options: argparse.Namespace) -> None:
         spacing_m=options.spacing_m,
         airspeed_mps=options.airspeed_mps,
         camera=read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA,
-        errors=Errors(**{each.name: getattr(options, each.name) for each in fields(Errors)}),
-        effects=ViewEffects(jpeg_quality=options.jpeg_quality),
+        errors=Errors(
+            **{each.name: given[each.name] for each in fields(Errors) if each.name in given}
+        ),
         seed=options.seed,
-        wind=None if options.wind_mps is None else Wind(options.wind_mps, from_deg),
         turn_radius_m=options.turn_radius_m,
-        cloud_share=options.cloud_share,
         terrain=dem,
         terrain_posting_m=1.0 if dem is None else dem.gsd_m,
         camera_pitch_deg=options.camera_pitch_deg,
-        beyond=options.beyond,
         gnss=receiver_of(options.receiver) if options.receiver else None,
     )
     with progress(options) as shown:

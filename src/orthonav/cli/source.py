@@ -1,116 +1,73 @@
-"""Options for reading a recording, shared by `import`, `localize` and `calibrate`."""
+"""Recordings and terrain of `import`, `localize`, `calibrate` and others: options and reading."""
 
 import argparse
 import logging
 import math
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_dem
+from orthonav.cli.common import add_options, watched
+from orthonav.core.errors import FlightError, ImageryError
 
 if TYPE_CHECKING:
-    from orthonav.core.localize import Localizer
-    from orthonav.ground.recordings import Recording, SourceView
+    from collections.abc import Callable, Iterable
 
+    from orthonav.cli.common import Progress
+    from orthonav.core.flight.heights import Array, FlownHeights, Undulation
+    from orthonav.core.flight.recording import RecordedView
+    from orthonav.core.geo.ground import TerrainHeights
+    from orthonav.core.localize import Localizer
+    from orthonav.core.localize.confidence import Acceptance
+    from orthonav.core.mapfile import MapFile
+    from orthonav.core.records import ViewResult
+    from orthonav.ground.imagery.terrain import Dem
+    from orthonav.ground.planning.route import Route
+    from orthonav.ground.recordings import Recording, SourceView
+    from orthonav.onboard.run import Locator
+
+AREA_POINTS = 48  # positions along a side of a map at which its terrain is averaged
 FAR_M = 1000.0
 """A recorded position farther from the map causes a warning: GNSS and logs err by less."""
 log = logging.getLogger(__name__)
 
 
 def topic(text: str) -> tuple[str, str]:
-    """ROLE=NAME."""
     role, equals, name = text.partition("=")
     if not (role and equals and name):
         raise argparse.ArgumentTypeError(f"expected ROLE=/topic, got '{text}'")
     return role, name
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
+def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     """Add the options; see docs/flights.md."""
     group = parser.add_argument_group("reading the recording")
-    group.add_argument(
-        "--kind",
-        choices=("flight", "photos", "video", "ros"),
-        help="kind of the recording (default: detected by content)",
-    )
-    group.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE",
-        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
-    )
-    group.add_argument(
-        "--telemetry",
-        type=Path,
-        metavar="LOG",
-        help="log to join by time: PX4 .ulg, ArduPilot .bin or .tlog, DJI .srt, .csv; or a .csv of "
-        "images by file name",
-    )
-    group.add_argument(
-        "--time-offset-s",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="offset that is added to the times of images to get times of the log (default 0)",
-    )
-    group.add_argument(
-        "--mount-deg",
-        type=float,
-        nargs=3,
-        default=(0.0, 0.0, 0.0),
-        metavar=("YAW", "PITCH", "ROLL"),
-        help="orientation of the camera in the aircraft; 0 0 0 (default) looks straight down with "
-        "the top of the image forward",
-    )
-    group.add_argument(
-        "--topic",
-        type=topic,
-        action="append",
-        default=[],
-        metavar="ROLE=NAME",
-        help="ROS topic for image, camera_info, attitude, velocity, position or height",
-    )
-    group.add_argument(
-        "--rate-hz",
-        type=float,
-        default=1.0,
-        metavar="HZ",
-        help="views per second taken from a recording: of a video (default 1)",
-    )
-    group.add_argument(
-        "--sensor-width-mm",
-        type=float,
-        metavar="MM",
-        help="longer side of the sensor of photographs, for the focal length",
-    )
-    group.add_argument(
-        "--fov-deg",
-        type=float,
-        help="field of view across the width of the images, where the camera is not known",
-    )
-    group.add_argument(
-        "--agl-m", type=float, help="height above ground of all views, instead of a recorded one"
-    )
-    group.add_argument(
-        "--ground-alt-m",
-        type=float,
-        metavar="M",
-        help="altitude of the ground, in the reference of the recorded altitudes, where no heights "
-        "were recorded",
-    )
-    add_dem(group, "for heights above ground where others were recorded")
-    group.add_argument(
-        "--looks-down",
-        action="store_true",
-        help="assume pitch and roll 0 where they were not recorded",
-    )
-    group.add_argument(
-        "--prior-std-m",
-        type=float,
-        metavar="M",
-        help="standard deviation of the prior position, per axis; the recorded position is then "
-        "the prior (default: no prior)",
-    )
+    add = group.add_argument
+    kinds = ("flight", "photos", "video", "ros")
+    add("--kind", choices=kinds, help="kind of the recording (default: detected by content)")
+    text = "log to join by time: PX4 .ulg, ArduPilot .bin or .tlog, DJI .srt, .csv; or a .csv of "
+    add("--telemetry", type=Path, metavar="LOG", help=f"{text}images by file name")
+    text = "offset that is added to the times of images to get times of the log (default 0)"
+    add("--time-offset-s", type=float, default=0.0, help=text)
+    add_options(group, "--camera", "--mount-deg")
+    text = "ROS topic for image, camera_info, attitude, velocity, position or height"
+    names: dict[str, Any] = {"dest": "topics", "metavar": "ROLE=NAME"}
+    add("--topic", type=topic, action="append", default=[], help=text, **names)
+    text = "views per second taken from a recording: of a video (default 1)"
+    add("--rate-hz", type=float, default=1.0, help=text)
+    text = "longer side of the sensor of photographs, for the focal length"
+    add("--sensor-width-mm", type=float, metavar="MM", help=text)
+    text = "field of view across the width of the images, where the camera is not known"
+    add("--fov-deg", type=float, help=text)
+    add_options(group, "--agl-m", help="height above ground of all views, not the recorded one")
+    text = "altitude of the ground, in the reference of the recorded altitudes, where no heights "
+    add("--ground-alt-m", type=float, help=f"{text}were recorded")
+    if dem:
+        add_options(group, "--dem", "--dem-datum")
+    text = "assume pitch and roll 0 where they were not recorded"
+    add("--looks-down", action="store_true", help=text)
+    text = "standard deviation of the prior position, per axis; the recorded position is then the "
+    add("--prior-std-m", type=float, help=f"{text}prior (default: no prior)")
 
 
 def distance_from_map(latlon_deg: tuple[float, float], localizer: "Localizer") -> tuple[float, str]:
@@ -142,12 +99,10 @@ def far_from_map(view: "SourceView", localizer: "Localizer") -> tuple[float, str
 
 
 def far_text(what: str, far_m: float, hint: str) -> str:
-    """A sentence about positions that are far from the map."""
     return f"{what} {far_m / 1000:,.0f} km from the map; check the map and the positions{hint}"
 
 
 def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
-    """Log a warning where the first view was recorded far from the map."""
     view = next(iter(flight.views), None)
     found = None if view is None else far_from_map(view, localizer)
     if found is not None and found[0] > FAR_M:
@@ -157,30 +112,152 @@ def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
 def open_source(
     path: Path | list[Path], options: argparse.Namespace, *, over_terrain: bool = False
 ) -> "Recording":
-    """The open recording of the command line; its warnings are logged.
-
-    `over_terrain`: whether a terrain turns its heights into heights above ground.
-    """
+    """The open recording of the command line; its warnings are logged. `over_terrain`: whether a
+    terrain turns its heights into heights above ground."""
     from orthonav.ground.recordings import SourceOptions, open_source
 
-    source_options = SourceOptions(
-        kind=options.kind,
-        camera=options.camera,
-        rate_hz=options.rate_hz,
-        telemetry=options.telemetry,
-        time_offset_s=options.time_offset_s,
-        mount_deg=tuple(options.mount_deg),
-        topics=dict(options.topic),
-        prior_std_m=options.prior_std_m,
-        sensor_width_mm=options.sensor_width_mm,
-        ground_alt_m=options.ground_alt_m,
-        agl_m=options.agl_m,
-        fov_deg=options.fov_deg,
-        looks_down=options.looks_down,
-        over_terrain=over_terrain,
-        skip_bad_images=getattr(options, "skip_bad_images", False),
-    )
+    names = {each.name for each in fields(SourceOptions)}
+    given = {name: value for name, value in vars(options).items() if name in names}
+    given |= {"mount_deg": tuple(options.mount_deg), "topics": dict(options.topics)}
+    source_options = SourceOptions(**given, over_terrain=over_terrain)
     recording = open_source(path, source_options)
     for warning in recording.warnings:
         log.warning("%s", warning)
     return recording
+
+
+def dem_of(options: argparse.Namespace, route: "Route | None" = None) -> "Dem | None":
+    """The terrain of `--dem`; at least one waypoint of the route lies in it."""
+    if options.dem is None:
+        if options.dem_datum is not None:
+            raise FlightError("--dem-datum needs a terrain model: give --dem too")
+        return None
+    if getattr(options, "ground_alt_m", None) is not None:
+        raise FlightError("--ground-alt-m assumes level ground: give it or --dem")
+    if hasattr(options, "fov_deg") and options.agl_m is not None:  # of a recording, not of a plan
+        raise FlightError("--agl-m is the height above ground of the views: give it or --dem")
+    from orthonav.core.geo.swapped import swapped_hint
+    from orthonav.ground.imagery.terrain import open_dem
+
+    dem = open_dem(options.dem, options.dem_datum)
+    if route is not None and not any(dem.covers(*waypoint) for waypoint in route.waypoints):
+        hint = swapped_hint(*route.waypoints[0], dem.covers)
+        raise ImageryError(f"the route lies outside the terrain{hint}: {options.dem}")
+    return dem
+
+
+def map_heights(
+    opened: "MapFile",
+    terrain: "TerrainHeights | None" = None,
+    *,
+    take_off: tuple[float, float, float] | None = None,
+    geoid: "Undulation | None" = None,
+    use_prior: bool = True,
+) -> "FlownHeights | None":
+    """Heights above ground on a map by `terrain`, else by its own; None where it has none."""
+    from orthonav.core.flight.heights import FlownHeights
+    from orthonav.core.mapfile.terrain import TerrainLayer
+
+    terrain = terrain or TerrainLayer.of(opened)
+    if terrain is None:
+        return None
+    area_deg = _area_deg(opened)
+    return FlownHeights(terrain, area_deg, take_off=take_off, geoid=geoid, use_prior=use_prior)
+
+
+def _area_deg(opened: "MapFile") -> "tuple[Array, Array]":
+    import numpy as np
+
+    sheet = opened.manifest.sheets[0]
+    grid = sheet.grid
+    half_m = grid.tile_m / 2
+    east, north = np.meshgrid(
+        grid.west_m + np.linspace(half_m, grid.width_px * grid.gsd_m - half_m, AREA_POINTS),
+        grid.north_m - np.linspace(half_m, grid.height_px * grid.gsd_m - half_m, AREA_POINTS),
+    )
+    return sheet.frame.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
+
+
+def flight_heights(
+    options: argparse.Namespace, opened: "MapFile", flight: "Recording", dem: "Dem | None"
+) -> "FlownHeights | None":
+    """Heights above ground of the views of a recorded flight; None without a terrain. What is
+    assumed about heights is logged once."""
+
+    if dem is not None and not any(map(dem.covers, *_area_deg(opened))):
+        raise ImageryError(f"the terrain lies outside the map: {dem.path}")
+    first = next(iter(flight.views), None)
+    if first is None:
+        return None
+    has_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
+    place = flight.take_off_latlon_deg or getattr(first, "truth_latlon_deg", None)
+    heights = map_heights(
+        opened,
+        dem,
+        take_off=None if place is None else (*place, 0.0),
+        geoid=geoid_for(flight) if has_terrain else None,
+        use_prior=getattr(options, "prior", None) != "none",
+    )
+    name = None
+    if heights is not None:
+        name = "the terrain of the map" if dem is None else f"the terrain of {options.dem.name}"
+    say_assumed_heights(flight, name)
+    return heights
+
+
+def say_assumed_heights(
+    flight: "Recording",
+    terrain: str | None = None,
+    advice: str = "give --dem, or build the map with it",
+) -> None:
+    """Log what is assumed about the heights of a flight, over a terrain or without one. `advice`:
+    what would help. Other recordings than flights have said it when they were opened."""
+    from orthonav.core.flight.heights import assumed_heights
+
+    first = next(iter(flight.views), None)
+    said = None if first is None else assumed_heights(first.telemetry, terrain, advice)
+    if said is not None and (terrain is not None or flight.kind in ("flight", "log")):
+        log.log(logging.WARNING if terrain is None else logging.INFO, "%s", said)
+
+
+def geoid_for(flight: "Recording") -> "Undulation | None":
+    """The geoid, where the height above the ellipsoid is known and that above the sea is not. Where
+    it is needed and missing, a warning says what to install."""
+    from orthonav.core.errors import MissingExtraError
+
+    first = next(iter(flight.views), None)
+    if first is None or first.telemetry.hae_m is None or first.telemetry.amsl_m is not None:
+        return None
+    try:
+        from orthonav.ground.imagery.terrain import geoid
+
+        return geoid()
+    except (ImageryError, MissingExtraError) as error:
+        if first.telemetry.home_m is None:
+            log.warning("%s", error)
+        return None
+
+
+def located(
+    options: argparse.Namespace,
+    locator: "Locator",
+    flight: "Recording",
+    views: "Iterable[RecordedView]",
+    shown: "Progress",
+    accept: "Acceptance | None" = None,
+    heights: "FlownHeights | None" = None,
+    take: "Callable[[ViewResult], None]" = lambda result: None,
+) -> "list[ViewResult]":
+    """Results of the views of a recording; `take` gets each."""
+    from orthonav.ground.recordings.localize import localize_flight
+
+    how: dict[str, Any] = {
+        "skip_bad_images": getattr(options, "skip_bad_images", True),
+        "accept": accept,
+    }
+    results = []
+    found = localize_flight(locator, flight, views=views, heights=heights, **how)
+    for result in watched(found, flight.expected, options.command, shown):
+        results.append(result)
+        take(result)
+    return results

@@ -3,21 +3,16 @@
 import argparse
 from pathlib import Path
 
+from orthonav.cli.common import add_options
+
+EXAMPLE = "area.onav --public-key keys/public.pem"
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to check")
-    parser.add_argument(
-        "--public-key",
-        type=Path,
-        required=True,
-        metavar="public.pem",
-        help="Ed25519 public key (PEM) of the expected signer",
-    )
-    parser.add_argument(
-        "--not-before",
-        metavar="DATE|SERIAL",
-        help="refuse a map signed before this date (2026-05-31, UTC) or with a lower serial number",
-    )
+    text = "Ed25519 public key (PEM) of the expected signer"
+    parser.add_argument("--public-key", type=Path, required=True, metavar="public.pem", help=text)
+    add_options(parser, "--not-before")
 
 
 def run(options: argparse.Namespace) -> None:

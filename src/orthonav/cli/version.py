@@ -1,35 +1,51 @@
-"""`orthonav --version`: the version and, with `--verbose`, what is installed on which machine."""
+"""`orthonav --version`, and which extras each command needs."""
 
-import argparse
-import contextlib
 import json
-import os
 import platform
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from orthonav import __version__
-from orthonav.cli.needs import NEEDS
 from orthonav.core.cores import usable_cores
-from orthonav.core.extras import missing, packages, pip_line
+from orthonav.core.extras import missing, packages, pip_line, require
 
-_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    "demo": ("geo", "report", "web"),
+    "simulate": ("geo",),
+    "fetch --source": ("fetch",),
+    "build": ("geo",),
+    "check": ("geo", "report", "web"),
+    "atlas": ("geo",),
+    "sign": ("signing",),
+    "verify": ("signing",),
+    "view": ("web",),
+    # Only with these options or inputs; the part that needs it says so.
+    "plan, localize, calibrate --dem": ("geo",),
+    "build --edges segments": ("segments",),
+    "build --method autoencoder, caevl, triplet or bovw": ("train",),
+    "atlas build, atlas index": ("atlas",),
+    "atlas build --cluster": ("cluster",),
+    "build --edges onnx": ("neural",),
+    "localize, fly: a map with a neural encoder or with onnx edges": ("neural",),
+    "localize --atlas": ("atlas",),
+    "localize, fly --require-signed": ("signing",),
+    "localize, import, calibrate: photographs, ROS, logs": ("flights",),
+    "fly --autopilot, --log": ("autopilot",),
+    "fly --ros2": ("ros2",),
+    "evaluate --report": ("report",),
+}
+"""Extras by command, or by command with an option or an input."""
+
+
+def require_extras(command: str) -> None:
+    """Raise `MissingExtraError`, one line with all that is missing, unless a command can run."""
+    require(f"orthonav {command}", *NEEDS.get(command, ()))
 
 
 def show_version(arguments: Sequence[str]) -> int:
     """Print what `--version`, with `--verbose` or `--json` beside it, asks for."""
-    parser = argparse.ArgumentParser(prog="orthonav", add_help=False)
-    parser.add_argument("--version", action="store_true")
-    parser.add_argument("-v", "--verbose", action="store_true")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args(arguments)
-    if options.json:
-        print(json.dumps(about(), indent=1))
-    elif options.verbose:
-        print(_text(about()))
-    else:
-        print(f"orthonav {__version__}")
+    whole = not {"-v", "--verbose", "--json"}.isdisjoint(arguments)
+    print(json.dumps(about(), indent=1) if whole else f"orthonav {__version__}")
     return 0
 
 
@@ -40,11 +56,15 @@ def about() -> dict[str, Any]:
         "orthonav": __version__,
         "python": f"{platform.python_version()} ({platform.python_implementation()})",
         "platform": platform.platform(),
-        "processor": _processor(),
-        "core": {package.name: package.version or None for package in packages()},
+        "processor": {
+            "machine": platform.machine(),
+            "cores": usable_cores(),
+            "features": _features(),
+            "kernel": _has_kernel(),
+        },
+        "core": {each.name: each.version or None for each in packages()},
         "extras": {
-            name: {package.name: package.version or None for package in packages(name)}
-            for name in names
+            name: {each.name: each.version or None for each in packages(name)} for name in names
         },
         "unavailable": _unavailable(names),
         "missing": {
@@ -68,18 +88,6 @@ def _answer(extras: Sequence[str]) -> str:
     return pip_line(*extras)
 
 
-def _processor() -> dict[str, Any]:
-    """Architecture, cores that may be used, memory, what OpenCV uses of the instruction set, and
-    whether the kernel of registration was compiled."""
-    return {
-        "machine": platform.machine(),
-        "cores": usable_cores(),
-        "memory_mb": _memory_mb(),
-        "features": _features(),
-        "kernel": _has_kernel(),
-    }
-
-
 def _has_kernel() -> bool:
     """Whether registration uses its compiled kernel; false without NumPy or OpenCV."""
     try:
@@ -98,45 +106,3 @@ def _features() -> list[str] | None:
     line = cv2.getCPUFeaturesLine().split()
     # OpenCV marks with * what is chosen at run time, with ? what this processor lacks.
     return [name.lstrip("*") for name in line if not name.endswith("?")]
-
-
-def _memory_mb() -> int | None:
-    """Memory of the machine, or of the container where that is less; None where not known."""
-    try:
-        whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):
-        return None
-    with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit ("max")
-        whole = min(whole, int(_CGROUP_LIMIT.read_text()))
-    return whole // 10**6
-
-
-def _text(plain: dict[str, Any]) -> str:
-    processor = plain["processor"]
-    features = ", ".join(processor["features"] or ["OpenCV cannot be loaded"])
-    lines = [
-        f"orthonav    {plain['orthonav']}",
-        f"Python      {plain['python']}",
-        f"platform    {plain['platform']}",
-        f"processor   {processor['machine']}, {processor['cores']} cores, "
-        f"{processor['memory_mb'] or '?'} MB of memory; {features}",
-        f"kernel      {'compiled' if processor['kernel'] else 'absent: registration is slower'}",
-        "",
-        f"{'core':<12}{_versions(plain['core'], [])}",
-        *(
-            f"{name:<12}{_versions(found, plain['unavailable'])}"
-            for name, found in plain["extras"].items()
-        ),
-    ]
-    if plain["missing"]:
-        width = max(map(len, plain["missing"]))
-        rows = (f"  {command:<{width}}  {line}" for command, line in plain["missing"].items())
-        lines += ["", "cannot run, and what to type for it:", *rows]
-    return "\n".join(lines)
-
-
-def _versions(found: dict[str, str | None], unavailable: Sequence[str]) -> str:
-    return ", ".join(
-        f"{name} {version or ('not made for this machine' if name in unavailable else 'MISSING')}"
-        for name, version in found.items()
-    )

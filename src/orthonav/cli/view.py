@@ -7,70 +7,36 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from orthonav.cli.common import add_options
+
 if TYPE_CHECKING:
     from orthonav.ground.view.server import Server
 
 log = logging.getLogger(__name__)
+EXAMPLE = "fixes.jsonl --map area.onav --flight flight"
 EVERYDAY = ("--flight", "--truth", "--live")
 LOOPBACK = "127.0.0.1"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "run",
-        type=Path,
-        metavar="RUN",
-        help="fixes.jsonl, the output of `orthonav fly --jsonl`, or a flight log (file, folder, or "
-        "the name given to --log)",
-    )
-    parser.add_argument(
-        "second",
-        type=Path,
-        nargs="?",
-        metavar="SECOND",
-        help="another run of the same flight to compare, such as single and tracked fixes",
-    )
-    parser.add_argument(
-        "--map", type=Path, required=True, metavar="MAP.onav", help="map of the flight"
-    )
-    parser.add_argument(
-        "--flight",
-        type=Path,
-        metavar="FLIGHT_DIR",
-        help="flight folder or flight log with the images (not needed if RUN is a log)",
-    )
-    parser.add_argument(
-        "--truth",
-        type=Path,
-        metavar="truth.csv",
-        help="ground truth: the true positions (default: those of the flight folder, if any)",
-    )
-    parser.add_argument(
-        "--mount",
-        type=Path,
-        metavar="mount.json",
-        help="calibration by `orthonav calibrate` with which the flight was localized (default: "
-        "that of the flight log, if RUN is one)",
-    )
-    parser.add_argument(
-        "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
-    )
-    parser.add_argument(
-        "--live",
-        action="store_true",
-        help="the run is in progress: show new views as they arrive; the file need not exist yet",
-    )
-    parser.add_argument(
-        "--port", type=_port, default=0, help="port of the server (default: any free port)"
-    )
-    parser.add_argument(
-        "--host",
-        default=LOOPBACK,
-        help=f"address to listen on (default {LOOPBACK}: this computer only)",
-    )
-    parser.add_argument(
-        "--no-browser", action="store_true", help="print the address without opening a browser"
-    )
+    add = parser.add_argument
+    text = "fixes.jsonl, the output of `orthonav fly --jsonl`, or a flight log (file, folder, or "
+    add("run", type=Path, metavar="RUN", help=f"{text}the name given to --log)")
+    text = "another run of the same flight to compare, such as single and tracked fixes"
+    add("second", type=Path, nargs="?", metavar="SECOND", help=text)
+    add("--map", type=Path, required=True, metavar="MAP.onav", help="map of the flight")
+    text = "flight folder or flight log with the images (not needed if RUN is a log)"
+    add("--flight", type=Path, metavar="FLIGHT_DIR", help=text)
+    text = "ground truth: the true positions (default: those of the flight folder, if any)"
+    add("--truth", type=Path, metavar="truth.csv", help=text)
+    add_options(parser, "--mount", "--radius-m")
+    text = "the run is in progress: show new views as they arrive; the file need not exist yet"
+    add("--live", action="store_true", help=text)
+    add("--port", type=_port, default=0, help="port of the server (default: any free port)")
+    text = f"address to listen on (default {LOOPBACK}: this computer only)"
+    add("--host", default=LOOPBACK, help=text)
+    text = "print the address without opening a browser"
+    add("--no-browser", action="store_true", help=text)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -87,8 +53,8 @@ def run(options: argparse.Namespace) -> None:
         radius_m=options.radius_m,
         live=options.live,
     )
-    assets = load_assets()
-    server = Server(Pages(open_run(request), assets), options.host, options.port)
+    pages = Pages(open_run(request), load_assets())
+    server = Server(pages, options.host, options.port)
     with server:
         _announce(server, options)
         try:

@@ -18,15 +18,13 @@ from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.onboard.cameras import NewestImage
 from orthonav.onboard.health import IMAGE_AGE_S, LINK_AGE_S, STATUSTEXT_INTERVAL_NS, Level
 from orthonav.onboard.link import AutopilotLink
-from orthonav.onboard.messages.mavlink_local import Autopilot
+from orthonav.onboard.messages.mavlink import Autopilot
 from orthonav.onboard.telemetry import Clocks
 
 TERMINAL_S, FILE_S = 5.0, 30.0
 """Interval of the status line on a terminal, and elsewhere."""
 REMIND_S = 10.0
 """Interval of lines about a missing input."""
-RATE_S = 2.0
-"""The rate of a camera is counted over so much time."""
 _MOST_AGES = 100_000
 _KINDS = {Autopilot.PX4: " PX4", Autopilot.ARDUPILOT: " ArduPilot", None: ""}
 _STATES = {
@@ -146,7 +144,9 @@ class Narrator:
         self._interval_ns = round((TERMINAL_S if console.is_terminal else FILE_S) * 1e9)
         self._status_ns = clocks.mono_ns() + self._interval_ns
         self._reminded: dict[str, int] = {}
-        self._camera, self._autopilot = _CameraWatch(console), _AutopilotWatch(console)
+        self._taken = self._outages = self._image_ns = 0
+        self._has_camera = False
+        self._autopilot = _AutopilotWatch(console)
         self._faults: tuple[str, ...] = ()
         self._faults_ns, self._is_faulty = 0, False
         self._result: ViewResult | None = None
@@ -211,8 +211,18 @@ class Narrator:
     def _watch(self, now_ns: int) -> None:
         if self._link is not None:
             self._remind(self._autopilot.waits(self._link, self._url), now_ns)
-        is_here = self._camera.delivers(self._newest, now_ns, is_live=self._is_live)
-        self._remind(None if is_here else self._images, now_ns)
+        newest, waits = self._newest, self._images
+        is_gone = newest.outages > self._outages or now_ns - self._image_ns > IMAGE_AGE_S * 1e9
+        if self._has_camera and is_gone and self._is_live:
+            self._console.warn("camera lost: no image any more")
+            self._has_camera = False
+        self._outages = newest.outages
+        if newest.taken != self._taken:
+            self._taken, self._image_ns = newest.taken, now_ns
+            if not self._has_camera and newest.size_px is not None:
+                self._console.say("camera {}x{}".format(*newest.size_px))
+            self._has_camera = True
+        self._remind(None if self._has_camera else waits, now_ns)
 
     def _remind(self, waits: str | None, now_ns: int) -> None:
         if waits is not None and now_ns >= self._reminded.get(waits, now_ns):
@@ -266,33 +276,6 @@ class Narrator:
         elif self._counts["views"]:
             parts.append("no position in the whole flight")
         return "end: " + "; ".join(parts)
-
-
-class _CameraWatch:
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._taken = self._outages = self._seen_ns = 0
-        self._since: tuple[int, int] | None = None
-        self._size: tuple[int, int] | None = None
-
-    def delivers(self, newest: NewestImage, now_ns: int, *, is_live: bool) -> bool:
-        taken, outages, size = newest.taken, newest.outages, newest.size_px
-        is_gone = outages > self._outages or now_ns - self._seen_ns > IMAGE_AGE_S * 1e9
-        if self._since is not None and is_gone and is_live:
-            self._console.warn("camera lost: no image any more")
-            self._since = self._size = None
-        self._outages = outages
-        if taken == self._taken:
-            return self._since is not None
-        self._taken, self._seen_ns = taken, now_ns
-        if self._since is None:
-            self._since = now_ns, taken
-        seconds = (now_ns - self._since[0]) / 1e9
-        if size is not None and size != self._size and seconds >= RATE_S:
-            rate_hz = (taken - self._since[1]) / seconds
-            self._console.say(f"camera {size[0]}x{size[1]}, {rate_hz:.1f} Hz")
-            self._size = size
-        return True
 
 
 class _AutopilotWatch:

@@ -31,7 +31,6 @@ from orthonav.onboard.health import (
     EventCounter,
     Health,
     HealthReporter,
-    Snapshot,
     StartCheck,
     TelemetryDiagnosis,
     judge,
@@ -369,7 +368,7 @@ class Runner:
         self._confident_ns = self._clocks.mono_ns()
         self._count("confident")
         if self._start_check is not None:
-            self._start_check.confirmed(fix, self._confident_ns)
+            self._start_check.found(fix, self._confident_ns, self._confident_ns, confirmed=True)
         mount = self.options.mount
         self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
         if not self.options.heading_known:
@@ -472,9 +471,9 @@ class Runner:
         self._count_changes()
         self._save_state()
         texts = [] if self._gnss is None else self._gnss.tick(now_ns)
-        seen = self._snapshot(now_ns)
-        health = self.health = judge(seen)
-        plain = self._plain(health, seen.start_off_m)
+        start_off_m = self._start_off_m(now_ns)
+        health = self.health = self._judged(now_ns, start_off_m)
+        plain = self._plain(health, start_off_m)
         self._publisher.health(plain)
         self._log(lambda sink: sink.health(plain))
         notify("WATCHDOG=1", f"STATUS={health.text()}")
@@ -484,8 +483,8 @@ class Runner:
         if self._link.target is not None:
             if self._reporter.due(health, now_ns):
                 self._send_text(health.level.severity, health.text())
-            for each in texts:
-                self._send_text(each.severity, each.text)
+            for severity, text in texts:
+                self._send_text(severity, text)
             if self._gnss is not None:
                 _send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:
@@ -516,26 +515,21 @@ class Runner:
             self._count("clock_jump")
         self._utc_ahead_ns = ahead_ns
 
-    def _snapshot(self, now_ns: int) -> Snapshot:
+    def _judged(self, now_ns: int, start_off_m: float) -> Health:
         counts = self.counter.counts(now_ns)
-        link, has_origin = None, True
-        if self._link is not None:
-            link, messenger = self._link, self._publisher.messenger
-            needed = messenger is not None and messenger.needs_origin
-            has_origin = not needed or self._link.origin is not None
-        uses_link = link is not None and not self.options.recorded
+        link, messenger = self._link, self._publisher.messenger
+        needs_origin = link is not None and messenger is not None and messenger.needs_origin
         taken_ns = self._image_taken_ns
         image_ns = self._begun_ns if taken_ns is None else taken_ns
         found = (0.0, 0.0) if self._diagnosis is None else self._diagnosis.mismatch(now_ns)
-        heading_deg, log_scale = found if any(found) else self._mismatch
         state = self._locator.state_name
         if state is None and taken_ns is None:
             state = "searching"
-        return Snapshot(
-            running_s=(now_ns - self._begun_ns) / 1e9,
-            counts=counts,
+        return judge(
+            (now_ns - self._begun_ns) / 1e9,
+            counts,
             image_age_s=(now_ns - image_ns) / 1e9,
-            telemetry_age_s=link.attitude_age_s if link and uses_link else 0.0,
+            telemetry_age_s=link.attitude_age_s if link and not self.options.recorded else 0.0,
             link_age_s=link.heard_age_s if link else 0.0,
             low_confidence_s=(now_ns - self._confident_ns) / 1e9,
             latency_s=self.counter.latency_s(0.95),
@@ -543,11 +537,10 @@ class Runner:
             synced=link is None or link.sync.is_exact,
             map_unchanged=_file_id(self.options.map_path) == self._map_id,
             map_intact=self.options.map_change() is None,
-            heading_mismatch_deg=heading_deg,
-            log_scale_mismatch=log_scale,
-            start_off_m=self._start_off_m(now_ns),
+            mismatch=found if any(found) else self._mismatch,
+            start_off_m=start_off_m,
             gnss=() if self._gnss is None else self._gnss.reasons,
-            has_origin=has_origin,
+            has_origin=not needs_origin or (link is not None and link.origin is not None),
             latency=None if self._latency is None or taken_ns is None else self._latency.reason,
         )
 
@@ -557,7 +550,7 @@ class Runner:
             return 0.0
         place = None if self._diagnosis is None else self._diagnosis.place
         if place is not None:
-            check.diagnosed(*place, now_ns)
+            check.found(*place, now_ns, confirmed=False)
         return check.off_m(now_ns)
 
     def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:

@@ -6,13 +6,11 @@ import os
 import socket
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
-from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
@@ -66,77 +64,73 @@ class Health:
         return f"{text}: {', '.join(self.reasons)}" if self.reasons else text
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """Input of `judge`. Ages are in seconds, infinite for "never".
+def judge(
+    running_s: float,
+    counts: Mapping[str, int],
+    *,
+    image_age_s: float = 0.0,
+    telemetry_age_s: float = 0.0,
+    link_age_s: float = 0.0,
+    low_confidence_s: float = 0.0,
+    latency_s: float = 0.0,
+    state: str | None = "tracking",
+    synced: bool = True,
+    map_unchanged: bool = True,
+    map_intact: bool = True,
+    mismatch: tuple[float, float] = (0.0, 0.0),
+    start_off_m: float = 0.0,
+    gnss: Sequence[str] = (),
+    has_origin: bool = True,
+    latency: str | None = None,
+) -> Health:
+    """Ages are in seconds, infinite for "never".
 
     `counts`: events within the window by name; `slow_vision` and `incomplete` are seconds in which
     a local message came too late for PX4 or a message could not be built. `latency_s`: 95th
     percentile from exposure to message. `map_unchanged`: the file of the map's name is the one that
-    was opened; `map_intact`: the open file was not changed. `start_off_m`: distance by which the
-    ground contradicts the start. `gnss`, `latency`: reasons of the monitors. `has_origin`: of the
-    local frame, where messages need it.
+    was opened; `map_intact`: the open file was not changed. `mismatch`: see there. `start_off_m`:
+    distance by which the ground contradicts the start. `gnss`, `latency`: reasons of the monitors.
+    `has_origin`: of the local frame, where messages need it.
     """
-
-    running_s: float
-    counts: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
-    image_age_s: float = 0.0
-    telemetry_age_s: float = 0.0
-    link_age_s: float = 0.0
-    low_confidence_s: float = 0.0
-    latency_s: float = 0.0
-    state: str | None = "tracking"
-    synced: bool = True
-    map_unchanged: bool = True
-    map_intact: bool = True
-    heading_mismatch_deg: float = 0.0
-    log_scale_mismatch: float = 0.0
-    start_off_m: float = 0.0
-    gnss: tuple[str, ...] = ()
-    has_origin: bool = True
-    latency: str | None = None
-
-
-def judge(seen: Snapshot) -> Health:
-    count = Counter(seen.counts)
+    count = Counter(counts)
     many = SHARE * max(count["taken"], 1)
-    settled = seen.running_s > GRACE_S
+    settled = running_s > GRACE_S
     failed = {
-        "no_camera": settled and seen.image_age_s > IMAGE_AGE_S,
-        "link_down": settled and seen.link_age_s > LINK_AGE_S,
-        "no_telemetry": settled and seen.telemetry_age_s > TELEMETRY_AGE_S,
+        "no_camera": settled and image_age_s > IMAGE_AGE_S,
+        "link_down": settled and link_age_s > LINK_AGE_S,
+        "no_telemetry": settled and telemetry_age_s > TELEMETRY_AGE_S,
         "wrong_camera": count["wrong_camera"] > 0,
-        "map_file_changed": not seen.map_intact,
+        "map_file_changed": not map_intact,
         "internal_errors": count["internal_error"] > 0.5 * max(count["processed"], 1),
     }
     degraded = {
-        "heading_mismatch": abs(seen.heading_mismatch_deg) > HEADING_DEG,
-        "height_mismatch": abs(seen.log_scale_mismatch) > LOG_SCALE,
-        "start_mismatch": seen.start_off_m > 0,
-        "lost": seen.state == "lost",
-        "searching": seen.state == "searching",
-        "coasting": seen.state == "coasting" and seen.low_confidence_s > COASTING_S,
-        "low_confidence": seen.state not in ("lost", "searching", "coasting")
-        and seen.low_confidence_s > LOW_CONFIDENCE_S,
+        "heading_mismatch": abs(mismatch[0]) > HEADING_DEG,
+        "height_mismatch": abs(mismatch[1]) > LOG_SCALE,
+        "start_mismatch": start_off_m > 0,
+        "lost": state == "lost",
+        "searching": state == "searching",
+        "coasting": state == "coasting" and low_confidence_s > COASTING_S,
+        "low_confidence": state not in ("lost", "searching", "coasting")
+        and low_confidence_s > LOW_CONFIDENCE_S,
         "frozen_image": count["frozen"] > many,
         "bad_images": count["bad_image"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
-        "slow": seen.latency_s > LATENCY_S or count["late"] > many,
+        "slow": latency_s > LATENCY_S or count["late"] > many,
         "slow_vision": count["slow_vision"] > SHARE * WINDOW_S,
-        "no_origin": settled and not seen.has_origin,
-        "incomplete_message": count["incomplete"] > SHARE * WINDOW_S and seen.has_origin,
+        "no_origin": settled and not has_origin,
+        "incomplete_message": count["incomplete"] > SHARE * WINDOW_S and has_origin,
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
-        "not_synchronized": settled and not seen.synced and not failed["link_down"],
-        "map_file_changed": not seen.map_unchanged and seen.map_intact,
+        "not_synchronized": settled and not synced and not failed["link_down"],
+        "map_file_changed": not map_unchanged and map_intact,
         "output_failed": count["output_failed"] > 0,
         "log_failed": count["log_failed"] > 0,
         "state_not_saved": count["state_failed"] > 0,
         "internal_error": count["internal_error"] > 0 and not failed["internal_errors"],
-        **dict.fromkeys(seen.gnss, True),
+        **dict.fromkeys(gnss, True),
     }
-    if seen.latency is not None:
-        degraded = {seen.latency: True, **degraded}  # the cause of others, so it comes first
+    if latency is not None:
+        degraded = {latency: True, **degraded}  # the cause of others, so it comes first
     worst = tuple(name for name, applies in failed.items() if applies)
     others = tuple(name for name, applies in degraded.items() if applies)
     level = Level.FAILED if worst else Level.DEGRADED if others else Level.OK
@@ -279,11 +273,13 @@ def _in_a_thread(work: Callable[[], None]) -> None:
 
 
 class StartCheck:
+    """Whether the first place that is found contradicts the start."""
+
     def __init__(self, start: Prior, time_ns: int) -> None:
         self._start, self._time_ns = start, time_ns
         self._moved_en_m, self._free_m = np.zeros(2), 0.0
-        self._diagnosed: _Place | None = None
-        self._confirmed: _Place | None = None
+        self._off_m: float | None = None
+        self._seen_ns, self._is_confirmed = 0, False
 
     def moved(self, telemetry: Telemetry) -> None:
         seconds = max(telemetry.time_ns - self._time_ns, 0) / 1e9
@@ -296,45 +292,20 @@ class StartCheck:
         self._moved_en_m += np.array(velocity) * seconds
         self._free_m += SIGMAS * std_mps * seconds
 
-    def diagnosed(self, fix: Fix, seen_ns: int, now_ns: int) -> None:
-        if self._diagnosed is None or self._diagnosed.fix is not fix:
-            self._diagnosed = self._place(fix, seen_ns, now_ns)
-
-    def confirmed(self, fix: Fix, now_ns: int) -> None:
-        # The first one decides.
-        if self._confirmed is None:
-            self._confirmed = self._place(fix, now_ns, now_ns)
+    def found(self, fix: Fix, seen_ns: int, now_ns: int, *, confirmed: bool) -> None:
+        """A place by the diagnosis, or, `confirmed`, by the track. The first one decides: later an
+        aircraft may have come to any place from the start."""
+        if self._is_confirmed:
+            return
+        self._seen_ns, self._is_confirmed = seen_ns, confirmed
+        if self._off_m is None:
+            plane = LocalFrame(fix.lat_deg, fix.lon_deg)
+            start_en_m = plane.en_from_latlon(self._start.lat_deg, self._start.lon_deg)
+            off_m = float(np.hypot(*(start_en_m + self._moved_en_m)))
+            std_m = math.hypot(self._start.std_m, fix.radius_m)
+            free_m = self._free_m + SPEED_MPS * (now_ns - seen_ns) / 1e9
+            self._off_m = off_m if off_m > SIGMAS * std_m + free_m else 0.0
 
     def off_m(self, now_ns: int) -> float:
-        """Distance by which the last place contradicts the start, m; 0 within the deviations."""
-        last = self._confirmed or self._diagnosed
-        return last.off_m if last is not None and now_ns - last.seen_ns < SHOWN_S * 1e9 else 0.0
-
-    def _place(self, fix: Fix, seen_ns: int, now_ns: int) -> "_Place":
-        """A place and what it says of the start. With time an aircraft may have come to any place
-        from the start: where it may have come from the last place, that one decides."""
-        off_m = float(np.hypot(*(_from(fix, self._start) + self._moved_en_m)))
-        std_m = math.hypot(self._start.std_m, fix.radius_m)
-        free_m = self._free_m + SPEED_MPS * (now_ns - seen_ns) / 1e9
-        if off_m <= SIGMAS * std_m + free_m:
-            before = self._diagnosed
-            off_m = before.off_m if before is not None and before.reaches(fix, seen_ns) else 0.0
-        return _Place(seen_ns, fix, off_m)
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A confident fix, and the distance by which it contradicts the start, 0 if it does not."""
-
-    seen_ns: int
-    fix: Fix
-    off_m: float
-
-    def reaches(self, fix: Fix, seen_ns: int) -> bool:
-        free_m = SPEED_MPS * (seen_ns - self.seen_ns) / 1e9
-        return float(np.hypot(*_from(fix, self.fix))) <= free_m + self.fix.radius_m + fix.radius_m
-
-
-def _from(fix: Fix, other: Fix | Prior) -> NDArray[np.float64]:
-    """Metres east and north (2,) of another place from a fix."""
-    return LocalFrame(fix.lat_deg, fix.lon_deg).en_from_latlon(other.lat_deg, other.lon_deg)
+        """Distance by which the place contradicts the start; 0 within the deviations."""
+        return self._off_m or 0.0 if now_ns - self._seen_ns < SHOWN_S * 1e9 else 0.0

@@ -36,7 +36,7 @@ LARGEST_STD_S = 0.3
 STATED_STD_S = 0.03
 """Least standard deviation of a stated latency: one image at 30 Hz."""
 FIRST_NS = 5 * 10**9
-"""A latency is used after images agreed with it, or after this time without enough motion."""
+"""A latency is used after images agreed with it, or so long without enough motion."""
 SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
 """Interval at which reported states are stored, and how far back after a time without images;
 telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_NS`)."""
@@ -65,11 +65,8 @@ LONGEST_S, LEAST_S, STEP_S = 12.0, 0.5, 0.1
 
 @dataclass(frozen=True)
 class Latency:
-    """The latency to use for one image.
-
-    `arrived_ns`: by our clock. `delay_s`, `std_s`: exposure to arrival; 0 and NaN where not stated.
-    `reason`: why the latency must not be used. `detail`: one sentence about it.
-    """
+    """`arrived_ns`: of an image, by our clock. `delay_s`, `std_s`: from its exposure; 0 and NaN
+    where not stated. `reason`: why they must not be used. `detail`: one sentence about it."""
 
     arrived_ns: int
     delay_s: float
@@ -79,8 +76,6 @@ class Latency:
 
 
 class LatencyMonitor:
-    """Judges the stated latency of a live camera. Mutable; for one thread."""
-
     def __init__(
         self,
         stated_s: float | None = None,
@@ -115,7 +110,7 @@ class LatencyMonitor:
         return Latency(arrived_ns, self._delay_s, self._std_s, *self._doubt())
 
     def frozen(self, arrived_ns: int) -> None:
-        """Note an image that repeats the one before: the stream may be stalled."""
+        # The stream may be stalled.
         if self._frozen_ns is None:
             self._frozen_ns = arrived_ns
 
@@ -140,7 +135,7 @@ class LatencyMonitor:
         state_at: Callable[[int], VehicleState],
         covered_ns: int | None,
     ) -> None:
-        """Compare an image with the one before and the states reported, known to `covered_ns`."""
+        # States are known to `covered_ns`.
         if not self._is_stated:
             return
         self._frozen_ns = None  # this image is not frozen
@@ -163,11 +158,9 @@ class LatencyMonitor:
 
     @property
     def reason(self) -> str | None:
-        """Reason why the latency cannot be used; None where it can."""
         return self._doubt()[0]
 
     def plain(self) -> dict[str, float | str | None]:
-        """What is known, for logs; `latency` is "stated" or why it is not used."""
         reason, detail = self._doubt()
         return {
             "latency_ms": round(self._delay_s * 1e3, 1) if self._is_stated else None,
@@ -210,25 +203,20 @@ class LatencyMonitor:
 
     def _compare_again(self) -> None:
         self._compared, self._first_ns = False, None
-        self._odometry.reset()
+        self._odometry = PictureOdometry()
         self._check.clear()
 
 
 class Compared(NamedTuple):
-    """Comparison of the last motion that images show with the reported one.
-
-    `share`: of the motion that is both seen and reported, `varying`: the same without steady turns;
-    NaN where little moved. `is_reported`: the aircraft moved by the report.
-    """
+    """Share of the motion that is both seen and reported; the same without steady turns; NaN where
+    little moved."""
 
     share: float = math.nan
     varying: float = math.nan
-    is_reported: bool = False
+    is_reported: bool = False  # the aircraft moved by the report
 
 
 class MotionCheck:
-    """Whether the images of the last seconds move as the autopilot reports. Mutable."""
-
     def __init__(self, delay_s: float, *, heading_known: bool = True) -> None:
         self._delay_ns = round(delay_s * 1e9)
         self._heading_known = heading_known
@@ -245,15 +233,12 @@ class MotionCheck:
         while self._waiting and self._waiting[0].end_ns - self._delay_ns <= history.newest_ns:
             one = self._waiting.popleft()
             times = (np.array([each - self._delay_ns]) for each in (one.start_ns, one.end_ns))
-            moved = history.motion(*times)
-            velocity = moved.velocity_shift[0]
-            turn, tilt = moved.turn_rad[0], moved.tilt_shift[0]
+            turn, tilt, velocity = (each[0] for each in history.motion(*times))
             row = np.array([one.seconds, one.turn_rad, *one.shift, turn, *tilt, *velocity])
             if np.isfinite(row[:7]).all():
                 self._rows.append((one.end_ns, row))
 
     def compared(self) -> Compared:
-        """The motion of the last seconds beside the reported one."""
         while self._rows and self._rows[0][0] < self._rows[-1][0] - SECONDS * 1e9:
             self._rows.popleft()
         if not self.is_filled:
@@ -293,7 +278,7 @@ class MotionCheck:
         return len(self._rows) >= LEAST_PAIRS
 
     def _contradicts(self, seen: Array, reported: Array) -> bool:
-        """Whether shifts per second (N, 2) by the velocity differ beyond errors of height."""
+        # Shifts per second (N, 2) by the velocity, beyond errors of height.
         seen, reported = np.median(seen, axis=0), np.median(reported, axis=0)
         size = float(np.hypot(*reported))
         if size < LEAST_PER_S:
@@ -313,34 +298,28 @@ def _sound(pairs: Array) -> Array:
     return np.asarray(pairs[worst <= limit])
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A position (2,), metres east and north, and its standard deviation."""
-
-    exposed_ns: int
-    en_m: Array
-    std_m: float
+Place = tuple[int, Array, float]
+"""Time of exposure, metres east and north (2,), standard deviation (m)."""
 
 
 class PositionCheck:
     def __init__(self) -> None:
-        self._places: deque[_Place] = deque(maxlen=100)
+        self._places: deque[Place] = deque(maxlen=100)
 
     def jump_s(
         self, exposed_ns: int, en_m: Array, std_m: float, history: StateHistory
     ) -> float | None:
         """Growth of the latency (s) by which the position jumped; None without a jump or where no
-        latency explains it. One that jumped does not count later. `exposed_ns`: by the latency in
-        use; `en_m` (2,): metres east and north."""
-        now = _Place(exposed_ns, en_m, std_m)
-        while len(self._places) > 1 and self._places[0].exposed_ns < exposed_ns - KEEP_S * 1e9:
+        latency explains it. One that jumped does not count later."""
+        now = exposed_ns, en_m, std_m
+        while len(self._places) > 1 and self._places[0][0] < exposed_ns - KEEP_S * 1e9:
             self._places.popleft()
         if self._places:
             ago_s, path = _path(exposed_ns, history)
             jumps = (_jump_s(each, now, ago_s, path) for each in self._places)
-            found = next((each for each in jumps if each is not None), None)
-            if found is not None:
-                return found
+            for found in jumps:
+                if found is not None:
+                    return found
         self._places.append(now)
         return None
 
@@ -359,17 +338,16 @@ def _path(exposed_ns: int, history: StateHistory) -> tuple[Array, Array]:
     return np.asarray(ago_s, np.float64), np.concatenate([later, np.zeros((1, 2)), earlier])
 
 
-def _jump_s(before: _Place, now: _Place, ago_s: Array, path: Array) -> float | None:
-    """Growth of the latency that explains a jump; None without a jump or an explanation."""
-    seconds = (now.exposed_ns - before.exposed_ns) / 1e9
+def _jump_s(before: Place, now: Place, ago_s: Array, path: Array) -> float | None:
+    seconds = (now[0] - before[0]) / 1e9
     if not 0 < seconds <= LONGEST_GAP_S:
         return None
     flown = -np.array([np.interp(seconds, ago_s, each) for each in path.T])
     if not np.isfinite(flown).all():
         return None
-    jump = now.en_m - before.en_m - flown
+    jump = now[1] - before[1] - flown
     speed_std = usual_velocity_std_mps(float(np.hypot(*flown)) / seconds)
-    std_m = math.hypot(before.std_m, now.std_m)
+    std_m = math.hypot(before[2], now[2])
     if not np.hypot(*jump) > SIGMAS * math.hypot(std_m, speed_std * seconds):
         return None
     usual = (np.abs(ago_s) >= LEAST_S) & (np.abs(ago_s) <= LONGEST_S)

@@ -11,17 +11,18 @@ from typing import Any
 
 from orthonav.core.extras import needed
 from orthonav.core.flight.gnss import GnssSample
-from orthonav.onboard.gnss.records import gnss_sample
+from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.onboard.messages.estimate import Clock, EstimateError
 from orthonav.onboard.messages.mavlink import (
+    Autopilot,
     Message,
+    Origin,
     Packer,
     Signing,
     Target,
     dialect,
     signing_timestamp,
 )
-from orthonav.onboard.messages.mavlink_local import Autopilot, Origin
 from orthonav.onboard.ports import Transport
 from orthonav.onboard.telemetry import (
     Aiding,
@@ -29,7 +30,6 @@ from orthonav.onboard.telemetry import (
     ClockSync,
     TelemetryBuffer,
     VehicleState,
-    wxyz_of_angles,
 )
 
 log = logging.getLogger(__name__)
@@ -48,6 +48,11 @@ _FAR_NS = 60 * 10**9
 _ARMED = 128
 _SAME_M = 0.05
 """Heights above home and above sea level that are the same within this are one height, twice."""
+_LATE_NS = 2 * 10**9
+"""Timestamps of GNSS solutions that differ more from their arrival are of another clock."""
+_UNKNOWN_16 = 65535
+HDOP_STD_M = 3.0
+"""Standard deviation of a GNSS position per unit of HDOP, where no accuracy is stated."""
 
 
 class AutopilotLink:
@@ -276,9 +281,9 @@ class AutopilotLink:
 
     def _attitude(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
-        angles = message.roll, message.pitch, message.yaw
+        angles = message.yaw, message.pitch, message.roll
         if all(map(math.isfinite, angles)):
-            self.buffer.add_attitude(time_ns, wxyz_of_angles(*angles).tolist())
+            self.buffer.add_attitude(time_ns, wxyz_of_angles(angles).tolist())
             self._attitude_ns = now_ns
 
     def _quaternion(self, message: Message, now_ns: int) -> None:
@@ -455,3 +460,32 @@ def _without_side_effects(decoder: Any) -> Callable[..., bool]:
 
 def _age_s(now_ns: int, then_ns: int | None) -> float:
     return math.inf if then_ns is None else (now_ns - then_ns) / 1e9
+
+
+def gnss_sample(message: Any, arrived_ns: int, arrived_boot_ns: int | None) -> GnssSample:
+    """The solution of a GPS_RAW_INT or GPS2_RAW by our clock.
+
+    `arrived_ns`: arrival by our clock; `arrived_boot_ns`: by the autopilot's, None where its offset
+    is not known. The time of the solution is its timestamp where that is time since boot, else its
+    arrival. `eph` is an HDOP; `h_acc`, an extension, is 0 where it is not known.
+    """
+    stamp_ns = int(message.time_usec) * 1000
+    late_ns = math.inf if arrived_boot_ns is None else arrived_boot_ns - stamp_ns
+    std_m = math.nan if message.eph == _UNKNOWN_16 else message.eph * 1e-2 * HDOP_STD_M
+    std_m = message.h_acc * 1e-3 if message.h_acc > 0 else std_m
+    velocity = None
+    if _UNKNOWN_16 not in (message.vel, message.cog):
+        speed, course = message.vel * 1e-2, math.radians(message.cog * 1e-2)
+        velocity = speed * math.sin(course), speed * math.cos(course)
+    return GnssSample(
+        time_ns=arrived_ns - int(late_ns) if abs(late_ns) <= _LATE_NS else arrived_ns,
+        arrived_ns=arrived_ns,
+        lat_deg=message.lat * 1e-7,
+        lon_deg=message.lon * 1e-7,
+        fix_type=message.fix_type,
+        std_m=std_m,
+        vel_en_mps=velocity,
+        satellites=-1 if message.satellites_visible == 255 else message.satellites_visible,
+        stamp_ns=stamp_ns or None,
+        receiver=int(message.get_type() == "GPS2_RAW"),
+    )

@@ -7,7 +7,7 @@ a pyramid, Bouguet 2001) in a small picture, independently of the odometry of th
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ SIDE_PX = 240
 CORNERS, LEAST_CORNERS, LEAST_SHARE = 90, 20, 0.5
 """Corners that are sought; those that must be found again, by number and share."""
 RETURN_PX = 0.5
-"""A corner tracked forth and back must return within this distance (Kalal et al. 2010)."""
+"""A corner tracked forth and back must return within this distance (Kalal et al., 2010)."""
 RANSAC_PX = 1.0
 EVENED_PX, LEAST_CONTRAST = 41, 2.0
 """Brightness and contrast (grey levels) are evened within squares of this size: of an exposure that
@@ -47,12 +47,9 @@ _WINDOW = (17, 17)
 
 @dataclass(frozen=True, eq=False)
 class ImageMotion:
-    """Motion from one image to a later one.
-
-    `start_ns`, `end_ns`: times of arrival of both. `turn_rad`: rotation of the picture about the
-    optical axis, clockwise in the image. `shift` (2,): displacement of the centre, right and down,
-    in units of the focal length.
-    """
+    """Of images that arrived at `start_ns` and `end_ns`. `turn_rad`: rotation of the picture about
+    the optical axis, clockwise in the image. `shift` (2,): displacement of the centre, right and
+    down, in units of the focal length."""
 
     start_ns: int
     end_ns: int
@@ -65,22 +62,14 @@ class ImageMotion:
 
 
 class PictureOdometry:
-    """Compares every image with the one before. Mutable."""
-
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
         self._before: Grey | None = None
         self._arrived_ns = 0
         self._corners: Corners | None = None
 
-    def wants(self, arrived_ns: int) -> bool:
-        return self._before is None or not 0 <= arrived_ns - self._arrived_ns < SHORTEST_S * 1e9
-
     def motion(self, grey: Grey, camera: Camera, arrived_ns: int) -> ImageMotion | None:
         """Motion since the image before; None where it is too close, too far away, or differs."""
-        if not self.wants(arrived_ns):
+        if self._before is not None and 0 <= arrived_ns - self._arrived_ns < SHORTEST_S * 1e9:
             return None
         share = min(1.0, SIDE_PX / max(grey.shape))
         size = (max(8, round(grey.shape[1] * share)), max(8, round(grey.shape[0] * share)))
@@ -100,7 +89,6 @@ class PictureOdometry:
 
 
 def _evened(grey: Grey) -> Grey:
-    """Image with even brightness and contrast: exposure, shadows and vignetting do not move."""
     square = (EVENED_PX, EVENED_PX)
     varying = np.asarray(grey, np.float32)
     varying = varying - cv2.blur(varying, square)
@@ -110,14 +98,12 @@ def _evened(grey: Grey) -> Grey:
 
 
 def _corners(grey: Grey) -> Corners | None:
-    """Corners (N, 1, 2) of an image; None where there are none."""
     found: Any = cv2.goodFeaturesToTrack(grey, CORNERS, 0.02, SIDE_PX / 30, blockSize=5)
     return None if found is None else np.asarray(found, np.float32)
 
 
 def _tracked(before: Grey, now: Grey, corners: Corners) -> tuple[Corners, Corners] | None:
-    """Corners (N, 2) of an image and where they are in the next one; None where too few are
-    found again."""
+    """Corners (N, 2) in both images; None where too few are found again."""
     options = {"winSize": _WINDOW, "maxLevel": 3}
     # The stubs of OpenCV require the argument that is None.
     ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, **options)  # type: ignore[call-overload]
@@ -148,14 +134,13 @@ def _motion(
 
 
 def _plane(px: Corners, camera: Camera) -> Array:
-    """Ideal camera-plane coordinates (N, 2) of OpenCV's pixels, which count from pixel centres."""
+    # OpenCV's pixels count from pixel centres.
     middle = np.array([camera.cx_px, camera.cy_px]) - 0.5
     return undistort(camera, (px - middle) / [camera.fx_px, camera.fy_px])
 
 
 def centre_motion(homographies: Array) -> tuple[Array, Array]:
-    """Rotation (N,) and displacement (N, 2) of the centre by homographies (N, 3, 3) between
-    camera planes."""
+    """Rotation (N,) and displacement (N, 2) of the centre by homographies (N, 3, 3)."""
     below = homographies[:, 2, 2]
     shift = homographies[:, :2, 2] / below[:, None]
     jacobian = homographies[:, :2, :2] - shift[:, :, None] * homographies[:, 2:, :2]
@@ -164,16 +149,10 @@ def centre_motion(homographies: Array) -> tuple[Array, Array]:
     return np.asarray(turn), np.asarray(shift)
 
 
-class ReportedMotion(NamedTuple):
-    """Motion of the picture by the reported state for N pairs of times; NaN where not known.
-
-    `turn_rad` (N,): by the attitudes, and the velocity where known. `tilt_shift` (N, 2): by the
-    attitudes alone. `velocity_shift` (N, 2): by the velocity over flat ground.
-    """
-
-    turn_rad: Array
-    tilt_shift: Array
-    velocity_shift: Array
+ReportedMotion = tuple[Array, Array, Array]
+"""Motion of the picture by the reported state for N pairs of times; NaN where not known: its turn
+(N,) in rad by the attitudes, and the velocity where known; its shift (N, 2) by the attitudes alone;
+that by the velocity over flat ground."""
 
 
 def reported_motion(
@@ -194,7 +173,7 @@ def reported_motion(
         both = turned - moved[:, :, None] * ground_up[:, None, :]
         turn_of_both, shift = centre_motion(both)
     turn = np.where(np.isfinite(turn_of_both), turn_of_both, turn)
-    return ReportedMotion(turn, tilt_shift, shift - tilt_shift)
+    return turn, tilt_shift, shift - tilt_shift
 
 
 class StateHistory:
@@ -214,8 +193,7 @@ class StateHistory:
         velocity_enu_mps: ArrayLike | None,
         height_m: float,
     ) -> None:
-        """Add a state: rotation (3, 3) from camera axes to east, north, up, velocity (3,), height
-        above ground. None and NaN: not known. A time that is not newer than the last is ignored."""
+        """Add a state; None and NaN: not known. A time that is not newer is ignored."""
         if time_ns <= self.newest_ns:
             return
         row = np.full(13, math.nan)
@@ -239,7 +217,6 @@ class StateHistory:
         return self._at(times_ns)[:, 9:11]
 
     def _at(self, times_ns: Times) -> Array:
-        """Values (N, 13), linear between states; NaN where not known."""
         if len(self._times) < 2:
             return np.full((len(times_ns), 13), math.nan)
         after = np.clip(np.searchsorted(self._times, times_ns), 1, len(self._times) - 1)

@@ -5,7 +5,6 @@ import errno
 import json
 import logging
 import math
-import socket
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,17 +25,15 @@ from orthonav.onboard.messages.estimate import (
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
+    Autopilot,
+    LocalPose,
     Message,
+    Origin,
     external_position_estimate,
     global_position_sensor,
     gps_input,
-    request_message,
-)
-from orthonav.onboard.messages.mavlink_local import (
-    Autopilot,
-    LocalPose,
-    Origin,
     odometry,
+    request_message,
     set_gps_global_origin,
     vision_position_estimate,
 )
@@ -66,7 +63,7 @@ PX4_VISION_S = 0.2
 ORIGIN_NS, ORIGIN_REQUESTS = 2 * 10**9, 3
 """Interval of requests for the origin, and their number after which the autopilot has none."""
 _GPS_GLOBAL_ORIGIN = 49
-_MOST_CLIENTS, _CLIENT_BYTES, _MOST_REASONS = 8, 8192, 20
+_MOST_REASONS = 20
 
 
 @dataclass(frozen=True)
@@ -202,37 +199,6 @@ def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
     )
 
 
-class TcpSink:
-    """TCP server that sends the same data to all clients; one that does not read is dropped."""
-
-    def __init__(self, address: tuple[str, int]) -> None:
-        self._listening = socket.create_server(address)
-        self._listening.setblocking(False)
-        self._clients: list[socket.socket] = []
-
-    def write(self, data: bytes) -> None:
-        try:
-            while len(self._clients) < _MOST_CLIENTS:
-                client, _ = self._listening.accept()
-                client.setblocking(False)
-                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _CLIENT_BYTES)
-                self._clients.append(client)
-        except BlockingIOError:
-            pass
-        for client in list(self._clients):
-            try:
-                whole = client.send(data) == len(data)
-            except OSError:
-                whole = False
-            if not whole:
-                client.close()
-                self._clients.remove(client)
-
-    def close(self) -> None:
-        for each in (*self._clients, self._listening):
-            each.close()
-
-
 class SerialSink:
     """A serial port; after a failure the next write opens it again."""
 
@@ -255,22 +221,18 @@ class SerialSink:
             self._port = None
 
 
-Sink = Udp | TcpSink | SerialSink
+Sink = Udp | SerialSink
 
 
 def open_sink(url: str) -> Sink:
-    """Output at `udp:HOST:PORT`, `tcp-listen:[HOST:]PORT` (default: loopback) or
-    `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where it cannot be opened."""
+    """Output at `udp:HOST:PORT` or `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where
+    it cannot be opened."""
     kind, _, rest = url.partition(":")
     if kind == "udp":
         return Udp(None, host_port(rest, url))
-    if kind == "tcp-listen":
-        return TcpSink(host_port(rest, url))
     if kind == "serial":
         return SerialSink(*device_baud(rest, url))
-    raise VariantError(
-        f"expected udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD, got '{url}'"
-    )
+    raise VariantError(f"expected udp:HOST:PORT or serial:DEVICE:BAUD, got '{url}'")
 
 
 class NmeaOut:

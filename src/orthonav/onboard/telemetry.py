@@ -15,10 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
-from orthonav.core.geo.camera import attitude_of
+from orthonav.core.geo.attitude import (
+    LOOKS_DOWN,
+    Angles,
+    enu_from_body_camera,
+    matrices_of_wxyz,
+    slerp,
+)
+from orthonav.core.geo.camera import angles_of_ned, attitude_of
 from orthonav.core.records import Telemetry
 
 HEIGHT_SOURCES = ("distance", "terrain", "amsl", "home", "relative")
@@ -104,7 +109,7 @@ class VehicleState:
         """Roll, pitch and yaw of the body in radians; NaN where not known."""
         if self.ned_from_body is None:
             return _NAN3
-        yaw, pitch, roll = Rotation.from_matrix(self.ned_from_body).as_euler("ZYX").tolist()
+        yaw, pitch, roll = angles_of_ned(self.ned_from_body)
         return roll, pitch, yaw
 
     def telemetry(self, time_ns: int, mount_deg: Angles = LOOKS_DOWN) -> Telemetry:
@@ -202,9 +207,6 @@ class TelemetryBuffer:
         if not abs(norm - 1) < 0.1:  # NaN too
             return
         quaternion /= norm
-        before = self._attitude.values
-        if before and float(before[-1] @ quaternion) < 0:
-            quaternion = -quaternion  # the same attitude, for the shorter interpolation
         self._attitude.add(time_ns, quaternion, KEEP_NS)
 
     def add_height(self, source: str, time_ns: int, height_m: float) -> None:
@@ -216,7 +218,7 @@ class TelemetryBuffer:
         """Add a distance along the body's down axis, converted to a height over flat ground."""
         found = self._attitude.values[-1] if self._attitude.values else None
         if found is not None:
-            down = _matrix(found)[2, 2]
+            down = matrices_of_wxyz(found)[2, 2]
             if down > 0.5:
                 self.add_height("distance", time_ns, distance_m * float(down))
 
@@ -243,10 +245,7 @@ class TelemetryBuffer:
         found = self._attitude.around(time_ns)
         if found is not None and time_ns > self._attitude.times[-1]:
             found = self._attitude.ahead(time_ns, ATTITUDE_AHEAD_NS) or found
-        turn = None
-        if found is not None:
-            before, after, weight = found
-            turn = _matrix(_slerp(before, after, weight))
+        turn = None if found is None else matrices_of_wxyz(slerp(*found))
         above_ground = [name for name in self._order if name != "amsl"]
         state = VehicleState(
             turn,
@@ -281,25 +280,6 @@ class TelemetryBuffer:
 
 def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def wxyz_of_angles(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
-    """Quaternion w, x, y, z of an autopilot's Euler angles (rotations in the order ZYX)."""
-    xyzw = Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_quat()
-    return np.asarray(xyzw[[3, 0, 1, 2]])
-
-
-def _slerp(before: Array, after: Array, weight: float) -> Array:
-    """Spherical linear interpolation of two quaternions whose dot product is not negative."""
-    angle = math.acos(min(1.0, float(before @ after)))
-    if weight == 0.0 or angle < 1e-6:
-        return before
-    mixed = math.sin((1 - weight) * angle) * before + math.sin(weight * angle) * after
-    return np.asarray(mixed / math.sin(angle))
-
-
-def _matrix(wxyz: Array) -> Array:
-    return np.asarray(Rotation.from_quat(wxyz[[1, 2, 3, 0]]).as_matrix())
 
 
 class ClockSync:

@@ -8,9 +8,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
-from orthonav.core.geo.attitude import AUTOPILOT_TILT_STD_DEG
+from orthonav.core.geo.attitude import (
+    AUTOPILOT_TILT_STD_DEG,
+    matrices_of_wxyz,
+    slerp,
+    wxyz_of_matrices,
+)
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.records import Prior, Telemetry
 
@@ -103,7 +107,7 @@ def attitude_series(
     """An attitude series from `enu_from_camera` (N, 3, 3) and whether its heading is known (N,)."""
     if len(time_ns) == 0:
         return None
-    quaternions = Rotation.from_matrix(rotations).as_quat()
+    quaternions = wxyz_of_matrices(rotations)
     flags = np.ones(len(time_ns)) if known is None else known.astype(np.float64)
     return series_of(time_ns, np.column_stack([quaternions, flags]))
 
@@ -154,7 +158,7 @@ class RecordedTrack:
     """Measurements along a flight; a series that is None was not recorded."""
 
     attitude: TimeSeries | None
-    """Quaternion x, y, z, w of `enu_from_camera`, and 1 where its heading is known."""
+    """Quaternion w, x, y, z of `enu_from_camera`, and 1 where its heading is known."""
     heights: tuple[TimeSeries, ...] = ()
     """Metres above ground, as measured; of several series the more accurate first."""
     home: TimeSeries | None = None  # metres above the place of take-off
@@ -262,10 +266,10 @@ def angles_at(attitude: TimeSeries | None, time_ns: int) -> tuple[float, float, 
     ends = attitude.values[[before, after]]
     known = bool(ends[:, 4].all())
     if before == after or not known:
-        rotation = Rotation.from_quat(ends[int(weight > 0.5), :4])
+        wxyz = ends[int(weight > 0.5), :4]
     else:
-        rotation = Slerp([0.0, 1.0], Rotation.from_quat(ends[:, :4]))(weight)
-    yaw, pitch, roll = attitude_of(rotation.as_matrix())
+        wxyz = slerp(ends[0, :4], ends[1, :4], weight)
+    yaw, pitch, roll = attitude_of(matrices_of_wxyz(wxyz))
     return yaw if known else math.nan, pitch, roll
 
 

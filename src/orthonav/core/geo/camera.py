@@ -178,14 +178,19 @@ def attitude_of(enu_from_camera: Array) -> tuple[float, float, float]:
     """Heading (0..360), pitch and roll in degrees: the inverse of `enu_from_camera`.
 
     At a pitch of +-90 only heading plus or minus roll is determined; the roll is then 0."""
-    ned_from_body = _ENU_FROM_NED.T @ enu_from_camera @ _BODY_FROM_CAMERA.T
+    yaw, pitch, roll = angles_of_ned(_ENU_FROM_NED.T @ enu_from_camera @ _BODY_FROM_CAMERA.T)
+    return math.degrees(yaw) % 360 % 360, math.degrees(pitch), math.degrees(roll)
+
+
+def angles_of_ned(ned_from_body: Array) -> tuple[float, float, float]:
+    """Yaw, pitch and roll (Tait-Bryan Z-Y-X) of a rotation (3, 3) in radians."""
     pitch = math.asin(min(1.0, max(-1.0, -ned_from_body[2, 0])))
     if math.hypot(ned_from_body[0, 0], ned_from_body[1, 0]) < 1e-9:
         yaw, roll = math.atan2(-ned_from_body[0, 1], ned_from_body[1, 1]), 0.0
     else:
         yaw = math.atan2(ned_from_body[1, 0], ned_from_body[0, 0])
         roll = math.atan2(ned_from_body[2, 1], ned_from_body[2, 2])
-    return math.degrees(yaw) % 360 % 360, math.degrees(pitch), math.degrees(roll)
+    return yaw, pitch, roll
 
 
 def _rotation(axis: int, angle_rad: float) -> Array:

@@ -41,11 +41,6 @@ class GreyInfo:
     quality: int
     valid_px: int
 
-    @property
-    def raw_bytes(self) -> int:
-        """As uncompressed RGB at the working resolution."""
-        return 3 * self.valid_px
-
     def to_plain(self) -> dict[str, Any]:
         return {"codec": CODEC, **vars(self)}
 

@@ -4,7 +4,7 @@
  * eight columns or rows at a time: those along a column, the product with the spectra of the map and
  * the one back stay in the processor's cache. `near` lays it on the places around each of many poses,
  * one by one. `moved` lays it on the places a little aside of one pose, by the same transforms. The
- * Python modules do the same with SciPy and OpenCV; they are the oracle of this file and take its place
+ * Python modules do the same with NumPy and OpenCV; they are the oracle of this file and take its place
  * where it was not compiled. */
 
 #include "_kernel.h"

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
 
 from orthonav.core.geo.camera import counted_from_centres
 from orthonav.core.register.channels import GROUPS, ChannelRecipe
@@ -85,8 +84,8 @@ class SearchWindow:
             # A view reaches so far beyond the border; beyond it is nothing.
             pad, least = max(half_px - margin_px, 0), 2 * half_px
         self.size = (
-            next_fast_len(max(self.height + pad, least), real=True),
-            next_fast_len(max(self.width + pad, least), real=True),
+            cv2.getOptimalDFTSize(max(self.height + pad, least)),
+            cv2.getOptimalDFTSize(max(self.width + pad, least)),
         )
         self._made, self._view_px = made, view_px
 
@@ -126,7 +125,7 @@ class SearchWindow:
 
     def _transformed(self) -> NDArray[np.complex64]:
         planes = np.moveaxis(self._normalized(), 2, 0)
-        return np.asarray(rfft2(planes, s=self.size), np.complex64)
+        return np.asarray(np.fft.rfft2(planes, s=self.size, axes=(1, 2)), np.complex64)
 
     def _normalized(self) -> Array:
         groups = (self._made[..., group] for group in GROUPS)
@@ -373,16 +372,16 @@ class _Scratch:
         strip = np.zeros((3, 2 * half, cols), np.float32)
         strip[:, :, : half + 1] = posed[:, :, half - 1 :]
         strip[:, :, cols - half + 1 :] = posed[:, :, : half - 1]
-        along = rfft(strip, axis=2)
+        along = np.fft.rfft(strip, axis=2)
         self._spectra[:, : half + 1] = along[:, half - 1 :]
         self._spectra[:, half + 1 : rows - half + 1] = 0
         self._spectra[:, rows - half + 1 :] = along[:, : half - 1]
-        spectra = fft(self._spectra, axis=1, overwrite_x=True)
+        spectra = np.fft.fft(self._spectra, axis=1)
         np.multiply(window.spectra[0], spectra[0], out=self._total)
         for number in (1, 2):
             np.multiply(window.spectra[number], spectra[number], out=self._product)
             np.add(self._total, self._product, out=self._total)
-        surface = irfft2(self._total, s=window.size, overwrite_x=True)
+        surface = np.fft.irfft2(self._total, s=window.size, axes=(0, 1))
         return np.asarray(surface, np.float32)[: window.height, : window.width]
 
 

@@ -7,9 +7,9 @@ correlation (Kuglin and Hines, 1975), all from the same spectra (docs/decisions/
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft2, next_fast_len, rfft2
 
 from orthonav.core.register.channels import CHANNELS, GROUPS
 from orthonav.core.register.kernel import KERNEL
@@ -71,7 +71,7 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
     rows, cols = (max(MIN_REACH_PX, int(side * REACH_SHARE)) for side in (height, width))
     window = MapWindow.of(template, reference, pose, 0, (rows, cols))
     # Moves of less than the margin never reach over the border: no padding.
-    size = tuple(next_fast_len(side, real=True) for side in window.shape)
+    size = tuple(cv2.getOptimalDFTSize(side) for side in window.shape)
     if KERNEL is not None:
         moved = np.empty((3, 2 * rows + 1, 2 * cols + 1), np.float32)
         KERNEL.moved(
@@ -86,10 +86,11 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
     for group, weight in zip(GROUPS, template.weights, strict=True):
         energy = float(np.square(planes[group]).sum())
         planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
-    products = np.conj(rfft2(template.channels, s=size)) * rfft2(planes[:3], s=size)
+    products = np.conj(np.fft.rfft2(template.channels, s=size, axes=(1, 2)))
+    products *= np.fft.rfft2(planes[:3], s=size, axes=(1, 2))
     power = np.abs(products)
     floor = PHASE_FLOOR * power.mean(axis=(1, 2), keepdims=True) + 1e-12
     phase = (products / (power + floor)).sum(axis=0)
     parts = np.stack([*(products[group].sum(axis=0) for group in GROUPS), phase])
-    moved = irfft2(parts, s=size)[:, : 2 * rows + 1, : 2 * cols + 1]
-    return np.asarray(moved, np.float32)
+    surface = np.fft.irfft2(parts, s=size, axes=(1, 2))
+    return np.asarray(surface[:, : 2 * rows + 1, : 2 * cols + 1], np.float32)

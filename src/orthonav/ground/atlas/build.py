@@ -4,15 +4,13 @@ A sheet is finished when its item is written, so an interrupted build keeps its 
 the same command resumes it. The same imagery, recipe and versions give the same atlas byte for
 byte, with any number of workers, on processors that round alike."""
 
-import contextlib
-import fcntl
 import logging
 import math
-import shutil
+import platform
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,24 +22,26 @@ import rasterio
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.core.errors import AreaError, AtlasError, OrthonavError, OutputError, WorkerError
+from orthonav.core.errors import AreaError, AtlasError, WorkerError
 from orthonav.core.files import Progress, no_progress, with_paths
-from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.tiles.cells import CellLayout
-from orthonav.ground.atlas.catalog import CATALOG, Atlas, AtlasRecipe, CoarseRecipe
+from orthonav.ground.atlas.catalog import CATALOG, Atlas, AtlasRecipe, CoarseRecipe, Sheet
 from orthonav.ground.atlas.cluster import Failure, TaskRunner
 from orthonav.ground.atlas.coarse import coarse_grid, write_coarse
 from orthonav.ground.atlas.cut import box_around, box_deg, turned
-from orthonav.ground.atlas.item import Sheet
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.build.build import BuildRequest, build_map
-from orthonav.ground.build.sheet import digest, grid_of, rounded_gsd_m
+from orthonav.ground.build.layer import rounded_gsd_m
+from orthonav.ground.build.sheet import digest, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.sheets import sheets_of_route
 
+log = logging.getLogger(__name__)
+
+GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full or gone
 MARGIN_PX = 64  # pixels beyond a tile that gradients and resampling use, and some more
 TOUCH_DEG = 1e-9  # boxes that overlap by less than this only touch: a tenth of a millimetre
 _POINTS = 17  # points along a side of a sheet at which it is compared with a search band
@@ -51,21 +51,19 @@ _POINTS = 17  # points along a side of a sheet at which it is compared with a se
 class AtlasRequest:
     """What to build into an atlas. `recipe`: fields of `AtlasRecipe` that were requested, `coarse`
     with some or all of its own; the others are the atlas's, or the defaults (`gsd_m`: that of the
-    imagery). `route`, `band_m`: area: a search band around a route, in metres. Without bounds or
-    route all imagery is the area. `replace`: rebuild sheets of other imagery or program versions
-    instead of refusing them. `dem`, `dem_datum`: terrain model of which sheets get a terrain layer
-    where it has heights, and what its heights count from."""
+    imagery). Without bounds or route all imagery is the area. `replace`: rebuild sheets of other
+    imagery or program versions instead of refusing them."""
 
     url: str  # the atlas, a folder or an fsspec URL, created where it does not exist
     orthos: Sequence[Path]  # files and folders of orthophotos; the first covers the next
     recipe: Mapping[str, Any] = field(default_factory=dict)
     bounds_deg: Extent | None = None  # area: west, south, east, north
-    route: Route | None = None
+    route: Route | None = None  # area: a search band around it
     band_m: float | None = None
     replace: bool = False
     index: bool = True  # also make the index of the coarse tiles
-    dem: Path | None = None
-    dem_datum: str | None = None
+    dem: Path | None = None  # terrain model of which sheets get a terrain layer
+    dem_datum: str | None = None  # what its heights count from
 
     def __post_init__(self) -> None:
         with_paths(self, "orthos", "dem")
@@ -73,14 +71,9 @@ class AtlasRequest:
 
 @dataclass(frozen=True)
 class SheetTask:
-    """A sheet to be built, with all that a worker on another machine needs."""
-
     sheet: Sheet  # its description, without tiles and area yet
-    atlas: str  # folder or URL of the atlas
-    orthos: tuple[Path, ...]  # the files and folders that may show it
+    request: AtlasRequest  # with those orthophotos that may show it
     recipe: AtlasRecipe  # how it is made
-    dem: Path | None = None
-    dem_datum: str | None = None
 
 
 def versions() -> dict[str, str]:
@@ -107,9 +100,8 @@ def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> l
     imagery = Imagery(mosaic)
     names = sorted(_names(recipe, imagery, request))
     if not names:
-        hint = _swapped(recipe, imagery, request)
-        raise AreaError(f"the area lies outside the orthophotos{hint}")
-    made_by, terrain = versions(), (request.dem, request.dem_datum)
+        raise AreaError("the area lies outside the orthophotos")
+    made_by = versions()
     tasks = []
     for name in names:
         bounds_deg = recipe.sheets.bounds_deg(name)
@@ -123,20 +115,16 @@ def plan_sheets(request: AtlasRequest, recipe: AtlasRecipe, mosaic: Mosaic) -> l
             area_km2=0.0,
             dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
             imagery=part.describe(),
-            request=request_digest(recipe, part, made_by, *terrain),
+            request=request_digest(recipe, part, made_by, request),
             made_by=made_by,
         )
-        needed = _orthos_of(request.orthos, mosaic, part)
-        tasks.append(SheetTask(sheet, request.url, needed, recipe, *terrain))
+        orthos = _orthos_of(request.orthos, mosaic, part)
+        tasks.append(SheetTask(sheet, replace(request, orthos=orthos, route=None), recipe))
     return tasks
 
 
 def request_digest(
-    recipe: AtlasRecipe,
-    part: Mosaic,
-    made_by: Mapping[str, str],
-    dem: Path | None = None,
-    dem_datum: str | None = None,
+    recipe: AtlasRecipe, part: Mosaic, made_by: Mapping[str, str], request: AtlasRequest
 ) -> str:
     """Each file counts with its name, size and second of change, in the order in which files cover
     each other; its folder does not count, as it may differ between machines."""
@@ -146,9 +134,9 @@ def request_digest(
         for name, size, changed_ns in source.stamp
     ]
     depends: list[Any] = [recipe.to_plain(), dict(made_by), part.common_stamp, stamps]
-    if dem is not None:
-        found = dem.stat()
-        depends.append([dem.name, found.st_size, found.st_mtime_ns // 10**9, dem_datum])
+    if request.dem is not None:
+        found, name = request.dem.stat(), request.dem.name
+        depends.append([name, found.st_size, found.st_mtime_ns // 10**9, request.dem_datum])
     return digest(depends)
 
 
@@ -183,7 +171,6 @@ class Imagery:
 
     @cached_property
     def _boxes(self) -> NDArray[np.float64]:
-        """West, south, east, north (N, 4) in degrees; east may be above 180."""
         outlines = [source.outline_latlon_deg for source in self.mosaic.sources]
         boxes = []
         for outline in outlines:
@@ -193,21 +180,7 @@ class Imagery:
         return np.array(boxes, np.float64)
 
 
-def _swapped(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> str:
-    """A hint if the middle of the bounds, or the start of the route, lies on imagery with latitude
-    and longitude swapped."""
-    there = imagery.sheets(recipe)
-    if request.bounds_deg is not None:
-        west, south, east, north = request.bounds_deg
-        place = (south + north) / 2, (west + east) / 2
-    elif request.route is not None:
-        place = request.route.waypoints[0]
-    else:
-        return ""
-    return swapped_hint(*place, lambda lat, lon: recipe.sheets.name_at(lat, lon) in there)
-
-
-def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> Iterable[str]:
+def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> set[str]:
     route, bounds_deg = request.route, request.bounds_deg
     require_one_area(route, request.band_m, bounds_deg)
     there = imagery.sheets(recipe)
@@ -257,10 +230,9 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
 
 
 def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
-    """What a worker needs to read the same pixels: all files where the stretch to 8 bits, or
-    whether a fourth band is a mask, was derived from many together."""
-    common = any(each is not None for each in mosaic.stretches)
-    if common or any(source.marked_alpha for source in mosaic.sources):
+    """What a worker needs to read the same pixels: all files where the stretch to 8 bits was
+    derived from many together."""
+    if any(each is not None for each in mosaic.stretches):
         return tuple(orthos)
     needed = {source.path for source in part.sources if source.folder is None}
     folders = {source.folder for source in part.sources if source.folder is not None}
@@ -268,22 +240,18 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
-    sheets = [task.sheet for task in tasks if task.sheet.id in known]
-    other = [sheet for sheet in sheets if known[sheet.id].request != sheet.request]
+    pairs = [(known[task.sheet.id], task.sheet) for task in tasks if task.sheet.id in known]
+    other = [(found, wanted) for found, wanted in pairs if found.request != wanted.request]
     if not other:
         return
-    why = sorted(
-        {
-            line
-            for sheet in other
-            for line in version_differences(sheet.made_by, known[sheet.id].made_by)
-            or ["their imagery has changed"]
-        }
-    )
-    named = ", ".join(sheet.id for sheet in other[:5]) + (", .." if len(other) > 5 else "")
+    why: set[str] = set()
+    for found, wanted in other:
+        differences = version_differences(wanted.made_by, found.made_by)
+        why.update(differences or ["their imagery has changed"])
+    named = ", ".join(sheet.id for sheet, _ in other[:5]) + (", .." if len(other) > 5 else "")
     raise AtlasError(
         f"{len(other)} of {len(tasks)} sheets of the atlas are of other imagery or versions "
-        f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
+        f"({'; '.join(sorted(why)[:4])}): {named}; rebuild them with --replace"
     )
 
 
@@ -294,15 +262,9 @@ Status = Literal["built", "unchanged", "empty", "failed"]
 class SheetResult:
     """`unchanged`: the sheet was there already; `empty`: there is no imagery."""
 
-    sheet: str  # name
+    sheet: Sheet
     status: Status
     error: str = ""  # why it failed
-    cpu_s: float = 0.0  # processor time
-    wall_s: float = 0.0  # time that the worker spent on it
-    size_bytes: int = 0
-    area_km2: float = 0.0
-    tiles: int = 0
-    peak_bytes: int = 0  # greatest memory that the worker process ever had
 
 
 @dataclass
@@ -311,111 +273,47 @@ class BuildReport:
 
     url: str  # the atlas
     total: int  # sheets asked for
-    started_s: float = field(default_factory=time.monotonic)  # monotonic clock at the start
     results: list[SheetResult] = field(default_factory=list)  # sheets that are finished or failed
-    finish_error: str | None = None  # why snapshot or index could not be written
     wall_s: float = 0.0
 
     def names(self, status: Status) -> list[str]:
-        return sorted(each.sheet for each in self.results if each.status == status)
+        return sorted(each.sheet.id for each in self.results if each.status == status)
 
     @property
     def untried(self) -> int:
         return self.total - len(self.results)
 
     @property
-    def share(self) -> float:
-        return len(self.results) / max(1, self.total)
-
-    @property
     def is_complete(self) -> bool:
-        return not self.names("failed") and not self.untried and self.finish_error is None
+        return not self.names("failed") and not self.untried
 
-    def line(self) -> str:
-        plain = self.to_plain()
-        text = f"{len(self.results):,} of {self.total:,} sheets"
-        if plain["area_km2"]:
-            text += (
-                f", {plain['km2_per_hour']:,.0f} km2/h, {plain['cpu_s_per_km2']:.2f} CPU s/km2, "
-                f"{plain['mb_per_km2']:.2f} MB/km2"
-            )
-        tried = len(self.results) - plain["unchanged"]
-        if tried:
-            left_s = plain["wall_s"] / tried * self.untried
-            text += f", {duration(left_s)} left"
-        return text + (f", {len(plain['failed'])} failed" if plain["failed"] else "")
-
-    def to_plain(self, cpu_hour_price: float | None = None) -> dict[str, Any]:
-        """Sums and rates as plain values; `cpu_hour_price` is the price of an hour of a core.
-        `core_s` is how long workers were busy with sheets, which is what machines are paid for."""
-        built = [each for each in self.results if each.status == "built"]
-        tried = [each for each in self.results if each.status != "unchanged"]
-        wall_s = self.wall_s or time.monotonic() - self.started_s
-        area_km2 = sum(each.area_km2 for each in built)
-        size_mb = sum(each.size_bytes for each in built) / 1e6
-        core_s, cpu_s = sum(each.wall_s for each in tried), sum(each.cpu_s for each in tried)
-        plain: dict[str, Any] = {
+    def to_plain(self) -> dict[str, Any]:
+        built = [each.sheet for each in self.results if each.status == "built"]
+        return {
             "atlas": self.url,
             "built": len(built),
             "unchanged": len(self.names("unchanged")),
             "empty": len(self.names("empty")),
             "failed": [
-                {"sheet": each.sheet, "error": each.error}
-                for each in sorted(self.results, key=lambda each: each.sheet)
+                {"sheet": each.sheet.id, "error": each.error}
+                for each in sorted(self.results, key=lambda each: each.sheet.id)
                 if each.status == "failed"
             ],
             "untried": self.untried,
-            "area_km2": round(area_km2, 4),
+            "area_km2": round(sum(each.area_km2 for each in built), 4),
             "tiles": sum(each.tiles for each in built),
-            "size_mb": round(size_mb, 4),
-            "wall_s": round(wall_s, 3),
-            "core_s": round(core_s, 3),
-            "cpu_s": round(cpu_s, 3),
-            "peak_mb": round(max((each.peak_bytes for each in tried), default=0) / 1e6, 1),
-            "finish_error": self.finish_error,
-            "sheets_per_hour": _rate(3600 * len(built), wall_s),
-            "km2_per_hour": _rate(3600 * area_km2, wall_s),
-            "cpu_s_per_km2": _rate(cpu_s, area_km2),
-            "mb_per_km2": _rate(size_mb, area_km2),
+            "size_mb": round(sum(each.size_bytes for each in built) / 1e6, 4),
+            "wall_s": round(self.wall_s, 3),
         }
-        if cpu_hour_price is not None:
-            cost = core_s / 3600 * cpu_hour_price
-            plain["cost"] = round(cost, 4)
-            plain["cost_per_km2"] = _rate(cost, area_km2, 6)
-        return plain
-
-
-def duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-def _rate(value: float, by: float, digits: int = 4) -> float | None:
-    return round(value / by, digits) if by > 0 else None
-
-
-log = logging.getLogger(__name__)
-
-PROGRESS_EVERY_S = 10.0  # between two lines of progress
-GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full or gone
-SCRATCH = "orthonav-sheet-"  # names of temporary folders begin with it
-_LOCK = "in-use"
-LEARNT = ("autoencoder", "caevl", "triplet")  # methods for which a worker is given a GPU
 
 
 def build_atlas(
-    request: AtlasRequest,
-    runner: TaskRunner,
-    progress: Progress = no_progress,
-    report: Callable[[str], None] = log.info,
+    request: AtlasRequest, runner: TaskRunner, progress: Progress = no_progress
 ) -> BuildReport:
     """Build the missing sheets with a runner that was entered, and report the results. A sheet that
-    fails is listed in the result, and the others are built. `progress` is called with a stage and
-    its share done, `report` with lines for people. Raises `AreaError`, `ImageryError`,
+    fails is listed in the result, and the others are built. Raises `AreaError`, `ImageryError`,
     `MissingFileError`; `AtlasError` where present sheets are of other imagery or versions;
-    `WorkerError` where workers have other versions; `StorageError`."""
+    `WorkerError` where a worker has other versions; `StorageError`."""
     started_s = time.monotonic()
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
@@ -423,28 +321,25 @@ def build_atlas(
     dem = request.dem and open_dem(Path(request.dem).absolute(), request.dem_datum).path
     request = replace(request, url=Store(request.url).url, orthos=orthos, dem=dem)
     tasks = plan_sheets(request, recipe, mosaic)
-    _require_same_versions(runner)
     atlas = Atlas.open_or_create(request.url, recipe)
     known = atlas.sheets()
     if not request.replace:
         require_same(tasks, known)
-    result = BuildReport(atlas.url, len(tasks), started_s)
+    result = BuildReport(atlas.url, len(tasks))
     missing = []
     for task in tasks:
         same = known.get(task.sheet.id)
         if same is not None and same.request == task.sheet.request:
-            result.results.append(SheetResult(same.id, "unchanged", area_km2=same.area_km2))
+            result.results.append(SheetResult(same, "unchanged"))
         else:
             missing.append(task)
-    there = len(result.results)
-    unchanged = f", {there} are there already" if there else ""
-    report(
-        f"{len(tasks):,} sheets of at most {recipe.sheet_km:g} km at {recipe.gsd_m:g} m"
-        f"{unchanged}; {len(missing):,} to build, {runner.at_once} at a time"
-    )
-    _build_sheets(missing, recipe, runner, result, progress, report)
-    index = request.index and recipe.coarse is not None and not result.names("failed")
-    result.finish_error = _finish(atlas, index, progress)
+    log.info("%d of %d sheets to build", len(missing), len(tasks))
+    _build_sheets(missing, runner, result, progress)
+    atlas.snapshot()
+    if request.index and recipe.coarse is not None and not result.names("failed"):
+        from orthonav.ground.atlas.index import make_index  # with FAISS
+
+        make_index(atlas, progress=progress)
     result.wall_s = time.monotonic() - started_s
     return result
 
@@ -470,27 +365,20 @@ def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, 
 
 
 def build_sheet(task: SheetTask) -> SheetResult:
-    wall_s, cpu_s = time.perf_counter(), time.process_time()
     wanted = task.sheet
     if differences := version_differences(wanted.made_by, versions()):
-        raise WorkerError(_other_versions("this worker", differences))
-    mosaic = Imagery(Mosaic.open(task.orthos)).under(wanted.bounds_deg, margin_m(task.recipe))
-    found = request_digest(task.recipe, mosaic, wanted.made_by, task.dem, task.dem_datum)
-    if found != wanted.request:
-        raise AtlasError("the imagery has changed, or is not the same on all machines")
-    with scratch_folder() as folder:
-        built = _built(task, mosaic, folder)
-    sheet = built or wanted  # of which nothing is known yet
-    return SheetResult(
-        wanted.id,
-        "empty" if built is None else "built",
-        cpu_s=time.process_time() - cpu_s,
-        wall_s=time.perf_counter() - wall_s,
-        size_bytes=sheet.size_bytes,
-        area_km2=sheet.area_km2,
-        tiles=sheet.tiles,
-        peak_bytes=_peak_bytes(),
+        raise WorkerError(
+            f"{platform.node()} has other versions than the machine that leads, and would make "
+            f"other maps: {'; '.join(differences)}; install the same on all"
+        )
+    mosaic = Imagery(Mosaic.open(task.request.orthos)).under(
+        wanted.bounds_deg, margin_m(task.recipe)
     )
+    if request_digest(task.recipe, mosaic, wanted.made_by, task.request) != wanted.request:
+        raise AtlasError("the imagery has changed, or is not the same on all machines")
+    with tempfile.TemporaryDirectory(prefix="orthonav-sheet-") as folder:
+        built = _built(task, mosaic, Path(folder))
+    return SheetResult(wanted, "empty") if built is None else SheetResult(built, "built")
 
 
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
@@ -499,18 +387,18 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
     name, bounds_deg = task.sheet.id, task.sheet.bounds_deg
     files = {"map": folder / f"{name}.onav"}
     request = BuildRequest(
-        orthos=task.orthos,
+        orthos=task.request.orthos,
         out=files["map"],
         bounds_deg=bounds_deg,
         workers=1,
-        dem=task.dem,
-        dem_datum=task.dem_datum,
+        dem=task.request.dem,
+        dem_datum=task.request.dem_datum,
         dem_needed=False,
         cells=True,
         **recipe,
     )
     try:
-        info = build_map(request, announce=log.debug).manifest.sheets[0]
+        info = build_map(request).manifest.sheets[0]
     except AreaError as error:  # the recipe was tried when the task was made: no imagery
         log.info("%s is empty: %s", name, error)
         return None
@@ -518,96 +406,26 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
         files["coarse"] = folder / f"{name}.safetensors"
         write_coarse(mosaic, bounds_deg, task.recipe.coarse, files["coarse"])
     described = replace(task.sheet, tiles=info.tiles, area_km2=info.area_km2)
-    return Atlas.open(task.atlas).put(files, described)
+    return Atlas.open(task.request.url).put(files, described)
 
 
 def _build_sheets(
-    tasks: Sequence[SheetTask],
-    recipe: AtlasRecipe,
-    runner: TaskRunner,
-    result: BuildReport,
-    progress: Progress,
-    report: Callable[[str], None],
+    tasks: Sequence[SheetTask], runner: TaskRunner, result: BuildReport, progress: Progress
 ) -> None:
-    reported_s = time.monotonic()
     not_stored = 0
-    gpu = recipe.method.partition(":")[0] in LEARNT
-    finished = runner.run(build_sheet, tasks, gpu=gpu)
-    for task, made in finished:
-        if isinstance(made, Failure):
-            log.info("sheet %s failed: %s: %s", task.sheet.id, made.kind, made.text)
-            log.debug("%s", made.trace)
-            not_stored = not_stored + 1 if made.kind in ("StorageError", "OutputError") else 0
-            made = SheetResult(task.sheet.id, "failed", f"{made.kind}: {made.text}")
-        else:
-            not_stored = 0
-        result.results.append(made)
-        progress("sheets", result.share)
-        if not_stored >= GIVE_UP_AFTER:
-            report(f"{not_stored} sheets in a row could not be stored: the others are not tried")
-            getattr(finished, "close", lambda: None)()
-            return
-        if time.monotonic() - reported_s >= PROGRESS_EVERY_S:
-            reported_s = time.monotonic()
-            report(result.line())
-
-
-def _require_same_versions(runner: TaskRunner) -> None:
-    wanted = versions()
-    for name, found in runner.everywhere(versions):
-        if isinstance(found, Failure):
-            raise WorkerError(f"{name} cannot run orthonav: {found.text}")
-        if differences := version_differences(wanted, found):
-            raise WorkerError(_other_versions(name, differences))
-
-
-def _other_versions(name: str, differences: Sequence[str]) -> str:
-    return (
-        f"{name} has other versions than the machine that leads, and would make other maps: "
-        f"{'; '.join(differences)}; install the same on all"
-    )
-
-
-def _finish(atlas: Atlas, index: bool, progress: Progress) -> str | None:
-    """Write snapshot and index; the error where that fails, which loses no sheet."""
-    try:
-        atlas.snapshot()
-        if index:
-            from orthonav.ground.atlas.index import make_index  # with FAISS
-
-            make_index(atlas, progress=progress)
-    except OrthonavError as error:
-        return str(error)
-    return None
-
-
-@contextmanager
-def scratch_folder() -> Iterator[Path]:
-    """A new folder in the system's folder of temporary files (`TMPDIR`), removed afterwards. It is
-    locked while this process lives; folders of processes that were killed are removed first."""
-    root = Path(tempfile.gettempdir())
-    for path in root.glob(f"{SCRATCH}*/{_LOCK}"):
-        with contextlib.suppress(OSError), path.open("r+") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(path.parent, ignore_errors=True)
-    try:
-        made = tempfile.TemporaryDirectory(prefix=SCRATCH, dir=root, ignore_cleanup_errors=True)
-    except OSError as error:
-        raise OutputError(f"no temporary folder can be made ({error.strerror}): {root}") from error
-    with made as name:
-        folder = Path(name)
-        with (folder / f".{_LOCK}").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            (folder / f".{_LOCK}").rename(folder / _LOCK)  # visible to others only when locked
-            yield folder
-
-
-def _peak_bytes() -> int:
-    """Greatest memory that this process ever had, earlier sheets included; 0 where unknown. Linux's
-    own count: that of getrusage includes the parent's."""
-    with contextlib.suppress(OSError):
-        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-        for line in status.splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    return 0
+    with closing(runner.run(build_sheet, tasks)) as finished:
+        for task, made in finished:
+            if isinstance(made, Failure):
+                if made.kind == WorkerError.__name__:
+                    raise WorkerError(made.text)
+                log.info("sheet %s failed: %s: %s", task.sheet.id, made.kind, made.text)
+                log.debug("%s", made.trace)
+                not_stored = not_stored + 1 if made.kind in ("StorageError", "OutputError") else 0
+                made = SheetResult(task.sheet, "failed", f"{made.kind}: {made.text}")
+            else:
+                not_stored = 0
+            result.results.append(made)
+            progress("sheets", len(result.results) / result.total)
+            if not_stored >= GIVE_UP_AFTER:
+                log.error("%d sheets in a row could not be stored: the build ends", not_stored)
+                return

@@ -2,39 +2,285 @@
 
 A sheet exists if and only if its item does, and the item is written last. Files are named by their
 content and never change. After a kill at any moment the finished sheets are intact; files without
-an item may remain, which `orthonav.ground.atlas.integrity` finds."""
+an item may remain, which `orthonav.ground.atlas.integrity` finds.
 
+An item is a STAC item (https://stacspec.org) in canonical JSON: the same sheet gives the same
+bytes. It is accepted only if writing the sheet read from it gives the same bytes again, so that an
+untrusted item can hold nothing that this program would not write."""
+
+import hashlib
+import json
+import re
+from calendar import monthrange
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import date
 from pathlib import Path
 from typing import Any, cast
 
-from orthonav.core.errors import AreaError, AtlasError, MissingFileError
+from orthonav.core.errors import AtlasError, described
 from orthonav.core.files import Progress, no_progress
-from orthonav.ground.atlas.item import (
-    COLLECTION,
-    FILES,
-    ITEMS,
-    MAX_ITEM_BYTES,
-    SNAPSHOT,
-    STAC_VERSION,
-    Sheet,
-    StoredFile,
-    canonical,
-    file_name,
-    parsed,
-    read_items,
-    read_some,
-    reason,
-    snapshot_of,
-    split_name,
-)
 from orthonav.ground.atlas.store import Store, digest_of
 from orthonav.ground.planning.area import Extent
 from orthonav.ground.planning.sheets import WorldSheets
 
-FORMAT = "orthonav-atlas"
 SCHEMA = 1
+FORMAT = "orthonav-atlas"
+ITEMS, SNAPSHOT = "items", "items.geojson"
+_READ_AT_ONCE = 1000  # one page of a listing of S3
+STAC_VERSION = "1.0.0"
+COLLECTION = "orthonav-atlas"
+MAX_ITEM_BYTES = 2**20  # a guard for memory: 2 kB, 60 bytes more for each further orthophoto
+MAX_REVISION = 9999  # what four digits of a file name hold
+FILES = {  # folder, suffix and media type of the files that a sheet may have
+    "map": ("sheets", ".onav", "application/octet-stream"),
+    "coarse": ("coarse", ".safetensors", "application/octet-stream"),
+}
+_FILE_EXTENSION = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
+_SHA256_MULTIHASH = "1220"
+_SHEET = re.compile(r"r[0-9]{6}c[0-9]{6}")
+_ITEM_NAME = re.compile(r"r[0-9]{6}c[0-9]{6}\.[0-9]{4}\.[0-9a-f]{12}\.json")
+_FILE_NAME = re.compile(r"([a-z]+)/(r[0-9]{6}c[0-9]{6})\.[0-9a-f]{12}\.[a-z]+")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False)
+_DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){0,2}")
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    name: str
+    size_bytes: int
+    sha256: str
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.size_bytes, int) and self.size_bytes >= 0):
+            raise AtlasError(f"size of a file is {self.size_bytes!r:.40}")
+        if not (isinstance(self.sha256, str) and _SHA256.fullmatch(self.sha256)):
+            raise AtlasError(f"sha256 of a file is {self.sha256!r:.80}")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A sheet of an atlas. All but `revision` and `files` is independent of place and time of
+    building, so that the same sheet is the same bytes everywhere. `imagery`: its orthophotos, as
+    the manifest of a map describes them."""
+
+    id: str  # name in the lattice, as r001526c001392
+    bounds_deg: Extent  # its box in the lattice: west, south, east, north
+    gsd_m: float  # ground resolution of its map, metres per pixel
+    tiles: int  # tiles of its map, 1 or more
+    area_km2: float  # area of its tile centres
+    dates: tuple[str, ...]  # dates of its imagery, YYYY[-MM[-DD]]
+    imagery: tuple[Mapping[str, Any], ...]
+    request: str  # digest of all that it was made from and how
+    made_by: Mapping[str, str]  # programs and versions that made it
+    revision: int = 0  # from 1; 0 for a sheet that is not in an atlas yet
+    files: Mapping[str, StoredFile] = field(default_factory=dict)
+
+    def stored(self, revision: int, files: Mapping[str, StoredFile]) -> "Sheet":
+        data = canonical(replace(self, revision=revision, files=files).to_item())
+        return self.from_item(json.loads(data), data)
+
+    @property
+    def size_bytes(self) -> int:
+        return sum(file.size_bytes for file in self.files.values())
+
+    @property
+    def item_name(self) -> str:
+        digest = hashlib.sha256(canonical(self.to_item())).hexdigest()
+        return f"{self.id}.{self.revision:04d}.{digest[:12]}.json"
+
+    def to_item(self) -> dict[str, Any]:
+        west, south, east, north = map(float, self.bounds_deg)
+        ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+        return {
+            "type": "Feature",
+            "stac_version": STAC_VERSION,
+            "stac_extensions": [_FILE_EXTENSION],
+            "id": self.id,
+            "collection": COLLECTION,
+            "geometry": {"type": "Polygon", "coordinates": [ring]},
+            "bbox": [west, south, east, north],
+            "properties": {
+                **_times(self.dates),
+                "gsd": float(self.gsd_m),
+                "orthonav:sheet": {
+                    "schema": SCHEMA,
+                    "revision": self.revision,
+                    "tiles": self.tiles,
+                    "area_km2": float(self.area_km2),
+                    "dates": list(self.dates),
+                    "imagery": [dict(each) for each in self.imagery],
+                    "request": self.request,
+                    "made_by": dict(self.made_by),
+                },
+            },
+            "links": [
+                {"rel": rel, "href": "../atlas.json", "type": "application/json"}
+                for rel in ("root", "parent", "collection")
+            ],
+            "assets": {
+                key: {
+                    "href": f"../{file.name}",
+                    "type": FILES[key][2],
+                    "roles": ["data"],
+                    "file:size": file.size_bytes,
+                    "file:checksum": _SHA256_MULTIHASH + file.sha256,
+                }
+                for key, file in self.files.items()
+            },
+        }
+
+    @classmethod
+    def from_item(cls, plain: Any, data: bytes) -> "Sheet":
+        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from. Writing
+        the sheet must give them, which also refuses values of another type."""
+        try:
+            properties = plain["properties"]
+            own = properties["orthonav:sheet"]
+            west, south, east, north = map(float, plain["bbox"])
+            sheet = cls(
+                id=str(plain["id"]),
+                bounds_deg=(west, south, east, north),
+                gsd_m=float(properties["gsd"]),
+                tiles=int(own["tiles"]),
+                area_km2=float(own["area_km2"]),
+                dates=tuple(map(str, own["dates"])),
+                imagery=tuple(own["imagery"]),
+                request=str(own["request"]),
+                made_by={key: str(value) for key, value in own["made_by"].items()},
+                revision=int(own["revision"]),
+                files=_files(plain["assets"], plain["id"]),
+            )
+            possible = (
+                _SHEET.fullmatch(sheet.id)
+                and -180 <= west < east <= 180
+                and -90 <= south < north <= 90
+                and 1 <= sheet.revision <= MAX_REVISION
+                and sheet.gsd_m > 0
+                and sheet.tiles >= 1
+                and sheet.area_km2 >= 0
+            )
+            if not possible or canonical(sheet.to_item()) != data:
+                raise AtlasError(f"damaged, altered or not an item of orthonav: {sheet.id:.40}")
+        except AtlasError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise AtlasError(f"damaged, or not an item of orthonav ({reason(error)})") from error
+        return sheet
+
+
+def reason(error: Exception) -> str:
+    if isinstance(error, TypeError | AttributeError):
+        return "a value is of another kind than expected"
+    return described(error)
+
+
+def canonical(plain: Any) -> bytes:
+    try:
+        return _ENCODER.encode(plain).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise AtlasError(f"cannot be written into the catalogue of an atlas: {error}") from error
+
+
+def parsed(data: bytes, what: str) -> Any:
+    """Plain values of JSON. The caller must compare the bytes with the canonical ones, which also
+    excludes repeated keys and numbers that are not finite."""
+    try:
+        return json.loads(data.decode())
+    except (ValueError, RecursionError) as error:
+        raise AtlasError(f"damaged, not JSON ({error}): {what}") from error
+
+
+def read_item(name: str, data: bytes) -> Sheet:
+    plain = parsed(data, f"{ITEMS}/{name}")
+    try:
+        sheet = Sheet.from_item(plain, data)
+    except AtlasError as error:
+        raise AtlasError(f"{error}: {ITEMS}/{name}") from error
+    if sheet.item_name != name:
+        raise AtlasError(f"damaged or altered: {ITEMS}/{name}")
+    return sheet
+
+
+def file_name(key: str, sheet_id: str, sha256: str) -> str:
+    folder, suffix, _ = FILES[key]
+    return f"{folder}/{sheet_id}.{sha256[:12]}{suffix}"
+
+
+def sheet_of_file(name: str) -> str | None:
+    match = _FILE_NAME.fullmatch(name)
+    return match[2] if match and any(match[1] == each[0] for each in FILES.values()) else None
+
+
+def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
+    found = {}
+    for key, entry in sorted(assets.items()):
+        if key not in FILES:
+            raise AtlasError(f"an item names an impossible file: {key:.40} {entry!r:.200}")
+        sha256 = entry["file:checksum"].removeprefix(_SHA256_MULTIHASH)
+        name = file_name(key, sheet_id, sha256)
+        found[key] = StoredFile(name, int(entry["file:size"]), sha256)
+    if "map" not in found:
+        raise AtlasError("an item names no map")
+    return found
+
+
+def _times(dates: tuple[str, ...]) -> dict[str, Any]:
+    """`datetime` and related properties, one of which STAC requires. A single day is a date; a
+    year, a month or several dates are a range; unknown dates are the epoch, marked as unknown."""
+    spans = [span for span in map(_span, dates) if span is not None]
+    if not spans:
+        return {"datetime": "1970-01-01T00:00:00Z", "orthonav:date_known": False}
+    first, last = min(start for start, _ in spans), max(end for _, end in spans)
+    if first == last:
+        return {"datetime": f"{first}T00:00:00Z"}
+    return {
+        "datetime": None,
+        "start_datetime": f"{first}T00:00:00Z",
+        "end_datetime": f"{last}T23:59:59Z",
+    }
+
+
+def _span(text: str) -> tuple[date, date] | None:
+    if not _DATE.fullmatch(text):
+        return None
+    try:
+        first = date.fromisoformat(f"{text}-01-01"[:10])
+    except ValueError:
+        return None
+    if len(text) == len("YYYY-MM"):
+        return first, first.replace(day=monthrange(first.year, first.month)[1])
+    return first, date.fromisoformat(f"{text}-12-31"[:10])
+
+
+def read_items(store: Store, prefix: str = "") -> tuple[dict[str, Sheet], dict[str, str]]:
+    """Items by file name, and the errors of damaged items by file name. Where a sheet has several
+    items, the last in the order of names is current."""
+    names = {n: s for n, s in store.names(ITEMS, prefix).items() if _ITEM_NAME.fullmatch(n)}
+    found: dict[str, Sheet] = {}
+    broken = {
+        name: f"{size} bytes, at most {MAX_ITEM_BYTES} are allowed: {ITEMS}/{name}"
+        for name, size in names.items()
+        if size > MAX_ITEM_BYTES
+    }
+    wanted = [f"{ITEMS}/{name}" for name in names if name not in broken]
+    for start in range(0, len(wanted), _READ_AT_ONCE):
+        for path, data in store.read_many(wanted[start : start + _READ_AT_ONCE]).items():
+            name = path.partition("/")[2]
+            try:
+                found[name] = read_item(name, data)
+            except AtlasError as error:
+                broken[name] = str(error)
+    return found, broken
+
+
+def snapshot_of(sheets: Iterable[Sheet]) -> bytes:
+    items = [sheet.to_item() for sheet in sheets]
+    for item in items:
+        for link in (*item["links"], *item["assets"].values()):
+            link["href"] = f"./{link['href'].removeprefix('../')}"
+    return canonical({"type": "FeatureCollection", "features": items})
 
 
 def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
@@ -90,6 +336,10 @@ class AtlasRecipe:
     def __post_init__(self) -> None:
         _require_possible(self)
         WorldSheets(self.sheet_km * 1000)  # refuses impossible widths
+        if self.method.partition(":")[0] != "gradient" or not self.registration:
+            raise AtlasError(
+                "maps are cut from sheets of the method gradient with registration layers only"
+            )
 
     @property
     def sheets(self) -> WorldSheets:
@@ -107,17 +357,8 @@ class AtlasRecipe:
         except (KeyError, TypeError, ValueError) as error:
             raise AtlasError(f"recipe of the atlas cannot be read ({reason(error)})") from error
 
-    def differences(self, other: "AtlasRecipe") -> list[str]:
-        mine, theirs = self.to_plain(), other.to_plain()
-        return [
-            f"{name}: {mine[name]}, not {theirs[name]}"
-            for name in mine
-            if mine[name] != theirs[name]
-        ]
-
 
 CATALOG = "atlas.json"
-_SAME_PLACE_DEG = 1e-9  # a tenth of a millimetre: rounding only
 
 
 class Atlas:
@@ -125,13 +366,9 @@ class Atlas:
     may put sheets into it at the same time."""
 
     def __init__(self, store: Store, recipe: AtlasRecipe) -> None:
-        self.store = store
+        self.store, self.url = store, store.url
         self.recipe = recipe
         self._sheets: dict[str, Sheet] | None = None
-
-    @property
-    def url(self) -> str:
-        return self.store.url
 
     @classmethod
     def open(cls, url: str | Path) -> "Atlas":
@@ -180,54 +417,52 @@ class Atlas:
 
     def put(self, files: Mapping[str, Path], described: Sheet) -> Sheet:
         """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`. Nothing is
-        written where the same files of the same request are there already. Safe with several
-        processes; after a kill the sheet is as before or as described."""
+        written where the same files of the same request are there already. After a kill the sheet
+        is as before or as described."""
         sheet_id = described.id
-        stored = {key: _stored(key, sheet_id, Path(path)) for key, path in sorted(files.items())}
+        stored = {}
+        for key, path in sorted(files.items()):
+            sha256 = digest_of(path)
+            stored[key] = StoredFile(file_name(key, sheet_id, sha256), path.stat().st_size, sha256)
         there = self._revisions(sheet_id)
-        before = there.get(max(there)) if there else None
+        before = there[max(there)] if there else None
         if before and before.request == described.request and before.files == stored:
             sheet = before
         else:
-            revisions = [found[1] for found in map(split_name, there) if found]
-            revision = 1 + max(revisions, default=0)
-            sheet = described.stored(revision, stored)
+            revisions = [int(name.split(".")[1]) for name in there]
+            sheet = described.stored(1 + max(revisions, default=0), stored)
         self.require_place(sheet)
-        self._upload(sheet, files, _named_by(there))
+        for key, file in sheet.files.items():
+            if sheet is not before or self.store.size(file.name) != file.size_bytes:
+                self.store.write(file.name, files[key])
         if sheet is not before:
             self.store.write(f"{ITEMS}/{sheet.item_name}", canonical(sheet.to_item()))
-            there = self._revisions(sheet_id)
-        if len(there) > 1:
-            self._remove_items([name for name in there if name != max(there)], there)
-            there = self._revisions(sheet_id)
-        if sheet.item_name in there:
-            self._upload(sheet, files, _named_by(there))  # another process may have removed some
-        elif there:  # another process has put this sheet meanwhile, and its revision is current
-            sheet = there[max(there)] or sheet
-        if self._sheets is not None:
-            self._sheets = dict(sorted({**self._sheets, sheet_id: sheet}.items()))
-        return sheet
+            there = {sheet.item_name: sheet, **self._revisions(sheet_id)}
+        current = max(there)  # perhaps of another process that has put this sheet meanwhile
+        self._remove_items(sheet_id, {name: there[name] for name in there if name != current})
+        return there[current] or sheet
 
     def retire(self, sheet_id: str) -> None:
-        """Take a sheet out: its items first, then the files that no item names."""
         there = self._revisions(sheet_id)
         if not there:
             raise AtlasError(f"the atlas has no sheet {sheet_id!r:.40}: {self.store}")
-        self._remove_items(there, there)
-        if self._sheets is not None:
-            self._sheets.pop(sheet_id, None)
+        self._remove_items(sheet_id, there)
 
     def path(self, sheet: Sheet, kind: str = "map") -> Path:
-        found = sheet.files.get(kind)
-        if found is None:
-            raise AtlasError(f"sheet {sheet.id} has no {kind}: {self.store}")
+        found = sheet.files[kind]
         return self.store.fetch(found.name, found.size_bytes, found.sha256)
 
     def snapshot(self) -> None:
         self.store.write(SNAPSHOT, snapshot_of(self.sheets(refresh=True).values()))
 
     def require_recipe(self, recipe: AtlasRecipe) -> "Atlas":
-        if differences := self.recipe.differences(recipe):
+        mine, other = self.recipe.to_plain(), recipe.to_plain()
+        differences = [
+            f"{name}: {value}, not {other[name]}"
+            for name, value in mine.items()
+            if value != other[name]
+        ]
+        if differences:
             raise AtlasError(
                 "all sheets of an atlas are made alike; this one has "
                 f"{'; '.join(differences)}: {self.store}"
@@ -235,37 +470,24 @@ class Atlas:
         return self
 
     def require_place(self, sheet: Sheet) -> None:
-        try:
-            box = self.recipe.sheets.bounds_deg(sheet.id)
-        except AreaError as error:
-            raise AtlasError(f"{error}: {self.store}") from error
-        if max(abs(a - b) for a, b in zip(box, sheet.bounds_deg, strict=True)) > _SAME_PLACE_DEG:
+        box = self.recipe.sheets.bounds_deg(sheet.id)
+        if max(abs(a - b) for a, b in zip(box, sheet.bounds_deg, strict=True)) > 1e-9:
             raise AtlasError(
                 f"sheet {sheet.id} has bounds {sheet.bounds_deg}, the lattice of the atlas has "
                 f"{box}: {self.store}"
             )
 
     def _revisions(self, sheet_id: str) -> dict[str, Sheet | None]:
-        names = self.store.names(ITEMS, f"{sheet_id}.")
-        found, broken = read_some(self.store, names)
+        found, broken = read_items(self.store, f"{sheet_id}.")
         return {**found, **dict.fromkeys(broken)}
 
-    def _upload(self, sheet: Sheet, files: Mapping[str, Path], named: set[str]) -> None:
-        """Copy missing files. Files that no item names yet may be removed at any moment, so they
-        are copied in any case."""
-        for key, file in sheet.files.items():
-            if file.name not in named or self.store.size(file.name) != file.size_bytes:
-                self.store.write(file.name, Path(files[key]))
-
-    def _remove_items(self, names: Iterable[str], there: Mapping[str, Sheet | None]) -> None:
-        names = sorted(names)
-        for name in names:
+    def _remove_items(self, sheet_id: str, items: Mapping[str, Sheet | None]) -> None:
+        for name in sorted(items):
             self.store.remove(f"{ITEMS}/{name}")
-        gone = _named_by({name: there[name] for name in names})
-        if gone:
-            still = _named_by(self._revisions(names[0].partition(".")[0]))
-            for file in sorted(gone - still):
+        if gone := _named_by(items):
+            for file in sorted(gone - _named_by(self._revisions(sheet_id))):
                 self.store.remove(file)
+        self._sheets = None
 
 
 def copy_sheets(
@@ -282,20 +504,16 @@ def copy_sheets(
     unknown = [each for each in sheet_ids or () if each not in found]
     if unknown:
         raise AtlasError(f"the atlas has no sheet {unknown[0]!r:.40}: {source.store}")
+    wanted = list(found) if sheet_ids is None else list(dict.fromkeys(sheet_ids))
     copied: list[str] = []
-    unchanged: list[str] = []
-    wanted = list(dict.fromkeys(sheet_ids)) if sheet_ids is not None else list(found)
     for number, sheet_id in enumerate(wanted):
         progress("copy", number / len(wanted))
         new, old = found[sheet_id], there.get(sheet_id)
-        same = old is not None and (old.request, old.files) == (new.request, new.files)
-        if old is not None and (same or not replace):
-            unchanged.append(sheet_id)
-            continue
-        atlas.put({key: source.path(new, key) for key in new.files}, new)
-        copied.append(sheet_id)
+        if old is None or (replace and (old.request, old.files) != (new.request, new.files)):
+            atlas.put({key: source.path(new, key) for key in new.files}, new)
+            copied.append(sheet_id)
     atlas.snapshot()
-    return copied, unchanged
+    return copied, [each for each in wanted if each not in copied]
 
 
 def _is_free(store: Store) -> bool:
@@ -307,18 +525,6 @@ def _is_free(store: Store) -> bool:
 
 def _named_by(items: Mapping[str, Sheet | None]) -> set[str]:
     return {file.name for sheet in items.values() if sheet for file in sheet.files.values()}
-
-
-def _stored(key: str, sheet_id: str, path: Path) -> StoredFile:
-    if key not in FILES:
-        raise AtlasError(f"a sheet has {' and '.join(FILES)}, not {key!r:.40}")
-    try:
-        sha256, size = digest_of(path), path.stat().st_size
-    except OSError as error:
-        raise MissingFileError(
-            f"file of a sheet cannot be read ({error.strerror}): {path}"
-        ) from error
-    return StoredFile(file_name(key, sheet_id, sha256), size, sha256)
 
 
 def _catalog(recipe: AtlasRecipe) -> bytes:

@@ -7,10 +7,8 @@ import itertools
 import logging
 import os
 import signal
-import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -18,15 +16,12 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import OrthonavError, WorkerError
 from orthonav.core.extras import needed
 
-log = logging.getLogger(__name__)
-
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 RETRIES = 3  # how often an item is started again where its process or machine died
 WINDOW = 2  # items submitted at a time for each core: one running, one waiting
 POLL_S = 1.0  # how long is waited for results before free cores are counted again
-PROBE_S = 120.0  # how long a machine may take to start a process and answer
 STOP_S = 15.0  # how long processes may take to clean up before they are killed
 OBJECTS_BYTES = 100 * 2**20  # shared memory of a local cluster; items and results are small
 ENVIRONMENT = {  # environment of the workers, as the command line sets it for itself
@@ -44,14 +39,9 @@ class Failure:
 
 
 class SerialRunner:
-    at_once = 1  # number of items that run at the same time
-
-    def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        return [("this machine", probe())]
-
     def run(
-        self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
-    ) -> Iterator[tuple[Item, Made | Failure]]:
+        self, work: Callable[[Item], Made], items: Sequence[Item]
+    ) -> Generator[tuple[Item, Made | Failure]]:
         for item in items:
             yield item, attempted(work, item)
 
@@ -71,32 +61,21 @@ class RayRunner:
             raise WorkerError(f"workers must be 1 or more, got {workers}")
         self._address, self._workers = address, workers
         self._ray: Any = None
-        self._was_there = False
 
     @property
     def at_once(self) -> int:
         cores = int(self._ray.cluster_resources().get("CPU", 0))
         return max(1, cores if self._workers is None else min(cores, self._workers))
 
-    def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        probes = []
-        for node in self._ray.nodes():
-            if node["Alive"] and node["Resources"].get("CPU", 0) >= 1:
-                here = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-                task = self._task(num_cpus=0, scheduling_strategy=here)
-                probes.append((str(node["NodeManagerHostname"]), task.remote(_called, probe)))
-        return [(name, self._made(ref, PROBE_S)) for name, ref in probes]
-
     def run(
-        self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
-    ) -> Iterator[tuple[Item, Made | Failure]]:
-        """Each item with its result, when it is finished; closing the iterator stops the others.
-        With `gpu` each item has a GPU to itself, where there are any. Items whose process died are
-        tried again `RETRIES` times."""
-        has_gpu = gpu and self._ray.cluster_resources().get("GPU", 0) >= 1
-        task = self._task(num_cpus=1, num_gpus=1 if has_gpu else 0)
+        self, work: Callable[[Item], Made], items: Sequence[Item]
+    ) -> Generator[tuple[Item, Made | Failure]]:
+        """Each item with its result, when it is finished; closing the iterator stops the others, by
+        request, so that they remove temporary files. Items whose process died are tried again
+        `RETRIES` times."""
+        ray = self._ray
+        # Errors of an item are returned as values: Ray tries again only where a process died.
+        task = ray.remote(attempted).options(max_retries=RETRIES, num_cpus=1)
         waiting = iter(items)
         running: dict[Any, Item] = {}
         try:
@@ -106,40 +85,26 @@ class RayRunner:
                     running[task.remote(work, item)] = item
                 if not running:
                     return
-                done, _ = self._ray.wait(list(running), num_returns=1, timeout=POLL_S)
+                done, _ = ray.wait(list(running), num_returns=1, timeout=POLL_S)
                 for ref in done:
                     made: Made | Failure = self._made(ref)
                     yield running.pop(ref), made
         finally:
-            self._stop(list(running))
+            for ref in running:
+                ray.cancel(ref)
+            if running:
+                ray.wait(list(running), num_returns=len(running), timeout=STOP_S)
 
-    def _task(self, **options: Any) -> Any:
-        # Errors of an item are returned as values: Ray tries again only where a process died.
-        return self._ray.remote(attempted).options(max_retries=RETRIES, **options)
-
-    def _made(self, ref: Any, timeout_s: float | None = None) -> Any:
+    def _made(self, ref: Any) -> Any:
         try:
-            return self._ray.get(ref, timeout=timeout_s)
+            return self._ray.get(ref)
         except self._ray.exceptions.RayError as error:
             why = (str(error).strip().splitlines() or [""])[0]
             text = f"its process died or could not be started ({why:.300})"
-            return Failure(WorkerError.__name__, text, str(error))
-
-    def _stop(self, refs: list[Any]) -> None:
-        """Stop running items: by request, so that they remove temporary files, then by force."""
-        if not refs:
-            return
-        for ref in refs:
-            self._ray.cancel(ref)
-        _, left = self._ray.wait(refs, num_returns=len(refs), timeout=STOP_S)
-        for ref in left:
-            self._ray.cancel(ref, force=True)
+            return Failure("RayError", text, str(error))
 
     def __enter__(self) -> "RayRunner":
         self._ray = ray = _imported()
-        self._was_there = ray.is_initialized()
-        if self._was_there:
-            return self
         logging.getLogger("ray").setLevel(logging.ERROR)
         options: dict[str, Any] = {
             "runtime_env": {"env_vars": ENVIRONMENT},
@@ -152,18 +117,19 @@ class RayRunner:
                 "include_dashboard": False,
                 "object_store_memory": OBJECTS_BYTES,
             }
+        at_sigterm = signal.getsignal(signal.SIGTERM)
         try:
-            with _own_sigterm():
-                ray.init(self._address or "local", **options)
+            ray.init(self._address or "local", **options)
         except (ConnectionError, OSError, RuntimeError, ValueError) as error:
             where = "on this machine" if self._address is None else f"at {self._address}"
             why = " ".join(str(error).split())
             raise WorkerError(f"no Ray cluster can be used {where}: {why:.300}") from error
+        finally:
+            signal.signal(signal.SIGTERM, at_sigterm)  # Ray's own would end the program at once
         return self
 
     def __exit__(self, *_: object) -> None:
-        if not self._was_there:
-            self._ray.shutdown()
+        self._ray.shutdown()
 
 
 TaskRunner = SerialRunner | RayRunner  # a context manager that runs tasks
@@ -175,28 +141,8 @@ def attempted(work: Callable[[Item], Made], item: Item) -> Made | Failure:
         return work(item)
     except OrthonavError as error:
         return Failure(type(error).__name__, str(error))
-    except MemoryError:
-        return Failure(MemoryError.__name__, "out of memory")
     except Exception as error:
-        text = str(error) or "the error has no text (--verbose shows where it was raised)"
-        return Failure(type(error).__name__, text, traceback.format_exc())
-
-
-@contextmanager
-def _own_sigterm() -> Iterator[None]:
-    """Keep the handler of SIGTERM: Ray's own would end the program at once."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may change signals
-        return
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _called(probe: Callable[[], Made]) -> Made:
-    return probe()
+        return Failure(type(error).__name__, str(error) or "no text", traceback.format_exc())
 
 
 def _imported() -> Any:

@@ -21,8 +21,7 @@ from orthonav.core.tiles import represent
 from orthonav.core.tiles.cells import MICRO
 from orthonav.core.tiles.whitened import WhitenedRecipe, pooled_features
 from orthonav.core.variants import make_variant
-from orthonav.ground.atlas.catalog import CoarseRecipe
-from orthonav.ground.atlas.item import canonical, reason
+from orthonav.ground.atlas.catalog import CoarseRecipe, canonical, reason
 from orthonav.ground.build.calibrate import CropSampler
 from orthonav.ground.build.sheet import MIN_TILE_VALID_SHARE, SheetReader
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -45,8 +44,6 @@ class CoarseTiles:
     """Coarse tiles of a sheet, in rows from north to south; arrays are read-only. N is 0 where no
     tile shows enough imagery."""
 
-    recipe: CoarseRecipe  # how they were made
-    bounds_deg: Extent  # of the sheet: west, south, east, north
     centres_latlon_deg: NDArray[np.float64]  # (N, 2)
     features: NDArray[np.float16]  # (N, F) float16; F is cells x cells x channels
     valid: NDArray[np.uint8]  # (N, cells x cells) uint8; 255 where all of a cell shows imagery
@@ -65,8 +62,9 @@ def coarse_grid(area: Area, recipe: CoarseRecipe) -> TileGrid:
     )
 
 
-def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> CoarseTiles:
-    """The coarse tiles whose centres lie in a box, made from the imagery with one thread."""
+def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path: Path) -> int:
+    """Write the coarse tiles whose centres lie in a box to `path`, whole or not at all; returns
+    their number. They are made from the imagery with one thread; the bytes are always the same."""
     area = Area.from_bounds(bounds_deg)
     grid = coarse_grid(area, recipe)
     representation = make_variant(represent.TABLE, EDGES)
@@ -92,20 +90,13 @@ def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> Coa
         values, weights = pooled_features(POOLING, reader.cells, first_px[part])
         features[part] = values
         valid[part] = np.rint(weights[:, :: representation.channels] * FULL)
-    return CoarseTiles(recipe, bounds_deg, latlon, features, valid)
-
-
-def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path: Path) -> int:
-    """Write the coarse tiles of a box to `path`, whole or not at all; returns their number. The
-    bytes are the same every time."""
-    made = make_coarse(mosaic, bounds_deg, recipe)
     arrays: dict[str, NDArray[Any]] = {
-        "centres_latlon_deg": made.centres_latlon_deg,
-        "features": made.features,
-        "valid": made.valid,
+        "centres_latlon_deg": latlon,
+        "features": features,
+        "valid": valid,
     }
     save_tensors(path, arrays, _metadata(recipe, bounds_deg), "coarse tiles")
-    return len(made.valid)
+    return len(valid)
 
 
 def tile_count(path: Path) -> int:
@@ -125,8 +116,7 @@ def read_coarse(path: Path) -> CoarseTiles:
             if metadata is None or names != {"centres_latlon_deg", "features", "valid"}:
                 raise AtlasError(f"not coarse tiles of an atlas: {path}")
             arrays = {name: stored.get_tensor(name) for name in sorted(names)}
-        recipe, bounds_deg = _parsed(metadata)
-        return _checked(recipe, bounds_deg, arrays)
+        return _checked(_bounds_deg(metadata), arrays)
     except AtlasError as error:
         raise AtlasError(f"{error}: {path}") from error
     except (SafetensorError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
@@ -150,27 +140,17 @@ def _metadata(recipe: CoarseRecipe, bounds_deg: Extent) -> str:
     return canonical(plain).decode()
 
 
-def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
-    """What `_metadata` wrote; raises `AtlasError` unless writing it again gives the same."""
+def _bounds_deg(metadata: str) -> Extent:
     plain: Any = json.loads(metadata)
-    if plain["schema"] != SCHEMA:
-        raise AtlasError(
-            f"coarse tiles of schema {plain['schema']!r:.20}, this program reads {SCHEMA}"
-        )
-    if (plain["edges"], plain["cells"]) != (EDGES, POOLING.cells):
-        raise AtlasError(
-            f"coarse tiles show {plain['edges']!r:.20} in {plain['cells']!r:.20} cells, this "
-            f"program compares {EDGES} in {POOLING.cells}: build the sheet again"
-        )
     recipe = CoarseRecipe(**plain["recipe"])
     west, south, east, north = map(float, plain["bounds_deg"])
     bounds_deg = west, south, east, north
     if _metadata(recipe, bounds_deg) != metadata or recipe.tile_px % MICRO:
         raise AtlasError("altered, or not coarse tiles of an atlas")
-    return recipe, bounds_deg
+    return bounds_deg
 
 
-def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -> CoarseTiles:
+def _checked(bounds_deg: Extent, arrays: dict[str, Any]) -> CoarseTiles:
     centres, features, valid = (arrays[n] for n in ("centres_latlon_deg", "features", "valid"))
     count = len(valid) if valid.ndim == 2 else -1
     right = (
@@ -193,4 +173,4 @@ def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -
         raise AtlasError("coarse tiles are damaged (centres lie outside their sheet)")
     for array in (centres, features, valid):
         array.flags.writeable = False
-    return CoarseTiles(recipe, bounds_deg, centres, features, valid)
+    return CoarseTiles(centres, features, valid)

@@ -1,19 +1,21 @@
 """Cutting a flight's map out of an atlas: the content of its sheets, resampled into one plane.
 
 The imagery is not needed: the grey picture comes from the registration layers of the sheets, tiles
-are embedded from the cell means of the sheets, and confidences are pooled, not learnt again. Where
-on the map a view was taken is not known, so the confidence of a fix is the mean of the sheets'
-confidences, weighted by their shares of the map. A logistic regression cannot represent that mean
-exactly. The pooled one has the mean weights, and a bias so low that it nowhere exceeds the mean in
-the range of evidence that decides. The same atlas gives the same bytes for any number of threads.
-"""
+are embedded from the cell means of the sheets. The confidence of registered views is the usual one,
+with the scores of chance of the sheet where they are highest; tiles have none. The same atlas gives
+the same bytes for any number of threads.
 
-import itertools
+Within a block of a kilometre two planes differ by a shift, a rotation of less than a degree and
+millimetres, so each sheet is resampled by one affine per block. A place is taken from the sheet
+whose box holds it; where that sheet shows nothing, from neighbours that reach over their border."""
+
 import json
 import logging
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,18 +29,14 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import (
     AreaError,
     AtlasError,
-    MapFileError,
-    MissingFileError,
-    OutputError,
     VariantError,
 )
 from orthonav.core.files import Progress, no_progress
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import (
     CHANCES,
     Chances,
-    LogisticConfidence,
     RegisteredConfidence,
 )
 from orthonav.core.mapfile.layer import GreyLayer
@@ -47,14 +45,18 @@ from orthonav.core.mapfile.reader import MapFile, open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.represent import OrientedGradients
+from orthonav.core.tiles.represent import HARMONICS, OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import variant_from_recipe
-from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.item import Sheet
-from orthonav.ground.atlas.warp import SheetSource, Warp, joined_cells, joined_grey, outline
+from orthonav.ground.atlas.catalog import Atlas, Sheet
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
-from orthonav.ground.build.layer import GreyLayerWriter, Parts, StoredCells
+from orthonav.ground.build.layer import (
+    GreyLayerWriter,
+    Parts,
+    StoredCells,
+    TerrainParts,
+    terrain_parts,
+)
 from orthonav.ground.build.sheet import (
     MIN_TILE_VALID_SHARE,
     PREVIEW_PX,
@@ -65,12 +67,11 @@ from orthonav.ground.build.sheet import (
     in_order,
     layer_parts,
     one_opencv_thread,
-    put_layer_parts,
     tiles_of,
 )
-from orthonav.ground.build.terrain import TerrainParts, terrain_parts
 from orthonav.ground.planning.area import Area, Extent
-from orthonav.ground.planning.sheets import WorldSheets, in_box
+from orthonav.ground.planning.route import along_polyline_en_m
+from orthonav.ground.planning.sheets import in_box
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +79,214 @@ MAX_TILES = 20_000  # tiles of an area that are checked; more are checked at eve
 EDGE_POINTS = 33  # points along an edge of a box: edges are not straight in degrees
 NAMED = 8  # missing sheets named in a message, at most
 Array = NDArray[np.float64]
+KERNEL_PX = 3  # margin of cubic interpolation, 2 pixels, and one more for rounding
+SHEET_POINTS = 16  # points along an edge of a sheet, which is not straight in another plane
+FILL_PX = 5  # kernel of cubic interpolation: imagery is extended beyond its edge
+OWN_BONUS = 0.01  # decides ties between sheets for the one whose box holds the cell
+_SHIFT = 6  # fractional bits of polygon corners in OpenCV
+Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]
+Cells = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(frozen=True, eq=False)
+class SheetSource:
+    sheet: Sheet
+    manifest: Manifest
+    layer: GreyLayer
+    cells: StoredCells
+    terrain: TerrainLayer | None
+
+    @property
+    def frame(self) -> LocalFrame:
+        return self.manifest.sheets[0].frame
+
+    @property
+    def grid(self) -> TileGrid:
+        return self.manifest.sheets[0].grid
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    source: SheetSource
+    frame: LocalFrame
+    grid: TileGrid
+    turns: bool  # whether cells are harmonics of a direction, which rotate with the plane
+
+    def reaches(self, block: Block) -> bool:
+        left, top, right, bottom = self._box_px
+        return (
+            block.col < right
+            and block.row < bottom
+            and block.col + block.width > left
+            and block.row + block.height > top
+        )
+
+    def affine(self, block: Block) -> Array:
+        """Affine (2, 3) from pixels of the grid to pixels of the sheet (pixel-is-area), fitted to
+        the corners of a block."""
+        corners = _corners(block)
+        places = _latlon_from_px(self.frame, self.grid, corners)
+        there = _px_from_latlon(self.source.frame, self.source.grid, *places)
+        design = np.column_stack([corners - corners[0], np.ones(len(corners))])
+        solved = np.linalg.lstsq(design, there, rcond=None)[0].T
+        solved[:, 2] -= solved[:, :2] @ corners[0]
+        return np.asarray(solved)
+
+    def owned(self, block: Block, layout: CellLayout | None = None) -> NDArray[np.bool_]:
+        spacing, middle = (1, 0.5) if layout is None else (layout.spacing_px, layout.micro_px / 2)
+        shape = -(-block.height // spacing), -(-block.width // spacing)
+        # OpenCV's coordinates 0, 0 are the middle of pixel or cell 0, 0.
+        points = (self._outline_px - [block.col + middle, block.row + middle]) / spacing
+        points = np.rint(points * 2**_SHIFT).astype(np.int32)
+        mask = np.zeros(shape, dtype=np.uint8)
+        cv2.fillPoly(mask, [points], 1, lineType=cv2.LINE_8, shift=_SHIFT)
+        return mask.astype(np.bool_)
+
+    def grey(self, block: Block) -> Pixels:
+        affine = self.affine(block)
+        matrix = _by_middles(affine, block, 1, 0.5)
+        size = block.width, block.height
+        top, left, height, width = _window(matrix, size)
+        grey, valid = self.source.layer.read(0, top, left, height, width)
+        shape = block.height, block.width
+        if not valid.any():
+            return np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
+        matrix[:, 2] -= [left, top]
+        whole = bool(valid.all())
+        if not whole:  # zeros beyond the imagery must not darken its edge
+            grown = cv2.dilate(grey, np.ones((FILL_PX, FILL_PX), np.uint8))
+            grey = np.where(valid, grey, grown).astype(np.uint8)
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        made = cv2.warpAffine(grey, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        if whole:
+            return np.asarray(made, np.uint8), np.ones(shape, np.bool_)
+        mask = valid.astype(np.uint8) * 255
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        shown = cv2.warpAffine(mask, matrix, size, flags=flags) >= 254
+        return np.where(shown, made, 0).astype(np.uint8), np.asarray(shown, np.bool_)
+
+    def cells(self, block: Block, layout: CellLayout) -> Cells:
+        spacing, middle = layout.spacing_px, layout.micro_px / 2
+        rows, cols = -(-block.height // spacing), -(-block.width // spacing)
+        matrix = _by_middles(self.affine(block), block, spacing, middle)
+        top, left, height, width = _window(matrix, (cols, rows))
+        means, share = self.source.cells.read(top, left, height, width)
+        matrix[:, 2] -= [left, top]
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        planes = [
+            cv2.warpAffine(np.ascontiguousarray(plane), matrix, (cols, rows), flags=flags)
+            for plane in (*np.moveaxis(means, 2, 0), share)
+        ]
+        made = np.stack(planes[:-1], axis=2).astype(np.float32)
+        if self.turns:
+            _turn(made, math.atan2(matrix[1, 0], matrix[0, 0]))
+        return made, np.asarray(planes[-1], np.float32)
+
+    @cached_property
+    def _outline_px(self) -> Array:
+        lon, lat = outline(self.source.sheet.bounds_deg, SHEET_POINTS).T
+        return _px_from_latlon(self.frame, self.grid, lat, lon)
+
+    @cached_property
+    def _box_px(self) -> tuple[float, float, float, float]:
+        grid = self.source.grid
+        corners = _corners(Block(0, 0, grid.height_px, grid.width_px))
+        places = _latlon_from_px(self.source.frame, grid, corners)
+        points = _px_from_latlon(self.frame, self.grid, *places)
+        (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        return left - 1, top - 1, right + 1, bottom + 1
+
+
+def outline(box: Extent, points: int) -> Array:
+    """Points (4 * points, 2), x and y, around a box (west, south, east, north) from its corner."""
+    west, south, east, north = box
+    corners = np.array([[west, south], [east, south], [east, north], [west, north], [west, south]])
+    share = np.arange(points)[:, None] / points
+    return np.concatenate([start + (end - start) * share for start, end in pairwise(corners)])
+
+
+def _px_from_latlon(frame: LocalFrame, grid: TileGrid, lat_deg: Array, lon_deg: Array) -> Array:
+    points = frame.en_from_latlon(lat_deg, lon_deg)
+    return np.asarray((points - [grid.west_m, grid.north_m]) / [grid.gsd_m, -grid.gsd_m])
+
+
+def _latlon_from_px(frame: LocalFrame, grid: TileGrid, px: Array) -> tuple[Array, Array]:
+    places = [grid.west_m, grid.north_m] + px * [grid.gsd_m, -grid.gsd_m]
+    return frame.latlon_from_en(places)
+
+
+def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
+    grey = np.zeros((block.height, block.width), dtype=np.uint8)
+    valid = np.zeros(grey.shape, dtype=np.bool_)
+    owners = [(warp, warp.owned(block)) for warp in warps]
+    for own in (True, False):
+        for warp, mask in owners:
+            wanted = ~valid & mask if own else ~(valid | mask)
+            part = _around(wanted)
+            if part is None:
+                continue
+            rows, cols = part
+            size = rows.stop - rows.start, cols.stop - cols.start
+            some, there = warp.grey(Block(block.row + rows.start, block.col + cols.start, *size))
+            taken = there & wanted[part]
+            np.copyto(grey[part], some, where=taken)
+            valid[part] |= taken
+    return grey, valid
+
+
+def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
+    rows, cols = (np.flatnonzero(wanted.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return None
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+def joined_cells(warps: Sequence[Warp], block: Block, layout: CellLayout) -> Cells:
+    owners = [(warp, warp.owned(block, layout)) for warp in warps]
+    owners.sort(key=lambda each: not each[1].any())
+    means, share = owners[0][0].cells(block, layout)
+    best = share + np.float32(OWN_BONUS) * owners[0][1]
+    for warp, mask in owners[1:]:
+        if best.min() >= 1:
+            break
+        some, their_share = warp.cells(block, layout)
+        rank = their_share + np.float32(OWN_BONUS) * mask
+        better = rank > best
+        means[better], share[better] = some[better], their_share[better]
+        best = np.maximum(best, rank)
+    return means, share
+
+
+def _turn(means: NDArray[np.float32], angle_rad: float) -> None:
+    for k in range(1, HARMONICS + 1):
+        cos, sin = np.float32(math.cos(2 * k * angle_rad)), np.float32(math.sin(2 * k * angle_rad))
+        real, imaginary = means[..., 2 * k - 1].copy(), means[..., 2 * k].copy()
+        means[..., 2 * k - 1] = real * cos + imaginary * sin
+        means[..., 2 * k] = imaginary * cos - real * sin
+
+
+def _corners(block: Block) -> Array:
+    right, bottom = block.col + block.width, block.row + block.height
+    return np.array(
+        [[block.col, block.row], [right, block.row], [block.col, bottom], [right, bottom]], float
+    )
+
+
+def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Array:
+    """The affine between indices of pixels (or cells) whose middles lie `middle` px into them.
+    Index 0, 0 is the first of the block, and the first of the raster of the sheet."""
+    linear = affine[:, :2]
+    first = linear @ [block.col + middle, block.row + middle] + affine[:, 2] - middle
+    return np.column_stack([linear, first / spacing])
+
+
+def _window(matrix: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    cols, rows = size
+    corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]], float)
+    there = corners @ matrix[:, :2].T + matrix[:, 2]
+    left, top = (int(value) for value in np.floor(there.min(axis=0)) - KERNEL_PX)
+    right, bottom = (int(value) for value in np.ceil(there.max(axis=0)) + KERNEL_PX)
+    return top, left, bottom - top + 1, right - left + 1
 
 
 def box_around(area: Area, margin_m: float) -> Extent:
@@ -100,134 +309,83 @@ def turned(lon_deg: float) -> float:
     return (lon_deg + 180) % 360 - 180
 
 
-def require_sheets(atlas: Atlas, area: Area, found: Sequence[object]) -> None:
-    """Raise `AreaError` with the extent of the atlas where no sheet was found in an area; names
-    swapped latitude and longitude."""
-    if found:
-        return
-    if atlas.bounds_deg is None:
-        raise AreaError(f"the atlas has no sheets yet: {atlas.url}")
-    west, south, east, north = atlas.bounds_deg
-    hint = swapped_hint(
-        *(area.frame.lat_deg, area.frame.lon_deg),
-        lambda lat, lon: south <= lat <= north and 0 <= (lon - west) % 360 <= (east - west) % 360,
-    )
-    raise AreaError(
-        f"the area lies outside the atlas, whose {len(atlas.sheets())} sheets lie within "
-        f"{west:.4f},{south:.4f},{east:.4f},{north:.4f} (west, south, east, north){hint}: "
-        f"{atlas.url}"
-    )
-
-
-def check_covered(
-    area: Area,
-    grid: TileGrid,
-    sources: Sequence[SheetSource],
-    lattice: WorldSheets,
-    allow_holes: bool,
+def check_shown(
+    area: Area, grid: TileGrid, cells: CellSheet, atlas: Atlas, allow_holes: bool
 ) -> None:
-    """Warn where sheets under an area are missing; `AtlasError` where they lie under the route.
-    With `allow_holes` that is a warning too."""
-    tiles = _some_tiles(area, grid)
-    lat, lon = area.frame.latlon_from_en(grid.centres_en_m(tiles))
-    covered = np.any([source.covers(lat, lon) for source in sources], axis=0)
-    if not covered.any():
-        raise AreaError("no part of the area lies on a sheet of the atlas")
-    route_lat, route_lon = area.frame.latlon_from_en(_route_en_m(area, grid))
-    missing = ~np.any([source.covers(route_lat, route_lon) for source in sources], axis=0)
-    under = _missing(lattice, route_lat[missing], route_lon[missing])
-    elsewhere = _missing(lattice, lat[~covered], lon[~covered])
-    lacks = "lies on sheets that the atlas lacks"
-    _require_route(missing, f"{lacks} ({under})", allow_holes)
-    _warn_area(~covered, f"{lacks}: {elsewhere}")
+    """Warn where the atlas shows no imagery of an area; `AtlasError` where the route is there. With
+    `allow_holes` that is a warning too."""
+    for part, points in _checked_points(area, grid).items():
+        tiles = grid.tiles_rc(points).clip(0, [grid.rows - 1, grid.cols - 1])
+        bare = cells.valid_share(tiles * grid.stride_px) < MIN_TILE_VALID_SHARE
+        if not bare.any():
+            continue
+        places = np.stack(area.frame.latlon_from_en(points[bare]), axis=1).tolist()
+        under = {atlas.recipe.sheets.name_at(*place) for place in places}
+        names = sorted(under - atlas.sheets().keys())
+        lacking = ", ".join(names[:NAMED]) + ", .." * (len(names) > NAMED)
+        said = f"{100 * bare.mean():.3g} % of the {part} has no imagery in the atlas"
+        said += f", which lacks sheets {lacking}" if names else ""
+        if part == "route" and not allow_holes:
+            raise AtlasError(f"{said}; extend the atlas, or allow holes (--allow-holes)")
+        log.warning("%s", said)
 
 
-def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool) -> None:
-    """Warn where the sheets under an area show no imagery; `AtlasError` where the route is there.
-    With `allow_holes` that is a warning too."""
-    route = grid.tiles_rc(_route_en_m(area, grid)).clip(0, [grid.rows - 1, grid.cols - 1])
-    tiles, lacks = _some_tiles(area, grid), "has no imagery in the atlas"
-    on_route, bare = (
-        cells.valid_share(each * grid.stride_px) < MIN_TILE_VALID_SHARE for each in (route, tiles)
-    )
-    _require_route(on_route, lacks, allow_holes)
-    _warn_area(bare, lacks)
-
-
-def _require_route(lacking: NDArray[np.bool_], lacks: str, allow_holes: bool) -> None:
-    """Raise `AtlasError` where points (N,) along a route lack something, unless holes may be."""
-    if lacking.any() and not allow_holes:
-        raise AtlasError(
-            f"{lacking.mean():.0%} of the route {lacks}; extend the atlas, or allow holes "
-            "(--allow-holes)"
-        )
-
-
-def _warn_area(lacking: NDArray[np.bool_], lacks: str) -> None:
-    if lacking.any():
-        log.warning("%.3g %% of the area %s", 100 * float(lacking.mean()), lacks)
-
-
-def _missing(lattice: WorldSheets, lat: Array, lon: Array) -> str:
-    names = sorted(
-        {lattice.name_at(*place) for place in zip(lat.tolist(), lon.tolist(), strict=True)}
-    )
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
-
-
-def _some_tiles(area: Area, grid: TileGrid) -> NDArray[np.intp]:
+def _checked_points(area: Area, grid: TileGrid) -> dict[str, Array]:
+    points = {}
+    if area.route is not None:
+        line = area.route.points_en_m(area.frame)
+        points["route"] = np.concatenate([along_polyline_en_m(line, grid.tile_m / 4)[0], line[-1:]])
     step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / MAX_TILES))))
-    tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T.astype(np.intp)
-    inside = area.contains(grid.centres_en_m(tiles), grid.stride_m * np.sqrt(0.5))
-    return tiles[inside] if inside.any() else tiles[len(tiles) // 2 :][:1]
-
-
-def _route_en_m(area: Area, grid: TileGrid) -> Array:
-    """Points (N, 2) along the route, a quarter of a tile apart; empty without a route."""
-    if area.route is None:
-        return np.zeros((0, 2))
-    line = area.route.points_en_m(area.frame)
-    parts = [line[:1]]
-    for start, end in pairwise(line):
-        count = max(1, int(np.ceil(np.hypot(*(end - start)) / (grid.tile_m / 4))))
-        parts.append(start + (end - start) * (np.arange(count)[:, None] + 1) / count)
-    return np.concatenate(parts)
+    tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T
+    centres = grid.centres_en_m(tiles)
+    points["area"] = centres[area.contains(centres, grid.stride_m * np.sqrt(0.5))]
+    return points
 
 
 CACHE_BYTES = 24 * 2**20  # decoded chunks of each sheet: those along the border of a row of blocks
 REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace)"
 
-DECIDING = 0.5, 0.99  # thresholds of acceptance lie in this range of probabilities
-SCORES = np.linspace(0.05, 1.0, 20)
-MARGINS = np.linspace(0.0, 0.6, 13)
-"""Evidence at which the pooled confidence is compared with the sheets': scores and margins of
-tiles."""
+GRID = "gsd_m", "tile_px", "stride_px"  # what the grids of all sheets have in common
+RECIPE = "method", "represent", "embed", "overlap"  # and their recipes
 
 
 def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[SheetSource]:
     found: list[SheetSource] = []
     for sheet in sheets:
-        try:
-            opened = open_map(atlas.path(sheet, "map"))
-            _check_alike(opened, sheet, grid, found[0].manifest if found else None)
-            found.append(_source(opened, sheet))
-        except (MapFileError, MissingFileError) as error:
-            raise AtlasError(f"sheet {sheet.id} is damaged, {REBUILD}: {error}") from error
+        opened = open_map(atlas.path(sheet))
+        first = found[0].manifest if found else opened.manifest
+        _require_alike(sheet, opened.manifest, grid, first)
+        found.append(_source(opened, sheet))
     return found
 
 
-def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
-    try:
-        recipe = variant_from_recipe(embed.TABLE, manifest.recipe.get("embed"))
-        representation = variant_from_recipe(represent.TABLE, manifest.recipe.get("represent"))
-    except VariantError as error:
-        raise AtlasError(f"this program cannot use the sheets ({error})") from error
-    if not isinstance(recipe, WhitenedRecipe):
+def _require_alike(sheet: Sheet, manifest: Manifest, grid: TileGrid, first: Manifest) -> None:
+    own = manifest.sheets[0].grid
+    other = [name for name in GRID if getattr(own, name) != getattr(grid, name)]
+    other += [name for name in RECIPE if manifest.recipe.get(name) != first.recipe.get(name)]
+    if other:
+        raise AtlasError(f"sheet {sheet.id} has another {' and '.join(other)}, {REBUILD}")
+
+
+def _source(opened: MapFile, sheet: Sheet) -> SheetSource:
+    _, representation = recipes(opened.manifest)
+    grid = opened.manifest.sheets[0].grid
+    layer = GreyLayer.of(opened, cache_bytes=CACHE_BYTES)
+    layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
+    cells = StoredCells.of(opened, layout, representation.channels)
+    if layer is None or cells is None or opened.manifest.registration is None:
+        lacking = "registration layer" if layer is None else "cells"
         raise AtlasError(
-            f"maps are cut from atlases of the method gradient, not {manifest.recipe.get('method')}"
-            ": every sheet of this one has its own encoder"
+            f"sheet {sheet.id} has no {lacking}, from which maps are cut; {REBUILD}: {opened.path}"
         )
+    return SheetSource(sheet, opened.manifest, layer, cells, TerrainLayer.of(opened))
+
+
+def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
+    recipe = variant_from_recipe(embed.TABLE, manifest.recipe.get("embed"))
+    representation = variant_from_recipe(represent.TABLE, manifest.recipe.get("represent"))
+    if not isinstance(recipe, WhitenedRecipe):
+        raise AtlasError(f"maps are cut from sheets of the method gradient, not of {recipe}")
     return recipe, representation
 
 
@@ -235,13 +393,6 @@ def pooled_manifest(
     members: Sequence[SheetSource], shares: NDArray[np.float64], sheet: SheetInfo
 ) -> Manifest:
     manifests = [member.manifest for member in members]
-    tiles = float(np.average([each.sheets[0].tiles for each in manifests], weights=shares))
-    known = [
-        (LogisticConfidence.from_plain(each.confidence), share)
-        for each, share in zip(manifests, shares, strict=True)
-        if each.confidence is not None and share > 0
-    ]
-    confidence = pooled_tiles([c for c, _ in known], [s for _, s in known], sheet.tiles / tiles)
     return Manifest(
         recipe={
             **manifests[0].recipe,
@@ -254,7 +405,7 @@ def pooled_manifest(
             "min_valid_share": max(each.view["min_valid_share"] for each in manifests),
             "position_std_m": max(each.view["position_std_m"] for each in manifests),
         },
-        confidence=None if confidence is None else confidence.to_plain(),
+        confidence=None,
         radius_m=max(each.radius_m for each in manifests),
         created_by=f"orthonav {__version__}",
         registration=_registration(manifests, shares),
@@ -263,93 +414,29 @@ def pooled_manifest(
 
 def _registration(manifests: Sequence[Manifest], shares: NDArray[np.float64]) -> dict[str, Any]:
     layers = [each.registration or {} for each in manifests]
-    confidence = pooled_registered(
-        [
-            RegisteredConfidence.from_plain(each["confidence"])
-            for each, share in zip(layers, shares, strict=True)
-            if each.get("confidence") is not None and share > 0
-        ]
-    )
+    known = [
+        RegisteredConfidence.from_plain(each["confidence"]).chances
+        for each, share in zip(layers, shares, strict=True)
+        if each.get("confidence") is not None and share > 0
+    ]
+    confidence = None
+    if known:
+        chances = {name: max(getattr(each, name) for each in known) for name in CHANCES}
+        confidence = RegisteredConfidence.usual(Chances(**chances)).to_plain()
     return {
-        "confidence": None if confidence is None else confidence.to_plain(),
+        "confidence": confidence,
         "radius_m": max(float(each["radius_m"]) for each in layers),
         "position_floor_px": max(float(each["position_floor_px"]) for each in layers),
     }
 
 
-def pooled_tiles(
-    confidences: Sequence[LogisticConfidence], shares: Sequence[float], more_tiles: float
-) -> LogisticConfidence | None:
-    """Confidence of tile search on a map made of sheets in these shares; None without sheets.
-    `more_tiles`: tiles of the map over tiles of a sheet. As many times more tiles resemble a view
-    by chance, and the odds of the best tile are lower by that factor."""
-    if not confidences:
-        return None
-    bias = float(np.average([each.bias for each in confidences], weights=shares))
-    weights = np.average([each.weights for each in confidences], axis=0, weights=shares)
-    pooled = LogisticConfidence(bias, tuple(weights.tolist()))
-    evidence = [{"score": s, "margin": m} for s, m in itertools.product(SCORES, MARGINS) if m <= s]
-    own = np.array([pooled(each) for each in evidence])
-    theirs = np.array([[single(each) for each in evidence] for single in confidences])
-    mean = np.average(theirs, axis=0, weights=shares)
-    deciding = (own > DECIDING[0]) & (mean < DECIDING[1])
-    own, mean = (np.clip(each[deciding], 1e-9, 1 - 1e-9) for each in (own, mean))
-    excess = (np.log(own / (1 - own)) - np.log(mean / (1 - mean))).max(initial=0.0)
-    return LogisticConfidence(bias - float(excess) - math.log(max(more_tiles, 1.0)), pooled.weights)
-
-
-def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> RegisteredConfidence | None:
-    """Confidence of registered views on a map made of sheets; None without sheets. It is the usual
-    one, with the scores of chance of the sheet where they are highest."""
-    if not confidences:
-        return None
-    chances = Chances(
-        **{name: max(getattr(each.chances, name) for each in confidences) for name in CHANCES}
-    )
-    return RegisteredConfidence.usual(chances)
-
-
 def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
     sources = {json.dumps(each, sort_keys=True): each for one in manifests for each in one.imagery}
 
-    def place(key: str) -> tuple[str, str, str]:
-        return str(sources[key].get("date") or ""), str(sources[key].get("name") or ""), key
-
-    return tuple(sources[key] for key in sorted(sources, key=place))
-
-
-def _check_alike(opened: MapFile, sheet: Sheet, grid: TileGrid, first: Manifest | None) -> None:
-    manifest = opened.manifest
-    if len(manifest.sheets) != 1:
-        raise MapFileError(f"it has {len(manifest.sheets)} sheets in one map: {opened.path}")
-    theirs = manifest.sheets[0].grid
-    for name in ("gsd_m", "tile_px", "stride_px"):
-        if getattr(theirs, name) != getattr(grid, name):
-            raise AtlasError(
-                f"sheet {sheet.id} has {name} {getattr(theirs, name)}, the atlas "
-                f"{getattr(grid, name)}; {REBUILD}: {opened.path}"
-            )
-    for name in ("method", "represent", "embed", "overlap"):
-        if first is not None and manifest.recipe.get(name) != first.recipe.get(name):
-            raise AtlasError(
-                f"sheet {sheet.id} was made differently from the others ({name}: "
-                f"{manifest.recipe.get(name)}, not {first.recipe.get(name)}); {REBUILD}: "
-                f"{opened.path}"
-            )
-
-
-def _source(opened: MapFile, sheet: Sheet) -> SheetSource:
-    _, representation = recipes(opened.manifest)
-    info = opened.manifest.sheets[0]
-    layer = GreyLayer.of(opened, cache_bytes=CACHE_BYTES)
-    layout = CellLayout.for_tiles(info.grid.tile_px, info.grid.stride_px)
-    cells = StoredCells.of(opened, layout, representation.channels)
-    if layer is None or cells is None or opened.manifest.registration is None:
-        lacking = "registration layer" if layer is None else "cells"
-        raise AtlasError(
-            f"sheet {sheet.id} has no {lacking}, from which maps are cut; {REBUILD}: {opened.path}"
-        )
-    return SheetSource(sheet, opened.manifest, layer, cells, TerrainLayer.of(opened))
+    dated = sorted(
+        (str(s.get("date") or ""), str(s.get("name") or ""), k) for k, s in sources.items()
+    )
+    return tuple(sources[key] for _, _, key in dated)
 
 
 def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> TerrainParts | None:
@@ -383,9 +470,6 @@ def _heights(
     return found
 
 
-COARSER = 4  # factor by which blocks are reduced for the preview
-
-
 def cut_map(
     atlas: Atlas,
     out: Path,
@@ -405,14 +489,9 @@ def cut_map(
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")
     progress("sheets", 0.0)
     cutter = _MapCutter(atlas, area)
-    if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in cutter.members):
-        raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
-    check_covered(area, cutter.grid, cutter.members, atlas.recipe.sheets, allow_holes)
-    progress("sheets", 1.0)
     cutter.read(progress, workers)
-    check_shown(area, cutter.grid, cutter.cells, allow_holes)
+    check_shown(area, cutter.grid, cutter.cells, atlas, allow_holes)
     written = write_map(out, *_learnt(cutter, workers, progress))
-    progress("learn", 1.0)
     return BuildResult(written, out.stat().st_size)
 
 
@@ -430,7 +509,12 @@ class _MapCutter:
         self.area = area
         self.grid = grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
         sheets = atlas.over(box_deg(area, grid.tile_m))
-        require_sheets(atlas, area, sheets)
+        if not sheets:
+            bounds = ",".join(f"{each:.4f}" for each in atlas.bounds_deg or ())
+            raise AreaError(
+                f"the area lies outside the atlas, whose {len(atlas.sheets())} sheets lie within "
+                f"'{bounds}' (west, south, east, north): {atlas.url}"
+            )
         self.members = members = opened_sheets(atlas, sheets, grid)
         self.recipe, representation = recipes(members[0].manifest)
         turns = isinstance(representation, OrientedGradients)
@@ -456,8 +540,8 @@ class _MapCutter:
         if not valid.any():
             return {}
         means, share = joined_cells(warps, block, self._layout)
-        # A whole factor is many times faster.
-        size = max(1, block.width // COARSER), max(1, block.height // COARSER)
+        # A whole factor, as 4, is many times faster.
+        size = max(1, block.width // 4), max(1, block.height // 4)
         coarse = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
         parts: Parts = {"means": means, "share": share}
         parts["preview"] = self.preview.small(block, coarse)
@@ -471,7 +555,7 @@ class _MapCutter:
         part = np.s_[: rows - block.row // spacing, : cols - block.col // spacing]
         self.cells.put(block.row, block.col, parts["means"][part], parts["share"][part])
         self.preview.put(block, parts["preview"])
-        put_layer_parts(self.layer, block, parts)
+        self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
 
 
 def _learnt(
@@ -482,7 +566,6 @@ def _learnt(
     tiles_px = tiles_rc * grid.stride_px
     progress("learn", 0.0)
     embedder = learn(cutter.recipe, cutter.cells, tiles_px, workers)
-    progress("learn", 0.3)
     embeddings = embedder.tiles(cutter.cells, tiles_px, workers)
     centres = grid.centres_en_m(tiles_rc)
     grey, grey_parts = cutter.layer.finish()

@@ -3,11 +3,16 @@
 Each view is searched among the coarse tiles of the whole atlas, under all possible headings. The
 best places, and the places where earlier views let expect it, are registered on their sheets. Each
 match has odds against the best other match of the whole atlas. A place is found where several views
-agree on it (`orthonav.ground.atlas.agreement`). From there on the aircraft is tracked on a map cut
-around it, in memory. Before the aircraft can reach its border, another one is cut around the place
-where it is expected, and the track continues there. A view that the track does not recognize is
-searched in the whole atlas too: where several of them agree on a place, another track begins there.
-"""
+agree on it: one view alone never decides where in a country an aircraft is. From there on the
+aircraft is tracked on a map cut around it, in memory. Before the aircraft can reach its border,
+another one is cut around the place where it is expected, and the track continues there. A view that
+the track does not recognize is searched in the whole atlas too: where several of them agree on a
+place, another track begins there.
+
+A chain is a sequence of places, one per view, that an aircraft can have flown through. A view found
+where a chain expects it supports the chain by its odds against the best other place in the whole
+atlas, and by how unlikely it is that a wrong place lies there by chance. A view counts by the share
+of it that is new ground, because views of the same ground are not independent."""
 
 import logging
 import math
@@ -15,8 +20,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError, AtlasError
+from orthonav.core.errors import AreaError, AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE
@@ -26,24 +32,190 @@ from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.track import Model, State
 from orthonav.core.track.mixture import MOST_SIGHTED
 from orthonav.core.track.tracker import Tracker
-from orthonav.ground.atlas.agreement import (
-    AGILE_MPS,
-    MAX_REACH_M,
-    MAX_SPEED_MPS,
-    Agreement,
-    PlaceEvidence,
-    Placement,
-)
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.cut import cut_in_memory
 from orthonav.ground.atlas.search import (
+    Placement,
     SearchRegion,
     SheetRegistrar,
     TileSearch,
     ViewMatches,
     ViewRegistrar,
+    nearest_m,
 )
 from orthonav.ground.planning.area import Area
+
+log = logging.getLogger(__name__)
+
+# Values without another source were chosen with `benchmarks.atlas_lost` at d63ac91.
+MAX_SPEED_MPS = 120.0  # faster than the aircraft that this program is for
+SLACK_M = 60.0  # errors of two registered positions, seven pixels of 8 m
+TURN_RATE_RAD_S = math.radians(12.0)  # four times a standard-rate turn (3 deg/s)
+TURN_SLACK_RAD = math.radians(12.0)  # errors of two registered headings
+SCALE_SLACK = 0.12  # greatest difference of log scale between two views, besides climbing
+CLIMB_PER_S = 0.02  # change of log scale per second: 20 m/s at 1000 m
+MIN_NEW = 0.15  # fraction of a view that must be new ground (docs/decisions/tracking.md)
+ANCHORS = 30  # places that counted and are remembered: circling over them proves nothing more
+MAX_REACH_M = 5_000.0  # a chain whose aircraft may be farther away is dropped
+MIN_VELOCITY_S = 0.5  # views closer in time do not give a velocity
+AGILE_MPS = 10.0  # the velocity may change by so much, and by half, between two views
+MISSED = 1.6  # nats that a view without support costs a chain: exp(-1.6) is 0.2, `1 - FOUND`
+CHANCE = 0.05  # least probability that a wrong place lies by chance where a chain expects the view
+FOUND = 0.8  # probability that the right place is found where a chain expects the view
+MAX_LOG_ODDS = 5.0  # no single view counts more than this: odds of 150
+MAX_CHAINS = 12
+HOPELESS = 9.0  # chains less likely than the best by more nats are dropped
+MIN_VIEWS = 1.7  # views of new ground that must agree: two that overlap by 30 %
+MAX_CHAIN_LOG_ODDS = 14.0  # so that a chain that became wrong is given up after some views
+
+
+@dataclass(frozen=True)
+class PlaceEvidence(Placement):
+    log_odds: float  # of this place against all others of the atlas, from this view alone (nats)
+    key: int  # number by which the caller recognizes the view
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    last: PlaceEvidence  # the latest place
+    time_ns: int  # when it was seen
+    log_odds: float  # of the chain (nats)
+    views: float  # how many agree, in views of new ground
+    latest_log_odds: float  # what the latest view alone says of its place (nats)
+    anchors: tuple[PlaceEvidence, ...]  # the places of the views that counted
+    velocity_en_mps: NDArray[np.float64] | None = None  # east and north, None where unknown
+    missed: int = 0  # views since the latest place that did not support the chain
+
+    def latest(self, count: int) -> tuple[PlaceEvidence, ...]:
+        places = self.anchors if self.anchors[-1] is self.last else (*self.anchors, self.last)
+        return places[-count:]
+
+    def _seconds(self, time_ns: int) -> float:
+        return max(0.0, (time_ns - self.time_ns) / 1e9)
+
+    def reach_m(self, time_ns: int) -> float:
+        speed = MAX_SPEED_MPS
+        if self.velocity_en_mps is not None:
+            latest = float(np.hypot(*self.velocity_en_mps))
+            speed = min(speed, (0.5 + self.missed) * latest + AGILE_MPS)
+        return SLACK_M + speed * self._seconds(time_ns)
+
+    def expected(self, time_ns: int) -> tuple[float, float]:
+        if self.velocity_en_mps is None:
+            return self.last.latlon_deg
+        frame = LocalFrame(*self.last.latlon_deg)
+        lat, lon = frame.latlon_from_en(self.velocity_en_mps * self._seconds(time_ns))
+        return float(lat), float(lon)
+
+    def turn_std_rad(self, time_ns: int) -> float:
+        turned = TURN_SLACK_RAD + TURN_RATE_RAD_S * self._seconds(time_ns)
+        return min(math.pi / 2, turned / 3)
+
+    def reaches(self, place: PlaceEvidence, time_ns: int) -> bool:
+        dt_s = self._seconds(time_ns)
+        away = distances_m([self.expected(time_ns)], [place.latlon_deg])[0]
+        turned = abs(math.remainder(place.turn_rad - self.last.turn_rad, 2 * math.pi))
+        scaled = abs(place.log_scale - self.last.log_scale)
+        return bool(
+            away <= self.reach_m(time_ns)
+            and turned <= TURN_SLACK_RAD + TURN_RATE_RAD_S * dt_s
+            and scaled <= SCALE_SLACK + CLIMB_PER_S * dt_s
+        )
+
+
+class Agreement:
+    def __init__(self) -> None:
+        self.chains: list[Chain] = []
+
+    def add_view(
+        self, places: Sequence[PlaceEvidence], time_ns: int, side_m: float, chance: float
+    ) -> None:
+        """`side_m`: width of the view. `chance`: probability that the best of the wrong places lies
+        where a chain expects it, the fraction of the searched area that was searched there."""
+        gain = math.log(FOUND / min(max(chance, CHANCE), FOUND))
+        made: list[Chain] = []
+        supporting = [each for each in places if _support(each, gain) > 0]
+        for chain in self.chains:
+            if time_ns < chain.time_ns or chain.reach_m(time_ns) > MAX_REACH_M:
+                continue
+            made += [
+                _extended(chain, each, time_ns, side_m, gain)
+                for each in supporting
+                if chain.reaches(each, time_ns)
+            ]
+            made.append(replace(chain, log_odds=chain.log_odds - MISSED, missed=chain.missed + 1))
+        # New chains come last: of two equal chains the older one comes first.
+        for each in places:
+            odds = min(each.log_odds, MAX_LOG_ODDS)
+            made.append(Chain(each, time_ns, odds, 1.0, odds, (each,)))
+        chains = _distinct(made, side_m)
+        # Subtracted from all alike: the limit must not make them equal.
+        excess = max(0.0, chains[0].log_odds - MAX_CHAIN_LOG_ODDS) if chains else 0.0
+        self.chains = [replace(each, log_odds=each.log_odds - excess) for each in chains]
+
+    @property
+    def best(self) -> Chain | None:
+        return self.chains[0] if self.chains else None
+
+    @property
+    def confidence(self) -> float:
+        best = self.best
+        if best is None:
+            return 0.0
+        odds = np.array([0.0, *(each.log_odds for each in self.chains)])
+        probability = float(np.exp(odds[1] - np.logaddexp.reduce(odds)))
+        return min(probability, 1 / (1 + math.exp(-best.latest_log_odds)))
+
+    @property
+    def agreed(self) -> bool:
+        best = self.best
+        return best is not None and best.views >= MIN_VIEWS and best.missed == 0
+
+
+def _support(place: PlaceEvidence, gain: float) -> float:
+    return min(place.log_odds, MAX_LOG_ODDS) + gain
+
+
+def _extended(
+    chain: Chain, place: PlaceEvidence, time_ns: int, side_m: float, gain: float
+) -> Chain:
+    there = [each.latlon_deg for each in chain.anchors]
+    new = min(1.0, nearest_m(place.latlon_deg, there) / max(side_m, 1.0))
+    anchors = (*chain.anchors, place)[-ANCHORS:]
+    if new < MIN_NEW:
+        new, anchors = 0.0, chain.anchors
+    support = _support(place, gain)
+    return Chain(
+        last=place,
+        time_ns=time_ns,
+        log_odds=max(chain.log_odds + new * support, min(place.log_odds, MAX_LOG_ODDS)),
+        views=chain.views + new,
+        latest_log_odds=support,
+        anchors=anchors,
+        velocity_en_mps=_velocity(chain, place, (time_ns - chain.time_ns) / 1e9),
+    )
+
+
+def _velocity(chain: Chain, place: PlaceEvidence, dt_s: float) -> NDArray[np.float64] | None:
+    if dt_s < MIN_VELOCITY_S:
+        return chain.velocity_en_mps
+    frame = LocalFrame(*chain.last.latlon_deg)
+    velocity = frame.en_from_latlon(place.lat_deg, place.lon_deg) / dt_s
+    speed = float(np.hypot(*velocity))
+    return np.asarray(velocity * min(1.0, MAX_SPEED_MPS / max(speed, 1e-9)))
+
+
+def _distinct(made: Sequence[Chain], side_m: float) -> list[Chain]:
+    chains: list[Chain] = []
+    for each in sorted(made, key=lambda one: (-one.log_odds, -one.views)):
+        if chains and each.log_odds < chains[0].log_odds - HOPELESS:
+            break
+        if nearest_m(each.last.latlon_deg, [one.last.latlon_deg for one in chains]) >= side_m / 4:
+            chains.append(each)
+        if len(chains) == MAX_CHAINS:
+            break
+    return chains
+
 
 # Values without another source: `benchmarks.atlas_lost` at d63ac91.
 CANDIDATES = 40  # places of the whole atlas that are judged, 4 ms each
@@ -71,21 +243,17 @@ class FoundPlace:
 
 
 class PlaceFinder:
-    """Finds where in an atlas the views of a flight were taken. Mutable; not to be shared between
-    threads."""
-
     def __init__(
         self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
         self._registrar, self._search = registrar, search
         self._heading_known = heading_known
-        self._agreement = Agreement()
-        self._views: dict[int, View] = {}
         self._number = 0
+        self.restart()
 
     def restart(self) -> None:
         self._agreement = Agreement()
-        self._views = {}
+        self._views: dict[int, View] = {}
 
     def find(self, view: View) -> FoundPlace | NoFix:
         recipe = self._search.recipe
@@ -197,8 +365,6 @@ def _moved(
     return float(lat), float(lon)
 
 
-log = logging.getLogger(__name__)
-
 SIGMAS = 3.0  # standard deviations of a position within which the aircraft is
 AHEAD_M = 1000.0  # a map reaches so much farther than the next view can: fewer maps are cut
 LIKELY = 0.5  # least confidence of a fix
@@ -259,8 +425,6 @@ class LocalTrack:
         return True
 
     def _take(self, seen: Fix | NoFix, telemetry: Telemetry, most: float = 1.0) -> None:
-        """Keep the estimate of the tracker; it is a fix with a confidence of `most`, and of what
-        the view itself says of the place."""
         assert isinstance(seen, Fix)  # a track with a start always has an estimate
         self._time_ns, self._last = telemetry.time_ns, seen
         confidence = min(seen.confidence, seen.evidence["recognized"], most)
@@ -298,18 +462,10 @@ class LocalTrack:
 
 
 class AtlasLocator:
-    """Places the views of one flight. Mutable; not to be shared between threads."""
-
     def __init__(
         self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
         self._atlas = registrar.atlas
-        recipe = self._atlas.recipe
-        if recipe.method.partition(":")[0] != "gradient" or not recipe.registration:
-            raise AtlasError(
-                "an aircraft is tracked on maps that are cut out of the atlas; that needs the "
-                f"method gradient and registration layers: {self._atlas.url}"
-            )
         self._heading_known = heading_known
         self._finder = PlaceFinder(registrar, search, heading_known=heading_known)
         self._track: LocalTrack | None = None
@@ -317,7 +473,6 @@ class AtlasLocator:
 
     @property
     def state_name(self) -> str | None:
-        """That of the track: `searching` before there is one, `lost` after it has ended."""
         return self._state.value
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
@@ -332,7 +487,12 @@ class AtlasLocator:
         found = self._finder.find(view)
         if isinstance(found, NoFix):
             return self._outcome(found)
-        self._begin(found)
+        try:
+            begun = LocalTrack(self._atlas, found, heading_known=self._heading_known)
+            if begun.agrees:
+                self._track = begun
+        except (AreaError, AtlasError, MapFileError) as error:
+            log.warning("no map can be cut around the place found: %s", error)
         return self._outcome()
 
     def _follow(self, take_in: Callable[[LocalTrack], bool]) -> None:
@@ -341,18 +501,9 @@ class AtlasLocator:
         try:
             if not take_in(self._track):
                 self._track = None
-        except (AreaError, AtlasError) as error:
+        except (AreaError, AtlasError, MapFileError) as error:
             log.warning("no map can be cut where the aircraft is expected: %s", error)
             self._track = None
-
-    def _begin(self, found: FoundPlace) -> None:
-        try:
-            begun = LocalTrack(self._atlas, found, heading_known=self._heading_known)
-        except (AreaError, AtlasError) as error:
-            log.warning("no map can be cut around the place found: %s", error)
-            return
-        if begun.agrees:
-            self._track = begun
 
     def _outcome(self, reason: NoFix | None = None) -> Fix | NoFix:
         if self._track is not None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AtlasError, MapFileError
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE, RegisteredConfidence, logit
 from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import RegistrationLocalizer
@@ -37,7 +37,6 @@ from orthonav.core.register.window import GreyPyramid
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_poses
 from orthonav.core.variants import make_variant
-from orthonav.ground.atlas.agreement import Placement, nearest_m
 from orthonav.ground.atlas.catalog import Atlas, CoarseRecipe
 from orthonav.ground.atlas.coarse import EDGES
 from orthonav.ground.atlas.index import (
@@ -50,6 +49,11 @@ from orthonav.ground.atlas.index import (
 )
 from orthonav.ground.atlas.vectors import ShardedIndex
 
+log = logging.getLogger(__name__)
+
+MAX_OPEN = 16  # sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all
+BORDER_SHARE = 0.25  # of its side that the middle of a view may lie outside the box of a sheet
+WIDEST = 1.25  # greatest scale at which all of a view lies on the part of a sheet, on level ground
 PER_POSE = 60  # tiles found for each pose; several neighbouring tiles are one place
 EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
 MOST_EFFORT = 0.085, 1500
@@ -60,19 +64,32 @@ APART_STRIDES = 1.5  # tiles nearer to each other are one place: the eight neigh
 MAX_LAT_DEG = 89.8  # nearer to a pole a view has no meaningful heading
 
 
+@dataclass(frozen=True)
+class Placement:
+    lat_deg: float
+    lon_deg: float
+    turn_rad: float  # heading of the top of the view
+    log_scale: float  # logarithm of true over reported height
+
+    @property
+    def latlon_deg(self) -> tuple[float, float]:
+        return self.lat_deg, self.lon_deg
+
+
+def nearest_m(place: tuple[float, float], others: Sequence[tuple[float, float]]) -> float:
+    return float(distances_m([place] * len(others), others).min(initial=math.inf))
+
+
 class TileSearch:
     """The index of an atlas with its shards mapped. Not to be shared between threads. `unknown`
     names the sheets that are not in the index, which are not found."""
 
     def __init__(self, atlas: Atlas) -> None:
-        if atlas.recipe.coarse is None:
-            raise AtlasError(
-                f"the atlas has no coarse tiles, so views need a prior there: {atlas.url}"
-            )
         manifest = read_manifest(atlas)
-        if manifest is None:
+        if manifest is None or atlas.recipe.coarse is None:
             raise AtlasError(
-                f"the atlas has no index: make it with 'orthonav atlas index': {atlas.url}"
+                "the atlas has no index: make it with 'orthonav atlas index', or build an atlas "
+                f"with coarse tiles: {atlas.url}"
             )
         self.atlas = atlas
         self.recipe: CoarseRecipe = atlas.recipe.coarse
@@ -116,21 +133,11 @@ class TileSearch:
         return found
 
 
-log = logging.getLogger(__name__)
-
-MAX_OPEN = 16  # sheets kept open: their decoded pictures take up to 64 MB each, 1 GB in all
-BORDER_SHARE = 0.25  # of its side that the middle of a view may lie outside the box of a sheet
-WIDEST = 1.25  # greatest scale at which all of a view lies on the part of a sheet, on level ground
-
-
 @dataclass(frozen=True)
 class SearchRegion(Placement):
     middle_latlon_deg: tuple[float, float]  # middle of the ground that the view shows
     reach_m: float  # how far from the place is searched
     turn_std_rad: float  # standard deviation of the heading
-
-    def contains(self, place: Placement) -> bool:
-        return nearest_m(self.latlon_deg, [place.latlon_deg]) <= self.reach_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +172,6 @@ class PyramidPart:
 
 
 class SheetRegistrar:
-    """Registers views on the sheets of an atlas. Not to be shared between threads."""
-
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
         self._lattice = atlas.recipe.sheets
@@ -181,15 +186,13 @@ class SheetRegistrar:
         opened = (self._sheet(name) for name in self._lattice.over(box) if name in self._usable)
         return [sheet for sheet in opened if sheet is not None]
 
-    def at(self, region: SearchRegion, side_m: float) -> list[RegistrationLocalizer]:
-        """The sheet in whose box the middle of a view is expected; where it cannot be used, its
-        neighbours within reach. Raises `StorageError` where a sheet cannot be fetched."""
+    def at(self, region: SearchRegion) -> RegistrationLocalizer | None:
+        """The sheet in whose box the middle of a view is expected, None where it cannot be used.
+        Raises `StorageError` where it cannot be fetched."""
         name = self._lattice.name_at(*region.middle_latlon_deg)
-        sheet = self._sheet(name) if name in self._usable else None
-        return self.near(region, side_m) if sheet is None else [sheet]
+        return self._sheet(name) if name in self._usable else None
 
     def _opened(self, name: str) -> RegistrationLocalizer | None:
-        """A sheet, None where it is damaged (logged once)."""
         try:
             opened = open_map(self.atlas.path(self.atlas.sheets()[name]))
             return RegistrationLocalizer.of_map(opened, None, level_ground=False)
@@ -214,12 +217,11 @@ class ViewRegistrar:
     def judged(self, region: SearchRegion) -> "JudgedRegion | None":
         """The best place near the middle of a region at the level where views are judged, on the
         sheet that covers it; None where there is none."""
-        parts = (self._part(each, region) for each in self._sheets.at(region, self._side_m))
-        found = [part for part in parts if part is not None and part.judged]
-        return max(found, key=lambda each: each.look, default=None)
+        sheet = self._sheets.at(region)
+        part = None if sheet is None else self._part(sheet, region)
+        return part if part is not None and part.judged else None
 
     def _part(self, sheet: RegistrationLocalizer, region: SearchRegion) -> "JudgedRegion | None":
-        """The view on the part of a sheet around a region; None where it does not reach there."""
         view = self._prepared(sheet.grid.gsd_m, sheet.pyramid.levels)
         if isinstance(view, NoFix):
             return None
@@ -382,7 +384,9 @@ class ViewMatches:
         return bool(self.found) and self.log_odds(0) >= PROVEN
 
     def _proven_in(self, region: SearchRegion) -> bool:
-        return self._proven and region.contains(self.found[0])
+        if not self._proven:
+            return False
+        return nearest_m(region.latlon_deg, [self.found[0].latlon_deg]) <= region.reach_m
 
     def log_odds(self, number: int) -> float:
         one = self.found[number]

@@ -1,64 +1,45 @@
 """The files of an atlas, in a local folder or by fsspec in object storage and on servers.
 
-A file exists completely or not at all: locally it is written to a temporary name and renamed,
-object stores show a file when it is complete, elsewhere (SFTP) it is moved to its name. No file
-outside the atlas is ever named, because the catalogue may come from an untrusted source. Remote
-files are copied to a cache and verified; that of fsspec neither verifies nor limits its size. Nor
-does a folder go through fsspec: its local file system neither syncs files to disk before it renames
-them nor refuses links that lead outside."""
+A file exists completely or not at all: locally it is written to a temporary name and renamed, and
+object stores show a file when it is complete. No file outside the atlas is ever named, because the
+catalogue may come from an untrusted source. Remote files are copied to a cache and verified, which
+the cache of fsspec does not do. Nor does a folder go through fsspec: its local file system neither
+syncs files to disk before it renames them nor refuses links that lead outside."""
 
 import contextlib
-import errno
+import functools
 import hashlib
-import logging
 import os
 import re
 import shutil
 import time
-import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from orthonav.core.errors import MissingExtraError, OrthonavError, StorageError
+from orthonav.core.errors import MissingExtraError, OrthonavError, StorageError, described
 from orthonav.core.extras import needed
 from orthonav.core.files import replacing
 
-log = logging.getLogger(__name__)
-
 MAX_READ_BYTES = 64 * 2**20  # a guard for memory: catalogue and index manifest are smaller
-LIMIT_BYTES = 20 * 10**9  # some 200 sheets of 100 km2 at 1 m, 70 to 100 MB each (docs/country.md)
-GRACE_S = 600.0  # files used within this time are not removed: a process may be about to open them
-_OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"}
-"""There a file appears when it is complete; elsewhere it is moved to its name."""
 _FINDS_BY_PREFIX = {"s3", "s3a", "gs", "gcs"}
 _NEEDS_OVERWRITE = {"abfs", "abfss", "az"}  # refuse to replace a file unless told
 _PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
 _PROTOCOL = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 _PASSWORD = re.compile(r"(://[^/@:]*):[^/]*@")
-_CREDENTIALS = re.compile(
-    "Credential|ClientAuthentication|NoAuthToken|ProfileNotFound|RefreshError"
-    "|TokenRetrieval|UnauthorizedSSOToken"
-)
-"""In the names of exceptions of boto, Google and Azure: there are no valid credentials."""
-_UNREACHABLE = re.compile(  # in the names of exceptions: the storage cannot be reached
-    "Connect(or|ion)|Timeout|HTTPClientError|SSLError|ServiceRe(quest|sponse)Error|gaierror"
-)
-_MAX_TEXT = 300
 
 
 class Store:
-    """The files of one atlas by name (`folder/file`). Can be pickled and used by several threads.
-    Every failure is a `StorageError` with its cause, or `MissingExtraError` where the package of a
-    protocol is not installed. `str()` gives the address without a password."""
+    """The files of one atlas by name (`folder/file`). Can be used by several threads. Every failure
+    is a `StorageError` with its cause, or `MissingExtraError` where the package of a protocol is
+    not installed. `str()` gives the address without a password."""
 
     def __init__(self, url: str) -> None:
         match = _PROTOCOL.match(url)
         self._protocol = match.group(1).lower() if match else "file"
         self.is_local = self._protocol in ("file", "local")
-        self._verified: set[tuple[str, int, int]] = set()
         if self.is_local:
             self._root = Path(url[match.end() :] if match else url).expanduser().absolute()
             self.url = str(self._root)
@@ -67,9 +48,6 @@ class Store:
         with storage_errors(str(self), "open the storage"):
             self._fsspec = needed("fsspec", "atlas", "an atlas in object storage")
             self._remote("")
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.url,)
 
     def __str__(self) -> str:
         return self.url if self.is_local else _PASSWORD.sub(r"\1@", self.url)
@@ -100,56 +78,64 @@ class Store:
                 return None
             return int(info["size"]) if info["type"] == "file" else None
 
-    def age_s(self, name: str) -> float | None:
+    def age_s(self, name: str) -> float:
         with storage_errors(self.shown(name), "access the atlas"):
             if self.is_local:
-                return time.time() - self._path(checked_name(name), follow=False).lstat().st_mtime
+                return time.time() - self._path(checked_name(name)).stat().st_mtime
             fs, remote_path = self._remote(checked_name(name))
-            try:
-                when = fs.modified(remote_path)
-            except NotImplementedError:
-                when = fs.info(remote_path).get("mtime")
-        if isinstance(when, datetime):
-            when = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-        return time.time() - when if isinstance(when, int | float) else None
+            when: datetime = fs.modified(remote_path)
+            return time.time() - (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
 
     def read(self, name: str, limit_bytes: int = MAX_READ_BYTES) -> bytes:
         size = self.size(name)
-        if size is None:
-            raise StorageError(f"the atlas has no such file: {self.shown(name)}")
-        if size > limit_bytes:
+        if size is not None and size > limit_bytes:
             raise StorageError(
                 f"file has {size} bytes, at most {limit_bytes} are allowed: {self.shown(name)}"
             )
-        return self.read_many([name])[name]
+        content = self.read_many([name]).get(name)
+        if content is None:
+            raise StorageError(f"the atlas has no such file: {self.shown(name)}")
+        return content
 
     def read_many(self, names: Iterable[str]) -> dict[str, bytes]:
+        """Contents of files; files that another process has removed are left out."""
         with storage_errors(str(self), "read files of the atlas"):
+            found: dict[str, Any] = {}
             names = [checked_name(name) for name in names]
             if self.is_local:
-                return self._read_local(names)
-            if not names:
-                return {}
-            fs, root = self._remote("")
-            paths = [f"{root}/{name}" for name in names]
-            found = fs.cat(paths) if len(paths) > 1 else {paths[0]: fs.cat_file(paths[0])}
-            return {name: found[path] for name, path in zip(names, paths, strict=True)}
+                for name in names:
+                    with contextlib.suppress(FileNotFoundError):
+                        found[name] = self._path(name).read_bytes()
+            elif names:
+                fs, root = self._remote("")
+                paths = {f"{root}/{name}": name for name in names}
+                there = fs.cat(list(paths), recursive=False, on_error="return")
+                found = {paths[path]: content for path, content in there.items()}
+            for name, content in list(found.items()):
+                if isinstance(content, FileNotFoundError):
+                    del found[name]
+                elif isinstance(content, Exception):
+                    raise content
+            return found
 
     def fetch(self, name: str, size: int, sha256: str) -> Path:
         """A local file with that content, verified once: the file itself or a cached copy. Several
         processes may use the cache at the same time."""
         if self.is_local:
-            return self._verified_path(name, size, sha256)
-        folder, limit_bytes = cache_folder(), cache_limit_bytes()
+            with storage_errors(self.shown(name), "read the atlas"):
+                path = self._path(checked_name(name))
+                if not path.is_file():
+                    raise StorageError(f"the atlas has no such file: {self.shown(name)}")
+                _require(path, size, sha256, self.shown(name))
+            return path
+        folder = cache_folder()
         path = folder / sha256[:2] / f"{sha256}{Path(checked_name(name)).suffix}"
         with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
             if path.is_file() and path.stat().st_size == size:
-                os.utime(path)  # last used now
                 return path
             with replacing(path) as temporary:
                 self.download(name, temporary)
                 _require(temporary, size, sha256, self.shown(name))
-            _shrink(folder, limit_bytes, path)
         return path
 
     def download(self, name: str, path: Path) -> None:
@@ -159,11 +145,15 @@ class Store:
 
     def write(self, name: str, content: Path | bytes) -> None:
         with storage_errors(self.shown(name), "write to the atlas"):
-            name = checked_name(name)
             if not self.is_local:
-                self._write_remote(name, content)
+                fs, path = self._remote(checked_name(name))
+                if isinstance(content, bytes):
+                    fs.pipe_file(path, content)
+                else:
+                    more = {"overwrite": True} if self._protocol in _NEEDS_OVERWRITE else {}
+                    fs.put_file(str(content), path, **more)
                 return
-            with replacing(self._path(name)) as temporary:
+            with replacing(self._path(checked_name(name))) as temporary:
                 if isinstance(content, Path):
                     shutil.copyfile(content, temporary)
                 else:
@@ -175,7 +165,7 @@ class Store:
             contextlib.suppress(FileNotFoundError),
         ):
             if self.is_local:
-                self._path(checked_name(name), follow=False).unlink()
+                self._path(checked_name(name)).unlink()
             else:
                 fs, remote_path = self._remote(checked_name(name))
                 fs.rm_file(remote_path)
@@ -183,37 +173,13 @@ class Store:
     def shown(self, name: str) -> str:
         return f"{self}/{name:.200}" if name else str(self)
 
-    def _path(self, name: str, follow: bool = True) -> Path:
-        """The path of a local file. Links that lead out of the atlas are refused; without `follow`
-        the file itself may be one."""
-        path = self._root.joinpath(*name.split("/")) if name else self._root
-        real = path.resolve() if follow or not name else path.parent.resolve()
-        if not real.is_relative_to(self._root.resolve()):
+    def _path(self, name: str) -> Path:
+        path = self._root / name
+        if not path.resolve().is_relative_to(self._root.resolve()):
             raise StorageError(f"a link leads out of the atlas: {path}")
         return path
 
-    def _read_local(self, names: Sequence[str]) -> dict[str, bytes]:
-        """Contents of files; folders are resolved once, which takes as long as reading a file."""
-        folders = {folder: self._path(folder).resolve() for folder in map(_folder_of, names)}
-        found = {}
-        for name in names:
-            path = folders[_folder_of(name)] / name.rpartition("/")[2]
-            found[name] = (self._path(name) if path.is_symlink() else path).read_bytes()
-        return found
-
-    def _verified_path(self, name: str, size: int, sha256: str) -> Path:
-        with storage_errors(self.shown(name), "read the atlas"):
-            path = self._path(checked_name(name))
-            if not path.is_file():
-                raise StorageError(f"the atlas has no such file: {self.shown(name)}")
-            state = (sha256, path.stat().st_size, path.stat().st_mtime_ns)
-            if state not in self._verified:
-                _require(path, size, sha256, self.shown(name))
-                self._verified.add(state)
-        return path
-
     def _remote(self, name: str) -> tuple[Any, str]:
-        """The file system and a path on it. fsspec keeps one per process and thread."""
         try:
             self._fsspec.get_filesystem_class(self._protocol)
             fs, root = self._fsspec.core.url_to_fs(self.url)
@@ -239,33 +205,6 @@ class Store:
                 sizes[name] = int(each["size"])
         return sizes
 
-    def _write_remote(self, name: str, content: Path | bytes) -> None:
-        fs, path = self._remote(name)
-        if self._protocol in _OBJECT_STORES:
-            self._send(fs, content, path)
-            return
-        folder, _, file = path.rpartition("/")
-        fs.makedirs(folder, exist_ok=True)
-        temporary = f"{folder}/.{file}.{uuid.uuid4().hex[:12]}.tmp"
-        try:
-            self._send(fs, content, temporary)
-            fs.mv(temporary, path)
-        except BaseException:
-            with contextlib.suppress(Exception):
-                fs.rm_file(temporary)
-            raise
-
-    def _send(self, fs: Any, content: Path | bytes, path: str) -> None:
-        if isinstance(content, bytes):
-            fs.pipe_file(path, content)
-        else:
-            more = {"overwrite": True} if self._protocol in _NEEDS_OVERWRITE else {}
-            fs.put_file(str(content), path, **more)
-
-
-def _folder_of(name: str) -> str:
-    return name.rpartition("/")[0]
-
 
 def _listed(folder: Path, prefix: str) -> dict[str, int]:
     found = {}
@@ -285,6 +224,13 @@ def checked_name(name: str) -> str:
 
 
 def digest_of(path: Path) -> str:
+    state = path.stat()
+    return _digest(path, state.st_size, state.st_mtime_ns)
+
+
+@functools.cache
+def _digest(path: Path, size: int, changed_ns: int) -> str:
+    """The digest of a file that has not changed is not computed again."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -308,30 +254,6 @@ def cache_folder() -> Path:
     return Path(users).expanduser() / "orthonav" / "atlas"
 
 
-def cache_limit_bytes() -> int:
-    gigabytes = os.environ.get("ORTHONAV_CACHE_GB")
-    try:
-        return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
-    except (ValueError, OverflowError) as error:
-        raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
-
-
-def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
-    files = []
-    for path in folder.glob("??/*"):
-        with contextlib.suppress(FileNotFoundError):  # removed by another process
-            state = path.stat()
-            files.append((state.st_mtime, state.st_size, path))
-    excess = sum(size for _, size, _ in files) - limit_bytes
-    for used, size, path in sorted(files):
-        if excess <= 0:
-            return
-        if path != newest and time.time() - used > GRACE_S:
-            path.unlink(missing_ok=True)
-            excess -= size
-            log.debug("cache: removed %s", path.name)
-
-
 @contextmanager
 def storage_errors(place: str, action: str) -> Iterator[None]:
     """Turn every error into `StorageError` with the cause: the libraries behind fsspec raise many
@@ -343,41 +265,5 @@ def storage_errors(place: str, action: str) -> Iterator[None]:
             raise
         raise StorageError(str(error)) from error
     except Exception as error:
-        raise StorageError(f"cannot {action}: {_cause(error)}: {place}") from error
-
-
-def _cause(error: Exception) -> str:
-    chain = list(_chain(error))
-    names = {kind.__name__ for each in chain for kind in type(each).__mro__}
-    text = " ".join(str(error).split())[:_MAX_TEXT] or type(error).__name__
-    numbers = {each.errno for each in chain if isinstance(each, OSError)}
-    if numbers & {errno.ENOSPC, errno.EDQUOT}:
-        return "disk full; free some space"
-    if any(map(_CREDENTIALS.search, names)):
-        return f"no valid credentials ({text}); set those of the storage, see its documentation"
-    if errno.EROFS in numbers:
-        return "the file system is read-only"
-    if "PermissionError" in names or any(_status(each) in (401, 403) for each in chain):
-        return f"not permitted, or credentials refused ({text})"
-    if any(isinstance(each, FileNotFoundError) for each in chain):
-        return f"no such file, folder or bucket ({text})"
-    if any(map(_UNREACHABLE.search, names)):
-        return f"it cannot be reached ({text}); check the address and the network"
-    return f"{type(error).__name__}: {text}"
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    for _ in range(10):
-        if error is None:
-            return
-        yield error
-        error = error.__cause__ or error.__context__
-
-
-def _status(error: BaseException) -> int | None:
-    response = getattr(error, "response", None)
-    if isinstance(response, dict):
-        status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
-    else:
-        status = getattr(error, "status_code", getattr(error, "code", None))
-    return status if isinstance(status, int) else None
+        why = f"{type(error).__name__}: {described(error)}"
+        raise StorageError(f"cannot {action}: {why}: {place}") from error

@@ -7,9 +7,8 @@ quantizers (`train`) and depend on nothing else, so they can be added and remove
 
 A shard NAME is four files in a folder: `NAME.vectors.npy` (rows, D) float16, `NAME.codes` with the
 codes and rows of every list, `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of each
-list, and `NAME.places.npy` (rows, 2) float64 with latitude and longitude of every row. FAISS maps
-neither lists of 4-bit codes nor checks the files that it reads, so this format is our own: every
-length is checked before FAISS is given the map."""
+list, and `NAME.places.npy` (rows, 2) float64 with latitude and longitude of every row. Every length
+is checked before FAISS is given the map."""
 
 import json
 import os
@@ -17,10 +16,8 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,18 +67,13 @@ class VectorRecipe:
     seed: int = 0  # seed of k-means
 
     def __post_init__(self) -> None:
-        if self.dims < 2 or self.dims % 2:
-            raise AtlasError(f"vectors must have an even number of dims, got {self.dims}")
-        if not 2 <= self.list_bits <= 20 or self.list_bits % 2:
-            raise AtlasError(f"list_bits must be even and 2 to 20, got {self.list_bits}")
-        if self.quantizers < 2 or self.quantizers % 2 or self.dims % self.quantizers:
-            raise AtlasError(
-                f"quantizers must be even and divide dims ({self.dims}), got {self.quantizers}"
-            )
+        even = not (self.dims % 2 or self.list_bits % 2 or self.quantizers % 2)
+        large = self.dims >= 2 and 2 <= self.list_bits <= 20 and self.quantizers >= 2
+        if not (even and large and self.dims % self.quantizers == 0):
+            raise AtlasError(f"impossible recipe of an index: {self}")
 
     @classmethod
     def for_count(cls, count: int, dims: int) -> "VectorRecipe":
-        """The recipe for `count` vectors: lists of up to 1600, 4 bits for every two components."""
         list_bits = 4
         while list_bits < 16 and count > 800 * 2 ** (list_bits + 1):
             list_bits += 2
@@ -107,12 +99,10 @@ class Quantizers:
     halves: Array
     codebook: Array  # (quantizers, 16, D / quantizers), codes of the residual
 
-    @cached_property
-    def digest(self) -> str:
-        return sha256(self._bytes()).hexdigest()[:16]
-
     def save(self, path: Path) -> None:
-        path.write_bytes(self._bytes())
+        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
+        recipe = json.dumps(asdict(self.recipe), sort_keys=True)
+        path.write_bytes(save(arrays, metadata={FORMAT: recipe}))
 
     @classmethod
     def load(cls, path: Path) -> "Quantizers":
@@ -128,13 +118,7 @@ class Quantizers:
                 raise AtlasError(f"{name} of an index must be {shape}, got {array.shape}: {path}")
         return made
 
-    def _bytes(self) -> bytes:
-        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
-        recipe = json.dumps(asdict(self.recipe), sort_keys=True)
-        return bytes(save(arrays, metadata={FORMAT: recipe}))
-
     def rotated(self, vectors: Array) -> Array:
-        """Vectors (N, D) in the axes of lists and codes."""
         return np.ascontiguousarray(np.asarray(vectors, dtype=np.float32) @ self.rotation)
 
     def nearest_lists(self, rotated: Array, probes: int) -> tuple[NDArray[np.int64], Array]:
@@ -232,7 +216,6 @@ def _rotation(vectors: Array, groups: int) -> Array:
 
 
 SCAN_ONE = 10  # FAISS's implementation of the scan that is fastest for one query at a time
-ADD_ROWS = 32_768
 NONE = -1  # id where fewer than k vectors were found
 
 Ids = NDArray[np.int64]
@@ -244,7 +227,7 @@ class Part:
     sheet: str  # name of the sheet
     sha256: str  # digest of its coarse tiles (hex)
     rows: int  # how many
-    retired: bool = False  # the sheet has changed or gone, and its rows are not found any more
+    retired: bool = False  # the sheet has gone: of earlier versions, refused
 
 
 @dataclass(frozen=True)
@@ -257,71 +240,49 @@ class ShardInfo:
     def rows(self) -> int:
         return sum(part.rows for part in self.parts)
 
-    @property
-    def retired_rows(self) -> NDArray[np.int64]:
-        ends = np.cumsum([part.rows for part in self.parts]).tolist()
-        retired = [
-            np.arange(end - part.rows, end, dtype=np.int64)
-            for part, end in zip(self.parts, ends, strict=True)
-            if part.retired
-        ]
-        return np.concatenate(retired) if retired else np.empty(0, np.int64)
-
 
 def write_shard(
-    folder: Path, name: str, quantizers: Quantizers, batches: Iterable[tuple[Places, Array]]
-) -> int:
+    folder: Path,
+    info: ShardInfo,
+    quantizers: Quantizers,
+    batches: Iterable[tuple[Places, Array]],
+) -> None:
     """`batches`: latitudes and longitudes (n, 2) and unit vectors (n, D) of some rows at a time.
     Memory grows by codes and places, some 40 bytes a vector."""
     folder.mkdir(parents=True, exist_ok=True)
     dims, index = quantizers.recipe.dims, quantizers.empty_index()
+    header = {"descr": "<f2", "fortran_order": False, "shape": (info.rows, dims)}
     places_deg = [np.empty((0, 2))]
-    with (folder / f"{name}.vectors.npy").open("wb") as out:
-        _write_header(out, 0, dims)
+    with (folder / f"{info.name}.vectors.npy").open("wb") as out:
+        np.lib.format.write_array_header_1_0(out, header)
         for places, batch in batches:
             places_deg.append(places)
-            for start in range(0, len(batch), ADD_ROWS):
-                stored = np.ascontiguousarray(batch[start : start + ADD_ROWS], dtype=np.float16)
-                if not np.isfinite(stored).all():
-                    raise AtlasError("vectors of an index must be finite")
-                out.write(stored.data)
-                with one_thread():
-                    index.add(quantizers.rotated(stored.astype(np.float32)))
-        out.seek(0)
-        _write_header(out, index.ntotal, dims)
-    np.save(folder / f"{name}.places.npy", np.concatenate(places_deg))
-    _write_lists(folder, name, index, quantizers)
-    return int(index.ntotal)
+            stored = np.ascontiguousarray(batch, dtype=np.float16)
+            if not np.isfinite(stored).all():
+                raise AtlasError("vectors of an index must be finite")
+            out.write(stored.data)
+            with one_thread():
+                index.add(quantizers.rotated(stored.astype(np.float32)))
+    np.save(folder / f"{info.name}.places.npy", np.concatenate(places_deg))
+    _write_lists(folder, info.name, index, quantizers.recipe)
 
 
-def _write_header(out: IO[bytes], rows: int, dims: int) -> None:
-    header = {"descr": "<f2", "fortran_order": False, "shape": (rows, dims)}
-    np.lib.format.write_array_header_1_0(out, header)
-
-
-def _write_lists(folder: Path, name: str, index: Any, quantizers: Quantizers) -> None:
-    table = np.zeros((quantizers.recipe.lists, 3), dtype=np.uint64)
-    code_bytes = quantizers.recipe.code_bytes
+def _write_lists(folder: Path, name: str, index: Any, recipe: VectorRecipe) -> None:
+    module, lists = faiss(), index.invlists
+    table = np.zeros((recipe.lists, 3), dtype=np.uint64)
     with (folder / f"{name}.codes").open("wb") as out:
-        for number, codes, rows in _lists(index, quantizers):
-            table[number] = len(rows), len(codes) // code_bytes, out.tell()
-            out.write(codes.data)
-            out.write(np.pad(rows, (0, int(table[number, 1]) - len(rows))).data)
+        for number in range(recipe.lists):
+            if not (size := lists.list_size(number)):
+                continue
+            room = -(-size // BLOCK) * BLOCK
+            table[number] = size, room, out.tell()
+            codes = module.rev_swig_ptr(lists.get_codes(number), room * recipe.code_bytes)
+            rows = module.rev_swig_ptr(lists.get_ids(number), size)
+            out.write(np.asarray(codes).data)
+            out.write(np.pad(np.asarray(rows, dtype=np.int64), (0, room - size)).data)
         if out.tell() == 0:
             out.write(bytes(BLOCK))  # an empty file cannot be mapped
     np.save(folder / f"{name}.lists.npy", table)
-
-
-def _lists(index: Any, quantizers: Quantizers) -> Iterator[tuple[int, NDArray[np.uint8], Ids]]:
-    module, lists = faiss(), index.invlists
-    for number in range(quantizers.recipe.lists):
-        size = lists.list_size(number)
-        if size == 0:
-            continue
-        room = -(-size // BLOCK) * BLOCK * quantizers.recipe.code_bytes
-        codes = module.rev_swig_ptr(lists.get_codes(number), room)
-        rows = module.rev_swig_ptr(lists.get_ids(number), size)
-        yield number, np.asarray(codes), np.asarray(rows, dtype=np.int64)
 
 
 class OpenShard:
@@ -334,48 +295,36 @@ class OpenShard:
         self.info = info
         ends = ("vectors.npy", "codes", "lists.npy", "places.npy")
         path, codes, lists, places = (file(f"{info.name}.{end}") for end in ends)
+        dims = quantizers.recipe.dims
         try:
             vectors = np.load(path, mmap_mode="r")
             table = np.load(lists)
             self.places_deg = np.load(places, mmap_mode="r")
-            codes_bytes = codes.stat().st_size
+            for array, width, kind in ((vectors, dims, "<f2"), (self.places_deg, 2, "<f8")):
+                if array.shape != (info.rows, width) or array.dtype != kind:
+                    raise ValueError(f"{array.shape} {array.dtype}, expected {info.rows} rows")
+            _check_table(table, quantizers.recipe, info.rows, codes.stat().st_size)
         except (OSError, ValueError) as error:
-            raise AtlasError(f"shard {info.name} cannot be read ({error})") from error
-        dims = quantizers.recipe.dims
-        if vectors.shape != (info.rows, dims) or vectors.dtype != np.float16:
             raise AtlasError(
-                f"shard holds {vectors.shape} {vectors.dtype}, expected {info.rows} vectors of "
-                f"{dims} float16; rebuild the index: {path}"
-            )
-        if self.places_deg.shape != (info.rows, 2) or self.places_deg.dtype != np.float64:
-            raise AtlasError(f"places of shard {info.name} are damaged; rebuild the index")
+                f"shard {info.name} is damaged ({error}); rebuild the index"
+            ) from error
         self._dims, self._offset = dims, path.stat().st_size - vectors.nbytes
         self._file = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._file)
         os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
-        self._retired = info.retired_rows
         self._index = quantizers.empty_index()
-        self._map_lists(codes, codes_bytes, table, quantizers)
-
-    def _map_lists(
-        self, path: Path, size: int, table: NDArray[np.uint64], quantizers: Quantizers
-    ) -> None:
         module, recipe = faiss(), quantizers.recipe
-        _check_table(table, recipe.lists, recipe.code_bytes, size, path)
-        if int(table[:, 0].sum()) != self.info.rows:
-            raise AtlasError(f"lists hold {table[:, 0].sum()} of {self.info.rows} rows: {path}")
-        mapped = module.OnDiskInvertedLists(recipe.lists, recipe.code_bytes, str(path))
+        mapped = module.OnDiskInvertedLists(recipe.lists, recipe.code_bytes, str(codes))
         mapped.lists.resize(recipe.lists)
         contents = np.ascontiguousarray(table)
         module.memcpy(mapped.lists.data(), module.swig_ptr(contents), contents.nbytes)
-        mapped.totsize, mapped.read_only, mapped.prefetch_nthread = size, True, 0
+        mapped.totsize, mapped.read_only, mapped.prefetch_nthread = codes.stat().st_size, True, 0
         mapped.do_mmap()
         self._index.replace_invlists(mapped, False)
         self._index.ntotal = self.info.rows
         self._index.referenced_objects.append(mapped)
 
     def scan(self, rotated: Array, lists: Ids, scores: Array, count: int) -> tuple[Array, Ids]:
-        """Approximate products (Q, count) and rows (Q, count), best first, of lists (Q, probes)."""
         module, index = faiss(), self._index
         found = np.empty((len(rotated), count), dtype=np.float32)
         rows = np.empty((len(rotated), count), dtype=np.int64)
@@ -394,28 +343,22 @@ class OpenShard:
         )
         if rows.max(initial=NONE) >= self.info.rows or rows.min(initial=NONE) < NONE:
             raise AtlasError(f"codes of shard {self.info.name} are damaged; rebuild the index")
-        if len(self._retired):
-            gone = np.isin(rows, self._retired)
-            rows[gone], found[gone] = NONE, -np.inf
         return found, rows
 
     def vectors(self, rows: Ids) -> Array:
-        """Stored vectors (N, D) of rows (N,)."""
         size, offset, file = 2 * self._dims, self._offset, self._file
         read = b"".join([os.pread(file, size, offset + size * row) for row in rows.tolist()])
         return np.frombuffer(read, dtype=np.float16).astype(np.float32).reshape(-1, self._dims)
 
 
-def _check_table(
-    table: NDArray[np.uint64], lists: int, code_bytes: int, size: int, path: Path
-) -> None:
-    fits = table.shape == (lists, 3) and table.dtype == np.uint64
-    if fits:
-        count, room, offset = table.astype(np.float64).T
-        ends = offset + room * (code_bytes + 8)
-        fits = bool(((count <= room) & (ends <= size) & (room % BLOCK == 0)).all())
-    if not fits:
-        raise AtlasError(f"lists do not fit their file; rebuild the index: {path}")
+def _check_table(table: NDArray[np.uint64], recipe: VectorRecipe, rows: int, size: int) -> None:
+    if table.shape != (recipe.lists, 3) or table.dtype != np.uint64:
+        raise ValueError("another number of lists")
+    count, room, offset = table.astype(np.float64).T
+    ends = offset + room * (recipe.code_bytes + 8)
+    fits = ((count <= room) & (ends <= size) & (room % BLOCK == 0)).all()
+    if not fits or count.sum() != rows:
+        raise ValueError("lists do not fit their file")
 
 
 class ShardedIndex:
@@ -453,7 +396,6 @@ class ShardedIndex:
         return self._compared(queries, ids, k)
 
     def vectors(self, ids: Ids) -> Array:
-        """Stored vectors (N, D) of ids (N,); zeros for ids that are in no shard."""
         out = np.zeros((len(ids), self.quantizers.recipe.dims), dtype=np.float32)
         for shard in self._shards:
             rows = ids - shard.info.base
@@ -471,8 +413,6 @@ class ShardedIndex:
         return None
 
     def _compared(self, queries: Array, ids: Ids, k: int) -> tuple[Array, Ids]:
-        """The k best of the candidates (Q, R) by their stored vectors; of equal ones the lower id
-        first."""
         out_scores = np.full((len(queries), k), -np.inf, dtype=np.float32)
         out_ids = np.full((len(queries), k), NONE, dtype=np.int64)
         for query, candidates in enumerate(ids):

@@ -5,7 +5,7 @@ and 256 px tiles) and the compressed registration layer (0.15 to 0.35 MB per km2
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.core.errors import AreaError, OutputError, VariantError
-from orthonav.core.files import Progress, with_paths
-from orthonav.core.geo.grid import TileGrid
+from orthonav.core.files import Progress, no_progress, with_paths
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import USUAL_TILES
 from orthonav.core.localize.localizer import RegistrationLocalizer
@@ -32,6 +31,7 @@ from orthonav.core.variants import make_variant, variant_recipe
 from orthonav.ground.build.calibrate import (
     CROPS,
     FLOOR_PX,
+    HEADING_STEP_DEG,
     RADIUS_STRIDES,
     Crop,
     CropSampler,
@@ -42,20 +42,17 @@ from orthonav.ground.build.calibrate import (
 from orthonav.ground.build.encoders import (
     EncoderRecipe,
     check_device,
-    check_positives,
     learn_encoder,
     method_recipe,
     stored_representation,
     usual_edges,
 )
-from orthonav.ground.build.layer import cell_parts
+from orthonav.ground.build.layer import TerrainParts, cell_parts, terrain_of_dem
 from orthonav.ground.build.sheet import SheetPictures, SheetReader, grid_of, read_pictures, tiles_of
-from orthonav.ground.build.terrain import TerrainParts, terrain_of_dem
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area
 from orthonav.ground.planning.route import Route
-from orthonav.ground.planning.spacing import estimate_map
 
 MAX_WORKERS = 64
 MAX_CALIBRATION_VIEWS = 2 * CROPS
@@ -73,26 +70,22 @@ class BuildRequest:
     - `band_m`: width of the search band for legs without a width of their own, metres, above 0.
     - `gsd_m`: ground resolution, metres per pixel, above 0; None: that of the finest orthophoto.
     - `tile_px`: width of a tile, pixels, 16 to 4096.
-    - `overlap`: overlap of neighbouring tiles as a fraction of their width, 0 to below 1; 0.875
-      gives a stride of 32 pixels at 256.
+    - `overlap`: of neighbouring tiles, as a fraction of their width, 0 to below 1.
     - `method`: embedding, `name:field=value,..`, a row of `embed.TABLE`.
     - `edges`: image representation, a row of `represent.TABLE`; None: the default of the method.
     - `seed`: of all random draws, 0 or more; equal requests give equal bytes.
     - `registration`: whether the map carries the grey layer that locates views below tile size.
     - `other_dates`: orthophotos of the same area at other dates, from which the confidence is
       calibrated, and a triplet network learns. They do not become part of the map.
-    - `calibration_views`: mirrored views of the reference that measure the scores of chance of
-      registration, 1 to 384; as many views of other dates are located.
-    - `work`: folder for finished blocks and checkpoints of networks, from which an interrupted
-      build resumes; None: blocks of a large map in `OUT.work` until it is written.
-    - `workers`: threads that read the imagery and make batches for a network, 1 to 64; None: one
-      per core that read, and 2 or, for a GPU, up to 16 that make batches.
+    - `calibration_views`: mirrored views, and views of other dates, that are located, 1 to 384.
+    - `work`: folder of blocks and checkpoints of networks, from which an interrupted build
+      resumes; None: blocks of a large map in `OUT.work` until it is written.
+    - `workers`: threads that read the imagery and make batches for a network, 1 to 64.
     - `device`: where a network is learnt, "auto" (a GPU if there is one), "cpu" or "cuda".
     - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
     - `dem_datum`: what its heights count from, where the file does not state it
       (`orthonav.ground.imagery.terrain.OPTION`).
-    - `dem_needed`: whether an area in which the model has no height is refused; else the map has
-      no terrain layer.
+    - `dem_needed`: whether an area in which the model has no height is refused.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
     """
@@ -133,26 +126,18 @@ class BuildResult:
 
 
 @dataclass(frozen=True, eq=False)
-class BuildInputs:
-    """`representation`: variant of `represent`. `recipe`: embedding to learn."""
-
+class _Inputs:
     request: BuildRequest
-    mosaic: Mosaic
     other_dates: tuple[Mosaic, ...]
-    area: Area
-    grid: TileGrid
-    representation: Any
     recipe: WhitenedRecipe | EncoderRecipe
-    terrain: TerrainParts | None = None
+    sheet: SheetReader
+    terrain: TerrainParts | None
 
     @classmethod
-    def open(cls, request: BuildRequest) -> "BuildInputs":
-        edges = request.edges or usual_edges(request.method)
-        representation = make_variant(represent.TABLE, edges)
+    def open(cls, request: BuildRequest) -> "_Inputs":
+        representation = make_variant(represent.TABLE, request.edges or usual_edges(request.method))
         recipe = method_recipe(request.method, representation)
         check_device(request.device)
-        if not request.other_dates:
-            check_positives(recipe, representation)
         mosaic = Mosaic.open(request.orthos, request.epoch)
         other_dates = tuple(Mosaic.open([path], request.epoch) for path in request.other_dates)
         inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]
@@ -168,40 +153,30 @@ class BuildInputs:
         if request.dem is not None:
             dem = open_dem(request.dem, request.dem_datum)
             terrain = terrain_of_dem(dem, area, grid, needed=request.dem_needed)
-        return cls(request, mosaic, other_dates, area, grid, representation, recipe, terrain)
-
-    @property
-    def learns_network(self) -> bool:
-        """From images of the tiles, not from cell means."""
-        return not isinstance(self.recipe, WhitenedRecipe)
-
-    def estimate_text(self) -> str:
-        grid = self.grid
-        need = estimate_map(
-            self.area,
-            gsd_m=grid.gsd_m,
-            tile_px=grid.tile_px,
-            overlap=1 - grid.stride_px / grid.tile_px,
-            registration=self.request.registration,
+        # Networks and visual words learn from images of the tiles, not from cell means.
+        needs_pictures = not isinstance(recipe, WhitenedRecipe)
+        sheet = SheetReader(
+            mosaic,
+            area,
+            grid,
+            representation,
+            CropSampler(grid.tile_px, request.seed, min(grid.height_px, grid.width_px)),
+            registration=request.registration,
+            pictures=SheetPictures(grid, representation) if needs_pictures else None,
         )
-        least, most = need.map_mb
-        size = f"{most:.1f} MB" if most - least < 0.1 else f"{least:.1f} to {most:.1f} MB"
-        more = ", and training the network" if self.learns_network else ""
-        return (
-            f"about {need.area_km2:.1f} km2, {need.tiles:,} tiles of {grid.tile_px} px at "
-            f"{grid.gsd_m:g} m, a map of {size}, {need.build_s / 60:.1f} min on one core{more}"
-        )
+        return cls(request, other_dates, recipe, sheet, terrain)
 
 
 def _check_numbers(request: BuildRequest) -> None:
     if request.seed < 0:
         raise VariantError(f"seed must be 0 or more, got {request.seed}")
-    for name, value, most in (
-        ("calibration views", request.calibration_views, MAX_CALIBRATION_VIEWS),
-        ("workers", 1 if request.workers is None else request.workers, MAX_WORKERS),
-    ):
-        if not 1 <= value <= most:
-            raise VariantError(f"{name} must be 1 to {most}, got {value}")
+    if not 1 <= request.calibration_views <= MAX_CALIBRATION_VIEWS:
+        raise VariantError(
+            f"calibration views must be 1 to {MAX_CALIBRATION_VIEWS}, "
+            f"got {request.calibration_views}"
+        )
+    if request.workers is not None and not 1 <= request.workers <= MAX_WORKERS:
+        raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {request.workers}")
 
 
 def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
@@ -213,32 +188,25 @@ def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
         area = Area.from_bounds(request.bounds_deg)
     else:
         return Area.from_outline(outline[:, 0], outline[:, 1])
-    _check_not_far(area, outline)
+    _check_near(area, outline)
     return area
 
 
-_FAR_DEG = 0.02
-"""About 2 km: an area farther from the box of the imagery is certainly outside it."""
+def _check_near(area: Area, outline_deg: NDArray[np.float64]) -> None:
+    """Refuse an area outside the box around the imagery (outline (N, 2))."""
+    (south, west), (north, east) = outline_deg.min(axis=0), outline_deg.max(axis=0)
 
-
-def _check_not_far(area: Area, outline_deg: NDArray[np.float64]) -> None:
-    """Refuse an area far from the imagery (outline (N, 2)), or in it with swapped coordinates."""
-    south, west = outline_deg.min(axis=0)
-    north, east = outline_deg.max(axis=0)
-
-    def within(lat_deg: float, lon_deg: float) -> bool:
-        turned = lon_deg + 360 * np.round(((west + east) / 2 - lon_deg) / 360)
-        return bool(south <= lat_deg <= north and west <= turned <= east)
+    def is_within(lat_deg: float, lon_deg: float) -> bool:
+        return bool(south <= lat_deg <= north and 0 <= (lon_deg - west) % 360 <= east - west)
 
     centre = area.frame.lat_deg, area.frame.lon_deg
     lat, lon = area.frame.latlon_from_en(np.array(area.extent_en_m).reshape(2, 2))
     lon += 360 * np.round(((west + east) / 2 - centre[1]) / 360)
-    apart_deg = max(south - lat[1], lat[0] - north, west - lon[1], lon[0] - east)
-    hint = swapped_hint(*centre, within)
-    if apart_deg > _FAR_DEG or (apart_deg > 0 and hint):
+    if lat[1] < south or lat[0] > north or lon[1] < west or lon[0] > east:
         raise AreaError(
             f"the area, at {centre[0]:.4f}, {centre[1]:.4f}, has no imagery: the orthophotos cover "
-            f"{south:.4f} to {north:.4f} N, {west:.4f} to {east:.4f} E{hint}"
+            f"{south:.4f} to {north:.4f} N, {west:.4f} to {east:.4f} E"
+            f"{swapped_hint(*centre, is_within)}"
         )
 
 
@@ -246,196 +214,151 @@ log = logging.getLogger(__name__)
 
 MIN_VIEW_VALID_SHARE = 0.4
 """Of a tile that a view must cover; below, tile matching fails."""
-HEADING_STEP_DEG = 6.0
-"""Spacing of the headings that tile matching tries."""
 SEARCH_MS = 100.0
 """Per view in calibration, which places many views."""
 RADIUS_PX = 10.0
 MIN_RADIUS_M = 35.0
 """A registered view is correct within this many pixels or metres, whichever is more: unreported
 tilt alone displaces views by metres."""
-Arrays = dict[str, NDArray[Any]]
 
 
-@dataclass(frozen=True, eq=False)
-class LearnedEmbedding:
-    """Tile centres (N, 2) float32, embeddings (N, D) float16, and what embeds views."""
-
-    centres_en_m: NDArray[np.float32]
-    embedder: ViewEmbedder
-    embeddings: NDArray[np.float16]
-
-
-def build_map(
-    request: BuildRequest,
-    progress: Progress | None = None,
-    announce: Callable[[str], None] = log.info,
-) -> BuildResult:
+def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildResult:
     """Build a map and write it to `request.out`, complete or not at all.
 
     Equal requests give equal bytes. `progress` is called with a stage and its finished share
-    (0..1), `announce` once with the estimated size and duration. Raises `MissingFileError`,
-    `ImageryError`, `AreaError`, `VariantError` or `OutputError`.
+    (0..1). Raises `MissingFileError`, `ImageryError`, `AreaError`, `VariantError` or `OutputError`.
     """
-    progress = progress or (lambda stage, share: None)
-    inputs = BuildInputs.open(request)
-    announce(inputs.estimate_text())
-    grid, representation = inputs.grid, inputs.representation
-    sheet = SheetReader(
-        inputs.mosaic,
-        inputs.area,
-        grid,
-        representation,
-        CropSampler(grid.tile_px, request.seed, min(grid.height_px, grid.width_px)),
-        registration=request.registration,
-        pictures=SheetPictures(grid, representation) if inputs.learns_network else None,
+    progress = progress or no_progress
+    inputs = _Inputs.open(request)
+    sheet, grid = inputs.sheet, inputs.sheet.grid
+    cache = sheet.block_cache(request.out, request.work)
+    sheet.read(progress, request.workers, cache)
+    tiles_rc = tiles_of(sheet.area, grid, sheet.cells)
+    embedder, embeddings = _learned(inputs, tiles_rc * grid.stride_px, progress)
+    tiles = TileMatcher(grid, grid.centres_en_m(tiles_rc).astype(np.float32), embeddings)
+    name = stored_representation(sheet.representation)["name"]
+    is_usual = isinstance(embedder.recipe, WhitenedRecipe) and name == "gradient"
+    calibration = calibrate(
+        sheet.sampler,
+        tiles,
+        sheet.representation,
+        embedder,
+        progress,
+        usual=USUAL_TILES if is_usual else None,
+        slow=not represent.TABLE[name].flies,
     )
-    with sheet.block_cache(request.out, request.work) as cache:
-        sheet.read(progress, request.workers, cache)
-        embedding = learn_embedding(inputs, sheet, progress)
-        calibration = calibrate_tiles(sheet, embedding, progress)
-        manifest, arrays = map_content(inputs, sheet, embedding, calibration)
-        if request.registration:
-            registration = registration_record(inputs, sheet, embedding, manifest, arrays, progress)
-            manifest = replace(manifest, registration=registration)
-        written = write_map(request.out, manifest, arrays)
+    arrays: dict[str, NDArray[Any]] = {
+        "sheet0/centres_en_m": tiles.centres_en_m,
+        "sheet0/embeddings": embeddings,
+        "sheet0/preview_jpeg": sheet.preview.jpeg(),
+        **{f"embed/{name}": array for name, array in embedder.parts().items()},
+    }
+    grey = terrain = None
+    if sheet.layer is not None:
+        grey, parts = sheet.layer.finish()
+        arrays |= parts
+    if inputs.terrain is not None:
+        terrain = inputs.terrain.info
+        arrays |= inputs.terrain.arrays
+    if request.cells and isinstance(inputs.recipe, WhitenedRecipe):
+        arrays |= cell_parts(sheet.cells)
+    area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
+    info = SheetInfo(sheet.area.frame, grid, len(tiles_rc), area_km2, grey, terrain)
+    manifest = _manifest(inputs, info, embedder, calibration)
+    if request.registration:
+        found = _registration(inputs, tiles, embedder, manifest, arrays, progress)
+        manifest = replace(manifest, registration=found)
+    written = write_map(request.out, manifest, arrays)
+    if cache is not None:
+        cache.discard()
     return BuildResult(written, request.out.stat().st_size)
 
 
-def learn_embedding(
-    inputs: BuildInputs, sheet: SheetReader, progress: Progress
-) -> LearnedEmbedding:
-    grid, recipe, request = inputs.grid, inputs.recipe, inputs.request
-    tiles_rc = tiles_of(inputs.area, grid, sheet.cells)
-    tiles_px = tiles_rc * grid.stride_px
-    centres = grid.centres_en_m(tiles_rc).astype(np.float32)
-    embedder: ViewEmbedder
+def _learned(
+    inputs: _Inputs, tiles_px: NDArray[np.intp], progress: Progress
+) -> tuple[ViewEmbedder, NDArray[np.float16]]:
+    """What embeds views, and embeddings (N, D) of the tiles with these first pixels (N, 2)."""
+    sheet, recipe = inputs.sheet, inputs.recipe
     progress("learn", 0.0)
+    embedder: ViewEmbedder
     if isinstance(recipe, WhitenedRecipe):
         embedder = whitened = learn(recipe, sheet.cells, tiles_px)
         embeddings = whitened.tiles(sheet.cells, tiles_px)
     else:
         assert sheet.pictures is not None
         dates = [
-            read_pictures(date, inputs.area, grid, inputs.representation, progress)
+            read_pictures(date, sheet.area, sheet.grid, sheet.representation, progress)
             for date in (inputs.other_dates if isinstance(recipe, TripletRecipe) else ())
         ]
         embedder, embeddings = learn_encoder(
-            recipe,
-            sheet.pictures,
-            dates,
-            tiles_px,
-            inputs.representation,
-            request,
+            *(recipe, sheet.pictures, dates, tiles_px, sheet.representation),
+            inputs.request,
             progress,
         )
     progress("learn", 1.0)
-    return LearnedEmbedding(centres, embedder, embeddings)
+    return embedder, embeddings
 
 
-def calibrate_tiles(
-    sheet: SheetReader, embedding: LearnedEmbedding, progress: Progress
-) -> TileCalibration:
-    representation = sheet.representation
-    name = stored_representation(representation)["name"]
-    is_usual = isinstance(embedding.embedder.recipe, WhitenedRecipe) and name == "gradient"
-    return calibrate(
-        sheet.sampler,
-        sheet.grid,
-        representation,
-        embedding.embedder,
-        embedding.embeddings,
-        embedding.centres_en_m,
-        HEADING_STEP_DEG,
-        progress,
-        usual=USUAL_TILES if is_usual else None,
-        slow=not represent.TABLE[name].flies,
-    )
-
-
-def map_content(
-    inputs: BuildInputs,
-    sheet: SheetReader,
-    embedding: LearnedEmbedding,
-    calibration: TileCalibration,
-) -> tuple[Manifest, Arrays]:
+def _manifest(
+    inputs: _Inputs, info: SheetInfo, embedder: ViewEmbedder, calibration: TileCalibration
+) -> Manifest:
     """Without the calibration of registration."""
-    request, grid, embedder = inputs.request, inputs.grid, embedding.embedder
-    grey, grey_parts = (None, {}) if sheet.layer is None else sheet.layer.finish()
-    tiles = len(embedding.centres_en_m)
-    area_km2 = round(tiles * grid.stride_m**2 / 1e6, 6)
-    terrain, terrain_parts = (None, {}) if inputs.terrain is None else inputs.terrain
-    sheet_info = SheetInfo(inputs.area.frame, grid, tiles, area_km2, grey, terrain)
-    manifest = Manifest(
+    request, sheet = inputs.request, inputs.sheet
+    return Manifest(
         recipe={
             "method": request.method.partition(":")[0],
-            "represent": stored_representation(inputs.representation),
+            "represent": stored_representation(sheet.representation),
             "embed": variant_recipe(embed.TABLE, embedder.recipe),
             "overlap": request.overlap,
             "seed": request.seed,
         },
-        sheets=(sheet_info,),
-        imagery=inputs.mosaic.describe(),
+        sheets=(info,),
+        imagery=sheet.mosaic.describe(),
         view={
             "heading_step_deg": HEADING_STEP_DEG,
             "min_valid_share": MIN_VIEW_VALID_SHARE,
             "position_std_m": calibration.position_std_m,
         },
         confidence=calibration.confidence.to_plain(),
-        radius_m=RADIUS_STRIDES * grid.stride_m,
+        radius_m=RADIUS_STRIDES * sheet.grid.stride_m,
         created_by=f"orthonav {__version__}",
     )
-    arrays: Arrays = {
-        "sheet0/centres_en_m": embedding.centres_en_m,
-        "sheet0/embeddings": embedding.embeddings,
-        "sheet0/preview_jpeg": sheet.preview.jpeg(),
-        **{f"embed/{name}": array for name, array in embedder.parts().items()},
-        **grey_parts,
-        **terrain_parts,
-    }
-    if request.cells and isinstance(inputs.recipe, WhitenedRecipe):
-        arrays |= cell_parts(sheet.cells)
-    return manifest, arrays
 
 
-def registration_record(
-    inputs: BuildInputs,
-    sheet: SheetReader,
-    embedding: LearnedEmbedding,
+def _registration(
+    inputs: _Inputs,
+    tiles: TileMatcher,
+    embedder: ViewEmbedder,
     manifest: Manifest,
-    arrays: Arrays,
+    arrays: dict[str, NDArray[Any]],
     progress: Progress,
 ) -> dict[str, Any]:
-    """Calibrated on the map as it will be written."""
-    request, grid = inputs.request, inputs.grid
-    radius_m = max(RADIUS_PX * grid.gsd_m, MIN_RADIUS_M)
+    """Its record in the manifest, calibrated on the map as it will be written."""
+    request, sheet = inputs.request, inputs.sheet
+    radius_m = max(RADIUS_PX * sheet.grid.gsd_m, MIN_RADIUS_M)
     unfitted = {"confidence": None, "radius_m": radius_m, "position_floor_px": FLOOR_PX}
-    made = MapFile(request.out, 0, replace(manifest, registration=unfitted), arrays)
-    tiles = TileMatcher(grid, embedding.centres_en_m, embedding.embeddings)
     localizer = RegistrationLocalizer.of_map(
-        made,
-        TileProposer.of(tiles, embedding.embedder, inputs.representation),
+        MapFile(request.out, 0, replace(manifest, registration=unfitted), arrays),
+        TileProposer.of(tiles, embedder, sheet.representation),
         SearchPlan(policy=SearchPolicy(last_ms=SEARCH_MS)),
     )
     assert localizer is not None
     crops = sheet.sampler.crops
-    later = [crop for date in inputs.other_dates for crop in _crops_of(date, inputs, crops)]
+    later = [crop for date in inputs.other_dates for crop in _crops_of(date, sheet, crops)]
     if inputs.other_dates and not later:
         log.warning("the other dates do not cover the area: nothing can be learned from them")
-    learned = calibrate_registration(
+    found = calibrate_registration(
         localizer, crops, later, request.calibration_views, request.seed, progress
     )
-    return {
-        "confidence": learned.confidence.to_plain(),
-        "radius_m": radius_m,
-        "position_floor_px": learned.floor_px,
+    return unfitted | {
+        "confidence": found.confidence.to_plain(),
+        "position_floor_px": found.floor_px,
     }
 
 
-def _crops_of(mosaic: Mosaic, inputs: BuildInputs, crops: Sequence[Crop]) -> list[Crop]:
-    """Crops of another date at the positions of the reference crops."""
+def _crops_of(mosaic: Mosaic, sheet: SheetReader, crops: Sequence[Crop]) -> list[Crop]:
     found = []
-    with mosaic.grid_sheet(inputs.area.frame, inputs.grid) as raster:
+    with mosaic.grid_sheet(sheet.area.frame, sheet.grid) as raster:
         for crop in crops:
             size = crop.grey.shape[0]
             col, row = round(crop.col_px - size / 2), round(crop.row_px - size / 2)

@@ -9,12 +9,13 @@ usual confidence is drawn to them.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize, minimize_scalar
 
 from orthonav.core.files import Progress
 from orthonav.core.geo.camera import Camera
@@ -22,16 +23,18 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.confidence import (
     TILE_FEATURES,
     USUAL_CHANCES,
+    USUAL_SHIFT,
     Chances,
     LogisticConfidence,
     RegisteredConfidence,
+    features_of,
+    logit,
 )
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
 from orthonav.core.tiles.embed import ViewEmbedder
-from orthonav.ground.build.fit import fit_few, fit_logistic, fit_registered
 
 
 def changed(
@@ -96,6 +99,8 @@ MIRRORED_WEIGHT = 0.25
 """A flight sees fewer places outside the map than inside."""
 PASTED_SHARE = 0.25
 """Of replacements by another position of the map; the others are mirrored."""
+HEADING_STEP_DEG = 6.0
+"""Spacing of the headings that tile matching tries."""
 RADIUS_STRIDES = 0.75
 """A fix is correct if its error is below this many strides."""
 MIN_VALID = 0.9
@@ -179,12 +184,9 @@ class CropSampler:
 
 def calibrate(
     sampler: CropSampler,
-    grid: TileGrid,
+    tiles: TileMatcher,
     representation: Any,
     embedder: ViewEmbedder,
-    embeddings: NDArray[np.float16],
-    centres_en_m: NDArray[np.float32],
-    heading_step_deg: float,
     progress: Progress,
     *,
     usual: LogisticConfidence | None,
@@ -192,9 +194,8 @@ def calibrate(
 ) -> TileCalibration:
     """Search changed and mirrored crops on the new map. `usual`: confidence on other maps, if
     known."""
-    sampled = sampler.crops
+    grid, sampled = tiles.grid, sampler.crops
     rng = np.random.default_rng([len(sampled), 2])
-    matcher = TileMatcher(grid, centres_en_m, embeddings)
     most = min(CROPS, SLOW_CROPS) if slow else CROPS
     crops = [sampled[i] for i in rng.permutation(len(sampled))[:most]]
     features, errors, mirrored = [], [], []
@@ -205,14 +206,13 @@ def calibrate(
         for mirror in (False, True):
             picture = crop.grey[:, ::-1] if mirror else crop.grey
             aged = changed_picture(rng, picture, other)
-            queries = _queries(rng, aged, grid, representation, embedder, heading_step_deg)
-            match = matcher.match(queries)
+            match = tiles.match(_queries(rng, aged, grid, representation, embedder))
             features.append([match.evidence[name] for name in TILE_FEATURES])
             truth = [
                 grid.west_m + crop.col_px * grid.gsd_m,
                 grid.north_m - crop.row_px * grid.gsd_m,
             ]
-            errors.append(centres_en_m[match.tile] + np.array(match.shift_en_m) - truth)
+            errors.append(tiles.centres_en_m[match.tile] + np.array(match.shift_en_m) - truth)
             mirrored.append(mirror)
         progress("calibrate", (done + 1) / len(crops))
     return _tile_calibration(
@@ -236,7 +236,7 @@ def _tile_calibration(
     weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
     if right.sum() < MIN_RIGHT:
         return TileCalibration(fit_few(features, right, weight, usual), grid.stride_m)
-    confidence = fit_logistic(features, right, weight)
+    confidence = LogisticConfidence(*fit_weights(features, right, weight))
     std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
     return TileCalibration(confidence, max(std_m, grid.gsd_m))
 
@@ -262,7 +262,6 @@ def _queries(
     grid: TileGrid,
     representation: Any,
     embedder: ViewEmbedder,
-    heading_step_deg: float,
 ) -> NDArray[np.float32]:
     """Embeddings (3, D) of the centre of an image at the headings that the localizer tries."""
     heading = rng.normal(0, HEADING_STD_DEG)
@@ -270,7 +269,7 @@ def _queries(
     size, middle = grid.tile_px, (picture.shape[0] - 1) / 2
     inside = np.ones(picture.shape, dtype=np.uint8)
     queries = []
-    for step in (-heading_step_deg, 0.0, heading_step_deg):
+    for step in (-HEADING_STEP_DEG, 0.0, HEADING_STEP_DEG):
         matrix = cv2.getRotationMatrix2D((middle, middle), heading + step, scale)
         matrix[:, 2] -= middle - (size - 1) / 2
         view = np.asarray(cv2.warpAffine(picture, matrix, (size, size)), dtype=np.uint8)
@@ -441,3 +440,88 @@ def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float
 def _median(evidence: Sequence[Mapping[str, float]], name: str) -> float:
     values = [each[name] for each in evidence if math.isfinite(each[name])]
     return max(float(np.median(values)), 1.0) if values else FALLBACK_CHANCE
+
+
+RIDGE = 3e-2
+"""Weight of the usual bias."""
+MAX_SHIFT = 5.0
+LEAST = 1e-9
+"""Keeps the loss finite."""
+TILE_RIDGE = 1e-3
+"""Only against weights without bound where right and wrong separate fully."""
+FEW_RIGHT, FEW = 0.5, 5.0
+"""Trials, right ones and all, added to those of a map without a usual confidence."""
+
+
+def fit_registered(
+    evidence: Sequence[Mapping[str, float]], right: NDArray[np.bool_], chances: Chances
+) -> RegisteredConfidence:
+    """The usual confidence with its first bias fitted to views (N) and drawn to the usual one."""
+    usual = RegisteredConfidence.usual(chances)
+    features = [features_of(each, chances) for each in evidence]
+
+    def shifted(shift: float) -> RegisteredConfidence:
+        return replace(usual, biases=(usual.biases[0] + shift, usual.biases[1]))
+
+    def loss(shift: float) -> float:
+        model = shifted(shift)
+        said = np.clip([model.of(each) for each in features], LEAST, 1 - LEAST)
+        return float(RIDGE * shift**2 - np.log(np.where(right, said, 1 - said)).mean())
+
+    return shifted(float(minimize_scalar(loss, bounds=(-MAX_SHIFT, MAX_SHIFT)).x))
+
+
+def fit_few(
+    features: NDArray[np.float64],
+    right: NDArray[np.bool_],
+    sample_weight: NDArray[np.float64],
+    usual: LogisticConfidence | None,
+) -> LogisticConfidence:
+    """The `usual` confidence, its bias drawn to trials of which too few came out right for a fit.
+
+    Without one, or without any trial, the fraction of right trials, whatever the evidence.
+    """
+    if usual is None or len(features) == 0:
+        share = (sample_weight @ right + FEW_RIGHT) / (sample_weight.sum() + FEW)
+        return LogisticConfidence(logit(float(share), TILE_RIDGE), (0.0,) * len(TILE_FEATURES))
+    known = features @ np.array(usual.weights) + usual.bias
+    sign = np.where(right, 1.0, -1.0)
+
+    def loss(shift: float) -> float:
+        off = sample_weight @ np.logaddexp(0, -sign * (known + shift))
+        return float(off + (shift / USUAL_SHIFT) ** 2 / 2)
+
+    shift = minimize_scalar(loss, bounds=(-10.0, 10.0)).x
+    return LogisticConfidence(usual.bias + float(shift), usual.weights)
+
+
+def fit_weights(
+    features: NDArray[np.float64],
+    right: NDArray[np.bool_],
+    sample_weight: NDArray[np.float64],
+    ridge: float = TILE_RIDGE,
+) -> tuple[float, tuple[float, ...]]:
+    """Bias and weights (at least 0) of a logistic regression with a slight ridge.
+
+    `features` (N, F) are standardized inside; the result applies to raw ones.
+    """
+    mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
+    scaled = (features - mean) / std
+    sign = np.where(right, 1.0, -1.0)
+    total = sample_weight.sum()
+
+    def loss(parameters: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        logit = parameters[0] + scaled @ parameters[1:]
+        value = sample_weight @ np.logaddexp(0, -sign * logit) / total
+        slope = -sign * sample_weight / (1 + np.exp(np.clip(sign * logit, -60, 60))) / total
+        gradient = np.concatenate([[slope.sum()], scaled.T @ slope])
+        gradient[1:] += 2 * ridge * parameters[1:]
+        value += ridge * (parameters[1:] ** 2).sum()
+        return float(value), gradient
+
+    bounds = [(None, None)] + [(0.0, None)] * features.shape[1]
+    found = minimize(
+        loss, np.zeros(features.shape[1] + 1), jac=True, bounds=bounds, method="L-BFGS-B"
+    ).x
+    weights = found[1:] / std
+    return float(found[0] - weights @ mean), tuple(float(weight) for weight in weights)

@@ -3,7 +3,7 @@
 import importlib
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,6 @@ LEARNT_WITH = {
 }
 """Modules of the extra "train"."""
 USUAL_EDGES = {"autoencoder": "canny", "caevl": "canny", "triplet": "gray", "bovw": "gray"}
-DEVICES = ("auto", "cpu", "cuda")
 LOCAL_FIELDS = ("weights", "cache")
 
 
@@ -66,27 +65,17 @@ def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderR
         raise VariantError(
             "edges per tile need a network; give --method autoencoder, caevl or triplet"
         )
-    if not represent.TABLE[_name_of(representation)].flies:
-        log.warning(
-            "%s is too slow for flight: this map is for experiments", _name_of(representation)
-        )
+    name = stored_representation(representation)["name"]
+    if not represent.TABLE[name].flies:
+        log.warning("%s is too slow for flight: this map is for experiments", name)
     return recipe
 
 
 def check_device(name: str) -> None:
-    if name not in DEVICES:
-        raise VariantError(f"device must be {', '.join(DEVICES)}, got '{name}'")
+    if name not in ("auto", "cpu", "cuda"):
+        raise VariantError(f"device must be auto, cpu or cuda, got '{name}'")
     if name == "cuda" and not needed("torch", "train", "a GPU").cuda.is_available():
         raise VariantError("PyTorch sees no GPU; use --device auto or cpu")
-
-
-def check_positives(recipe: WhitenedRecipe | EncoderRecipe, representation: Any) -> None:
-    """A triplet network without other dates would need days with a slow representation."""
-    if isinstance(recipe, TripletRecipe) and not represent.TABLE[_name_of(representation)].flies:
-        raise VariantError(
-            f"a triplet network on {_name_of(representation)} edges needs orthophotos of other "
-            "dates; give --other-date"
-        )
 
 
 def stored_representation(representation: Any) -> dict[str, Any]:
@@ -95,15 +84,8 @@ def stored_representation(representation: Any) -> dict[str, Any]:
     return {name: "" if name in LOCAL_FIELDS else value for name, value in recipe.items()}
 
 
-def _name_of(representation: Any) -> str:
-    return str(variant_recipe(represent.TABLE, representation)["name"])
-
-
 BATCH_TILES = 64
 MAX_WORD_TILES = 2000
-CHECKED_TILES, SAME = 32, 4e-3
-"""Tiles on which a device is compared with flight, and the largest difference, relative to the
-largest value: four times that of float16."""
 MOST_REPLACED, MOST_MIXED = 0.35, 0.4
 """Change of the positives of a triplet, weaker than in calibration: with the stronger change a
 network learned a third as much in its first 300 batches."""
@@ -125,21 +107,32 @@ def learn_encoder(
     """
     tiles = pictures.tiles(tiles_px, progress)
     if isinstance(recipe, WordsRecipe):
-        chosen = _word_tiles(tiles)
+        step = -(-len(tiles) // MAX_WORD_TILES)
+        chosen = ((tiles.grey_tile(i), tiles.valid_tile(i)) for i in range(0, len(tiles), step))
         encoder = learn_words(
             recipe, chosen, request.seed, lambda share: progress("learn words", share)
         )
-        return encoder, _embedded(lambda of: _words(encoder, tiles, of), tiles, progress)
+
+        def words(indices: NDArray[np.intp]) -> NDArray[np.float32]:
+            valid = np.stack([tiles.valid_tile(int(index)) for index in indices])
+            return encoder.views(tiles.batch(indices), valid)
+
+        return encoder, _embedded(words, tiles, progress)
     needed("torch", "train", "learning a network")
     if os.environ.get("WORLD_SIZE", "1") != "1":
         raise VariantError("a network is trained by one process: run the command without torchrun")
     training = importlib.import_module("orthonav.research.training")
     device = None if request.device == "auto" else request.device
+
+    def report(text: str, share: float) -> None:
+        log.info("%s", text, extra={"share": share})
+        progress("learn", share)
+
     how: dict[str, Any] = {
         "binary": not pictures.is_grey,
         "seed": request.seed,
         "work": request.work,
-        "report": lambda text, share: _log_progress(progress, text, share),
+        "report": report,
         "means": training.Means(device=device, workers=request.workers),
     }
     if isinstance(recipe, CaevlRecipe):
@@ -150,32 +143,7 @@ def learn_encoder(
         positive = positive or _changed_tiles(tiles, representation)
         trained = training.learn_network(recipe, tiles, positive=positive, **how)
     embedded = _embedded(lambda of: trained.views(tiles.batch(of)), tiles, progress)
-    _require_as_in_flight(trained.embedder, tiles, embedded)
     return trained.embedder, embedded
-
-
-def _require_as_in_flight(
-    embedder: NetworkEmbedder, tiles: SheetTiles, embedded: NDArray[np.float16]
-) -> None:
-    some = np.unique(np.linspace(0, len(tiles) - 1, CHECKED_TILES).astype(np.intp))
-    flown, found = embedder.views(tiles.batch(some)), embedded[some].astype(np.float32)
-    away = float(np.abs(flown - found).max())
-    if away > SAME * max(float(np.abs(flown).max()), 1e-6):
-        raise VariantError(
-            f"the device embeds tiles otherwise than the encoder in flight, by {away:.2g}; "
-            "learn with --device cpu"
-        )
-
-
-def _log_progress(progress: Progress, text: str, share: float) -> None:
-    log.info("%s", text, extra={"share": share})
-    progress("learn", share)
-
-
-def _word_tiles(tiles: SheetTiles) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
-    step = -(-len(tiles) // MAX_WORD_TILES)
-    for index in range(0, len(tiles), step):
-        yield tiles.grey_tile(index), tiles.valid_tile(index)
 
 
 def _changed_tiles(
@@ -190,13 +158,6 @@ def _changed_tiles(
         return np.asarray(representation(made, np.ones(made.shape, np.bool_)), np.float32)
 
     return positive
-
-
-def _words(
-    encoder: WordsEmbedder, tiles: SheetTiles, indices: NDArray[np.intp]
-) -> NDArray[np.float32]:
-    valid = np.stack([tiles.valid_tile(int(index)) for index in indices])
-    return encoder.views(tiles.batch(indices), valid)
 
 
 def _embedded(

@@ -1,4 +1,4 @@
-"""Layers of pixels in a map: the grey pyramid of registration, and the means of micro-cells.
+"""Layers of a map: the grey pyramid of registration, the means of micro-cells, terrain.
 
 A chunk is encoded as soon as it is complete, and passed at half the resolution to the next level,
 so memory holds compressed chunks and incomplete ones. Cell means, from which new tiles are embedded
@@ -6,19 +6,33 @@ without imagery, are quantized to a byte each, relative to the largest of a cell
 float16: the rounding error is at most 0.4 % of the largest.
 """
 
+import logging
+import math
 import zlib
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import MapFileError
+from orthonav.core.errors import AreaError, MapFileError
+from orthonav.core.geo.grid import TileGrid
+from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.mapfile.layer import ChunkTable, part_names
-from orthonav.core.mapfile.manifest import MAX_LEVELS, GreyInfo
+from orthonav.core.mapfile.manifest import (
+    MAX_CODE,
+    MAX_LEVELS,
+    MAX_POSTING_M,
+    GreyInfo,
+    TerrainInfo,
+)
 from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.mapfile.terrain import encode_terrain, terrain_part_names
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
+from orthonav.ground.imagery.terrain import Dem
+from orthonav.ground.planning.area import Area
 
 CHUNK_PX = 256
 """A view touches few chunks, and each decodes in 0.1 to 0.2 ms (docs/map-format.md)."""
@@ -30,7 +44,6 @@ COARSER_QUALITIES = (50, 30)
 """For chunks of noise, so that the size of a map is bounded."""
 MAX_BYTES_PER_PX = 0.5
 _HEADER_BYTES = 512
-_BLOBS = ("jpeg", "mask")
 Parts = dict[str, NDArray[Any]]
 
 
@@ -90,33 +103,14 @@ class GreyLayerWriter:
         self._valid_px += int(np.count_nonzero(valid))
         self._add(0, row, col, grey, valid)
 
-    def add_block(self, row: int, col: int, parts: Parts) -> None:
-        """Add the result of `compressed_block`."""
-        number, ends = 0, [np.concatenate([[0], parts[f"{kind}_ends"]]) for kind in _BLOBS]
-        rows, cols = self._table.shapes[0]
-        small = parts["half_valid"].shape
-        for chunk_row in range(row // CHUNK_PX, _chunks(min(row + 2 * small[0], rows))):
-            for chunk_col in range(col // CHUNK_PX, _chunks(min(col + 2 * small[1], cols))):
-                jpeg, mask = (
-                    parts[kind][end[number] : end[number + 1]].tobytes()
-                    for kind, end in zip(_BLOBS, ends, strict=True)
-                )
-                if jpeg:
-                    place = self._table.number(0, chunk_row, chunk_col)
-                    self._encoded[place] = (jpeg, mask)
-                number += 1
-        self._valid_px += int(parts["valid_px"][0])
-        if self._levels > 1:
-            self._add(1, row // 2, col // 2, parts["half"], parts["half_valid"])
-
-    def finish(self, sheet: int = 0) -> tuple[GreyInfo, dict[str, NDArray[np.uint8 | np.int64]]]:
+    def finish(self) -> tuple[GreyInfo, Parts]:
         for level, pending in enumerate(self._pending):
             for place in sorted(pending):
                 self._complete(level, place)
         empty = (b"", b"")
         chunks = [self._encoded.get(number, empty) for number in range(self._table.count)]
-        names = part_names(sheet)
-        parts: dict[str, NDArray[np.uint8 | np.int64]] = {}
+        names = part_names(0)
+        parts: Parts = {}
         for index, kind in enumerate(("", "mask_")):
             blobs = [chunk[index] for chunk in chunks]
             ends = np.cumsum([0, *map(len, blobs)], dtype=np.int64)
@@ -159,26 +153,6 @@ class GreyLayerWriter:
             self._add(level + 1, place[0] * half, place[1] * half, *smaller)
 
 
-def compressed_block(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> Parts:
-    """The layer of a block of whole chunks: `jpeg`, `mask` (B,) by rows, and the next level."""
-    chunks = [
-        encode_chunk(grey[part], valid[part]) if valid[part].any() else (b"", b"")
-        for row in range(0, grey.shape[0], CHUNK_PX)
-        for col in range(0, grey.shape[1], CHUNK_PX)
-        for part in [np.s_[row : row + CHUNK_PX, col : col + CHUNK_PX]]
-    ]
-    parts: Parts = {"valid_px": np.array([np.count_nonzero(valid)])}
-    for kind, blobs in zip(_BLOBS, zip(*chunks, strict=True), strict=True):
-        parts[kind] = np.frombuffer(b"".join(blobs), dtype=np.uint8)
-        parts[f"{kind}_ends"] = np.cumsum([len(blob) for blob in blobs])
-    parts["half"], parts["half_valid"] = halved(grey, valid)
-    return parts
-
-
-def _chunks(size_px: int) -> int:
-    return -(-size_px // CHUNK_PX)
-
-
 def encode_chunk(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[bytes, bytes]:
     """JPEG of a chunk (H, W), and its mask, empty if all of it is valid."""
     if valid.all():
@@ -198,13 +172,14 @@ def _jpeg(grey: NDArray[np.uint8]) -> bytes:
     return encoded
 
 
+CODES, SCALE, VALID = (f"sheet0/cells/{kind}" for kind in ("codes", "scale", "valid"))
 MIDDLE, LEVELS = 128, 127
 WHOLE = 255
 _ROWS_AT_ONCE = 256
 _SMALLEST = float(np.finfo(np.float16).tiny)
 
 
-def cell_parts(cells: CellSheet, sheet: int = 0) -> dict[str, NDArray[Any]]:
+def cell_parts(cells: CellSheet) -> Parts:
     """Valid shares only where not all are 1."""
     codes = np.full(cells.means.shape, MIDDLE, dtype=np.uint8)
     scale = np.zeros(cells.valid.shape, dtype=np.float16)
@@ -216,37 +191,30 @@ def cell_parts(cells: CellSheet, sheet: int = 0) -> dict[str, NDArray[Any]]:
         unit = np.maximum(scale[rows].astype(np.float32), _SMALLEST)[..., None]
         codes[rows] = np.clip(np.rint(means / unit) + MIDDLE, MIDDLE - LEVELS, WHOLE)
         valid[rows] = cells.valid[rows] * WHOLE + 1e-3  # truncated: only complete cells get 255
-    names = _names(sheet)
-    parts: dict[str, NDArray[Any]] = {names["codes"]: codes, names["scale"]: scale}
-    return parts if (valid == WHOLE).all() else {**parts, names["valid"]: valid}
+    parts: Parts = {CODES: codes, SCALE: scale}
+    return parts if (valid == WHOLE).all() else {**parts, VALID: valid}
 
 
 class StoredCells:
     """Cell means of a sheet in an opened map. May be shared between threads."""
 
-    def __init__(self, opened: MapFile, layout: CellLayout, channels: int, sheet: int = 0) -> None:
-        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
-        grid = opened.manifest.sheets[sheet].grid
-        names = _names(sheet)
-        self.layout = layout
+    def __init__(self, opened: MapFile, layout: CellLayout, channels: int) -> None:
+        """Raises `MapFileError` if the parts do not fit the manifest."""
+        grid = opened.manifest.sheets[0].grid
         self.shape = layout.samples(grid.height_px), layout.samples(grid.width_px)
-        self._codes = opened.array(names["codes"], np.uint8, 3)
-        self._scale = opened.array(names["scale"], np.float16, 2)
-        whole = names["valid"] not in opened.arrays
-        self._valid = None if whole else opened.array(names["valid"], np.uint8, 2)
-        shapes = [part.shape for part in (self._scale, self._valid) if part is not None]
-        if self._codes.shape != (*self.shape, channels) or set(shapes) != {self.shape}:
+        self._codes = opened.array(CODES, np.uint8, 3)
+        self._scale = opened.array(SCALE, np.float16, 2)
+        self._valid = opened.array(VALID, np.uint8, 2) if VALID in opened.arrays else None
+        shapes = {part.shape for part in (self._scale, self._valid) if part is not None}
+        if self._codes.shape != (*self.shape, channels) or shapes != {self.shape}:
             raise MapFileError(
                 f"map's cells must be {self.shape} of {channels} numbers, got "
                 f"{self._codes.shape}: {opened.path}"
             )
 
     @classmethod
-    def of(
-        cls, opened: MapFile, layout: CellLayout, channels: int, sheet: int = 0
-    ) -> "StoredCells | None":
-        there = _names(sheet)["codes"] in opened.arrays
-        return cls(opened, layout, channels, sheet) if there else None
+    def of(cls, opened: MapFile, layout: CellLayout, channels: int) -> "StoredCells | None":
+        return cls(opened, layout, channels) if CODES in opened.arrays else None
 
     def read(
         self, row: int, col: int, height: int, width: int
@@ -269,5 +237,110 @@ class StoredCells:
         return means, share
 
 
-def _names(sheet: int) -> dict[str, str]:
-    return {kind: f"sheet{sheet}/cells/{kind}" for kind in ("codes", "scale", "valid")}
+POSTING_M = 10.0
+"""Distance of samples; that of the terrain model where it is coarser."""
+TERRAIN_CHUNK_PX = 128
+UNIT_M = 0.1
+HeightSampler = Callable[[float, float, int, int], NDArray[np.float64]]
+"""Heights above mean sea level of rows and columns of samples from a north-west corner, metres."""
+log = logging.getLogger(__name__)
+
+
+def rounded_gsd_m(gsd_m: float) -> float:
+    """To few digits: 5.002 to 5, 0.2431 to 0.243."""
+    for digits in (1, 2, 3):
+        rounded = float(f"{gsd_m:.{digits}g}")
+        if abs(rounded / gsd_m - 1) < 0.005:
+            return rounded
+    return float(f"{gsd_m:.4g}")
+
+
+class TerrainParts(NamedTuple):
+    info: TerrainInfo
+    arrays: dict[str, NDArray[Any]]
+
+
+def terrain_of_dem(
+    dem: Dem, area: Area, grid: TileGrid, *, needed: bool = True
+) -> TerrainParts | None:
+    """None where the model has no height in the area; `AreaError` if it is `needed`."""
+    posting_m = min(max(POSTING_M, rounded_gsd_m(dem.gsd_m)), MAX_POSTING_M)
+
+    def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
+        return dem.in_plane(area.frame, west_m, north_m, posting_m, rows, cols)
+
+    made = terrain_parts(area, grid, posting_m, dem.path.name, dem.datum.name, sampled)
+    if made is None and needed:
+        centre = area.frame.lat_deg, area.frame.lon_deg
+        hint = swapped_hint(*centre, dem.covers)
+        raise AreaError(
+            f"the terrain has no height in the area, at {centre[0]:.4f}, {centre[1]:.4f}{hint}: "
+            f"{dem.path}"
+        )
+    return made
+
+
+def terrain_parts(
+    area: Area, grid: TileGrid, posting_m: float, name: str, datum: str, sampled: HeightSampler
+) -> TerrainParts | None:
+    """None where the source has no height; smaller holes stay holes, and a warning names them."""
+    west_m, north_m = grid.west_m - posting_m, grid.north_m + posting_m
+    rows = math.ceil(grid.height_px * grid.gsd_m / posting_m) + 2
+    cols = math.ceil(grid.width_px * grid.gsd_m / posting_m) + 2
+    table = ChunkTable(rows, cols, 1, TERRAIN_CHUNK_PX)
+    found: dict[int, NDArray[np.float32]] = {}
+    inside = unknown = 0
+    for chunk_row, chunk_col in np.ndindex(
+        -(-rows // TERRAIN_CHUNK_PX), -(-cols // TERRAIN_CHUNK_PX)
+    ):
+        shape = table.shape(0, chunk_row, chunk_col)
+        west = west_m + chunk_col * TERRAIN_CHUNK_PX * posting_m
+        north = north_m - chunk_row * TERRAIN_CHUNK_PX * posting_m
+        middle = [west + shape[1] * posting_m / 2, north - shape[0] * posting_m / 2]
+        reach_m = math.hypot(*shape) / 2 * posting_m + grid.tile_m + grid.stride_m
+        if area.route is not None and not area.contains(np.array([middle]), reach_m)[0]:
+            continue  # too far from the route for any view
+        heights = sampled(west, north, *shape).astype(np.float32)
+        row, col = np.mgrid[: shape[0], : shape[1]] + 0.5
+        points = np.stack([west + col * posting_m, north - row * posting_m], axis=-1)
+        here = area.contains(points.reshape(-1, 2)).reshape(shape)
+        inside += int(here.sum())
+        unknown += int((here & np.isnan(heights)).sum())
+        if np.isfinite(heights).any():
+            found[table.number(0, chunk_row, chunk_col)] = heights
+    if not found:
+        return None
+    if unknown:
+        log.warning(
+            "terrain has no height for %.1f %% of the area: these holes stay holes in the map (%s)",
+            100 * unknown / inside,
+            name,
+        )
+    low_m = math.floor(min(float(np.nanmin(each)) for each in found.values()) * 10) / 10
+    high_m = max(float(np.nanmax(each)) for each in found.values())
+    unit_m = UNIT_M
+    while high_m - low_m > unit_m * MAX_CODE:
+        unit_m *= 2
+    known = sum(int(np.isfinite(each).sum()) for each in found.values())
+    high_m = round(high_m, 3)
+    info = TerrainInfo(
+        west_m,
+        north_m,
+        posting_m,
+        rows,
+        cols,
+        TERRAIN_CHUNK_PX,
+        low_m,
+        high_m,
+        unit_m,
+        known,
+        name,
+        datum,
+    )
+    blobs = [
+        encode_terrain(found[number], info) if number in found else b""
+        for number in range(table.count)
+    ]
+    data, offsets = terrain_part_names(0)
+    ends = np.cumsum([0, *map(len, blobs)]).astype(np.int64)
+    return TerrainParts(info, {data: np.frombuffer(b"".join(blobs), np.uint8), offsets: ends})

@@ -2,23 +2,21 @@
 
 Several threads read blocks, each with its own datasets; results are collected in the order of the
 blocks, so the map is the same for any number of threads. The result of a block is a dictionary of
-arrays, one file in a cache from which an interrupted build resumes; its name holds a digest of
-everything that determines it.
+arrays, one file in a cache from which an interrupted build resumes.
 """
 
-import contextlib
 import hashlib
-import itertools
 import json
 import logging
 import math
 import queue
-import re
 import shutil
 import threading
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +28,7 @@ from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.core.cores import usable_cores
-from orthonav.core.errors import AreaError, OutputError, VariantError
+from orthonav.core.errors import AreaError, VariantError
 from orthonav.core.files import Progress, no_progress, replacing
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.tiles import represent
@@ -39,8 +37,8 @@ from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.variants import variant_recipe
 from orthonav.ground.build.calibrate import CropSampler
-from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
-from orthonav.ground.imagery.mosaic import GreyPixels, Mosaic, SheetRaster
+from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, rounded_gsd_m
+from orthonav.ground.imagery.mosaic import Mosaic, Pixels, SheetRaster
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 from orthonav.research.tiles import SheetTiles
@@ -48,13 +46,9 @@ from orthonav.research.tiles import SheetTiles
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 Worker = AbstractContextManager[Callable[[Item], Made]]
+_Jobs = queue.SimpleQueue[tuple[Future[Made], Item] | None]
 AHEAD = 2
 """Finished results that may wait for a slower one."""
-
-
-@dataclass(frozen=True)
-class _Failed:
-    error: BaseException
 
 
 def in_order(
@@ -70,58 +64,53 @@ def in_order(
         with opened() as work:
             yield from map(work, items)
         return
-    todo: queue.SimpleQueue[int | None] = queue.SimpleQueue()
-    done: list[queue.SimpleQueue[Made | _Failed]] = [queue.SimpleQueue() for _ in items]
-    stop = threading.Event()
-    shared = items, opened, todo, done, stop
-    threads = [threading.Thread(target=_serve, args=shared, daemon=True) for _ in range(workers)]
-    waiting = iter(range(len(items)))
+    todo: _Jobs[Made, Item] = queue.SimpleQueue()
+    threads = [
+        threading.Thread(target=_serve, args=(todo, opened), daemon=True) for _ in range(workers)
+    ]
+    waiting: deque[Future[Made]] = deque()
     try:
         for thread in threads:
             thread.start()
-        for index in itertools.islice(waiting, workers + AHEAD):
-            todo.put(index)
-        for place in done:
-            made = place.get()
-            if isinstance(made, _Failed):
-                raise made.error
-            for index in itertools.islice(waiting, 1):
-                todo.put(index)
-            yield made
+        for item in items:
+            waiting.append(Future())
+            todo.put((waiting[-1], item))
+            if len(waiting) >= workers + AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
     finally:
-        stop.set()
+        for result in waiting:
+            result.cancel()
         for _ in threads:
             todo.put(None)
         for thread in threads:
             thread.join()
 
 
-def _serve(
-    items: Sequence[Item],
-    opened: Callable[[], Worker[Item, Made]],
-    todo: "queue.SimpleQueue[int | None]",
-    done: "list[queue.SimpleQueue[Made | _Failed]]",
-    stop: threading.Event,
-) -> None:
-    at = slice(None)  # all waiting items, until one is started
-    try:
-        with opened() as work:
-            while (index := todo.get()) is not None and not stop.is_set():
-                at = slice(index, index + 1)
-                done[index].put(work(items[index]))
-    except BaseException as error:
-        for place in done[at]:
-            place.put(_Failed(error))
+def _serve(todo: _Jobs[Made, Item], opened: Callable[[], Worker[Item, Made]]) -> None:
+    with ExitStack() as stack:
+        work = None
+        while (job := todo.get()) is not None:
+            result, item = job
+            if result.set_running_or_notify_cancel():
+                try:
+                    work = work or stack.enter_context(opened())
+                    result.set_result(work(item))
+                except BaseException as error:
+                    result.set_exception(error)
 
 
 @dataclass(frozen=True)
 class Block:
-    """In pixels of a sheet."""
-
     row: int
     col: int
     height: int
     width: int
+
+    @property
+    def window(self) -> tuple[int, int, int, int]:
+        return self.col, self.row, self.width, self.height
 
     def may_matter(self, area: Area, grid: TileGrid) -> bool:
         """Whether a tile of the area may need the block; False only far from a route."""
@@ -154,10 +143,6 @@ class Block:
         return Block(top, left, bottom - top, right - left)
 
 
-def read_block(raster: SheetRaster, outer: Block) -> GreyPixels:
-    return raster.read_grey(outer.col, outer.row, outer.width, outer.height)
-
-
 def blocks_of(area: Area, grid: TileGrid, side_px: int) -> list[Block]:
     """Blocks of at most `side_px` that tiles of an area may need."""
     whole = Block(0, 0, grid.height_px, grid.width_px)
@@ -184,7 +169,6 @@ class Preview:
             self._grey[y0:y1, x0:x1] = small
 
     def _edges(self, block: Block) -> tuple[int, int, int, int]:
-        """Top, bottom, left, right in the overview."""
         rows, cols = self._grey.shape
         y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
         x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
@@ -224,15 +208,6 @@ def grid_of(
     return grid
 
 
-def rounded_gsd_m(gsd_m: float) -> float:
-    """To few digits: 5.002 to 5, 0.2431 to 0.243."""
-    for digits in (1, 2, 3):
-        rounded = float(f"{gsd_m:.{digits}g}")
-        if abs(rounded / gsd_m - 1) < 0.005:
-            return rounded
-    return float(f"{gsd_m:.4g}")
-
-
 def _whole_cells(tile_px: int, overlap: float) -> float:
     """So that tiles share all their cells; else memory grows with the square of stride to cell."""
     micro_px = max(1, tile_px // MICRO)
@@ -244,7 +219,14 @@ def _whole_cells(tile_px: int, overlap: float) -> float:
 
 def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
     """Grid rows and columns (N, 2) of the tiles in the area that have imagery."""
-    tiles = np.concatenate(_inside(area, grid))
+    reach_m = grid.stride_m * np.sqrt(0.5)
+    step = max(1, _TILES_AT_ONCE // grid.cols)
+    found = []
+    for first in range(0, grid.rows, step):  # a few rows at a time: the box may be mostly empty
+        rows, cols = np.mgrid[first : min(first + step, grid.rows), : grid.cols]
+        some = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
+        found.append(some[area.contains(grid.centres_en_m(some), reach_m)])
+    tiles = np.concatenate(found)
     share = cells.valid_share(tiles * grid.stride_px)
     if not (share >= MIN_TILE_VALID_SHARE).any():
         best = share.max(initial=0.0)
@@ -255,18 +237,6 @@ def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
             "ground resolution"
         )
     return tiles[share >= MIN_TILE_VALID_SHARE]
-
-
-def _inside(area: Area, grid: TileGrid) -> list[NDArray[np.intp]]:
-    """The tiles (N, 2) in the area, a few rows at a time: the box may be mostly empty."""
-    reach_m = grid.stride_m * np.sqrt(0.5)
-    step = max(1, _TILES_AT_ONCE // grid.cols)
-    found = []
-    for first in range(0, grid.rows, step):
-        rows, cols = np.mgrid[first : min(first + step, grid.rows), : grid.cols]
-        tiles = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
-        found.append(tiles[area.contains(grid.centres_en_m(tiles), reach_m)])
-    return found
 
 
 def is_per_tile(representation: Any) -> bool:
@@ -291,7 +261,7 @@ class SheetPictures:
         self._grey = None if self.is_grey else np.zeros(shape, np.uint8)
 
     def parts(
-        self, pixels: GreyPixels, maps: NDArray[np.float32], part: tuple[slice, slice]
+        self, pixels: Pixels, maps: NDArray[np.float32], part: tuple[slice, slice]
     ) -> dict[str, NDArray[Any]]:
         """`pixels` and their representation `maps` (1, H, W) of a block that is a part of them."""
         parts: dict[str, NDArray[Any]] = {
@@ -340,7 +310,7 @@ def read_pictures(
     with mosaic.grid_sheet(area.frame, grid) as raster:
         for done, block in enumerate(blocks):
             outer = block.with_margin(grid, representation.margin_px)
-            pixels = read_block(raster, outer)
+            pixels = raster.read_grey(*outer.window)
             if pixels.valid.any():
                 maps = sheet_maps(representation, pixels.grey, pixels.valid)
                 pictures.put(block, pictures.parts(pixels, maps, block.within(outer)))
@@ -354,13 +324,6 @@ PREVIEW_PX = 384
 """Limit of the map format."""
 MIN_CACHED_BLOCKS = 16
 """Smaller builds do not cache blocks by default: they are quickly rebuilt."""
-CACHED_BYTES_PER_PX = 1.6
-"""A corridor of the generated landscape at 1 m took 1.3."""
-
-
-FORMAT = 2
-"""Of the arrays of a block: increase it when they change."""
-_OURS = re.compile(r"\.?r\d+-c\d+-[0-9a-f]{24}\.npz(\..*\.tmp\.npz)?")
 
 
 def digest(values: Any) -> str:
@@ -369,97 +332,46 @@ def digest(values: Any) -> str:
 
 
 class BlockCache:
-    """Deletes its files when the build succeeds or fails with an `AreaError`, else keeps them.
+    """Finished blocks of one request, as files in a folder of their own.
 
     May be shared between threads.
     """
 
-    def __init__(self, folder: Path, request: str, needed_bytes: int) -> None:
-        """`request`: digest of the inputs common to all blocks."""
-        self._folder = folder
-        self._request = request
-        self._names: dict[Block, str] = {}
-        parent = next(each for each in [folder, *folder.absolute().parents] if each.exists())
-        room = shutil.disk_usage(parent).free + sum(path.stat().st_size for path in self._files())
-        if room < needed_bytes:
-            raise OutputError(
-                f"finished blocks need about {needed_bytes / 1e6:.0f} MB until the map is written, "
-                f"but only {room / 1e6:.0f} MB are free; free disk space or name another folder "
-                f"(--work): {folder}"
-            )
-        log.info("caching finished blocks in %s: about %.0f MB", folder, needed_bytes / 1e6)
+    def __init__(self, folder: Path, request: str) -> None:
+        """`request`: digest of everything that determines the blocks; removes other blocks."""
+        self._folder, self._request = folder, request
+        there = list(folder.glob("*.npz"))
+        found = [path for path in there if request in path.name]
+        for path in set(there) - set(found):
+            path.unlink()
+        if found:
+            log.warning("resuming: %d blocks are cached in %s", len(found), folder)
 
-    def __enter__(self) -> "BlockCache":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
-    ) -> None:
-        if error is None or isinstance(error, AreaError):
-            self.discard()
-        elif count := len(self._files()):
-            log.warning(
-                "%d finished blocks are cached; rerun the same build to resume: %s",
-                count,
-                self._folder,
-            )
-
-    def begin(self, blocks: Sequence[tuple["Block", Any]]) -> int:
-        """Remove the files of other blocks or inputs, and count those that are cached."""
-        self._names = {
-            block: f"r{block.row}-c{block.col}-{digest([FORMAT, self._request, own])[:24]}.npz"
-            for block, own in blocks
-        }
-        wanted = set(self._names.values())
-        there = 0
-        for path in self._files():
-            if path.name in wanted:
-                there += 1
-            else:
-                path.unlink(missing_ok=True)
-        return there
-
-    def load(self, block: "Block") -> dict[str, NDArray[Any]] | None:
+    def load(self, block: "Block") -> Parts | None:
         """None if it is not cached or damaged."""
-        path = self._folder / self._names[block]
+        path = self._path(block)
         try:
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-                return {name: stored[name] for name in stored.files}
+                return dict(stored)
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             log.warning("cached block is damaged (%s) and is recomputed: %s", error, path)
             return None
 
-    def store(self, block: "Block", parts: dict[str, NDArray[Any]]) -> None:
-        path = self._folder / self._names[block]
-        try:
-            with replacing(path) as temporary:
-                np.savez(temporary, **parts)  # type: ignore[arg-type]  # none is `allow_pickle`
-        except OutputError as error:
-            raise OutputError(
-                f"{error}; earlier blocks stay cached for a rerun of the same build; or name "
-                "another folder (--work)"
-            ) from error
+    def store(self, block: "Block", parts: Parts) -> None:
+        with replacing(self._path(block)) as temporary:
+            np.savez(temporary, **parts)  # type: ignore[arg-type]  # none is `allow_pickle`
 
     def discard(self) -> None:
-        for path in self._files():
-            path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # missing, or not empty
-            self._folder.rmdir()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _files(self) -> list[Path]:
-        if not self._folder.is_dir():
-            return []
-        return [path for path in self._folder.iterdir() if _OURS.fullmatch(path.name)]
+    def _path(self, block: "Block") -> Path:
+        return self._folder / f"r{block.row}-c{block.col}-{self._request}.npz"
 
 
-@dataclass(frozen=True)
-class Job:
-    """A block to be read, and the positions (row, col) of crops in it."""
-
-    block: Block
-    places: tuple[tuple[int, int], ...]
+Job = tuple[Block, NDArray[np.intp]]
+"""A block to be read, and the positions (N, 2) of crops in it."""
 
 
 class SheetReader:
@@ -500,33 +412,25 @@ class SheetReader:
         @contextmanager
         def opened() -> Iterator[Callable[[Job], Parts]]:
             with self.mosaic.grid_sheet(self.area.frame, self.grid, threads=1) as raster:
-                yield lambda job: self._cached_or_read(raster, job, cache)
+                yield lambda job: self._read_block(raster, job, cache)
 
         with one_opencv_thread(), quiet():
             for done, parts in enumerate(in_order(self._jobs, opened, workers)):
-                self._take(self._jobs[done], parts)
+                if parts:
+                    self._take(self._jobs[done][0], parts)
                 progress("imagery", (done + 1) / len(self._jobs))
         if not self.cells.valid.any():
             raise AreaError(
                 "the area has no imagery: it lies outside the orthophotos or is all nodata"
             )
 
-    def block_cache(
-        self, out: Path, work: Path | None
-    ) -> AbstractContextManager[BlockCache | None]:
+    def block_cache(self, out: Path, work: Path | None) -> BlockCache | None:
         """Cache in `work`, or, if there are many blocks, beside the map; else None."""
-        pixels = sum(job.block.height * job.block.width for job in self._jobs)
-        worthwhile = work is not None or len(self._jobs) >= MIN_CACHED_BLOCKS
-        needed_bytes = round(CACHED_BYTES_PER_PX * pixels) if worthwhile else 0
-        beside, name = out.with_name(f"{out.name}.work"), f"blocks-{out.name}"
-        cache = BlockCache(work / name if work else beside, self._request(), needed_bytes)
-        if not worthwhile:
-            cache.discard()  # left by an earlier request for the same map
-            return nullcontext()
-        found = cache.begin(self._depends_on())
-        if found:
-            log.warning("resuming: %d of %d blocks are cached", found, len(self._jobs))
-        return cache
+        if work is None and len(self._jobs) < MIN_CACHED_BLOCKS:
+            return None
+        name = f"blocks-{out.name}"
+        folder = out.with_name(f"{out.name}.work") if work is None else work / name
+        return BlockCache(folder, self._request())
 
     @property
     def _recipe(self) -> dict[str, Any]:
@@ -541,45 +445,37 @@ class SheetReader:
         jobs = []
         for block in blocks:
             outer, share = self._outer(block), block.height * block.width / total_px
-            places = self.sampler.places(outer.height, outer.width, share)
-            jobs.append(Job(block, tuple((int(row), int(col)) for row, col in places)))
+            jobs.append((block, self.sampler.places(outer.height, outer.width, share)))
         return jobs
 
-    def _cached_or_read(self, raster: SheetRaster, job: Job, cache: BlockCache | None) -> Parts:
-        parts = None if cache is None else cache.load(job.block)
-        if parts is None:
-            parts = self._read_block(raster, job)
-            if cache is not None:
-                cache.store(job.block, parts)
-        return parts
-
-    def _read_block(self, raster: SheetRaster, job: Job) -> Parts:
-        """The result of a block; does not change the state of the reader."""
-        outer = self._outer(job.block)
-        pixels, part = read_block(raster, outer), job.block.within(outer)
+    def _read_block(self, raster: SheetRaster, job: Job, cache: BlockCache | None) -> Parts:
+        block, places = job
+        cached = None if cache is None else cache.load(block)
+        if cached is not None:
+            return cached
+        outer = self._outer(block)
+        pixels, part = raster.read_grey(*outer.window), block.within(outer)
         grey, valid = pixels.grey, pixels.valid
-        if not valid.any():
-            return {}
-        maps = sheet_maps(self.representation, grey, valid)
-        more = job.block.within(outer, self._beyond_px)
-        means, share = cell_means(maps[:, more[0], more[1]], valid[more], self._layout)
-        parts: Parts = {
-            "means": means,
-            "share": share,
-            "preview": self.preview.small(job.block, grey[part]),
-        }
-        if self.pictures is not None:
-            parts |= self.pictures.parts(pixels, maps, part)
-        places = np.array(job.places, np.intp).reshape(-1, 2)
-        parts["crops"], parts["crop_places"] = self.sampler.cut(grey, valid, places)
-        if self.layer is not None:
-            parts |= layer_parts(self.area, self.grid, job.block, grey[part], valid[part])
+        parts: Parts = {}
+        if valid.any():
+            maps = sheet_maps(self.representation, grey, valid)
+            more = block.within(outer, self._beyond_px)
+            means, share = cell_means(maps[:, more[0], more[1]], valid[more], self._layout)
+            parts = {
+                "means": means,
+                "share": share,
+                "preview": self.preview.small(block, grey[part]),
+            }
+            parts["crops"], parts["crop_places"] = self.sampler.cut(grey, valid, places)
+            if self.pictures is not None:
+                parts |= self.pictures.parts(pixels, maps, part)
+            if self.layer is not None:
+                parts |= layer_parts(self.area, self.grid, block, grey[part], valid[part])
+        if cache is not None:
+            cache.store(block, parts)
         return parts
 
-    def _take(self, job: Job, parts: Parts) -> None:
-        if not parts:
-            return
-        block = job.block
+    def _take(self, block: Block, parts: Parts) -> None:
         self.cells.put(block.row, block.col, parts["means"], parts["share"])
         self.preview.put(block, parts["preview"])
         if self.pictures is not None:
@@ -587,36 +483,22 @@ class SheetReader:
         outer = self._outer(block)
         self.sampler.take(parts["crops"], parts["crop_places"], outer.row, outer.col)
         if self.layer is not None:
-            put_layer_parts(self.layer, block, parts)
+            self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
 
     def _request(self) -> str:
-        """Digest of the inputs common to all blocks, including program versions."""
-        frame = self.area.frame
-        return digest(
-            {
-                "versions": [__version__, np.__version__, cv2.__version__, rasterio.__version__],
-                "gdal": rasterio.__gdal_version__,
-                "represent": self._recipe,
-                "frame": [frame.lat_deg, frame.lon_deg],
-                "grid": vars(self.grid),
-                "layout": [vars(self._layout), self._margin_px, PREVIEW_PX, CHUNK_PX],
-                "crop_px": self.sampler.size_px,
-                "layer": self.layer is not None,
-                "pictures": self.pictures is not None,
-                "imagery": self.mosaic.common_stamp,
-            }
-        )
-
-    def _depends_on(self) -> list[tuple[Block, Any]]:
-        """Inputs of each block alone: its imagery, crops, and distance from the route."""
-        found: list[tuple[Block, Any]] = []
-        with self.mosaic.grid_sheet(self.area.frame, self.grid) as raster:
-            for job in self._jobs:
-                block, outer = job.block, self._outer(job.block)
-                far = [not chunk.may_matter(self.area, self.grid) for chunk in block.cut(CHUNK_PX)]
-                stamps = raster.stamps(outer.col, outer.row, outer.width, outer.height)
-                found.append((block, [block.height, block.width, job.places, far, stamps]))
-        return found
+        everything = {
+            "versions": [__version__, np.__version__, cv2.__version__, rasterio.__version__],
+            "gdal": rasterio.__gdal_version__,
+            "represent": self._recipe,
+            "area": repr(self.area),
+            "grid": vars(self.grid),
+            "layout": [vars(self._layout), self._margin_px, PREVIEW_PX, CHUNK_PX],
+            "jobs": [[*block.window, places.tolist()] for block, places in self._jobs],
+            "crop_px": self.sampler.size_px,
+            "parts": [self.layer is not None, self.pictures is not None],
+            "imagery": [source.stamp for source in self.mosaic.sources],
+        }
+        return digest(everything)[:24]
 
 
 @contextmanager
@@ -631,44 +513,21 @@ def one_opencv_thread() -> Iterator[None]:
 
 
 def blocks_of_area(area: Area, grid: TileGrid, layout: CellLayout) -> list[Block]:
-    return blocks_of(area, grid, _block_side_px(grid.tile_px, layout.micro_px))
+    """Their side is a multiple of the micro-cell, and of the layer chunk if possible."""
+    least = max(BLOCK_PX, 2 * grid.tile_px)
+    step = math.lcm(layout.micro_px, CHUNK_PX)
+    if step > 1.5 * least:
+        step = layout.micro_px
+    return blocks_of(area, grid, -(-least // step) * step)
 
 
 def layer_parts(
     area: Area, grid: TileGrid, block: Block, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> Parts:
-    """Compressed if the chunks of the block do not extend into other blocks."""
+    """Copies of a block (H, W) without the chunks that are too far from the route."""
     grey, valid = grey.copy(), valid.copy()
     for chunk in block.cut(CHUNK_PX):
         if not chunk.may_matter(area, grid):
             where = chunk.within(block)
             grey[where], valid[where] = 0, False
-    if _whole_chunks(grid, block):
-        return compressed_block(grey, valid)
     return {"grey": grey, "valid": valid}
-
-
-def _whole_chunks(grid: TileGrid, block: Block) -> bool:
-    bottom, right = block.row + block.height, block.col + block.width
-    return (
-        block.row % CHUNK_PX == 0
-        and block.col % CHUNK_PX == 0
-        and (bottom % CHUNK_PX == 0 or bottom == grid.height_px)
-        and (right % CHUNK_PX == 0 or right == grid.width_px)
-    )
-
-
-def put_layer_parts(layer: GreyLayerWriter, block: Block, parts: Parts) -> None:
-    if "jpeg" in parts:
-        layer.add_block(block.row, block.col, parts)
-    else:
-        layer.add(block.row, block.col, parts["grey"], parts["valid"])
-
-
-def _block_side_px(tile_px: int, micro_px: int) -> int:
-    """A multiple of the micro-cell, and of the layer chunk if possible."""
-    least = max(BLOCK_PX, 2 * tile_px)
-    step = math.lcm(micro_px, CHUNK_PX)
-    if step > 1.5 * least:
-        step = micro_px
-    return -(-least // step) * step

@@ -13,11 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import OrthonavError
+from orthonav.core.errors import MapFileError, OrthonavError
 from orthonav.core.flight.recording import Flight
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.localizer import Localizer, RegistrationLocalizer
 from orthonav.core.localize.view import PreparedView, check_view
+from orthonav.core.mapfile import MapFile
+from orthonav.core.mapfile.signature import map_digest
 from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
 from orthonav.core.register.channels import channels_of
 from orthonav.core.register.pose import Pose
@@ -223,14 +225,6 @@ _STEPS = 8
 _LEAST_WEIGHT = 1e-3
 
 
-@dataclass(frozen=True)
-class _Tone:
-    """Tone of a view as `gain` times that of the map plus `offset`."""
-
-    gain: float
-    offset: float
-
-
 def changed_ground(
     views: Sequence[SeenCells], grid: ChangeGrid, *, map_name: str = "", map_sha256: str = ""
 ) -> ChangedGround:
@@ -272,32 +266,33 @@ def _deviations(views: Sequence[SeenCells], unchanged: Array) -> Array:
     usual = _relation(mine, theirs, whole, None)
     found = []
     for each, weight in zip(views, weights, strict=True):
-        fitted = _relation(each.view_tone, each.map_tone, weight, usual)
-        expected = fitted.gain * each.map_tone + fitted.offset
-        found.append(np.abs(each.view_tone - expected) / fitted.gain)
+        gain, offset = _relation(each.view_tone, each.map_tone, weight, usual)
+        found.append(np.abs(each.view_tone - gain * each.map_tone - offset) / gain)
     off = np.concatenate(found)
     return off / max(_weighted_median(off, whole), USUAL_FLOOR)
 
 
-def _relation(mine: Array, theirs: Array, weights: Array, usual: _Tone | None) -> _Tone:
-    """The relation of tones (N,), robust against cells that do not follow it (Cauchy weights)."""
+def _relation(
+    mine: Array, theirs: Array, weights: Array, usual: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Gain and offset of tones (N,) of a view over those of the map, robust against cells that do
+    not follow them (Cauchy weights)."""
     held = 0.0 if usual is None else FLIGHT_CELLS
-    start = usual or _Tone(1.0, 0.0)
-    gain, offset = start.gain, start.offset
+    usual_gain, usual_offset = gain, offset = usual or (1.0, 0.0)
     now = weights
     for _ in range(_STEPS):
         total = now.sum()
         at, seen = (now @ theirs) / total, (now @ mine) / total
         spread = now @ (theirs - at) ** 2 + held * _FLIGHT_SPREAD
-        product = now @ ((theirs - at) * (mine - seen)) + held * _FLIGHT_SPREAD * start.gain
-        gain = float(np.clip(product / max(spread, 1e-9), *GAINS)) if spread > 1e-9 else start.gain
+        product = now @ ((theirs - at) * (mine - seen)) + held * _FLIGHT_SPREAD * usual_gain
+        gain = float(np.clip(product / max(spread, 1e-9), *GAINS)) if spread > 1e-9 else usual_gain
         # What the whole flight expects at the mean tone of these cells.
-        expected = start.gain * at + start.offset
+        expected = usual_gain * at + usual_offset
         offset = float((total * seen + held * expected) / (total + held) - gain * at)
         off = np.abs(mine - gain * theirs - offset)
         scale = float(weights @ off / weights.sum()) + USUAL_FLOOR
         now = weights / (1 + (off / scale) ** 2)
-    return _Tone(gain, offset)
+    return gain, offset
 
 
 def _weighted_median(values: Array, weights: Array) -> float:
@@ -316,3 +311,25 @@ def _medians(values: Array, cells: NDArray[np.intp], count: int) -> Array:
     used, first, number = np.unique(cells[order], return_index=True, return_counts=True)
     found[used] = values[order][first + (number - 1) // 2]
     return found
+
+
+def changes_of_flight(
+    opened: MapFile,
+    flight: Flight,
+    results: Sequence[ViewResult],
+    progress: Callable[[float], None],
+) -> ChangedGround | None:
+    """Changed ground by the confident views of a flight; None without a confident view.
+
+    Raises `MapFileError` for a map without a registration layer.
+    """
+    registration = Localizer(opened, level_ground=True).registration
+    if registration is None:
+        raise MapFileError(f"changes need a map with a registration layer: {opened.path}")
+    side_m = cell_side_m([(flight.camera, results)])
+    if side_m is None:
+        return None
+    grid = ChangeGrid.of_sheet(registration.sheet, side_m)
+    views = list(views_beside_map(registration, grid, flight, results, progress))
+    digest = map_digest(opened.path)
+    return changed_ground(views, grid, map_name=opened.path.name, map_sha256=digest)

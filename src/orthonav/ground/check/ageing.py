@@ -145,7 +145,8 @@ def another_year(
     # Rotated by 180 deg, because the donor also fills holes of `grey`; flipped once more it would
     # be real ground.
     other, _ = _bands(np.ascontiguousarray(donor[::-1, ::-1]))
-    log_factor = FIELD * _normal(rng, size, int(rng.integers(4, 10)))
+    cells = int(rng.integers(4, 10))
+    log_factor = FIELD * _enlarged(rng.standard_normal((cells, cells)), size)
     log_factor += VIEW * rng.standard_normal()
     factor = np.exp(log_factor)
     gain = 0.6 + 0.8 * _uniform(rng, size, 6)
@@ -178,7 +179,7 @@ def displaced(
     size = grey.shape[0]
     cells = int(np.clip(size / max(cell_px, 1.0), 2, 96))
     along = np.linspace(-1, 1, size, dtype=np.float32)
-    shift = relief_px * _normal(rng, size, cells)
+    shift = relief_px * _enlarged(rng.standard_normal((cells, cells)), size)
     index = np.arange(size, dtype=np.float32)
     cols = index[None, :] - shift * along[None, :]
     rows = index[:, None] - shift * along[:, None]
@@ -205,10 +206,6 @@ def _strength(band: Array, window_px: int) -> Array:
 def _uniform(rng: np.random.Generator, size: int, cells: int) -> Array:
     """A smooth random field (S, S) around 0.5, `cells` values across."""
     return _enlarged(rng.random((cells, cells)), size)
-
-
-def _normal(rng: np.random.Generator, size: int, cells: int) -> Array:
-    return _enlarged(rng.standard_normal((cells, cells)), size)
 
 
 def _enlarged(values: NDArray[np.float64], size: int) -> Array:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.ground.build.fit import fit_weights
+from orthonav.ground.build.calibrate import fit_weights
 
 if TYPE_CHECKING:
     from orthonav.ground.check.trials import Trial
@@ -95,7 +95,13 @@ _PAIRS_AT_ONCE = 2**20
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Predictions at places (N,); fields as in `Cells`."""
+    """Predictions for places, arrays of one shape: cells, or points along a route.
+
+    `probability`: of a correct, confident fix of one view; `low`, `high`: its 80 % interval.
+    `error_m`: expected error of such a fix, root mean square.
+    `wrong`: fraction of trials that were false fixes.
+    `persistence`: expected correlation of the ground with another year, 0 to 1.
+    """
 
     probability: Array
     low: Array

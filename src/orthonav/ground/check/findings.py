@@ -1,11 +1,10 @@
-"""What trials and predictions say: tolerated errors, heights, gaps, ambiguous places; the verdict.
+"""What trials and predictions say: ambiguous places, predictions along a route, gaps; the verdict.
 
 docs/check.md lists the rules of the verdict.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,73 +12,20 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.estimate import Prediction
-from orthonav.ground.check.outcome import (
+from orthonav.ground.check.records import (
     Along,
-    Alternative,
     BlindStretch,
     Conditions,
-    Envelope,
     Lookalike,
     Reason,
     Verdict,
     Word,
 )
-from orthonav.ground.check.trials import Trial, TrialPlan, Work
+from orthonav.ground.check.trials import Trial
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import along_polyline_en_m
 
 Array = NDArray[np.float64]
-YAW_OFF_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
-AGL_OFF = (-0.2, -0.1, 0.0, 0.1, 0.2)
-"""Errors tried: about one to four default standard deviations."""
-TOLERATED = 0.85
-"""An error is tolerated while the rate of fixes stays above this part of that without error."""
-HEIGHTS = (0.5, 0.7, 1.4, 2.0)
-"""Other heights tried, as parts of the planned one: steps of about the square root of two."""
-
-
-def envelope_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
-    return [
-        (replace(plan, yaw_off_deg=yaw, agl_off=agl), places_en_m)
-        for yaw in YAW_OFF_DEG
-        for agl in AGL_OFF
-    ]
-
-
-def envelope_of(trials: Sequence[Sequence[Trial]]) -> Envelope:
-    shares = [right_share(each) for each in trials]
-    share = np.array(shares, np.float64).reshape(len(YAW_OFF_DEG), len(AGL_OFF))
-    middle = AGL_OFF.index(0.0)
-    tolerated = (share >= TOLERATED * share[0, middle]) & (share > 0)
-    yaw = YAW_OFF_DEG[_last_without_gap(tolerated[:, middle])]
-    low = AGL_OFF[middle - _last_without_gap(tolerated[0, middle::-1])]
-    high = AGL_OFF[middle + _last_without_gap(tolerated[0, middle:])]
-    return Envelope(np.array(YAW_OFF_DEG), np.array(AGL_OFF), share, yaw, low, high)
-
-
-def _last_without_gap(tolerated: NDArray[np.bool_]) -> int:
-    gaps = np.flatnonzero(~tolerated)
-    return max(int(gaps[0]) - 1, 0) if len(gaps) else len(tolerated) - 1
-
-
-def heights_work(plan: TrialPlan, places_en_m: Array) -> list[Work]:
-    return [(replace(plan, agl_m=plan.agl_m * part), places_en_m) for part in HEIGHTS]
-
-
-def heights_of(
-    plan: TrialPlan, planned: Sequence[Trial], others: Sequence[Sequence[Trial]]
-) -> tuple[Alternative, ...]:
-    tried = sorted({1.0: planned, **dict(zip(HEIGHTS, others, strict=True))}.items())
-    return tuple(
-        Alternative("agl_m", plan.agl_m * part, right_share(each), part == 1.0)
-        for part, each in tried
-    )
-
-
-def right_share(trials: Sequence[Trial]) -> float:
-    return float(np.mean([each.right for each in trials])) if trials else float("nan")
-
-
 SIMILAR = 0.8
 MAX_PAIRS = 40
 _WRONG_CONFIDENCE = 0.5
@@ -94,12 +40,7 @@ class _Pair(NamedTuple):
 
 
 def found_lookalikes(
-    trials: Sequence[Trial],
-    frame: LocalFrame,
-    *,
-    view_side_m: float,
-    radius_m: float,
-    prior_std_m: float | None,
+    trials: Sequence[Trial], frame: LocalFrame, conditions: Conditions
 ) -> tuple[Lookalike, ...]:
     """Pairs of places, most similar first; pairs whose ends lie within half a view are merged.
 
@@ -107,19 +48,19 @@ def found_lookalikes(
     it with its best rival, if that scores high enough.
     """
     # Within a quarter of a view it is the same place, only located badly.
-    far_m = max(radius_m, view_side_m / 4)
+    far_m = max(conditions.radius_m, conditions.side_m / 4)
     pairs = [pair for each in trials if (pair := _pair(each, far_m)) is not None]
     pairs.sort(key=lambda pair: -pair.similarity)
     groups: list[list[_Pair]] = []
     for pair in pairs:
-        group = next((g for g in groups if _same(g[0], pair, view_side_m / 2)), None)
+        group = next((g for g in groups if _same(g[0], pair, conditions.side_m / 2)), None)
         if group is None:
             groups.append([pair])
         else:
             group.append(pair)
     groups = [group for group in groups if len(group) > 1 or group[0].confident]
     groups.sort(key=lambda group: (-min(len(group), 3), -group[0].similarity))
-    return tuple(_lookalike(group, frame, prior_std_m) for group in groups[:MAX_PAIRS])
+    return tuple(_lookalike(group, frame, conditions.prior_std_m) for group in groups[:MAX_PAIRS])
 
 
 def _pair(trial: Trial, far_m: float) -> _Pair | None:
@@ -165,22 +106,18 @@ NEGLIGIBLE = 1e-9
 
 
 def predicted_along(
-    area: Area,
-    bands_m: Sequence[float],
-    view_side_m: float,
-    conditions: Conditions,
-    predict: Callable[[Array], Prediction],
+    area: Area, conditions: Conditions, predict: Callable[[Array], Prediction]
 ) -> Along:
     """Predictions along the route of an area.
 
-    `bands_m` is the width of the band of every leg; `predict` takes places (N, 2) and returns a
-    probability of 0 and an error of NaN beyond the map.
+    `predict` takes places (N, 2) and returns a probability of 0 and an error of NaN beyond the map.
     """
     assert area.route is not None
+    bands_m = area.route.bands_m(area.band_m) or (area.band_m,)
     line = area.route.points_en_m(area.frame)
     ends_m = np.cumsum(np.hypot(*np.diff(line, axis=0).T))
     length_m = float(ends_m[-1]) if len(ends_m) else 0.0
-    step_m = max(view_side_m / POINTS_PER_VIEW, length_m / MAX_POINTS)
+    step_m = max(conditions.side_m / POINTS_PER_VIEW, length_m / MAX_POINTS)
     points, course_deg = along_polyline_en_m(line, max(step_m, 1e-6))
     distance_m = np.minimum(np.arange(len(points)) * step_m, length_m)
     if length_m - distance_m[-1] > _REACHED * step_m:  # the last waypoint
@@ -196,14 +133,11 @@ def predicted_along(
     return Along(
         distance_m=distance_m,
         points_en_m=points,
-        probability=middle.probability,
-        low=middle.low,
-        high=middle.high,
         across_low=np.minimum(lowest, middle.probability),
-        error_m=middle.error_m,
         drift_m=expected_drift(
-            distance_m, middle.probability, middle.error_m, conditions.drift, view_side_m
+            distance_m, middle.probability, middle.error_m, conditions.drift, conditions.side_m
         ),
+        **vars(middle),
     )
 
 
@@ -235,9 +169,7 @@ def expected_drift(
     return np.interp(distance_m, stops, expected)
 
 
-def blind_stretches(
-    along: Along, conditions: Conditions, view_side_m: float
-) -> tuple[BlindStretch, ...]:
+def blind_stretches(along: Along, conditions: Conditions) -> tuple[BlindStretch, ...]:
     """Gaps: stretches of at least one side of a view with a probability below `BLIND`, in order."""
     blind = along.probability < BLIND
     edges = np.flatnonzero(np.diff(np.concatenate([[0], blind.astype(int), [0]])))
@@ -247,7 +179,7 @@ def blind_stretches(
     for first, end in edges.reshape(-1, 2):
         start_m = float(along.distance_m[first])
         end_m = float(along.distance_m[min(end, last)])
-        if end_m - start_m < view_side_m:
+        if end_m - start_m < conditions.side_m:
             continue
         stretch = BlindStretch(
             start_m=start_m,
@@ -353,12 +285,16 @@ def _mean(found: Findings, where: str) -> Reason:
     return Reason("few_fixes", text, Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL)
 
 
+def _word(value: float, go: float, no_go: float) -> Word:
+    if value > no_go:
+        return Word.NO_GO
+    return Word.MARGINAL if value > go else Word.GO
+
+
 def _outside(fraction: float) -> list[Reason]:
-    if fraction <= GO_OUTSIDE:
-        return []
-    word = Word.NO_GO if fraction > NO_GO_OUTSIDE else Word.MARGINAL
+    word = _word(fraction, GO_OUTSIDE, NO_GO_OUTSIDE)
     text = f"{100 * fraction:.0f} % of the route is outside the map. Limit: {100 * GO_OUTSIDE:g} %."
-    return [Reason("outside_map", text, word)]
+    return [] if word is Word.GO else [Reason("outside_map", text, word)]
 
 
 def _drift(along: Along, allowed_m: float | None) -> Reason:
@@ -368,8 +304,7 @@ def _drift(along: Along, allowed_m: float | None) -> Reason:
     text += f"at km {along.distance_m[worst] / 1000:.1f}."
     if allowed_m is not None:
         text += f" Limit: {allowed_m:.0f} m (--prior-std-m)."
-        if drift_m > allowed_m:
-            word = Word.NO_GO if drift_m > TOO_FAR * allowed_m else Word.MARGINAL
+        word = _word(drift_m, allowed_m, TOO_FAR * allowed_m)
     return Reason("drift", text, word)
 
 

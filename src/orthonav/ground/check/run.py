@@ -2,65 +2,62 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.cores import usable_cores
 from orthonav.core.errors import AreaError, CameraError, MapFileError
 from orthonav.core.files import Progress, no_progress
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import MAP_STD_M
-from orthonav.ground.changes.record import CellGrid
+from orthonav.core.register.window import GreyPyramid
+from orthonav.ground.changes.record import CellGrid, ChangedGround
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
     Findings,
     blind_stretches,
-    envelope_of,
-    envelope_work,
     found_lookalikes,
-    heights_of,
-    heights_work,
     predicted_along,
     verdict_of,
 )
-from orthonav.ground.check.outcome import (
-    OF_REQUEST,
-    Along,
-    Alternative,
-    Cells,
-    CheckResult,
-    Conditions,
-    Envelope,
-)
-from orthonav.ground.check.places import MapCoverage, cell_side_m, checked_m2, trial_places
-from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.records import Along, Cells, CheckRequest, CheckResult, Conditions
 from orthonav.ground.check.trials import (
     MIN_VALID,
     Trial,
-    TrialPlan,
     registration_of,
     require_overlap,
-    run_many,
+    run_trials,
 )
-from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import distance_to_polyline_m
+from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.spacing import MIN_BAND_VIEWS, default_band_m
 
 Array = NDArray[np.float64]
-ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30
-"""Places of trials for the envelope (25 at each) and for other heights (4 at each)."""
-BANDS = (0.25, 0.5)
 MIN_VIEWS = 20
 MAX_ASPECT = 8.0
 MIN_COVERED = 0.25
 MAX_CELLS_AROUND = 250_000
 """Limit of cells in the box around a band, most of them empty."""
+# Limits of work and of what a page can show; the benchmark's maps need no more trials.
+MAX_CELLS = 4000
+CELLS_PER_VIEW = 4.0
+"""Cells per side of a view, unless that gives too many."""
+MIN_TRIALS, MAX_TRIALS = 240, 1500
+TRIALS_PER_VIEW = 4.0
+"""Trials per area of a view, within those limits."""
+FEWEST_TRIALS = 40
+MASK_PX = 2048
+"""The coverage of the map is read at the finest level no larger than this."""
+_REDRAWS = 6
+_MAX_POINTS = 500_000
 
 
 def check_map(
@@ -94,89 +91,62 @@ class _Check:
         registration = registration_of(opened)
         self.sheet = registration.sheet
         self.coverage = MapCoverage.of(registration.pyramid, self.sheet.grid)
-        self.radius_m, self.floor_px = registration.radius_m, registration.floor_px
+        self.floor_px = registration.floor_px
         self.calibrated = registration.confidence is not None
-        self.workers = request.workers or usable_cores()
-        self.plan = self._plan()
-        self.conditions = Conditions(
-            self.plan.width_m,
-            self.plan.height_m,
-            self.plan.agl_m,
-            radius_m=self.radius_m,
-            **{name: getattr(request, name) for name in OF_REQUEST},
-        )
-        self.bands_m = self._leg_bands_m()
+        agl_m = request.agl_m or self.sheet.grid.tile_m / min(request.camera.extent)
+        self.conditions = Conditions.of(request, agl_m, registration.radius_m)
+        self._require_views()
         self.area = self._area()
         if request.other_date is not None:
             require_overlap(request.other_date, self.sheet)
         self.extent = self.coverage.extent_en_m if self.area is None else self.area.extent_en_m
         self.checked_m2 = checked_m2(self.coverage, self.area)
 
-    def _plan(self) -> TrialPlan:
-        request, agl_m = self.request, self.request.agl_m
-        if agl_m is None:
-            agl_m = self.sheet.grid.tile_m / min(request.camera.extent)
-        plan = TrialPlan(request, agl_m)
-        short_m, long_m = sorted((plan.width_m, plan.height_m))
+    def _require_views(self) -> None:
+        footprint = self.conditions.footprint_text
+        short_m, long_m = sorted((self.conditions.width_m, self.conditions.height_m))
         if long_m > MAX_ASPECT * short_m:
             raise CameraError(
                 f"a view may be at most {MAX_ASPECT:g} times as long as wide, but with this camera "
-                f"{plan.footprint_text}; check the calibration"
+                f"{footprint}; check the calibration"
             )
         if MIN_VALID * (short_m**2 + long_m**2) > self.coverage.area_m2:
             raise AreaError(
-                f"views do not fit on the map: {plan.footprint_text}; fly lower, or build a larger "
-                "map"
+                f"views do not fit on the map: {footprint}; fly lower, or build a larger map"
             )
-        return plan
-
-    def _leg_bands_m(self) -> tuple[float, ...]:
-        route, band_m = self.request.route, self.request.band_m
-        if route is None:
-            return ()
-        if band_m is None:
-            band_m = default_band_m(self.plan.side_m, self.request.prior_std_m)
-        Area.from_route(route, band_m)
-        return route.bands_m(band_m) or ()
 
     def _area(self) -> Area | None:
-        route = self.request.route
-        if route is None:
+        """The bands of the route, at least half a view wide."""
+        request, side_m = self.request, self.conditions.side_m
+        if request.route is None:
             return None
-        line = route.points_en_m(self.sheet.frame)
-        bands_m = tuple(max(each, MIN_BAND_VIEWS * self.plan.side_m) for each in self.bands_m)
+        band_m = request.band_m
+        if band_m is None:
+            band_m = default_band_m(side_m, request.prior_std_m)
+        Area.from_route(request.route, band_m)  # which raises for a width of 0 or a route too long
+        bands_m = tuple(
+            max(each, MIN_BAND_VIEWS * side_m) for each in request.route.bands_m(band_m) or ()
+        )
+        line = request.route.points_en_m(self.sheet.frame)
         half = max(bands_m) / 2
         (west, south), (east, north) = line.min(axis=0) - half, line.max(axis=0) + half
         extent = (float(west), float(south), float(east), float(north))
-        return Area(self.sheet.frame, extent, replace(route, leg_bands_m=bands_m), half * 2)
+        route = replace(request.route, leg_bands_m=bands_m)
+        return Area(self.sheet.frame, extent, route, half * 2)
 
     def result(self) -> CheckResult:
-        request, side_m = self.request, self.plan.side_m
-        rng = np.random.default_rng([request.seed, 4])
-        places = trial_places(
-            self.coverage, self.area, self.extent, self.checked_m2, side_m, request.effort, rng
-        )
-        own, other = self._trials(places)
-        envelope, heights = self._extra_trials(own, rng) if request.extras else (None, [])
+        request, conditions, frame = self.request, self.conditions, self.sheet.frame
+        own, other = self._trials()
         predictor = self._predictor(own, other)
-        cells = self._cells(predictor, own)
-        along = self._along(predictor)
-        outside = 0.0
-        if along is not None:
-            outside = float(1 - self.coverage.covers(along.points_en_m).mean())
+        cells, along = self._cells(predictor, own), self._along(predictor)
         known = np.isfinite(cells.probability)
         mean, low, changed = (
             float(each[known].mean()) if known.any() else 0.0
             for each in (cells.probability, cells.low, cells.changed)
         )
-        stretches = () if along is None else blind_stretches(along, self.conditions, side_m)
-        lookalikes = found_lookalikes(
-            [*own, *other],
-            self.sheet.frame,
-            view_side_m=side_m,
-            radius_m=self.radius_m,
-            prior_std_m=request.prior_std_m,
-        )
+        stretches = () if along is None else blind_stretches(along, conditions)
+        outside = 0.0 if along is None else np.mean(~self.coverage.covers(along.points_en_m))
+        lookalikes = found_lookalikes([*own, *other], frame, conditions)
         findings = Findings(
             along,
             stretches,
@@ -186,32 +156,55 @@ class _Check:
             calibrated=self.calibrated,
             wrong=int(predictor.wrong.sum()),
             trials=len(own) + len(other),
-            outside=outside,
+            outside=float(outside),
             changed=changed,
             allowed_m=request.prior_std_m,
-            predicted_px=None if other else side_m / self.sheet.grid.gsd_m,
+            predicted_px=None if other else conditions.side_m / self.sheet.grid.gsd_m,
         )
-        route = request.route
         return CheckResult(
             about=replace(request.about, map_sha256=self.opened.manifest.sha256),
-            conditions=self.conditions,
-            frame=self.sheet.frame,
+            conditions=conditions,
+            frame=frame,
             cells=cells,
             verdict=verdict_of(findings),
             area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
             mean=mean,
             second_date=bool(other),
             along=along,
-            route_en_m=None if route is None else route.points_en_m(self.sheet.frame),
+            route_en_m=None if request.route is None else request.route.points_en_m(frame),
             band_m=None if self.area is None else self.area.band_m,
             stretches=stretches,
             lookalikes=lookalikes,
-            envelope=envelope,
-            alternatives=self._alternatives(heights, own, cells),
         )
 
+    def _trials(self) -> tuple[list[Trial], list[Trial]]:
+        request, conditions = self.request, self.conditions
+        places = trial_places(
+            self.coverage,
+            self.area,
+            self.extent,
+            self.checked_m2,
+            conditions.side_m,
+            request.effort,
+            np.random.default_rng([request.seed, 4]),
+        )
+        workers = request.workers or usable_cores()
+        report = partial(self.progress, "trials")
+        own, other = run_trials(request, conditions, places, workers, report)
+        if len(own) < MIN_VIEWS:
+            raise AreaError(
+                f"only {len(own)} of {len(places)} trial views fit on the map: "
+                f"{conditions.footprint_text}; fly lower, or build a larger map"
+            )
+        if request.other_date is not None and not other:
+            raise AreaError(
+                "the orthophoto of the other date does not cover the checked area: "
+                f"{request.other_date}"
+            )
+        return own, other
+
     def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:
-        request, side_m = self.request, self.plan.side_m
+        request, side_m = self.request, self.conditions.side_m
         lasting = self.coverage.without(request.changes, self.sheet.frame)
         recalibration = request.recalibration
         if request.other_sensor:
@@ -237,44 +230,9 @@ class _Check:
         other, the displacement of the map as a whole, the unreported tilt at a height that may be
         off."""
         floor_m = self.floor_px * self.sheet.grid.gsd_m
-        high_m = self.plan.agl_m * math.hypot(1.0, self.request.agl_std)
+        high_m = self.conditions.agl_m * math.hypot(1.0, self.request.agl_std)
         tilt_m = high_m * math.tan(math.radians(self.request.tilt_std_deg))
         return math.sqrt(2) * math.hypot(floor_m, MAP_STD_M, tilt_m)
-
-    def _trials(self, places: Array) -> tuple[list[Trial], list[Trial]]:
-        other_date, plan = self.request.other_date, self.plan
-        work = [(plan, places)]
-        if other_date is not None:
-            work.append((replace(plan, second_date=True), places))
-        own, *others = run_many(work, self.workers, lambda share: self.progress("trials", share))
-        if len(own) < MIN_VIEWS:
-            raise AreaError(
-                f"only {len(own)} of {len(places)} trial views fit on the map: "
-                f"{plan.footprint_text}; fly lower, or build a larger map"
-            )
-        if others and not others[0]:
-            raise AreaError(
-                f"the orthophoto of the other date does not cover the checked area: {other_date}"
-            )
-        return own, others[0] if others else []
-
-    def _extra_trials(
-        self, own: Sequence[Trial], rng: np.random.Generator
-    ) -> tuple[Envelope | None, list[list[Trial]]]:
-        # Where views are not placed, errors of heading and height make no difference.
-        placed = [each.en_m for each in own if each.right]
-        order = rng.permutation(len(placed))[:ENVELOPE_PLACES]
-        exact = np.array([placed[i] for i in order], np.float64).reshape(-1, 2)
-        places = np.array([each.en_m for each in own])
-        places = places[rng.permutation(len(places))[:HEIGHT_PLACES]]
-        errors = envelope_work(self.plan, exact) if len(exact) >= ENVELOPE_PLACES // 2 else []
-        found = run_many(
-            [*errors, *heights_work(self.plan, places)],
-            self.workers,
-            lambda share: self.progress("envelope", share),
-        )
-        envelope = envelope_of(found[: len(errors)]) if errors else None
-        return envelope, found[len(errors) :]
 
     def _predict(
         self, predictor: Predictor, points: Array, covered: NDArray[np.bool_]
@@ -289,13 +247,13 @@ class _Check:
     def _cells(self, predictor: Predictor, own: Sequence[Trial]) -> Cells:
         west, south, east, north = self.extent
         around_m2 = (east - west) * (north - south)
-        side_m = cell_side_m(around_m2, self.plan.side_m)
+        side_m = cell_side_m(around_m2, self.conditions.side_m)
         if self.area is not None:
-            side_m = cell_side_m(self.checked_m2, self.plan.side_m)
+            side_m = cell_side_m(self.checked_m2, self.conditions.side_m)
             side_m = max(side_m, math.sqrt(around_m2 / MAX_CELLS_AROUND))
         grid = CellGrid.over(self.extent, side_m)
         points = grid.centres_en_m
-        here = covered = self.coverage.cell_share(grid).ravel() > MIN_COVERED
+        here = covered = self.coverage.seen_share(points, side_m) > MIN_COVERED
         if self.area is not None:
             # A band that is narrower than a cell still crosses cells.
             bands_m = self.area.route.bands_m(None) if self.area.route else None
@@ -305,45 +263,131 @@ class _Check:
         columns = {name: np.full((grid.rows, grid.cols), np.nan) for name in vars(found)}
         for name, values in vars(found).items():
             columns[name].ravel()[here] = values
-        columns["changed"] = self._changed(grid)
+        columns["changed"] = self._changed(points, side_m).reshape(grid.rows, grid.cols)
         trials = grid.counts(np.array([each.en_m for each in own]))
-        return Cells(grid.west_m, grid.north_m, side_m, trials=trials, **columns)
+        return Cells(
+            west_m=grid.west_m, north_m=grid.north_m, side_m=side_m, trials=trials, **columns
+        )
 
-    def _changed(self, grid: CellGrid) -> Array:
-        """Fraction (rows, cols) of every cell that changed since the map was made."""
+    def _changed(self, points: Array, side_m: float) -> Array:
+        """Fraction (N,) of squares around points (N, 2) that changed since the map was made."""
         if self.request.changes is None:
-            return np.zeros((grid.rows, grid.cols))
-        whole = self.coverage.cell_share(grid)
-        lasting = self.coverage.without(self.request.changes, self.sheet.frame).cell_share(grid)
-        return np.clip(1 - lasting / np.maximum(whole, 1e-6), 0.0, 1.0) * (whole > 0)
+            return np.zeros(len(points))
+        whole = self.coverage.seen_share(points, side_m)
+        lasting = self.coverage.without(self.request.changes, self.sheet.frame)
+        share = lasting.seen_share(points, side_m) / np.maximum(whole, 1e-6)
+        return np.clip(1 - share, 0.0, 1.0) * (whole > 0)
 
     def _along(self, predictor: Predictor) -> Along | None:
         if self.area is None:
             return None
+        covers = self.coverage.covers
+        return predicted_along(
+            self.area, self.conditions, lambda at: self._predict(predictor, at, covers(at))
+        )
 
-        def predict(points: Array) -> Prediction:
-            return self._predict(predictor, points, self.coverage.covers(points))
 
-        side_m = self.plan.side_m
-        return predicted_along(self.area, self.bands_m, side_m, self.conditions, predict)
+@dataclass(frozen=True, eq=False)
+class MapCoverage:
+    """Where a map has imagery: `valid` (rows, cols) of the pixels of a raster."""
 
-    def _alternatives(
-        self, heights: list[list[Trial]], own: Sequence[Trial], cells: Cells
-    ) -> tuple[Alternative, ...]:
-        found: tuple[Alternative, ...] = ()
-        if heights:
-            found = heights_of(self.plan, own, heights)
-        route, widths = self.request.route, set(self.bands_m)
-        if route is None or len(widths) != 1:
-            return found
-        line = route.points_en_m(self.sheet.frame)
-        away_m = distance_to_polyline_m(cells.grid.centres_en_m, line)
-        probability = cells.probability.ravel()
-        bands = []
-        for part in (*BANDS, 1.0):
-            width_m = part * max(widths)
-            inside = (away_m <= max(width_m, cells.side_m) / 2) & np.isfinite(probability)
-            if inside.any() and width_m > cells.side_m:
-                mean = float(probability[inside].mean())
-                bands.append(Alternative("band_m", width_m, mean, chosen=part == 1.0))
-        return found + tuple(bands) if len(bands) > 1 else found
+    pixels: CellGrid
+    valid: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, layer: GreyPyramid, grid: TileGrid) -> "MapCoverage":
+        level = 0
+        while level < layer.levels - 1 and max(layer.shape(level)) > MASK_PX:
+            level += 1
+        rows, cols = layer.shape(level)
+        _, valid = layer.read(level, 0, 0, rows, cols)
+        return cls(CellGrid(grid.west_m, grid.north_m, grid.gsd_m * 2**level, rows, cols), valid)
+
+    def without(self, changes: ChangedGround | None, frame: LocalFrame) -> "MapCoverage":
+        if changes is None:
+            return self
+        changed = changes.covers(self.pixels.centres_en_m, frame).reshape(self.valid.shape)
+        return replace(self, valid=self.valid & ~changed)
+
+    def covers(self, points_en_m: Array) -> NDArray[np.bool_]:
+        numbers = self.pixels.numbers(points_en_m)
+        return np.asarray((numbers >= 0) & self.valid.ravel()[numbers])
+
+    def seen_share(self, points_en_m: Array, side_m: float) -> Array:
+        """Fraction (N,) of squares of a side around points (N, 2) that the map covers."""
+        side = max(1, round(side_m / self.pixels.side_m))
+        padded = np.pad(self.valid.astype(np.float32), side)
+        share = cv2.blur(padded, (side, side), borderType=cv2.BORDER_CONSTANT)
+        numbers = self.pixels.numbers(points_en_m, side)
+        return np.where(numbers >= 0, np.asarray(share, np.float64).ravel()[numbers], 0.0)
+
+    @property
+    def extent_en_m(self) -> Extent:
+        rows, cols = np.flatnonzero(self.valid.any(axis=1)), np.flatnonzero(self.valid.any(axis=0))
+        if not len(rows):
+            raise AreaError("the map has no imagery; build it again from an orthophoto with data")
+        return (
+            self.pixels.west_m + cols[0] * self.pixels.side_m,
+            self.pixels.north_m - (rows[-1] + 1) * self.pixels.side_m,
+            self.pixels.west_m + (cols[-1] + 1) * self.pixels.side_m,
+            self.pixels.north_m - rows[0] * self.pixels.side_m,
+        )
+
+    @property
+    def area_m2(self) -> float:
+        return float(self.valid.sum()) * self.pixels.side_m**2
+
+
+def checked_m2(coverage: MapCoverage, area: Area | None) -> float:
+    """Area of the map's imagery within `area`, the band of a route; all of it without one.
+
+    Raises `AreaError` where the band does not touch the imagery.
+    """
+    if area is None:
+        return coverage.area_m2
+    west, south, east, north = area.extent_en_m
+    side_m = math.sqrt((east - west) * (north - south) / _MAX_POINTS)
+    points = CellGrid.over(area.extent_en_m, side_m).centres_en_m
+    count = np.count_nonzero(area.contains(points) & coverage.covers(points))
+    if not count:
+        left, below, right, above = coverage.extent_en_m
+        far_m = math.hypot(max(west - right, left - east, 0), max(south - above, below - north, 0))
+        raise AreaError(
+            f"the band of the route does not touch the map, {far_m / 1000:,.1f} km from it; give "
+            "the map of this route, and check that latitude and longitude are not swapped"
+        )
+    return float(count) * side_m**2
+
+
+def cell_side_m(area_m2: float, view_side_m: float) -> float:
+    return max(view_side_m / CELLS_PER_VIEW, math.sqrt(area_m2 / MAX_CELLS))
+
+
+def trial_places(
+    coverage: MapCoverage,
+    area: Area | None,
+    extent: Extent,
+    wanted_m2: float,
+    view_side_m: float,
+    effort: float,
+    rng: np.random.Generator,
+) -> Array:
+    """Places (N, 2) of trials, spread evenly at random over `wanted_m2` of checked imagery."""
+    per_view = wanted_m2 / view_side_m**2
+    count = min(max(TRIALS_PER_VIEW * per_view, MIN_TRIALS), MAX_TRIALS) * effort
+    side_m = math.sqrt(wanted_m2 / max(count, FEWEST_TRIALS))
+    all_m2 = (extent[2] - extent[0]) * (extent[3] - extent[1])
+    cells = CellGrid.over(extent, max(side_m, math.sqrt(all_m2 / _MAX_POINTS)))
+
+    def usable(points: Array) -> NDArray[np.bool_]:
+        covered = coverage.covers(points)
+        return covered if area is None else covered & area.contains(points)
+
+    points = cells.drawn(rng)
+    good = usable(points)
+    for _ in range(_REDRAWS):  # another point of a cell on the border may be usable
+        again = cells.drawn(rng)
+        better = ~good & usable(again)
+        points[better] = again[better]
+        good |= better
+    return points[good]

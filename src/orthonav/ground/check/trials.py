@@ -4,7 +4,7 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing
@@ -33,7 +33,7 @@ from orthonav.core.register.pose import rotation
 from orthonav.core.register.template import Levels
 from orthonav.core.register.window import GreyPyramid
 from orthonav.ground.check.ageing import MARGIN_PX, another_year, default_model, displaced, features
-from orthonav.ground.check.request import CheckRequest
+from orthonav.ground.check.records import CheckRequest, Conditions
 from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 
 EVERY_PX, PERSISTENCE_LEVELS = 8, 3
@@ -44,43 +44,6 @@ _DONOR_DRAWS = 12
 
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class TrialPlan:
-    """How trial views are made; the seed of `request` and the number of a trial give its random
-    numbers.
-
-    `second_date`: views are cut from the orthophoto of a second date, not from the map's imagery
-    with simulated ageing.
-    `yaw_off_deg`: additional heading error, to either side at random; `agl_off`: height error, a
-    fraction of the height.
-    """
-
-    request: CheckRequest
-    agl_m: float
-    second_date: bool = False
-    yaw_off_deg: float = 0.0
-    agl_off: float = 0.0
-
-    @property
-    def width_m(self) -> float:
-        """Footprint along the rows of the image."""
-        return self.agl_m * self.request.camera.width_px / self.request.camera.fx_px
-
-    @property
-    def height_m(self) -> float:
-        """Footprint along the columns of the image."""
-        return self.agl_m * self.request.camera.height_px / self.request.camera.fy_px
-
-    @property
-    def side_m(self) -> float:
-        """Side of the square with the area of the footprint."""
-        return math.sqrt(self.width_m * self.height_m)
-
-    @property
-    def footprint_text(self) -> str:
-        return f"a view from {self.agl_m:.0f} m covers {self.width_m:.0f} x {self.height_m:.0f} m"
 
 
 def reported_persistence(grey: Grey, gsd_m: float, first: int = 0) -> list[NDArray[np.float32]]:
@@ -105,24 +68,27 @@ def reported_persistence(grey: Grey, gsd_m: float, first: int = 0) -> list[NDArr
 
 
 def crop_around(
-    layer: GreyPyramid, grid: TileGrid, en_m: Points, size: int, level: int
+    read: Callable[[int, int, int], tuple[Grey, NDArray[np.bool_]]],
+    grid: TileGrid,
+    en_m: Points,
+    size: int,
+    gsd_m: float,
 ) -> tuple[Grey, NDArray[np.bool_], Points] | None:
     """Grey, valid and the exact centre of a square crop; None where too little of it has imagery.
 
-    The crop is `size` pixels of the level wide, plus `MARGIN_PX` on each side. `layer` is in the
-    plane of the checked map, whose tile grid is `grid`.
+    The crop is `size` pixels of `gsd_m` wide, plus `MARGIN_PX` on each side. `read` takes row,
+    column and side of a square in such pixels of the sheet, which may reach beyond it.
     """
-    unit_m = grid.gsd_m * 2**level
     whole = size + 2 * MARGIN_PX
-    col = round((en_m[0] - grid.west_m) / unit_m - whole / 2)
-    row = round((grid.north_m - en_m[1]) / unit_m - whole / 2)
-    grey, valid = layer.read(level, row, col, whole, whole)
+    col = round((en_m[0] - grid.west_m) / gsd_m - whole / 2)
+    row = round((grid.north_m - en_m[1]) / gsd_m - whole / 2)
+    grey, valid = read(row, col, whole)
     if valid[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX].mean() < MIN_VALID:
         return None
     if not valid.all():
         grey = np.where(valid, grey, np.uint8(grey[valid].mean()))
-    east = grid.west_m + (col + whole / 2) * unit_m
-    north = grid.north_m - (row + whole / 2) * unit_m
+    east = grid.west_m + (col + whole / 2) * gsd_m
+    north = grid.north_m - (row + whole / 2) * gsd_m
     return grey, valid, np.array([east, north])
 
 
@@ -140,47 +106,6 @@ def mirrored_donor(rng: np.random.Generator, layer: GreyPyramid, size: int, leve
     return np.ascontiguousarray(grey[:, ::-1])
 
 
-class OrthoPyramid:
-    """Grey levels of an orthophoto in the plane and at the resolutions of a map's sheet. Not safe
-    to share between threads."""
-
-    def __init__(self, path: Path, sheet: SheetInfo, levels: int) -> None:
-        self.levels = levels
-        self._sheet, self._mosaic = sheet, Mosaic.open([path])
-        self._opened: dict[int, SheetRaster] = {}
-        self._stack = ExitStack()
-
-    def close(self) -> None:
-        self._stack.close()
-        self._opened.clear()
-
-    def shape(self, level: int) -> tuple[int, int]:
-        return level_shape(self._sheet.grid.height_px, self._sheet.grid.width_px, level)
-
-    def read(
-        self, level: int, row: int, col: int, height: int, width: int
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Grey and valid (height, width) of a window, which may reach beyond the sheet."""
-        pixels = self._raster(level).read_grey(col, row, width, height)
-        return pixels.grey, pixels.valid
-
-    def _raster(self, level: int) -> SheetRaster:
-        if level not in self._opened:
-            grid = self._sheet.grid
-            rows, cols = self.shape(level)
-            raster = self._mosaic.sheet(
-                self._sheet.frame,
-                west_m=grid.west_m,
-                north_m=grid.north_m,
-                width_px=cols,
-                height_px=rows,
-                gsd_m=grid.gsd_m * 2**level,
-                threads=1,  # trials run in several processes
-            )
-            self._opened[level] = self._stack.enter_context(raster)
-        return self._opened[level]
-
-
 def require_overlap(path: Path, sheet: SheetInfo) -> None:
     lat_lon = Mosaic.open([path]).outline_latlon_deg
     points = sheet.frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
@@ -190,14 +115,21 @@ def require_overlap(path: Path, sheet: SheetInfo) -> None:
         raise AreaError(f"the orthophoto of the other date does not overlap the map: {path}")
 
 
-def view_of(rng: np.random.Generator, plan: TrialPlan, picture: Grey, gsd_m: float) -> View:
+def view_of(
+    rng: np.random.Generator,
+    request: CheckRequest,
+    conditions: Conditions,
+    picture: Grey,
+    gsd_m: float,
+) -> View:
+    """A view from the middle of a picture (S, S), with errors of its telemetry."""
     size = picture.shape[0]
-    width = max(8, round(plan.width_m / gsd_m))
-    height = max(8, round(plan.height_m / gsd_m))
+    width = max(8, round(conditions.width_m / gsd_m))
+    height = max(8, round(conditions.height_m / gsd_m))
     yaw_deg = float(rng.uniform(0, 360))
     linear = rotation(math.radians(yaw_deg))
     move = np.full(2, (size - 1) / 2) - linear @ [(width - 1) / 2, (height - 1) / 2]
-    camera_gsd_m = plan.request.camera.gsd_m(plan.agl_m)
+    camera_gsd_m = request.camera.gsd_m(conditions.agl_m)
     if camera_gsd_m > gsd_m:
         blur_px = 0.5 * camera_gsd_m / gsd_m
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur_px), np.uint8)
@@ -208,26 +140,21 @@ def view_of(rng: np.random.Generator, plan: TrialPlan, picture: Grey, gsd_m: flo
         flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REFLECT,
     )
-    focal = plan.agl_m / gsd_m
+    focal = conditions.agl_m / gsd_m
     camera = Camera(width, height, focal, focal, width / 2, height / 2)
-    return View(np.asarray(view, dtype=np.uint8), camera, _telemetry(rng, plan, yaw_deg))
-
-
-def _telemetry(rng: np.random.Generator, plan: TrialPlan, yaw_deg: float) -> Telemetry:
-    yaw_error_deg = plan.yaw_off_deg if rng.random() < 0.5 else -plan.yaw_off_deg
-    if plan.request.yaw_std_deg is not None:
-        yaw_error_deg += float(rng.normal(0, plan.request.yaw_std_deg))
-    agl_m = plan.agl_m * max(0.5, 1 + plan.agl_off + float(rng.normal(0, plan.request.agl_std)))
-    return Telemetry(
+    yaw_error_deg = float(rng.normal(0, conditions.yaw_std_deg or 0.0))
+    agl_m = conditions.agl_m * max(0.5, 1 + float(rng.normal(0, conditions.agl_std)))
+    telemetry = Telemetry(
         time_ns=0,
         yaw_deg=yaw_deg + yaw_error_deg,
         pitch_deg=0.0,
         roll_deg=0.0,
         agl_m=agl_m,
-        yaw_std_deg=plan.request.yaw_std_deg,
-        agl_std_m=plan.request.agl_std * agl_m,
-        tilt_std_deg=plan.request.tilt_std_deg,
+        yaw_std_deg=conditions.yaw_std_deg,
+        agl_std_m=conditions.agl_std * agl_m,
+        tilt_std_deg=conditions.tilt_std_deg,
     )
+    return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
 
 
 AT_ONCE = 8
@@ -235,9 +162,6 @@ AT_ONCE = 8
 RELIEF_CELL_M = 15.0
 """Distance over which the height of objects changes: a house or a group of trees."""
 NOWHERE = (math.nan, math.nan)
-
-Work = tuple[TrialPlan, NDArray[np.float64]]
-"""A plan and the places (N, 2) of its trials, metres in the plane of the map's sheet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,44 +186,49 @@ class Trial:
     rival_share: float = math.nan
 
 
-def run_many(
-    work: Sequence[Work], workers: int, progress: Callable[[float], None] = lambda share: None
-) -> list[list[Trial]]:
-    """Trials of several plans of one map, in the order of their places; those off it are left out.
+def run_trials(
+    request: CheckRequest,
+    conditions: Conditions,
+    places_en_m: Points,
+    workers: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[list[Trial], list[Trial]]:
+    """Trials at places (N, 2) in the plane of the map's sheet, in their order: of the map's own
+    imagery with simulated ageing, and of the second date, if any. Places off the map are left out.
 
     `progress` is called with 0..1. The result does not depend on the number of `workers`
     (processes). Raises `WorkerError` where one of them ends unexpectedly.
     """
     jobs = [
-        (number, index, float(east), float(north))
-        for number, (_, places) in enumerate(work)
-        for index, (east, north) in enumerate(places)
+        (second_date, index, float(east), float(north))
+        for second_date in ((False,) if request.other_date is None else (False, True))
+        for index, (east, north) in enumerate(places_en_m)
     ]
-    plans = [plan for plan, _ in work]
-    found: list[list[Trial]] = [[] for _ in work]
-    for done, (number, trial) in enumerate(_run_jobs(plans, jobs, workers)):
-        if trial is not None:
-            found[number].append(trial)
-        progress((done + 1) / len(jobs))
-    return found
+    own: list[Trial] = []
+    other: list[Trial] = []
+    with closing(_run_jobs(request, conditions, jobs, workers)) as outcomes:
+        for done, (job, trial) in enumerate(zip(jobs, outcomes, strict=True)):
+            if trial is not None:
+                (other if job[0] else own).append(trial)
+            progress((done + 1) / len(jobs))
+    return own, other
 
 
-_Job = tuple[int, int, float, float]
-_Outcome = tuple[int, Trial | None]
+_Job = tuple[bool, int, float, float]
+"""Whether it is of the second date, its number, and its place."""
 
 
-def _run_jobs(plans: list[TrialPlan], jobs: list[_Job], workers: int) -> Iterator[_Outcome]:
+def _run_jobs(
+    request: CheckRequest, conditions: Conditions, jobs: list[_Job], workers: int
+) -> Generator[Trial | None, None, None]:
     if workers <= 1 or len(jobs) < 4 * AT_ONCE:
-        trier = Trier(plans)
-        try:
+        with closing(Trier(request, conditions)) as trier:
             yield from map(trier, jobs)
-        finally:
-            trier.close()
         return
     context = get_context("spawn")  # forking a process with threads is not safe
     workers = min(workers, -(-len(jobs) // AT_ONCE))
     stop = context.Event()
-    with ProcessPoolExecutor(workers, context, _start_worker, (plans, stop)) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (request, conditions, stop)) as pool:
         try:
             yield from _submit(pool, jobs)
         except BrokenProcessPool as error:
@@ -312,7 +241,7 @@ def _run_jobs(plans: list[TrialPlan], jobs: list[_Job], workers: int) -> Iterato
             pool.shutdown(cancel_futures=True)
 
 
-def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[_Outcome]:
+def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[Trial | None]:
     """Outcomes in the order of the jobs. Ctrl-C is blocked while workers start, which inherit that:
     only the parent handles it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -326,9 +255,9 @@ _stop: Event
 _trier: "Trier"
 
 
-def _start_worker(plans: list[TrialPlan], stop: Event) -> None:
+def _start_worker(request: CheckRequest, conditions: Conditions, stop: Event) -> None:
     global _stop, _trier
-    _stop, _trier = stop, Trier(plans)
+    _stop, _trier = stop, Trier(request, conditions)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
@@ -341,8 +270,8 @@ def _exit_with_parent() -> None:
         os._exit(1)
 
 
-def _work(job: _Job) -> _Outcome:
-    return (job[0], None) if _stop.is_set() else _trier(job)
+def _work(job: _Job) -> Trial | None:
+    return None if _stop.is_set() else _trier(job)
 
 
 def registration_of(opened: MapFile) -> RegistrationLocalizer:
@@ -356,90 +285,106 @@ class Trier:
     """Runs trials. Files are opened by the first one, so that errors of a worker reach its
     parent."""
 
-    def __init__(self, plans: Sequence[TrialPlan]) -> None:
-        self._plans = plans
+    def __init__(self, request: CheckRequest, conditions: Conditions) -> None:
+        self._request, self._conditions = request, conditions
         self._files = ExitStack()
 
     def close(self) -> None:
         self._files.close()
 
-    def __call__(self, job: _Job) -> _Outcome:
-        number, index, east, north = job
-        plan = self._plans[number]
-        rng = np.random.default_rng([plan.request.seed + plan.second_date, index])
-        return number, self._trial(rng, plan, np.array([east, north]))
+    def __call__(self, job: _Job) -> Trial | None:
+        second_date, index, east, north = job
+        rng = np.random.default_rng([self._request.seed + second_date, index])
+        return self._trial(rng, second_date, np.array([east, north]))
 
     @cached_property
     def _registration(self) -> RegistrationLocalizer:
-        return registration_of(open_map(self._plans[0].request.map_path))
+        return registration_of(open_map(self._request.map_path))
 
     @cached_property
-    def _other(self) -> OrthoPyramid:
-        path, registration = self._plans[0].request.other_date, self._registration
-        assert path is not None
-        other = OrthoPyramid(path, registration.sheet, registration.pyramid.levels)
-        return self._files.enter_context(closing(other))
+    def _final_level(self) -> int:
+        registration = self._registration
+        side_px = self._conditions.side_m / registration.grid.gsd_m
+        return Levels.of(side_px, registration.pyramid.levels).final
 
-    def _trial(
-        self, rng: np.random.Generator, plan: TrialPlan, en_m: NDArray[np.float64]
-    ) -> Trial | None:
-        registration, request = self._registration, plan.request
-        grid = registration.grid
-        # One level finer than the final one, where ambiguous views are registered too.
-        final = Levels.of(plan.side_m / grid.gsd_m, registration.pyramid.levels).final
-        level = max(final - 1, 0)
-        gsd_m = grid.gsd_m * 2**level
-        size = math.ceil(math.hypot(plan.width_m, plan.height_m) / gsd_m) + 4
-        layer = self._other if plan.second_date else registration.pyramid
-        crop = crop_around(layer, grid, en_m, size, level)
+    @property
+    def _level(self) -> int:
+        """One level finer than the final one, where ambiguous views are registered too."""
+        return max(self._final_level - 1, 0)
+
+    @cached_property
+    def _other(self) -> SheetRaster:
+        """The second date in the plane of the sheet, at the resolution of the level."""
+        grid, path = self._registration.grid, self._request.other_date
+        assert path is not None
+        rows, cols = level_shape(grid.height_px, grid.width_px, self._level)
+        raster = Mosaic.open([path]).sheet(
+            self._registration.sheet.frame,
+            west_m=grid.west_m,
+            north_m=grid.north_m,
+            width_px=cols,
+            height_px=rows,
+            gsd_m=grid.gsd_m * 2**self._level,
+            threads=1,  # trials run in several processes
+        )
+        return self._files.enter_context(raster)
+
+    def _read_own(self, row: int, col: int, side: int) -> tuple[Grey, NDArray[np.bool_]]:
+        return self._registration.pyramid.read(self._level, row, col, side, side)
+
+    def _read_other(self, row: int, col: int, side: int) -> tuple[Grey, NDArray[np.bool_]]:
+        pixels = self._other.read_grey(col, row, side, side)
+        return pixels.grey, pixels.valid
+
+    def _trial(self, rng: np.random.Generator, second_date: bool, en_m: Points) -> Trial | None:
+        registration, request, conditions = self._registration, self._request, self._conditions
+        level = self._level
+        gsd_m = registration.grid.gsd_m * 2**level
+        size = math.ceil(math.hypot(conditions.width_m, conditions.height_m) / gsd_m) + 4
+        read = self._read_other if second_date else self._read_own
+        crop = crop_around(read, registration.grid, en_m, size, gsd_m)
         if crop is None:
             return None
         grey, valid, place = crop
         donor = mirrored_donor(rng, registration.pyramid, size, level)
         inner = np.s_[MARGIN_PX : MARGIN_PX + size, MARGIN_PX : MARGIN_PX + size]
         lasting = valid[inner]
-        if request.changes is not None and not plan.second_date:
+        if request.changes is not None and not second_date:
             steps = (np.arange(size) + 0.5 - size / 2) * gsd_m
             points = np.stack(np.meshgrid(steps, -steps), axis=-1) + place
             lasting = lasting & ~request.changes.covers(points, registration.sheet.frame)
         picture = np.where(lasting, grey[inner], donor)
         expected = math.nan
-        if not plan.second_date:
-            maps = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
+        if not second_date:
+            maps = [
+                each[inner] for each in reported_persistence(grey, gsd_m, self._final_level - level)
+            ]
             expected = float(np.mean([each.mean() for each in maps[:2]]))
             picture = another_year(rng, picture, donor, maps)
         if request.relief_m > 0:
-            rim_px = request.relief_m * size / 2 / plan.agl_m
+            rim_px = request.relief_m * size / 2 / conditions.agl_m
             picture = displaced(rng, picture, rim_px, RELIEF_CELL_M / gsd_m)
-        view = view_of(rng, plan, picture, gsd_m)
-        return self._placed(rng, plan, place, view, expected)
+        view = view_of(rng, request, conditions, picture, gsd_m)
+        return self._placed(rng, place, view, expected)
 
     def _placed(
-        self,
-        rng: np.random.Generator,
-        plan: TrialPlan,
-        place_en_m: NDArray[np.float64],
-        view: View,
-        expected: float,
+        self, rng: np.random.Generator, place_en_m: Points, view: View, expected: float
     ) -> Trial:
-        registration = self._registration
+        registration, conditions = self._registration, self._conditions
         here = (float(place_en_m[0]), float(place_en_m[1]))
         prior = None
-        if plan.request.prior_std_m is not None:
-            at = place_en_m + rng.normal(0, plan.request.prior_std_m, 2)
+        if conditions.prior_std_m is not None:
+            at = place_en_m + rng.normal(0, conditions.prior_std_m, 2)
             lat, lon = registration.sheet.frame.latlon_from_en(at)
-            prior = Prior(float(lat), float(lon), plan.request.prior_std_m)
-        search = registration.search(view, prior, plan.request.yaw_std_deg is not None)
+            prior = Prior(float(lat), float(lon), conditions.prior_std_m)
+        search = registration.search(view, prior, conditions.yaw_std_deg is not None)
         best = search if isinstance(search, NoFix) else search.run()
         if isinstance(search, NoFix) or isinstance(best, NoFix):
             return Trial(here, math.nan, 0.0, expected)
         fix = fix_of(search, best)
         found = registration.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-        rivals = [
-            each
-            for each in best.rivals
-            if each.apart_px(best) * registration.grid.gsd_m > plan.side_m / 4
-        ]
+        far_px = conditions.side_m / 4 / registration.grid.gsd_m
+        rivals = [each for each in best.rivals if each.apart_px(best) > far_px]
         rival, share = NOWHERE, math.nan
         if rivals:
             strongest = max(rivals, key=lambda each: each.score)
@@ -447,7 +392,7 @@ class Trier:
             rival, share = (float(east), float(north)), strongest.score / max(best.score, 1e-6)
         error_m = float(np.hypot(*(found - place_en_m)))
         confidence = fix.confidence if math.isfinite(fix.confidence) else 0.0
-        accepted, near = confidence >= plan.request.accept, error_m <= fix.radius_m
+        accepted, near = confidence >= conditions.accept, error_m <= fix.radius_m
         return Trial(
             en_m=here,
             error_m=error_m,

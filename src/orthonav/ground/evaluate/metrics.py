@@ -1,8 +1,7 @@
 """Metrics of the fixes of a flight. Arrays and records only: no files, no plots.
 
 Names follow the paper (arXiv 2404.06207): accuracy at a radius (`acc_at_15m`), confidence
-criterion, Lowe's ratio. A share is 0 to 1, and NaN where it is not defined. Confidence and
-covariance are checked in `calibration`, standard figures of the field are in `figures`.
+criterion, Lowe's ratio. A share is 0 to 1, and NaN where it is not defined.
 """
 
 import logging
@@ -24,18 +23,15 @@ from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, ViewResult
-from orthonav.ground.evaluate.calibration import (
+from orthonav.ground.evaluate.statistics import (
+    BoolArray,
     ConfidenceCalibration,
     CovarianceConsistency,
-    calibrate,
-    check_covariance,
-)
-from orthonav.ground.evaluate.figures import (
-    RPE_DISTANCE_M,
-    BoolArray,
     FloatArray,
     Longest,
     StandardFigures,
+    calibrate,
+    check_covariance,
     frozen,
     longest,
     path_so_far_m,
@@ -58,7 +54,6 @@ RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
 CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
         "lowe_ratio": (1.13,),  # best tile against second best, threshold of the paper
-        "peak_ratio": (1.05, 1.13, 1.3),  # best peak against the best elsewhere on the map
         "confidence": (0.5, 0.9, 0.99),
     }
 )
@@ -115,8 +110,9 @@ class Comparison:
 class CriterionRow:
     """What one threshold of a criterion accepts, NaN where undefined.
 
-    `share_accepted`: of all views; `accuracy`: right ones among the accepted; `recall`: accepted
-    ones among all right fixes; `n_far`, `share_far`: accepted views wrong by more than `far_m`.
+    `share_accepted`: of all views; `accuracy`: right ones among the accepted;
+    `share_of_right_accepted`: recall, accepted ones among all right fixes; `n_wrong_by_35m`,
+    `wrong_by_35m`: accepted views wrong by more than `FAR_M`, their number and fraction.
     """
 
     name: str
@@ -125,20 +121,9 @@ class CriterionRow:
     accuracy: float
     n_accepted: int
     n_right: int
-    recall: float
-    far_m: float
-    n_far: int
-    share_far: float
-
-
-@dataclass(frozen=True, eq=False)
-class CriterionCurve:
-    """The same over all thresholds (K,), from the strictest to the one that accepts every fix."""
-
-    name: str
-    thresholds: FloatArray
-    share_accepted: FloatArray
-    accuracy: FloatArray
+    share_of_right_accepted: float
+    n_wrong_by_35m: int
+    wrong_by_35m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +138,6 @@ class Metrics:
     `coverage`: fraction of the true positions with a fix, low confidence included.
     `gap`: the longest stretch without a confident fix, of one flight.
     `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
-    `accuracy_of_confident`: fraction of the confident fixes within `radius_m`.
     `reasons`: number of views without a fix by reason.
     `standard`, `of_confident`: errors of all and of confident fixes.
     """
@@ -173,12 +157,10 @@ class Metrics:
     gap: Longest
     acc_at_m: Mapping[float, float]
     acc_fixes_at_m: Mapping[float, float]
-    accuracy_of_confident: float
     latency_median_ms: float
     latency_p95_ms: float
     reasons: Mapping[str, int]
     criteria: tuple[CriterionRow, ...]
-    curves: tuple[CriterionCurve, ...]
     calibration: ConfidenceCalibration
     consistency: CovarianceConsistency
     standard: StandardFigures
@@ -197,10 +179,6 @@ class Metrics:
 
 def radius_key(radius_m: float) -> str:
     return f"acc_at_{radius_m:g}m"
-
-
-def wrong_key(far_m: float) -> str:
-    return f"wrong_by_{far_m:g}m"
 
 
 def evaluate(fixes: Path | str, truth: Path | str, radius_m: float = 15.0) -> Metrics:
@@ -331,33 +309,27 @@ def _joined(values: list[Any]) -> Any:
     return sum(values, start=type(values[0])())
 
 
-def measure(
-    comparison: Comparison,
-    radius_m: float = 15.0,
-    radii_m: Sequence[float] = RADII_M,
-    far_m: float = FAR_M,
-    rpe_distance_m: float = RPE_DISTANCE_M,
-) -> Metrics:
-    """All metrics of `comparison`; `radius_m` defines right fixes and joins `radii_m`.
+def measure(comparison: Comparison, radius_m: float = 15.0) -> Metrics:
+    """All metrics of `comparison`; `radius_m` defines right fixes and joins `RADII_M`.
 
-    `rpe_distance_m` is the distance of the relative pose error. Raises `ValueError` for a radius
-    that is not a positive finite number, and for a confidence that is not 0 to 1.
+    Raises `ValueError` for a radius that is not a positive finite number, and for a confidence that
+    is not 0 to 1.
     """
-    radii = sorted({float(r) for r in (*radii_m, radius_m)})
-    if not all(0.0 < radius < math.inf for radius in (*radii, far_m)):
-        raise ValueError(f"a radius must be positive and finite, got {[*radii, far_m]} (metres)")
+    if not 0.0 < radius_m < math.inf:
+        raise ValueError(f"a radius must be positive and finite, got {radius_m} m")
+    radii = sorted({float(radius_m), *RADII_M})
     errors_m, own_radius_m = comparison.errors_m, comparison.own_radius_m
     errors_en_m = comparison.fix_en_m - comparison.truth_en_m
     of_fixes_m = errors_m[np.isfinite(errors_m)]
     of_confident_m = errors_m[comparison.confident & np.isfinite(errors_m)]
     n_confident = of_confident_m.size
-    wrong_above_m, n_views = float(max(far_m, radius_m)), comparison.n_views
+    wrong_above_m, n_views = float(max(FAR_M, radius_m)), comparison.n_views
     n_wrong = int(np.count_nonzero(comparison.confident_wrong(wrong_above_m)))
     reasons = Counter(reason for reason in comparison.reasons if reason)
     if comparison.n_without_result:
         reasons[NO_RESULT] += comparison.n_without_result
     standard, of_confident = (
-        standard_figures(comparison.truth_en_m, fix_en_m, comparison.starts, rpe_distance_m)
+        standard_figures(comparison.truth_en_m, fix_en_m, comparison.starts)
         for fix_en_m in (
             comparison.fix_en_m,
             np.where(comparison.confident[:, None], comparison.fix_en_m, np.nan),
@@ -379,16 +351,14 @@ def measure(
         gap=_longest_gap(comparison),
         acc_at_m={r: share_of(of_fixes_m <= r, n_views) for r in radii},
         acc_fixes_at_m={r: share_of(of_fixes_m <= r) for r in radii},
-        accuracy_of_confident=share_of(of_confident_m <= radius_m),
         latency_median_ms=percentile(comparison.latency_ms, 50.0),
         latency_p95_ms=percentile(comparison.latency_ms, 95.0),
         reasons=dict(reasons.most_common()),
         criteria=tuple(
-            _criterion_row(comparison, name, threshold, radius_m, far_m)
+            _criterion_row(comparison, name, threshold, radius_m)
             for name, thresholds in CRITERIA.items()
             for threshold in thresholds
         ),
-        curves=tuple(criterion_curve(comparison, name, radius_m) for name in CRITERIA),
         calibration=calibrate(
             comparison.criteria["confidence"], errors_m, own_radius_m, float(radius_m)
         ),
@@ -400,27 +370,6 @@ def measure(
     )
 
 
-def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> CriterionCurve:
-    """Share accepted and accuracy at every value that the criterion takes.
-
-    Views of equal value are accepted together. Empty where no view has the criterion.
-    """
-    values = comparison.criteria[name]
-    known = ~np.isnan(values)
-    order = np.argsort(-values[known], kind="stable")
-    ordered = values[known][order]
-    n_right = np.cumsum(comparison.errors_m[known][order] <= radius_m)
-    last = np.ones(ordered.size, dtype=bool)
-    last[:-1] = ordered[1:] != ordered[:-1]
-    n_accepted = np.flatnonzero(last) + 1
-    return CriterionCurve(
-        name=name,
-        thresholds=frozen(ordered[last]),
-        share_accepted=frozen(n_accepted / max(comparison.n_views, 1)),
-        accuracy=frozen(n_right[last] / n_accepted),
-    )
-
-
 def worst_views(comparison: Comparison, n: int = 10, wrong_above_m: float = FAR_M) -> list[int]:
     fixes = np.flatnonzero(np.isfinite(comparison.errors_m))
     wrong = comparison.confident_wrong(wrong_above_m)
@@ -429,14 +378,14 @@ def worst_views(comparison: Comparison, n: int = 10, wrong_above_m: float = FAR_
 
 
 def _criterion_row(
-    comparison: Comparison, name: str, threshold: float, radius_m: float, far_m: float
+    comparison: Comparison, name: str, threshold: float, radius_m: float
 ) -> CriterionRow:
     values, errors_m = comparison.criteria[name], comparison.errors_m
     known = bool(np.any(~np.isnan(values)))
     accepted = values >= threshold  # NaN is never accepted
     n_accepted = int(np.count_nonzero(accepted))
     n_right = int(np.count_nonzero(errors_m[accepted] <= radius_m))
-    n_far = int(np.count_nonzero(errors_m[accepted] > far_m))
+    n_far = int(np.count_nonzero(errors_m[accepted] > FAR_M))
     n_all_right = int(np.count_nonzero(errors_m <= radius_m))
     return CriterionRow(
         name=name,
@@ -445,10 +394,9 @@ def _criterion_row(
         accuracy=share(n_right, n_accepted),
         n_accepted=n_accepted,
         n_right=n_right,
-        recall=share(n_right, n_all_right) if known else math.nan,
-        far_m=float(far_m),
-        n_far=n_far,
-        share_far=share(n_far, n_accepted),
+        share_of_right_accepted=share(n_right, n_all_right) if known else math.nan,
+        n_wrong_by_35m=n_far,
+        wrong_by_35m=share(n_far, n_accepted),
     )
 
 

@@ -1,25 +1,33 @@
-"""The evaluation of flights as one self-contained page, and its figures as files."""
+"""The evaluation of flights as one self-contained page, and its figures as files.
+
+Colour shows confidence and the mark shows the error; false fixes stand out by both. States of a
+track differ in colour and in mark.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from orthonav.ground.evaluate import plots
-from orthonav.ground.evaluate.contact_sheet import row_text, sheet_picture
-from orthonav.ground.evaluate.figures import share
-from orthonav.ground.evaluate.metrics import Comparison, Metrics, pool, worst_views
+import numpy as np
+
+from orthonav.ground.evaluate.metrics import FAR_M, Comparison, Metrics, worst_views
+from orthonav.ground.evaluate.statistics import (
+    BoolArray,
+    ConfidenceCalibration,
+    FloatArray,
+    runs,
+    seconds_since_first,
+)
 from orthonav.ground.evaluate.tables import (
     STANDARD_HEADER,
     FlightReport,
-    bins_rows,
     confidence_text,
-    covariance_card,
     covariance_text,
     criteria_header,
     criteria_rows,
     gnss_rows,
-    levels_rows,
+    percentiles_text,
     standard_rows,
     table_header,
     table_rows,
@@ -28,10 +36,40 @@ from orthonav.ground.evaluate.tables import (
     verdict,
     wrong_bound_text,
 )
-from orthonav.ground.report.numbers import measure_text, percent_text, plain_text
+from orthonav.ground.evaluate.track import GnssMetrics, TrackMetrics
+from orthonav.ground.report import measure_text, percent_text, plain_text
+from orthonav.ground.report.drawing import (
+    BACKING,
+    GREY,
+    LEGEND_ABOVE,
+    LOW_CONFIDENCE,
+    OFFSET,
+    RIGHT,
+    SOFT,
+    TRUTH,
+    WRONG,
+    Background,
+    Drawing,
+    draw_axes,
+    draw_figure,
+    draw_map,
+    map_size_in,
+)
 from orthonav.ground.report.page import Figure, file_names, render, write_page
 
+if TYPE_CHECKING:
+    from matplotlib import figure as mpl
+    from matplotlib.axes import Axes
+
+STATE_STYLES = {
+    "searching": (LOW_CONFIDENCE, "^"),
+    "tracking": (RIGHT, "o"),
+    "coasting": ("#56B4E9", "s"),
+    "lost": ("#B8558F", "X"),
+}
 _N_WORST = 10
+_SIDE: dict[str, Any] = {"fontsize": 9, "color": "#777777", "style": "italic"}
+_NO_FIX_SHADE = "#EFE6C8"
 
 
 @dataclass(frozen=True)
@@ -42,23 +80,6 @@ class MadeFrom:
     flight: str = ""
     command: str = ""
     version: str = ""
-
-
-class _Drawn(NamedTuple):
-    general: tuple[Figure, ...]
-    track: tuple[Figure, ...] = ()
-    worst: tuple[Figure, ...] = ()
-
-    def named(self, name: str, file_name: str) -> "_Drawn":
-        """With the flight's name in texts and, if given, in file names, set off by two dashes,
-        which neither `file_names` nor the names of figures contain."""
-        start = f"{file_name}--" if file_name else ""
-        return _Drawn(
-            *(
-                tuple(replace(f, name=f"{start}{f.name}", alt=f"{name}: {f.alt}") for f in figures)
-                for figures in self
-            )
-        )
 
 
 def write_report(
@@ -74,12 +95,10 @@ def write_report(
     """
     whole = whole or total(flights)
     several = len(flights) > 1
-    drawn = [_drawn(flight) for flight in flights]
-    if several:
-        drawn.append(_Drawn(_figures(pool([flight.comparison for flight in flights]), whole)))
-    names = [*(flight.name for flight in flights), "all flights"]
-    files = file_names(names) if several else [""]
-    drawn = [each.named(*named) for each, *named in zip(drawn, names, files, strict=False)]
+    prefixes = [""]
+    if several:  # two dashes, which neither `file_names` nor the names of figures contain
+        prefixes = [f"{name}--" for name in file_names([flight.name for flight in flights])]
+    sections = [_section(*each) for each in zip(flights, prefixes, strict=True)]
     subject = f"{len(flights)} flights" if several else flights[0].name
     values: dict[str, Any] = {
         "title": f"Evaluation of {subject}",
@@ -87,25 +106,21 @@ def write_report(
         "verdict": verdict(whole),
         "verdict_kind": "bad" if whole.n_confident_wrong else "good" if whole.n_confident else "",
         "cards": _cards(whole),
-        "compared": _compared(whole),
         "notes": _notes(whole),
         "radius": f"{whole.radius_m:g} m",
         "wrong_above": f"{whole.wrong_above_m:g} m",
         "table_header": table_header(whole),
         "table_rows": table_rows(flights, whole),
-        "sections": [_section(*each) for each in zip(flights, drawn, strict=False)],
-        "total_section": None,
+        "standard_header": STANDARD_HEADER,
+        "criteria_header": criteria_header(whole),
+        "sections": sections,
         "made_from": [
             ("orthonav" if name == "version" else name.removesuffix("_name"), text)
             for name, text in vars(made_from or MadeFrom()).items()
         ],
     }
-    if several:
-        figures = {"name": "all flights", "figures": drawn[-1].general}
-        values["total_section"] = {**figures, **_trust(whole)}
     page = render("orthonav.ground.evaluate", "report.html", values)
-    shown = [figure for each in drawn for figures in each for figure in figures]
-    return write_page(out_dir, page, shown)
+    return write_page(out_dir, page, [each for section in sections for each in section["figures"]])
 
 
 def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
@@ -131,30 +146,15 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
             measure_text(of_confident.cep95_m, " m"),
             f"CEP95 of confident fixes; {measure_text(of_all.cep95_m, ' m')} of all fixes",
         ),
-        covariance_card(metrics.consistency),
+        (
+            plain_text(metrics.consistency.nees_mean),
+            "NEES, mean of correct fixes: 2 expected, more where covariances are too small",
+        ),
         (
             measure_text(metrics.gap.seconds_s, " s"),
             f"longest gap without a confident fix, {measure_text(metrics.gap.path_m, ' m')}",
         ),
     )
-
-
-def _compared(metrics: Metrics) -> list[tuple[str, ...]]:
-    kinds = (
-        ("confident fixes", metrics.accuracy_of_confident, metrics.of_confident),
-        ("all fixes", metrics.accuracy_of_fixes, metrics.standard),
-    )
-    return [
-        (
-            name,
-            str(figures.ape.n),
-            percent_text(share(figures.ape.n, metrics.n_views)),
-            percent_text(within),
-            *map(measure_text, (figures.cep50_m, figures.cep95_m)),
-            *map(measure_text, (figures.ape.rmse_m, figures.ape.max_m)),
-        )
-        for name, within, figures in kinds
-    ]
 
 
 def _notes(metrics: Metrics) -> list[str]:
@@ -170,38 +170,25 @@ def _notes(metrics: Metrics) -> list[str]:
     return notes
 
 
-def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
+def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
+    metrics, figures = flight.metrics, _figures(flight)
     return {
         "name": flight.name,
         "view_command": flight.view_command,
-        "figures": drawn.general,
+        "figures": [
+            Figure(f"{prefix}{name}", f"{flight.name}: {alt}", caption, drawing)
+            for name, alt, caption, drawing in figures
+        ],
         "track": (
             *(track_rows(flight.track) if flight.track else ()),
             *(gnss_rows(flight.gnss) if flight.gnss else ()),
         ),
-        "track_figures": drawn.track,
-        "worst": _worst(flight.comparison, flight.metrics),
-        "worst_figures": drawn.worst,
-        "reasons": [(reason, str(count)) for reason, count in flight.metrics.reasons.items()],
-        **_trust(flight.metrics),
-    }
-
-
-def _trust(metrics: Metrics) -> dict[str, Any]:
-    return {
-        "standard_header": STANDARD_HEADER,
+        "worst": _worst(flight.comparison, metrics),
+        "reasons": [(reason, str(count)) for reason, count in metrics.reasons.items()],
         "standard": standard_rows(metrics),
-        "standard_more": [
-            ("ECE", plain_text(metrics.calibration.ece)),
-            ("NEES (mean, 2 expected)", plain_text(metrics.consistency.nees_mean)),
-            ("definitions", "APE and RPE as evo defines them: horizontal, not aligned, fixes only"),
-        ],
-        "criteria_header": criteria_header(metrics),
         "criteria": criteria_rows(metrics),
         "confidence": confidence_text(metrics),
-        "bins": bins_rows(metrics),
         "covariance": covariance_text(metrics.consistency),
-        "levels": levels_rows(metrics.consistency),
     }
 
 
@@ -219,72 +206,234 @@ def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
                 f"{east_m:+.1f}",
                 f"{north_m:+.1f}",
                 confidence + ("" if comparison.confident[i] else ", low confidence"),
-                plain_text(comparison.criteria["peak_ratio"][i]),
             )
         )
     return rows
 
 
-def _drawn(flight: FlightReport) -> _Drawn:
-    comparison, metrics, track = flight.comparison, flight.metrics, flight.track
-    radius_m, background = metrics.radius_m, flight.background
-    general = (
-        Figure(
+def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
+    """Name, description, caption and drawing of each figure of a flight."""
+    comparison, metrics, radius_m = flight.comparison, flight.metrics, flight.metrics.radius_m
+    bounds = " Shaded below: 1 sigma and the 95 % bound that the covariance states."
+    figures = [
+        (
             "map",
             f"Map of {metrics.n_views} true positions, {metrics.n_confident} confident fixes and "
             f"{metrics.n_fixes - metrics.n_confident} best guesses",
             "Map, north up: each fix is joined to its true position.",
-            plots.map_picture(comparison, radius_m, background),
+            map_picture(comparison, radius_m, flight.track, flight.background),
         ),
-        Figure(
+        (
             "error-over-time",
             f"Error of each view over time; {percent_text(metrics.coverage)} have a fix",
-            "Error over time, confident and of low confidence; shaded where there is no fix.",
-            plots.over_time_picture(comparison, radius_m),
+            "Error over time; shaded where there is no fix." + bounds * (flight.track is not None),
+            over_time_picture(comparison, radius_m, flight.track),
         ),
-        *_figures(comparison, metrics),
-    )
-    of_track = plots.track_figures(comparison, track, radius_m, background) if track else []
-    of_gnss = [plots.gnss_figure(flight.gnss)] if flight.gnss else []
-    if not flight.worst:
-        return _Drawn(general, (*of_track, *of_gnss))
-    caption = (
-        "The worst fixes, those in state tracking first: the view rectified with heading and "
-        "height of its fix, north up, beside the map at the same scale; + fix, ○ true position."
-    )
-    alt = "The worst views. " + "; ".join(map(row_text, flight.worst))
-    sheet = Figure("worst-views", alt, caption, sheet_picture(flight.worst))
-    return _Drawn(general, (*of_track, *of_gnss), (sheet,))
-
-
-def _figures(comparison: Comparison, metrics: Metrics) -> tuple[Figure, ...]:
-    return (
-        Figure(
-            "error-curve",
-            f"Error curve: {percent_text(metrics.accuracy)} of all views within "
-            f"{metrics.radius_m:g} m",
-            "Percentage of all views with a fix whose error is at most the value on the axis.",
-            plots.error_curve_picture(comparison, metrics),
-        ),
-        Figure(
-            "accepted-against-accuracy",
-            "Percentage of views accepted against accuracy among them, per confidence criterion",
-            "Percentage of views that a stricter criterion accepts, and percentage of these that "
-            "are correct, with thresholds; the ring marks a confidence of 0.9.",
-            plots.criteria_picture(metrics),
-        ),
-        Figure(
+        (
             "reliability",
             f"Reliability diagram of confidence: {confidence_text(metrics)}",
             "Fraction of correct fixes over their confidence, with 95 % intervals (Wilson); "
             "dashed: ideal; orange: the difference. Below: fixes per bin.",
-            plots.reliability_picture(metrics.calibration),
+            reliability_picture(metrics.calibration),
         ),
-        Figure(
-            "covariance",
-            f"Errors of correct fixes against covariance: {covariance_text(metrics.consistency)}",
-            "Errors of correct fixes in units of their covariance C; dashed: ideal; shaded: where "
-            "95 % of samples of this size stay.",
-            plots.nees_picture(metrics.consistency),
-        ),
+    ]
+    if flight.gnss:
+        figures.append(
+            (
+                "gnss",
+                f"GNSS: {percentiles_text(flight.gnss.errors_m)}; "
+                f"alarms: {len(flight.gnss.alarms)}",
+                "Errors of GNSS and of the map, and the distance between them; shaded while the "
+                "GNSS monitor reports a fault.",
+                gnss_picture(flight.gnss),
+            )
+        )
+    return figures
+
+
+def fix_classes(
+    comparison: Comparison, radius_m: float, track: TrackMetrics | None
+) -> list[tuple[str, BoolArray, str, str, float]]:
+    """Label, mask (N,), colour, mark and size of each kind of fix, the worst last."""
+    errors_m, confident = comparison.errors_m, comparison.confident
+    if track is not None:
+        wrong, states = track.series.wrong, np.array(track.series.states)
+        kinds: list[tuple[str, BoolArray, str, str, float]] = [
+            (state, (states == state) & np.isfinite(errors_m) & ~wrong, colour, mark, 4.5)
+            for state, (colour, mark) in STATE_STYLES.items()
+        ]
+    else:
+        wrong = comparison.confident_wrong(max(FAR_M, radius_m))
+        near, off = errors_m <= radius_m, errors_m > radius_m
+        beyond = f"off by more than {radius_m:g} m"
+        kinds = [
+            ("low confidence", near & ~confident, LOW_CONFIDENCE, "o", 4.5),
+            (f"low confidence, {beyond}", off & ~confident, LOW_CONFIDENCE, "x", 5.5),
+            ("confident", near & confident, RIGHT, "o", 5.0),
+            (f"confident, {beyond}", off & confident & ~wrong, RIGHT, "x", 5.5),
+        ]
+    kinds.append(("false fix", wrong, WRONG, "X", 7.5))
+    return [kind for kind in kinds if kind[1].any()]
+
+
+def map_picture(
+    comparison: Comparison,
+    radius_m: float,
+    track: TrackMetrics | None = None,
+    background: Background | None = None,
+) -> Drawing:
+    box = view_box(comparison, radius_m)
+    truth, fixes = comparison.truth_en_m, comparison.fix_en_m
+    none = np.isnan(comparison.errors_m)
+
+    def draw(axes: "Axes") -> None:
+        draw_map(axes, box, background)
+        if not none.all():
+            dots: dict[str, Any] = {"color": TRUTH, "markersize": 3, "label": "ground truth"}
+            axes.plot(*truth[~none].T, "." if track is None else ".-", **dots, zorder=7)
+        kinds = fix_classes(comparison, radius_m, track)
+        for order, (label, chosen, colour, mark, size) in enumerate(kinds):
+            lines = np.full((3 * int(chosen.sum()), 2), np.nan)  # as one, with gaps
+            lines[0::3], lines[1::3] = truth[chosen], fixes[chosen]
+            axes.plot(*lines.T, color=colour, linewidth=0.9, alpha=0.7, zorder=3)
+            outside = int((chosen & ~inside_box(fixes, box)).sum())
+            style: dict[str, Any] = {"color": colour, "markersize": size, "zorder": 5 + order / 10}
+            label += f" ({outside} outside)" if outside else ""
+            axes.plot(*fixes[chosen].T, mark, **style, label=label)
+        if none.any():
+            ring: dict[str, Any] = {"color": TRUTH, "markersize": 4.5, "markerfacecolor": "white"}
+            axes.plot(*truth[none].T, "o", **ring, zorder=4, label="ground truth, no fix")
+        axes.legend(ncols=3, **LEGEND_ABOVE)
+
+    return draw_axes(map_size_in(box, 7.5), draw)
+
+
+def view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, float, float]:
+    """West, east, south, north of the flight and of the fixes near it."""
+    truth, fixes = comparison.truth_en_m, comparison.fix_en_m
+    low, high = truth.min(axis=0), truth.max(axis=0)
+    reach = max(float((high - low).max()) * 0.35, 5 * radius_m)
+    near = inside_box(fixes, (low[0] - reach, high[0] + reach, low[1] - reach, high[1] + reach))
+    seen = np.concatenate([truth, fixes[near]])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    side = max(float((high - low).max()), 4 * radius_m)
+    middle = (low + high) / 2
+    half = np.maximum((high - low) / 2 + 0.06 * side, 0.3 * side)
+    west, south = (float(value) for value in middle - half)
+    east, north = (float(value) for value in middle + half)
+    return west, east, south, north
+
+
+def inside_box(positions_en_m: FloatArray, box: tuple[float, ...]) -> BoolArray:
+    east, north = positions_en_m.T
+    inside: BoolArray = (box[0] <= east) & (east <= box[1]) & (box[2] <= north) & (north <= box[3])
+    return inside
+
+
+def over_time_picture(
+    comparison: Comparison, radius_m: float, track: TrackMetrics | None = None
+) -> Drawing:
+    def draw(axes: "Axes") -> None:
+        errors_m = comparison.errors_m
+        x, name = _time_axis(seconds_since_first(comparison.time_ns))
+        half = max(float(np.median(np.diff(x))) / 2 if x.size > 1 else 0.5, 1e-3)
+        edges = np.concatenate([[x[0] - half], (x[1:] + x[:-1]) / 2, [x[-1] + half]])
+        shown_m = np.maximum(errors_m, 0.01)  # a log axis has no zero; NaN stays NaN
+        finite = shown_m[np.isfinite(shown_m)]
+        low = min([radius_m / 10, *finite]) / 1.5
+        high = max([radius_m * 10, *finite]) * 1.5
+        for i, (start, stop) in enumerate(runs(np.isnan(errors_m))):
+            label = "no fix" if i == 0 else "_nolegend_"
+            axes.axvspan(edges[start], edges[stop], color=_NO_FIX_SHADE, linewidth=0, label=label)
+        if track is not None:
+            for label, bound_m in (
+                ("95 % bound", track.series.bound_95_m),
+                ("1 sigma", track.series.sigma_m),
+            ):
+                axes.fill_between(x, low, bound_m, color=RIGHT, alpha=0.15, lw=0, label=label)
+        axes.plot(x, shown_m, color="#BBBBBB", linewidth=0.9, zorder=2)
+        for label, chosen, colour, mark, size in fix_classes(comparison, radius_m, track):
+            style: dict[str, Any] = {"color": colour, "markersize": size, "label": label}
+            axes.plot(x[chosen], shown_m[chosen], mark, **style, zorder=3)
+        axes.axhline(radius_m, color=SOFT, linewidth=1.2, label=f"{radius_m:g} m")
+        axes.set(yscale="log", ylim=(low, high), xlim=(edges[0], edges[-1]))
+        axes.set(xlabel=name, ylabel="error (m)")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("")
+        axes.legend(ncols=4, **LEGEND_ABOVE)
+
+    return draw_axes((10.5, 3.4), draw)
+
+
+def _time_axis(seconds_s: FloatArray) -> tuple[FloatArray, str]:
+    if np.isfinite(seconds_s).all():
+        return seconds_s, "time since the first view (s)"
+    return np.arange(1.0, seconds_s.size + 1), "view, in order of the flight"
+
+
+def reliability_picture(calibration: ConfidenceCalibration) -> Drawing:
+    def draw(figure: "mpl.Figure") -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
+        above.plot([0, 1], [0, 1], linewidth=1.2, color=GREY, linestyle=(0, (4, 3)))
+        above.text(0.03, 0.96, "under-confident", va="top", **_SIDE)
+        above.text(0.97, 0.04, "over-confident", ha="right", **_SIDE)
+        if calibration.n_fixes:
+            _draw_bins(above, calibration)
+        else:
+            above.text(0.5, 0.5, "no fix states a confidence", ha="center", bbox=BACKING)
+        above.set(xlim=(-0.015, 1.015), ylim=(-0.02, 1.04))
+        above.set(ylabel="fraction with an error\nwithin the stated radius")
+        counts = [b.n_fixes for b in calibration.bins]
+        middles = [(b.lower + b.upper) / 2 for b in calibration.bins]
+        below.bar(middles, counts, width=0.094, color="#9DB9CC")
+        for x, count in zip(middles, counts, strict=True):
+            below.annotate(f"{count}", (x, count), (0, 2), **OFFSET, ha="center", color=SOFT)
+        below.set(ylim=(0, 1.45 * max([1, *counts])), ylabel="fixes", xlabel="stated confidence")
+        below.set_xticks(np.arange(11) / 10)
+        below.yaxis.set_major_locator(MaxNLocator(nbins=2, integer=True))
+        figure.align_ylabels()
+
+    return draw_figure((6.2, 5.0), draw)
+
+
+def _draw_bins(axes: "Axes", calibration: ConfidenceCalibration) -> None:
+    filled = [b for b in calibration.bins if b.n_fixes]
+    x = [b.mean_confidence for b in filled]
+    y = np.array([b.share_right for b in filled])
+    low = y - [b.right_low for b in filled]
+    high = [b.right_high for b in filled] - y
+    for b in filled:  # the gap that counts in the ECE
+        ends = [b.mean_confidence, b.share_right]
+        axes.plot([b.mean_confidence] * 2, ends, color=WRONG, linewidth=5, alpha=0.3, zorder=2)
+    yerr = np.maximum([low, high], 0.0)  # rounding may leave -1e-17
+    axes.errorbar(x, y, yerr, fmt="none", ecolor=RIGHT, elinewidth=1.3, capsize=3, zorder=3)
+    axes.plot(x, y, "-", color=RIGHT, linewidth=1.2, alpha=0.8, zorder=3)
+    axes.plot(x, y, "o", color=RIGHT, markersize=7, markeredgecolor="white", zorder=4)
+    title = (
+        f"ECE {calibration.ece:.3f} · Brier {calibration.brier:.3f}\n"
+        f"mean confidence {calibration.mean_confidence:.2f}, "
+        f"fraction correct {calibration.share_right:.2f}"
     )
+    axes.set_title(title, fontsize=9, color=SOFT, linespacing=1.4)
+
+
+def gnss_picture(found: GnssMetrics) -> Drawing:
+    def draw(figure: "mpl.Figure") -> None:
+        above, below = figure.subplots(2, 1, sharex=True)
+        x, name = _time_axis(found.seconds_s)
+        thin: dict[str, Any] = {"linewidth": 1.0, "markersize": 3}
+        above.plot(x, found.errors_m, ".-", color=WRONG, label="GNSS", **thin)
+        above.plot(x, found.map_errors_m, ".-", color=RIGHT, label="map", **thin)
+        below.plot(x, found.differences_m, ".-", color=TRUTH, **thin)
+        for axes in (above, below):
+            for first, end in found.alarms:
+                axes.axvspan(x[first], x[min(end, len(x) - 1)], color=GREY, alpha=0.25, linewidth=0)
+            axes.set_ylim(bottom=0)
+        above.legend(ncols=2, loc="upper left", frameon=False)
+        above.set(ylabel="error (m)")
+        below.set(ylabel="difference (m)", xlabel=name)
+        figure.align_ylabels()
+
+    return draw_figure((6.2, 4.0), draw)

@@ -1,32 +1,26 @@
 """Figures of evaluated flights as JSON values, as text for a terminal, and as rows for the page."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from orthonav.core.flight.fixes import STATES
 from orthonav.core.flight.gnss import BIASES as GNSS_BIASES
-from orthonav.ground.evaluate.calibration import (
+from orthonav.ground.evaluate.metrics import FAR_M, Comparison, Metrics, measure, pool, radius_key
+from orthonav.ground.evaluate.statistics import (
     NEES_LEVELS,
+    RPE_DISTANCE_M,
     CovarianceConsistency,
+    FloatArray,
+    StandardFigures,
     nees_bound,
     nees_mean_bounds,
-)
-from orthonav.ground.evaluate.contact_sheet import Row
-from orthonav.ground.evaluate.figures import RPE_FRAMES, FloatArray, StandardFigures, percentile
-from orthonav.ground.evaluate.metrics import (
-    Comparison,
-    CriterionRow,
-    Metrics,
-    measure,
-    pool,
-    radius_key,
-    wrong_key,
+    percentile,
 )
 from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
+from orthonav.ground.report import aligned, measure_text, percent_text, to_plain
 from orthonav.ground.report.drawing import Background
-from orthonav.ground.report.numbers import aligned, measure_text, percent_text, plain_text, to_plain
 
 Plain = dict[str, Any]
 _COLUMNS = (
@@ -34,7 +28,7 @@ _COLUMNS = (
     *("median m", "95 % m", "max m", "latency ms"),
 )
 STANDARD_HEADER = ("", "fixes", "RMSE m", "mean m", "median m", "std m", "max m", "number")
-LABELS = {"confidence": "confidence", "peak_ratio": "peak ratio", "lowe_ratio": "Lowe's ratio"}
+LABELS = {"confidence": "confidence", "lowe_ratio": "Lowe's ratio"}
 _EAST, _NORTH, _PITCH, _ROLL, _LATENCY = GNSS_BIASES
 _LEARNT = {
     "learnt displacement of the map": ((_EAST, 1, "m east"), (_NORTH, 1, "m north")),
@@ -47,8 +41,8 @@ _LEARNT = {
 class FlightReport:
     """One evaluated flight, and what its report shows beside the metrics.
 
-    `background`: image in the plane of `comparison`; `worst`: rows of the contact sheet;
-    `track`, `gnss`: None where there is none; `view_command`: shows single views, "" without a map.
+    `background`: image in the plane of `comparison`; `track`, `gnss`: None where there is none;
+    `view_command`: shows single views, "" without a map.
     """
 
     name: str
@@ -56,7 +50,6 @@ class FlightReport:
     metrics: Metrics
     background: Background | None = None
     track: TrackMetrics | None = None
-    worst: tuple[Row, ...] = ()
     gnss: GnssMetrics | None = None
     view_command: str = ""
 
@@ -71,9 +64,7 @@ def total(flights: Sequence[FlightReport]) -> Metrics:
     first = flights[0].metrics
     if len(flights) == 1:
         return first
-    pooled = pool([flight.comparison for flight in flights])
-    distance_m = first.standard.distance_m
-    return measure(pooled, first.radius_m, list(first.acc_at_m), rpe_distance_m=distance_m)
+    return measure(pool([flight.comparison for flight in flights]), first.radius_m)
 
 
 # JSON.
@@ -105,17 +96,9 @@ def metrics_to_json(metrics: Metrics) -> Plain:
             "latency_median_ms": metrics.latency_median_ms,
             "latency_p95_ms": metrics.latency_p95_ms,
             "reasons": metrics.reasons,
-            "criteria": [_criterion_to_json(row) for row in metrics.criteria],
+            "criteria": metrics.criteria,
             "standard": _standard_to_json(standard),
             "standard_of_confident": _standard_to_json(confident),
-            "curves": {
-                curve.name: {
-                    "threshold": curve.thresholds,
-                    "share_accepted": curve.share_accepted,
-                    "accuracy": curve.accuracy,
-                }
-                for curve in metrics.curves
-            },
             "calibration": metrics.calibration,
             "covariance": {
                 "n_right": found.n_right,
@@ -131,14 +114,6 @@ def metrics_to_json(metrics: Metrics) -> Plain:
     return plain
 
 
-def _criterion_to_json(row: CriterionRow) -> Plain:
-    plain = asdict(row)
-    far = wrong_key(plain.pop("far_m"))
-    plain["share_of_right_accepted"] = plain.pop("recall")
-    plain[f"n_{far}"], plain[far] = plain.pop("n_far"), plain.pop("share_far")
-    return plain
-
-
 def _standard_to_json(standard: StandardFigures) -> Plain:
     return {
         "rmse_m": standard.ape.rmse_m,
@@ -146,22 +121,20 @@ def _standard_to_json(standard: StandardFigures) -> Plain:
         "cep95_m": standard.cep95_m,
         "ape": standard.ape,
         "rpe": [
-            {"delta": RPE_FRAMES, "unit": "frames", **asdict(standard.rpe_frames)},
-            {"delta": standard.distance_m, "unit": "m", **asdict(standard.rpe_distance)},
+            {"delta": 1, "unit": "frames", **asdict(standard.rpe_frames)},
+            {"delta": RPE_DISTANCE_M, "unit": "m", **asdict(standard.rpe_distance)},
         ],
     }
 
 
 def flights_to_json(flights: Sequence[FlightReport], whole: Metrics) -> Plain:
-    """The figures of all flights together, and of several also of each, for strict JSON."""
+    """The figures of all flights together, and of several also of each, for strict JSON; those of a
+    track or of GNSS are given per flight."""
     plain = metrics_to_json(whole)
     if len(flights) == 1:
         track, gnss = flights[0].track, flights[0].gnss
         plain |= {} if track is None else {"track": track_to_json(track)}
         return plain | ({} if gnss is None else {"gnss": gnss_to_json(gnss)})
-    tracks = [flight.track for flight in flights if flight.track is not None]
-    if tracks:
-        plain["track"] = tracks_to_json(tracks)
     plain["flights"] = {each.name: flights_to_json([each], each.metrics) for each in flights}
     return plain
 
@@ -175,39 +148,6 @@ def track_to_json(track: TrackMetrics) -> Plain:
     names = ("seconds_s", "sigma_m", "bound_95_m", "along_m", "across_m")
     plain["over_time"] = to_plain({name: getattr(track.series, name) for name in names}, 3)
     return plain
-
-
-def tracks_to_json(tracks: Sequence[TrackMetrics]) -> Plain:
-    """Sums and maxima over several tracks; medians, biases and consistency are given per flight."""
-
-    def most(values: Iterable[float]) -> float | None:
-        return max((value for value in values if math.isfinite(value)), default=None)
-
-    n_after = sum(track.after.n_views for track in tracks)
-    known = [track.after for track in tracks if track.after.n_views]
-    within = {
-        radius_key(r): sum(a.acc_at_m[r] * a.n_views for a in known) / n_after if known else None
-        for r in tracks[0].after.acc_at_m
-    }
-    n_views = sum(track.n_views for track in tracks)
-    errors_m = most(track.after.error_max_m for track in tracks)
-    return {
-        "n_tracks": len(tracks),
-        "n_found": sum(math.isfinite(track.first_view) for track in tracks),
-        "n_views": n_views,
-        "first_s_max": most(track.first_s for track in tracks),
-        "after": {"n_views": n_after, "error_max_m": errors_m, **within},
-        "share_of_views": {
-            state: sum(t.share_of_views[state] * t.n_views for t in tracks) / n_views
-            for state in tracks[0].share_of_views
-        },
-        "n_lost": sum(track.n_lost for track in tracks),
-        "low_confidence_seconds_s_max": most(track.low_confidence.seconds_s for track in tracks),
-        "low_confidence_path_m_max": most(track.low_confidence.path_m for track in tracks),
-        "n_confident_wrong": sum(track.n_confident_wrong for track in tracks),
-        "n_false_locks": sum(track.n_false_locks for track in tracks),
-        "false_lock_longest_s": most(track.false_lock_longest_s for track in tracks),
-    }
 
 
 def gnss_to_json(found: GnssMetrics) -> Plain:
@@ -302,14 +242,6 @@ def covariance_verdict(consistency: CovarianceConsistency) -> str:
     return f"Covariances are {_judged(consistency)}."
 
 
-def covariance_card(consistency: CovarianceConsistency) -> tuple[str, str, str]:
-    if not consistency.nees.size:
-        return "-", "covariance: no correct fix states one", ""
-    word, _, times = _judged(consistency).partition(": ")
-    label = f"{times}; NEES {consistency.nees_mean:.3g}, 2 expected".removeprefix("; ")
-    return word if times else "right", f"covariance: {label}", "bad" * (word == "too small")
-
-
 def covariance_text(consistency: CovarianceConsistency) -> str:
     if not consistency.n_right:
         return "unknown, no fix is correct"
@@ -376,17 +308,16 @@ def standard_rows(metrics: Metrics) -> list[tuple[str, ...]]:
         for kind, standard in (("confident", metrics.of_confident), ("all", metrics.standard))
         for name, found in (
             ("APE", standard.ape),
-            (f"RPE over {RPE_FRAMES} frame", standard.rpe_frames),
-            (f"RPE over {standard.distance_m:g} m", standard.rpe_distance),
+            ("RPE over 1 frame", standard.rpe_frames),
+            (f"RPE over {RPE_DISTANCE_M:g} m", standard.rpe_distance),
         )
     ]
 
 
 def criteria_header(metrics: Metrics) -> tuple[str, ...]:
-    far = f"{metrics.criteria[0].far_m:g} m" if metrics.criteria else ""
     within = f"precision within {metrics.radius_m:g} m"
     names = ("criterion", "at least", "accepted", "of all views")
-    return (*names, within, "recall", f"wrong by > {far}")
+    return (*names, within, "recall", f"wrong by > {FAR_M:g} m")
 
 
 def criteria_rows(metrics: Metrics) -> list[tuple[str, ...]]:
@@ -397,30 +328,10 @@ def criteria_rows(metrics: Metrics) -> list[tuple[str, ...]]:
             str(row.n_accepted),
             percent_text(row.share_accepted),
             percent_text(row.accuracy),
-            percent_text(row.recall),
-            percent_text(row.share_far) + (f" ({row.n_far})" if row.n_accepted else ""),
+            percent_text(row.share_of_right_accepted),
+            percent_text(row.wrong_by_35m) + f" ({row.n_wrong_by_35m})" * (row.n_accepted > 0),
         )
         for row in metrics.criteria
-    ]
-
-
-def bins_rows(metrics: Metrics) -> list[tuple[str, ...]]:
-    return [
-        (
-            f"{b.lower:g} to {b.upper:g}",
-            str(b.n_fixes),
-            *map(plain_text, (b.mean_confidence, b.share_right, b.right_low, b.right_high)),
-        )
-        for b in metrics.calibration.bins
-        if metrics.calibration.n_fixes
-    ]
-
-
-def levels_rows(consistency: CovarianceConsistency) -> list[tuple[str, ...]]:
-    return [
-        (f"{100 * level:g} %", f"{nees_bound(level):.2f}", percent_text(level), percent_text(share))
-        for level, share in consistency.within.items()
-        if consistency.nees.size
     ]
 
 
@@ -470,8 +381,7 @@ def track_consistency_text(found: TrackConsistency) -> str:
         f"{nees_text(found.nees_mean, found.effective_low, found.effective_high)}; "
         f"NEES of {found.n_views} tracking views has mean {found.nees_mean:.3g} "
         f"(2 expected; 95 % interval {found.effective_low:.2f} to {found.effective_high:.2f} for "
-        f"{found.n_effective:.0f} effective views, as errors are correlated; for independent views "
-        f"{found.independent_low:.2f} to {found.independent_high:.2f}); "
+        f"{found.n_effective:.0f} effective views, as errors are correlated); "
         f"{percent_text(found.nees_within_95)} below {nees_bound(0.95):.2f} (95 % expected)"
         f"{left_out}"
     )

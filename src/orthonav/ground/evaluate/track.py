@@ -8,7 +8,6 @@ figures in seconds are undefined: NaN, and null in JSON.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,36 +16,31 @@ from orthonav.core.flight.fixes import STATES
 from orthonav.core.flight.gnss import biases_of, fault_of, gnss_of
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.evaluate.calibration import (
-    is_covariance,
-    nees_bound,
-    nees_mean_bounds,
-    normalized_squared,
-)
-from orthonav.ground.evaluate.figures import (
+from orthonav.ground.evaluate.metrics import FAR_M, Comparison
+from orthonav.ground.evaluate.statistics import (
+    BoolArray,
     FloatArray,
     Longest,
     frozen,
+    is_covariance,
     longest,
     longest_stretch,
     mean,
+    nees_bound,
+    nees_mean_bounds,
+    normalized_squared,
     path_so_far_m,
     percentile,
     runs,
     seconds_since_first,
     share_of,
 )
-from orthonav.ground.evaluate.metrics import FAR_M, Comparison
-
-if TYPE_CHECKING:
-    pass
 
 RADII_M = (25.0, 60.0)
 COURSE_M = 5.0
 """Minimum distance over which a course is measured, in the median."""
 STILL_M = 1.0
 """Below this distance the aircraft is stationary and has no course."""
-BIASES = ("heading_bias_deg", "log_scale_bias", "pitch_bias_deg", "roll_bias_deg")
 
 
 @dataclass(frozen=True)
@@ -76,17 +70,15 @@ class TrackConsistency:
     """NEES (2 degrees of freedom, 2 expected) of the tracking views.
 
     `n_left_out`: views without a usable covariance; `nees_within_95`: share below the 95 % bound.
-    `independent_*`: 95 % interval of the mean of independent views.
     `n_effective`: effective number of views, as errors of consecutive views are correlated;
-    `effective_*`: the interval for that number, which decides the verdict ("" without views).
+    `effective_*`: the 95 % interval of the mean of so many independent views, which decides the
+    verdict ("" without views).
     """
 
     n_views: int
     n_left_out: int
     nees_mean: float
     nees_within_95: float
-    independent_low: float
-    independent_high: float
     n_effective: float
     effective_low: float
     effective_high: float
@@ -100,7 +92,7 @@ class TrackSeries:
     `sigma_m`: standard deviation along the longer axis of the covariance; `bound_95_m`: the same
     axis of the 95 % ellipse.
     `along_m`, `across_m`: error ahead and to the right of the true position.
-    `biases`: estimated biases by the name of their evidence.
+    `wrong`: the views that `n_confident_wrong` counts.
     """
 
     seconds_s: FloatArray
@@ -109,12 +101,12 @@ class TrackSeries:
     bound_95_m: FloatArray
     along_m: FloatArray
     across_m: FloatArray
-    biases: Mapping[str, FloatArray]
+    wrong: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
 class TrackMetrics:
-    """Metrics of one track; `n_compared` of its views have a true position.
+    """Metrics of one track.
 
     `first_view`, `first_s`: number (from 1) and time of the first confirmed fix, that is, one in
     state tracking.
@@ -126,7 +118,6 @@ class TrackMetrics:
     """
 
     n_views: int
-    n_compared: int
     first_view: float
     first_s: float
     after: After
@@ -169,10 +160,9 @@ def measure_track(
     low_confidence = ~(tracking & confident)
     found = first < len(results)
     after_m = comparison.errors_m[rows >= first]
-    series = _series(comparison, [results[i] for i in rows], seconds_s[rows])
+    series = _series(comparison, states[rows].tolist(), seconds_s[rows], wrong)
     return TrackMetrics(
         n_views=len(results),
-        n_compared=len(rows),
         first_view=first + 1 if found else math.nan,
         first_s=float(seconds_s[first]) if found else math.nan,
         after=After(
@@ -238,14 +228,11 @@ def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> TrackCo
     found = mean(nees)
     verdict = "over-confident" if found > high else "consistent"
     verdict = "under-confident" if found < low else verdict
-    independent = nees_mean_bounds(nees.size)
     return TrackConsistency(
         n_views=nees.size,
         n_left_out=int(np.count_nonzero(~usable)),
         nees_mean=found,
         nees_within_95=share_of(nees <= nees_bound(0.95)),
-        independent_low=independent[0],
-        independent_high=independent[1],
         n_effective=n_effective,
         effective_low=low,
         effective_high=high,
@@ -310,26 +297,22 @@ def _whitened(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatArray:
 
 
 def _series(
-    comparison: Comparison, results: Sequence[ViewResult], seconds_s: FloatArray
+    comparison: Comparison, states: Sequence[str], seconds_s: FloatArray, wrong: BoolArray
 ) -> TrackSeries:
     errors_en_m = comparison.fix_en_m - comparison.truth_en_m
     course = course_en(comparison.truth_en_m)
     right = np.stack([course[:, 1], -course[:, 0]], axis=1)
     usable = is_covariance(comparison.cov_en_m2)
-    sigma_m = np.full(len(results), math.nan)
+    sigma_m = np.full(len(states), math.nan)
     sigma_m[usable] = np.sqrt(np.linalg.eigvalsh(comparison.cov_en_m2[usable])[:, 1])
-    biases = {
-        name: frozen([result.outcome.evidence.get(name, math.nan) for result in results])
-        for name in BIASES
-    }
     return TrackSeries(
         seconds_s=frozen(seconds_s),
-        states=tuple(result.state or "" for result in results),
+        states=tuple(states),
         sigma_m=frozen(sigma_m),
         bound_95_m=frozen(sigma_m * math.sqrt(nees_bound(0.95))),
         along_m=frozen((errors_en_m * course).sum(axis=1)),
         across_m=frozen((errors_en_m * right).sum(axis=1)),
-        biases=biases,
+        wrong=wrong,
     )
 
 

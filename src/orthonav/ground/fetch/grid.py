@@ -1,5 +1,6 @@
 """The grid of a service, cells of pixels in its own coordinate system, and the cells of an area."""
 
+import logging
 import math
 import re
 from dataclasses import dataclass
@@ -8,7 +9,8 @@ from functools import lru_cache
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
-from rasterio.transform import Affine
+from rasterio.transform import Affine, array_bounds
+from rasterio.warp import transform_bounds
 
 from orthonav.core.errors import AreaError, FetchError
 from orthonav.core.geo.frames import LocalFrame
@@ -18,9 +20,8 @@ MERCATOR_HALF_M = math.pi * 6378137.0
 """Half the width of the square of EPSG:3857, metres of that projection."""
 MAX_CANDIDATES = 40_000_000
 """Cells of the box around an area that are examined: some hundred megabytes at one row a time."""
+log = logging.getLogger(__name__)
 _ROUND = 1.02  # allowance for the change of scale across an area
-_EDGE = np.linspace(0, 1, 21)
-"""Points along an edge that are projected, as rasterio's `transform_bounds` does."""
 
 
 @dataclass(frozen=True)
@@ -42,36 +43,27 @@ class CellGrid:
     cell_h_px: int
     limits: tuple[int, int, int, int] | None = None
 
-    def corner(self, row: int, col: int) -> tuple[float, float]:
-        """North-west corner x, y of a cell."""
-        return (
-            self.west + col * self.cell_w_px * self.res_x,
-            self.north - row * self.cell_h_px * self.res_y,
-        )
-
     def transform(self, row: int, col: int) -> Affine:
         """From column and row of a pixel, counted from a cell's corner, to coordinates."""
-        west, north = self.corner(row, col)
+        west = self.west + col * self.cell_w_px * self.res_x
+        north = self.north - row * self.cell_h_px * self.res_y
         return Affine(self.res_x, 0, west, 0, -self.res_y, north)
 
     def bounds(self, row: int, col: int) -> tuple[float, float, float, float]:
         """West, south, east, north of a cell."""
-        west, north = self.corner(row, col)
-        east, south = self.corner(row + 1, col + 1)
+        west, south, east, north = array_bounds(
+            self.cell_h_px, self.cell_w_px, self.transform(row, col)
+        )
         return west, south, east, north
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The cells of `grid` that cover an area: `cells` (N, 2) rows and columns, by row; `gsd_m`.
-
-    `is_cut`: whether the area reaches beyond the limits of the grid.
-    """
+    """The cells of `grid` that cover an area: `cells` (N, 2) rows and columns, by row; `gsd_m`."""
 
     grid: CellGrid
     cells: NDArray[np.int64]
     gsd_m: float
-    is_cut: bool
 
     @property
     def first(self) -> tuple[int, int]:
@@ -115,22 +107,20 @@ def select(grid: CellGrid, area: Area, margin_m: float) -> Selection:
     cells = np.concatenate(chosen or [np.zeros((0, 2), dtype=np.int64)])
     if not len(cells):
         raise AreaError("area lies outside what the service covers")
-    gsd_m = math.sqrt(scale[0] * grid.res_x * scale[1] * grid.res_y)
-    return Selection(grid, cells, gsd_m, wanted != (row0, col0, row1, col1))
+    if wanted != (row0, col0, row1, col1):
+        log.warning("part of the area lies outside what the service covers")
+    return Selection(grid, cells, math.sqrt(scale[0] * grid.res_x * scale[1] * grid.res_y))
 
 
 def _box(grid: CellGrid, area: Area, margin_m: float) -> tuple[int, int, int, int]:
     west, south, east, north = area.extent_en_m
-    u = (west - margin_m) + _EDGE * (east - west + 2 * margin_m)
-    v = (south - margin_m) + _EDGE * (north - south + 2 * margin_m)
-    points = np.stack([m.ravel() for m in np.meshgrid(u, v)], axis=1)
-    lat, lon = area.frame.latlon_from_en(points)
-    x, y = (np.asarray(values) for values in transformers(grid.crs)[0].transform(lon, lat))
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+    wide = west - margin_m, south - margin_m, east + margin_m, north + margin_m
+    box = transform_bounds(area.frame.proj4, grid.crs, *wide)
+    if not all(map(math.isfinite, box)):
         raise AreaError(f"area lies outside the coordinate system {grid.crs}")
     across, down = grid.cell_w_px * grid.res_x, grid.cell_h_px * grid.res_y
-    col0, col1 = (math.floor((edge - grid.west) / across) for edge in (x.min(), x.max()))
-    row0, row1 = (math.floor((grid.north - edge) / down) for edge in (y.max(), y.min()))
+    col0, col1 = (math.floor((edge - grid.west) / across) for edge in box[::2])
+    row0, row1 = (math.floor((grid.north - edge) / down) for edge in box[:0:-2])
     return row0, col0, row1, col1
 
 

@@ -1,33 +1,148 @@
 """What `--source` means: a service known by name, from `presets.toml`, or an address.
 
+`ImageryOptions` is what a service is asked for, `Provenance` what travels with the imagery.
 Needs no extra.
 """
 
 import os
 import re
 import tomllib
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
 from functools import cache
 from importlib import resources
 from typing import Any
 
 from orthonav.core.errors import FetchError
-from orthonav.ground.fetch.options import ImageryOptions, Provenance, SourceSpec, listed
-from orthonav.ground.fetch.urls import (
-    KEY,
-    Secret,
-    checked_url,
-    origin_of,
-    shown,
-    without_literal_keys,
-)
+from orthonav.ground.fetch.urls import KEY, Secret, checked_url, holds_key, origin_of, shown
 
+DEFAULT_GSD_M = 0.5
+"""Ground resolution where none is given: half that of a usual map (1 m), so nothing is lost."""
+GSD_TOLERANCE = 1.05
+"""A level counts as fine enough when it is at most this much coarser than requested (zoom levels
+are powers of two and do not fall on round numbers)."""
+FORMATS = ("image/jpeg", "image/png", "image/webp")
+"""Media types that can be read, the usual one of orthophotos first."""
+HEIGHTS_FORMAT = "image/geotiff"
+"""Media type of heights, numbers of 32 bits. Taken where a preset or user names it."""
+TERRAIN_GSD_M = 5.0
+"""Ground resolution of heights where none is given: half the posting of a map's terrain."""
+MAX_COARSER = 1.5
+"""Where no level is fine enough, the finest one is taken if it is at most this much coarser."""
 _DATE = re.compile(r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?")
 PROTOCOLS = ("wmts", "wms", "xyz", "tms", "stac", "cog")
 CURRENT = "current"
+
+
+@dataclass(frozen=True)
+class ImageryOptions:
+    """Which imagery a service is asked for; None leaves the choice to the preset or the service."""
+
+    layer: str | None = None
+    style: str | None = None
+    format: str | None = None  # media type, such as image/jpeg
+    crs: str | None = None  # as EPSG:CODE
+    matrix_set: str | None = None  # of a WMTS
+    zoom: str | None = None  # zoom level, or name of a tile matrix
+    gsd_m: float | None = None  # metres on the ground per pixel
+    time: str | None = None  # ISO 8601; for STAC an interval with a slash
+    tile_px: int | None = None  # width of tiles (XYZ) or of the images requested (WMS)
+    max_zoom: int | None = None  # finest zoom level, where the service does not say
+    empty: str | None = None  # colour of missing imagery: "black" or "white"
+    collection: str | None = None  # of a STAC API
+    asset: str | None = None  # of each STAC item
+    bands: tuple[int, ...] | None = None  # of a file, from 1
+    version: str | None = None  # of the WMS protocol, 1.1.1 or 1.3.0
+
+    def over(self, preset: "ImageryOptions") -> "ImageryOptions":
+        """These options where they are set, else those of the preset."""
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        return replace(preset, **given)
+
+    @property
+    def wanted_gsd_m(self) -> float:
+        """Metres per pixel requested, or the default."""
+        return self.gsd_m if self.gsd_m is not None else DEFAULT_GSD_M
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Origin and terms of imagery, written into the file."""
+
+    source: str  # address without keys
+    layer: str  # or STAC collection
+    date: str | None = None  # acquisition: YYYY[-MM[-DD]], or first and last with a slash between
+    licence: str | None = None
+    attribution: str | None = None
+    note: str | None = None  # what a user should know, such as resampling
+    datum: str | None = None  # what the heights of a terrain model count from
+
+
+@dataclass(frozen=True)
+class SourceSpec:
+    """A service and the imagery requested of it."""
+
+    protocol: str  # one of `PROTOCOLS`
+    url: str  # with `{key}` in place of a key
+    options: ImageryOptions
+    provenance: Provenance  # as far as it is known before the service is asked
+    secrets: tuple[Secret, ...] = ()  # the key, if the address holds one
+    token_url: str | None = None  # address of a signing service for files
+
+
+def finest_fitting(gsds_m: list[float], wanted_m: float, levels: str) -> int:
+    """Index of the coarsest level that is as fine as wanted, else of the finest if nearly so.
+
+    Raises `FetchError` with the available `levels`.
+    """
+    fitting = [gsd_m for gsd_m in gsds_m if gsd_m <= wanted_m * GSD_TOLERANCE]
+    finest_m = min(gsds_m)
+    if not fitting and finest_m > wanted_m * MAX_COARSER:
+        raise FetchError(
+            f"no imagery of {wanted_m:g} m per pixel: the finest is {finest_m:.3g} m; "
+            f"available: {levels}"
+        )
+    return gsds_m.index(max(fitting, default=finest_m))
+
+
+def choose(names: Sequence[str], wanted: str | None, what: str) -> str:
+    """`wanted` if it is one of `names`, else `FetchError` that lists the names; None: the first."""
+    if wanted in names:
+        return str(wanted)
+    if wanted is None and names:
+        return names[0]
+    raise FetchError(f"{what} {wanted}; available: {listed(names, wanted or '')}")
+
+
+def choose_layer(names: list[str], wanted: str | None, url: str) -> str:
+    """The layer of that name; without a name the only one. Raises `FetchError` with the choices."""
+    if not names:
+        raise FetchError(f"document lists no layer: {url}")
+    if wanted is None and len(names) > 1:
+        raise FetchError(f"choose one with --layer; available: {listed(names, 'ortho')}")
+    return choose(names, wanted, "no layer")
+
+
+def choose_format(offered: Sequence[str], options: ImageryOptions, what: str) -> str:
+    """The media type requested, else the first of `FORMATS` on offer."""
+    if options.format is not None:
+        return choose(offered, options.format, f"{what} has no format")
+    found = next((name for name in FORMATS if name in offered), None)
+    if found is None:
+        raise FetchError(f"{what} comes as {listed(offered)}; supported are JPEG, PNG, WebP")
+    return found
+
+
+def listed(names: Sequence[str], wanted: str = "", most: int = 12) -> str:
+    """Names for an error: if there are many, those that resemble the wanted one."""
+    chosen = get_close_matches(wanted, names, most, cutoff=0.0) if wanted else names
+    chosen = sorted(chosen)[:most]
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(chosen) + more if names else "none"
+
+
 _OPTIONS = {field.name for field in fields(ImageryOptions)}
-_RENAMED = {"style": "preferred_style", "format": "preferred_format"}
-"""A preset prefers a style or format; a user who names one wants no other."""
 
 
 @dataclass(frozen=True)
@@ -60,42 +175,12 @@ class Preset:
     note: str | None = None
     datum: str | None = None  # as in `Provenance`
 
-    def layer(self, id_: str | None) -> PresetLayer:
-        """The layer of that id, or the current one. Raises `FetchError` with the available ones."""
-        found = self.layers.get(id_ or CURRENT)
-        if found is None:
-            problem = f"{self.name} has no '{id_}'" if id_ else f"add a year: {self.name}:YEAR"
-            available = listed(list(self.layers), id_ or "", most=40)
-            raise FetchError(f"{problem}; available: {available}")
-        return found
-
-    def describe(self) -> dict[str, Any]:
-        """Plain values for JSON; options that are not set are left out."""
-        layers = [
-            {
-                name: value
-                for name, value in (vars(layer) | vars(layer.options)).items()
-                if name != "options" and (value is not None or name in ("date", "note"))
-            }
-            | {"gsd_m": layer.gsd_m}
-            for layer in self.layers.values()
-        ]
-        return {**vars(self), "layers": layers}
-
 
 @cache
 def presets() -> dict[str, Preset]:
     """All services by name."""
     text = resources.files(__package__).joinpath("presets.toml").read_text(encoding="utf-8")
     return {name: _preset(name, values) for name, values in tomllib.loads(text).items()}
-
-
-def find_preset(name: str) -> Preset:
-    """The service of that name. Raises `FetchError` with the available ones."""
-    known = presets()
-    if name not in known:
-        raise FetchError(f"unknown service '{name}'; available: {listed(list(known), name, 40)}")
-    return known[name]
 
 
 def parse_source(
@@ -118,16 +203,22 @@ def parse_source(
         checked_url(re.sub(r"\{[^{}]*\}", "0", rest))
         if head not in ("xyz", "tms") and set(re.findall(r"\{[^{}]*\}", rest)) - {KEY}:
             raise FetchError(f"only {KEY} may stand in this address: {shown(rest)}")
-        url, literal = without_literal_keys(rest)
-        provenance = Provenance(shown(url), options.layer or "", date, licence, attribution)
-        secrets = _secrets(url, key_env, literal)
-        return SourceSpec(head, url, options, provenance, secrets)
+        provenance = Provenance(shown(rest), options.layer or "", date, licence, attribution)
+        return SourceSpec(head, rest, options, provenance, _secrets(rest, key_env))
     if head.lower() in ("http", "https", "file"):
         raise FetchError(
             f"write the protocol before the address ({'|'.join(PROTOCOLS)}:ADDRESS): {shown(text)}"
         )
-    preset = find_preset(head)
-    layer = preset.layer(rest or None)
+    if head not in presets():
+        raise FetchError(
+            f"unknown service '{head}'; available: {listed(list(presets()), head, 40)}"
+        )
+    preset = presets()[head]
+    layer = preset.layers.get(rest or CURRENT)
+    if layer is None:
+        problem = f"{head} has no '{rest}'" if rest else f"add a year: {head}:YEAR"
+        available = listed(list(preset.layers), rest, most=40)
+        raise FetchError(f"{problem}; available: {available}")
     options = options.over(layer.options)
     provenance = Provenance(
         shown(preset.url),
@@ -138,7 +229,7 @@ def parse_source(
         "; ".join(note for note in (layer.note, preset.note) if note) or None,
         preset.datum,
     )
-    secrets = _secrets(preset.url, key_env or preset.key_env, None)
+    secrets = _secrets(preset.url, key_env or preset.key_env)
     return SourceSpec(preset.protocol, preset.url, options, provenance, secrets, preset.token_url)
 
 
@@ -169,23 +260,24 @@ def _preset(name: str, values: dict[str, Any]) -> Preset:
 def _options(values: dict[str, Any]) -> ImageryOptions:
     """The options among the values of a table; `gsd_m` describes the imagery and is not one."""
     chosen: dict[str, Any] = {
-        _RENAMED.get(key, key): tuple(value) if isinstance(value, list) else value or None
+        key: tuple(value) if isinstance(value, list) else value or None
         for key, value in values.items()
         if key in _OPTIONS and key != "gsd_m" and not (key == "layer" and isinstance(value, list))
     }
     return ImageryOptions(**chosen)
 
 
-def _secrets(url: str, key_env: str | None, literal: str | None) -> tuple[Secret, ...]:
-    if literal is None and key_env is None:
-        if KEY in url:
-            raise FetchError(
-                f"address contains {KEY}; name the environment variable with --key-env"
-            )
+def _secrets(url: str, key_env: str | None) -> tuple[Secret, ...]:
+    if holds_key(url):
+        raise FetchError(
+            f"write {KEY} for the key in the address and name the environment variable that holds "
+            f"it with --key-env: {shown(url)}"
+        )
+    if (key_env is None) != (KEY not in url):
+        raise FetchError(f"{KEY} in the address and --key-env need each other: {shown(url)}")
+    if key_env is None:
         return ()
-    if KEY not in url:
-        raise FetchError(f"--key-env needs {KEY} in the address, where the key goes: {shown(url)}")
-    value = literal or os.environ.get(key_env or "", "").strip()
+    value = os.environ.get(key_env, "").strip()
     if not value:
         raise FetchError(
             f"this service needs a key; put yours into the environment variable {key_env}"

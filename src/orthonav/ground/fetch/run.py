@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -23,29 +23,19 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from orthonav import __version__
-from orthonav.core.errors import AreaError, FetchError, OutputError
-from orthonav.core.files import Progress, no_progress, not_written, replacing, with_paths
-from orthonav.core.geo.swapped import swapped_hint
-from orthonav.ground.fetch.cog import cog_source
+from orthonav.core.errors import FetchError, OutputError
+from orthonav.core.files import Progress, no_progress, not_written, replacing
+from orthonav.ground.fetch.files import cog_source, stac_source
 from orthonav.ground.fetch.grid import Selection, select
-from orthonav.ground.fetch.options import Provenance, SourceSpec
+from orthonav.ground.fetch.presets import Provenance, SourceSpec
 from orthonav.ground.fetch.service import CellPixels, CellReader, CellSource
-from orthonav.ground.fetch.stac import find_files
+from orthonav.ground.fetch.tiles import wms_cells, wmts_tiles, xyz_tiles
 from orthonav.ground.fetch.web import RequestLimits, Web
-from orthonav.ground.fetch.wms import wms_cells
-from orthonav.ground.fetch.wmts import wmts_tiles
-from orthonav.ground.fetch.xyz import xyz_tiles
 from orthonav.ground.planning.area import Area
 
-DEFAULT_MAX_TILES = 50_000
-"""About 200 km2 at 0.5 m: more than a flight needs, less than a service minds."""
-DEFAULT_MAX_MB = 4000.0
-DEFAULT_MARGIN_M = 200.0
-"""Reference tiles at the border of a map reach beyond its area by less than this."""
 _SECONDS_PER_TILE = 0.3  # usual latency of a tile service; an assumption for the estimate
 _BYTES_PER_SECOND = 3e6  # usual throughput of a connection; an assumption for the estimate
 _OURS = re.compile(r"[0-9a-f]|mosaic-\w+")  # names in a cache that GDAL and this program make
-BLOCK_PX = 512  # GDAL's default block of a COG
 GIVE_UP_AFTER = 20  # failed cells in a row after which the service counts as down
 _BATCH_PER_THREAD = 8  # cells that may wait in memory until they are written
 log = logging.getLogger(__name__)
@@ -58,17 +48,14 @@ class FetchRequest:
     spec: SourceSpec
     area: Area
     out: Path  # the GeoTIFF, .tif or .tiff
-    margin_m: float = DEFAULT_MARGIN_M  # fetched beyond the area
+    margin_m: float = 200.0  # fetched beyond the area, as tiles of a map reach beyond its border
     compress: str = "jpeg"  # or deflate
     quality: int = 90  # of JPEG, 1 to 100
     cache: Path | None = None  # folder of tiles; None: beside `out`, removed at the end
-    max_tiles: int = DEFAULT_MAX_TILES  # a fetch of more is refused before it starts
-    max_mb: float = DEFAULT_MAX_MB  # likewise, as estimated
+    max_tiles: int = 50_000  # a fetch of more is refused before it starts
+    max_mb: float = 4000.0  # likewise, as estimated
     allow_holes: bool = False  # whether the file is written although tiles failed
     limits: RequestLimits = field(default_factory=RequestLimits)
-
-    def __post_init__(self) -> None:
-        with_paths(self, "out", "cache")
 
 
 @dataclass(frozen=True)
@@ -93,66 +80,39 @@ class CostEstimate:
 
 
 @dataclass(eq=False)
-class CellCounts:
+class FetchResult:
     """What became of the cells of a selection."""
 
+    estimate: CostEstimate
     images: int = 0
-    absent: int = 0  # without imagery, as the service reports
+    not_covered: int = 0  # without imagery, as the service reports
     blank: int = 0  # wholly black or white
     placeholders: int = 0  # with the same image as another: no two orthophotos agree
     failed: Counter[str] = field(default_factory=Counter)  # by reason
-    examples: dict[str, str] = field(default_factory=dict)  # a whole message for each reason
-    valid_px: int = 0
+    example: str = ""  # a whole message of a failure
+    valid_share: float = 0.0  # fraction of valid pixels, 0 to 1
+    size_bytes: int = 0
 
     def holes(self) -> str:
         """Cells without imagery by reason, on one line; empty where there are none."""
         names = ("failed", "not covered", "blank", "placeholders")
-        numbers = (self.failed.total(), self.absent, self.blank, self.placeholders)
+        numbers = (self.failed.total(), self.not_covered, self.blank, self.placeholders)
         counted = zip(numbers, names, strict=True)
         return ", ".join(f"{number} {name}" for number, name in counted if number)
 
-    def add_failure(self, error: FetchError) -> None:
-        """Count a cell that failed."""
-        reason = str(error).partition(" (")[0].partition(": http")[0]
-        self.failed[reason] += 1
-        self.examples.setdefault(reason, str(error))
-        log.info("not fetched: %s", error)
-
-    def failure(self, cells: int) -> str:
-        """Why nothing was written."""
-        common = self.failed.most_common(4)
-        reasons = ", ".join(f"{reason}: {count}" for reason, count in common)
-        return (
-            f"{self.failed.total()} of {cells} tiles failed ({reasons}; for example "
-            f"{self.examples[common[0][0]]}); nothing was written; --allow-holes writes the file "
-            "without them"
-        )
-
-
-@dataclass(frozen=True)
-class FetchResult:
-    """What was fetched: cells by outcome, and the fraction of valid pixels, 0 to 1."""
-
-    estimate: CostEstimate
-    cells: CellCounts
-    valid_share: float
-    size_bytes: int
-
     def describe(self) -> dict[str, Any]:
         """Plain values for JSON."""
+        own = {name: value for name, value in vars(self).items() if name != "example"}
+        estimate = own.pop("estimate")
         return {
-            "tiles": self.estimate.tiles,
-            "gsd_m": round(self.estimate.gsd_m, 4),
-            "width_px": self.estimate.width_px,
-            "height_px": self.estimate.height_px,
-            "images": self.cells.images,
-            "not_covered": self.cells.absent,
-            "blank": self.cells.blank,
-            "placeholders": self.cells.placeholders,
-            "failed": dict(self.cells.failed),
+            "tiles": estimate.tiles,
+            "gsd_m": round(estimate.gsd_m, 4),
+            "width_px": estimate.width_px,
+            "height_px": estimate.height_px,
+            **own,
+            "failed": dict(self.failed),
             "valid_share": round(self.valid_share, 4),
-            "size_bytes": self.size_bytes,
-            **vars(self.estimate.provenance),
+            **vars(estimate.provenance),
         }
 
 
@@ -188,13 +148,12 @@ def fetch(
                 "(--gsd-m), a part of the area, or raise the limit"
             )
         started(estimate)
-        if selection.is_cut:
-            log.warning("part of the area lies outside what the service covers")
         try:
             cache.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix="mosaic-", dir=cache) as folder:
                 read = source.reader(web, selection, cache)
-                cells = _write_mosaic(request, source, selection, read, Path(folder), progress)
+                result = FetchResult(estimate)
+                _write_mosaic(request, source, selection, read, Path(folder), result, progress)
         except FetchError as error:
             if any(cache.iterdir()):
                 stored = f"fetched tiles are stored, rerun the command to resume: {cache}"
@@ -207,18 +166,17 @@ def fetch(
             raise not_written(error, cache) from error
     if request.cache is None and all(_OURS.fullmatch(path.name) for path in cache.iterdir()):
         shutil.rmtree(cache, ignore_errors=True)
-    grid = selection.grid
-    share = cells.valid_px / (len(selection.cells) * grid.cell_w_px * grid.cell_h_px)
-    if cells.holes():
-        log.warning("of %d tiles: %s; masked in the file", estimate.tiles, cells.holes())
-    return FetchResult(estimate, cells, share, request.out.stat().st_size)
+    if result.holes():
+        log.warning("of %d tiles: %s; masked in the file", estimate.tiles, result.holes())
+    result.size_bytes = request.out.stat().st_size
+    return result
 
 
 def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, CostEstimate]:
     if not (math.isfinite(request.margin_m) and request.margin_m >= 0):
         raise FetchError(f"margin must be 0 m or more, got {request.margin_m}")
     source = open_cells(web, request.spec, request.area)
-    selection = _selected(source, request)
+    selection = select(source.grid, request.area, request.margin_m)
     height, width = selection.shape_px
     tiles = len(selection.cells)
     size = tiles * source.cell_bytes
@@ -242,31 +200,7 @@ def open_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
         return xyz_tiles(spec, area)
     if spec.protocol == "cog":
         return cog_source(web, spec, area, [spec.url])
-    west, south, east, north = area.extent_en_m
-    corners = [(west, south), (west, north), (east, south), (east, north)]
-    lat, lon = area.frame.latlon_from_en(corners)
-    box = (float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max()))
-    urls, date = find_files(web, spec, box)
-    provenance = replace(spec.provenance, date=date or spec.provenance.date)
-    return cog_source(web, replace(spec, provenance=provenance), area, urls)
-
-
-def _selected(source: CellSource, request: FetchRequest) -> Selection:
-    frame = request.area.frame
-
-    def covered(lat_deg: float, lon_deg: float) -> bool:
-        west, south, east, north = lon_deg - 1e-4, lat_deg - 1e-4, lon_deg + 1e-4, lat_deg + 1e-4
-        try:
-            select(source.grid, Area.from_bounds((west, south, east, north)), 0.0)
-        except (AreaError, FetchError):
-            return False
-        return True
-
-    try:
-        return select(source.grid, request.area, request.margin_m)
-    except AreaError as error:
-        hint = swapped_hint(frame.lat_deg, frame.lon_deg, covered)
-        raise AreaError(f"{error}{hint}") from None
+    return stac_source(web, spec, area)
 
 
 def _check_out(out: Path) -> None:
@@ -282,13 +216,10 @@ def _write_mosaic(
     selection: Selection,
     read: CellReader,
     folder: Path,
+    result: FetchResult,
     progress: Progress,
-) -> CellCounts:
-    """Read the cells and write them as one GeoTIFF, with missing ones masked.
-
-    The raw mosaic is written into `folder` first. Raises `FetchError` where cells failed, unless
-    holes are allowed, and where no pixel is valid; `OutputError` where it cannot be written.
-    """
+) -> None:
+    """The raw mosaic is written into `folder` first; missing cells are masked."""
     raw = folder / "mosaic.tif"
     try:
         with rasterio.Env(GDAL_TIFF_INTERNAL_MASK="YES", GDAL_CACHEMAX=128 * 2**20):
@@ -296,10 +227,15 @@ def _write_mosaic(
                 dataset.update_tags(**_tags(source.provenance, selection))
                 if source.bands == 3:
                     dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
-                counts = _write_cells(dataset, selection, read, request.limits.parallel, progress)
-            if counts.failed and not request.allow_holes:
-                raise FetchError(counts.failure(len(selection.cells)))
-            if counts.valid_px == 0:
+                _write_cells(dataset, selection, read, result, request.limits.parallel, progress)
+            if result.failed and not request.allow_holes:
+                reasons = ", ".join(f"{why}: {n}" for why, n in result.failed.most_common(4))
+                raise FetchError(
+                    f"{result.failed.total()} of {len(selection.cells)} tiles failed ({reasons}; "
+                    f"for example {result.example}); nothing was written; --allow-holes writes the "
+                    "file without them"
+                )
+            if result.valid_share == 0:
                 raise FetchError("the service has no imagery of this area in this layer")
             progress("pack", 0.1)
             with replacing(request.out) as temporary:
@@ -307,26 +243,32 @@ def _write_mosaic(
             progress("pack", 1.0)
     except (RasterioError, MemoryError) as error:
         raise not_written(error.__cause__ or error, request.out) from error
-    return counts
 
 
 def _write_cells(
-    dataset: Any, selection: Selection, read: CellReader, parallel: int, progress: Progress
-) -> CellCounts:
-    counts, (row0, col0) = CellCounts(), selection.first
+    dataset: Any,
+    selection: Selection,
+    read: CellReader,
+    result: FetchResult,
+    parallel: int,
+    progress: Progress,
+) -> None:
+    row0, col0 = selection.first
+    valid_px = in_a_row = 0
     written: dict[bytes, list[tuple[Window, int]]] = {}
-    in_a_row = 0
     for number, ((row, col), found) in enumerate(_read_cells(selection, read, parallel), start=1):
         progress("fetch", number / len(selection.cells))
         in_a_row = in_a_row + 1 if isinstance(found, FetchError) else 0
         if in_a_row >= GIVE_UP_AFTER:
             raise FetchError(f"{in_a_row} requests in a row failed, the last: {found}")
         if isinstance(found, FetchError):
-            counts.add_failure(found)
+            log.info("not fetched: %s", found)
+            result.failed[str(found).partition(" (")[0].partition(": http")[0]] += 1
+            result.example = result.example or str(found)
         elif not found.valid.any():
-            counts.absent += 1
+            result.not_covered += 1
         elif found.blank:
-            counts.blank += 1
+            result.blank += 1
         else:
             height, width = found.valid.shape
             window = Window((col - col0) * width, (row - row0) * height, width, height)
@@ -335,15 +277,16 @@ def _write_cells(
             written.setdefault(digest, []).append((window, int(found.valid.sum())))
     for same in written.values():
         if len(same) == 1:
-            counts.images += 1
-            counts.valid_px += same[0][1]
+            result.images += 1
+            valid_px += same[0][1]
             continue
-        counts.placeholders += len(same)
+        result.placeholders += len(same)
         for window, _ in same:
             shape = window.height, window.width
             nothing = np.zeros((dataset.count, *shape), dataset.dtypes[0])
             _write(dataset, window, CellPixels(nothing, np.zeros(shape, dtype=bool)))
-    return counts
+    cell_px = selection.grid.cell_w_px * selection.grid.cell_h_px
+    result.valid_share = valid_px / (len(selection.cells) * cell_px)
 
 
 def _read_cells(
@@ -389,12 +332,9 @@ def _profile(source: CellSource, selection: Selection) -> dict[str, Any]:
 
 
 def _pack(raw: Path, out: Path, request: FetchRequest) -> None:
-    """Copy into a cloud-optimized file; JPEG takes one or three bands of bytes only.
-
-    Raises `OutputError` unless its size, place and bands are those of the raw one.
-    """
+    """Copy into a cloud-optimized file; JPEG takes one or three bands of bytes only."""
     options: dict[str, Any] = {
-        "BLOCKSIZE": BLOCK_PX,
+        "BLOCKSIZE": 512,
         "BIGTIFF": "IF_SAFER",
         "OVERVIEW_RESAMPLING": "AVERAGE",
         "SPARSE_OK": "YES",
@@ -406,19 +346,11 @@ def _pack(raw: Path, out: Path, request: FetchRequest) -> None:
         bytes_only = set(written.dtypes) == {"uint8"} and written.count in (1, 3)
         if request.compress == "jpeg" and bytes_only:
             options |= {"COMPRESS": "JPEG", "QUALITY": request.quality, "PREDICTOR": "NO"}
-        rasterio.shutil.copy(raw, out, driver="COG", **options)
-        with rasterio.open(out) as packed:
-            for name in ("shape", "transform", "crs", "count"):
-                if getattr(packed, name) != getattr(written, name):
-                    raise OutputError(f"the packed file differs from the mosaic: {out}")
+    rasterio.shutil.copy(raw, out, driver="COG", **options)
 
 
 def _tags(provenance: Provenance, selection: Selection) -> dict[str, str]:
-    """Origin, terms and dates as tags of the file, without keys.
-
-    ACQUISITION_DATE is the date of the imagery as far as it is known; TIFFTAG_DATETIME exists only
-    where the day is known, because that tag has no shorter form.
-    """
+    """TIFFTAG_DATETIME exists only where the day is known: that tag has no shorter form."""
     tags = {
         "ORTHONAV_SOURCE": provenance.source,
         "ORTHONAV_LAYER": provenance.layer,

@@ -21,7 +21,7 @@ from rasterio.windows import Window
 from orthonav.core.errors import FetchError
 from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M
 from orthonav.ground.fetch.grid import CellGrid, Selection
-from orthonav.ground.fetch.options import HEIGHTS_FORMAT, Provenance, SourceSpec
+from orthonav.ground.fetch.presets import HEIGHTS_FORMAT, Provenance, SourceSpec
 from orthonav.ground.fetch.urls import checked_url, shown
 from orthonav.ground.fetch.web import CONNECT_S, READ_S, USER_AGENT, Web, is_temporary
 
@@ -99,7 +99,7 @@ def service_source(
 
     def reader(web: Web, selection: Selection, cache: Path) -> CellReader:
         (row0, col0), (rows_px, cols_px) = selection.first, selection.shape_px
-        west, north = grid.corner(row0, col0)
+        west, north = grid.transform(row0, col0) * (0, 0)
         tile_row = rows_px // height - 2**level + row0 if from_south else row0
         # Blocks without content are filled with it, and `_heights` refuses it.
         no_data = {f'DataValues NoData="{NO_HEIGHT_M}"': None} if heights else {}

@@ -11,8 +11,7 @@ from orthonav.core.errors import FetchError
 
 KEY = "{key}"
 TOKEN = "{token}"  # placeholder of a query string that a signing service issued for a file server
-MAX_URL = 4096
-"""Longest address, characters: half of what servers accept by default (8 KB of header)."""
+MAX_URL = 4096  # characters: half of what servers accept by default (8 KB of header)
 _SECRET_NAME = re.compile(
     r"^(api[-_]?key|key|token|access[-_]?token|apikey|auth|authkey|password|pwd|sig|signature"
     r"|subscription-key|ocp-apim-subscription-key)$",
@@ -42,19 +41,17 @@ def checked_url(url: str) -> str:
     """
     try:
         parts = urlsplit(url)
-        named = bool(parts.hostname)
-        port_is_number = parts.port is None or parts.port > 0
+        is_http = parts.scheme.lower() in ("http", "https") and parts.port != 0
     except ValueError as error:
         raise FetchError(f"invalid address: {shown(url)}") from error
-    if parts.scheme.lower() not in ("http", "https") or not named or not port_is_number:
+    is_plain = len(url) <= MAX_URL and re.search(r"[\x00-\x20\x7f]", url) is None
+    if not (is_http and parts.hostname and is_plain):
         raise FetchError(f"only http:// and https:// addresses are fetched, got: {shown(url)}")
     if parts.username is not None or parts.password is not None:
         raise FetchError(
             "an address must not contain a user name or password; write the key as {key} and give "
             f"it with --key-env: {parts.scheme}://{parts.hostname}"
         )
-    if len(url) > MAX_URL or any(ord(letter) <= 32 or ord(letter) == 127 for letter in url):
-        raise FetchError(f"address is too long or contains blanks: {shown(url)}")
     return url
 
 
@@ -66,21 +63,10 @@ def origin_of(url: str) -> str:
     return f"{scheme}://{(parts.hostname or '').lower()}:{port}"
 
 
-def without_literal_keys(url: str) -> tuple[str, str | None]:
-    """The address with `{key}` for a key written into its query, and that key.
-
-    Raises `FetchError` where several parameters look like keys.
-    """
-    parts = urlsplit(url)
-    query = parse_qsl(parts.query, keep_blank_values=True)
-    secret = {value for name, value in query if _SECRET_NAME.match(name) and "{" not in value}
-    secret -= {""}
-    if not secret:
-        return url, None
-    if len(secret) > 1 or KEY in url:
-        raise FetchError(f"address contains several keys; one is supported: {shown(url)}")
-    plain = [(name, KEY if value in secret else value) for name, value in query]
-    return urlunsplit(parts._replace(query=_encoded(plain))), secret.pop()
+def holds_key(url: str) -> bool:
+    """Whether a value in the query looks like a key, by the name of its parameter."""
+    query = parse_qsl(urlsplit(url).query)
+    return any(_SECRET_NAME.match(name) and "{" not in value for name, value in query)
 
 
 def shown(url: str) -> str:

@@ -3,14 +3,12 @@
 Errors never quote messages of the HTTP library, because those contain whole addresses with keys.
 """
 
-import io
 import json as json_format
 import logging
 import re
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any
 from urllib.parse import quote
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
@@ -24,13 +22,6 @@ USER_AGENT = f"orthonav/{__version__} (fetches orthophotos for one area; +orthon
 CONNECT_S, READ_S = 10.0, 30.0
 MAX_DOCUMENT_BYTES = 64 * 2**20
 """The capabilities of a national service list a thousand layers in some ten megabytes."""
-_FAILURES = {
-    requests.exceptions.ProxyError: "the proxy refused",
-    requests.exceptions.SSLError: "no secure connection: the certificate is not accepted",
-    requests.exceptions.ConnectTimeout: "no connection in time",
-    requests.exceptions.Timeout: "no answer in time",
-    requests.exceptions.ConnectionError: "no connection; is this machine online?",
-}
 log = logging.getLogger(__name__)
 
 
@@ -114,31 +105,15 @@ class Web:
         return plain
 
     def get(self, url: str, json: Any = None) -> bytes:
-        """The body of an answer, at most `MAX_DOCUMENT_BYTES`. Raises `FetchError`."""
-        body = io.BytesIO()
-        self.download(url, body, json=json, max_bytes=MAX_DOCUMENT_BYTES)
-        return body.getvalue()
+        """The body of an answer, at most `MAX_DOCUMENT_BYTES`; `json` is sent with POST.
 
-    def download(
-        self,
-        url: str,
-        out: BinaryIO,
-        *,
-        max_bytes: int | None,
-        json: Any = None,
-        received: Callable[[int], None] = lambda size: None,
-    ) -> None:
-        """Write the body of an answer to `out`, from its beginning; `json` is sent with POST.
-
-        The request is repeated after a temporary status and a broken connection. `received` gets
-        the number of bytes so far. Raises `FetchError`.
+        The request is repeated after a temporary status and a broken connection. Raises
+        `FetchError`.
         """
         method, failure = "GET" if json is None else "POST", ""
         url_sent, timeout = self.with_keys(checked_url(url)), (CONNECT_S, READ_S)
         for attempt in range(self.limits.attempts):
             self.limits.pause(attempt)
-            out.seek(0)
-            out.truncate()
             try:
                 with self._session.request(
                     method, url_sent, json=json, stream=True, timeout=timeout
@@ -150,15 +125,16 @@ class Web:
                         if is_temporary(status):
                             continue
                         break
+                    body = bytearray()
                     for part in response.iter_content(64 * 1024):
-                        out.write(part)
-                        received(out.tell())
-                        if max_bytes is not None and out.tell() > max_bytes:
-                            raise FetchError(f"body is over {max_bytes} bytes: {shown(url)}")
-                    return
+                        body += part
+                        if len(body) > MAX_DOCUMENT_BYTES:
+                            raise FetchError(
+                                f"body is over {MAX_DOCUMENT_BYTES} bytes: {shown(url)}"
+                            )
+                    return bytes(body)
             except requests.RequestException as error:
-                kinds = (words for kind, words in _FAILURES.items() if isinstance(error, kind))
-                failure = next(kinds, "the answer was cut short")
+                failure = f"no whole answer ({type(error).__name__})"
         raise FetchError(self.redacted(f"{failure}: {shown(url)}"))
 
     def _excerpt(self, body: bytes) -> str:

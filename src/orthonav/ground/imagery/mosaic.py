@@ -1,6 +1,9 @@
-"""One or several orthophotos as one image, resampled into a sheet's plane and read by windows."""
+"""One or several orthophotos as one image, resampled into a sheet's plane and read by windows.
 
-import logging
+GDAL's VRT joins files on one pixel lattice, such as the tiles of a producer, on their own pixels
+first. Resampled one by one, they would leave a line of invalid pixels between neighbours.
+"""
+
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -9,11 +12,13 @@ from functools import cached_property
 from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio.dtypes import dtype_rev, typename_fwd
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.transform import Affine
@@ -25,10 +30,8 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import ImageryError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.imagery.folder import sources_in
-from orthonav.ground.imagery.joined import Lattice, lattices_of
 from orthonav.ground.imagery.plates import at_epoch
-from orthonav.ground.imagery.source import Source, open_sources, quiet, unreadable
+from orthonav.ground.imagery.source import Source, open_sources, quiet, sources_in, unreadable
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
 WHOLLY_VALID = 250
@@ -43,7 +46,176 @@ _REACH_PX = 7
 SAMPLE_PX = 512
 """Side of the decimated image that percentiles are computed from."""
 SAMPLED_SOURCES = 12
-log = logging.getLogger(__name__)
+STRIP_PX = 4 * 2**20
+MAX_OFF_PX = 0.05
+"""Largest deviation of a tile from the lattice: far below the error of orthophotos."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Sources on one pixel lattice; where several overlap, the first wins.
+
+    `members`: indexes of the mosaic's sources. `boxes_px` (N, 4): left, top, right, bottom of each.
+    """
+
+    members: tuple[int, ...]
+    sources: tuple[Source, ...]
+    transform: Affine
+    boxes_px: NDArray[np.int64]
+
+    @property
+    def first(self) -> Source:
+        """All share its CRS, type and resolution."""
+        return self.sources[0]
+
+    @cached_property
+    def size_px(self) -> tuple[int, int]:
+        return int(self.boxes_px[:, 2].max()), int(self.boxes_px[:, 3].max())
+
+    def open(self, near: NDArray[np.bool_]) -> Any:
+        """The members that are `near` (N,) as one dataset."""
+        return rasterio.open(self._vrt(np.flatnonzero(near).tolist()))
+
+    def read(
+        self, dataset: Any, window: Window, gsd_m: float
+    ) -> tuple[NDArray[Any], NDArray[np.uint8], Affine]:
+        """Bands (C, h, w), mask (h, w), 0 (invalid) to 255, and transform of a window.
+
+        Averaged to about `gsd_m` where that is coarser, against aliasing, all windows alike.
+        """
+        factor = self._factor(max(1, round(gsd_m / self.first.gsd_m)))
+        (left, top), (width, height) = (window.col_off, window.row_off), self.size_px
+        left, top = left // factor * factor, top // factor * factor
+        right = min(-(-(window.col_off + window.width) // factor) * factor, width)
+        bottom = min(-(-(window.row_off + window.height) // factor) * factor, height)
+        # GDAL reads band by band: decoded tiles must stay in its cache
+        step = max(1, STRIP_PX // (factor * (right - left))) * factor
+        strips = [
+            self._read(dataset, Window(left, row, right - left, min(step, bottom - row)), factor)
+            for row in range(top, bottom, step)
+        ]
+        values = np.concatenate([strip[0] for strip in strips], axis=1)
+        mask = np.concatenate([strip[1] for strip in strips])
+        if values.dtype.kind == "f":  # NaN is nodata, whether the file declares it or not
+            mask = mask * np.isfinite(values).all(axis=0)
+        scale = Affine.scale((right - left) / mask.shape[1], (bottom - top) / mask.shape[0])
+        return values, mask, self.transform * Affine.translation(left, top) * scale
+
+    def _read(
+        self, dataset: Any, window: Window, factor: int
+    ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+        shape = max(1, round(window.height / factor)), max(1, round(window.width / factor))
+        how: dict[str, Any] = {"window": window}
+        if factor > 1:
+            how["resampling"] = Resampling.average
+        values = dataset.read(out_shape=(dataset.count, *shape), **how)
+        return values, dataset.dataset_mask(out_shape=shape, **how)
+
+    def _factor(self, wanted: int) -> int:
+        """Pixels per side averaged: the largest with which squares end where tiles do, if any."""
+        if len(self.members) > 1:
+            for factor in range(wanted, max(1, (wanted + 1) // 2) - 1, -1):
+                if not (self.boxes_px % factor).any():
+                    return factor
+        return wanted
+
+    def _vrt(self, members: list[int]) -> str:
+        """XML that joins members, the first on top, each where it is valid."""
+        width, height = self.size_px
+        t = self.transform
+        dtype = _gdal_type(self.first.dtype)
+        bands = "".join(
+            f'<VRTRasterBand dataType="{dtype}" band="{band + 1}">'
+            + "".join(_values(*member, band) for member in self._placed(members))
+            + "</VRTRasterBand>"
+            for band in range(len(self.first.bands))
+        )
+        masks = "".join(_mask(*member) for member in self._placed(members))
+        return (
+            f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">'
+            f"<SRS>{escape(self.first.system.to_wkt())}</SRS>"
+            f"<GeoTransform>{t.c!r},{t.a!r},{t.b!r},{t.f!r},{t.d!r},{t.e!r}</GeoTransform>{bands}"
+            f'<MaskBand><VRTRasterBand dataType="Byte">{masks}</VRTRasterBand></MaskBand>'
+            "</VRTDataset>"
+        )
+
+    def _placed(self, members: list[int]) -> Iterator[tuple[Source, str]]:
+        """Members, the last first, with the XML of file and place."""
+        for index in reversed(members):
+            source, (left, top) = self.sources[index], self.boxes_px[index, :2].tolist()
+            size = f'xSize="{source.width_px}" ySize="{source.height_px}"'
+            dtype = _gdal_type(source.dtype)
+            yield (
+                source,
+                f'<SourceFilename relativeToVRT="0">{escape(str(source.path))}</SourceFilename>'
+                f'<SourceProperties RasterXSize="{source.width_px}" '
+                f'RasterYSize="{source.height_px}" DataType="{dtype}" BlockXSize="256" '
+                f'BlockYSize="256"/><SrcRect xOff="0" yOff="0" {size}/>'
+                f'<DstRect xOff="{left}" yOff="{top}" {size}/>',
+            )
+
+
+def _gdal_type(dtype: str) -> str:
+    return str(typename_fwd[dtype_rev[dtype]])
+
+
+def _values(source: Source, place: str, band: int) -> str:
+    kind, more = "SimpleSource", ""
+    if source.masks:
+        kind, more = "ComplexSource", "<UseMaskBand>true</UseMaskBand>"
+    return f"<{kind}>{place}<SourceBand>{source.bands[band]}</SourceBand>{more}</{kind}>"
+
+
+def _mask(source: Source, place: str) -> str:
+    """255 everywhere, or the union of the masks of a file."""
+    everywhere = "<ScaleOffset>255</ScaleOffset><ScaleRatio>0</ScaleRatio>"
+    valid = [(mask, "<NODATA>0</NODATA>") for mask in source.masks]
+    return "".join(
+        f"<ComplexSource>{place}<SourceBand>{band}</SourceBand>{more}</ComplexSource>"
+        for band, more in valid or [(str(source.bands[0]), everywhere)]
+    )
+
+
+def lattices_of(sources: Sequence[Source]) -> list[Lattice]:
+    """Only consecutive sources share one, so that earlier sources still cover later ones."""
+    runs: list[list[int]] = []
+    for index, source in enumerate(sources):
+        if runs and _offset_px(sources[runs[-1][0]], source) is not None:
+            runs[-1].append(index)
+        else:
+            runs.append([index])
+    return [_lattice(run, [sources[index] for index in run]) for run in runs]
+
+
+def _lattice(members: list[int], sources: list[Source]) -> Lattice:
+    offsets = np.array([_offset_px(sources[0], each) for each in sources], np.int64)
+    corner = offsets.min(axis=0)
+    sizes = np.array([(each.width_px, each.height_px) for each in sources], np.int64)
+    boxes = np.concatenate([offsets - corner, offsets - corner + sizes], axis=1)
+    transform = sources[0].transform * Affine.translation(int(corner[0]), int(corner[1]))
+    return Lattice(tuple(members), tuple(sources), transform, boxes)
+
+
+def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:
+    """Columns and rows from corner to corner; None where no lattice fits."""
+    alike = (
+        first.crs == other.crs
+        and len(first.bands) == len(other.bands)
+        and first.dtype == other.dtype
+    )
+    if not alike:
+        return None
+    col, row = ~first.transform * (other.transform.c, other.transform.f)
+    offset = round(col), round(row)
+    longest = max(other.width_px, other.height_px)
+    skew = np.array(other.transform[:6]) - np.array(first.transform[:6])
+    unit = min(
+        np.hypot(first.transform.a, first.transform.d),
+        np.hypot(first.transform.b, first.transform.e),
+    )
+    stretch_px = np.abs(skew[[0, 1, 3, 4]]).max() * longest / unit
+    off_px = max(abs(col - offset[0]), abs(row - offset[1])) + stretch_px
+    return offset if off_px <= MAX_OFF_PX else None
 
 
 @dataclass(frozen=True)
@@ -61,45 +233,30 @@ def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None,
     """None for 8 bit, else the 0.5 and 99.5 percentiles of all valid pixels of a product."""
     alike: dict[Any, list[int]] = {}
     for index, source in enumerate(sources):
-        if source.dtype != "uint8" and not source.has_palette:
-            kind = source.dtype, source.colours, round(source.gsd_m, 2), source.crs
+        if source.dtype != "uint8":
+            kind = source.dtype, len(source.bands), round(source.gsd_m, 2), source.crs
             alike.setdefault(kind, []).append(index)
     found: list[ContrastStretch | None] = [None] * len(sources)
     for members in alike.values():
-        stretch = _common([sources[index] for index in members])
+        some = members[:: max(1, -(-len(members) // SAMPLED_SOURCES))]
+        values = np.concatenate([_valid_values(sources[index]) for index in some])
+        if values.size == 0:
+            raise ImageryError("orthophotos have no valid pixel (all nodata)")
+        low, high = (float(value) for value in np.percentile(values, [0.5, 99.5]))
         for index in members:
-            found[index] = stretch
-    deep = sum(len(members) for members in alike.values())
-    if len(alike) > 1 or 0 < deep < len(sources):
-        log.warning(
-            "orthophotos have several pixel types; each kind is stretched to 8 bits separately"
-        )
+            found[index] = ContrastStretch(low, high if high > low else low + 1.0)
     return tuple(found)
-
-
-def _common(sources: list[Source]) -> ContrastStretch:
-    values = []
-    broken: ImageryError | None = None
-    for source in sources[:: max(1, -(-len(sources) // SAMPLED_SOURCES))]:
-        try:
-            values.append(_valid_values(source))
-        except RasterioError as error:  # it may not be needed; reported where it is
-            broken = broken or unreadable(source.path, error)
-    if broken is not None and not values:
-        raise broken
-    every = np.concatenate(values)
-    if every.size == 0:
-        raise ImageryError("orthophotos have no valid pixel (all nodata)")
-    low, high = (float(value) for value in np.percentile(every, [0.5, 99.5]))
-    return ContrastStretch(low, high if high > low else low + 1.0)
 
 
 def _valid_values(source: Source) -> NDArray[Any]:
     (lattice,) = lattices_of([source])
-    with quiet(), lattice.open(np.ones(1, np.bool_)) as data:
-        shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
-        pixels = data.read(lattice.bands, out_shape=(source.colours, *shape))
-        valid = data.dataset_mask(out_shape=shape) > 0
+    try:
+        with quiet(), lattice.open(np.ones(1, np.bool_)) as data:
+            shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
+            pixels = data.read(out_shape=(data.count, *shape))
+            valid = data.dataset_mask(out_shape=shape) > 0
+    except RasterioError as error:
+        raise unreadable(source.path, error) from error
     sampled = pixels[:, valid].ravel()
     return np.asarray(sampled[np.isfinite(sampled)])
 
@@ -119,17 +276,11 @@ class Mosaic:
         sources: list[Source] = []
         for are_folders, group in groupby(map(Path, paths), Path.is_dir):
             some = list(group)
-            found = map(sources_in, some) if are_folders else [open_sources(some)[0]]
-            sources += chain.from_iterable(found)
+            sources += chain(*map(sources_in, some)) if are_folders else open_sources(some)
         if epoch is not None:
             sources = at_epoch(sources, epoch)
         with rasterio.Env(**GDAL_OPTIONS):
             return cls(tuple(sources), sample_stretches(sources))
-
-    @property
-    def stretch(self) -> ContrastStretch | None:
-        """Of the first source with more than 8 bits."""
-        return next((each for each in self.stretches if each is not None), None)
 
     @property
     def gsd_m(self) -> float:
@@ -190,7 +341,7 @@ def _described(sources: Sequence[Source]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """`rgb` (H, W, 3) uint8 and `valid` (H, W) bool."""
+    """`rgb` (H, W, 3) uint8, or (H, W, 1) of `read_grey`, and `valid` (H, W) bool."""
 
     rgb: NDArray[np.uint8]
     valid: NDArray[np.bool_]
@@ -198,15 +349,9 @@ class Pixels:
     @cached_property
     def grey(self) -> NDArray[np.uint8]:
         """ITU-R BT.601 weights; 0 where not valid."""
+        if self.rgb.shape[2] == 1:
+            return self.rgb[..., 0]
         return np.asarray(cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class GreyPixels:
-    """`grey` (H, W) uint8, 0 where not valid, and `valid` (H, W) bool."""
-
-    grey: NDArray[np.uint8]
-    valid: NDArray[np.bool_]
 
 
 class SheetRaster:
@@ -230,7 +375,7 @@ class SheetRaster:
         self._threads = threads or usable_cores()
         self.width_px, self.height_px = width_px, height_px
         self._boxes_px = self._boxes()
-        self._open: dict[int, Any] = {}
+        self._opened: dict[int, Any] = {}
         self._env = ExitStack()
 
     def __enter__(self) -> "SheetRaster":
@@ -240,24 +385,15 @@ class SheetRaster:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for dataset in self._open.values():
-            dataset.close()
         self._env.close()
 
     def read(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
         """Pixels of a window; outside all imagery they are 0 and invalid."""
-        values, valid = self._composed(Window(col, row, width_px, height_px), 3)
-        return Pixels(values, valid)
+        return Pixels(*self._composed(Window(col, row, width_px, height_px), 3))
 
-    def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> GreyPixels:
+    def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
         """Converted before resampling: within one level of `read`, and faster."""
-        values, valid = self._composed(Window(col, row, width_px, height_px), 1)
-        return GreyPixels(values[..., 0], valid)
-
-    def stamps(self, col: int, row: int, width_px: int, height_px: int) -> list[Any]:
-        """Files that a window depends on, in order of precedence, each with size and time."""
-        near = self._near(col, row, col + width_px, row + height_px)
-        return [self._mosaic.sources[index].stamp for index in np.flatnonzero(near).tolist()]
+        return Pixels(*self._composed(Window(col, row, width_px, height_px), 1))
 
     def _composed(
         self, window: Window, colours: int
@@ -318,10 +454,9 @@ class SheetRaster:
         """A lattice resampled into a window of the sheet: values (H, W, C) and mask (H, W)."""
         shape = (window.height, window.width)
         target = self._transform * Affine.translation(window.col_off, window.row_off)
-        needed = self._source_window(lattice, target, shape)
-        if needed is None:
+        part = self._source_window(lattice, target, shape)
+        if part is None:
             return np.zeros((*shape, colours), np.uint8), np.zeros(shape, np.uint8)
-        part, is_inside = needed
         try:
             values, mask, transform = lattice.read(self._dataset(lattice), part, self._gsd_m)
         except RasterioError as error:
@@ -330,10 +465,6 @@ class SheetRaster:
             raise unreadable(next(named, lattice.first.path), error) from error
         stretch = self._mosaic.stretches[lattice.members[0]]
         picture = _in_colours(values if stretch is None else stretch.apply(values), colours)
-        if is_inside and mask.all() and mask.min() == 255:
-            return self._resampled(lattice, picture, transform, target, shape, True), np.full(
-                shape, 255, np.uint8
-            )
         _fill_holes(picture, mask)
         warped = self._resampled(lattice, picture, transform, target, shape, True)
         warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
@@ -372,8 +503,8 @@ class SheetRaster:
 
     def _source_window(
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]
-    ) -> tuple[Window, bool] | None:
-        """Pixels of a lattice that a window needs, and whether all of them exist; None for none."""
+    ) -> Window | None:
+        """Pixels of a lattice that a window needs; None for none."""
         share = np.linspace(0, 1, 9)
         zero, one = np.zeros(9), np.ones(9)
         cols = np.concatenate([share, share, zero, one]) * shape[1]
@@ -385,25 +516,21 @@ class SheetRaster:
         if not (np.isfinite(col).all() and np.isfinite(row).all()):
             return None
         margin = _MARGIN_PX * max(1.0, self._gsd_m / lattice.first.gsd_m)
-        wanted = [
-            (math.floor(each.min() - margin), math.floor(each.max() + margin) + 1)
-            for each in (col, row)
-        ]
-        had = [
-            (max(0, low), min(size, high))
-            for (low, high), size in zip(wanted, lattice.size_px, strict=True)
-        ]
-        (left, right), (top, bottom) = had
+        low = np.floor([col.min() - margin, row.min() - margin]).astype(int)
+        high = np.floor([col.max() + margin, row.max() + margin]).astype(int) + 1
+        left, top = np.maximum(low, 0).tolist()
+        right, bottom = np.minimum(high, lattice.size_px).tolist()
         if left >= right or top >= bottom:
             return None
-        return Window(left, top, right - left, bottom - top), had == wanted
+        return Window(left, top, right - left, bottom - top)
 
     def _dataset(self, lattice: Lattice) -> Any:
         key = lattice.members[0]
-        if key not in self._open:
+        if key not in self._opened:
             near = self._near(0, 0, self.width_px, self.height_px)
-            self._open[key] = lattice.open(near[list(lattice.members)])
-        return self._open[key]
+            opened = lattice.open(near[list(lattice.members)])
+            self._opened[key] = self._env.enter_context(opened)
+        return self._opened[key]
 
     def _boxes(self) -> NDArray[np.int64]:
         """Left, top, right, bottom pixel (N, 4) of the sources in this raster, with a margin."""

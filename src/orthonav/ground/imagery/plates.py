@@ -7,9 +7,7 @@ converts them to the ITRF of an epoch, with which WGS 84 agrees within some cent
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -23,8 +21,6 @@ try:
 except ImportError as error:
     raise missing_extra("systems of plates", "geo", "pyproj", error) from error
 
-EPOCHS = (1980.0, 2100.0)
-_ITRF = "EPSG:7912"
 _FRAMES = (
     (r"NAD83(?!\((?:PA|MA)11)", "EPSG:6318"),
     (r"ETRS89|ETRF|RGF93|SWEREF99|EUREF|IGNF", "EPSG:4258"),
@@ -43,8 +39,10 @@ def plate_shift_deg(
     frame = next((code for pattern, code in _FRAMES if re.search(pattern, name)), None)
     if frame is None:
         return None
-    lon, lat, *_ = _to_itrf(frame).transform(lon_deg, lat_deg, 0.0, year)
-    read_lon, read_lat = _as_read(frame).transform(lon_deg, lat_deg)
+    to_itrf = pyproj.Transformer.from_crs(pyproj.CRS(frame).to_3d(), "EPSG:7912", always_xy=True)
+    as_read = pyproj.Transformer.from_crs(frame, "EPSG:4326", always_xy=True)
+    lon, lat, *_ = to_itrf.transform(lon_deg, lat_deg, 0.0, year)
+    read_lon, read_lat = as_read.transform(lon_deg, lat_deg)
     return float(lat - read_lat), float(lon - read_lon)
 
 
@@ -58,8 +56,8 @@ def plate_shift_m(crs: str, lat_deg: float, lon_deg: float, year: float) -> floa
 
 def at_epoch(sources: Sequence[Source], year: float) -> list[Source]:
     """The sources, those of one system moved by one distance to where WGS 84 has them."""
-    if not EPOCHS[0] <= year <= EPOCHS[1]:
-        raise ImageryError(f"epoch must be a year from {EPOCHS[0]:g} to {EPOCHS[1]:g}, got {year}")
+    if not 1980 <= year <= 2100:
+        raise ImageryError(f"epoch must be a year from 1980 to 2100, got {year}")
     lat, lon = np.concatenate([each.outline_latlon_deg for each in sources]).mean(axis=0).tolist()
     shifts = {each.crs: plate_shift_deg(each.crs, lat, lon, year) for each in sources}
     if not any(shifts.values()):
@@ -94,13 +92,3 @@ def _name(crs: str) -> str:
         return crs
     geodetic = system.geodetic_crs
     return system.name if geodetic is None else geodetic.name
-
-
-@cache
-def _to_itrf(frame: str) -> Any:
-    return pyproj.Transformer.from_crs(pyproj.CRS(frame).to_3d(), _ITRF, always_xy=True)
-
-
-@cache
-def _as_read(frame: str) -> Any:
-    return pyproj.Transformer.from_crs(frame, "EPSG:4326", always_xy=True)

@@ -1,9 +1,9 @@
 """A terrain model in a file that GDAL reads: heights above mean sea level by position."""
 
 import functools
-import logging
 import math
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,14 +29,14 @@ try:
     from rasterio.vrt import WarpedVRT
     from rasterio.windows import Window
 
-    from orthonav.ground.imagery.source import quiet, unwarped
+    from orthonav.ground.imagery.source import ground_m, quiet, unwarped
 except ImportError as error:
     raise missing_extra("reading terrain", "geo", "rasterio", error) from error
 
 Array = NDArray[np.float64]
 BLOCK_PX = 256
 SAMPLE_PX = 512
-"""Side of the overview from which units and voids are judged."""
+"""Side of the overview from which units are judged."""
 DATUM_TAG = "ORTHONAV_VERTICAL_DATUM"
 """In files that `orthonav fetch` wrote."""
 _UNITS = {
@@ -45,14 +45,11 @@ _UNITS = {
     "us-ft": 1200 / 3937, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937,
 }  # fmt: skip
 _OPTIONS = {"GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 64 * 2**20}
-Undulation = Callable[[Array, Array], Array]
-"""Height of the geoid above the ellipsoid (m) by latitudes and longitudes (deg)."""
 NAMED = {"egm96": "EPSG:5773", "egm2008": "EPSG:3855", "msl": "EPSG:5714"}
 ELLIPSOID = "ellipsoid"
 OPTION = f"--dem-datum {'|'.join((*NAMED, ELLIPSOID))}|EPSG:NUMBER"
 GEOIDS = ("us_nga_egm08_25.tif", "egm08_25.gtx", "us_nga_egm96_15.tif", "egm96_15.gtx")
 """In the order of preference; the second names are those of older PROJ."""
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -124,18 +121,19 @@ def _vertical(system: pyproj.CRS) -> VerticalDatum:
 
 
 @functools.cache
-def geoid() -> Undulation:
-    """From a grid of PROJ on this machine; nothing is downloaded."""
+def geoid() -> Callable[[Array, Array], Array]:
+    """Height of the geoid above the ellipsoid (m) by latitudes and longitudes (deg).
+
+    From a grid of PROJ on this machine; nothing is downloaded.
+    """
     for name in GEOIDS:
-        try:
+        with suppress(ProjError):
             found = pyproj.Transformer.from_pipeline(
                 "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
                 f"+step +proj=vgridshift +grids={name} +multiplier=1 "
                 "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
             )
-        except ProjError:
-            continue
-        return functools.partial(_undulation, found)
+            return functools.partial(_undulation, found)
     raise ImageryError(
         "heights above the ellipsoid need a geoid, and PROJ has none of the grids "
         f"{', '.join(GEOIDS[::2])} in {pyproj.datadir.get_data_dir()}: install one (projsync "
@@ -161,7 +159,6 @@ class Dem:
     gsd_m: float
     _data: Any = field(repr=False)
     _horizontal: pyproj.CRS = field(repr=False)
-    _void: float | None = field(repr=False)
 
     @functools.cached_property
     def _system_from_world(self) -> pyproj.Transformer:
@@ -222,7 +219,6 @@ class Dem:
                 WarpedVRT(
                     self._data,
                     src_crs=CRS.from_wkt(self._horizontal.to_wkt()),
-                    src_nodata=self._void,
                     nodata=math.nan,
                     dtype="float64",
                     resampling=resampling,
@@ -249,13 +245,9 @@ class Dem:
     def _pixels(self, lat_deg: Array, lon_deg: Array) -> tuple[Array, Array]:
         """Columns and rows from the outer corner of the first pixel; not finite where none."""
         x, y = self._system_from_world.transform(lon_deg, lat_deg)
-        inverse = ~self._data.transform
-        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         with np.errstate(invalid="ignore"):
-            return (
-                inverse.a * x + inverse.b * y + inverse.c,
-                inverse.d * x + inverse.e * y + inverse.f,
-            )
+            col, row = ~self._data.transform * (np.asarray(x), np.asarray(y))
+        return col, row
 
     def _blocks_of(
         self, col: Array, row: Array, inside: NDArray[np.bool_]
@@ -263,22 +255,17 @@ class Dem:
         """Positions of each window that holds some, its first column and row, and its heights."""
         which = np.flatnonzero(inside)
         blocks = np.stack([col[which], row[which]], axis=1) // BLOCK_PX
-        for left, top in np.unique(blocks.astype(np.intp), axis=0).tolist():
-            some = which[(blocks == (left, top)).all(axis=1)]
-            first_col, first_row = max(0, left * BLOCK_PX - 1), max(0, top * BLOCK_PX - 1)
-            yield some, first_col, first_row, self._block(left, top, first_col, first_row)
-
-    def _block(self, left: int, top: int, first_col: int, first_row: int) -> Array:
-        last_col = min((left + 1) * BLOCK_PX + 1, self._data.width)
-        last_row = min((top + 1) * BLOCK_PX + 1, self._data.height)
-        window = Window(first_col, first_row, last_col - first_col, last_row - first_row)
-        try:
-            raw = self._data.read(1, window=window, masked=True)
-        except (RasterioError, CPLE_BaseError) as error:
-            raise _unreadable(self.path, error) from error
-        if self._void is not None and not math.isnan(self._void):
-            raw = np.ma.masked_equal(raw, self._void)
-        return self._metres(raw)
+        for corner in np.unique(blocks.astype(np.intp), axis=0).tolist():
+            some = which[(blocks == corner).all(axis=1)]
+            left, top = (max(0, at * BLOCK_PX - 1) for at in corner)
+            right, bottom = ((at + 1) * BLOCK_PX + 1 for at in corner)
+            right, bottom = min(right, self._data.width), min(bottom, self._data.height)
+            window = Window(left, top, right - left, bottom - top)
+            try:
+                raw = self._data.read(1, window=window, masked=True)
+            except (RasterioError, CPLE_BaseError) as error:
+                raise _unreadable(self.path, error) from error
+            yield some, left, top, self._metres(raw)
 
 
 def open_dem(path: Path, datum: str | None = None) -> Dem:
@@ -310,22 +297,20 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
         )
     unit_m = _UNITS.get(unit, vertical.unit_m)
     vertical = VerticalDatum(vertical.name, vertical.above_ellipsoid, unit_m)
-    void = _void_of(path, data, vertical)
+    _require_heights(path, data, vertical)
     if vertical.above_ellipsoid:
         geoid()  # refuses before the work
-    return Dem(path, vertical, _gsd_m(data, horizontal), data, horizontal, void)
+    return Dem(path, vertical, ground_m(data, CRS.from_wkt(horizontal.to_wkt())), data, horizontal)
 
 
-def _void_of(path: Path, data: Any, datum: VerticalDatum) -> float | None:
-    """The stored value that stands for no height: as stated, else one that no ground can have."""
+def _require_heights(path: Path, data: Any, datum: VerticalDatum) -> None:
+    """Heights that ground can have, beside at most one value that stands for none."""
     shape = min(data.height, SAMPLE_PX), min(data.width, SAMPLE_PX)
     raw = data.read(1, out_shape=shape, masked=True, resampling=Resampling.nearest)
-    values = np.ma.compressed(raw).astype(np.float64)
-    values = values[np.isfinite(values)]
-    heights = (values * data.scales[0] + data.offsets[0]) * datum.unit_m
+    values = np.unique(np.ma.compressed(raw).astype(np.float64))
+    heights = (values[np.isfinite(values)] * data.scales[0] + data.offsets[0]) * datum.unit_m
     sound = (heights >= LOWEST_M) & (heights <= HIGHEST_M)
-    odd = np.unique(values[~sound])
-    if len(odd) > 1:
+    if (~sound).sum() > 1:
         raise ImageryError(
             f"heights of the terrain file are {heights.min():.6g} to {heights.max():.6g} m: "
             f"{LOWEST_M:g} to {HIGHEST_M:g} m above the sea are expected; state its unit and its "
@@ -333,29 +318,6 @@ def _void_of(path: Path, data: Any, datum: VerticalDatum) -> float | None:
         )
     if not sound.any():
         raise ImageryError(f"terrain file holds no height: {path}")
-    if heights[sound].min() == heights[sound].max():
-        log.warning(
-            "terrain is %g m high everywhere: check that this is the right file: %s",
-            heights[sound][0],
-            path,
-        )
-    stated = None if data.nodata is None else float(data.nodata)
-    if len(odd) and stated is None:
-        log.warning("terrain: %g is treated as no data: %s", odd[0], path)
-        return float(odd[0])
-    return stated
-
-
-def _gsd_m(data: Any, horizontal: pyproj.CRS) -> float:
-    to_world = pyproj.Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True)
-    step = data.transform
-    col = data.width / 2 + np.array([0, 1, 0])
-    row = data.height / 2 + np.array([0, 0, 1])
-    lon, lat = to_world.transform(
-        step.a * col + step.b * row + step.c, step.d * col + step.e * row + step.f
-    )
-    middle, beside, below = LocalFrame(lat[0], lon[0]).en_from_latlon(lat, lon)
-    return math.sqrt(float(np.hypot(*(beside - middle)) * np.hypot(*(below - middle))))
 
 
 def _unreadable(path: Path, error: Exception) -> ImageryError:

@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError
+from orthonav.core.extras import needed
 from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.core.geo.swapped import swapped_bounds_hint
-from orthonav.ground.planning.route import Array, Route, within_bands
+from orthonav.ground.planning.route import Array, Route
 
 Extent = tuple[float, float, float, float]
 
@@ -76,19 +78,30 @@ class Area:
     def contains(self, points_en_m: Array, margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Mask `(N,)` of the local points `(N, 2)` inside, or at most `margin_m` outside."""
         if self.route is not None:
-            return within_bands(points_en_m, *self._bands, margin_m)
+            shapely = needed("shapely", "geo", "a route")
+            points, inside = shapely.points(points_en_m), np.zeros(len(points_en_m), np.bool_)
+            for band_m, legs in self._bands:
+                inside |= shapely.dwithin(legs, points, max(0.0, band_m / 2 + margin_m))
+            return inside
         west, south, east, north = self.extent_en_m
         low = np.array([west, south]) - margin_m
         high = np.array([east, north]) + margin_m
         return np.asarray(((points_en_m >= low) & (points_en_m <= high)).all(axis=1))
 
     @cached_property
-    def _bands(self) -> tuple[Array, Array]:
-        """Vertices of the route (M, 2) in the plane, and the band width of each leg."""
+    def _bands(self) -> list[tuple[float, Any]]:
+        """Widths of the search band, and prepared geometries of the legs that have them."""
+        shapely = needed("shapely", "geo", "a route")
         assert self.route is not None
-        bands_m = self.route.bands_m(self.band_m or None)
-        assert bands_m is not None
-        return self.route.points_en_m(self.frame), np.array(bands_m)
+        bands_m = np.array(self.route.bands_m(self.band_m or None))
+        line = self.route.points_en_m(self.frame)
+        legs = shapely.linestrings(np.stack([line[: len(bands_m)], line[-len(bands_m) :]], axis=1))
+        found = [
+            (width, shapely.multilinestrings(legs[bands_m == width]))
+            for width in np.unique(bands_m).tolist()
+        ]
+        shapely.prepare([each for _, each in found])
+        return found
 
 
 def unwrapped(bounds_deg: Extent) -> Extent:
@@ -117,6 +130,6 @@ def _checked(extent: Extent) -> Extent:
         raise AreaError(
             f"area is {across / 1000:.1f} km across, a sheet holds at most "
             f"{MAX_SHEET_M / 1000:.0f} km; build it in parts with --bounds or --route "
-            "(orthonav plan cuts it into sheets)"
+            "(orthonav plan cuts a route into sheets), or as an atlas"
         )
     return extent

@@ -1,127 +1,237 @@
-"""A planned route: read from the file formats of ground stations or made from a preset, and its
-geometry.
+"""A planned route: read from the file formats of ground stations, and its geometry.
 
-The file name suffix selects the format (`orthonav.ground.planning.routes`). Presets are the
-trajectories A to D of the paper, Di Piazza et al. (IGARSS 2024), Table 1, at any position. The
-paper states altitude, length, search band and overlap; it does not state the ground resolution:
-0.2 m is assumed for A, 1 m for B and D, 2 m for C, so that a tile of 256 px has about the size of a
-view from 40, 2000 and 4000 m. The paper does not draw the trajectories; they are straight here."""
+The file name suffix selects the format."""
 
 import csv
-import logging
-import math
+import io
+import json
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import MissingFileError, RouteError, described, lfs_pointer
-from orthonav.core.geo.frames import LocalFrame, distances_m
-from orthonav.core.geo.swapped import swapped_hint
-from orthonav.ground.planning.routes.delimited import read_delimited
-from orthonav.ground.planning.routes.geojson import read_geojson, routes_of
-from orthonav.ground.planning.routes.markup import read_gpx, read_kml, read_kmz, read_wpml
-from orthonav.ground.planning.routes.mission import is_plan, is_wpl, plan_route, read_plan, read_wpl
-from orthonav.ground.planning.routes.record import Height, Route, json_object, left_out_text
-
-Array = NDArray[np.float64]
-PREFIX = "paper:"
-EAST_DEG = 90.0
-_FORM = f"{PREFIX}A@LAT,LON[,BEARING]"
-
-
-@dataclass(frozen=True)
-class PaperTrajectory:
-    name: str
-    agl_m: float
-    length_m: float
-    band_m: float
-    overlap: float
-    gsd_m: float
-
-
-TABLE_1 = {
-    "A": PaperTrajectory("A", 40, 150, 10, 0.995, 0.2),
-    "B": PaperTrajectory("B", 2000, 12_000, 1000, 0.875, 1.0),
-    "C": PaperTrajectory("C", 4000, 50_000, 5000, 0.875, 2.0),
-    "D": PaperTrajectory("D", 2000, 2000, 2000, 0.875, 1.0),
-}
-
-
-def preset(text: str) -> Route:
-    """The straight line that `paper:A@46.6,1.9,30` names: about that centre, with the bearing in
-    degrees clockwise from north, 90 where it is not given."""
-    name, _, where = text.removeprefix(PREFIX).partition("@")
-    shape = TABLE_1.get(name.upper())
-    if shape is None:
-        raise RouteError(f"preset must be one of {', '.join(TABLE_1)} as {_FORM}, got '{text:.60}'")
-    try:
-        numbers = [float(value) for value in where.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
-        raise RouteError(f"preset must be {_FORM} with numbers in degrees, got '{text:.60}'")
-    lat_deg, lon_deg, *bearing = numbers
-    if not (abs(lat_deg) <= 89 and abs(lon_deg) <= 360):
-        raise RouteError(
-            "the centre of a preset needs a latitude of -89 to 89 and a longitude of -360 to 360, "
-            f"got {lat_deg}, {lon_deg}{swapped_hint(lat_deg, lon_deg)}"
-        )
-    turn = math.radians(bearing[0] if bearing else EAST_DEG)
-    half_m = shape.length_m / 2
-    ends = np.array([[-half_m], [half_m]]) * [math.sin(turn), math.cos(turn)]
-    lat, lon = LocalFrame(lat_deg, lon_deg).latlon_from_en(ends)
-    return Route(
-        tuple(zip(lat.tolist(), lon.tolist(), strict=True)),
-        (Height(shape.agl_m, "agl"),) * 2,
-        (shape.band_m,),
-        f"{PREFIX}{shape.name}",
-    )
-
+from orthonav.core.extras import needed
+from orthonav.core.geo.frames import distances_m
+from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
+from orthonav.ground.planning.markup import read_gpx, read_kml, read_kmz, read_wpml
+from orthonav.ground.planning.mission import is_wpl, plan_route, read_wpl
+from orthonav.ground.planning.record import (
+    Height,
+    HeightFrame,
+    Route,
+    decoded,
+    json_object,
+    number,
+    number_or_none,
+    parsed,
+    require_few_waypoints,
+)
 
 __all__ = [
     "Height",
     "Route",
     "along_polyline_en_m",
-    "beyond_bands_m",
     "distance_to_polyline_m",
     "leg_lengths_m",
     "read_route",
-    "within_bands",
 ]
 
+Array = NDArray[np.float64]
 MAX_ROUTE_BYTES = 20_000_000  # twice 100,000 waypoints; JSON and XML take 20 times in memory
 MAX_LISTED = 20
-_PAIRS_AT_ONCE = 2**18
-_FEW_POINTS = 64
 _BROKEN = (
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError),
     csv.Error,
 )
 
-log = logging.getLogger(__name__)
+"""Properties of a GeoJSON feature (RFC 7946): `name`; `band_m`, a number or a list with one per leg
+(null: the default); `height_frame`, above what the third coordinate is ("agl", "home", "amsl",
+"hae"; the RFC's ellipsoid is hardly ever meant, so without it that is taken as not said);
+`home_amsl_m`."""
+
+
+def _routes_of(plain: dict[str, Any]) -> list[Route]:
+    found: list[Route] = []
+    for geometry, properties in _geometries(plain):
+        kind = geometry.get("type")
+        if kind == "LineString":
+            found.append(_route(geometry["coordinates"], properties))
+        elif kind == "MultiLineString":
+            joined = [point for part in geometry["coordinates"] for point in part]
+            found.append(_route(joined, properties))
+    if not found:
+        raise RouteError("GeoJSON holds no LineString")
+    return found
+
+
+def to_geojson(routes: Sequence[Route]) -> str:
+    features = [_feature(route) for route in routes]
+    several = {"type": "FeatureCollection", "features": features}
+    plain = features[0] if len(features) == 1 else several
+    return json.dumps(plain, allow_nan=False) + "\n"
+
+
+def _feature(route: Route) -> dict[str, Any]:
+    coordinates = [[lon, lat] for lat, lon in route.waypoints]
+    properties: dict[str, Any] = {}
+    if route.name is not None:
+        properties["name"] = route.name
+    if route.leg_bands_m:
+        same = len(set(route.leg_bands_m)) == 1 and route.leg_bands_m[0] is not None
+        properties["band_m"] = route.leg_bands_m[0] if same else list(route.leg_bands_m)
+    heights = [height for height in route.heights if height is not None]
+    if heights and len(heights) == len(route.waypoints):
+        coordinates = [
+            [*point, height.height_m] for point, height in zip(coordinates, heights, strict=True)
+        ]
+        frames = [height.frame for height in heights]
+        if any(frames):
+            properties["height_frame"] = frames[0] if len(set(frames)) == 1 else frames
+    if route.home_amsl_m is not None:
+        properties["home_amsl_m"] = route.home_amsl_m
+    geometry = {"type": "LineString", "coordinates": coordinates}
+    return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+
+def _route(coordinates: Any, properties: dict[str, Any]) -> Route:
+    require_few_waypoints(len(coordinates))
+    points = [_position(point) for point in coordinates]
+    frames = properties.get("height_frame")
+    if not isinstance(frames, list):
+        frames = [frames] * len(points)
+    if len(frames) != len(points):
+        raise RouteError(f"height_frame has {len(frames)} entries for {len(points)} waypoints")
+    heights = tuple(
+        None if height is None else Height(height, frame)
+        for (_, _, height), frame in zip(points, frames, strict=True)
+    )
+    name, bands = properties.get("name"), properties.get("band_m")
+    if not isinstance(bands, list):
+        bands = [] if bands is None else [bands] * max(1, len(points) - 1)
+    return Route(
+        tuple((lat, lon) for lat, lon, _ in points),
+        heights,
+        tuple(number_or_none(each, "band_m") for each in bands),
+        name if isinstance(name, str) else None,
+        number_or_none(properties.get("home_amsl_m"), "home_amsl_m"),
+    )
+
+
+def _position(point: Any) -> tuple[float, float, float | None]:
+    lon, lat, *rest = (number(value, "GeoJSON position") for value in point[:3])
+    return lat, lon, rest[0] if rest else None
+
+
+def _geometries(node: Any) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    stack: list[tuple[Any, dict[str, Any]]] = [(node, {})]
+    while stack:
+        item, properties = stack.pop()
+        if not isinstance(item, dict):
+            continue
+        if item.get("type") == "Feature":
+            own = item.get("properties")
+            properties = own if isinstance(own, dict) else {}
+            stack.append((item.get("geometry"), properties))
+        within = item.get("features") or item.get("geometries") or []
+        stack.extend((each, properties) for each in reversed(within))
+        yield item, properties
+
+
+_LAT = ("lat_deg", "lat", "latitude", "latitude_deg")
+_LON = ("lon_deg", "lon", "lng", "long", "longitude", "longitude_deg")
+_HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
+    ("agl", ("agl_m", "agl", "altitude_agl_m", "altitudeagl")),
+    ("home", ("home_m", "height_above_home_m")),
+    ("amsl", ("amsl_m", "amsl", "altitude_amsl_m", "altitudeamsl")),
+    ("hae", ("hae_m",)),
+    (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
+)
+_MODE = "altitudemode"  # column of Litchi
+_FRAME_OF_MODE: dict[float | None, HeightFrame] = {0: "home", 1: "agl"}
+_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
+_METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
+_Values = Callable[[str], list[float | None]]
+
+
+def _read_delimited(data: bytes) -> list[Route]:
+    stream = io.StringIO(decoded(data), newline=None)
+    header = stream.readline(MAX_LINE_CHARS)
+    stream.seek(0)
+    delimiter = max(",;\t", key=header.count)
+    try:
+        table = TableRows(stream, delimiter=delimiter)
+        names = {_UNIT.sub("", name.strip().lower()): name for name in table.columns}
+        rows = []
+        for row in table:
+            rows.append(row)
+            require_few_waypoints(len(rows))
+    except TableError as error:
+        raise RouteError(f"route table cannot be read ({error})") from error
+    lat, lon = (next(filter(names.get, aliases), None) for aliases in (_LAT, _LON))
+    if lat is None or lon is None:
+        raise RouteError(
+            "route CSV needs the columns lat_deg,lon_deg (or lat,lon or latitude,longitude), got "
+            f"{','.join(names) or 'none'!s:.80}"
+        )
+
+    def values(name: str) -> list[float | None]:
+        found = []
+        for line, row in enumerate(rows, 2):
+            text = row.get(names[name]) or ""
+            if delimiter != "," and "." not in text:
+                text = text.replace(",", ".")
+            what = f"route table cannot be read: row {line}, {names[name]}"
+            found.append(parsed(text, what) if name in (lat, lon) or text.strip() else None)
+        return found
+
+    waypoints = tuple((a or 0.0, b or 0.0) for a, b in zip(values(lat), values(lon), strict=True))
+    bands = values("band_m") if "band_m" in names else []
+    return [Route(waypoints, _heights(names, values), tuple(bands[:-1] if bands[1:] else bands))]
+
+
+def _heights(names: dict[str, str], values: _Values) -> tuple[Height | None, ...]:
+    known = ((frame, name) for frame, aliases in _HEIGHTS for name in aliases if name in names)
+    frame, name = next(known, (None, None))
+    if name is None:
+        return ()
+    unit = _UNIT.search(names[name].strip().lower())
+    if unit is not None and unit[1] not in _METRES:
+        raise RouteError(f"heights must be in m or ft, got the column {names[name]!r:.60}")
+    factor = 1.0 if unit is None else _METRES[unit[1]]
+    heights = values(name)
+    frames = [frame] * len(heights)
+    if frame is None and _MODE in names:
+        modes = values(_MODE)
+        if not {None, 0, 1}.issuperset(modes):
+            raise RouteError(f"{names[_MODE]} must be 0 (above take-off) or 1 (above ground)")
+        frames = [_FRAME_OF_MODE.get(mode) for mode in modes]
+    return tuple(
+        None if height is None else Height(factor * height, each)
+        for height, each in zip(heights, frames, strict=True)
+    )
 
 
 def _read_json(data: bytes) -> list[Route]:
     plain = json_object(data)
-    return [plan_route(plain)] if is_plan(plain) else routes_of(plain)
+    return [plan_route(plain)] if plain.get("fileType") == "Plan" else _routes_of(plain)
 
 
 def _read_text(data: bytes) -> list[Route]:
-    return read_wpl(data) if is_wpl(data) else read_delimited(data)
+    return read_wpl(data) if is_wpl(data) else _read_delimited(data)
 
 
 _READERS: dict[str, Callable[[bytes], list[Route]]] = {
-    ".geojson": read_geojson,
+    ".geojson": lambda data: _routes_of(json_object(data)),
     ".json": _read_json,
     ".csv": _read_text,
     ".tsv": _read_text,
     ".txt": _read_text,
     ".waypoints": read_wpl,
-    ".plan": read_plan,
+    ".plan": lambda data: [plan_route(json_object(data))],
     ".kml": read_kml,
     ".kmz": read_kmz,
     ".wpml": read_wpml,
@@ -130,24 +240,23 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
 
 
 def read_route(path: Path) -> Route:
-    """`FILE#NAME` selects a line by its name, or else its number from 1; `paper:B@46.6,1.9,30` is a
-    preset. Raises `MissingFileError` or `RouteError`."""
-    if str(path).startswith(PREFIX):
-        return preset(str(path))
-    path, name = _name_apart(Path(path))
+    """`FILE#NAME` selects a line by its name, or else its number from 1. Raises `MissingFileError`
+    or `RouteError`."""
+    path, name = Path(path), ""
+    if "#" in str(path) and not path.exists():
+        file, _, name = str(path).partition("#")
+        path = Path(file)
     data = _bytes_of(path)
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         raise RouteError(f"route must be one of {', '.join(_READERS)}, got '{path.suffix}': {path}")
     try:
         found = _READERS[suffix](data)
-        route = _chosen(found, name, first=suffix in (".geojson", ".json"))
+        route = _chosen(found, name)
     except RouteError as error:
         raise RouteError(f"{error}: {path}") from error
     except _BROKEN as error:
         raise RouteError(f"route cannot be read ({described(error)}): {path}") from error
-    if route.left_out:
-        log.warning("%s: %s", left_out_text(route.left_out), path)
     return route
 
 
@@ -165,20 +274,9 @@ def _bytes_of(path: Path) -> bytes:
     return data
 
 
-def _name_apart(path: Path) -> tuple[Path, str | None]:
-    text = str(path)
-    if path.exists():
-        return path, None
-    for at, letter in enumerate(text):
-        if letter == "#" and Path(text[:at]).is_file():
-            return Path(text[:at]), text[at + 1 :]
-    return path, None
-
-
-def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
-    """The line of that name, else of that number, from 1; without a name the only one. With
-    `first`, the first of several unnamed lines, with a warning."""
-    if name is not None:
+def _chosen(found: list[Route], name: str) -> Route:
+    """The line of that name, else of that number, from 1; without a name the only one."""
+    if name:
         named = [route for route in found if route.name == name]
         number = int(name) if re.fullmatch(r"[0-9]{1,9}", name) else 0
         if not named and 1 <= number <= len(found):
@@ -190,11 +288,9 @@ def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
             )
         return named[0]
     if len(found) > 1:
-        if not first or any(route.name for route in found):
-            raise RouteError(
-                f"file holds {len(found)} lines; give FILE#NAME or FILE#NUMBER: {_listed(found)}"
-            )
-        log.warning("route file holds %d unnamed lines: using the first", len(found))
+        raise RouteError(
+            f"file holds {len(found)} lines; give FILE#NAME or FILE#NUMBER: {_listed(found)}"
+        )
     return found[0]
 
 
@@ -214,56 +310,9 @@ def leg_lengths_m(route: Route) -> Array:
 
 def distance_to_polyline_m(points_en_m: Array, line_en_m: Array) -> Array:
     """Shortest distance in metres of `(N, 2)` points to a polyline of `(M, 2)` vertices, M >= 1."""
-    return beyond_bands_m(points_en_m, line_en_m, np.zeros(max(1, len(line_en_m) - 1)))
-
-
-def beyond_bands_m(points_en_m: Array, line_en_m: Array, bands_m: Array) -> Array:
-    """Distance in metres of `(N, 2)` points outside the bands (full widths of max(1, M - 1) legs)
-    of a polyline of `(M, 2)` vertices; negative inside."""
-    starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
-    legs = (line_en_m[1:] if len(line_en_m) > 1 else line_en_m) - starts
-    length2 = np.maximum((legs**2).sum(axis=1), np.finfo(np.float64).tiny)
-    best = np.full(len(points_en_m), np.inf)
-    at_once = max(1, _PAIRS_AT_ONCE // max(1, len(points_en_m)))
-    for first in range(0, len(legs), at_once):
-        some = slice(first, first + at_once)
-        east, north = (points_en_m[:, axis, None] - starts[some, axis] for axis in (0, 1))
-        along = (east * legs[some, 0] + north * legs[some, 1]) / length2[some]
-        np.clip(along, 0, 1, out=along)
-        east -= along * legs[some, 0]
-        north -= along * legs[some, 1]
-        beyond = np.hypot(east, north) - bands_m[some] / 2
-        np.minimum(best, beyond.min(axis=1), out=best)
-    return best
-
-
-def within_bands(
-    points_en_m: Array, line_en_m: Array, bands_m: Array, margin_m: float
-) -> NDArray[np.bool_]:
-    """Mask `(N,)` of the points `(N, 2)` inside the band of a leg or at most `margin_m` outside.
-    Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs."""
-    if len(points_en_m) <= _FEW_POINTS:
-        return np.asarray(beyond_bands_m(points_en_m, line_en_m, bands_m) <= margin_m)
-    order = np.argsort(points_en_m[:, 0], kind="stable")
-    x, y = points_en_m[order].T
-    starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
-    ends = line_en_m[1:] if len(line_en_m) > 1 else line_en_m
-    reach = bands_m / 2 + margin_m
-    low, high = np.minimum(starts, ends) - reach[:, None], np.maximum(starts, ends) + reach[:, None]
-    first = np.searchsorted(x, low[:, 0], side="left").tolist()
-    last = np.searchsorted(x, high[:, 0], side="right").tolist()
-    inside = np.zeros(len(x), dtype=np.bool_)
-    for leg in np.flatnonzero(reach >= 0).tolist():
-        some = slice(first[leg], last[leg])
-        near = np.flatnonzero(~inside[some] & (y[some] >= low[leg, 1]) & (y[some] <= high[leg, 1]))
-        if len(near):
-            near += first[leg]
-            points = np.stack([x[near], y[near]], axis=1)
-            vertices = np.stack([starts[leg], ends[leg]])
-            inside[near] = beyond_bands_m(points, vertices, bands_m[leg : leg + 1]) <= margin_m
-    found = np.empty_like(inside)
-    found[order] = inside
-    return found
+    shapely = needed("shapely", "geo", "a route")
+    line = shapely.linestrings(np.concatenate([line_en_m, line_en_m[-1:]]))
+    return np.asarray(shapely.distance(line, shapely.points(points_en_m)))
 
 
 def along_polyline_en_m(line_en_m: Array, spacing_m: float) -> tuple[Array, Array]:

@@ -7,7 +7,6 @@ The sheets of the Earth (`WorldSheets`) have names. Rows have equal height in la
 divided into the number of equal boxes its longest parallel requires. Rows are counted from the
 South Pole, columns from 180 deg west."""
 
-import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -17,77 +16,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError
-from orthonav.core.geo.frames import MAX_SHEET_M, WGS84_A_M
-from orthonav.core.geo.swapped import swapped_bounds_hint, swapped_hint
-from orthonav.ground.planning.area import Area, Extent, unwrapped
+from orthonav.core.geo.frames import MAX_SHEET_M
+from orthonav.core.geo.swapped import swapped_hint
+from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.route import Array, Height, Route, leg_lengths_m
 
-MAX_SHEETS = 10_000  # limit of the program; 2500 km2 each, so 25 million km2
 MAX_ROUTE_SHEETS = 500  # more than once around the Earth with bands of less than 10 km
-_DEGREE_M = 110_574.0  # shortest degree of latitude, at the equator (WGS84)
-_LON_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
-_TRIES = 4  # numbers of columns tried for one row before rows are made lower
+_MERIDIAN_DEGREE_M = 111_695.0  # longest degree of latitude, at a pole (WGS84)
+_PARALLEL_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
 
 
-def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
-    """Boxes (west, south, east, north in degrees) that each fit a sheet: rows of equal height, from
-    south to north, each divided into equal boxes, from west to east."""
-    west, south, east, north = unwrapped(bounds_deg)
-    if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
-        hint = swapped_bounds_hint((west, south, east, north))
-        raise AreaError(
-            f"bounds must lie within 89.5 deg of the equator{hint}, "
-            f"got {','.join(map(str, bounds_deg))}"
-        )
-    zone = math.sin(math.radians(north)) - math.sin(math.radians(south))
-    least = math.radians(east - west) * zone * WGS84_A_M**2 / MAX_SHEET_M**2
-    if least > MAX_SHEETS:
-        raise _too_many(round(least))
-    rows = max(1, int((north - south) * _DEGREE_M / MAX_SHEET_M))
-    while True:
-        edges = np.linspace(south, north, rows + 1).tolist()
-        found = [_row(west, low, east, high) for low, high in itertools.pairwise(edges)]
-        if all(found):
-            break
-        rows += 1
-    sheets = [sheet for row in found for sheet in row]
-    if len(sheets) > MAX_SHEETS:
-        raise _too_many(len(sheets))
-    return sheets
-
-
-def _row(west: float, south: float, east: float, north: float) -> list[Extent]:
-    widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
-    width_m = (east - west) * _LON_DEGREE_M * math.cos(math.radians(widest))
-    least = max(1, int(width_m / MAX_SHEET_M))
-    for count in range(least, least + _TRIES):
-        edges = np.linspace(west, east, count + 1).tolist()
-        boxes = [
-            (_wrapped(left), south, _wrapped(right), north)
-            for left, right in itertools.pairwise(edges)
-        ]
-        if _box_fits((edges[0], south, edges[1], north)):
-            return boxes
-    return []
-
-
-def _box_fits(bounds_deg: Extent) -> bool:
+def _fits(route: Route, band_m: float | None) -> bool:
     try:
-        Area.from_bounds(bounds_deg)
+        Area.from_route(route, band_m)
     except AreaError:
         return False
     return True
-
-
-def _wrapped(lon_deg: float) -> float:
-    return lon_deg if abs(lon_deg) <= 180 else (lon_deg + 180) % 360 - 180
 
 
 def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
     """Parts of a route, in order, as long as their search bands fit a sheet. A leg too long for one
     is divided into equal pieces on the great circle."""
     bands_m = route.bands_m(band_m)
-    if bands_m is None or _route_fits(route, band_m):
+    if bands_m is None or _fits(route, band_m):
         Area.from_route(route, band_m)  # raises if a band is missing
         return [route]
     if max(bands_m) >= MAX_SHEET_M:
@@ -106,50 +57,40 @@ def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
     return parts
 
 
-def _route_fits(route: Route, band_m: float | None) -> bool:
-    try:
-        Area.from_route(route, band_m)
-    except AreaError:
-        return False
-    return True
-
-
 def _last_that_fits(route: Route, first: int, band_m: float | None) -> int:
     """The last waypoint for which the legs from `first` fit a sheet; at least one leg."""
+
+    def fits(last: int) -> bool:
+        within = last < len(route.waypoints)
+        return within and _fits(route.part(first, last), band_m)
+
     step, last = 1, first + 1
-    while last + step < len(route.waypoints) and _route_fits(
-        route.part(first, last + step), band_m
-    ):
+    while fits(last + step):
         last += step
         step *= 2
     while step > 0:
-        if last + step < len(route.waypoints) and _route_fits(
-            route.part(first, last + step), band_m
-        ):
+        if fits(last + step):
             last += step
         step //= 2
     return last
 
 
 def _with_short_legs(route: Route, bands_m: tuple[float, ...]) -> Route:
+    pieces = np.ceil(leg_lengths_m(route) / (0.99 * (MAX_SHEET_M - np.array(bands_m))))
+    pieces = np.maximum(pieces, 1).astype(int)
+    divided = int(pieces[pieces > 1].sum())
+    if divided > MAX_ROUTE_SHEETS:
+        raise _route_too_long(f"{divided:,} or more")
     waypoints, heights = [route.waypoints[0]], list(route.heights[:1])
     leg_bands: list[float | None] = []
-    lengths_m = leg_lengths_m(route)
-    divided = 0
-    for leg, (start, end) in enumerate(zip(route.waypoints, route.waypoints[1:], strict=False)):
-        pieces = math.ceil(lengths_m[leg] / (0.99 * (MAX_SHEET_M - bands_m[leg])))
-        if pieces <= 1 or _route_fits(Route((start, end)), bands_m[leg]):
-            pieces = 1  # most legs
-        divided += pieces if pieces > 1 else 0
-        if divided > MAX_ROUTE_SHEETS:
-            raise _route_too_long(f"{divided:,} or more")
-        shares = [number / pieces for number in range(1, pieces)]
+    for leg, count in enumerate(pieces.tolist()):
+        shares = np.arange(1, count) / count
+        start, end = route.waypoints[leg : leg + 2]
         waypoints += [*_on_great_circle(start, end, shares), end]
         if route.heights:
-            below, above = route.heights[leg], route.heights[leg + 1]
-            heights += [*(_between(below, above, share) for share in shares), above]
-        if route.leg_bands_m:
-            leg_bands += [route.leg_bands_m[leg]] * pieces
+            below, above = route.heights[leg : leg + 2]
+            heights += [*(_between(below, above, share) for share in shares.tolist()), above]
+        leg_bands += [band for band in route.leg_bands_m[leg : leg + 1] for _ in range(count)]
     return replace(
         route, waypoints=tuple(waypoints), heights=tuple(heights), leg_bands_m=tuple(leg_bands)
     )
@@ -162,20 +103,16 @@ def _between(below: Height | None, above: Height | None, share: float) -> Height
 
 
 def _on_great_circle(
-    start: tuple[float, float], end: tuple[float, float], shares: list[float]
+    start: tuple[float, float], end: tuple[float, float], shares: Array
 ) -> Iterator[tuple[float, float]]:
-    one, other = _direction(start), _direction(end)
+    lat, lon = np.radians([start, end]).T
+    one, other = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], 1)
     angle = math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
-    if shares and math.sin(angle) < 1e-6:
+    if len(shares) and math.sin(angle) < 1e-6:
         raise AreaError(f"leg from {start} to {end} spans half of the Earth: add waypoints")
-    for share in shares:
+    for share in shares.tolist():
         x, y, z = math.sin((1 - share) * angle) * one + math.sin(share * angle) * other
         yield math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
-
-
-def _direction(place: tuple[float, float]) -> Array:
-    lat, lon = (math.radians(value) for value in place)
-    return np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
 
 
 def _route_too_long(sheets: str) -> AreaError:
@@ -185,14 +122,8 @@ def _route_too_long(sheets: str) -> AreaError:
     )
 
 
-def _too_many(count: int) -> AreaError:
-    return AreaError(f"area needs {count:,} sheets, more than the limit of {MAX_SHEETS:,}")
-
-
 LARGEST_SIDE_M = 0.9 * MAX_SHEET_M  # boxes are wider than sheets: meridians converge
 SMALLEST_SIDE_M = 200.0
-_MERIDIAN_DEGREE_M = 111_695.0  # longest degree of latitude, at a pole (WGS84)
-_PARALLEL_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
 _NAME = re.compile(r"r([0-9]{6})c([0-9]{6})")
 
 

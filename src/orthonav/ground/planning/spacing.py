@@ -15,7 +15,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import TerrainHeights
-from orthonav.ground.planning.area import Area, Extent
+from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route, leg_lengths_m
 
 TILE_SIZES_PX = (256, 128, 64)  # to choose from; 256 is the default of `build`
@@ -27,7 +27,6 @@ FINEST_IMAGERY_M = 0.2  # open orthophotos of whole countries are rarely finer (
 LOW_VIEW_M = 100.0  # below this a single field or wood can fill the view
 MOST_RELIEF = 0.05  # within a view, as a fraction of the height: the std of reported heights
 VIEW_OVERLAP = 0.6  # usual forward overlap of aerial photography
-TRACKED_PER_S = 10.0  # views per second while tracking on one desktop core: docs/benchmarks.md
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)  # 65 by 51 deg
 DEFAULT_PRIOR_STD_M = 150.0  # about 5 km of dead reckoning with an error of 3 %
 BAND_PRIORS = 4.0  # width of a band that is not given: two deviations of the prior to each side
@@ -114,52 +113,31 @@ def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
     share, across_px = view.tile_share(tile_m), view.across_px(gsd_m)
     across = f"a view is {across_px:.0f} map pixels across"
     covers = f"a view covers {share:.0%} of a tile"
-    little, part = across_px < LEAST_VIEW_PX, share < LEAST_TILE_SHARE
-    cautions = {
-        "low": (
-            view.short_m < LOW_VIEW_M,
+    found = []
+    if view.short_m < LOW_VIEW_M:
+        text = (
             f"a view is only {view.short_m:.0f} m across: over forest or one large field it shows "
-            "no lasting structure, and relief displacement of trees and houses is large; fly "
-            "higher",
-        ),
-        "too_coarse": (
-            coarser > MOST_COARSER,
+            "no lasting structure, and relief displacement of trees and houses is large; fly higher"
+        )
+        found.append(Caution("low", text))
+    if coarser > MOST_COARSER:
+        text = (
             f"a pixel of the view covers {coarser:.1f} pixels of the map: refused (too_coarse); "
-            "build coarser, or fly lower",
-        ),
-        "too_small": (
-            little,
-            f"{across}: refused below {LEAST_VIEW_PX:.0f}; build finer, or fly higher",
-        ),
-        "few_pixels": (
-            not little and across_px < GOOD_VIEW_PX * 0.999,
-            f"{across}, fewer than {GOOD_VIEW_PX:.0f}; build finer, or fly higher",
-        ),
-        "tile_too_large": (
-            part,
-            f"{covers}: tile search refuses below {LEAST_TILE_SHARE:.0%}; use smaller tiles",
-        ),
-        "part_of_tile": (
-            not part and share < 0.999,
-            f"{covers} of {tile_m:.0f} m; best is a whole tile",
-        ),
-        "fine_imagery": (
-            gsd_m < FINEST_IMAGERY_M * 0.999,
-            f"orthophotos of {gsd_m:g} m are rare ({FINEST_IMAGERY_M:g} m is the usual minimum)",
-        ),
-    }
-    return [Caution(code, text) for code, (applies, text) in cautions.items() if applies]
-
-
-def rate_cautions(view: ViewPlan, speed_mps: float) -> list[Caution]:
-    needed = speed_mps / view.spacing_m
-    if needed <= TRACKED_PER_S:
-        return []
-    text = (
-        f"{VIEW_OVERLAP:.0%} overlap at {speed_mps:g} m/s needs {needed:.0f} views per second; a "
-        f"desktop core tracks about {TRACKED_PER_S:.0f}"
-    )
-    return [Caution("fast", text)]
+            "build coarser, or fly lower"
+        )
+        found.append(Caution("too_coarse", text))
+    if across_px < LEAST_VIEW_PX:
+        text = f"{across}: refused below {LEAST_VIEW_PX:.0f}; build finer, or fly higher"
+        found.append(Caution("too_small", text))
+    elif across_px < GOOD_VIEW_PX * 0.999:
+        text = f"{across}, fewer than {GOOD_VIEW_PX:.0f}; build finer, or fly higher"
+        found.append(Caution("few_pixels", text))
+    if share < LEAST_TILE_SHARE:
+        text = f"{covers}: tile search refuses below {LEAST_TILE_SHARE:.0%}; use smaller tiles"
+        found.append(Caution("tile_too_large", text))
+    elif share < 0.999:
+        found.append(Caution("part_of_tile", f"{covers} of {tile_m:.0f} m; best is a whole tile"))
+    return found
 
 
 TILE_BYTES = 273.0  # embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles
@@ -169,7 +147,6 @@ BUILD_S_PER_MPX = 0.5
 """Measured with one worker on a core of an AMD EPYC, generated landscape, 1 m, default build: 179 s
 for a corridor of 284 million pixels (`benchmarks.corridor` at d63ac91), 47 s for 4 million on a
 shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
-_PAIRS = 1_000_000_000  # limit on pairs of points and legs, which bounds the time of an estimate
 _MOST_POINTS = 200_000
 _LEAST_POINTS = 2_500  # points sampled: a standard error of the fraction of 0.1 % to 1 %
 
@@ -198,25 +175,19 @@ def estimate_map(
     """Tiles are counted if that is cheap, else estimated from a sample (within 2 %), which is
     smaller where this is one of many `maps`. Imagery is assumed everywhere."""
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
-    half_m, centre_m = grid.tile_m / 2, (grid.tile_m - grid.stride_m) / 2
-    raster = (
-        grid.west_m,
-        grid.north_m - grid.height_px * gsd_m,
-        grid.west_m + grid.width_px * gsd_m,
-        grid.north_m,
-    )
-    centres = tuple(np.array(raster) + np.array([1, 1, -1, -1]) * centre_m)
-    reach_m = grid.stride_m * math.sqrt(0.5)
     room = max(_LEAST_POINTS, _MOST_POINTS // maps)
-    cells = grid.rows, grid.cols
-    tiles = round(grid.rows * grid.cols * _share(area, centres, reach_m, room, cells))
-    imagery_m2 = grid.width_px * grid.height_px * gsd_m**2 * _share(area, raster, half_m, room)
-    pixels = imagery_m2 / gsd_m**2
+    border_m = (grid.tile_m - grid.stride_m) / 2
+    reach_m = grid.stride_m * math.sqrt(0.5)
+    tiles = round(
+        grid.rows * grid.cols * _share(area, grid, border_m, reach_m, (grid.rows, grid.cols), room)
+    )
+    size_px = grid.height_px, grid.width_px
+    pixels = math.prod(size_px) * _share(area, grid, 0.0, grid.tile_m / 2, size_px, room)
     layer = [pixels * each / 1e6 if registration else 0.0 for each in LAYER_BYTES_PER_PX]
     embeddings = tiles * TILE_BYTES / 1e6
     return MapEstimate(
         area_km2=tiles * grid.stride_m**2 / 1e6,
-        imagery_km2=imagery_m2 / 1e6,
+        imagery_km2=pixels * gsd_m**2 / 1e6,
         tiles=tiles,
         map_mb=(embeddings + layer[0], embeddings + layer[1]),
         build_s=BUILD_FIXED_S + BUILD_S_PER_MPX * pixels / 1e6,
@@ -224,20 +195,24 @@ def estimate_map(
 
 
 def _share(
-    area: Area, box_en_m: Extent, margin_m: float, room: int, cells: tuple[int, int] | None = None
+    area: Area,
+    grid: TileGrid,
+    border_m: float,
+    margin_m: float,
+    cells: tuple[int, int],
+    room: int,
 ) -> float:
-    """Share of a box that lies in the area or within a margin of it, computed from the centres of
-    its `cells` (rows, columns), or of at most about `room`."""
+    """Share of the grid without its border that lies in the area or within a margin of it, computed
+    from the centres of `cells` (rows, columns), or of at most about `room`."""
     if area.route is None:
         return 1.0
-    room = min(room, max(_LEAST_POINTS, _PAIRS // area.route.legs))
-    west, south, east, north = box_en_m
-    if cells is None or cells[0] * cells[1] > room:
-        rows = max(1, min(room, round(math.sqrt(room * (north - south) / (east - west)))))
-        cells = rows, max(1, room // rows)
-    rows, cols = cells
-    x = west + (np.arange(cols) + 0.5) * (east - west) / cols
-    y = north - (np.arange(rows) + 0.5) * (north - south) / rows
+    step = max(1.0, math.sqrt(math.prod(cells) / room))
+    rows, cols = (math.ceil(count / step) for count in cells)
+    width_m, height_m = (
+        count * grid.gsd_m - 2 * border_m for count in (grid.width_px, grid.height_px)
+    )
+    x = grid.west_m + border_m + (np.arange(cols) + 0.5) * width_m / cols
+    y = grid.north_m - border_m - (np.arange(rows) + 0.5) * height_m / rows
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return float(area.contains(points, margin_m).mean())
 
@@ -282,11 +257,15 @@ def profile(
     ]
 
 
-def _leg_m(route: Route, leg: int) -> tuple[LocalFrame, float, Array]:
-    ends = route.part(leg, min(leg + 1, len(route.waypoints) - 1))
-    frame = LocalFrame(*ends.waypoints[0])
-    points = ends.points_en_m(frame)
-    return frame, float(np.linalg.norm(points[-1] - points[0])), points[[0, -1]]
+def flown_agl_m(route: Route, terrain: TerrainHeights | None) -> list[float]:
+    """Known heights above ground along a route, without take-off and landing: as planned, or where
+    not all are planned so, over a terrain."""
+    heights = [height for height in route.heights if height is not None]
+    planned = [height.height_m for height in heights if height.frame == "agl"]
+    if heights and len(planned) < len(heights) and terrain is not None:
+        legs = profile(route, (0.0,) * route.legs, None, 0.0, terrain)
+        planned = [height for leg in legs for height in leg.agl_m]
+    return [height for height in planned if height >= LANDING_M]
 
 
 def _leg(
@@ -299,7 +278,10 @@ def _leg(
     home_m: float,
     terrain: TerrainHeights,
 ) -> LegProfile:
-    frame, length_m, (start, end) = _leg_m(route, leg)
+    ends = route.part(leg, min(leg + 1, len(route.waypoints) - 1))
+    frame = LocalFrame(*ends.waypoints[0])
+    start, end = ends.points_en_m(frame)[[0, -1]]
+    length_m = float(np.linalg.norm(end - start))
     along = (end - start) / length_m if length_m > 0 else np.array([1.0, 0.0])
     across = np.array([along[1], -along[0]])
     shares = np.linspace(0, 1, math.ceil(length_m / spacing_m) + 1)
@@ -331,7 +313,6 @@ def _leg(
 def _flown_amsl_m(
     route: Route, leg: int, agl_m: float | None, shares: Array, below: Array, home_m: float
 ) -> Array:
-    """Flown heights above mean sea level at shares of a leg, over the terrain heights `below`."""
     ends = route.heights[leg : leg + 2]
     frames = {None if height is None else height.frame for height in ends}
     if not ends or not frames.isdisjoint({None, "hae"}) or len(frames) > 1:
@@ -349,21 +330,20 @@ def _flown_amsl_m(
 
 def terrain_cautions(legs: list[LegProfile]) -> list[Caution]:
     found = []
-    low = [leg.leg for leg in legs if leg.agl_m[0] < -_BELOW_GROUND_M]
-    steep = [leg for leg in legs if leg.relief > MOST_RELIEF and leg.leg not in low]
+    low = [leg for leg in legs if leg.agl_m[0] < -_BELOW_GROUND_M]
+    steep = [leg for leg in legs if leg.relief > MOST_RELIEF and leg not in low]
     if low:
-        text = f"{_named(low)} would pass below the terrain"
-        found.append(Caution("ground", text))
+        found.append(Caution("ground", f"{_named(low)} would pass below the terrain"))
     if steep:
         most = max(leg.relief for leg in steep)
         text = (
-            f"relief within a view is up to {most:.0%} of the height on "
-            f"{_named([leg.leg for leg in steep])}; above {MOST_RELIEF:.0%} it distorts the view"
+            f"relief within a view is up to {most:.0%} of the height on {_named(steep)}; "
+            f"above {MOST_RELIEF:.0%} it distorts the view"
         )
         found.append(Caution("relief", text))
     return found
 
 
-def _named(legs: list[int]) -> str:
-    shown = ", ".join(map(str, legs[:10])) + (", .." if len(legs) > 10 else "")
+def _named(legs: list[LegProfile]) -> str:
+    shown = ", ".join(str(leg.leg) for leg in legs[:10]) + (", .." if len(legs) > 10 else "")
     return f"leg {shown}" if len(legs) == 1 else f"legs {shown}"

@@ -3,19 +3,15 @@
 from orthonav.ground.recordings.flightlog import LoggedFlight
 from orthonav.ground.recordings.opening import (
     Imported,
-    OverTerrain,
     import_flight,
     open_source,
     source_kind,
 )
-from orthonav.ground.recordings.recording import KINDS, ROLES, Recording, SourceOptions, SourceView
+from orthonav.ground.recordings.recording import Recording, SourceOptions, SourceView
 
 __all__ = [
-    "KINDS",
-    "ROLES",
     "Imported",
     "LoggedFlight",
-    "OverTerrain",
     "Recording",
     "SourceOptions",
     "SourceView",

@@ -5,20 +5,19 @@ Only confident positions are written: photogrammetry takes what it is given as m
 
 import csv
 import io
-import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 from xml.sax.saxutils import escape
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from orthonav.core.errors import VariantError
 from orthonav.core.files import write_text
+from orthonav.core.geo.attitude import wxyz_of_matrices
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import TerrainHeights
@@ -34,25 +33,28 @@ class CameraPosition:
     """Where a picture was taken: a view and its confident fix.
 
     `height_m`: above mean sea level, NaN without a terrain. `std_m`: standard deviation of the
-    position along its worst axis, the displacement of the map included.
+    position along its worst axis, the displacement of the map included. `above_sea`: whether all
+    heights of the flight are known. `en_m`: metres east and north of the first position.
     """
 
     view: ViewResult
     fix: Fix
     height_m: float
     std_m: float
+    above_sea: bool = False
+    en_m: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def frame(self) -> str:
-        """Name of the picture."""
-        return self.view.frame
+    def up_m(self) -> float:
+        """Height above sea where all are known, else above ground."""
+        return self.height_m if self.above_sea else self.fix.agl_m
 
 
 def camera_positions(
     results: Sequence[ViewResult], terrain: TerrainHeights | None
 ) -> list[CameraPosition]:
     """The confident positions of a flight; heights above sea by the ground of `terrain`."""
-    found = []
+    found: list[CameraPosition] = []
     for view in results:
         fix = view.outcome
         if not isinstance(fix, Fix) or not view.is_confident:
@@ -64,11 +66,21 @@ def camera_positions(
         if view.state is None:  # that of a track has it already
             worst += MAP_STD_M**2
         found.append(CameraPosition(view, fix, ground_m + fix.agl_m, math.sqrt(worst)))
-    return found
+    if not found:
+        return found
+    above_sea = all(math.isfinite(each.height_m) for each in found)
+    plane = LocalFrame(found[0].fix.lat_deg, found[0].fix.lon_deg)
+    return [
+        replace(
+            each,
+            above_sea=above_sea,
+            en_m=tuple(plane.en_from_latlon(each.fix.lat_deg, each.fix.lon_deg).tolist()),
+        )
+        for each in found
+    ]
 
 
 def export_of(text: str) -> tuple[str, Path]:
-    """Format and path of `FORMAT=PATH`; raises `VariantError`."""
     name, _, path = text.partition("=")
     if name not in FORMATS or not path:
         raise VariantError(
@@ -83,176 +95,87 @@ def export_all(
     results: Sequence[ViewResult],
     terrain: TerrainHeights | None,
 ) -> None:
-    """Write the camera positions of a flight in formats and to paths of `export_of`.
-
-    Existing files are replaced atomically.
-    """
+    """Write the camera positions of a flight in formats and to paths of `export_of`."""
     positions = camera_positions(results, terrain) if exports else []
     for name, path in exports:
-        write_text(path, FORMATS[name](positions))
+        head, line_of, tail = FORMATS[name]
+        write_text(path, "\n".join([head, *map(line_of, positions), *tail]) + "\n")
 
 
-def _fixed(value: float, decimals: int = 3) -> str:
-    return "" if math.isnan(value) else f"{value:.{decimals}f}"
+def _csv(each: CameraPosition) -> str:
+    values = each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m
+    known = ("" if math.isnan(value) else f"{value:.3f}" for value in values)
+    out = io.StringIO()
+    csv.writer(out, lineterminator="").writerow(
+        [each.view.frame, f"{each.fix.lat_deg:.8f}", f"{each.fix.lon_deg:.8f}", *known]
+    )
+    return out.getvalue()
 
 
-def _csv(positions: Sequence[CameraPosition]) -> str:
-    rows: list[Sequence[str]] = [CSV_COLUMNS]
-    for each in positions:
-        place = _fixed(each.fix.lat_deg, 8), _fixed(each.fix.lon_deg, 8)
-        values = each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m
-        rows.append([each.frame, *place, *map(_fixed, values)])
-    return _table(rows)
-
-
-def _geojson(positions: Sequence[CameraPosition]) -> str:
-    features = []
-    for each in positions:
-        point = [round(each.fix.lon_deg, 8), round(each.fix.lat_deg, 8)]
-        if not math.isnan(each.height_m):
-            point.append(round(each.height_m, 3))
-        numbers = {
-            "agl_m": round(each.fix.agl_m, 3),
-            "heading_deg": round(each.fix.heading_deg, 3),
-            "std_m": round(each.std_m, 3),
-            "confidence": round(each.fix.confidence, 4),
-        }
-        known = {key: value if math.isfinite(value) else None for key, value in numbers.items()}
-        geometry = {"type": "Point", "coordinates": point}
-        about = {"frame": each.frame, **known}
-        features.append({"type": "Feature", "geometry": geometry, "properties": about})
-    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
-
-
-def _odm_geo(positions: Sequence[CameraPosition]) -> str:
-    """OpenDroneMap's image geolocation file, https://docs.opendronemap.org/geo.
+def _odm_geo(each: CameraPosition) -> str:
+    """A line of OpenDroneMap's image geolocation file, https://docs.opendronemap.org/geo.
 
     Accuracy follows angles, and angles follow the height: without a height it is left out. Angles
     are 0, which means not available. Names must have no spaces.
     """
-    lines = ["EPSG:4326"]
-    for each in positions:
-        if any(character.isspace() for character in each.frame):
-            raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.frame!r}")
-        line = f"{each.frame} {each.fix.lon_deg:.8f} {each.fix.lat_deg:.8f}"
-        if not math.isnan(each.height_m):
-            line += f" {each.height_m:.3f} 0 0 0 {each.std_m:.3f}"
-        lines.append(line)
-    return "\n".join(lines) + "\n"
+    if any(character.isspace() for character in each.view.frame):
+        raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.view.frame!r}")
+    line = f"{each.view.frame} {each.fix.lon_deg:.8f} {each.fix.lat_deg:.8f}"
+    if math.isnan(each.height_m):
+        return line
+    return f"{line} {each.height_m:.3f} 0 0 0 {each.std_m:.3f}"
 
 
-def _exif(positions: Sequence[CameraPosition]) -> str:
-    """A table that ExifTool writes into photographs (`exiftool -csv=TABLE FOLDER`)."""
-    header = (
-        *("SourceFile", "GPSLatitude", "GPSLatitudeRef", "GPSLongitude", "GPSLongitudeRef"),
-        *("GPSAltitude", "GPSAltitudeRef", "GPSImgDirection", "GPSImgDirectionRef"),
-        *("GPSHPositioningError", "GPSMapDatum"),
-    )
-    rows: list[Sequence[str]] = [header]
-    for each in positions:
-        lat, lon, height_m = each.fix.lat_deg, each.fix.lon_deg, each.height_m
-        level = f"{'Below' if height_m < 0 else 'Above'} Sea Level"
-        heading = _fixed(each.fix.heading_deg, 2)
-        rows.append(
-            [
-                *(each.frame, _fixed(abs(lat), 8), "North" if lat >= 0 else "South"),
-                *(_fixed(abs(lon), 8), "East" if lon >= 0 else "West"),
-                *(_fixed(abs(height_m)), "" if math.isnan(height_m) else level),
-                *(heading, heading and "True North", _fixed(each.std_m), "WGS-84"),
-            ]
-        )
-    return _table(rows)
+def _tum(each: CameraPosition) -> str:
+    """A pose as evo reads it: `timestamp tx ty tz qx qy qz qw`, metres and a quaternion.
 
-
-def _tum(positions: Sequence[CameraPosition]) -> str:
-    """A trajectory as evo reads it: `timestamp tx ty tz qx qy qz qw`, metres and a quaternion.
-
-    East, north and up of the first position; the quaternion turns camera axes (x to the right of
-    the image, y down the image, z along the optical axis) to these. Unknown angles count as 0.
-    Heights are above sea where all are known, else above ground.
+    The quaternion turns camera axes (x to the right of the image, y down the image, z along the
+    optical axis) to east, north and up. Unknown angles count as 0.
     """
-    if not positions:
-        return ""
-    origin = positions[0].fix.lat_deg, positions[0].fix.lon_deg
-    plane, above_sea = LocalFrame(*origin), _are_above_sea(positions)
-    lines = [f"# east, north, up (m) of {origin[0]:.8f}, {origin[1]:.8f} (WGS84)"]
-    for each in positions:
-        east, north = plane.en_from_latlon(each.fix.lat_deg, each.fix.lon_deg).tolist()
-        up = each.height_m if above_sea else each.fix.agl_m
-        angles = np.nan_to_num([each.fix.heading_deg, each.fix.pitch_deg, each.fix.roll_deg])
-        rotation = Rotation.from_matrix(enu_from_camera(*angles.tolist()))
-        numbers = " ".join(f"{value:.9f}" for value in rotation.as_quat(canonical=True))
-        lines.append(
-            f"{Decimal(each.view.time_ns).scaleb(-9):f} {east:.4f} {north:.4f} {up:.4f} {numbers}"
-        )
-    return "\n".join(lines) + "\n"
+    angles = np.nan_to_num([each.fix.heading_deg, each.fix.pitch_deg, each.fix.roll_deg])
+    w, *xyz = wxyz_of_matrices(enu_from_camera(*angles.tolist())).tolist()
+    numbers = " ".join(f"{math.copysign(1, w) * value:.9f}" for value in (*xyz, w))
+    place = f"{each.en_m[0]:.4f} {each.en_m[1]:.4f} {each.up_m:.4f}"
+    return f"{Decimal(each.view.time_ns).scaleb(-9):f} {place} {numbers}"
 
 
-def _are_above_sea(positions: Sequence[CameraPosition]) -> bool:
-    return all(math.isfinite(each.height_m) for each in positions)
-
-
-def _kml(positions: Sequence[CameraPosition]) -> str:
-    """The track and a place for each picture; heights are absolute where all are above sea."""
-    above_sea = _are_above_sea(positions)
-    mode = "absolute" if above_sea else "relativeToGround"
-    heights_m = [each.height_m if above_sea else each.fix.agl_m for each in positions]
-    points = [
-        f"{each.fix.lon_deg:.8f},{each.fix.lat_deg:.8f},{height_m:.2f}"
-        for each, height_m in zip(positions, heights_m, strict=True)
-    ]
-
-    def placemark(name: str, about: str, kind: str, coordinates: str) -> str:
-        return (
-            f"<Placemark><name>{escape(name)}</name><description>{about}</description>"
-            f"<{kind}><altitudeMode>{mode}</altitudeMode><coordinates>{coordinates}</coordinates>"
-            f"</{kind}></Placemark>"
-        )
-
-    marks = [placemark("track", f"{len(points)} positions", "LineString", " ".join(points))]
-    marks += [
-        placemark(each.frame, f"std {each.std_m:.1f} m", "Point", point)
-        for each, point in zip(positions, points, strict=True)
-    ]
-    body = "\n".join(marks)
+def _kml(each: CameraPosition) -> str:
+    mode = "absolute" if each.above_sea else "relativeToGround"
     return (
-        f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document>\n{body}\n</Document></kml>\n'
+        f"<Placemark><name>{escape(each.view.frame)}</name>"
+        f"<description>std {each.std_m:.1f} m</description>"
+        f"<Point><altitudeMode>{mode}</altitudeMode><coordinates>"
+        f"{each.fix.lon_deg:.8f},{each.fix.lat_deg:.8f},{each.up_m:.2f}"
+        "</coordinates></Point></Placemark>"
     )
 
 
-def _gpx(positions: Sequence[CameraPosition]) -> str:
-    """A track (GPX 1.1); with heights above sea where known, and times that are dates."""
-    lines = []
-    for each in positions:
-        height = f"<ele>{each.height_m:.2f}</ele>" if math.isfinite(each.height_m) else ""
-        time = ""
-        if each.view.time_ns >= _YEAR_2000_NS:
-            seconds = datetime.fromtimestamp(each.view.time_ns // 10**9, UTC).strftime(
-                "%Y-%m-%dT%H:%M:%S"
-            )
-            time = f"<time>{seconds}.{each.view.time_ns % 10**9 // 10**6:03d}Z</time>"
-        place = f'lat="{each.fix.lat_deg:.8f}" lon="{each.fix.lon_deg:.8f}"'
-        lines.append(f"<trkpt {place}>{height}{time}<name>{escape(each.frame)}</name></trkpt>")
-    body = "\n".join(lines)
-    return (
+def _gpx(each: CameraPosition) -> str:
+    """A point of a track (GPX 1.1); with height above sea and date where they are known."""
+    height = f"<ele>{each.height_m:.2f}</ele>" if math.isfinite(each.height_m) else ""
+    time = ""
+    if each.view.time_ns >= _YEAR_2000_NS:
+        whole = datetime.fromtimestamp(each.view.time_ns // 10**9, UTC)
+        milliseconds = each.view.time_ns % 10**9 // 10**6
+        time = f"<time>{whole:%Y-%m-%dT%H:%M:%S}.{milliseconds:03d}Z</time>"
+    place = f'lat="{each.fix.lat_deg:.8f}" lon="{each.fix.lon_deg:.8f}"'
+    return f"<trkpt {place}>{height}{time}<name>{escape(each.view.frame)}</name></trkpt>"
+
+
+FORMATS: dict[str, tuple[str, Callable[[CameraPosition], str], tuple[str, ...]]] = {
+    "csv": (",".join(CSV_COLUMNS), _csv, ()),
+    "odm-geo": ("EPSG:4326", _odm_geo, ()),
+    "tum": ("# east, north, up (m) of the first position", _tum, ()),
+    "kml": (
+        f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document>',
+        _kml,
+        ("</Document></kml>",),
+    ),
+    "gpx": (
         f'{_XML}<gpx version="1.1" creator="orthonav" xmlns="http://www.topografix.com/GPX/1/1">'
-        f"<trk><trkseg>\n{body}\n</trkseg></trk></gpx>\n"
-    )
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
-    return out.getvalue()
-
-
-FORMATS: dict[str, Callable[[Sequence[CameraPosition]], str]] = {
-    "csv": _csv,
-    "geojson": _geojson,
-    "odm-geo": _odm_geo,
-    "exif": _exif,
-    "tum": _tum,
-    "kml": _kml,
-    "gpx": _gpx,
+        "<trk><trkseg>",
+        _gpx,
+        ("</trkseg></trk></gpx>",),
+    ),
 }
-"""Writers by the name of their format."""
+"""First line, a line for each position, and last line, by the name of the format."""

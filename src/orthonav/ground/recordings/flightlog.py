@@ -7,7 +7,7 @@ anywhere: all chunks that are complete are read.
 import logging
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -35,7 +35,7 @@ from orthonav.core.flight.logged import (
 from orthonav.core.flight.mount import logged_mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import ViewResult
-from orthonav.ground.recordings.mcap_files import Walk, chunk_at, chunks, messages, profile_of
+from orthonav.ground.recordings.mcap_files import McapFile, chunk_at, chunks, messages, profile_of
 from orthonav.ground.recordings.recording import (
     Grey,
     Recording,
@@ -54,24 +54,16 @@ _NUMBERED = re.compile(r"(.+)_(\d{4,9})\.mcap")
 
 @dataclass(frozen=True, eq=False)
 class LoggedFlight(Recording):
-    """An open flight log. `session`: run, version, views, map and options as they were logged.
+    """An open flight log.
 
-    `results` reads the results of the flight, in order. `arrivals` reads all views in the order of
-    arrival, also those that were withheld, each with the latency that was subtracted from it.
+    `session`: run, version, views, map and options as they were logged. `results`: reads the
+    results of the flight. `arrivals`: all views in the order of arrival, also those that were
+    withheld, each with the latency (s) that was subtracted from it.
     """
 
     session: Mapping[str, Any] = field(default_factory=dict)
-    results: Callable[[], Iterator[ViewResult]] = lambda: iter(())
-    arrivals: Callable[[], Iterator[tuple[SourceView, float]]] = lambda: iter(())
-
-
-@dataclass
-class LogFile:
-    """A file of a log and how far it was read."""
-
-    path: Path
-    walk: Walk = field(default_factory=Walk)
-    channels: dict[int, str] = field(default_factory=dict)
+    results: Callable[[], list[ViewResult]] = list
+    arrivals: Callable[[], Iterable[tuple[SourceView, float]]] = list
 
 
 @dataclass(frozen=True)
@@ -93,31 +85,27 @@ class BrokenLogError(FlightError):
 
 
 class LogContent:
-    """What the files of one flight hold, collected as they are read.
-
-    `session`: of the last message; `views`: in order; `places`: of images by index of the view.
-    `broken`: number of messages that were skipped; `problem`: about the first one.
-    """
+    """What the files of one flight hold, collected as they are read."""
 
     def __init__(self) -> None:
-        self.session: dict[str, Any] = {}
+        self.session: dict[str, Any] = {}  # of the last message
         self.views: list[LoggedView] = []
-        self.places: dict[int, ImagePlace] = {}
-        self.broken, self.problem = 0, ""
+        self.places: dict[int, ImagePlace] = {}  # of images by index of the view
+        self.broken, self.problem = 0, ""  # number of messages skipped; about the first one
         self._messages = 0
         self._lock = threading.Lock()
         self._held: tuple[Path, int] | None = None
         self._chunk = b""
 
     def read(
-        self, file: LogFile, take: Callable[[str, bytes], None] = lambda topic, data: None
+        self, file: McapFile, take: Callable[[str, bytes], None] = lambda topic, data: None
     ) -> None:
         """Read what is new in a file; `take` gets topic and data of every message but images.
 
         Messages that are damaged, or for which `take` raises, are skipped. Raises `BrokenLogError`.
         """
-        for offset, data in chunks(file.path, file.walk):
-            for found in messages(data, file.channels):
+        for offset, data in chunks(file):
+            for found in messages(data, file):
                 if found.topic in (VIEW.name, THUMBNAIL.name):
                     whole = found.topic == VIEW.name
                     place = ImagePlace(file.path, offset, found.first, found.last, whole)
@@ -183,7 +171,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
         raise FlightError(f"a flight log has its own telemetry; omit --telemetry: {path}")
     files, content, warnings = files_of_run(path), LogContent(), list[str]()
     for file in files:
-        warnings += _warnings_of_file(LogFile(file), content)
+        warnings += _warnings_of_file(McapFile(file), content)
     if not content.session:
         raise FlightError(f"no chunk of the flight log is complete: {path}")
     try:
@@ -203,33 +191,30 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
         warnings=(*warnings, *_gaps(content.views, replayable)),
         session=content.session,
         results=partial(_results, files),
-        arrivals=partial(_arrivals, content, camera, options),
+        arrivals=lambda: (
+            (_view(each, content, camera, options), (each.camera_latency_ms or 0.0) / 1e3)
+            for each in content.views
+            if _has_image(each, content)
+        ),
     )
 
 
 def files_of_run(path: Path) -> list[Path]:
     """The files of one run in order: of a folder, or from the one that is given."""
-    if not path.is_dir():
-        return _from_file(path)
-    files = sorted(file for file in path.glob("*.mcap") if profile_of(file) == PROFILE)
-    found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
-    runs = {run: file for file, run in reversed(found.items())}
-    if len(runs) > 1:
-        names = ", ".join(sorted(file.name for file in runs.values())[:5])
-        raise FlightError(
-            f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
-        )
-    return list(found)
-
-
-def _from_file(path: Path) -> list[Path]:
-    """A file and those of its name that continue its run; other files are not opened."""
-    name, number = _order(path)
-    if _NUMBERED.fullmatch(path.name) is None or (run := run_of(path)) is None:
-        return [path]
-    others = (each for each in path.parent.glob("*.mcap") if _order(each)[0] == name)
+    if path.is_dir():
+        files = [file for file in path.glob("*.mcap") if profile_of(file) == PROFILE]
+        found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
+        runs = {run: file for file, run in reversed(found.items())}
+        if len(runs) > 1:
+            names = ", ".join(sorted(file.name for file in runs.values())[:5])
+            raise FlightError(
+                f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
+            )
+        return list(found)
+    (name, number), run = _order(path), run_of(path)
+    others = [each for each in path.parent.glob("*.mcap") if _order(each)[0] == name]
     later = sorted((each for each in others if _order(each)[1] > number), key=_order)
-    return [path, *(each for each in later if run_of(each) == run)]
+    return [path, *(each for each in later if run and run_of(each) == run)]
 
 
 def _order(path: Path) -> tuple[str, int]:
@@ -239,24 +224,22 @@ def _order(path: Path) -> tuple[str, int]:
 
 def run_of(path: Path) -> str | None:
     """The run that a file belongs to; None where no chunk states it."""
-    for _, data in chunks(path, Walk()):
-        for found in messages(data, {}):
+    for _, data in chunks(file := McapFile(path)):
+        for found in messages(data, file):
             if found.topic == SESSION.name:
                 return str(from_json(data[found.first : found.last]).get("run"))
     return None
 
 
-def _warnings_of_file(file: LogFile, content: LogContent) -> list[str]:
+def _warnings_of_file(file: McapFile, content: LogContent) -> list[str]:
     before, warnings = content.broken, []
     content.read(file)
-    damaged, broken = file.walk.damaged, content.broken - before
+    damaged, broken = file.damaged, content.broken - before
     if damaged or broken:
+        warnings.append(f"{damaged} chunks and {broken} messages are damaged: {file.path}")
+    if not file.ended:
         warnings.append(
-            f"{damaged} chunks and {broken} messages are damaged and ignored: {file.path}"
-        )
-    if not file.walk.ended:
-        warnings.append(
-            f"flight log was cut short, {file.walk.lost_bytes} bytes after its last complete chunk "
+            f"flight log was cut short, {file.lost_bytes} bytes after its last complete chunk "
             f"are lost: {file.path}"
         )
     return warnings
@@ -317,22 +300,19 @@ def _is_name(frame: str) -> bool:
 
 def _gaps(views: list[LoggedView], replayable: list[LoggedView]) -> list[str]:
     """Warnings about missing views: without them the track differs from the one in flight."""
-    logged = sorted(view.index for view in views)
-    begin, end = logged[0], logged[-1] + 1
+    begin, end = min(view.index for view in views), max(view.index for view in views) + 1
     warnings = []
     if begin > 0:
         warnings.append(
             f"the first {begin} views of the flight are not in the log: a track begins later than "
             "in flight"
         )
-    withheld = sum(view.withheld for view in views)
-    missing = end - begin - len(replayable) - withheld
-    if withheld:
+    if withheld := sum(view.withheld for view in views):
         warnings.append(
             f"{withheld} views were not located in flight, because the latency of the camera was "
             "not known; only `orthonav calibrate --latency` uses them"
         )
-    if missing > 0:
+    if (missing := end - begin - len(replayable) - withheld) > 0:
         warnings.append(
             f"{missing} views lack a full image and are left out: a track differs after them"
         )
@@ -354,24 +334,16 @@ def _unusable(where: str) -> Grey:
     raise FlightError(f"the camera delivered no usable image in flight: {where}")
 
 
-def _arrivals(
-    content: LogContent, camera: Camera, options: SourceOptions
-) -> Iterator[tuple[SourceView, float]]:
-    for each in content.views:
-        if _has_image(each, content):
-            yield _view(each, content, camera, options), (each.camera_latency_ms or 0.0) / 1e3
+def _results(files: list[Path]) -> list[ViewResult]:
+    found: list[ViewResult] = []
 
+    def take(topic: str, data: bytes) -> None:
+        if topic == RESULT.name:
+            found.append(logged_result(data))
 
-def _results(files: list[Path]) -> Iterator[ViewResult]:
     for path in files:
-        channels: dict[int, str] = {}
-        for _, data in chunks(path, Walk()):
-            for found in messages(data, channels):
-                if found.topic == RESULT.name:
-                    try:
-                        yield logged_result(data[found.first : found.last])
-                    except (FlightError, UnicodeDecodeError):
-                        continue
+        LogContent().read(McapFile(path), take)
+    return found
 
 
 def logged_result(data: bytes) -> ViewResult:
@@ -392,7 +364,6 @@ LOCALIZE_CHOICES = {
 
 
 def compare_with_flight(flight: Recording, results: Sequence[ViewResult]) -> None:
-    """Log how many results of a replay differ from those of the flight."""
     if not isinstance(flight, LoggedFlight):
         return
     logged = {result.frame: _comparable(result) for result in flight.results()}
@@ -406,7 +377,6 @@ def compare_with_flight(flight: Recording, results: Sequence[ViewResult]) -> Non
 
 
 def _comparable(result: ViewResult) -> str:
-    """A result as text, without its latency."""
     return result_to_json(replace(result, latency_ms=0.0))
 
 
@@ -415,16 +385,13 @@ def logged_options(logged: Any) -> dict[str, Any]:
     if not isinstance(logged, dict):
         return {}
     found: dict[str, Any] = {}
-    for name, choices in LOCALIZE_CHOICES.items():
+    for name in ("accept", "track", *LOCALIZE_CHOICES):
         if name in logged:
-            if logged[name] not in choices:
-                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
-            found[name] = logged[name]
-    for name, kinds in (("accept", str | None), ("track", bool)):
-        if name in logged:
-            if not isinstance(logged[name], kinds):
-                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
-            found[name] = logged[name]
+            value = logged[name]
+            kinds = {"accept": str | None, "track": bool}.get(name, str)
+            if not isinstance(value, kinds) or value not in LOCALIZE_CHOICES.get(name, (value,)):
+                raise FlightError(f"flight log: invalid option {name}: {value!r:.40}")
+            found[name] = value
     if "mount" in logged:
         found["mount"] = logged_mount(logged)
     return found

@@ -1,16 +1,19 @@
-"""A table of images by file name: CSV, as people and programs write them beside a folder of images.
+"""A table of images by file name: a CSV beside a folder of images.
 
-Columns are found by their names, in many spellings. A pitch near -90 is that of a gimbal as DJI
+Columns are found by their names, case and units aside. A pitch near -90 is that of a gimbal as DJI
 counts it, where -90 looks straight down; any other is in the convention of orthonav.
 """
 
 import math
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
+from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -27,21 +30,18 @@ from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
 
 MAX_BYTES = 100_000_000
 _SYNONYMS = {
-    "file": "file filename image imagename imagefile img photo photoname picture sourcefile frame "
-    "label imagepath path name",
-    "yaw": "gimbalyaw camerayaw yaw cameraheading heading hdg azimuth compass flightyaw droneyaw",
-    "pitch": "gimbalpitch camerapitch pitch",
-    "roll": "gimbalroll cameraroll roll",
-    "agl": "agl heightagl aglheight altitudeagl altagl aglaltitude heightaboveground aboveground "
-    "height",
-    "home": "home relalt relativealtitude relativeheight heightabovetakeoff heightabovehome",
-    "amsl": "amsl msl altitudeamsl altamsl altitudemsl heightamsl",
-    "hae": "hae altitudehae ellipsoidalheight heightellipsoid",
-    "alt": "altitude alt gpsaltitude absolutealtitude absalt elevation z",
-    "lat": "lat latitude gpslatitude",
-    "lon": "lon lng long longitude gpslongitude",
-    "time": "timestamp datetime datetimeoriginal time utc utctime timeutc captured gpstime",
-    "date": "date day gpsdate",
+    "file": ("file", "filename", "image", "sourcefile", "frame"),
+    "yaw": ("gimbalyaw", "yaw", "heading"),
+    "pitch": ("gimbalpitch", "pitch"),
+    "roll": ("gimbalroll", "roll"),
+    "agl": ("agl", "height"),
+    "home": ("home", "relativealtitude"),
+    "amsl": ("amsl",),
+    "hae": ("hae",),
+    "alt": ("altitude",),
+    "lat": ("lat", "latitude"),
+    "lon": ("lon", "longitude"),
+    "time": ("time", "timestamp", "datetimeoriginal"),
 }
 _BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]")
 _FEET = ("ft", "feet", "foot")
@@ -50,56 +50,49 @@ _EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
 _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 _GIMBAL_DEG = -45.0
 """A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
-_DATE = re.compile(r"(\d{4})[:/](\d\d)[:/](\d\d)")
-_COMPACT = re.compile(r"(19|20)\d{12}")  # a date and time in 14 digits
-_CLOCK = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)")
+_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")  # as EXIF writes it
 _LARGEST_S = 9e9
 
 
 @dataclass(frozen=True)
 class ImageRow:
-    """What a table says of an image; NaN and None where it says nothing.
+    """What a table says of an image: fields of `Photo` and of its pose by their names."""
 
-    Angles are in the convention of orthonav. `order`: number of the row. `alt_m`: altitude whose
-    reference is not stated.
-    """
-
-    order: int
-    time_ns: int | None = None
-    yaw_deg: float = math.nan
-    pitch_deg: float = math.nan
-    roll_deg: float = math.nan
-    tilt_std_deg: float = AUTOPILOT_TILT_STD_DEG
-    agl_m: float = math.nan
-    home_m: float = math.nan
-    amsl_m: float = math.nan
-    hae_m: float = math.nan
-    alt_m: float = math.nan
-    latlon_deg: tuple[float, float] | None = None
-
-    @property
-    def has_height(self) -> bool:
-        """Whether it says any height."""
-        heights = (self.agl_m, self.home_m, self.amsl_m, self.hae_m, self.alt_m)
-        return any(map(math.isfinite, heights))
+    order: int  # number of the row
+    values: Mapping[str, Any]
+    pose: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class ImageTable:
-    """The rows of a table by the names of images, and warnings about them."""
+    """The rows of a table by the paths of images as it writes them, and warnings about them."""
 
     path: Path
     rows: Mapping[str, ImageRow]
     warnings: tuple[str, ...]
 
     def row(self, name: str) -> ImageRow | None:
-        """The row of an image: by the end of its path below the folder, or by its name without a
-        suffix. An image without a folder is that of a row with one too."""
-        parts = PurePosixPath(name.lower()).parts
-        ends = ["/".join(parts[first:]) for first in range(len(parts))]
-        stem = PurePosixPath(parts[-1]).stem
-        keys = [*ends, stem] + [f"/{parts[-1]}", f"/{stem}"] * (len(parts) == 1)
-        return next((self.rows[key] for key in keys if key in self.rows), None)
+        """The row of an image by its path below the folder; None where there is none, or several.
+
+        Tables and folders begin at different levels, so the shorter path must be the end of the
+        other one.
+        """
+        image = f"/{name.lower()}"
+        fitting = [
+            path
+            for path in self._by_name.get(PurePosixPath(image).name, ())
+            if image.endswith(f"/{path}") or f"/{path}".endswith(image)
+        ]
+        if image[1:] in fitting:
+            return self.rows[image[1:]]
+        return self.rows[fitting[0]] if len(fitting) == 1 else None
+
+    @cached_property
+    def _by_name(self) -> Mapping[str, list[str]]:
+        found: defaultdict[str, list[str]] = defaultdict(list)
+        for path in self.rows:
+            found[PurePosixPath(path).name].append(path)
+        return found
 
 
 def is_image_table(path: Path) -> bool:
@@ -123,23 +116,30 @@ def read_image_table(path: Path) -> ImageTable:
             delimiter = max(",;\t", key=header.count)
             table = TableRows(stream, delimiter=delimiter)
             columns = _columns(table.columns)
+            named = list(columns.items())
             if "file" not in columns or len(columns) == 1:
                 held = ", ".join(table.columns)
                 raise FlightError(
                     "table needs a column of file names (file, image, filename) and others, such "
                     f"as yaw, pitch, roll, agl, lat, lon, time; it has {held:.200}: {path}"
                 )
-            lines = [(table.line, _texts(row, columns)) for row in table]
+            lines = [
+                (table.line, {key: (row.get(name) or "").strip() for key, (name, _) in named})
+                for row in table
+            ]
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
     comma = delimiter != ","
     numbers = [(line, texts, _numbers(texts, columns, line, comma, path)) for line, texts in lines]
     gimbal = _is_gimbal(columns, [values for _, _, values in numbers])
-    rows = [
-        (texts["file"], _row(order, values, _time_ns(_moment(texts), line, path), gimbal))
-        for order, (line, texts, values) in enumerate(numbers)
-        if texts["file"]
-    ]
+    rows: dict[str, ImageRow] = {}
+    for order, (line, texts, values) in enumerate(numbers):
+        name = str(PurePosixPath(texts["file"].replace("\\", "/").lower()))
+        if name in rows:
+            raise FlightError(f"table names {texts['file']!r:.80} twice: {path}")
+        if texts["file"]:
+            time_ns = _time_ns(texts.get("time", ""), line, path)
+            rows[name] = _row(order, values, time_ns, gimbal)
     if not rows:
         raise FlightError(f"table names no image: {path}")
     warnings = _missing(columns, path)
@@ -148,21 +148,14 @@ def read_image_table(path: Path) -> ImageTable:
             f"pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight "
             f"down: {path}"
         )
-    return ImageTable(path, _by_name(rows, path), tuple(warnings))
-
-
-def _texts(
-    row: Mapping[str, str | None], columns: Mapping[str, tuple[str, float]]
-) -> dict[str, str]:
-    return {field: (row.get(name) or "").strip() for field, (name, _) in columns.items()}
+    return ImageTable(path, rows, tuple(warnings))
 
 
 def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
-    """Name of the column of each field that is there, and the metres of its unit."""
     spelt = {_plain(name): name for name in reversed(names)}
     found = {}
     for field, synonyms in _SYNONYMS.items():
-        name = next((spelt[each] for each in synonyms.split() if each in spelt), None)
+        name = next((spelt[each] for each in synonyms if each in spelt), None)
         if name is not None:
             found[field] = name, 0.3048 if _unit(name) in _FEET else 1.0
     return found
@@ -172,7 +165,7 @@ def _plain(name: str) -> str:
     words = re.findall(r"[a-z0-9]+", _BRACKETS.sub("", name.lower()))
     if len(words) > 1 and words[-1] in _UNITS:
         words.pop()
-    return re.sub(r"(?<=.)degrees?$", "", "".join(words))
+    return "".join(words).removesuffix("degree")
 
 
 def _unit(name: str) -> str:
@@ -191,7 +184,7 @@ def _numbers(
     values = {}
     for field, (name, metres) in columns.items():
         text = texts[field]
-        if field in ("file", "time", "date") or text.lower() in _EMPTY:
+        if field in ("file", "time") or text.lower() in _EMPTY:
             continue
         if comma and "." not in text:
             text = text.replace(",", ".")
@@ -217,47 +210,38 @@ def _is_gimbal(
 
 
 def _row(order: int, values: Mapping[str, float], time_ns: int | None, gimbal: bool) -> ImageRow:
+    found: dict[str, Any] = {}
+    if time_ns is not None:
+        found |= {"time_ns": time_ns, "zone_known": True}
+    if "lat" in values and "lon" in values and (values["lat"] or values["lon"]):
+        found["latlon_deg"] = values["lat"], values["lon"]
+    if any(math.isfinite(values.get(name, math.nan)) for name in _HEIGHTS):
+        found |= {f"{name}_m": values.get(name, math.nan) for name in _HEIGHTS}
     yaw, pitch = values.get("yaw", math.nan), values.get("pitch", math.nan)
-    roll = values.get("roll", math.nan if math.isnan(pitch) else 0.0)
+    roll = values.get("roll", 0.0)
     if gimbal and math.isfinite(pitch):
         known = math.isfinite(yaw)
         turned = attitude_of(enu_from_gimbal_camera((yaw if known else 0.0, pitch, roll)))
         yaw, pitch, roll = (turned[0] if known else math.nan), turned[1], turned[2]
-    placed = "lat" in values and "lon" in values and (values["lat"] or values["lon"])
-    return ImageRow(
-        order,
-        time_ns,
-        yaw % 360,
-        pitch,
-        roll,
-        GIMBAL_TILT_STD_DEG if gimbal else AUTOPILOT_TILT_STD_DEG,
-        **{f"{name}_m": values.get(name, math.nan) for name in _HEIGHTS},
-        latlon_deg=(values["lat"], values["lon"]) if placed else None,
-    )
-
-
-def _moment(texts: Mapping[str, str]) -> str:
-    """The time of a row, with the date where that is in a column of its own."""
-    time, date = texts.get("time", ""), texts.get("date", "")
-    return f"{date} {time}".strip() if _CLOCK.fullmatch(time) else time or date
+    pose: dict[str, Any] = {}
+    if math.isfinite(pitch):
+        std_deg = GIMBAL_TILT_STD_DEG if gimbal else AUTOPILOT_TILT_STD_DEG
+        pose |= {"pitch_deg": pitch, "roll_deg": roll, "tilt_std_deg": std_deg}
+    if math.isfinite(yaw):
+        pose |= {"yaw_deg": yaw % 360, "yaw_std_deg": None}
+    return ImageRow(order, found, pose)
 
 
 def _time_ns(text: str, line: int, path: Path) -> int | None:
-    """Nanoseconds of seconds, or of ms, us or ns since 1970, of a time of day, or of a date with
-    time; UTC where no zone."""
+    """Nanoseconds of seconds, of milliseconds since 1970, or of a date; UTC where no zone."""
     if text.lower() in _EMPTY:
         return None
-    if _COMPACT.fullmatch(text):
-        text = f"{text[:8]}T{text[8:]}"
     number = number_of(text)
     if math.isfinite(number):
         seconds = Decimal(text)
         while abs(seconds) > _LARGEST_S:
             seconds /= 1000
         return round(seconds * 10**9)
-    if clock := _CLOCK.fullmatch(text):
-        hours, minutes, seconds = map(Decimal, clock.groups())
-        return round((hours * 3600 + minutes * 60 + seconds) * 10**9)
     try:
         moment = datetime.fromisoformat(_DATE.sub(r"\1-\2-\3", text))
     except ValueError as error:
@@ -271,30 +255,6 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
 
 
 def _missing(columns: Mapping[str, tuple[str, float]], path: Path) -> list[str]:
-    lacks = [
-        f"{what} ({spelt})"
-        for what, spelt, fields in (
-            ("heading", "yaw or heading", ("yaw",)),
-            ("height", "agl or height", _HEIGHTS),
-        )
-        if not set(fields) & columns.keys()
-    ]
-    if not lacks:
-        return []
-    return [f"table has no column of {' and of '.join(lacks)}: {path}"]
-
-
-def _by_name(rows: Sequence[tuple[str, ImageRow]], path: Path) -> dict[str, ImageRow]:
-    """Rows by path, by name and by name without suffix, as far as these are of one row only; names
-    of rows with a folder begin with a slash."""
-    found: dict[str, ImageRow] = {}
-    short: dict[str, ImageRow | None] = {}
-    for text, row in rows:
-        pure = PurePosixPath(text.replace("\\", "/").lower())
-        if str(pure) in found:
-            raise FlightError(f"table names {text!r:.80} twice: {path}")
-        found[str(pure)] = row
-        slash = "/" if len(pure.parts) > 1 else ""
-        for name in {slash + pure.name, slash + pure.stem}:
-            short[name] = None if name in short else row
-    return {name: row for name, row in short.items() if row is not None} | found
+    lacks = [] if "yaw" in columns else ["heading (yaw or heading)"]
+    lacks += [] if set(_HEIGHTS) & columns.keys() else ["height (agl or height)"]
+    return [f"table has no column of {' and of '.join(lacks)}: {path}"] if lacks else []

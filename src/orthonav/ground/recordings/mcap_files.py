@@ -10,7 +10,7 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -35,14 +35,16 @@ class MessageSpan:
 
 
 @dataclass
-class Walk:
-    """Progress through a file, and its damage."""
+class McapFile:
+    """A file, how far it was read, and its damage."""
 
+    path: Path
     next_offset: int = len(MAGIC)
     """Offset of the first record that was not read yet; reading a growing file continues there."""
     lost_bytes: int = 0  # bytes after the last complete record
     damaged: int = 0  # damaged chunks
     ended: bool = False  # whether the file has a proper end
+    channels: dict[int, str] = field(default_factory=dict)  # topics by id
 
 
 def profile_of(path: Path) -> str | None:
@@ -58,34 +60,34 @@ def profile_of(path: Path) -> str | None:
     return profile.decode("latin-1") if len(profile) == length else None
 
 
-def chunks(path: Path, walk: Walk) -> Iterator[tuple[int, bytes]]:
-    """Offset and content of each complete chunk, from `walk.next_offset`; updates `walk`."""
-    with path.open("rb") as stream:
-        for opcode, at, length in _records(stream, walk):
+def chunks(file: McapFile) -> Iterator[tuple[int, bytes]]:
+    """Offset and content of each complete chunk that was not read yet; updates `file`."""
+    with file.path.open("rb") as stream:
+        for opcode, at, length in _records(stream, file):
             if opcode == _CHUNK:
                 data = _content(stream, length)
                 if data is None:
-                    walk.damaged += 1
+                    file.damaged += 1
                 else:
                     yield at, data
 
 
-def _records(stream: BinaryIO, walk: Walk) -> Iterator[tuple[int, int, int]]:
+def _records(stream: BinaryIO, file: McapFile) -> Iterator[tuple[int, int, int]]:
     """Opcode, offset and length of each complete record of data; `stream` is at its content."""
     size = stream.seek(0, io.SEEK_END)
-    at = walk.next_offset
+    at = file.next_offset
     while at + _RECORD_BYTES <= size:
         stream.seek(at)
         opcode, length = struct.unpack("<BQ", stream.read(_RECORD_BYTES))
         if opcode in (_DATA_END, _FOOTER):
-            walk.ended = True
+            file.ended = True
             return
         if opcode == 0 or length > size - at - _RECORD_BYTES:
             break
-        walk.next_offset = at + _RECORD_BYTES + length
+        file.next_offset = at + _RECORD_BYTES + length
         yield opcode, at, length
-        at = walk.next_offset
-    walk.lost_bytes = max(0, size - at)
+        at = file.next_offset
+    file.lost_bytes = max(0, size - at)
 
 
 def chunk_at(path: Path, offset: int) -> bytes:
@@ -139,17 +141,17 @@ def inflated(kind: bytes, data: bytes, most: int) -> bytes:
     return data[:most]
 
 
-def messages(data: bytes, channels: dict[int, str]) -> Iterator[MessageSpan]:
-    """The messages of a chunk; its channels are added to `channels`, id to topic."""
+def messages(data: bytes, file: McapFile) -> Iterator[MessageSpan]:
+    """The messages of a chunk; its channels are added to those of the file."""
     for opcode, first, last in _inner_records(data):
         if opcode == _CHANNEL and last - first >= 8:
             named = first + 8 + int.from_bytes(data[first + 4 : first + 8], "little")
             if named <= min(last, first + 8 + MAX_TOPIC_BYTES):
                 topic = data[first + 8 : named].decode("utf-8", "replace")
-                channels[int.from_bytes(data[first : first + 2], "little")] = topic
+                file.channels[int.from_bytes(data[first : first + 2], "little")] = topic
         elif opcode == _MESSAGE and last - first >= _MESSAGE_BYTES:
             channel, number = struct.unpack_from("<HI", data, first)
-            yield MessageSpan(channels.get(channel, ""), number, first + _MESSAGE_BYTES, last)
+            yield MessageSpan(file.channels.get(channel, ""), number, first + _MESSAGE_BYTES, last)
 
 
 def _inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
@@ -166,11 +168,11 @@ def _inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 def complete_bytes(path: Path) -> int:
     """Bytes of a file up to the end of its last complete record of data."""
-    walk = Walk()
+    file = McapFile(path)
     with path.open("rb") as stream:
-        for _ in _records(stream, walk):
+        for _ in _records(stream, file):
             pass
-        return min(walk.next_offset, stream.seek(0, io.SEEK_END))
+        return min(file.next_offset, stream.seek(0, io.SEEK_END))
 
 
 def partial_records(path: Path, offset: int) -> bytes:

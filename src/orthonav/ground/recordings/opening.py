@@ -1,8 +1,7 @@
-"""Opening a recording of any kind, importing it, and its heights over a terrain."""
+"""Opening a recording of any kind, and importing it."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -10,14 +9,6 @@ from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.files import replacing_folder, require_file
 from orthonav.core.flight import FlightFolder, FlightWriter, open_flight, read_truth
 from orthonav.core.flight.folder import encoded
-from orthonav.core.flight.heights import (
-    GroundHeights,
-    Undulation,
-    assumed_heights,
-    is_measured,
-    warn_of_mismatch,
-)
-from orthonav.core.geo.ground import TerrainHeights, ground_around
 from orthonav.core.geo.headings import seem_radians
 from orthonav.ground.recordings.flightlog import is_flight_log, open_flight_log
 from orthonav.ground.recordings.image_table import is_image_table
@@ -27,12 +18,10 @@ from orthonav.ground.recordings.recording import (
     SourceOptions,
     SourceView,
     given_camera,
-    rounded,
     time_warnings,
     with_options,
 )
-from orthonav.ground.recordings.ros import open_ros
-from orthonav.ground.recordings.ros_files import METADATA, bag_suffix, storage_files
+from orthonav.ground.recordings.ros import METADATA, bag_suffix, open_ros, storage_files
 from orthonav.ground.recordings.video import open_video
 
 _VIDEO_STARTS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"FLV\1")
@@ -157,8 +146,6 @@ def _flight_views(
 
 @dataclass(frozen=True)
 class Imported:
-    """Number of views that were written."""
-
     views: int  # all of them
     with_truth: int  # those with a true position
     complete: int  # those with all telemetry that a fix needs
@@ -217,53 +204,3 @@ def _encoded_image(
     suffix = ".png" if jpeg_quality is None else ".jpg"
     frame = str(PurePosixPath(view.frame).with_suffix(suffix))
     return frame, encoded(grey, frame, jpeg_quality or 0)
-
-
-@dataclass(eq=False)
-class OverTerrain:
-    """Heights above ground of the views of a recording. Mutable: it counts.
-
-    `terrain`: heights above mean sea level. `name`: the terrain in words. `geoid`: None where
-    heights above the ellipsoid cannot be used. `without`: number of views without a height above
-    ground, because no height or no position was recorded, or because it lies over a hole of the
-    terrain or outside it.
-    """
-
-    terrain: TerrainHeights
-    name: str
-    geoid: Undulation | None = None
-    without: int = field(default=0, init=False)
-
-    def recording(self, recording: Recording) -> Recording:
-        """The same recording with heights above ground; its note says how.
-
-        Raises `FlightError` where no position was recorded.
-        """
-        first = next((v for v in recording.views if v.truth_latlon_deg is not None), None)
-        if first is None or first.truth_latlon_deg is None:
-            raise FlightError(
-                "--dem needs recorded positions, and the recording has none: import without it, "
-                f"and give it to orthonav localize: {recording.path}"
-            )
-        take_off = ground_around(
-            self.terrain, recording.take_off_latlon_deg or first.truth_latlon_deg, 0.0
-        )
-        heights = GroundHeights(self.terrain, take_off, self.geoid)
-        off_m = heights.mismatch_m(first.telemetry)
-        if math.isfinite(off_m):
-            warn_of_mismatch(off_m)
-        assumed = assumed_heights(first.telemetry, self.name)
-        note = "; ".join(filter(None, [recording.note, assumed]))
-        return replace(recording, stream=lambda: self._views(recording, heights), note=note)
-
-    def _views(self, recording: Recording, heights: GroundHeights) -> Iterator[SourceView]:
-        self.without = 0
-        for view in recording.views:
-            telemetry, place = view.telemetry, view.truth_latlon_deg
-            below = None if place is None else ground_around(self.terrain, place, 0.0)
-            if below is not None and place is not None:
-                telemetry = heights.above(telemetry, below, place)
-            if telemetry is view.telemetry and not is_measured(telemetry):
-                telemetry = replace(telemetry, agl_m=math.nan)  # level ground is not assumed
-            self.without += math.isnan(telemetry.agl_m)
-            yield replace(view, telemetry=rounded(telemetry))

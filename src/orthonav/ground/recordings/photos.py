@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from orthonav.core.errors import CameraError, FlightError, lfs_pointer
 from orthonav.core.files import require_file
@@ -22,10 +23,8 @@ from orthonav.core.geo.attitude import (
 )
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
-from orthonav.ground.recordings.exif import Photo, PhotoPose, read_photo
-from orthonav.ground.recordings.focal import FocalLength, focal_length
+from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, read_photo
 from orthonav.ground.recordings.image_table import (
-    ImageRow,
     ImageTable,
     is_image_table,
     read_image_table,
@@ -38,7 +37,6 @@ from orthonav.ground.recordings.recording import (
     check_overlap,
     given_camera,
     height_warnings,
-    jump_warnings,
     known_at,
     rounded,
     time_warnings,
@@ -66,7 +64,6 @@ _BY_NAME_NS = 10**9  # spacing of photographs without a time, which are ordered 
 
 
 def photo_paths(folder: Path) -> list[Path]:
-    """Photographs below a folder, hidden ones left out, by name."""
     found = folder.rglob("*")
     return sorted(
         path
@@ -77,7 +74,6 @@ def photo_paths(folder: Path) -> list[Path]:
 
 
 def is_photo(path: Path) -> bool:
-    """Whether a file begins as an image does."""
     with path.open("rb") as stream:
         return stream.read(8).startswith(_MAGICS)
 
@@ -95,32 +91,29 @@ class ChosenPhotos:
     table: ImageTable | None
     singly: bool
 
-    @classmethod
-    def of(cls, sources: Sequence[Path], options: SourceOptions) -> "ChosenPhotos":
-        """The images of a folder, of a table in it, or those named."""
-        first, telemetry = sources[0], options.telemetry
-        table = None
-        if telemetry is not None and is_image_table(require_file(telemetry, "telemetry log")):
-            table = read_image_table(telemetry)
-        if len(sources) == 1 and first.is_dir():
-            paths = photo_paths(first)
-            if table is None and telemetry is None:
-                table = image_table_in(first, paths)
-            return cls(first, paths, table, table is not None)
-        if len(sources) == 1 and is_image_table(first):
-            return cls(first.parent, photo_paths(first.parent), read_image_table(first), True)
-        for path in sources:
-            if not is_photo(require_file(path, "photograph")):
-                raise FlightError(f"expected photographs, where several files are given: {path}")
-        folder = Path(os.path.commonpath([path.resolve().parent for path in sources]))
-        return cls(folder, [path.resolve() for path in sources], table, True)
+
+def chosen_photos(sources: Sequence[Path], options: SourceOptions) -> ChosenPhotos:
+    first, telemetry, table = sources[0], options.telemetry, None
+    if telemetry is not None and is_image_table(require_file(telemetry, "telemetry log")):
+        table = read_image_table(telemetry)
+    if len(sources) == 1 and first.is_dir():
+        paths = photo_paths(first)
+        if table is None and telemetry is None:
+            table = image_table_in(first, paths)
+        return ChosenPhotos(first, paths, table, table is not None)
+    if len(sources) == 1 and is_image_table(first):
+        return ChosenPhotos(
+            first.parent, photo_paths(first.parent), read_image_table(first), singly=True
+        )
+    for path in sources:
+        if not is_photo(require_file(path, "photograph")):
+            raise FlightError(f"expected photographs, where several files are given: {path}")
+    folder = Path(os.path.commonpath([path.resolve().parent for path in sources]))
+    return ChosenPhotos(folder, [path.resolve() for path in sources], table, singly=True)
 
 
 def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
-    """The table that lies in a folder and names some of these photographs below it.
-
-    Raises `FlightError` where there are several.
-    """
+    """The table that lies in a folder and names some of these photographs below it."""
     names = [path.relative_to(folder).as_posix() for path in photos]
     found = []
     for path in sorted(path for path in folder.iterdir() if is_image_table(path)):
@@ -164,31 +157,26 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
             "the heading of these is taken as unknown"
         )
     for number in edited:
-        poses[number] = replace(poses[number], yaw_std_deg=UNKNOWN_YAW_STD_DEG)
+        poses[number]["yaw_std_deg"] = UNKNOWN_YAW_STD_DEG
     return [
-        replace(photo, pose=_pose_with_row(pose, photo.row))
+        replace(photo, pose={**pose, **(photo.row.pose if photo.row else {})})
         for photo, pose in zip(photos, poses, strict=True)
     ], warnings
 
 
-def _pose(photo: Photo, gimbal_unrecorded: bool) -> PhotoPose:
+def _pose(photo: Photo, gimbal_unrecorded: bool) -> dict[str, Any]:
+    std_deg = None
     if gimbal_unrecorded:
-        return PhotoPose(photo.body_yaw_deg % 360, 0.0, 0.0, tilt_std_deg=ASSUMED_TILT_STD_DEG)
-    if photo.gimbal_deg is not None:
-        rotation, tilt_std_deg = enu_from_gimbal_camera(photo.gimbal_deg), GIMBAL_TILT_STD_DEG
-        return PhotoPose(*attitude_of(rotation), tilt_std_deg=tilt_std_deg)
-    if photo.rotation is not None:
-        return PhotoPose(*attitude_of(photo.rotation), tilt_std_deg=AUTOPILOT_TILT_STD_DEG)
-    return PhotoPose(photo.body_yaw_deg % 360)
-
-
-def _pose_with_row(pose: PhotoPose, row: ImageRow | None) -> PhotoPose:
-    if row is not None and math.isfinite(row.pitch_deg):
-        tilt = {"pitch_deg": row.pitch_deg, "roll_deg": row.roll_deg}
-        pose = replace(pose, **tilt, tilt_std_deg=row.tilt_std_deg)
-    if row is not None and math.isfinite(row.yaw_deg):
-        pose = replace(pose, yaw_deg=row.yaw_deg, yaw_std_deg=None)
-    return pose
+        angles, std_deg = (photo.body_yaw_deg % 360, 0.0, 0.0), ASSUMED_TILT_STD_DEG
+    elif photo.gimbal_deg is not None:
+        angles, std_deg = attitude_of(enu_from_gimbal_camera(photo.gimbal_deg)), GIMBAL_TILT_STD_DEG
+    elif photo.rotation is not None:
+        angles, std_deg = attitude_of(photo.rotation), AUTOPILOT_TILT_STD_DEG
+    else:
+        angles = photo.body_yaw_deg % 360, math.nan, math.nan
+    return dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), angles, strict=True)) | {
+        "tilt_std_deg": std_deg
+    }
 
 
 def _is_unrecorded(photos: Sequence[Photo]) -> bool:
@@ -213,16 +201,16 @@ def _edited(photos: Sequence[Photo]) -> list[int]:
 def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     """The flight of photographs, by time: of a folder, of a table of images, or named one by one.
 
-    Raises `MissingFileError`, `FlightError`, `CameraError` or `MissingExtraError`. Photographs that
-    cannot be read, have no time, or another size or focal length than most, are left out, with a
-    warning.
+    Photographs that cannot be read, have no time, or another size or focal length than most, are
+    left out, with a warning.
     """
-    chosen = ChosenPhotos.of(sources, options)
+    chosen = chosen_photos(sources, options)
     if chosen.table is not None:
         options = replace(options, telemetry=None)
     photos, warnings = _taken(chosen, options)
     if options.camera is None and options.fov_deg is None:
-        photos, zoomed = _of_one_focal_length(photos, options)
+        focal_px = [_focal_px(photo, options) for photo in photos]
+        photos, zoomed = _alike(photos, focal_px, "of another focal length than most")
         warnings += zoomed
     camera, note = _camera(photos[0], options)
     track = None
@@ -233,26 +221,20 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     else:
         photos, doubts = posed(photos)
         warnings += doubts
-        level = sum(math.isnan(photo.pose.pitch_deg) for photo in photos)
+        level = sum(math.isnan(photo.pose["pitch_deg"]) for photo in photos)
         if chosen.singly and level:
             options = replace(options, looks_down=True)
             warnings.append(
                 f"pitch and roll of {level} of {len(photos)} photographs are not known: a camera "
                 "that looks straight down is assumed"
             )
-        known = {
-            name: any(math.isfinite(getattr(photo, name)) for photo in photos)
+        heights = {
+            name
             for name in ("home_m", "amsl_m", "hae_m", "alt_m")
+            if any(math.isfinite(getattr(photo, name)) for photo in photos)
         }
         if any(math.isnan(photo.agl_m) for photo in photos):
-            warnings += height_warnings(
-                options,
-                above_ground=False,
-                above_home=known["home_m"],
-                above_sea=known["amsl_m"] or known["hae_m"],
-                altitudes=known["alt_m"],
-            )
-        warnings += jump_warnings([(_time_ns(photo), photo.latlon_deg) for photo in photos])
+            warnings += height_warnings(options, heights)
     doubted = [photo for photo in photos if photo.doubts]
     if doubted:
         warnings.append(
@@ -294,9 +276,10 @@ def _taken(chosen: ChosenPhotos, options: SourceOptions) -> tuple[list[Photo], l
             unread.append(path)
             with path.open("rb") as stream:
                 reason = reason or lfs_pointer(stream.read(64)) or ""
-    photos, odd = _of_one_size(photos)
     warnings = _left_out(paths, unread, reason or "not readable")
-    warnings += _left_out(paths, odd, "of another size than most")
+    sizes = [(photo.width_px, photo.height_px) for photo in photos]
+    photos, odd = _alike(photos, sizes, "of another size than most")
+    warnings += odd
     if photos:
         photos, lost = _with_rows(photos, chosen)
         photos, untimed, undated = _in_time(photos, chosen, options)
@@ -320,11 +303,17 @@ def _left_out(all_of_them: Sequence[Path | Photo], bad: Sequence[Path], reason: 
     return [f"{count}, {reason}, the first: {bad[0].name}"]
 
 
-def _of_one_size(photos: Sequence[Photo]) -> tuple[list[Photo], list[Path]]:
-    sizes = Counter((photo.width_px, photo.height_px) for photo in photos)
-    usual = max(sizes, key=lambda size: (sizes[size], size[0] * size[1]), default=None)
-    alike = [photo for photo in photos if (photo.width_px, photo.height_px) == usual]
-    return alike, [each.path for each in photos if (each.width_px, each.height_px) != usual]
+def _alike(photos: list[Photo], keys: Sequence[Any], reason: str) -> tuple[list[Photo], list[str]]:
+    """The photographs with the most frequent key or without one, and a warning about others, which
+    include those with NaN. All of them where none has a key."""
+    counted = Counter(key for key in keys if key is not None and key == key)
+    if not counted:
+        return photos, []
+    usual = max(counted, key=lambda key: (counted[key], key))
+    fits = [key is None or key == usual for key in keys]
+    odd = [photo.path for photo, fit in zip(photos, fits, strict=True) if not fit]
+    alike = [photo for photo, fit in zip(photos, fits, strict=True) if fit]
+    return alike, _left_out(photos, odd, reason)
 
 
 def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], list[str]]:
@@ -332,7 +321,11 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
     if table is None:
         return photos, []
     rows = [table.row(photo.path.relative_to(chosen.folder).as_posix()) for photo in photos]
-    known = [_with_row(photo, row) for photo, row in zip(photos, rows, strict=True) if row]
+    known = [
+        replace(photo, row=row, **row.values)
+        for photo, row in zip(photos, rows, strict=True)
+        if row
+    ]
     without = [photo.path for photo, row in zip(photos, rows, strict=True) if row is None]
     if not known:
         raise FlightError(
@@ -351,36 +344,25 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
     return known, warnings
 
 
-def _with_row(photo: Photo, row: ImageRow) -> Photo:
-    photo = replace(photo, row=row, latlon_deg=row.latlon_deg or photo.latlon_deg)
-    if row.time_ns is not None:
-        photo = replace(photo, time_ns=row.time_ns, zone_known=True)
-    if row.has_height:
-        names = ("agl_m", "home_m", "amsl_m", "hae_m", "alt_m")
-        photo = replace(photo, **{name: getattr(row, name) for name in names})
-    return photo
-
-
 def _in_time(
     photos: list[Photo], chosen: ChosenPhotos, options: SourceOptions
 ) -> tuple[list[Photo], list[Path], int]:
     """Photographs with a time, those without one that are left out, and the number of those that
     were given one by their order: where most have a pose but no time, and where they were named one
     by one and one of them has none."""
-    timed = [photo for photo in photos if photo.time_ns is not None]
     untimed = [photo for photo in photos if photo.time_ns is None]
-    ordered: list[Photo] = []
-    if untimed and options.telemetry is None and chosen.singly:
+    if not untimed or options.telemetry is not None:
+        ordered: list[Photo] = []
+    elif chosen.singly:
         ordered = sorted(photos, key=lambda photo: photo.row.order if photo.row else 0)
-    elif untimed and options.telemetry is None:
-        posed = [
-            each
-            for each in untimed
-            if not (each.gimbal_deg is None and each.rotation is None and each.latlon_deg is None)
+    else:
+        known = [
+            one for one in untimed if one.gimbal_deg or one.rotation is not None or one.latlon_deg
         ]
-        ordered = sorted(posed, key=lambda photo: _natural(photo.path))
-        ordered = ordered if len(ordered) > len(timed) else []
+        ordered = sorted(known, key=lambda photo: _natural(photo.path))
+        ordered = ordered if len(ordered) > len(photos) - len(untimed) else []
     if not ordered:
+        timed = [photo for photo in photos if photo.time_ns is not None]
         return timed, [photo.path for photo in untimed], 0
     left_out = [] if chosen.singly else [each.path for each in untimed if each not in ordered]
     spaced = [replace(each, time_ns=number * _BY_NAME_NS) for number, each in enumerate(ordered)]
@@ -392,30 +374,13 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _of_one_focal_length(
-    photos: list[Photo], options: SourceOptions
-) -> tuple[list[Photo], list[str]]:
-    """The photographs of the most frequent focal length, and a warning about others.
-
-    Those that state none are used too, and all of them where no focal length can be used.
-    """
-    focal_px: list[float | None] = []
-    known: Counter[FocalLength] = Counter()
-    for photo in photos:
-        try:
-            found = _focal_length(photo, options)
-        except CameraError:
-            focal_px.append(math.nan)
-        else:
-            focal_px.append(None if found is None else found.px)
-            known.update([found] if found else [])
-    if not known:
-        return photos, []
-    usual = known.most_common(1)[0][0]
-    fits = [px is None or abs(px / usual.px - 1) <= usual.std for px in focal_px]
-    odd = [photo.path for photo, fit in zip(photos, fits, strict=True) if not fit]
-    warnings = _left_out(photos, odd, "of another focal length than most")
-    return [photo for photo, fit in zip(photos, fits, strict=True) if fit], warnings
+def _focal_px(photo: Photo, options: SourceOptions) -> float | None:
+    """The focal length, NaN for one that cannot be used, None for none."""
+    try:
+        found = _focal_length(photo, options)
+    except CameraError:
+        return math.nan
+    return None if found is None else found.px
 
 
 def _focal_length(photo: Photo, options: SourceOptions) -> FocalLength | None:
@@ -466,13 +431,5 @@ def _own_telemetry(photo: Photo, options: SourceOptions) -> Telemetry:
     heights = {name: getattr(photo, name) for name in ("home_m", "amsl_m", "hae_m")}
     known = {name: value for name, value in heights.items() if math.isfinite(value)}
     return Telemetry(
-        _time_ns(photo),
-        photo.pose.yaw_deg,
-        photo.pose.pitch_deg,
-        photo.pose.roll_deg,
-        height,
-        yaw_std_deg=photo.pose.yaw_std_deg,
-        tilt_std_deg=photo.pose.tilt_std_deg,
-        vel_en_mps=photo.vel_en_mps,
-        **known,
+        _time_ns(photo), agl_m=height, vel_en_mps=photo.vel_en_mps, **photo.pose, **known
     )

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from orthonav.core.flight.telemetry_track import RecordedTrack, measured
 from orthonav.core.geo.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
-from orthonav.core.geo.frames import distances_m
 from orthonav.core.records import Prior, Telemetry
 
 KINDS = ("flight", "photos", "video", "ros", "log")
@@ -36,9 +35,6 @@ _ROUNDED = (
     *("yaw_deg", "pitch_deg", "roll_deg", "agl_m", "yaw_std_deg", "agl_std_m", "prior"),
     *("vel_en_mps", "home_m", "amsl_m", "hae_m"),
 )
-JUMP_M, JUMP_MPS = 500.0, 150.0
-"""Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
-that this program is for flies slower, and logs round positions to some metres."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,6 @@ class SourceOptions:
 
     @property
     def time_offset_ns(self) -> int:
-        """The offset in nanoseconds."""
         return round(self.time_offset_s * 1e9)
 
 
@@ -128,7 +123,6 @@ class Recording:
 
     @property
     def views(self) -> Iterator[SourceView]:
-        """The views in order; each is read when its turn comes."""
         return self.stream()
 
 
@@ -186,28 +180,7 @@ def with_mean_velocities(views: Iterable[SourceView], track: RecordedTrack) -> I
         yield view
 
 
-def jump_warnings(
-    positions: Sequence[tuple[int, tuple[float, float] | None]],
-) -> list[str]:
-    """Warning about jumps of a recorded position, at times in ns; empty without one."""
-    known = [(time_ns, place) for time_ns, place in positions if place is not None]
-    if len(known) < 2:
-        return []
-    seconds = np.diff([time_ns / 1e9 for time_ns, _ in known])
-    places = np.array([place for _, place in known])
-    apart_m = distances_m(places[:-1], places[1:])
-    jumps = np.flatnonzero((apart_m > JUMP_M) & (apart_m > JUMP_MPS * seconds))
-    if not len(jumps):
-        return []
-    first = int(jumps[0])
-    return [
-        f"recorded position jumps {len(jumps)} times, the first by {apart_m[first] / 1000:.1f} km "
-        f"{seconds[: first + 1].sum():.1f} s after the beginning: check it before it is used"
-    ]
-
-
 def time_warnings(times_ns: Iterable[int]) -> list[str]:
-    """Warning about views that have the time of another one; empty without one."""
     counted = Counter(times_ns)
     equal = sum(count for count in counted.values() if count > 1)
     if not equal:
@@ -220,45 +193,25 @@ def time_warnings(times_ns: Iterable[int]) -> list[str]:
 
 
 def warnings_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
-    """Warnings about a track for people: its own, what its heights are, and jumps."""
-    home, series = track.home is not None, track.position
-    warnings = [
-        *track.warnings,
-        *height_warnings(
-            options,
-            above_ground=bool(track.heights),
-            above_home=home,
-            above_sea=track.amsl is not None or track.hae is not None,
-            altitudes=track.altitude is not None,
-        ),
-    ]
-    if series is None:
-        return warnings
-    places = [(float(lat), float(lon)) for lat, lon in series.values[:, :2]]
-    return [*warnings, *jump_warnings(list(zip(series.time_ns.tolist(), places, strict=True)))]
+    known = {"agl_m"} if track.heights else set[str]()
+    known |= {f"{name}_m" for name in ("home", "amsl", "hae") if getattr(track, name) is not None}
+    known |= {"alt_m"} if track.altitude is not None else set()
+    return [*track.warnings, *height_warnings(options, known)]
 
 
-def height_warnings(
-    options: SourceOptions,
-    *,
-    above_ground: bool,
-    above_home: bool,
-    above_sea: bool,
-    altitudes: bool,
-) -> list[str]:
-    """What is assumed about heights above ground, where these references were recorded."""
-    if options.agl_m is not None:
+def height_warnings(options: SourceOptions, known: set[str]) -> list[str]:
+    """What is assumed about heights above ground where those of the names `known` were recorded."""
+    over_terrain = options.over_terrain and not known <= {"alt_m"}
+    if options.agl_m is not None or over_terrain:
         return []
-    if options.over_terrain and (above_ground or above_home or above_sea):
-        return []  # the terrain gives heights above ground
-    if above_home:
-        return [LEVEL_GROUND_IN_GAPS if above_ground else LEVEL_GROUND]
-    if above_ground or not altitudes:
+    if "home_m" in known:
+        return [LEVEL_GROUND_IN_GAPS if "agl_m" in known else LEVEL_GROUND]
+    if "agl_m" in known or "alt_m" not in known:
         return []
     if options.ground_alt_m is None:
         return [
             "no height above ground was recorded, only altitudes, which are not taken for one; "
-            "give --ground-alt-m, in the same reference"
+            "give --ground-alt-m, in the same reference, or --dem to localize and calibrate"
         ]
     return [f"height above ground is the recorded altitude minus {options.ground_alt_m:g} m"]
 
@@ -266,10 +219,7 @@ def height_warnings(
 def given_camera(
     options: SourceOptions, width_px: int, height_px: int, where: str
 ) -> Camera | None:
-    """The camera of the options for images of this size: of a file, or of a field of view.
-
-    Raises `MissingFileError` or `CameraError`.
-    """
+    """The camera of the options for images of this size: of a file, or of a field of view."""
     if options.camera is not None:
         return fitted(read_camera_file(options.camera), width_px, height_px, where)
     if options.fov_deg is None:
@@ -278,7 +228,6 @@ def given_camera(
 
 
 def check_overlap(track: RecordedTrack, first_ns: int, last_ns: int, path: Path) -> None:
-    """Raise `FlightError` where images and track do not overlap in time."""
     span = track.span_ns()
     if span is None or first_ns > span[1] or last_ns < span[0]:
         recorded = "none" if span is None else f"{span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"

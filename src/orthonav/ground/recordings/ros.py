@@ -3,16 +3,24 @@
 Messages: https://docs.ros.org/en/rolling/p/sensor_msgs/, axes: REP 103 and REP 105.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import bz2
+import contextlib
+import io
+import logging
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
+from orthonav.core.files import require_file
+from orthonav.core.flight.logged import MAX_CHUNK_BYTES
 from orthonav.core.flight.recording import fitted
 from orthonav.core.flight.ros_messages import (
     attitude_of_message,
@@ -30,7 +38,14 @@ from orthonav.core.flight.telemetry_track import (
 )
 from orthonav.core.geo.attitude import Angles, enu_from_ros_camera, rotations_of_wxyz
 from orthonav.core.geo.camera import Camera
+from orthonav.core.guard import needed, reading, without_plea
 from orthonav.ground.recordings.logs import read_log
+from orthonav.ground.recordings.mcap_files import (
+    MAGIC,
+    complete_bytes,
+    inflated,
+    partial_records,
+)
 from orthonav.ground.recordings.recording import (
     Recording,
     SourceOptions,
@@ -41,7 +56,15 @@ from orthonav.ground.recordings.recording import (
     warnings_of,
     with_mean_velocities,
 )
-from orthonav.ground.recordings.ros_files import opened
+
+MAGICS = {b"#ROSBAG V": ".bag", MAGIC: ".mcap", b"SQLite format 3\0": ".db3"}
+METADATA = "metadata.yaml"
+MAX_HELD_BYTES = 2**30
+WHAT = "ROS recordings"
+_ROS_2 = (".mcap", ".db3")
+_SPLIT = re.compile(r"(.+)_(\d{1,9})")
+_END = b"\x0f" + (4).to_bytes(8, "little") + bytes(4)  # data end
+_END += b"\x02" + (20).to_bytes(8, "little") + bytes(20) + MAGIC  # footer without a summary
 
 TYPES: dict[str, tuple[str, ...]] = {
     "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
@@ -65,42 +88,306 @@ _ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*":
 _PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
 _HOME_NAMES = ("rel_alt", "relative_altitude")
 _HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
+log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
-class Topics:
+def bag_suffix(path: Path) -> str | None:
+    """The suffix that fits the content of a file, None where it is not a bag."""
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    return next((suffix for magic, suffix in MAGICS.items() if head.startswith(magic)), None)
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The files of a ROS 2 bag in a folder, by name and number."""
+    found = [path for path in folder.iterdir() if path.is_file() and path.suffix in _ROS_2]
+    found = [path for path in found if bag_suffix(require_file(path, "file of the bag")) in _ROS_2]
+    found.sort(key=_order)
+    if len({_order(path)[0] for path in found}) > 1 or len({path.suffix for path in found}) > 1:
+        names = ", ".join(path.name for path in found[:5])
+        raise FlightError(
+            f"folder holds {len(found)} ROS 2 recordings ({names}); give one of the files: {folder}"
+        )
+    return found
+
+
+def _order(path: Path) -> tuple[str, int]:
+    match = _SPLIT.fullmatch(path.stem)
+    return (match[1], int(match[2])) if match else (path.stem, 0)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
+    """A reader of the recording, and warnings about its files."""
+    bound_inflation()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(reading("ROS recording", path))
+        warnings: list[str] = []
+        reader = _entered(path, stack, warnings)
+        try:
+            yield reader, warnings
+        except FlightError as error:
+            raise FlightError("; ".join([*warnings, str(error)])) from error
+
+
+def _entered(path: Path, stack: contextlib.ExitStack, warnings: list[str]) -> Any:
+    if path.is_file():
+        require_file(path, "ROS recording")
+        if (suffix := bag_suffix(path)) not in (None, path.suffix):  # which selects the reader
+            raise FlightError(f"ROS recording needs the suffix {suffix}; rename it: {path}")
+        return _reader([_whole(path, warnings)], path, stack)
+    doubt = None
+    try:
+        files = storage_files(path)
+    except FlightError:
+        if not (path / METADATA).is_file():
+            raise
+        files = []  # only the metadata can tell which they are
+    if (path / METADATA).is_file() and not any(_is_cut(file) for file in files):
+        try:
+            return _reader([path], path, stack)
+        except Exception as error:
+            if not files:
+                raise
+            doubt = without_plea(" ".join(str(error).split()))[:160]
+    if not files:
+        raise FlightError(f"folder holds no complete file of a bag (.mcap, .db3): {path}")
+    if doubt:
+        warnings.append(f"{METADATA} is not used ({doubt}); the files beside it are read")
+    return _reader([_whole(file, warnings) for file in files], path, stack)
+
+
+def _reader(paths: Sequence[Any], path: Path, stack: contextlib.ExitStack) -> Any:
+    highlevel = needed("rosbags.highlevel", WHAT)
+    typesys = needed("rosbags.typesys", WHAT)
+    known = typesys.get_typestore(typesys.Stores.LATEST)  # for old bags without definitions
+    reader = highlevel.AnyReader(paths, default_typestore=known)
+    reader.readers = [ParsableReader(each) for each in reader.readers]
+    try:
+        stack.enter_context(reader)
+    except highlevel.AnyReaderError as error:
+        if getattr(paths[0], "suffix", "") == ".bag":
+            raise FlightError(
+                f"ROS 1 bag has no complete index ({error}): it was not closed, or was cut off; "
+                f"run `rosbag reindex` on it: {path}"
+            ) from error
+        if "malformed" in str(error):
+            raise FlightError(
+                "ROS 2 bag was cut off or is damaged; `sqlite3 BAG.db3 .recover | sqlite3 new.db3` "
+                f"may restore it: {path}"
+            ) from error
+        raise
+    check_held(reader.readers)
+    return reader
+
+
+class ParsableReader:
+    """A reader of `rosbags` without the connections whose messages it cannot describe.
+
+    `rosbags` refuses a whole recording for one of them. Such are events of services and actions:
+    their definitions refer to types that messages do not have.
+    """
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+
+    def __enter__(self) -> "ParsableReader":
+        self._reader.__enter__()
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._reader.__exit__(*raised)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._reader, name)
+
+    @cached_property
+    def connections(self) -> list[Any]:
+        return [one for one in self._reader.connections if _is_parsable(one)]
+
+
+def _is_parsable(connection: Any) -> bool:
+    typesys = needed("rosbags.typesys", WHAT)
+    parsable = "/msg/" in connection.msgtype
+    if parsable and connection.msgdef.format.name == "MSG":
+        store = typesys.get_typestore(typesys.Stores.EMPTY)
+        try:
+            store.register(typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype))
+            store.hash_rihs01(connection.msgtype)
+        except Exception as error:  # of the parser, or of a type that is not defined
+            log.info("%s cannot be parsed: %s", connection.msgtype, error)
+            parsable = False
+    if not parsable:
+        log.info("topic is ignored: %s carries %s", connection.topic, connection.msgtype)
+    return parsable
+
+
+def _is_cut(path: Path) -> bool:
+    if path.suffix != ".mcap":
+        return False
+    with path.open("rb") as stream:
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(max(0, size - len(MAGIC)))
+        return stream.read() != MAGIC
+
+
+def _whole(path: Path, warnings: list[str]) -> "Path | _CutMcap":
+    journal = path.with_name(f"{path.name}-wal")
+    if journal.is_file() and journal.stat().st_size:
+        warnings.append(
+            f"bag was not closed, and data in {journal.name} are not read; write them into "
+            f"the bag first: sqlite3 {path.name} 'pragma wal_checkpoint(truncate)': {path}"
+        )
+    if not _is_cut(path):
+        return path
+    complete = complete_bytes(path)
+    warnings.append(
+        "recording was cut short: it is read up to its last complete message; `mcap recover` "
+        f"repairs it for other programs: {path}"
+    )
+    return _CutMcap(path, complete, partial_records(path, complete) + _END)
+
+
+@dataclass(frozen=True)
+class _CutMcap:
+    """The path, for `rosbags`, of an MCAP file whose first `complete` bytes `end` follows."""
+
+    path: Path
+    complete: int
+    end: bytes
+    suffix: str = ".mcap"
+
+    def exists(self) -> bool:
+        return self.path.exists()
+
+    def is_dir(self) -> bool:
+        return False
+
+    def open(self, mode: str = "rb") -> io.BufferedReader:
+        return io.BufferedReader(_Ended(self.path.open(mode, buffering=0), self.complete, self.end))
+
+
+class _Ended(io.RawIOBase):
+    """The first `complete` bytes of a file, then `end`."""
+
+    def __init__(self, stream: Any, complete: int, end: bytes) -> None:
+        self._stream, self._complete, self._end, self._at = stream, complete, end, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        starts = 0, self._at, self._complete + len(self._end)
+        self._at = max(0, starts[whence] + offset)
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        if self._at < self._complete:
+            self._stream.seek(self._at)
+            data = self._stream.read(min(len(buffer), self._complete - self._at))
+        else:
+            first = self._at - self._complete
+            data = self._end[first : first + len(buffer)]
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+def bound_inflation() -> None:
+    """Limit decompression by `rosbags` to the stated size of a chunk and `MAX_CHUNK_BYTES`.
+
+    It decompresses a whole chunk before it compares its size with the stated one, so a small
+    malicious file could exhaust memory. Violations raise `ValueError`, as damage does there.
+    """
+    lz4 = needed("lz4.frame", WHAT).LZ4FrameDecompressor
+
+    def unpacked_zstd(data: bytes, size: int) -> bytes:
+        _require(size)
+        return inflated(b"zstd", data, size + 1)
+
+    def unpacked(decompressor: Any, data: bytes, size: int) -> bytes:
+        _require(size)
+        # One byte more than allowed, so that the end after exactly `size` bytes is seen.
+        plain: bytes = decompressor.decompress(data, max_length=size + 1)
+        if len(plain) > size or not decompressor.eof:
+            raise ValueError(f"a chunk is cut, or takes more than the {size} bytes it may")
+        return plain
+
+    mcap = needed("rosbags.rosbag2.storage_mcap", WHAT)
+    mcap.DECOMPRESSORS.update(
+        zstd=unpacked_zstd, lz4=lambda data, size: unpacked(lz4(), data, size)
+    )
+    bag = needed("rosbags.rosbag1.reader", WHAT)
+    bag.decompressors.update(
+        lz4=lambda data: unpacked(lz4(), data, MAX_CHUNK_BYTES),
+        bz2=lambda data: unpacked(bz2.BZ2Decompressor(), data, MAX_CHUNK_BYTES),
+    )
+
+
+def check_held(readers: Iterable[Any]) -> None:
+    """Raises `ValueError` where chunks state too many bytes, singly or those of the same time,
+    which are held at once.
+
+    `readers` are those of an opened recording (`AnyReader.readers`).
+    """
+    for reader in readers:
+        storage = getattr(reader, "storage", None)  # a ROS 1 bag has none: one chunk at a time
+        for one in getattr(storage, "storages", [storage]):
+            chunks = getattr(one, "chunks", [])
+            _require(max((chunk.uncompressed_size for chunk in chunks), default=0))
+            edges = [(each.message_start_time, 0, each.uncompressed_size) for each in chunks]
+            edges += [
+                (max(each.message_start_time, each.message_end_time), 1, -each.uncompressed_size)
+                for each in chunks
+            ]
+            held = max(accumulate(step for _, _, step in sorted(edges)), default=0)
+            if held > MAX_HELD_BYTES:
+                raise ValueError(
+                    f"chunks of the same time state {held} bytes, more than {MAX_HELD_BYTES}"
+                )
+
+
+def _require(size: int) -> None:
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk states {size} bytes, more than {MAX_CHUNK_BYTES}")
+
+
+class Topics(NamedTuple):
     """The connection of each role that was found, and all candidates for attitude."""
 
     roles: Mapping[str, Any]  # "image" first
-    attitudes: tuple[Any, ...]
-    connections: tuple[Any, ...]
+    attitudes: Sequence[Any]
 
-    def of(self, connection: Any) -> list[Any]:
-        """All connections on the topic of one (bags split or appended have several)."""
-        return [one for one in self.connections if one.topic == connection.topic]
 
-    def summary(self) -> str:
-        """Role and topic of each connection, for people."""
-        return ", ".join(f"{role} {one.topic}" for role, one in self.roles.items())
+def all_on(reader: Any, connection: Any) -> list[Any]:
+    """All connections on the topic of one (bags split or appended have several)."""
+    return [one for one in reader.connections if one.topic == connection.topic]
 
 
 def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
-    """The topics of a recording by role.
-
-    Raises `FlightError` where a requested topic is missing or has another type, and where there is
-    no image topic, or more than one.
-    """
-    connections = tuple(reader.connections)
-    counted = {one.topic: one for one in connections if one.msgcount}
+    """The topics of a recording by role."""
+    counted = {one.topic: one for one in reader.connections if one.msgcount}
     found: dict[str, list[Any]] = {}
     for role, types in TYPES.items():
         if role in asked:
             found[role] = [_asked(role, asked[role], counted, path)]
-        else:
-            of_type = [one for one in counted.values() if _fits(one, role)]
-            found[role] = sorted(
-                of_type, key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic)
-            )
+            continue
+        of_type = [
+            one
+            for one in counted.values()
+            if one.msgtype in types
+            and (one.msgtype not in _PLAIN_NUMBERS or _last_name(one) in _HEIGHT_NAMES)
+        ]
+        found[role] = sorted(
+            of_type, key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic)
+        )
     images = found["image"]
     if len(images) != 1:
         found_names = ", ".join(sorted(one.topic for one in images))
@@ -114,7 +401,7 @@ def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
     near = [one for one in infos if images[0].topic.startswith(one.topic.rpartition("/")[0] + "/")]
     found["camera_info"] = near or (infos if len(infos) == 1 else [])
     roles = {role: ones[0] for role, ones in found.items() if ones}
-    return Topics(roles, tuple(found["attitude"]), connections)
+    return Topics(roles, found["attitude"])
 
 
 def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
@@ -130,16 +417,14 @@ def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
     return counted[name]
 
 
-def _fits(connection: Any, role: str) -> bool:
-    named = connection.topic.rpartition("/")[2] in _HEIGHT_NAMES
-    return connection.msgtype in TYPES[role] and (named or connection.msgtype not in _PLAIN_NUMBERS)
+def _last_name(connection: Any) -> str:
+    return str(connection.topic.rpartition("/")[2])
 
 
 def open_ros(path: Path, options: SourceOptions) -> Recording:
     """The flight of a recording of ROS messages.
 
     Telemetry is read first, in one pass over its topics; images are read on request.
-    Raises `FlightError`, `CameraError` or `MissingExtraError`.
     """
     with opened(path) as (reader, doubts):
         topics = find_topics(reader, options.topics, path)
@@ -156,11 +441,12 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         if track.span_ns() is not None or options.telemetry is not None:
             offset = options.time_offset_ns
             check_overlap(track, first_ns + offset, last_ns + offset, options.telemetry or path)
+    used = ", ".join(f"{role} {one.topic}" for role, one in topics.roles.items())
     return Recording(
         kind="ros",
         path=path,
         camera=camera,
-        note=f"{path.name}: {topics.summary()}",
+        note=f"{path.name}: {used}",
         expected=image.msgcount,
         stream=lambda: with_mean_velocities(_views(path, image.topic, track, options), track),
         warnings=(*doubts, *warnings, *warnings_of(track, options)),
@@ -171,7 +457,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
 def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, int], int, int]:
     """Width and height of the first image that can be read, and times of the first and the last."""
     reason, image = "there is none", topics.roles["image"]
-    for _, time_ns, raw in reader.messages(connections=topics.of(image)):
+    for _, time_ns, raw in reader.messages(connections=all_on(reader, image)):
         try:
             message = reader.deserialize(raw, image.msgtype)
             grey = grey_of_message(message, "the last")
@@ -188,7 +474,7 @@ def _camera(reader: Any, topics: Topics, path: Path) -> Camera:
     info = topics.roles.get("camera_info")
     if info is None:
         raise CameraError(f"no camera_info for the images; give --camera FILE: {path}")
-    for _, _, raw in reader.messages(connections=topics.of(info)):
+    for _, _, raw in reader.messages(connections=all_on(reader, info)):
         try:
             return camera_of_info(reader.deserialize(raw, info.msgtype))
         except CameraError as error:
@@ -230,14 +516,14 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
     """
     attitude: TimeSeries | None = None
     for connection in topics.attitudes:
-        times, wxyz = _samples(reader, topics, connection, 4, attitude_of_message).arrays()
+        times, wxyz = _samples(reader, connection, 4, attitude_of_message).arrays()
         enu_from_flu, sound = rotations_of_wxyz(wxyz)
         attitude = attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
         if attitude is not None:
             break
     agl, home, amsl = _heights(reader, topics)
-    places = _samples(reader, topics, topics.roles.get("position"), 3, _position).positions()
-    velocity = _samples(reader, topics, topics.roles.get("velocity"), 2, _velocity)
+    places = _samples(reader, topics.roles.get("position"), 3, _position).positions()
+    velocity = _samples(reader, topics.roles.get("velocity"), 2, _velocity)
     return RecordedTrack(
         attitude=attitude,
         heights=() if agl is None else (agl,),
@@ -250,10 +536,10 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
     )
 
 
-def _messages(reader: Any, topics: Topics, connection: Any) -> Iterator[tuple[int, Any]]:
+def _messages(reader: Any, connection: Any) -> Iterator[tuple[int, Any]]:
     if connection is None:
         return
-    for one, recorded_ns, raw in reader.messages(connections=topics.of(connection)):
+    for one, recorded_ns, raw in reader.messages(connections=all_on(reader, connection)):
         try:
             message = reader.deserialize(raw, one.msgtype)
         except Exception:  # a damaged message is one sample less
@@ -263,13 +549,12 @@ def _messages(reader: Any, topics: Topics, connection: Any) -> Iterator[tuple[in
 
 def _samples(
     reader: Any,
-    topics: Topics,
     connection: Any,
     width: int,
     values_of: Callable[[Any], tuple[float, ...] | None],
 ) -> Samples:
     samples = Samples(width)
-    for time_ns, message in _messages(reader, topics, connection):
+    for time_ns, message in _messages(reader, connection):
         if (values := values_of(message)) is not None:
             samples.add(time_ns, *values)
     return samples
@@ -278,13 +563,13 @@ def _samples(
 def _heights(reader: Any, topics: Topics) -> tuple[TimeSeries | None, ...]:
     agl, home, amsl = (Samples(1) for _ in range(3))
     connection: Any = topics.roles.get("height")
-    for time_ns, message in _messages(reader, topics, connection):
+    for time_ns, message in _messages(reader, connection):
         if hasattr(message, "bottom_clearance"):
             agl.add(time_ns, message.bottom_clearance)
             home.add(time_ns, message.relative)
             amsl.add(time_ns, message.amsl)
         elif (height := height_of_message(message)) is not None:
-            above_home = connection.topic.rpartition("/")[2] in _HOME_NAMES
+            above_home = _last_name(connection) in _HOME_NAMES
             (home if above_home else agl).add(time_ns, height)
     return agl.series(), home.series(), amsl.series()
 

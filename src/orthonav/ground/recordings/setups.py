@@ -1,8 +1,8 @@
 """Other configurations, tried on views that are not confident, to find the wrong value.
 
-A wrong heading, height, focal length or a mirrored image lowers the confidence of every view, and
-so does a map of another area. A few of the views of low confidence are localized again with one
-value changed at a time. The change that makes them confident names the value to check.
+A wrong heading, height or focal length lowers the confidence of every view, and so does a map of
+another area. A few of the views of low confidence are localized again with one value changed at a
+time. The change that makes them confident names the value to check.
 """
 
 import math
@@ -17,7 +17,6 @@ import numpy as np
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.geo.camera import Camera
-from orthonav.core.geo.headings import seem_radians
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.localize.view import MAX_AGL_STD
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
@@ -34,67 +33,48 @@ _RETRIED = ("too_small", "too_coarse", "no_match", "outside_map", "low_confidenc
 
 @dataclass(frozen=True)
 class Setup:
-    """One change of the configuration. `changed` makes the view as it then is; `factor` is that of
-    the height, 1 where it stays."""
+    """One change of the configuration: `factor` is that of the height, 1 where it stays."""
 
     name: str
     any_heading: bool = False
     factor: float = 1.0
-    mirrored: bool = False
-    radians: bool = False
     without_prior: bool = False
 
     def changed(self, view: View) -> View:
-        """The view with this change."""
-        telemetry, camera, grey = view.telemetry, view.camera, view.grey
-        if self.radians:
-            telemetry = replace(telemetry, yaw_deg=math.degrees(telemetry.yaw_deg) % 360)
-        if self.factor != 1.0:
-            agl_m = self.factor * telemetry.agl_m
-            telemetry = replace(telemetry, agl_m=agl_m, agl_std_m=MAX_AGL_STD * agl_m)
-        if self.mirrored:
-            camera, grey = mirrored_camera(camera), np.ascontiguousarray(grey[:, ::-1])
-            telemetry = replace(telemetry, roll_deg=-telemetry.roll_deg)
-        return View(grey, camera, telemetry)
+        if self.factor == 1.0:
+            return view
+        agl_m = self.factor * view.telemetry.agl_m
+        telemetry = replace(view.telemetry, agl_m=agl_m, agl_std_m=MAX_AGL_STD * agl_m)
+        return replace(view, telemetry=telemetry)
 
 
-AS_REPORTED = Setup("as reported")
-_ANY_HEADING = Setup("any heading", any_heading=True)
-_TWICE = Setup("twice the height", factor=2.0)
-_HALF = Setup("half the height", factor=0.5)
-_ORDER = (
-    Setup("headings in radians", radians=True),
-    _ANY_HEADING,
-    _TWICE,
-    _HALF,
-    Setup("mirrored", mirrored=True, any_heading=True),
+_SETUPS = (
+    Setup("any heading", any_heading=True),
+    Setup("twice the height", factor=2.0),
+    Setup("half the height", factor=0.5),
     Setup("four times the height", factor=4.0),
     Setup("a quarter of the height", factor=0.25),
-    replace(_TWICE, name="any heading and twice the height", any_heading=True),
-    replace(_HALF, name="any heading and half the height", any_heading=True),
     Setup("without the prior", without_prior=True),
 )
+"""In the order of the trials. What is tried for a wrong heading is the same where it is unknown."""
 
 
 @dataclass(frozen=True)
 class Tried:
     """What a change did: `views` were localized again, `confident` of them are.
 
-    `heading_off_deg`, `heading_std_deg`: mean and standard deviation of the heading found, less the
-    reported one. `height_ratio`: median of the height found over the reported one. All three are
-    of the confident views, NaN without any.
+    `heading_off_deg`, `height_ratio`: mean of the heading found less the reported one, and median
+    of the height found over the reported one, of the confident views; NaN without any.
     """
 
     setup: Setup
     views: int
     confident: int
     heading_off_deg: float
-    heading_std_deg: float
     height_ratio: float
 
     @property
     def explains(self) -> bool:
-        """Whether this change makes the views confident."""
         return self.confident >= FEW * self.views and self.confident > 0
 
 
@@ -139,28 +119,25 @@ def try_setups(
     *,
     use_prior: bool,
     heading_known: bool,
-    tracked: bool = False,
     stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[float], None] = lambda share: None,
 ) -> list[Tried]:
     """What each change of the configuration does to the views, in the order of the trials.
 
     `stop` is asked before each view and ends the search: the last change may then have been tried
     on fewer views, and may be missing. `accepts` says whether an outcome is confident. The first
-    change that explains it ends the search; at most ten are tried, each on at most `SAMPLE` views.
-    `tracked`: the views were judged as a track, so they are first placed one by one as reported.
+    change that explains it ends the search; each is tried on at most `SAMPLE` views.
     """
     setups = [
         setup
-        for setup in ((AS_REPORTED, *_ORDER) if tracked else _ORDER)
-        if _makes_sense(setup, views, use_prior=use_prior, heading_known=heading_known)
+        for setup in _SETUPS
+        if (heading_known or not setup.any_heading)
+        and (not setup.without_prior or (use_prior and any(v.telemetry.prior for v in views)))
     ]
     found: list[Tried] = []
-    for number, setup in enumerate(setups):
+    for setup in setups:
         fixes: list[tuple[View, Fix]] = []
         placed = 0
         for i, view in enumerate(views):
-            progress((number + i / len(views)) / len(setups))
             if stop() or (i == _GIVE_UP and not fixes):
                 break
             placed += 1
@@ -175,51 +152,20 @@ def try_setups(
             found.append(_tried(setup, placed if stop() else len(views), fixes))
         if stop() or found[-1].explains:
             break
-    progress(1.0)
     return found
 
 
-def mirrored_camera(camera: Camera) -> Camera:
-    """The camera of the images mirrored left to right."""
-    lens = camera.distortion
-    if camera.model == "brown" and lens:
-        lens = (*lens[:3], -lens[3], *lens[4:])  # p2 is the tangential part along x
-    return replace(camera, cx_px=camera.width_px - camera.cx_px, distortion=lens)
-
-
-def _makes_sense(
-    setup: Setup, views: Sequence[View], *, use_prior: bool, heading_known: bool
-) -> bool:
-    if setup.radians:
-        return heading_known and seem_radians([view.telemetry.yaw_deg for view in views])
-    if setup.without_prior:
-        return use_prior and any(view.telemetry.prior is not None for view in views)
-    # With an unknown heading each of these is the same as another one.
-    only_heading = setup.any_heading and not setup.mirrored
-    return heading_known or not only_heading
-
-
 def _tried(setup: Setup, views: int, fixes: list[tuple[View, Fix]]) -> Tried:
-    off = np.array([fix.heading_deg - view.telemetry.yaw_deg for view, fix in fixes])
+    if not fixes:
+        return Tried(setup, views, 0, math.nan, math.nan)
+    off_rad = [math.radians(fix.heading_deg - view.telemetry.yaw_deg) for view, fix in fixes]
     ratios = [fix.agl_m / view.telemetry.agl_m for view, fix in fixes]
-    mean, std = math.nan, math.nan
-    if len(off) and np.isfinite(off).all():
-        # Circular mean and standard deviation; Mardia and Jupp, Directional statistics, 2.3.
-        vector = complex(np.exp(1j * np.radians(off)).mean())
-        mean = math.degrees(math.atan2(vector.imag, vector.real))
-        std = math.degrees(math.sqrt(-2 * math.log(min(max(abs(vector), 1e-12), 1.0))))
-    ratio = float(np.median(ratios)) if ratios else math.nan
-    return Tried(setup, views, len(fixes), mean, std, ratio)
-
-
-_SCATTERED_DEG = 20.0
-"""Headings that differ by a constant scatter less about it: compasses err by some degrees."""
+    mean = math.degrees(math.atan2(np.sin(off_rad).mean(), np.cos(off_rad).mean()))
+    return Tried(setup, views, len(fixes), mean, float(np.median(ratios)))
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Views of a run by what is known of their positions."""
-
     views: int
     confident: int
     low: int
@@ -244,7 +190,6 @@ class Counts:
 
     @property
     def few(self) -> bool:
-        """Whether so few views are confident that the configuration may be wrong."""
         return self.confident < FEW * self.views
 
 
@@ -266,40 +211,17 @@ def setup_text(tried: Sequence[Tried], *, on_map: bool) -> list[str]:
         )
         tested = f"{names}: at most {most} of {last.views} views of low confidence become confident"
         return [f"no other configuration explains it ({tested}); {where}"]
-    found = f"{last.confident} of {last.views} views of low confidence become confident"
-    lines = [f"{found} {_explanation(last)}"]
-    return [*lines, f"also tried: {_listed(failed)}"] if failed else lines
-
-
-def _listed(tried: Iterable[Tried]) -> str:
-    return ", ".join(f"{each.setup.name} ({each.confident} of {each.views})" for each in tried)
-
-
-def _explanation(found: Tried) -> str:
-    setup, parts, checks = found.setup, [], []
-    if setup.name == "as reported":
-        return (
-            "if localized one by one: the configuration is right, but the views do not form a track"
+    off, ratio = last.heading_off_deg, last.height_ratio
+    if last.setup.without_prior:
+        cause = "without the prior; check the prior positions"
+    elif last.setup.any_heading:
+        apart = "" if math.isnan(off) else f", {off:+.0f} deg from the reported one"
+        cause = f"with any heading{apart}; check the heading column and the mounting of the camera"
+    else:
+        cause = (
+            f"at {ratio:.2f} times the reported height (or {1 / ratio:.2f} times the focal "
+            "length); check the height column (above ground?) and the camera"
         )
-    if setup.without_prior:
-        return "without the prior; check the prior positions"
-    if setup.radians:
-        return "if the headings are read as radians"
-    if setup.mirrored:
-        return "if mirrored left to right, with any heading; check where the images come from"
-    if setup.any_heading:
-        off, std = found.heading_off_deg, found.heading_std_deg
-        constant = std < _SCATTERED_DEG
-        apart = ", which differs from the reported one from view to view"
-        if constant:
-            apart = f", {off:+.0f} deg from the reported one" if round(off) else ""
-            apart += f" (standard deviation {std:.0f} deg)"
-        parts.append(f"with any heading{apart}")
-        checks.append("the heading column" + " and the mounting of the camera" * constant)
-    if setup.factor != 1.0:
-        ratio = found.height_ratio
-        parts.append(
-            f"at {ratio:.2f} times the reported height (or {1 / ratio:.2f} times the focal length)"
-        )
-        checks.append("the height column (above ground?) and the camera")
-    return f"{' and '.join(parts)}; check {' and '.join(checks)}"
+    lines = [f"{last.confident} of {last.views} views of low confidence become confident {cause}"]
+    also = ", ".join(f"{each.setup.name} ({each.confident} of {each.views})" for each in failed)
+    return [*lines, f"also tried: {also}"] if failed else lines

@@ -38,8 +38,7 @@ SILENT = 0  # OpenCV's level of logging at which it writes nothing
 def open_video(path: Path, options: SourceOptions) -> Recording:
     """The flight of a video, `options.rate_hz` views per second.
 
-    Telemetry is that of `options.telemetry`, else of a file with the same name. Raises
-    `FlightError` or `CameraError`.
+    Telemetry is that of `options.telemetry`, else of a file with the same name.
     """
     with _opened(path) as capture:
         sides = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)

@@ -16,15 +16,12 @@ from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.geo.camera import (
     Camera,
     axis_on_ground_en_m,
-    enu_from_camera,
     footprint_en_m,
-    seen_px,
 )
 from orthonav.core.localize.rectify import MAX_REACH, downsampled, rectify
 from orthonav.core.localize.view import check_telemetry
 from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View, ViewResult
 
 MIN_PX, MAX_PX = 256, 1024
@@ -95,20 +92,6 @@ def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindo
     return GroundWindow(side_m, size_px, axis)
 
 
-def image_px(
-    telemetry: Telemetry, camera: Camera, window: GroundWindow, place: tuple[float, float]
-) -> tuple[float, float]:
-    """The image point of a place in the window of a view, shares from the left and the top; the
-    inverse of `rectified`. Raises `FlightError` where the view does not show it."""
-    east = window.offset_en_m[0] + (place[0] - 0.5) * window.side_m
-    north = window.offset_en_m[1] + (0.5 - place[1]) * window.side_m
-    down = enu_from_camera(telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg)
-    x, y = seen_px(camera, np.array([east, north, -telemetry.agl_m]) @ down).tolist()
-    if not (0 <= x <= camera.width_px and 0 <= y <= camera.height_px):  # also where it is NaN
-        raise FlightError("the view does not show this place")
-    return x, y
-
-
 def rectified(
     grey: Grey, telemetry: Telemetry, camera: Camera, window: GroundWindow
 ) -> tuple[Grey, Mask]:
@@ -133,9 +116,9 @@ def jpeg(grey: Grey, quality: int = 95) -> bytes:
     return bytes(cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])[1].tobytes())
 
 
-def shrunk(grey: Grey, max_px: int, max_area_px: float = math.inf) -> Grey:
+def shrunk(grey: Grey, max_px: int) -> Grey:
     rows, cols = grey.shape
-    share = min(1.0, max_px / max(rows, cols), math.sqrt(max_area_px / (rows * cols)))
+    share = min(1.0, max_px / max(rows, cols))
     if share == 1:
         return grey
     size = (max(1, round(share * cols)), max(1, round(share * rows)))
@@ -148,7 +131,6 @@ class SheetImagery:
     def __init__(self, opened: MapFile) -> None:
         self.sheet = opened.manifest.sheets[0]
         self.frame, self.grid = self.sheet.frame, self.sheet.grid
-        self.terrain = TerrainLayer.of(opened)
         self._layer = GreyLayer.of(opened)
         self.preview = b""
         drawn = "preview_jpeg" if self._layer is None else "grey/bytes"
@@ -201,16 +183,23 @@ class SheetImagery:
     def crop(self, box: Box, size_px: tuple[int, int]) -> tuple[Grey, Mask]:
         """Grey and valid (rows, cols) of a box, north up; `size_px`: columns and rows."""
         west, north = box[0] - self.grid.west_m, self.grid.north_m - box[3]  # from the corner
-        width_m, height_m = box[2] - box[0], box[3] - box[1]
-        level = self._level(min(width_m / size_px[0], height_m / size_px[1]))
-        col_m, row_m = self._steps_m(level)
-        first_col, first_row = math.floor(west / col_m) - 1, math.floor(north / row_m) - 1
-        cols, rows = math.ceil(width_m / col_m) + 4, math.ceil(height_m / row_m) + 4
-        if max(cols, rows) > MAX_READ_PX:
-            nothing = np.zeros(size_px[::-1], np.uint8)
-            return nothing, nothing > 0
-        grey, valid = self._read(level, first_row, first_col, rows, cols)
-        scale_x, scale_y = width_m / size_px[0] / col_m, height_m / size_px[1] / row_m
+        step_x_m, step_y_m = (box[2] - box[0]) / size_px[0], (box[3] - box[1]) / size_px[1]
+        if self._layer is None:
+            grey, valid, first_row, first_col = self._small, np.ones(self._small.shape, bool), 0, 0
+            row_m = self.grid.height_px * self.grid.gsd_m / grey.shape[0]
+            col_m = self.grid.width_px * self.grid.gsd_m / grey.shape[1]
+        else:
+            fine = math.floor(math.log2(max(min(step_x_m, step_y_m) / self.grid.gsd_m, 1.0)) + 1e-6)
+            level = min(fine, self._layer.levels - 1)
+            row_m = col_m = self.grid.gsd_m * 2**level
+            first_row, first_col = math.floor(north / row_m) - 1, math.floor(west / col_m) - 1
+            rows = math.ceil((box[3] - box[1]) / row_m) + 4
+            cols = math.ceil((box[2] - box[0]) / col_m) + 4
+            if max(cols, rows) > MAX_READ_PX:
+                nothing = np.zeros(size_px[::-1], np.uint8)
+                return nothing, nothing > 0
+            grey, valid = self._layer.read(level, first_row, first_col, rows, cols)
+        scale_x, scale_y = step_x_m / col_m, step_y_m / row_m
         # OpenCV counts from the centres of pixels, we from the corner of the first one.
         from_window = np.array(
             [
@@ -223,30 +212,3 @@ class SheetImagery:
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
         seen = cv2.warpAffine(valid.astype(np.uint8), from_window, size_px, flags=flags)
         return np.asarray(drawn, dtype=np.uint8), np.asarray(seen > 0, dtype=np.bool_)
-
-    def _level(self, step_m: float) -> int:
-        if self._layer is None:
-            return 0
-        fine = math.floor(math.log2(max(step_m / self.grid.gsd_m, 1.0)) + 1e-6)
-        return min(fine, self._layer.levels - 1)
-
-    def _steps_m(self, level: int) -> tuple[float, float]:
-        grid = self.grid
-        if self._layer is not None:
-            return grid.gsd_m * 2**level, grid.gsd_m * 2**level
-        rows, cols = self._small.shape
-        return grid.width_px * grid.gsd_m / cols, grid.height_px * grid.gsd_m / rows
-
-    def _read(self, level: int, row: int, col: int, height: int, width: int) -> tuple[Grey, Mask]:
-        if self._layer is not None:
-            return self._layer.read(level, row, col, height, width)
-        grey = np.zeros((height, width), np.uint8)
-        valid = np.zeros((height, width), np.bool_)
-        rows, cols = self._small.shape
-        top, bottom = max(row, 0), min(row + height, rows)
-        left, right = max(col, 0), min(col + width, cols)
-        if top < bottom and left < right:
-            inside = np.s_[top - row : bottom - row, left - col : right - col]
-            grey[inside] = self._small[top:bottom, left:right]
-            valid[inside] = True
-        return grey, valid

@@ -20,7 +20,7 @@ from orthonav.core.geo.camera import Camera, footprint_en_m
 from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import Prior, Telemetry
-from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
+from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import DEFAULT_CAMERA as DEFAULT_CAMERA
@@ -35,17 +35,14 @@ from orthonav.ground.simulate.ground import (
 )
 from orthonav.ground.simulate.motion import (
     FlownPath,
-    Wind,
     camera_attitude,
     drifting,
     horizon_errors,
     rounded,
     steady_path,
-    windy_path,
 )
-from orthonav.ground.simulate.perspective import Raster
 from orthonav.ground.simulate.receiver import Good, samples_of, solutions
-from orthonav.ground.simulate.render import Clouds, ViewEffects, degraded, render_view
+from orthonav.ground.simulate.render import Clouds, Raster, ViewEffects, degraded, render_view
 
 MAX_VIEWS = 1_000_000  # sanity limit
 TRIES_PER_VIEW = 400  # suffices if 2 % of random positions are covered by imagery
@@ -124,15 +121,13 @@ class SimulateRequest:
     `route`: route to fly; or `random`: number of random positions, 1 to 1e6. One of the two.
     `agl_m`: height above ground, 1..50,000 m; None: the shorter side of the image covers 256 pixels
     of the orthophoto. On a route over a terrain it is the height above the ground at the first
-    view, and the altitude is constant. `spacing_m`: distance between views on a route in still air;
-    None: flown in one second. `airspeed_mps`: airspeed. In wind, views are `spacing_m /
-    airspeed_mps` seconds apart too. `camera`: intrinsics; `errors`: of the telemetry; `effects`:
-    image degradation. `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on
-    the spot. `beyond`: whether the route may leave the imagery, which is then mirrored at its
-    border. `terrain`: heights of the ground or surface above mean sea level. Views are then true
-    perspectives of it, and the telemetry reports heights above sea level and, on a route, above the
-    first view, and no measured one above ground. `camera_pitch_deg`: angle by which the camera
-    looks ahead of straight down, 0..65; reported.
+    view, and the altitude is constant. `spacing_m`: distance between views on a route; None: flown
+    in one second. `camera`: intrinsics; `errors`: of the telemetry; `effects`: image degradation.
+    `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot. `terrain`:
+    heights of the ground or surface above mean sea level. Views are then true perspectives of it,
+    and the telemetry reports heights above sea level and, on a route, above the first view, and no
+    measured one above ground. `camera_pitch_deg`: angle by which the camera looks ahead of straight
+    down, 0..65; reported.
     """
 
     orthos: Sequence[Path]  # orthophotos to fly over; earlier ones take precedence
@@ -146,10 +141,8 @@ class SimulateRequest:
     errors: Errors = NO_ERRORS
     effects: ViewEffects = USUAL_EFFECTS
     seed: int = 0  # of all random draws, 0 or more; equal requests give equal bytes
-    wind: Wind | None = None  # none for still air; only on a route
     turn_radius_m: float = 0.0
     cloud_share: float = 0.0  # fraction of the views with clouds, 0..1
-    beyond: bool = False
     terrain: TerrainHeights | None = None
     terrain_posting_m: float = 5.0  # resolution of the terrain
     camera_pitch_deg: float = 0.0
@@ -216,7 +209,8 @@ def simulate_flight(
     with replacing_folder(request.out) as folder, raster:
         coverage = Coverage(mosaic, area)
         poses = list(_poses(request, area, agl_m, coverage))
-        ground = _ground(request, raster, (west, north, gsd_m), coverage)
+        mirror_en_m = coverage.box_en_m() if request.in_perspective else None
+        ground = GroundImagery(raster, west, north, gsd_m, mirror_en_m)
         surface = None
         if request.in_perspective:
             posting_m = request.terrain_posting_m
@@ -263,34 +257,13 @@ def _check(request: SimulateRequest) -> None:
     if request.cloud_share and request.camera_pitch_deg:
         raise FlightError("clouds are simulated below cameras that look straight down only")
     on_a_route = {
-        "wind": request.wind is not None,
         "turn_radius_m": request.turn_radius_m > 0,
         "velocity_drift": request.errors.velocity_drift is not None,
-        "beyond": request.beyond,
         "gnss": request.gnss is not None,
     }
     given = [name for name, value in on_a_route.items() if value]
     if request.route is None and given:
         raise FlightError(f"{', '.join(given)}: only along a route, not at random positions")
-
-
-def _ground(
-    request: SimulateRequest,
-    raster: SheetRaster,
-    corner: tuple[float, float, float],
-    coverage: Coverage,
-) -> GroundImagery:
-    west_m, north_m, gsd_m = corner
-    if not (request.beyond or request.in_perspective):
-        return GroundImagery(raster, west_m, north_m, gsd_m)
-    west, south, east, north = coverage.box_en_m()
-    box = (
-        math.ceil((west - west_m) / gsd_m),
-        math.ceil((north_m - north) / gsd_m),
-        math.floor((east - west_m) / gsd_m),
-        math.floor((north_m - south) / gsd_m),
-    )
-    return GroundImagery(raster, west_m, north_m, gsd_m, box)
 
 
 def _sees_ground(coverage: Coverage, request: SimulateRequest, pose: _Pose) -> bool:
@@ -362,7 +335,7 @@ def _route_poses(
         pose = _tilted(request, rng, place, float(heading), above_m, time_s, tilt_deg, velocity)
         if ground_m is not None:
             pose = replace(pose, home_m=agl_m, amsl_m=agl_m + float(ground_m[0]))
-        if not request.beyond and not _sees_ground(coverage, request, pose):
+        if not _sees_ground(coverage, request, pose):
             lat, lon = (float(value) for value in area.frame.latlon_from_en(place))
             raise AreaError(
                 f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
@@ -391,14 +364,7 @@ def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
             f"route of {length_m / 1000:,.1f} km with a view every {spacing_m:g} m has more than "
             f"{MAX_VIEWS:,} views; increase the distance between views"
         )
-    if request.wind is None:
-        path = steady_path(line, spacing_m, airspeed_mps)
-    else:
-        rng = np.random.default_rng([request.seed, 2])
-        path = windy_path(line, spacing_m, airspeed_mps, request.wind, rng, MAX_VIEWS)
-    if len(path.places_en_m) > MAX_VIEWS:
-        raise FlightError(f"route has more than {MAX_VIEWS:,} views; increase their distance")
-    return path
+    return steady_path(line, spacing_m, airspeed_mps)
 
 
 def _reported_velocities(

@@ -15,7 +15,7 @@ from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.records import Telemetry
 from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.ground.planning.area import Area
-from orthonav.ground.simulate.perspective import Raster, coloured, met, rays_enu
+from orthonav.ground.simulate.render import Raster, coloured, met, rays_enu
 
 COVERAGE_PX = 1024  # size of the coverage mask; bounds its memory for any imagery
 MAX_NODES = 4000  # heights along a side of the area, at most; bounds their memory
@@ -61,12 +61,9 @@ class Coverage:
         return not (part & (inside > 0)).any()
 
     def box_en_m(self) -> tuple[float, float, float, float]:
-        height, width = self._missing.shape
-        left, top, right, bottom = 0, 0, width, height
-        while left < right and top < bottom:
-            part = self._missing[top:bottom, left:right]
-            if not part.any():
-                break
+        """West, south, east, north of a part without holes."""
+        top, left, bottom, right = 0, 0, *self._missing.shape
+        while (part := self._missing[top:bottom, left:right]).any():
             sides = [part[:, 0], part[0], part[:, -1], part[-1]]
             worst = int(np.argmax([side.mean() for side in sides]))
             left, top = left + (worst == 0), top + (worst == 1)
@@ -74,7 +71,7 @@ class Coverage:
         # One pixel less on every side, because the mask is subsampled.
         left, top, right, bottom = left + 1, top + 1, right - 1, bottom - 1
         if left >= right or top >= bottom:
-            raise AreaError("imagery has no part without holes that could be mirrored (--beyond)")
+            raise AreaError("imagery has no part without holes that could be mirrored")
         return (
             self._west + left * self._gsd_m,
             self._north - bottom * self._gsd_m,
@@ -85,18 +82,15 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class GroundImagery:
-    """`mirror_px`: box (left, top, right, bottom) that is mirrored at its sides to fill pixels
-    without imagery, None for no filling."""
-
     raster: SheetRaster  # the resampled imagery
     west_m: float
     north_m: float
     gsd_m: float  # metres per pixel
-    mirror_px: tuple[int, int, int, int] | None = None
+    mirror_en_m: tuple[float, float, float, float] | None = None  # box to mirror at its sides
 
     def window(self, corners_en_m: Array, margin_px: int) -> tuple[NDArray[np.uint8], Array]:
-        """Pixels (H, W, 3) of the box around points (N, 2), and the position (2,) of their
-        corner."""
+        """Pixels (H, W, 3) of the box around points (N, 2), and the position (2,) of their corner.
+        Ground without imagery is mirrored, where a box for this is given."""
         cols = (corners_en_m[:, 0] - self.west_m) / self.gsd_m
         rows = (self.north_m - corners_en_m[:, 1]) / self.gsd_m
         left, top = math.floor(cols.min()) - margin_px, math.floor(rows.min()) - margin_px
@@ -104,26 +98,23 @@ class GroundImagery:
         height = math.ceil(rows.max()) + margin_px - top
         pixels = self.raster.read(left, top, width, height)
         rgb = pixels.rgb
-        if self.mirror_px is not None and not pixels.valid.all():
-            filled = self._mirrored(left, top, width, height)
+        if self.mirror_en_m is not None and not pixels.valid.all():
+            west, south, east, north = self.mirror_en_m
+            x = (np.array([west, east]) - self.west_m) / self.gsd_m
+            y = (self.north_m - np.array([north, south])) / self.gsd_m
+            col, row = reflected(left, width, x), reflected(top, height, y)
+            first = int(col.min()), int(row.min())
+            part = self.raster.read(*first, int(np.ptp(col)) + 1, int(np.ptp(row)) + 1)
+            filled = part.rgb[np.ix_(row - first[1], col - first[0])]
             rgb = np.where(pixels.valid[..., None], rgb, filled)
-        corner = np.array([self.west_m + left * self.gsd_m, self.north_m - top * self.gsd_m])
-        return rgb, corner
-
-    def _mirrored(self, left: int, top: int, width: int, height: int) -> NDArray[np.uint8]:
-        assert self.mirror_px is not None
-        x0, y0, x1, y1 = self.mirror_px
-        cols = reflected(np.arange(left, left + width), x0, x1)
-        rows = reflected(np.arange(top, top + height), y0, y1)
-        x, y = int(cols.min()), int(rows.min())
-        part = self.raster.read(x, y, int(cols.max()) + 1 - x, int(rows.max()) + 1 - y)
-        return np.asarray(part.rgb[np.ix_(rows - y, cols - x)])
+        return rgb, np.array([self.west_m + left * self.gsd_m, self.north_m - top * self.gsd_m])
 
 
-def reflected(index: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64]:
-    size = high - low
-    folded = (index - low) % (2 * size)
-    return np.asarray(low + np.minimum(folded, 2 * size - 1 - folded))
+def reflected(first: int, count: int, sides: Array) -> NDArray[np.int64]:
+    """Indices from `first` on, mirrored at two sides so that they lie between them."""
+    low, high = math.ceil(sides[0]), math.floor(sides[1])
+    folded = (np.arange(first, first + count) - low) % (2 * (high - low))
+    return np.asarray(low + np.minimum(folded, 2 * (high - low) - 1 - folded))
 
 
 def ground_below_m(terrain: TerrainHeights, frame: LocalFrame, places_en_m: Array) -> Array:

@@ -8,7 +8,8 @@ import logging
 import math
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -18,42 +19,32 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.core.files import with_paths
-from orthonav.core.flight import read_truth
+from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.flight.fixes import STATES
+from orthonav.core.flight.folder import FlightFolder
 from orthonav.core.flight.gnss import fault_of, gnss_of
 from orthonav.core.flight.mount import Mount, read_mount
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
-from orthonav.ground.evaluate.calibration import is_covariance
+from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult, error_ellipse
 from orthonav.ground.evaluate.metrics import FAR_M, check_truth, warn_of_another_run
 from orthonav.ground.recordings.flightlog import is_flight_log
-from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
+from orthonav.ground.report import to_plain
 from orthonav.ground.report.imagery import (
     GroundWindow,
     SheetImagery,
     as_fixed,
-    image_px,
     jpeg,
     png,
     rectified,
     shrunk,
     window_of,
 )
-from orthonav.ground.report.numbers import to_plain
-from orthonav.ground.view.feed import (
-    Batch,
-    Feed,
-    FolderImages,
-    LineFeed,
-    NoImages,
-    Shot,
-    ViewImages,
-)
-from orthonav.ground.view.logs import LogReader
+from orthonav.ground.view.feed import Batch, LineFeed, LogReader, Shot
 
 Array = NDArray[np.float64]
 LatLon = tuple[float, float]
+Feed = LineFeed | LogReader
 FAR_AWAY_PX = 1e9
 RAW_PX = 640
 log = logging.getLogger(__name__)
@@ -74,26 +65,6 @@ class ViewRequest:
         with_paths(self, "run", "map_path", "second", "flight", "truth", "mount")
 
 
-@dataclass(frozen=True)
-class RunLabels:
-    name: str
-    map_name: str
-    images: str
-    truth: str
-    live: bool
-    second: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """A view without the errors of its mount, the telemetry corrected by its fix, and the ground
-    that it shows."""
-
-    shot: Shot
-    telemetry: Telemetry
-    window: GroundWindow
-
-
 class Run:
     """Everything that the page requests. Safe to share between threads.
 
@@ -103,17 +74,18 @@ class Run:
 
     def __init__(
         self,
-        labels: RunLabels,
+        labels: dict[str, Any],
         feed: Feed,
-        images: ViewImages,
+        images: "LogReader | FolderImages | None",
         sheet: SheetImagery,
         truth: Mapping[str, LatLon],
         radius_m: float,
         mount: Mount | None = None,
         second: Mapping[str, ViewResult] | None = None,
     ) -> None:
-        """Read what exists. `mount`: None: that of the flight log, where the feed is one. `second`:
-        results of another run of the same flight by frame, to compare.
+        """Read what exists. `labels`: names of the files for the page, and whether it is `live`.
+        `mount`: None: that of the flight log, where the feed is one. `second`: results of another
+        run of the same flight by frame, to compare.
 
         Raises what the feed raises, and `FlightError` for an empty run.
         """
@@ -129,9 +101,9 @@ class Run:
         self.problems: list[str] = []
         self._trouble = ""
         self._take(feed.poll())
-        if not self._results and not labels.live:
+        if not self._results and not labels["live"]:
             reason = f": {self.problems[0]}" if self.problems else ""
-            raise FlightError(f"run has no views{reason}: {labels.name}")
+            raise FlightError(f"run has no views{reason}: {labels['name']}")
 
     @property
     def count(self) -> int:
@@ -140,17 +112,9 @@ class Run:
     def any_known(self, column: str) -> bool:
         return any(value is not None for value in self._columns.get(column, ()))
 
-    def any_on_map(self) -> bool:
-        grid = self.sheet.grid
-        places = zip(self._columns.get("x", ()), self._columns.get("y", ()), strict=True)
-        return any(
-            x is not None and 0 <= x <= grid.width_px and 0 <= y <= grid.height_px
-            for x, y in places
-        )
-
     def summary(self) -> dict[str, Any]:
         return {
-            **asdict(self.labels),
+            **self.labels,
             "version": __version__,
             "radius_m": self._radius_m,
             "states": list(STATES),
@@ -178,7 +142,7 @@ class Run:
         found: dict[str, Any] = {
             "index": index,
             "frame": result.frame,
-            "time_s": _seconds(result.time_ns),
+            "time_s": str(Decimal(result.time_ns).scaleb(-9)),  # JavaScript rounds numbers
             "state": result.state,
             "evidence": {str(name): value for name, value in outcome.evidence.items()},
         }
@@ -194,49 +158,30 @@ class Run:
             if place is not None:
                 found |= {f"{name}lat_deg": place[0], f"{name}lon_deg": place[1]}
         try:
-            shot = self._images.shot(result.frame)
+            telemetry = self._shot(result).telemetry
             names = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
-            found["telemetry"] = {name: getattr(shot.telemetry, name) for name in names}
-            found["window"] = self._placed(result, shot).window
+            found["telemetry"] = {name: getattr(telemetry, name) for name in names}
+            found["window"] = self._placed(result)[2]
         except FlightError as error:
             found["why_no_window"] = str(error)
         plain: dict[str, Any] = to_plain(found)
         return plain
 
     def view_png(self, index: int) -> bytes:
-        result = self._result(index)
-        placed = self._placed(result, self._images.shot(result.frame))
-        made = rectified(placed.shot.load(), placed.telemetry, placed.shot.camera, placed.window)
-        return png(*made)
+        shot, telemetry, window = self._placed(self._result(index))
+        return png(*rectified(shot.load(), telemetry, shot.camera, window))
 
     def raw_jpeg(self, index: int) -> bytes:
-        return jpeg(shrunk(self._images.shot(self._result(index).frame).load(), RAW_PX))
+        return jpeg(shrunk(self._shot(self._result(index)).load(), RAW_PX))
 
     def map_png(self, index: int, at: str) -> bytes:
         result = self._result(index)
         place = self._truth.get(result.frame) if at == "truth" else _place(result.outcome)
         if place is None:
             raise FlightError(f"view {result.frame} has no such position: {at}")
-        window = self._placed(result, self._images.shot(result.frame)).window
+        window = self._placed(result)[2]
         box = window.box_at(np.asarray(self.sheet.frame.en_from_latlon(*place)))
         return png(*self.sheet.crop(box, (window.size_px, window.size_px)))
-
-    def ground(self, index: int, x: float, y: float) -> dict[str, Any]:
-        result = self._result(index)
-        fix = result.outcome
-        if not isinstance(fix, Fix):
-            raise FlightError(f"view {result.frame} has no position")
-        placed = self._placed(result, self._images.shot(result.frame))
-        camera = placed.shot.camera
-        px = image_px(placed.telemetry, camera, placed.window, (x, y))
-        found = locate_pixel(camera, placed.shot.telemetry, fix, px, self.sheet.terrain)
-        return {
-            "lat_deg": found.lat_deg,
-            "lon_deg": found.lon_deg,
-            "height_m": to_plain(found.height_m),
-            "ellipse_95": ellipse_95(found.cov_en_m2),
-            "confident": result.is_confident,
-        }
 
     def _result(self, index: int) -> ViewResult:
         with self._lock:
@@ -244,17 +189,24 @@ class Run:
                 raise IndexError(f"no view {index}")
             return self._results[index]
 
-    def _placed(self, result: ViewResult, shot: Shot) -> _Placed:
-        mount = self._mount
+    def _shot(self, result: ViewResult) -> Shot:
+        if self._images is None:
+            raise FlightError("there are no images; name the flight with --flight")
+        return self._images.shot(result.frame)
+
+    def _placed(self, result: ViewResult) -> tuple[Shot, Telemetry, GroundWindow]:
+        """A view without the errors of its mount, the telemetry corrected by its fix, and the
+        ground that it shows."""
+        shot, mount = self._shot(result), self._mount
         if mount is None and isinstance(self._feed, LogReader):
             mount = self._feed.mount
         if mount is not None:
             shot = replace(shot, telemetry=mount.corrected(shot.telemetry))
         telemetry = as_fixed(shot.telemetry, result)
-        return _Placed(shot, telemetry, window_of(telemetry, shot.camera, self.sheet.grid.gsd_m))
+        return shot, telemetry, window_of(telemetry, shot.camera, self.sheet.grid.gsd_m)
 
     def _refresh(self) -> None:
-        if not self.labels.live:
+        if not self.labels["live"]:
             return
         try:
             if isinstance(self._images, LogReader) and self._images is not self._feed:
@@ -315,7 +267,7 @@ def columns_of(
         for f, r in zip(fixes, results, strict=True)
     ]
     wrong = np.array(trusted, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), radii_m))
-    axes_m, turn_deg = _ellipses(fixes)
+    major_m, minor_m, direction_deg = _ellipses(fixes).T
 
     def stated(name: str) -> list[float]:
         return [math.nan if fix is None else getattr(fix, name) for fix in fixes]
@@ -332,9 +284,9 @@ def columns_of(
         "err": to_plain(error_m, 4),
         "conf": to_plain(stated("confidence"), 4),
         "radius": to_plain(radii_m, 1),
-        "a": to_plain(axes_m[:, 1], 2),
-        "b": to_plain(axes_m[:, 0], 2),
-        "turn": to_plain(turn_deg, 1),
+        "a": to_plain(major_m, 2),
+        "b": to_plain(minor_m, 2),
+        "turn": to_plain((90.0 - direction_deg) % 180.0, 1),
         "head": to_plain(stated("heading_deg"), 1),
         "agl": to_plain(stated("agl_m"), 1),
         "ms": to_plain([float(r.latency_ms) for r in results], 1),
@@ -377,25 +329,11 @@ def _drawn(names: tuple[str, str], en_m: Array, sheet: SheetImagery) -> dict[str
     return {name: to_plain(each, 2) for name, each in zip(names, px.T, strict=True)}
 
 
-def _ellipses(fixes: Sequence[Fix | None]) -> tuple[Array, Array]:
-    """Standard deviations (N, 2) along both axes, shorter first, and the angle of the longer."""
-    cov = np.full((len(fixes), 2, 2), math.nan)
-    for i, fix in enumerate(fixes):
-        if fix is not None and np.shape(fix.cov_en_m2) == (2, 2):
-            cov[i] = fix.cov_en_m2
-    axes, turn = np.full((len(fixes), 2), math.nan), np.full(len(fixes), math.nan)
-    usable = is_covariance(cov)
-    if usable.any():
-        sizes, vectors = np.linalg.eigh(cov[usable])
-        axes[usable] = np.sqrt(np.maximum(sizes, 0.0))
-        turn[usable] = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])) % 180.0
-    return axes, turn
-
-
-def _seconds(time_ns: int) -> str:
-    """Decimal seconds with all nanoseconds, as text: JavaScript's numbers cannot hold them."""
-    whole, rest = divmod(abs(time_ns), 10**9)
-    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
+def _ellipses(fixes: Sequence[Fix | None]) -> Array:
+    """Axes of one standard deviation, longer first, and the angle of the longer one (N, 3)."""
+    unknown = np.full((2, 2), math.nan)
+    found = [error_ellipse(unknown if fix is None else fix.cov_en_m2) for fix in fixes]
+    return np.array(found, np.float64).reshape(-1, 3)
 
 
 def open_run(request: ViewRequest) -> Run:
@@ -413,20 +351,20 @@ def open_run(request: ViewRequest) -> Run:
     if truth:
         centre = sheet.frame.lat_deg, sheet.frame.lon_deg
         check_truth(truth, (), centre, Path(truth_name))
-    labels = RunLabels(
-        name=request.run.name or str(request.run),
-        map_name=request.map_path.name,
-        images="" if isinstance(images, NoImages) else (request.flight or request.run).name,
-        truth=truth_name,
-        live=request.live,
-        second=request.second.name if request.second else "",
-    )
+    labels = {
+        "name": request.run.name or str(request.run),
+        "map_name": request.map_path.name,
+        "images": "" if images is None else (request.flight or request.run).name,
+        "truth": truth_name,
+        "live": request.live,
+        "second": request.second.name if request.second else "",
+    }
     mount = None if request.mount is None else read_mount(request.mount)
     second = _second(request)
     run = Run(labels, feed, images, sheet, truth, request.radius_m, mount, second)
     for problem in run.problems:
         log.warning("%s", problem)
-    _warn(request, opened, run, feed, images)
+    _warn(request, opened, run, feed, getattr(images, "folder", None))
     return run
 
 
@@ -457,10 +395,24 @@ def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
     return {result.frame: result for result in batch.results}
 
 
-def _images(request: ViewRequest, feed: Feed) -> ViewImages:
+class FolderImages:
+    """Views of a flight folder by frame."""
+
+    def __init__(self, path: Path) -> None:
+        self.folder = open_flight(path, images_needed=False)
+        self._views = {view.frame: view for view in self.folder.views}
+
+    def shot(self, frame: str) -> Shot:
+        view = self._views.get(frame)
+        if view is None:
+            raise FlightError("this view is not in the flight")
+        return Shot(view.telemetry, self.folder.camera, view.grey)
+
+
+def _images(request: ViewRequest, feed: Feed) -> LogReader | FolderImages | None:
     path = request.flight
     if path is None:
-        return feed if isinstance(feed, LogReader) else NoImages()
+        return feed if isinstance(feed, LogReader) else None
     if not path.exists() and not request.live:
         raise MissingFileError(f"flight does not exist: {path}")
     if is_log(path):
@@ -484,19 +436,18 @@ def _truth(request: ViewRequest) -> tuple[Mapping[str, LatLon], str]:
     return {}, ""
 
 
-def _warn(request: ViewRequest, opened: MapFile, run: Run, feed: Feed, images: ViewImages) -> None:
+def _warn(
+    request: ViewRequest, opened: MapFile, run: Run, feed: Feed, folder: FlightFolder | None
+) -> None:
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
     if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
-    folder = images.folder if isinstance(images, FolderImages) else None
     for path in filter(None, (request.run, request.second)):
         if path.is_file() and not is_log(path):
             warn_of_another_run(path, opened, folder)
     if not run.count:
         return
-    if run.labels.truth and not run.any_known("tx"):
-        log.warning("no view of the run has a true position in %s", run.labels.truth)
+    if run.labels["truth"] and not run.any_known("tx"):
+        log.warning("no view of the run has a true position in %s", run.labels["truth"])
     if request.second is not None and not run.any_known("x2"):
         log.warning("no view has a position in the second run: %s", request.second)
-    if run.any_known("x") and not run.any_on_map():
-        log.warning("no position of the run lies on this map: %s", request.map_path)

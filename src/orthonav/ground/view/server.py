@@ -11,7 +11,7 @@ import logging
 import re
 import socket
 import socketserver
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
@@ -90,19 +90,14 @@ class Pages:
     def __init__(self, run: Run, assets: dict[str, Response]) -> None:
         self._run, self._assets = run, assets
 
-        def png(data: bytes) -> Response:
-            return Response(HTTPStatus.OK, data, "image/png")
-
-        def raw(data: bytes) -> Response:
-            return Response(HTTPStatus.OK, data, "image/jpeg")
-
+        png = partial(Response, HTTPStatus.OK, media_type="image/png")
+        raw = partial(Response, HTTPStatus.OK, media_type="image/jpeg")
         number = r"(\d{1,9})"
         view = rf"/api/views/{number}"
         self._routes: dict[str, Callable[..., Response]] = {
             r"/api/run": lambda query: _json(run.summary()),
             r"/api/news": self._news,
             view: lambda i, query: _json(run.detail(int(i))),
-            rf"{view}/ground": self._ground,
             rf"{view}/view\.png": lambda i, query: png(run.view_png(int(i))),
             rf"{view}/raw\.jpg": lambda i, query: raw(run.raw_jpeg(int(i))),
             rf"{view}/map-(fix|truth)\.png": lambda i, at, query: png(run.map_png(int(i), at)),
@@ -134,14 +129,11 @@ class Pages:
             return _error(HTTPStatus.BAD_REQUEST, str(error))
 
     def _news(self, query: str) -> Response:
-        names = ("generation", "views", "health")
-        asked = _fields(query, names, r"\d{1,9}", "0", "generation, views and health are numbers")
+        fields = parse_qs(query, max_num_fields=10)
+        asked = [fields.get(name, ["0"])[0] for name in ("generation", "views", "health")]
+        if not all(re.fullmatch(r"\d{1,9}", each) for each in asked):
+            raise ValueError("generation, views and health are numbers")
         return _json(self._run.news(*map(int, asked)))
-
-    def _ground(self, index: str, query: str) -> Response:
-        share = r"0(\.\d{1,9})?|1(\.0{1,9})?"
-        asked = _fields(query, ("x", "y"), share, "", "x and y must be fractions, 0 to 1")
-        return _json(self._run.ground(int(index), *map(float, asked)))
 
     def _tile(self, level: str, col: str, row: str, query: str) -> Response:
         found = self._run.sheet.tile(int(level), int(col), int(row))
@@ -153,16 +145,6 @@ class Pages:
         if not self._run.sheet.preview:
             return _error(HTTPStatus.NOT_FOUND, "the map has tiles")
         return Response(HTTPStatus.OK, self._run.sheet.preview, "image/jpeg", _CACHED)
-
-
-def _fields(
-    query: str, names: Sequence[str], pattern: str, default: str, expected: str
-) -> list[str]:
-    fields = parse_qs(query, max_num_fields=10)
-    asked = [fields.get(name, [default])[0] for name in names]
-    if not all(re.fullmatch(pattern, each) for each in asked):
-        raise ValueError(expected)
-    return asked
 
 
 def _json(plain: Any) -> Response:
@@ -210,8 +192,7 @@ class Server(ThreadingHTTPServer):
         return int(self.server_address[1])
 
     def url(self) -> str:
-        address = self._address
-        host = _own_address(address.version) if address.is_unspecified else str(address)
+        host = "localhost" if self._address.is_unspecified else str(self._address)
         return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
 
     def allows(self, host: str) -> bool:
@@ -230,22 +211,6 @@ class Server(ThreadingHTTPServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         log.debug("request of %s", client_address, exc_info=True)
-
-
-def _own_address(version: int) -> str:
-    """The address of this computer in its network, or the loopback without one.
-
-    Nothing is sent: connecting a datagram socket only looks up the route.
-    """
-    family, far, own = socket.AF_INET, "192.0.2.1", "127.0.0.1"
-    if version == 6:
-        family, far, own = socket.AF_INET6, "2001:db8::1", "::1"
-    try:
-        with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect((far, 9))
-            return str(probe.getsockname()[0])
-    except OSError:
-        return own
 
 
 def _host_name(host: str) -> str:
@@ -278,20 +243,11 @@ class Handler(BaseHTTPRequestHandler):
             return _error(HTTPStatus.FORBIDDEN, "cross-site requests are refused")
         return None
 
-    def _only_reads(self) -> None:
-        self.close_connection = True  # the body is not read
-        reply = self._refused() or _error(HTTPStatus.METHOD_NOT_ALLOWED, "this server is read-only")
-        self._send(reply)
-
-    do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _only_reads  # noqa: N815 - names of http.server
-
     def _send(self, reply: Response) -> None:
         self.send_response(reply.status)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         self.send_header("Cache-Control", reply.cache)
-        if reply.status == HTTPStatus.METHOD_NOT_ALLOWED:
-            self.send_header("Allow", "GET, HEAD")
         if reply.status != HTTPStatus.NO_CONTENT:
             self.send_header("Content-Type", reply.media_type)
             self.send_header("Content-Length", str(len(reply.data)))

@@ -23,19 +23,48 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.linalg import cholesky, solve_triangular
+from numpy.typing import ArrayLike, NDArray
 
+from orthonav.core.flight.gnss import FAULTS
 from orthonav.core.records import MAP_STD_M
-from orthonav.onboard.gnss.records import Array, Fault
+
+Array = NDArray[np.float64]
+NANOSECONDS = 1e-9
+
+
+class Fault(Enum):
+    """A fault of GNSS; the value is the reason in health, logs and pages. In order of priority."""
+
+    LOST = "gnss_lost"
+    """No messages, no 3D fix, or a useless stated accuracy."""
+    FROZEN = "gnss_frozen"
+    """The position or the timestamp stands still while the aircraft moves."""
+    JUMP = "gnss_jump"
+    """The position jumps against the receiver's own velocity."""
+    STEP = "gnss_step"
+    """The difference from the map changed within seconds."""
+    DRIFT = "gnss_drift"
+    """The difference from the map grows."""
+    VELOCITY = "gnss_velocity"
+    """The velocity contradicts the positions of the receiver."""
+    OFFSET = "gnss_offset"
+    """The difference from the map is too large, and did not begin within the window."""
+    DISAGREES = "gnss_disagrees"
+    """The difference changed, but the map jumped too: which of the two is wrong is not known."""
+
+    @property
+    def code(self) -> int:
+        """Number of the fault, from 1, in evidence and NAMED_VALUE_FLOAT."""
+        return FAULTS.index(self.value) + 1
+
 
 NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
 """Biases in the order of `Biases.mean`."""
-_MOUNT = slice(2, 4)
 LARGEST_M = 100.0
 """Largest displacement; a larger difference is a fault."""
 LIMITS = np.array([LARGEST_M, LARGEST_M, math.radians(10), math.radians(10), 1.0])
@@ -101,14 +130,6 @@ class Biases:
     def correction(self, design: Array) -> tuple[Array, Array]:
         """Mean (2,) and covariance (2, 2) of GNSS minus map for the `design` (2, 5) of a view."""
         return design @ self.mean, design @ self.cov @ design.T
-
-    def correction_at_any_heading(self, agl_m: float, vel_en_mps: Array) -> tuple[Array, Array]:
-        """The same where all headings are equally likely: the error of the mount, which turns with
-        the heading, is only part of the covariance."""
-        mean, cov = self.correction(design(0.0, 0.0, vel_en_mps))
-        tilt, spread = self.mean[_MOUNT], self.cov[_MOUNT, _MOUNT]
-        turning_m2 = agl_m**2 * (float(tilt @ tilt) + float(np.trace(spread)))
-        return mean, cov + turning_m2 / 2 * np.eye(2)
 
     def without_displacement(self) -> "Biases":
         mean, cov = self.mean.copy(), self.cov.copy()
@@ -200,35 +221,23 @@ FINE_S, MERGED = 12.0, 3
 """Older values than this are merged, so many into one: a tenth of the work, for the same delays."""
 
 
-@dataclass(frozen=True)
-class DifferenceModel:
-    """Parameters of errors and tests; chosen by `benchmarks/gnss_watch.py` unless noted.
-
-    `window_s`: length of the window.
-    `gnss_std_m`: least standard deviation of the slowly varying error of GNSS per axis; receivers
-    state less.
-    `gnss_tau_s`: its correlation time.
-    `map_tau_s`: correlation time of the map's local errors.
-    `mount_share`: share of the map's variance that turns with the aircraft, as from a tilted mount.
-    `mount_tau_s`: correlation time of that part.
-    `white_share`: fraction of the map's variance that is independent from view to view.
-    `multipath_m`: change of the difference that is no fault.
-    `sigmas`: standard deviations, in addition to `multipath_m`, from which a change is a fault.
-    `step_ages`: onsets of a step, in values before the newest, less than `FINE_S`.
-    `ramp_ages_s`: onsets of a ramp, in seconds before the newest value.
-    """
-
-    window_s: float = 60.0
-    gnss_std_m: float = 3.0
-    gnss_tau_s: float = 120.0
-    map_tau_s: float = 60.0
-    mount_share: float = 0.4
-    mount_tau_s: float = 600.0
-    white_share: float = 0.2
-    multipath_m: float = 8.0
-    sigmas: float = 5.0
-    step_ages: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
-    ramp_ages_s: tuple[float, ...] = (12.0, 18.0, 24.0, 32.0, 40.0, 50.0)
+# Errors and tests, chosen by `benchmarks/gnss_watch.py` unless noted.
+WINDOW_S = 60.0
+GNSS_STD_M, GNSS_TAU_S = 3.0, 120.0
+"""Least standard deviation per axis of the slowly varying error of GNSS (receivers state less), and
+its correlation time."""
+MAP_TAU_S, MOUNT_TAU_S = 60.0, 600.0
+"""Correlation times of the map's local errors, and of the part that turns with the aircraft."""
+MOUNT_SHARE, WHITE_SHARE = 0.4, 0.2
+"""Fractions of the map's variance that turn with the aircraft, as from a tilted mount, and that are
+independent from view to view."""
+LOCAL_SHARE = 1 - MOUNT_SHARE - WHITE_SHARE
+MULTIPATH_M, FAULT_SIGMAS = 8.0, 5.0
+"""Change of the difference that is no fault; in addition, standard deviations from which it is."""
+STEP_AGES = (2, 3, 4, 5, 6, 8)
+"""Onsets of a step, in values before the newest, less than `FINE_S`."""
+RAMP_AGES_S = (12.0, 18.0, 24.0, 32.0, 40.0, 50.0)
+"""Onsets of a ramp, in seconds before the newest value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,8 +247,7 @@ class Difference:
     `time_s`: time. `en_m` (2,): GNSS minus map. `gnss_std_m`, `map_std_m`: stated deviations.
     `heading_rad`: heading. `vel_en_mps` (2,): velocity. `agl_m`: height above ground; 0 where not
     known, which gives it no error of the mount. `rolling_std_m`: standard deviation of an error of
-    this value alone, while the aircraft rolls. `as_stated`: whether the latency of the images is
-    the stated one; one that was measured in flight has no bias to be learnt.
+    this value alone, while the aircraft rolls.
     """
 
     time_s: float
@@ -250,7 +258,6 @@ class Difference:
     vel_en_mps: Array
     agl_m: float = 0.0
     rolling_std_m: float = 0.0
-    as_stated: bool = True
 
     def rolling(self, std_m: float) -> "Difference":
         """The same with at least this error by rolling."""
@@ -258,7 +265,7 @@ class Difference:
 
     @cached_property
     def design(self) -> Array:
-        return design(self.heading_rad, self.agl_m, self.as_stated * self.vel_en_mps)
+        return design(self.heading_rad, self.agl_m, self.vel_en_mps)
 
     def residual(self, known: Biases) -> Array:
         """Difference (2,) that the biases do not explain."""
@@ -283,8 +290,7 @@ class Finding:
 class DifferenceWindow:
     """Differences of the last minute and their tests. Mutable; deterministic."""
 
-    def __init__(self, model: DifferenceModel) -> None:
-        self.model = model
+    def __init__(self) -> None:
         self._old: deque[Difference] = deque()
         self._new: deque[Difference] = deque()
 
@@ -301,7 +307,7 @@ class DifferenceWindow:
             mean = np.mean([each.en_m for each in merged], axis=0)
             rolling_m = max(each.rolling_std_m for each in merged)
             self._old.append(replace(merged[MERGED // 2], en_m=mean, rolling_std_m=rolling_m))
-        while self._old and self._old[0].time_s < value.time_s - self.model.window_s:
+        while self._old and self._old[0].time_s < value.time_s - WINDOW_S:
             self._old.popleft()
 
     def widen(self, rolling_std_m: float) -> None:
@@ -314,15 +320,12 @@ class DifferenceWindow:
         self._new.clear()
 
     def recent(self, seconds: float) -> list[Difference]:
-        """Values of the last seconds, less than `FINE_S`, before the newest."""
+        # Less than `FINE_S`.
         begin = self._new[-1].time_s - seconds if self._new else 0.0
         return [each for each in self._new if each.time_s > begin]
 
     def finding(self, known: Biases) -> Finding | None:
-        """The likeliest change that is a fault; None without one.
-
-        `known`: what is known of the biases.
-        """
+        """The likeliest change that is a fault; None without one."""
         values = self.values
         count = len(values)
         if count < 3:
@@ -331,21 +334,20 @@ class DifferenceWindow:
         signatures, named = self._signatures(times)
         biased = np.concatenate([each.design for each in values])
         off = np.concatenate([each.en_m for each in values]) - biased @ known.mean
-        covariance = _covariance(values, self.model) + biased @ known.cov @ biased.T
-        lower = cholesky(covariance, lower=True, check_finite=False)
+        covariance = _covariance(values) + biased @ known.cov @ biased.T
         columns = np.kron(signatures, np.eye(2))
-        stacked = np.column_stack([columns, off])
-        white = solve_triangular(lower, stacked, lower=True, check_finite=False)
-        seen, data = white[:, :-1].reshape(2 * count, -1, 2), white[:, -1]
-        information = np.einsum("nka,nkb->kab", seen, seen)
+        solved = np.linalg.solve(covariance, columns)
+        seen = columns.reshape(2 * count, -1, 2)
+        weights = solved.reshape(2 * count, -1, 2)
+        information = np.einsum("nka,nkb->kab", seen, weights)
         spread = np.linalg.inv(information)
-        sizes = np.einsum("kab,nkb,n->ka", spread, seen, data)
+        sizes = np.einsum("kab,nkb,n->ka", spread, weights, off)
         length = np.hypot(*sizes.T)
         along = np.einsum("ka,kab,kb->k", sizes, spread, sizes)
         std = np.sqrt(along) / np.maximum(length, 1e-9)
-        excess = (length - self.model.multipath_m) / std
+        excess = (length - MULTIPATH_M) / std
         likelihood = np.einsum("ka,kab,kb->k", sizes, information, sizes)
-        likelihood[excess <= self.model.sigmas] = 0.0
+        likelihood[excess <= FAULT_SIGMAS] = 0.0
         best = int(np.argmax(likelihood))
         if likelihood[best] == 0:
             return None
@@ -356,11 +358,11 @@ class DifferenceWindow:
     def _signatures(self, times: Array) -> tuple[Array, list[tuple[Fault, float]]]:
         """Unit changes (N, K): constant, steps, and ramps that end at 1; their names and onsets."""
         columns, named = [np.ones(len(times))], [(Fault.OFFSET, float(times[0]))]
-        for age in self.model.step_ages:
+        for age in STEP_AGES:
             if age < len(times):
                 columns.append((np.arange(len(times)) >= len(times) - age).astype(np.float64))
                 named.append((Fault.STEP, float(times[-age])))
-        for age_s in self.model.ramp_ages_s:
+        for age_s in RAMP_AGES_S:
             onset = times[-1] - age_s
             if onset >= times[0]:
                 columns.append(np.maximum(times - onset, 0.0) / age_s)
@@ -368,7 +370,7 @@ class DifferenceWindow:
         return np.stack(columns, axis=1), named
 
 
-def _covariance(values: Sequence[Difference], model: DifferenceModel) -> Array:
+def _covariance(values: Sequence[Difference]) -> Array:
     """Covariance (2 N, 2 N) of the differences without a fault and without biases."""
     gnss, map_std, heading, rolling, times = np.array(
         [
@@ -376,15 +378,14 @@ def _covariance(values: Sequence[Difference], model: DifferenceModel) -> Array:
             for each in values
         ]
     ).T
-    gnss = np.maximum(gnss, model.gnss_std_m)
+    gnss = np.maximum(gnss, GNSS_STD_M)
     apart = np.abs(times[:, None] - times[None])
     products = np.multiply.outer(map_std, map_std)
-    local_share = 1 - model.mount_share - model.white_share
-    same = np.multiply.outer(gnss, gnss) * np.exp(-apart / model.gnss_tau_s)
-    same += local_share * products * np.exp(-apart / model.map_tau_s)
-    same += np.diag(model.white_share * map_std**2 + rolling**2)
+    same = np.multiply.outer(gnss, gnss) * np.exp(-apart / GNSS_TAU_S)
+    same += LOCAL_SHARE * products * np.exp(-apart / MAP_TAU_S)
+    same += np.diag(WHITE_SHARE * map_std**2 + rolling**2)
     turned = heading[:, None] - heading[None]
-    mount = model.mount_share * products * np.exp(-apart / model.mount_tau_s)
+    mount = MOUNT_SHARE * products * np.exp(-apart / MOUNT_TAU_S)
     cos, sin = mount * np.cos(turned), mount * np.sin(turned)
     blocks = np.empty((len(times), 2, len(times), 2))
     blocks[:, 0, :, 0] = blocks[:, 1, :, 1] = same + cos
@@ -483,13 +484,11 @@ def before_flight(plain: Mapping[str, Any]) -> tuple[Biases | None, Resumed | No
 class BiasLearner:
     """Learns the biases of one receiver over one map. Mutable; deterministic."""
 
-    def __init__(
-        self, start: Biases, model: DifferenceModel, resumed: Resumed | None = None
-    ) -> None:
+    def __init__(self, start: Biases, resumed: Resumed | None = None) -> None:
         """`start` is what is known before the flight; a `resumed` flight continues to learn with
         the reference that it had."""
         resumed = resumed or Resumed(start, start)
-        self._model, self._filter = model, _Filter(resumed.learnt, model)
+        self._filter = _Filter(resumed.learnt)
         self._reference = resumed.reference
         self._waiting: deque[Difference] = deque()
 
@@ -524,7 +523,7 @@ class BiasLearner:
         """Go back to the reference, if there is one: a drag-off may have been learnt since."""
         self.discard()
         if self._reference.agreed_s >= SETTLED_S:
-            self._filter = _Filter(self._reference, self._model)
+            self._filter = _Filter(self._reference)
 
     def until(self, time_s: float) -> Biases:
         """Estimate with the values before a time as well, though they are in quarantine."""
@@ -538,9 +537,9 @@ class BiasLearner:
 class _Filter:
     """The filter; its arrays are replaced, never changed, so a shallow copy is independent."""
 
-    def __init__(self, start: Biases, model: DifferenceModel) -> None:
-        self.biases, self._model = start, model
-        self._taus = np.repeat([model.gnss_tau_s, model.map_tau_s, model.mount_tau_s], 2)
+    def __init__(self, start: Biases) -> None:
+        self.biases = start
+        self._taus = np.repeat([GNSS_TAU_S, MAP_TAU_S, MOUNT_TAU_S], 2)
         self._mean = np.concatenate([start.mean, np.zeros(_STATES - len(NAMES))])
         self._cov = np.eye(_STATES)
         self._cov[_BIAS, _BIAS] = start.cov
@@ -550,7 +549,7 @@ class _Filter:
         elapsed_s = 0.0 if self._time_s is None else value.time_s - self._time_s
         mean, cov = self._predicted(elapsed_s)
         shown = self._design(value)
-        noise_m2 = self._model.white_share * value.map_std_m**2 + value.rolling_std_m**2
+        noise_m2 = WHITE_SHARE * value.map_std_m**2 + value.rolling_std_m**2
         spread = shown @ cov @ shown.T + noise_m2 * np.eye(2)
         off = value.en_m - shown @ mean
         gain = np.linalg.solve(spread, shown @ cov).T
@@ -576,13 +575,11 @@ class _Filter:
 
     def _design(self, value: Difference) -> Array:
         """Derivatives (2, 11) of a value by the state; slow errors have unit variance."""
-        model = self._model
         made = np.zeros((2, _STATES))
         made[:, _BIAS] = value.design
-        made[:, _GNSS] = max(value.gnss_std_m, model.gnss_std_m) * np.eye(2)
-        local_share = 1 - model.mount_share - model.white_share
-        made[:, _LOCAL] = math.sqrt(local_share) * value.map_std_m * np.eye(2)
+        made[:, _GNSS] = max(value.gnss_std_m, GNSS_STD_M) * np.eye(2)
+        made[:, _LOCAL] = math.sqrt(LOCAL_SHARE) * value.map_std_m * np.eye(2)
         sin, cos = math.sin(value.heading_rad), math.cos(value.heading_rad)
         turned = np.array([[cos, sin], [-sin, cos]])
-        made[:, _BODY] = math.sqrt(model.mount_share) * value.map_std_m * turned
+        made[:, _BODY] = math.sqrt(MOUNT_SHARE) * value.map_std_m * turned
         return made

@@ -8,32 +8,99 @@ import math
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
-from orthonav.core.flight.gnss import GnssSample
+from orthonav.core.flight.gnss import FAULTS, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import (
     BIN_S,
+    FAULT_SIGMAS,
+    GNSS_STD_M,
+    GNSS_TAU_S,
     LARGEST_M,
+    MULTIPATH_M,
+    NANOSECONDS,
+    Array,
     Biases,
     BiasLearner,
     Difference,
-    DifferenceModel,
     DifferenceWindow,
+    Fault,
     Finding,
     Resumed,
     Rolling,
     unknown,
 )
-from orthonav.onboard.gnss.records import (
-    NANOSECONDS,
-    Array,
-    Fault,
-    GnssState,
-    GnssStatus,
-    MapPosition,
-)
+
+RETURNING = FAULTS[-1]
+"""Reason in health while GNSS agrees again, but not yet for long enough."""
+RETURNING_CODE = len(FAULTS)
+
+
+class GnssState(Enum):
+    WAITING = "waiting"
+    """Since the start: no fault, but no agreement with the map yet."""
+    GOOD = "good"
+    """GNSS and map agree; the biases of their difference are learnt."""
+    ALARM = "alarm"
+    """A fault."""
+    RETURNING = "returning"
+    """No fault is seen any more; not yet in agreement for long enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapPosition:
+    """A confident position by the map.
+
+    `time_ns`: exposure, by the clock of the samples.
+    `en_m` (2,): position in the plane of the map, uncorrected.
+    `std_m`: standard deviation along the worst axis.
+    `vel_en_mps` (2,): velocity of the track; None where not known.
+    `heading_deg`: heading of the top of the image; errors of a tilted mount turn with it.
+    `agl_m`: height above ground; errors of a tilted mount grow with it. 0 where not known.
+    """
+
+    time_ns: int
+    en_m: Array
+    std_m: float
+    vel_en_mps: Array | None = None
+    heading_deg: float = 0.0
+    agl_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class GnssStatus:
+    """Status of one receiver.
+
+    `state`, `fault`: the fault is that of the alarm, also while returning; None without one.
+    `since_ns`: time at which the state began.
+    `difference_en_m`: recent GNSS minus map, east and north; NaN where not known. A switch from the
+    map to GNSS would make this jump.
+    `fault_en_m`: estimated change of the difference by the fault; NaN where it has none.
+    """
+
+    state: GnssState = GnssState.WAITING
+    fault: Fault | None = None
+    since_ns: int = 0
+    difference_en_m: tuple[float, float] = (math.nan, math.nan)
+    fault_en_m: tuple[float, float] = (math.nan, math.nan)
+
+    @property
+    def reason(self) -> str | None:
+        """Reason in the health; None while there is no alarm."""
+        if self.state is GnssState.RETURNING:
+            return RETURNING
+        return self.fault.value if self.state is GnssState.ALARM and self.fault else None
+
+    @property
+    def code(self) -> int:
+        """0 without a fault, else that of the fault, or `RETURNING_CODE`."""
+        if self.state is GnssState.RETURNING:
+            return RETURNING_CODE
+        return self.fault.code if self.state is GnssState.ALARM and self.fault else 0
+
 
 LOST_STD_M = 50.0
 """Stated standard deviation from which a position counts as none: that of `--max-std-m`."""
@@ -203,14 +270,13 @@ class GnssMonitor:
         self,
         frame: LocalFrame,
         start: Biases | None = None,
-        model: DifferenceModel | None = None,
         resumed: Resumed | None = None,
     ) -> None:
         """`frame`: plane of the map. `start`: biases known before the flight. `resumed`: what it
         had learnt when it was interrupted."""
-        self._frame, self._model = frame, model or DifferenceModel()
-        self._receiver, self._window = Receiver(), DifferenceWindow(self._model)
-        self._learner = BiasLearner(start or unknown(), self._model, resumed)
+        self._frame = frame
+        self._receiver, self._window = Receiver(), DifferenceWindow()
+        self._learner = BiasLearner(start or unknown(), resumed)
         self._rolling = Rolling()
         self._pending: deque[MapPosition] = deque(maxlen=PENDING)
         self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=SOLVED)
@@ -291,7 +357,7 @@ class GnssMonitor:
         velocity = position.vel_en_mps
         if velocity is None:
             velocity = np.array(sample.vel_en_mps or (0.0, 0.0))
-        std_m = sample.std_m if math.isfinite(sample.std_m) else self._model.gnss_std_m
+        std_m = sample.std_m if math.isfinite(sample.std_m) else GNSS_STD_M
         heading = math.radians(position.heading_deg)
         time_s = position.time_ns * NANOSECONDS
         made = Difference(
@@ -302,7 +368,6 @@ class GnssMonitor:
             heading,
             velocity,
             position.agl_m,
-            as_stated=position.as_stated,
         )
         if self._bin and math.floor(self._bin[0].time_s / BIN_S) != math.floor(time_s / BIN_S):
             value, self._bin = _median(self._bin), []
@@ -411,25 +476,24 @@ class GnssMonitor:
         east, north = moved.tolist()
         _, cov = reference.correction(value.design)
         std_m = math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
-        excess = (math.hypot(east, north) - self._model.multipath_m) / std_m
-        if excess <= self._model.sigmas:
+        excess = (math.hypot(east, north) - MULTIPATH_M) / std_m
+        if excess <= FAULT_SIGMAS:
             return None
         return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north), std_m, excess)
 
     def _std_m(self, value: Difference, known: Biases) -> float:
         """Standard deviation of a difference from the known biases, along the worst axis."""
-        gnss_m = max(value.gnss_std_m, self._model.gnss_std_m)
+        gnss_m = max(value.gnss_std_m, GNSS_STD_M)
         _, cov = known.correction(value.design)
         worst_m2 = float(np.linalg.eigvalsh(cov)[-1])
         return math.sqrt(worst_m2 + gnss_m**2 + value.map_std_m**2)
 
     def _velocity_fault(self) -> Fault | None:
         """Whether the receiver's velocity contradicts its positions."""
-        model = self._model
-        gnss_m2 = 2 * model.gnss_std_m**2 * (1 - math.exp(-VELOCITY_S / model.gnss_tau_s))
+        gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-VELOCITY_S / GNSS_TAU_S))
         drift_m2 = (VELOCITY_STD_MPS * VELOCITY_S) ** 2
         own_m = self._receiver.residual_over(VELOCITY_S)
-        if own_m > model.multipath_m + model.sigmas * math.sqrt(gnss_m2 + drift_m2):
+        if own_m > MULTIPATH_M + FAULT_SIGMAS * math.sqrt(gnss_m2 + drift_m2):
             return Fault.VELOCITY
         return None
 

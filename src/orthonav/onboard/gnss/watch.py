@@ -8,9 +8,9 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -18,15 +18,16 @@ from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT, Fix, NoFix, ViewResult
-from orthonav.onboard.gnss.biases import SETTLED_S, Biases, Resumed, at_start, design
-from orthonav.onboard.gnss.monitor import GnssMonitor
-from orthonav.onboard.gnss.records import (
+from orthonav.onboard.gnss.biases import (
     NANOSECONDS,
+    SETTLED_S,
     Array,
-    GnssState,
-    GnssStatus,
-    MapPosition,
+    Biases,
+    Resumed,
+    at_start,
+    design,
 )
+from orthonav.onboard.gnss.monitor import GnssMonitor, GnssState, GnssStatus, MapPosition
 
 log = logging.getLogger(__name__)
 DISPLACED = "map_displaced"
@@ -39,38 +40,29 @@ SHOWN_S = 1.0
 ALARM_SEVERITY, RETURN_SEVERITY = 2, 5  # MAV_SEVERITY_CRITICAL, MAV_SEVERITY_NOTICE
 
 
-class GnssSource(Protocol):
-    def take(self, until_ns: int) -> list[GnssSample]:
-        """Solutions that arrived until a time, each once, in order."""
+Solutions = Callable[[int], list[GnssSample]]
+"""Gives the solutions that arrived until a time, each once, in order."""
 
 
-class LiveSolutions:
+def live_solutions(queue: deque[GnssSample]) -> Solutions:
     """Solutions that another thread puts into a queue."""
-
-    def __init__(self, queue: deque[GnssSample]) -> None:
-        self._queue = queue
-
-    def take(self, until_ns: int) -> list[GnssSample]:
-        return [self._queue.popleft() for _ in range(len(self._queue))]
+    return lambda until_ns: [queue.popleft() for _ in range(len(queue))]
 
 
-class RecordedSolutions:
-    def __init__(self, samples: list[GnssSample]) -> None:
-        self._samples = deque(sorted(samples, key=lambda each: each.arrived_ns))
+def recorded_solutions(samples: list[GnssSample]) -> Solutions:
+    waiting = deque(sorted(samples, key=lambda each: each.arrived_ns))
 
-    def take(self, until_ns: int) -> list[GnssSample]:
+    def take(until_ns: int) -> list[GnssSample]:
         taken = []
-        while self._samples and self._samples[0].arrived_ns <= until_ns:
-            taken.append(self._samples.popleft())
+        while waiting and waiting[0].arrived_ns <= until_ns:
+            taken.append(waiting.popleft())
         return taken
 
+    return take
 
-@dataclass(frozen=True)
-class GnssText:
-    """A message for the operator: at most 50 characters, and its MAV_SEVERITY."""
 
-    severity: int
-    text: str
+GnssText = tuple[int, str]
+"""MAV_SEVERITY and at most 50 characters, for the operator."""
 
 
 class GnssWatch:
@@ -79,7 +71,7 @@ class GnssWatch:
     def __init__(
         self,
         frame: LocalFrame,
-        source: GnssSource,
+        solutions: Solutions,
         *,
         digest: str = "",
         known: Mapping[str, Biases] = MappingProxyType({}),
@@ -99,7 +91,7 @@ class GnssWatch:
         those of the recording. `utc_ahead_ns`: what is added to times of solutions in the log.
         `log` gets every solution, as the message of a flight log.
         """
-        self._frame, self._source, self._utc_ahead_ns = frame, source, utc_ahead_ns
+        self._frame, self._solutions, self._utc_ahead_ns = frame, solutions, utc_ahead_ns
         self.log: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self._digest, self._known = digest, dict(known)
         self._start = at_start(known, digest, setup)
@@ -116,46 +108,38 @@ class GnssWatch:
             log.warning("positions are not corrected: %s", _why_not(self._start))
         self._correction_en_m = np.zeros(2)
 
-    def view(self, result: ViewResult, exposed_ns: int, *, as_stated: bool = True) -> ViewResult:
-        """Compare a view; the result with the GNSS position of its exposure as evidence.
-
-        `as_stated`: whether the latency of the image is the stated one.
-        """
+    def view(self, result: ViewResult, exposed_ns: int) -> ViewResult:
+        """Compare a view; the result with the GNSS position of its exposure as evidence."""
         now_ns = result.time_ns if self._recorded else exposed_ns
         try:
-            return self._compared(result, now_ns, as_stated=as_stated)
+            return self._compared(result, now_ns)
         except Exception:  # the flight does not depend on the monitor
             self._failed("a view could not be compared with GNSS")
             return result
 
-    def _compared(self, result: ViewResult, now_ns: int, *, as_stated: bool) -> ViewResult:
+    def _compared(self, result: ViewResult, now_ns: int) -> ViewResult:
         self._take(now_ns)
         fix = result.outcome
         if isinstance(fix, Fix) and self._is_confident(fix, result.state):
-            position = self._position(fix, now_ns, as_stated=as_stated)
+            position = self._position(fix, now_ns)
             for monitor in self._monitors.values():
                 monitor.position(position)
         evidence = MappingProxyType({**fix.evidence, **self._evidence(now_ns)})
         return replace(result, outcome=replace(fix, evidence=evidence))
 
-    def corrected(self, outcome: Fix | NoFix, *, as_stated: bool = True) -> Fix | NoFix:
+    def corrected(self, outcome: Fix | NoFix) -> Fix | NoFix:
         """A fix moved by the biases known before the flight, where they are to be corrected; its
-        covariance includes theirs at its heading, height and velocity.
-
-        Without a heading the error of the mount is only part of the covariance; without a height
-        nothing is corrected. The learnt latency is that of images with the stated one
-        (`as_stated`).
-        """
-        if not isinstance(outcome, Fix) or not self._corrects or not math.isfinite(outcome.agl_m):
+        covariance includes theirs at its heading, height and velocity. Without a heading or a
+        height nothing is corrected."""
+        if not isinstance(outcome, Fix) or not self._corrects:
+            return outcome
+        if not math.isfinite(outcome.agl_m + outcome.heading_deg):
             return outcome
         en_m = np.asarray(self._frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg))
-        velocity = _velocity(outcome) if as_stated else None
+        velocity = _velocity(outcome)
         velocity = np.zeros(2) if velocity is None else velocity
-        if math.isfinite(outcome.heading_deg):
-            shown = design(math.radians(outcome.heading_deg), outcome.agl_m, velocity)
-            moved, more = self._start.correction(shown)
-        else:
-            moved, more = self._start.correction_at_any_heading(outcome.agl_m, velocity)
+        shown = design(math.radians(outcome.heading_deg), outcome.agl_m, velocity)
+        moved, more = self._start.correction(shown)
         self._correction_en_m = moved
         lat, lon = self._frame.latlon_from_en(en_m + moved)
         cov = outcome.cov_en_m2 + more
@@ -236,7 +220,7 @@ class GnssWatch:
 
     def _take(self, now_ns: int) -> None:
         self._now_ns = max(self._now_ns, now_ns) if not self._recorded else now_ns
-        for sample in self._source.take(now_ns):
+        for sample in self._solutions(now_ns):
             if sample.receiver not in self._monitors:
                 resumed = self._resumed if sample.receiver == 0 else None
                 made = GnssMonitor(self._frame, self._start, resumed=resumed)
@@ -255,7 +239,7 @@ class GnssWatch:
         known = math.isfinite(fix.std_m + fix.heading_deg)
         return known and fix.confidence >= self._least and state in (None, "tracking")
 
-    def _position(self, fix: Fix, now_ns: int, *, as_stated: bool) -> MapPosition:
+    def _position(self, fix: Fix, now_ns: int) -> MapPosition:
         return MapPosition(
             now_ns,
             np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)),
@@ -263,7 +247,6 @@ class GnssWatch:
             _velocity(fix),
             fix.heading_deg,
             fix.agl_m if math.isfinite(fix.agl_m) else 0.0,
-            as_stated,
         )
 
     def _evidence(self, now_ns: int) -> dict[str, float]:
@@ -311,13 +294,13 @@ def _change(
         before.state is not GnssState.ALARM or before.fault != now.fault
     ):
         kind = now.fault.value.removeprefix("gnss_") if now.fault else "fault"
-        return GnssText(ALARM_SEVERITY, f"orthonav {name} {kind}{_size(now.fault_en_m)}")
+        return ALARM_SEVERITY, f"orthonav {name} {kind}{_size(now.fault_en_m)}"
     if now.state is GnssState.GOOD and before.state in (
         GnssState.ALARM,
         GnssState.RETURNING,
     ):
         east, north = (np.array(now.difference_en_m) - correction_en_m).tolist()
-        return GnssText(RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size((east, north))}")
+        return RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size((east, north))}"
     return None
 
 

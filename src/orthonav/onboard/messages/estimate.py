@@ -65,17 +65,6 @@ class NavigationEstimate:
                 f"a position needs a latitude within 90 and a longitude within 180 degrees, "
                 f"got {self.lat_deg}, {self.lon_deg}"
             )
-        for name, cov in (("cov_en_m2", self.cov_en_m2), ("vel_cov_en", self.vel_cov_en)):
-            if cov is not None and np.shape(cov) != (2, 2):
-                raise EstimateError(f"{name} must be two by two, got {np.shape(cov)}")
-        if not (math.isnan(self.confidence) or 0 <= self.confidence <= 1):
-            raise EstimateError(f"confidence must be 0 to 1 or NaN, got {self.confidence:g}")
-        if not math.isfinite(self.processing_s):
-            raise EstimateError(f"processing_s must be finite, got {self.processing_s}")
-        if self.alt_std_m < 0:
-            raise EstimateError(f"alt_std_m must not be negative, got {self.alt_std_m:g}")
-        if not 0 <= self.reset_counter <= 255:
-            raise EstimateError(f"reset_counter must be 0 to 255, got {self.reset_counter}")
         if self.utc_ns is None and self.boot_ns is None:
             raise EstimateError("the time of exposure is missing: give utc_ns or boot_ns")
 

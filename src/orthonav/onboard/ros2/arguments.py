@@ -31,11 +31,7 @@ _CHOICES = {
     "covariance": ("filter", "fix"),
 }
 _ALTITUDES = ("none", "terrain", "home")
-_LEVELS = {
-    **{"UNSET": logging.NOTSET, "DEBUG": logging.DEBUG, "INFO": logging.INFO},
-    **{"WARN": logging.WARNING, "ERROR": logging.ERROR, "FATAL": logging.CRITICAL},
-}
-_PASSED = ("-e", "--enclave", "--log-config-file", "--log-file-name")
+_PASSED = ("-e", "--enclave", "--log-level", "--log-config-file", "--log-file-name")
 _STREAMS = re.compile("--(enable|disable)-(rosout|stdout|external-lib)-logs")
 
 
@@ -45,17 +41,15 @@ class Parameters:
 
     `use_sim_time`: ROS time is that of `/clock`, not the system's. `image_transport`: "raw" or
     "compressed". `image_reliability`: "best_effort" (sensor data) or "reliable", which resends lost
-    parts of large pictures and matches reliable writers only. `publish_tf`: publish the transform
-    from `map_frame` to `base_frame` too. `covariance`: "filter" (larger, for a filter that takes
-    positions as independent) or "fix". `altitude` of the fix: "none" (NaN), that of the "terrain"
-    of the map plus the height above ground, that of the origin plus the height above "home", or a
-    number of metres.
+    parts of large pictures and matches reliable writers only. `covariance`: "filter" (larger, for
+    a filter that takes positions as independent) or "fix". `altitude` of the fix: "none" (NaN),
+    that of the "terrain" of the map plus the height above ground, that of the origin plus the
+    height above "home", or a number of metres.
     """
 
     use_sim_time: bool = False
     image_transport: str = "raw"
     image_reliability: str = "best_effort"
-    publish_tf: bool = False
     map_frame: str = "map"
     base_frame: str = "base_link"
     covariance: str = "filter"
@@ -69,9 +63,8 @@ class RosArguments:
     `rules` are pairs of a name to match and its replacement, not yet expanded. `is_local`:
     discovery and traffic stay on the loopback interface. `is_alone`: it discovers nobody. `peers`:
     addresses to be found beside that. `distro`: whose message definitions. `cyclonedds_uri`: the
-    user's configuration of Cyclone DDS. `log_level`: of `logging`, 0 for the usual one.
-    `silenced`: of "rosout" and "stdout", where nothing is to be logged. `passed`: arguments about
-    security and logging that only ROS understands.
+    user's configuration of Cyclone DDS. `passed`: arguments about security and logging that only
+    ROS understands.
     """
 
     node: str = "orthonav"
@@ -84,8 +77,6 @@ class RosArguments:
     is_alone: bool = False
     peers: tuple[str, ...] = ()
     cyclonedds_uri: str = ""
-    log_level: int = logging.NOTSET
-    silenced: frozenset[str] = frozenset()
     passed: tuple[str, ...] = ()
 
     @property
@@ -118,8 +109,6 @@ class _Words:
 
     rules: list[tuple[str, str]] = field(default_factory=list)
     parameters: list[tuple[str, str] | Path] = field(default_factory=list)
-    levels: list[tuple[str, int]] = field(default_factory=list)
-    silenced: set[str] = field(default_factory=set)
     passed: list[str] = field(default_factory=list)
 
 
@@ -127,11 +116,10 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
     """Arguments after `--ros-args`, and variables of the environment.
 
     Reads `-r FROM:=TO` (`--remap`; `__node`, `__name` and `__ns` too), `-p NAME:=VALUE`
-    (`--param`), `--params-file`, `--log-level`, `--disable-rosout-logs`, `--disable-stdout-logs`,
-    `ROS_DOMAIN_ID`, `ROS_NAMESPACE`, `ROS_LOCALHOST_ONLY`, `ROS_AUTOMATIC_DISCOVERY_RANGE`,
-    `ROS_STATIC_PEERS`, `ROS_DISTRO` and `CYCLONEDDS_URI`. As in ROS, an unknown parameter is
-    ignored. Raises `VariantError` for an argument that ROS does not have either, and
-    `MissingFileError`.
+    (`--param`), `--params-file`, and `ROS_DOMAIN_ID`, `ROS_NAMESPACE`, `ROS_LOCALHOST_ONLY`,
+    `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS`, `ROS_DISTRO` and `CYCLONEDDS_URI`. As in
+    ROS, an unknown parameter is ignored. Raises `VariantError` for an argument that ROS does not
+    have either, and `MissingFileError`.
     """
     given = _words(words)
     node, namespace = "orthonav", environment.get("ROS_NAMESPACE", "") or "/"
@@ -153,7 +141,6 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
     only_local = environment.get("ROS_LOCALHOST_ONLY") == "1"
     peers = environment.get("ROS_STATIC_PEERS", "").split(";")
     full_name = f"{namespace.rstrip('/')}/{node}"
-    logger = full_name.strip("/").replace("/", ".")
     made = RosArguments(
         node,
         namespace,
@@ -165,8 +152,6 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
         is_alone=not only_local and scope == "OFF",
         peers=tuple(peer.strip() for peer in peers if peer.strip()),
         cyclonedds_uri=environment.get("CYCLONEDDS_URI", ""),
-        log_level=next((n for name, n in reversed(given.levels) if name in ("", logger)), 0),
-        silenced=frozenset(given.silenced),
         passed=tuple(given.passed),
     )
     for rule in rules:
@@ -180,13 +165,10 @@ def _words(words: Sequence[str]) -> _Words:
     waiting = list(words)
     while waiting:
         flag = waiting.pop(0)
-        stream = _STREAMS.fullmatch(flag)
         if flag in ("--ros-args", "--") and (flag == "--ros-args" or not waiting):
             continue
-        if stream is not None:
+        if _STREAMS.fullmatch(flag):
             found.passed.append(flag)
-            change = found.silenced.add if stream[1] == "disable" else found.silenced.discard
-            change(stream[2])
             continue
         text = waiting.pop(0) if waiting else ""
         name, separator, value = text.partition(":=")
@@ -196,25 +178,14 @@ def _words(words: Sequence[str]) -> _Words:
             found.parameters.append((name, value))
         elif flag == "--params-file" and text:
             found.parameters.append(Path(text))
-        elif flag == "--log-level" and text:
-            found.levels.append(_level(text))
-            found.passed += [flag, text]
         elif flag in _PASSED and text:
             found.passed += [flag, text]
         else:
             raise VariantError(
-                "after --ros-args expected -r FROM:=TO, -p NAME:=VALUE, --params-file FILE or "
-                f"--log-level LEVEL, got '{' '.join((flag, text)).strip()}'"
+                "after --ros-args expected -r FROM:=TO, -p NAME:=VALUE or --params-file FILE, got "
+                f"'{' '.join((flag, text)).strip()}'"
             )
     return found
-
-
-def _level(text: str) -> tuple[str, int]:
-    """Logger ("": all) and level of `--log-level`."""
-    name, _, level = text.rpartition(":=")
-    if level.upper() not in _LEVELS:
-        raise VariantError(f"--log-level is {', '.join(_LEVELS).lower()}, got '{level}'")
-    return name, _LEVELS[level.upper()]
 
 
 def _for_node(name: str, node: str) -> str | None:

@@ -11,9 +11,8 @@ import importlib
 import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from orthonav.core.errors import MissingExtraError, described
 from orthonav.onboard.ros2.arguments import RosArguments
@@ -150,16 +149,15 @@ log = logging.getLogger(__name__)
 Handler = Callable[[Any, bytes], None]
 
 
-class Writer(Protocol):
-    def write(self, message: Any) -> None:
-        """Send one message. Raises `OSError` where the middleware does not take it."""
+Writer = Callable[[Any], None]
+"""Sends one message. Raises `OSError` where the middleware does not take it."""
 
 
 class Graph(ABC):
     """Reads and writes topics. `spin` is for one thread, writers are for any.
 
     `problems` says by topic why little or nothing can flow there: another type, QoS that does not
-    match, lost messages. `undecodable` counts damaged messages by topic.
+    match. `undecodable` counts damaged messages by topic.
     """
 
     def __init__(self, arguments: RosArguments) -> None:
@@ -194,12 +192,9 @@ class Graph(ABC):
     def _mismatches(self) -> dict[str, str]:
         """Topics whose endpoints cannot match now, and why."""
 
-    def check_graph(self, others: Mapping[str, str] = MappingProxyType({})) -> None:
-        """Look for endpoints that cannot match now; `others` are further problems by topic.
-
-        Each problem is logged once.
-        """
-        self.problems = {**others, **self._mismatches()}
+    def check_graph(self) -> None:
+        """Look for endpoints that cannot match now; each problem is logged once."""
+        self.problems = self._mismatches()
         for topic, text in self.problems.items():
             if (topic, text) not in self._said:
                 self._said.add((topic, text))
@@ -213,6 +208,15 @@ class Graph(ABC):
             why = f"is of type {other_kind}; expected {kind}"
         if why:
             found.setdefault(topic, why)
+
+    def _writing(self, topic: str, send: Callable[[bytes], None]) -> Writer:
+        def write(message: Any) -> None:
+            try:
+                send(self.definitions.encoded(message))
+            except Exception as error:  # of the middleware
+                raise OSError(f"cannot publish on {topic} ({error})") from error
+
+        return write
 
     def _handle(self, topic: str, kind: str, handler: Handler, cdr: bytes) -> None:
         """Decode a sample and hand it on; one odd message never ends a flight."""
@@ -230,7 +234,7 @@ class Rosout(logging.Handler):
     def __init__(self, node: Graph) -> None:
         super().__init__()
         self._node = node
-        self._writer = node.advertise(
+        self._write = node.advertise(
             node.arguments.resolved("/rosout"), _LOG, depth=100, latched=True
         )
 
@@ -248,4 +252,4 @@ class Rosout(logging.Handler):
                 function=record.funcName or "",
                 line=record.lineno,
             )
-            self._writer.write(message)
+            self._write(message)

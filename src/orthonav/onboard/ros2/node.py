@@ -1,4 +1,6 @@
-"""A node over DDS, without ROS: readers and writers under the names, types and QoS of ROS 2.
+"""Nodes: over DDS, without ROS, and by `rclpy`.
+
+Over DDS: readers and writers under the names, types and QoS of ROS 2.
 
 QoS profiles: https://docs.ros.org/en/rolling/Concepts/Intermediate/About-Quality-of-Service-Settings.html.
 For `ros2 node list` and `ros2 node info` a participant says by a topic of its own which readers and
@@ -8,8 +10,9 @@ https://design.ros2.org/articles/Node_to_Participant_mapping.html.
 
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -21,6 +24,7 @@ from orthonav.onboard.ros2.graph import (
     Definitions,
     Graph,
     Handler,
+    Writer,
     ros2_module,
     ros_type_name,
 )
@@ -86,18 +90,13 @@ class Subscription:
     handler: Handler
 
 
-class DdsWriter:
-    def __init__(self, topic: str, kind: str, definitions: Definitions, writer: Any) -> None:
-        self.topic, self.kind, self.writer = topic, kind, writer
-        self._definitions, self._sample = definitions, writer.topic.data_type
+@dataclass(frozen=True)
+class Publication:
+    """A topic that is written: its name, message type and DDS writer."""
 
-    def write(self, message: Any) -> None:
-        sample = self._sample()
-        sample.cdr = self._definitions.encoded(message)
-        try:
-            self.writer.write(sample)
-        except Exception as error:  # DDSException
-            raise OSError(f"cannot publish on {self.topic} ({error})") from error
+    topic: str
+    kind: str
+    writer: Any
 
 
 class Node(Graph):
@@ -113,9 +112,9 @@ class Node(Graph):
         made = self._qos.Qos(self._qos.Policy.Userdata(USER_DATA))
         self._participant = domain.DomainParticipant(arguments.domain_id, made)
         self._subscriptions: list[Subscription] = []
-        self._writers: list[DdsWriter] = []
+        self._writers: list[Publication] = []
         self._conditions: list[Any] = []
-        self._names = self._writer(TOPIC, KIND, depth=1, latched=True)
+        self._names, _ = self._writer(TOPIC, KIND, depth=1, latched=True)
         self._waitset = self._core.WaitSet(self._participant)
         self._publishers, self._subscribers = (
             Endpoints(builtin.BuiltinDataReader(self._participant, topic))
@@ -138,12 +137,11 @@ class Node(Graph):
         self._subscriptions.append(Subscription(topic, kind, reader, depth, handler))
         self._announce()
 
-    def advertise(
-        self, topic: str, kind: str, *, depth: int = 10, latched: bool = False
-    ) -> DdsWriter:
-        self._writers.append(self._writer(f"rt{topic}", kind, depth=depth, latched=latched))
+    def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
+        write, made = self._writer(f"rt{topic}", kind, depth=depth, latched=latched)
+        self._writers.append(Publication(topic, kind, made))
         self._announce()
-        return self._writers[-1]
+        return write
 
     def spin(self, timeout_s: float) -> int:
         self._waitset.wait(round(timeout_s * 1e9))
@@ -198,13 +196,19 @@ class Node(Graph):
         writers = [each.writer for each in self._writers]
         own = self._participant
         message = _node_entities(self.definitions, self.arguments, own, readers, writers)
-        self._names.write(message)
+        self._names(message)
 
-    def _writer(self, name: str, kind: str, *, depth: int, latched: bool) -> DdsWriter:
+    def _writer(self, name: str, kind: str, *, depth: int, latched: bool) -> tuple[Writer, Any]:
         qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
         pub = ros2_module("cyclonedds.pub")
         made = pub.DataWriter(self._participant, self._topic(name, kind), qos)
-        return DdsWriter(name.removeprefix("rt"), kind, self.definitions, made)
+
+        def send(cdr: bytes) -> None:
+            sample = made.topic.data_type()
+            sample.cdr = cdr
+            made.write(sample)
+
+        return self._writing(name.removeprefix("rt"), send), made
 
     def _topic(self, name: str, kind: str) -> Any:
         made = ros2_module("cyclonedds.topic")
@@ -278,3 +282,138 @@ def _unmatched(status: Any, other: str) -> str:
         return ""
     policy = _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}")
     return f"{other} has QoS that does not match ours: {policy}"
+
+
+class RclNode(Graph):
+    """A node by `rclpy`, where a ROS environment is sourced: with its middleware and security.
+    Messages stay serialized: their definitions are those of the node over DDS."""
+
+    def __init__(self, arguments: RosArguments) -> None:
+        super().__init__(arguments)
+        self._rclpy, self._qos = import_module("rclpy"), import_module("rclpy.qos")
+        self._subscriptions: list[tuple[Any, str]] = []
+        self._handled = 0
+        self._publishers: list[tuple[Any, str]] = []
+        try:
+            self._context = self._rclpy.Context()
+            self._rclpy.init(
+                args=["--ros-args", *arguments.passed],
+                context=self._context,
+                signal_handler_options=import_module("rclpy.signals").SignalHandlerOptions.NO,
+            )
+            self._node = self._rclpy.create_node(
+                arguments.node,
+                namespace=arguments.namespace,
+                context=self._context,
+                use_global_arguments=False,  # names are resolved already
+                enable_rosout=False,  # as over DDS, see `rosout`
+            )
+        except Exception as error:  # of the middleware
+            raise OutputError(f"cannot join the ROS graph: {error}") from error
+        self._executor = import_module("rclpy.executors").SingleThreadedExecutor(
+            context=self._context
+        )
+        self._executor.add_node(self._node)
+
+    def subscribe(
+        self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
+    ) -> None:
+        def take(cdr: bytes) -> None:
+            self._handled += 1
+            self._handle(topic, kind, handler, cdr)
+
+        qos = self._made_qos(depth, reliable=reliable)
+        made = self._node.create_subscription(_message(kind), topic, take, qos, raw=True)
+        self._subscriptions.append((made, kind))
+
+    def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
+        """See `Graph.advertise`; without a message of ROS nothing is sent, and that is logged."""
+        try:
+            qos = self._made_qos(depth, reliable=True, latched=latched)
+            made = self._node.create_publisher(_message(kind), topic, qos)
+        except ImportError:
+            log.warning("nothing is published on %s: ROS has no %s here", topic, kind)
+            return lambda message: None
+        self._publishers.append((made, kind))
+        return self._writing(topic, made.publish)
+
+    def spin(self, timeout_s: float) -> int:
+        self._handled = 0
+        self._executor.spin_once(timeout_s)
+        for made, _ in self._subscriptions:  # spin_once handles one message
+            with made.handle:
+                for _ in range(made.qos_profile.depth):
+                    taken = made.handle.take_message(made.msg_type, True)
+                    if taken is None:
+                        break
+                    made.callback(taken[0])
+        return self._handled
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def _mismatches(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for made, kind in self._subscriptions:
+            for other in self._node.get_publishers_info_by_topic(made.topic_name):
+                why = self._unmatched(other.qos_profile, made.qos_profile, "a publisher")
+                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
+        for made, kind in self._publishers:
+            for other in self._node.get_subscriptions_info_by_topic(made.topic_name):
+                why = self._unmatched(made.qos_profile, other.qos_profile, "a subscriber")
+                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
+        return found
+
+    def _unmatched(self, offered: Any, requested: Any, other: str) -> str:
+        """Why a subscription does not match a publisher; "" where it does."""
+        reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
+        policy = ""
+        if requested.reliability == reliability.RELIABLE != offered.reliability:
+            policy = "reliability"
+        elif requested.durability == durability.TRANSIENT_LOCAL != offered.durability:
+            policy = "durability"
+        return f"{other} has QoS that does not match ours: {policy}" if policy else ""
+
+    def _made_qos(self, depth: int, *, reliable: bool, latched: bool = False) -> Any:
+        qos = self._qos
+        return qos.QoSProfile(
+            depth=depth,
+            reliability=qos.ReliabilityPolicy.RELIABLE
+            if reliable
+            else qos.ReliabilityPolicy.BEST_EFFORT,
+            durability=qos.DurabilityPolicy.TRANSIENT_LOCAL
+            if latched
+            else qos.DurabilityPolicy.VOLATILE,
+        )
+
+
+def _message(kind: str) -> Any:
+    """The class of a message type of ROS. Raises `ImportError` where ROS does not have it."""
+    package, _, name = kind.split("/")
+    return getattr(import_module(f"{package}.msg"), name)
+
+
+_NEEDS_ROS = {
+    "RMW_IMPLEMENTATION": "zenoh",
+    "ROS_SECURITY_ENABLE": "true",
+    "ROS_DISCOVERY_SERVER": "",
+}
+"""Variables, and what in their values, only ROS itself can do."""
+
+
+def joined_graph(arguments: RosArguments, environment: Mapping[str, str]) -> Graph:
+    """A node by `rclpy` where a ROS environment is sourced, else over DDS."""
+    if environment.get("AMENT_PREFIX_PATH"):
+        try:
+            import_module("rclpy")
+        except ImportError as error:
+            log.warning("rclpy of the sourced ROS environment cannot be used (%s)", error)
+        else:
+            return RclNode(arguments)
+    for name, part in _NEEDS_ROS.items():
+        value = environment.get(name, "")
+        if value and part in value:
+            log.warning("%s=%s has no effect without a sourced ROS environment", name, value)
+    return Node(arguments)

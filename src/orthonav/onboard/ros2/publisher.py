@@ -1,4 +1,4 @@
-"""Positions, the origin of their local frame, health and a transform as messages of ROS 2.
+"""Positions, the origin of their local frame and health as messages of ROS 2.
 
 Frames by REP 103 and REP 105: `map` is east, north, up at the origin, the aircraft forward, left,
 up. Positions reach this module only through the gate.
@@ -58,9 +58,6 @@ class Ros2Publisher:
         )
         diagnostics = "diagnostic_msgs/msg/DiagnosticArray"
         self._health = node.advertise(resolved("/diagnostics"), diagnostics)
-        self._transform = None
-        if self._parameters.publish_tf:
-            self._transform = node.advertise(resolved("/tf"), "tf2_msgs/msg/TFMessage", depth=100)
         self._send_origin()
 
     def position(
@@ -71,15 +68,11 @@ class Ros2Publisher:
         if self._silent:
             return ()
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
-        self._fix.write(self._navsatfix(estimate, cov, self._altitude_m(vehicle), stamp_ns))
+        self._fix(self._navsatfix(estimate, cov, self._altitude_m(vehicle), stamp_ns))
         east, north = self._frame.en_from_latlon(estimate.lat_deg, estimate.lon_deg).tolist()
         turn = orientation(vehicle)
-        self._pose.write(self._posed((east, north), cov, turn, stamp_ns))
-        sent = ["NavSatFix", "PoseWithCovarianceStamped"]
-        if self._transform is not None:
-            self._transform.write(self._transformed((east, north), turn, stamp_ns))
-            sent.append("TFMessage")
-        return tuple(sent)
+        self._pose(self._posed((east, north), cov, turn, stamp_ns))
+        return "NavSatFix", "PoseWithCovarianceStamped"
 
     def health(self, plain: dict[str, Any]) -> None:
         """Publish the health, and the problems of the topics."""
@@ -100,9 +93,7 @@ class Ros2Publisher:
             values=values,
         )
         header = self._node.definitions.header(self._now_ns(), "")
-        self._health.write(
-            new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
-        )
+        self._health(new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status]))
 
     def close(self) -> None:
         """Nothing to do: the node is closed by its owner."""
@@ -116,7 +107,7 @@ class Ros2Publisher:
             altitude=self._origin_alt_m,  # NaN: not specified
         )
         header = definitions.header(self._now_ns(), self._parameters.map_frame)
-        self._origin.write(
+        self._origin(
             definitions.new("geographic_msgs/msg/GeoPointStamped", header=header, position=place)
         )
 
@@ -167,21 +158,6 @@ class Ros2Publisher:
                 "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=full.ravel()
             ),
         )
-
-    def _transformed(self, position_en_m: tuple[float, float], turn: Array, stamp_ns: int) -> Any:
-        definitions = self._node.definitions
-        moved = definitions.new(
-            "geometry_msgs/msg/Transform",
-            translation=definitions.vector("Vector3", "xyz", (*position_en_m, 0.0)),
-            rotation=definitions.vector("Quaternion", "xyzw", turn.tolist()),
-        )
-        stamped = definitions.new(
-            "geometry_msgs/msg/TransformStamped",
-            header=definitions.header(stamp_ns, self._parameters.map_frame),
-            child_frame_id=self._parameters.base_frame,
-            transform=moved,
-        )
-        return definitions.new("tf2_msgs/msg/TFMessage", transforms=[stamped])
 
 
 def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:

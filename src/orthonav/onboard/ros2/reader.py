@@ -6,12 +6,10 @@ header stamps; for a message without a stamp the time of arrival is used.
 
 import logging
 import math
-from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 from orthonav.core.errors import CameraError, FlightError, StoppedError
@@ -35,42 +33,6 @@ from orthonav.core.records import NoFix
 from orthonav.onboard.cameras import CameraImage
 from orthonav.onboard.ros2.graph import TIME_NS, Graph
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
-
-WINDOW_NS = 10 * 10**9
-LOST_SHARE, LEAST_IMAGES = 0.2, 5
-IRREGULAR = 2
-"""Steps from image to image, in messages of the camera, differ by less where a node between passes
-every n-th image on."""
-
-
-class LostImages:
-    """Stamps of the images and of the `camera_info` that arrived; a camera gives both the same.
-
-    An image is sent in many parts and lost with one of them, its `camera_info` is a single part.
-    """
-
-    def __init__(self) -> None:
-        self.images: deque[int] = deque(maxlen=1000)
-        self.infos: deque[int] = deque(maxlen=1000)
-
-    def reason(self) -> str | None:
-        """What is wrong where more than `LOST_SHARE` of the last seconds' images are missing."""
-        infos = sorted(self.infos)
-        images = sorted(self.images)
-        if not images:
-            return None
-        images = images[bisect_left(images, images[-1] - WINDOW_NS) :]
-        if len(images) < LEAST_IMAGES:
-            return None
-        steps = [bisect_right(infos, b) - bisect_right(infos, a) for a, b in pairwise(images)]
-        lost = sum(max(step - 1, 0) for step in steps)
-        if lost <= LOST_SHARE * (lost + len(images)) or max(steps) - min(steps) < IRREGULAR:
-            return None
-        return (
-            "loses images: use compressed ones, image_reliability:=reliable, or a larger "
-            "net.core.rmem_max"
-        )
-
 
 log = logging.getLogger(__name__)
 JUMP_NS = TIME_NS
@@ -122,7 +84,6 @@ class Ros2Reader:
         self._checked_ns = self._reminded_ns = clocks.mono_ns()
         self._tilt_std_deg = AUTOPILOT_TILT_STD_DEG
         self._said: set[str] = set()
-        self._lost = LostImages()
         self._subscribe()
 
     def wait_for_camera(self) -> Camera:
@@ -194,8 +155,7 @@ class Ros2Reader:
         now_ns = self._clocks.mono_ns()
         if now_ns - self._checked_ns >= TIME_NS:
             self._checked_ns = now_ns
-            lost = self._lost.reason()
-            self._node.check_graph({} if lost is None else {self._image_topic: lost})
+            self._node.check_graph()
 
     def _ahead_ns(self) -> int | None:
         """ROS time minus our monotonic clock; None before the first `/clock`."""
@@ -227,14 +187,12 @@ class Ros2Reader:
                 return
             self._restart(self._image_topic, self._image_ns - time_ns)
         self._image_ns = time_ns
-        self._lost.images.append(time_ns)
         while len(self._images) > 1:
             self._images.pop()
         self._images.append(_WaitingImage(message, time_ns, self._clocks.mono_ns()))
 
     def _take_camera_info(self, message: Any, cdr: bytes) -> None:
         """Use the first one: the camera does not change in flight."""
-        self._lost.infos.append(stamp_ns(message, 0))
         if self._camera is None:
             try:
                 self._camera = camera_of_info(message)
@@ -318,7 +276,6 @@ class Ros2Reader:
         log.warning("ROS time went back by %.1f s (%s); telemetry is cleared", back_ns / 1e9, what)
         self._buffer.clear()
         self._images.clear()
-        self._lost = LostImages()
         self._image_ns = self._attitude_ns = 0
 
     def _remind(self, text: str) -> None:

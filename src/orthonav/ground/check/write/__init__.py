@@ -1,50 +1,98 @@
-"""Writes a check: a page, JSON, GeoTIFF, GeoJSON and figures in a folder of their own.
+"""Writes a check: a page, JSON, GeoTIFF and GeoJSON, in a folder of their own.
 
-The folder is written whole or not at all; it replaces only an earlier check.
+The folder is written whole or not at all; it replaces only an earlier check. The page is one
+self-contained file, also for print; without JavaScript it lacks map and profile.
 """
 
 import json
 from hashlib import sha256
 from pathlib import Path
 
+import numpy as np
+
 from orthonav.core.errors import OutputError
 from orthonav.core.extras import needed
 from orthonav.core.files import replacing, replacing_folder, write_text
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.ground.check.outcome import CheckResult
-from orthonav.ground.check.write.figures import FIGURE_NAMES, check_figures, map_image, visible_box
-from orthonav.ground.check.write.page import page_of
-from orthonav.ground.check.write.plain import FORMAT, tif_bytes, to_geojson, to_json, writable
-from orthonav.ground.report.page import FOLDER, LIST, leaflet_files, load_leaflet, write_figures
+from orthonav.ground.check.records import CELL_VALUES, Cells, CheckResult
+from orthonav.ground.check.write.plain import (
+    FORMAT,
+    check_to_plain,
+    tif_bytes,
+    to_geojson,
+    to_json,
+    writable,
+)
+from orthonav.ground.check.write.wording import (
+    GAP_COLUMNS,
+    SIMULATED,
+    SYMBOLS,
+    conditions_text,
+    key_figures,
+    stretch_row,
+    verdict_sentence,
+)
+from orthonav.ground.report import BY_UNIT, metres_text, to_plain
+from orthonav.ground.report.imagery import Box, Grey, SheetImagery, jpeg
+from orthonav.ground.report.page import (
+    FOLDER,
+    LIST,
+    data_url,
+    joined_scripts,
+    leaflet_files,
+    load_leaflet,
+    render,
+    static_text,
+)
 
 PAGE, JSON, TIF, GEOJSON = "index.html", "check.json", "check.tif", "check.geojson"
 _SIDECAR = "check.tif.aux.xml"
 """Written by GIS programs that open the raster."""
 _OURS = {
     *(PAGE, JSON, TIF, GEOJSON, _SIDECAR, FOLDER, f"{FOLDER}/{LIST}"),
-    *(f"{FOLDER}/{name}.{kind}" for name in FIGURE_NAMES for kind in ("svg", "png")),
+    # Of checks by earlier versions.
+    *(
+        f"{FOLDER}/{name}.{kind}"
+        for name in ("map", "profile", "envelope")
+        for kind in ("svg", "png")
+    ),
 }
-_EXTRAS = {"rasterio": "geo", "shapely": "geo", "matplotlib": "report", "jinja2": "report"}
+_EXTRAS = {"rasterio": "geo", "shapely": "geo", "jinja2": "report"}
+PACKAGE = "orthonav.ground.check.write"
+_SHARED = ("format.js", "plane.js", "chart.js")
+_SCRIPTS = ("data.js", "map.js", "profile.js", "page.js")
+MAX_ROWS = 200
+MAX_LOOKALIKES = 20
+"""Shown on map and page, the most similar ones; the files hold all."""
+LAYERS = ("probability", "low", "error_m", "wrong", "persistence", "changed")
+DOWNLOADS = {
+    "check.geojson": "GeoJSON: route, gaps, cells, ambiguous places",
+    "check.tif": "GeoTIFF: a band per layer of the map",
+    "check.json": "JSON: all results and conditions",
+}
+MAX_SIDE_PX = 1500
+"""Of the image of the map: 0.5 to 1.5 MB."""
+_MARGIN = 0.04
+_EMPTY = 226
+"""Grey level without imagery, as light as a light page."""
+_QUALITY = 60
 
 
 def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
-    """Write page, JSON, GeoTIFF, GeoJSON and figures into the folder `out`; return the page's path.
+    """Write page, JSON, GeoTIFF and GeoJSON into the folder `out`; return the page's path.
 
     Raises `OutputError` where the folder holds other files or cannot be written,
     `MissingExtraError` without the extras geo, report and web.
     """
     out = Path(out)
     require_free(out)
-    image = map_image(opened, visible_box(result))
-    drawn = check_figures(result, image)
     plain = writable(to_json(result))
-    page = page_of(result, image, drawn, load_leaflet(), sha256(plain.encode()).hexdigest())
+    page = page_of(result, opened, sha256(plain.encode()).hexdigest())
     with replacing_folder(out, is_ours=lambda folder: _foreign(folder) is None) as folder:
         for name, text in ((JSON, plain), (GEOJSON, to_geojson(result)), (PAGE, page)):
             write_text(folder / name, writable(text))
         with replacing(folder / TIF) as temporary:
             temporary.write_bytes(tif_bytes(result))
-        write_figures(folder, drawn)
     return out / PAGE
 
 
@@ -78,3 +126,122 @@ def _foreign(folder: Path) -> str | None:
         return found[0]
     except OSError as error:
         raise OutputError(f"cannot read folder ({error.strerror or error}): {folder}") from error
+
+
+def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
+    about = result.about
+    script, style = load_leaflet()
+    scripts = (script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
+    image = map_image(opened, visible_box(result.cells))
+    values = {
+        "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
+        "kind": "Check before take-off",
+        "result": result,
+        "symbols": {"info": "i", **{word.value: symbol for word, symbol in SYMBOLS.items()}},
+        "sentence": verdict_sentence(result),
+        "cards": key_figures(result),
+        "note": "" if result.second_date else SIMULATED,
+        "layers": {name: CELL_VALUES[name] for name in LAYERS},
+        "gap_columns": GAP_COLUMNS,
+        "stretches": [
+            stretch_row(number, each) for number, each in enumerate(result.stretches, start=1)
+        ],
+        "lookalikes": _lookalike_rows(result),
+        "max_rows": MAX_ROWS,
+        "max_lookalikes": MAX_LOOKALIKES,
+        "radius": metres_text(result.conditions.radius_m),
+        "conditions": conditions_text(result.conditions, result.band_m),
+        "downloads": DOWNLOADS,
+        "checked": _checked(result, json_sha256),
+        "data": _page_data(result),
+        "image": data_url(jpeg(image, _QUALITY), "image/jpeg"),
+    }
+    style += static_text("check.css", PACKAGE)
+    return render(PACKAGE, "page.html", values, style=style, scripts=scripts)
+
+
+def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:
+    return [
+        (
+            str(number),
+            "{:.5f}, {:.5f}".format(*each.place_latlon_deg),
+            "{:.5f}, {:.5f}".format(*each.other_latlon_deg),
+            metres_text(each.apart_m),
+            f"{each.similarity:.2f}",
+            str(each.trials),
+            "yes" if each.within_prior else "no",
+        )
+        for number, each in enumerate(result.lookalikes, start=1)
+    ]
+
+
+def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
+    about = result.about
+    return [
+        ("map", about.map_name),
+        ("SHA-256 of the map's manifest", about.map_sha256),
+        ("imagery", about.imagery),
+        ("build parameters", about.recipe),
+        ("second date", about.other_date),
+        ("route", about.route_name),
+        ("command", about.command),
+        ("orthonav", about.version),
+        ("SHA-256 of check.json", json_sha256),
+    ]
+
+
+def _page_data(result: CheckResult) -> str:
+    """JSON for the scripts: `check.json`, and under `drawn` positions in metres. Of the cells, only
+    those of which something is known, by number (row after row).
+
+    The text contains no `<`, so that no name can end the script element.
+    """
+    along, cells = result.along, result.cells
+    known = np.isfinite(cells.persistence) | (cells.trials > 0) | (cells.changed > 0)
+    known_m = cells.error_m[np.isfinite(cells.error_m)]
+    most_m = float(np.percentile(known_m, 98)) if len(known_m) else 1.0
+    most_wrong = float(np.nanmax(cells.wrong, initial=0.0, where=np.isfinite(cells.wrong)))
+    drawn = {
+        "box": visible_box(cells),
+        "values": list(CELL_VALUES),
+        "most": {
+            "error_m": float(f"{max(most_m, 1.0):.2g}"),
+            "wrong": float(f"{max(0.05, most_wrong):.2g}"),
+        },
+        "route": None if along is None else along.points_en_m,
+        "waypoints": [] if result.route_en_m is None else result.route_en_m,
+        "lookalikes": [
+            [result.frame.en_from_latlon(*at) for at in (p.place_latlon_deg, p.other_latlon_deg)]
+            for p in result.lookalikes[:MAX_LOOKALIKES]
+        ],
+    }
+    values = {**check_to_plain(result), "drawn": to_plain(drawn, 2)}
+    values["cells"] |= {
+        "known": np.flatnonzero(known).tolist(),
+        **to_plain({name: getattr(cells, name)[known] for name in CELL_VALUES}, BY_UNIT),
+    }
+    text = json.dumps(values, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
+
+
+def visible_box(cells: Cells) -> Box:
+    """West, south, east, north in metres of the cells, with a margin."""
+    rows, cols = cells.probability.shape
+    margin_m = _MARGIN * max(rows, cols) * cells.side_m
+    return (
+        cells.west_m - margin_m,
+        cells.north_m - rows * cells.side_m - margin_m,
+        cells.west_m + cols * cells.side_m + margin_m,
+        cells.north_m + margin_m,
+    )
+
+
+def map_image(opened: MapFile, box: Box) -> Grey:
+    """The imagery of the map within a box, north up."""
+    sheet = SheetImagery(opened)
+    west, south, east, north = box
+    gsd_m = max(sheet.grid.gsd_m, max(east - west, north - south) / MAX_SIDE_PX)
+    size = max(1, round((east - west) / gsd_m)), max(1, round((north - south) / gsd_m))
+    grey, valid = sheet.crop(box, size)
+    grey[~valid] = _EMPTY
+    return grey

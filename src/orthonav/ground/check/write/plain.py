@@ -6,7 +6,6 @@ Positions are latitude and longitude; unknown values are None, NaN in the raster
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,78 +14,22 @@ from numpy.typing import NDArray
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.changes.record import lonlat
-from orthonav.ground.check.outcome import CELL_VALUES, Along, Cells, CheckResult, summarize
-from orthonav.ground.report.numbers import BY_UNIT, to_plain
+from orthonav.ground.check.records import CELL_VALUES, Along, Cells, CheckResult, summarize
+from orthonav.ground.report import BY_UNIT, to_plain
 
 FORMAT, VERSION = "orthonav-check", 1
-EDGE_PX = 3.0
-"""How much wider the edge of a line of risk is than the line."""
 _LATLON_DIGITS = 7
-_STEP_M = 1000.0
-"""Legs get a vertex at least this often: they are straight in the plane, not in degrees."""
 
 Array = NDArray[np.float64]
 Plain = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Risk:
-    """A class of places along the route; classes differ in colour, width (pixels) and dash.
-
-    `least`: lowest probability of the class; NaN where the probability is unknown.
-    `colour`: that of the middle of its range on the scale of the cells (cividis: light is likely);
-    `edge`: behind it, so that it stands out on the cells.
-    """
-
-    name: str
-    least: float
-    colour: str
-    edge: str
-    width: float
-    dash: tuple[int, ...]
-    range_text: str
+RISKS = {"confident": CONFIDENT, "likely": 0.7, "doubtful": 0.5, "unlikely": 0.0}
+"""Classes of places along the route, and the lowest probability of each."""
 
 
-_DARK, _LIGHT = "#1a1a1a", "#ffffff"
-RISKS = (
-    Risk("confident", CONFIDENT, "#ead34c", _DARK, 4.0, (), "0.9 or more"),
-    Risk("likely", 0.7, "#a99f73", _DARK, 2.5, (), "0.7 to 0.9"),
-    Risk("doubtful", 0.5, "#5e626e", _LIGHT, 5.0, (9, 4), "0.5 to 0.7"),
-    Risk("unlikely", 0.0, "#083370", _LIGHT, 6.5, (), "below 0.5"),
-    Risk("unknown", float("nan"), "#ffffff", _DARK, 4.0, (4, 6), "unknown"),
-)
-
-
-def risk_of(probability: float) -> int:
-    found = (i for i, risk in enumerate(RISKS) if probability >= risk.least)
-    return next(found, len(RISKS) - 1)
-
-
-def segments(probability: Array) -> list[tuple[int, int, int]]:
-    """The route of points (N,) in segments of one class: (class, first point, last point).
-
-    Between two points the worse class counts; segments share their ends.
-    """
-    classes = [risk_of(value) for value in probability]
-    found: list[tuple[int, int, int]] = []
-    for i in range(len(classes) - 1):
-        here = max(classes[i], classes[i + 1])
-        if found and found[-1][0] == here:
-            found[-1] = (here, found[-1][1], i + 1)
-        else:
-            found.append((here, i, i + 1))
-    return found
-
-
-def stretch_en_m(along: Along, start_m: float, end_m: float) -> Array:
-    """The route (N, 2) between two distances from its start; empty where they are equal."""
-    distance = along.distance_m
-    start_m, end_m = np.clip([start_m, end_m], distance[0], distance[-1])
-    if not end_m > start_m:
-        return np.empty((0, 2))
-    inside = (distance > start_m) & (distance < end_m)
-    at = np.concatenate([[start_m], distance[inside], [end_m]])
-    return np.stack([np.interp(at, distance, axis) for axis in along.points_en_m.T], axis=1)
+def risk_of(probability: float) -> str:
+    return next((name for name, least in RISKS.items() if probability >= least), "unknown")
 
 
 def to_json(result: CheckResult) -> str:
@@ -115,8 +58,6 @@ def check_to_plain(result: CheckResult) -> Plain:
         "route": _route_to_plain(result),
         "stretches": _stretches(result),
         "lookalikes": _lookalikes(result),
-        "envelope": to_plain(result.envelope, BY_UNIT),
-        "alternatives": to_plain(result.alternatives, BY_UNIT),
     }
 
 
@@ -152,23 +93,22 @@ def _cells_to_plain(frame: LocalFrame, cells: Cells) -> Plain:
 
 def _route_to_plain(result: CheckResult) -> Plain | None:
     along = result.along
-    if along is None and result.route_en_m is None:
+    if along is None or result.route_en_m is None:
         return None
-    found: Plain = to_plain({"name": result.about.route_name, "band_m": result.band_m}, BY_UNIT)
-    if result.route_en_m is not None:
-        found["waypoints_latlon_deg"] = _latlon_deg(result.frame, result.route_en_m)
-    if along is not None:
-        lat, lon = result.frame.latlon_from_en(along.points_en_m)
-        names = ("probability", "low", "high", "across_low", "error_m", "drift_m")
-        points = {
-            "distance_m": along.distance_m,
-            "time_s": along.distance_m / result.conditions.speed_mps,
-            "lat_deg": lat,
-            "lon_deg": lon,
-            **{name: getattr(along, name) for name in names},
-        }
-        found["points"] = to_plain(points, BY_UNIT)
-    return found
+    lat, lon = result.frame.latlon_from_en(along.points_en_m)
+    names = ("probability", "low", "high", "across_low", "error_m", "drift_m")
+    points = {
+        "distance_m": along.distance_m,
+        "time_s": along.distance_m / result.conditions.speed_mps,
+        "lat_deg": lat,
+        "lon_deg": lon,
+        **{name: getattr(along, name) for name in names},
+    }
+    return {
+        **to_plain({"name": result.about.route_name, "band_m": result.band_m}, BY_UNIT),
+        "waypoints_latlon_deg": _latlon_deg(result.frame, result.route_en_m),
+        "points": to_plain(points, BY_UNIT),
+    }
 
 
 def _latlon_deg(frame: LocalFrame, points_en_m: Array) -> list[list[float]]:
@@ -192,14 +132,17 @@ def features(result: CheckResult) -> Iterator[Plain]:
     if along is not None:
         yield from _route_features(result, along)
         for each, properties in zip(result.stretches, _stretches(result), strict=True):
-            line = stretch_en_m(along, each.start_m, each.end_m)
-            yield _feature(frame, "blind", "LineString", line, properties)
+            inside = (along.distance_m >= each.start_m) & (along.distance_m <= each.end_m)
+            yield _feature(frame, "blind", "LineString", along.points_en_m[inside], properties)
     for properties in _lookalikes(result):
         ends = [properties.pop(name) for name in ("place_latlon_deg", "other_latlon_deg")]
         geometry = {"type": "LineString", "coordinates": [[lon, lat] for lat, lon in ends]}
         yield _as_feature("lookalikes", geometry, properties)
     if result.route_en_m is not None:
-        yield from _plan_features(frame, result.route_en_m)
+        legs_m = np.hypot(*np.diff(result.route_en_m, axis=0).T)
+        for i, point in enumerate(result.route_en_m):
+            properties = {"number": i + 1, "distance_m": round(float(legs_m[:i].sum()), 2)}
+            yield _feature(frame, "waypoints", "Point", point[None], properties)
 
 
 def _cell_features(result: CheckResult) -> Iterator[Plain]:
@@ -226,27 +169,10 @@ def _route_features(result: CheckResult, along: Along) -> Iterator[Plain]:
             "across_low": float(along.across_low[pair].min()),
             "error_m": float(along.error_m[pair].max()),
             "drift_m": float(along.drift_m[pair].max()),
-            "risk": RISKS[risk_of(probability)].name,
+            "risk": risk_of(probability),
         }
         line = along.points_en_m[pair]
         yield _feature(result.frame, "route", "LineString", line, to_plain(properties, BY_UNIT))
-
-
-def _plan_features(frame: LocalFrame, waypoints: Array) -> Iterator[Plain]:
-    steps = np.diff(waypoints, axis=0)
-    lengths_m = np.hypot(*steps.T)
-    for i, (start, step, length_m) in enumerate(zip(waypoints, steps, lengths_m, strict=False)):
-        at = np.linspace(0, 1, max(2, int(np.ceil(length_m / _STEP_M)) + 1))
-        bearing_deg = float(np.degrees(np.arctan2(*step)) % 360)
-        properties = {
-            "number": i + 1,
-            "length_m": round(float(length_m), 2),
-            "bearing_deg": round(bearing_deg, 1),
-        }
-        yield _feature(frame, "legs", "LineString", start + at[:, None] * step, properties)
-    for i, point in enumerate(waypoints):
-        properties = {"number": i + 1, "distance_m": round(float(lengths_m[:i].sum()), 2)}
-        yield _feature(frame, "waypoints", "Point", point[None], properties)
 
 
 def _feature(
@@ -306,16 +232,12 @@ def _tags(result: CheckResult) -> dict[str, str]:
         "verdict": result.verdict.word.value,
         **vars(result.conditions),
     }
-    return {
-        "TIFFTAG_SOFTWARE": f"orthonav {result.about.version}".strip(),
-        **{
-            f"ORTHONAV_{name.upper()}": (
-                writable(value) if isinstance(value, str) else f"{value:.9g}"
-            )
-            for name, value in values.items()
-            if value not in (None, "")
-        },
+    tags = {
+        f"ORTHONAV_{name.upper()}": writable(each) if isinstance(each, str) else f"{each:.9g}"
+        for name, each in values.items()
+        if each not in (None, "")
     }
+    return {"TIFFTAG_SOFTWARE": f"orthonav {result.about.version}".strip(), **tags}
 
 
 def writable(text: str) -> str:

@@ -2,7 +2,7 @@
 
 export const known = (value) => value !== null && Number.isFinite(value);
 
-/** A length in metres, as `metres_text` of `orthonav.ground.report.numbers` writes it. */
+/** A length in metres, as `metres_text` of `orthonav.ground.report` writes it. */
 export function metres(value) {
   if (!known(value)) return "–";
   const size = Math.abs(value);

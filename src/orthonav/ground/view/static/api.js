@@ -12,11 +12,6 @@ export function getNews(generation, views, health) {
   return getJson(`api/news?generation=${generation}&views=${views}&health=${health}`);
 }
 
-/** The ground at a point of the rectified view, given as shares of its sides. */
-export function getGround(index, x, y) {
-  return getJson(`api/views/${index}/ground?x=${x.toFixed(6)}&y=${y.toFixed(6)}`);
-}
-
 const POLL_MS = 500;
 const POLL_LATER_MS = 3000;
 

@@ -1,7 +1,7 @@
 // The selected view beside the map at its fix and at its true position, and overlaid on both to
 // compare by eye: faded, or blinking.
 
-import { getGround, getJson, mapUrl, rawUrl, viewUrl } from "./api.js";
+import { getJson, mapUrl, rawUrl, viewUrl } from "./api.js";
 import { L, at } from "./map.js";
 import { clock, metres, number } from "./format.js";
 import { described } from "./look.js";
@@ -20,7 +20,6 @@ export class Compare {
     this.find("opacity").addEventListener("input", () => this.#fade());
     this.find("on-map").addEventListener("change", () => this.#fade());
     this.find("blink").addEventListener("click", () => this.blink());
-    this.find("img-view").addEventListener("click", (event) => this.#ground(event));
     this.find("enlarge").addEventListener("click", () => this.enlarge());
     this.find("copy").addEventListener("click", () => this.#copy());
   }
@@ -33,7 +32,7 @@ export class Compare {
     this.map.invalidateSize();
   }
 
-  /** Copies the coordinates of the point that was clicked last, otherwise of the fix. */
+  /** Copies the coordinates of the fix. */
   async #copy() {
     let said = this.copied;
     try {
@@ -47,30 +46,6 @@ export class Compare {
   #offer(text) {
     this.copied = text;
     this.find("copy").hidden = !text;
-  }
-
-  /** Says what ground a point of the view shows. */
-  async #ground(event) {
-    const { asked } = this;
-    const box = this.find("img-view").getBoundingClientRect();
-    const share = (value, side) => Math.min(Math.max(value / side, 0), 1);
-    const [x, y] = [share(event.clientX - box.left, box.width), share(event.clientY - box.top, box.height)];
-    let said;
-    try {
-      const g = await getGround(this.store.selected, x, y);
-      const ellipse = g.ellipse_95;
-      const height = g.height_m === null ? "" : `, ${metres(g.height_m)} above sea`;
-      said = g.confident ? "" : "Best guess, not a confident position: ";
-      said += place(g.lat_deg, g.lon_deg) + height;
-      if (asked === this.asked) this.#offer(place(g.lat_deg, g.lon_deg));
-      if (ellipse !== null) {
-        said += `; 95 % ellipse ${metres(ellipse.major_m)} x ${metres(ellipse.minor_m)}, `
-          + `major axis at ${number(ellipse.direction_deg, 0)}°`;
-      }
-    } catch (error) {
-      said = error.message;
-    }
-    if (asked === this.asked) this.find("ground").textContent = said;
   }
 
   /** Shows the selected view. */

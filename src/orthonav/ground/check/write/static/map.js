@@ -17,7 +17,7 @@ function makeMap() {
   map.setMaxBounds(whole.pad(0.6));
   for (const [name, order] of [["image", 200], ["cells", 250]]) map.createPane(name).style.zIndex = order;
   const image = document.getElementById("check-image");
-  L.imageOverlay(image.src, boundsOf(drawn.image), { pane: "image", alt: "" }).addTo(map);
+  L.imageOverlay(image.src, whole, { pane: "image", alt: "" }).addTo(map);
   const north = L.control({ position: "topright" });
   north.onAdd = () => {
     const arrow = make("div", "N");
@@ -30,6 +30,13 @@ function makeMap() {
   map.on("focus", () => map.scrollWheelZoom.enable()); // otherwise the wheel scrolls the page
   map.on("blur", () => map.scrollWheelZoom.disable());
   document.getElementById("whole").addEventListener("click", () => map.fitBounds(whole));
+  for (const [event, width] of [["beforeprint", "680px"], ["afterprint", ""]]) {
+    addEventListener(event, () => { // the map fits the paper
+      map.getContainer().style.width = width;
+      map.invalidateSize({ animate: false });
+      map.fitBounds(whole, { animate: false });
+    });
+  }
   return map;
 }
 
@@ -86,27 +93,25 @@ function numbered(place, text, kind, description, chosen) {
 function addRoute(map) {
   const group = L.layerGroup().addTo(map);
   const quiet = { interactive: false, lineCap: "round", lineJoin: "round" };
-  for (const [colour, weight] of [["#fff", 4], ["#1a1a1a", 1.5]]) {
-    L.polygon(drawn.band.map((ring) => ring.map(at)), { ...quiet, color: colour, weight, fill: false }).addTo(group);
-  }
   const line = drawn.route.map(at);
-  for (const [risk, first, last] of drawn.segments) {
-    const { edge, width } = drawn.risks[risk];
-    L.polyline(line.slice(first, last + 1), { ...quiet, color: edge, weight: width + drawn.edge_px }).addTo(group);
+  for (const [risk, first, last] of segments) {
+    const { edge, width } = RISKS[risk];
+    L.polyline(line.slice(first, last + 1), { ...quiet, color: edge, weight: width + EDGE_PX }).addTo(group);
   }
-  for (const [risk, first, last] of drawn.segments) {
-    const { colour, width, dash } = drawn.risks[risk];
+  for (const [risk, first, last] of segments) {
+    const { colour, width, dash } = RISKS[risk];
     const style = { ...quiet, color: colour, weight: width, dashArray: dash.length ? dash.join(" ") : null };
     L.polyline(line.slice(first, last + 1), { ...style, lineCap: "butt" }).addTo(group);
   }
   for (const place of drawn.waypoints) {
     L.circleMarker(at(place), { ...quiet, radius: 4, color: "#1a1a1a", weight: 2, fillColor: "#fff", fillOpacity: 1 }).addTo(group);
   }
-  data.stretches.forEach((blind, i) => {
-    if (drawn.blind[i].length < 2) return;
-    L.polyline(drawn.blind[i].map(at), { ...quiet, color: "#1a1a1a", weight: 2.5 }).addTo(group);
+  data.stretches.forEach((blind) => {
+    const inside = (_, k) => route.distance_m[k] >= blind.start_m && route.distance_m[k] <= blind.end_m;
+    L.polyline(line.filter(inside), { ...quiet, color: "#1a1a1a", weight: 2.5 }).addTo(group);
     const middle = nearestAlong((blind.start_m + blind.end_m) / 2);
-    const description = drawn.blind_texts[i];
+    const outcome = blind.recoverable ? "recovers" : "lost";
+    const description = `Gap ${blind.number}: ${metres(blind.length_m)}, probability ${percent(blind.probability)}, ${outcome}.`;
     numbered(drawn.route[middle], String(blind.number), blind.recoverable ? "blind" : "lost", description, () => {
       selectAlong(middle, false);
       announce(description);
@@ -118,8 +123,8 @@ function addRoute(map) {
 function addLookalikes(map) {
   const group = L.layerGroup().addTo(map);
   drawn.lookalikes.forEach((ends, k) => {
-    const { number: name, within_prior: near } = data.lookalikes[k];
-    const description = drawn.lookalike_texts[k];
+    const { number: name, within_prior: near, apart_m: apart } = data.lookalikes[k];
+    const description = `Ambiguous places ${name}: ${metres(apart)} apart, ${near ? "within" : "outside"} the prior.`;
     L.polyline(ends.map(at), { color: "#8a2f63", weight: 2, dashArray: "3 6", interactive: false }).addTo(group);
     ends.forEach((place, i) => {
       const kind = near ? "twin near" : "twin";

@@ -1,4 +1,4 @@
-// Panel, legend and start. If a script fails, the static figures stay visible.
+// Panel, legend and start. If a script fails, the tables stay visible.
 
 /** A probability with its interval, if known. */
 function between(value, low, high) {
@@ -69,15 +69,15 @@ function showLegend(name, title) {
   }
   if (!route) return;
   make("b", "probability along the route", legend);
-  const used = new Set(drawn.segments.map(([risk]) => risk));
-  drawn.risks.forEach(({ name: risk, colour, edge, width, dash, range_text: range }, i) => {
+  const used = new Set(segments.map(([risk]) => risk));
+  RISKS.forEach(({ name: risk, colour, edge, width, dash, range }, i) => {
     if (!used.has(i)) return;
     const row = make("div", "", legend);
     row.className = "risk";
     const sample = make("canvas", "", row);
     [sample.width, sample.height] = [34, 10];
     const context = sample.getContext("2d");
-    for (const [paint, thick, dashes] of [[edge, width + drawn.edge_px, []], [colour, width, dash]]) {
+    for (const [paint, thick, dashes] of [[edge, width + EDGE_PX, []], [colour, width, dash]]) {
       [context.strokeStyle, context.lineWidth] = [paint, thick];
       context.setLineDash(dashes);
       context.beginPath();

@@ -13,7 +13,9 @@ class Profile extends Chart {
     Object.assign(this, { slider, index: -1 });
     slider.addEventListener("input", () => selectAlong(Number(slider.value)));
     listeners.push(({ index }) => { this.index = index; this.drawCursor(); });
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+    for (const look of ["(prefers-color-scheme: dark)", "print"]) {
+      matchMedia(look).addEventListener("change", () => this.draw());
+    }
     this.start();
   }
 
@@ -29,7 +31,7 @@ class Profile extends Chart {
     this.#blind(context, split, bottom);
     this.probabilityY = (v) => split - v * (split - 8);
     this.rules(context, [0, 0.5, 1], this.probabilityY, this.colour("line"), { text: String });
-    this.rules(context, [drawn.confident], this.probabilityY, this.colour("soft"), { text: String, dash: [5, 4] });
+    this.rules(context, [RISKS[0].least], this.probabilityY, this.colour("soft"), { text: String, dash: [5, 4] });
     this.area(context, xs, route.low, route.high, this.probabilityY, "rgb(0 114 178 / 22%)", split);
     this.line(context, xs, route.across_low, this.probabilityY, this.colour("soft"), { width: 1 });
     this.line(context, xs, route.probability, this.probabilityY, this.colour("mark"));

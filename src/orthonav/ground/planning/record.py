@@ -2,8 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -18,15 +17,6 @@ HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl", "hae")
 MAX_HEIGHT_M = 100_000.0  # sanity limit: the edge of space
 MAX_BAND_M = 50_000.0  # width of the largest sheet
 MAX_WAYPOINTS = 100_000  # sanity limit against files that exhaust memory
-MAX_NAMED = 12
-
-
-def left_out_text(left_out: Sequence[str]) -> str:
-    more = f" and {len(left_out) - MAX_NAMED} more" if len(left_out) > MAX_NAMED else ""
-    return (
-        "positions that are not part of the route, so the map may not cover them: "
-        f"{', '.join(left_out[:MAX_NAMED])}{more}"
-    )
 
 
 def require_few_waypoints(count: int) -> None:
@@ -64,15 +54,13 @@ class Route:
     lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360. `heights`: one per waypoint, None if
     unknown; empty if the file has none. `leg_bands_m`: full width of the search band per leg in
     metres, None for the default; empty if the file has none. `home_amsl_m`: height of the take-off
-    position above mean sea level, metres, None if unknown. `left_out`: what of the file has a
-    position and is not part of the route, by name."""
+    position above mean sea level, metres, None if unknown."""
 
     waypoints: tuple[tuple[float, float], ...]
     heights: tuple[Height | None, ...] = ()
     leg_bands_m: tuple[float | None, ...] = ()
     name: str | None = None  # name of the line in its file, None if it has none
     home_amsl_m: float | None = None
-    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.waypoints:
@@ -84,10 +72,6 @@ class Route:
                     "waypoint must have a latitude within 90 and a longitude within 360 degrees, "
                     f"got {lat}, {lon}{swapped_hint(lat, lon)}"
                 )
-        if self.heights and len(self.heights) != len(self.waypoints):
-            raise RouteError(
-                f"route has {len(self.heights)} heights for {len(self.waypoints)} waypoints"
-            )
         if not any(self.heights):
             object.__setattr__(self, "heights", ())
         if self.leg_bands_m and len(self.leg_bands_m) != self.legs:
@@ -98,28 +82,12 @@ class Route:
                     f"search band of a leg must be wider than 0 and at most {MAX_BAND_M:,.0f} m, "
                     f"got {band_m}"
                 )
-        if self.home_amsl_m is not None and not math.isfinite(self.home_amsl_m):
-            raise RouteError(
-                f"height of the take-off position must be finite, got {self.home_amsl_m}"
-            )
-
-    def leaving_out(self, points: Sequence[tuple[str, Sequence[float]]]) -> "Route":
-        """The route with the names of those `points` (longitude, latitude, ..) that are none of its
-        waypoints in `left_out`."""
-        visited = {(round(lat, 6), round(lon, 6)) for lat, lon in self.waypoints}
-        lost = [
-            name
-            for name, place in points
-            if len(place) < 2 or (round(place[1], 6), round(place[0], 6)) not in visited
-        ]
-        return replace(self, left_out=tuple(lost))
 
     @property
     def legs(self) -> int:
         return max(1, len(self.waypoints) - 1)
 
     def points_en_m(self, frame: LocalFrame) -> NDArray[np.float64]:
-        """Waypoints as local `(N, 2)` metres of `frame`."""
         lat_lon = np.array(self.waypoints, dtype=np.float64)
         return frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
 
@@ -162,15 +130,6 @@ def parsed(text: str, what: str) -> float:
     if not math.isfinite(value):
         raise RouteError(f"{what} must be a number, got {text!r:.80}")
     return value
-
-
-def numbers_in(text: str) -> list[float]:
-    """The numbers of a text with commas, such as longitude, latitude, height; none where it holds
-    something else."""
-    try:
-        return [float(each) for each in text.split(",")]
-    except ValueError:
-        return []
 
 
 def decoded(data: bytes) -> str:

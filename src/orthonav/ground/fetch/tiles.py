@@ -1,7 +1,7 @@
-"""WMTS 1.0.0 (OGC 07-057r7): a layer as its capabilities describe it, and the tiles of it.
+"""Tiles and images of services: by address template (XYZ, TMS), WMTS 1.0.0, WMS 1.1.1 and 1.3.0.
 
-Its tiles are read by address template, as those of XYZ: GDAL's own driver of WMTS takes the default
-time only, and resolutions as they are rounded in the document.
+Tiles of a WMTS (OGC 07-057r7) are read by address template, as those of XYZ: GDAL's own driver of
+WMTS takes the default time only, and resolutions as they are rounded in the document.
 """
 
 import math
@@ -16,17 +16,19 @@ from orthonav.ground.fetch.grid import (
     MERCATOR_HALF_M,
     CellGrid,
     epsg_name,
+    ground_scale,
     known_crs,
     mean_scale,
     north_first,
 )
-from orthonav.ground.fetch.options import (
+from orthonav.ground.fetch.presets import (
+    HEIGHTS_FORMAT,
+    TERRAIN_GSD_M,
     ImageryOptions,
     SourceSpec,
     choose,
     choose_format,
     choose_layer,
-    choose_time,
     finest_fitting,
 )
 from orthonav.ground.fetch.service import CellSource, service_source
@@ -34,10 +36,61 @@ from orthonav.ground.fetch.urls import linked, with_query
 from orthonav.ground.fetch.web import Web, texts
 from orthonav.ground.planning.area import Area
 
+MAX_ZOOM = 24  # finest zoom level, 9 mm per pixel at the equator: finer than any orthophoto
+_PARTS = {"z", "x", "y", "-y", "q", "s", "r", "key"}
 PIXEL_M = 0.28e-3  # width of the standardized pixel of scale denominators (OGC 07-057r7, 6.1)
 METRES_PER_DEGREE = 6378137.0 * math.pi / 180
 """At the equator of WGS84, as scale denominators are defined (OGC 07-057r7, 6.1)."""
 MAX_TILE_PX = 4096  # largest tile that is accepted; usual ones have 256 or 512 px
+CELL_PX = 1024  # width of the images requested: services render several per second at this size
+_VERSIONS = ("1.3.0", "1.1.1")
+
+
+def xyz_tiles(spec: SourceSpec, area: Area) -> CellSource:
+    """The tiles of a template with `{z}/{x}/{y}` in Web Mercator, as web maps use them.
+
+    `{-y}` counts rows from the south, as `{y}` of a TMS does; `{q}` is a quadkey, `{s}` one of the
+    hosts a, b and c (a is taken), `{r}` the `@2x` of tiles of 512 px. Raises `FetchError`.
+    """
+    template, options = spec.url, spec.options
+    parts = set(re.findall(r"\{([^{}]*)\}", template))
+    if parts - _PARTS or not (({"z", "x"} <= parts and parts & {"y", "-y"}) or "q" in parts):
+        raise FetchError(
+            "template needs {z}, {x} and {y} (or {-y}), or {q}, and may hold {s}, {r} and {key}; "
+            f"got: {template[:200]}"
+        )
+    tile_px = options.tile_px or (512 if "{r}" in template or "@2x" in template else 256)
+    if not 64 <= tile_px <= 4096:
+        raise FetchError(f"tiles must be 64 to 4096 px wide, got {tile_px}")
+    high = min(MAX_ZOOM, options.max_zoom or MAX_ZOOM)
+    resolutions = [2 * MERCATOR_HALF_M / tile_px / 2.0**zoom for zoom in range(high + 1)]
+    if options.zoom is None:
+        scale = mean_scale("EPSG:3857", area.frame)
+        gsds_m = [res * scale for res in resolutions]
+        zoom = finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom 0 to {high}")
+    elif options.zoom.isdecimal() and int(options.zoom) <= high:
+        zoom = int(options.zoom)
+    else:
+        raise FetchError(f"no zoom {options.zoom}; available: 0 to {high}")
+    half, last, res = MERCATOR_HALF_M, 2**zoom - 1, resolutions[zoom]
+    grid = CellGrid("EPSG:3857", -half, half, res, res, tile_px, tile_px, (0, 0, last, last))
+    values = {
+        "{z}": str(zoom),
+        "{x}": "${x}",
+        "{y}": "${y}",
+        "{-y}": "${y}",
+        "{q}": "${quadkey}",
+        "{s}": "a",
+        "{r}": "@2x" if tile_px == 512 else "",
+    }
+    for part, value in values.items():
+        template = template.replace(part, value)
+    service = {"name": "VirtualEarth" if "q" in parts else "TMS", "ServerUrl": template}
+    path = template.partition("?")[0].lower()
+    formats = {".png": "image/png", ".webp": "image/webp"}
+    format_ = next((kind for end, kind in formats.items() if path.endswith(end)), "image/jpeg")
+    from_south = spec.protocol == "tms" or "-y" in parts
+    return service_source(spec, grid, format_, service, zoom, from_south=from_south)
 
 
 def wmts_tiles(web: Web, spec: SourceSpec, area: Area) -> CellSource:
@@ -89,8 +142,7 @@ def _id(element: Element) -> list[str]:
 def _style(layer: Element, name: str, options: ImageryOptions) -> str:
     elements = sorted(layer.iterfind("Style"), key=lambda each: each.get("isDefault") != "true")
     styles = [style for element in elements for style in _id(element)] or ["default"]
-    preferred = options.preferred_style if options.preferred_style in styles else None
-    return choose(styles, options.style or preferred, f"layer {name} has no style")
+    return choose(styles, options.style, f"layer {name} has no style")
 
 
 def _dimensions(layer: Element, name: str, options: ImageryOptions) -> dict[str, str]:
@@ -101,7 +153,9 @@ def _dimensions(layer: Element, name: str, options: ImageryOptions) -> dict[str,
         for dimension in map(str.lower, _id(element) if values else []):
             found[dimension] = values[0]
             if dimension == "time" and options.time is not None:
-                found[dimension] = choose_time(values, options.time, name)
+                any_time = any("/" in value for value in values)  # of an interval
+                known = [options.time] if any_time else values
+                found[dimension] = choose(known, options.time, f"layer {name} has no time")
     if options.time is not None and "time" not in found:
         raise FetchError(f"layer {name} has no time to choose, --time was {options.time}")
     return found
@@ -134,18 +188,15 @@ def _grids(
     else:
         wanted = options.crs or ("EPSG:3857" if "EPSG:3857" in by_crs else None)
         set_name = by_crs[choose(list(by_crs), wanted, f"layer {name} does not come in")]
-    limits = {
-        zoom: each
-        for each in links[set_name].iterfind("TileMatrixSetLimits/TileMatrixLimits")
-        for zoom in texts(each, "TileMatrix")
-    }
+    limits = texts(links[set_name], "TileMatrixSetLimits/TileMatrixLimits/TileMatrix")
+    finest = math.inf if options.max_zoom is None else options.max_zoom
     crs_name = texts(known[set_name], "SupportedCRS")[0]
     grids = {}
     for element in known[set_name].iterfind("TileMatrix"):
         for zoom in _id(element):
-            if zoom in limits or (not limits and _is_within(zoom, options)):
+            if zoom in limits or (not limits and (_number(zoom) or 0) <= finest):
                 try:
-                    grids[zoom] = _grid(element, limits.get(zoom), crs_name)
+                    grids[zoom] = _grid(element, crs_name)
                 except (ValueError, IndexError, OverflowError):
                     problem = f"tile matrix {zoom} of {set_name} cannot be read"
                     raise FetchError(problem) from None
@@ -154,7 +205,7 @@ def _grids(
     return set_name, grids
 
 
-def _grid(matrix: Element, limits: Element | None, crs_name: str) -> CellGrid:
+def _grid(matrix: Element, crs_name: str) -> CellGrid:
     """The grid of a tile matrix. Raises `ValueError` and `IndexError` for a malformed one."""
     crs = epsg_name(crs_name)
     known = known_crs(crs)
@@ -175,15 +226,7 @@ def _grid(matrix: Element, limits: Element | None, crs_name: str) -> CellGrid:
         west, north, whole = -MERCATOR_HALF_M, MERCATOR_HALF_M, 2 * MERCATOR_HALF_M / width
         exact = whole / 2.0 ** round(math.log2(whole / res))
         res = exact if math.isclose(res, exact, rel_tol=1e-4) else res
-    last_row, last_col = (_whole(matrix, tag) - 1 for tag in ("MatrixHeight", "MatrixWidth"))
-    edges = 0, 0, last_row, last_col
-    if limits is not None:
-        edges = (
-            max(0, _whole(limits, "MinTileRow")),
-            max(0, _whole(limits, "MinTileCol")),
-            min(last_row, _whole(limits, "MaxTileRow")),
-            min(last_col, _whole(limits, "MaxTileCol")),
-        )
+    edges = 0, 0, _whole(matrix, "MatrixHeight") - 1, _whole(matrix, "MatrixWidth") - 1
     return CellGrid(crs, west, north, res, res, width, height, edges)
 
 
@@ -212,6 +255,74 @@ def _number(zoom: str) -> int | None:
     return int(number) if number.isdecimal() else None
 
 
-def _is_within(zoom: str, options: ImageryOptions) -> bool:
-    number, low, high = _number(zoom), options.min_zoom, options.max_zoom
-    return number is None or ((low or 0) <= number and (high is None or number <= high))
+def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
+    """Images of any box, requested as the cells of a fixed grid. Raises `FetchError`.
+
+    In 1.3.0 the order of coordinates is that of the coordinate system's authority, so northing
+    first in EPSG:4326 and in many national ones (OGC 06-042, 6.7.2); in 1.1.1 it is always x, y.
+    """
+    url, options, frame = spec.url, spec.options, area.frame
+    if options.time is not None:
+        raise FetchError(f"times of a WMS cannot be chosen, --time was {options.time}")
+    wanted = options.version or _VERSIONS[0]
+    url = with_query(url, {"SERVICE": "WMS", "REQUEST": "GetCapabilities", "VERSION": wanted})
+    root = web.get_xml(url)
+    version = root.get("version", "")
+    if version not in _VERSIONS:
+        found = version or root.tag
+        raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, got '{found}': {url}")
+    get_map = root.find("Capability/Request/GetMap")
+    address = root.find("Capability/Request/GetMap/DCPType/HTTP/Get/OnlineResource")
+    if get_map is None or address is None:
+        raise FetchError(f"WMS capabilities name no address of GetMap: {url}")
+    layers = _wms_layers(root)
+    name = choose_layer(list(layers), options.layer, url)
+    chain = layers[name]
+    styles = [style for each in chain for style in texts(each, "Style/Name")]
+    if options.style is not None:
+        choose(styles, options.style, f"layer {name} has no style")
+    names = _crs_names([crs for each in chain for crs in texts(each, "CRS") + texts(each, "SRS")])
+    wanted_crs = options.crs or ("EPSG:3857" if "EPSG:3857" in names else None)
+    crs = choose(list(names), wanted_crs, f"layer {name} does not come in")
+    format_ = choose_format(texts(get_map, "Format"), options, "service")
+    cell_px = options.tile_px or CELL_PX
+    gsd_m = options.wanted_gsd_m
+    if format_ == HEIGHTS_FORMAT and options.gsd_m is None:
+        gsd_m = TERRAIN_GSD_M
+    res_x, res_y = (gsd_m / scale for scale in ground_scale(crs, frame))
+    service = {
+        "name": "WMS",
+        "Version": version,
+        "ServerUrl": linked(url, address.get("href", "")),
+        "Layers": name,
+        "Styles": options.style or "",
+        "CRS" if version == "1.3.0" else "SRS": names[crs],
+        "ImageFormat": format_,
+        "Transparent": "FALSE" if format_ in ("image/jpeg", HEIGHTS_FORMAT) else "TRUE",
+    }
+    if version == "1.3.0" and not names[crs].startswith("CRS:") and north_first(crs):
+        service["BBoxOrder"] = "yxYX"
+    grid = CellGrid(crs, 0.0, 0.0, res_x, res_y, cell_px, cell_px)
+    return service_source(spec, grid, format_, service)
+
+
+def _wms_layers(root: Element) -> dict[str, list[Element]]:
+    found: dict[str, list[Element]] = {}
+    stack = [[layer] for layer in root.findall("Capability/Layer")]
+    while stack:
+        chain = stack.pop()
+        for name in texts(chain[0], "Name"):
+            found[name] = chain
+        stack += [[inner, *chain] for inner in reversed(chain[0].findall("Layer"))]
+    return found
+
+
+def _crs_names(options: list[str]) -> dict[str, str]:
+    crs: dict[str, str] = {}
+    for option in (name for text in options for name in text.split()):
+        try:
+            epsg = epsg_name(option)
+        except FetchError:
+            continue
+        crs[epsg] = option if option == epsg else crs.get(epsg, option)
+    return crs

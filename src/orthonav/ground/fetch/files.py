@@ -1,10 +1,11 @@
-"""Cloud-optimized GeoTIFFs read by windows through GDAL's /vsicurl: one file, or several.
+"""Cloud-optimized GeoTIFFs, read by windows through GDAL's /vsicurl, and the search of a STAC API.
 
-Files on one pixel grid are read without resampling. A file off the grid of the first (another zone
-or phase) is resampled into it, and `Provenance.note` says so.
+Files keep their pixels on one grid; those off the grid of the first (another zone or phase) are
+resampled into it. Documents of STAC 0.9 and 1.0 are read as plain JSON; pystac-client was tried
+instead (docs/decisions/dependencies.md).
 """
 
-import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -23,7 +24,14 @@ from rasterio.warp import transform_bounds
 from orthonav.core.errors import FetchError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.fetch.grid import CellGrid, Selection, mean_scale
-from orthonav.ground.fetch.options import ImageryOptions, SourceSpec, finest_fitting
+from orthonav.ground.fetch.presets import (
+    GSD_TOLERANCE,
+    ImageryOptions,
+    SourceSpec,
+    choose,
+    finest_fitting,
+    listed,
+)
 from orthonav.ground.fetch.service import (
     GDAL_OPTIONS,
     CellPixels,
@@ -31,17 +39,19 @@ from orthonav.ground.fetch.service import (
     CellSource,
     reason_of,
 )
-from orthonav.ground.fetch.urls import checked_url, shown
+from orthonav.ground.fetch.urls import TOKEN, Secret, checked_url, linked, origin_of, shown
 from orthonav.ground.fetch.web import Web
 from orthonav.ground.imagery.mosaic import WHOLLY_VALID
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 
+MAX_ITEMS = 500  # files of one fetch: an open dataset each, per thread
+PAGE = 100  # items per page; APIs allow at least this many
+MAX_PAGES = 200
+_TIFF = re.compile(r"image/(tiff|vnd\.stac\.geotiff)|\.tiff?$", re.IGNORECASE)
 CELL_PX = 512  # GDAL's block size for COG, so a cell is usually one block
 MAX_BLOCK_BYTES = 64 * 2**20
 """Largest block, unpacked: one of a tiled file has at most a few megabytes."""
-ALIGNED_PX = 0.02
-"""Grids that differ by less count as one: a fiftieth of a pixel is below any error of imagery."""
 _PACKED_SHARE = 0.35  # size of a usual JPEG block relative to its pixels, for the estimate
 _DTYPES = ("uint8", "uint16", "int16", "float32")
 
@@ -58,17 +68,6 @@ class CogLevel:
     dtype: str
     count: int
 
-    def is_aligned(self, grid: CellGrid) -> bool:
-        """Whether its pixels are those of a grid."""
-        if self.crs != grid.crs or not (
-            math.isclose(self.transform.a, grid.res_x, rel_tol=1e-9)
-            and math.isclose(-self.transform.e, grid.res_y, rel_tol=1e-9)
-        ):
-            return False
-        col = (grid.west - self.transform.c) / grid.res_x
-        row = (self.transform.f - grid.north) / grid.res_y
-        return bool(max(abs(col - round(col)), abs(row - round(row))) <= ALIGNED_PX)
-
 
 def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellSource:
     """The files as one source, on the grid of the first at the level that fits the options.
@@ -76,7 +75,7 @@ def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellS
     Where they overlap, the first valid pixel counts. Raises `FetchError` where one cannot be read
     or they differ in pixel type or bands.
     """
-    options, provenance = spec.options, spec.provenance
+    options = spec.options
     files = [_inspect(web, url, options, area.frame) for url in urls]
     first = files[0]
     bands = options.bands or ((1,) if first.count < 3 else (1, 2, 3))
@@ -88,11 +87,6 @@ def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellS
             )
     origin, res_x, res_y = first.transform, first.transform.a, -first.transform.e
     grid = CellGrid(first.crs, origin.c, origin.f, res_x, res_y, CELL_PX, CELL_PX)
-    off_grid = sum(not file.is_aligned(grid) for file in files)
-    if off_grid:
-        note = f"{off_grid} of {len(files)} files resampled (bilinear)"
-        note = "; ".join(part for part in (provenance.note, note) if part)
-        provenance = replace(provenance, note=note)
     placed = [(file, transform_bounds(file.crs, grid.crs, *file.bounds)) for file in files]
 
     def reader(web: Web, _: Selection, __: Path) -> CellReader:
@@ -113,7 +107,7 @@ def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellS
         return read
 
     cell_bytes = CELL_PX**2 * np.dtype(first.dtype).itemsize * len(bands) * _PACKED_SHARE
-    return CellSource(provenance, grid, len(bands), first.dtype, cell_bytes, reader)
+    return CellSource(spec.provenance, grid, len(bands), first.dtype, cell_bytes, reader)
 
 
 @contextmanager
@@ -177,7 +171,7 @@ def _read(
             transform=grid.transform(*cell),
             width=grid.cell_w_px,
             height=grid.cell_h_px,
-            resampling=Resampling.nearest if file.is_aligned(grid) else Resampling.bilinear,
+            resampling=Resampling.bilinear,
             add_alpha=adds_alpha,
         ) as placed:
             pixels = placed.read(list(bands))
@@ -185,3 +179,115 @@ def _read(
                 alpha = placed.read(placed.count)
                 return pixels, alpha >= (WHOLLY_VALID if adds_alpha else 1)
             return pixels, (placed.read_masks(list(bands)) > 0).any(axis=0)
+
+
+def stac_source(web: Web, spec: SourceSpec, area: Area) -> CellSource:
+    """The files that a STAC API finds in the area and time requested, newest on top.
+
+    Of items whose names differ by a year only the newest is taken. Raises `FetchError` where there
+    are none.
+    """
+    options = spec.options
+    items: list[tuple[str, str, str]] = []  # time, name, address
+    for feature, where in _found(web, spec, area):
+        items.append(_item(feature, where, options))
+        if len(items) > MAX_ITEMS:
+            problem = f"more than {MAX_ITEMS} files; choose a smaller area or time"
+            raise FetchError(f"{problem}: {spec.url}")
+    if not items:
+        when = f" at {options.time}" if options.time else ""
+        raise FetchError(f"catalogue has no imagery of the area{when}: {spec.url}")
+    newest: dict[str, tuple[str, str]] = {}
+    for time, name, url in sorted(items, reverse=True):
+        newest.setdefault(re.sub(r"(?<!\d)(19|20)\d\d(?!\d)", "", name), (time, url))
+    days = sorted({time[:10] for time, _ in newest.values() if time})
+    if days:
+        date = "/".join(dict.fromkeys([days[0], days[-1]]))
+        spec = replace(spec, provenance=replace(spec.provenance, date=date))
+    urls = [url for _, url in newest.values()]
+    return cog_source(web, spec, area, _signed(web, spec.token_url, urls))
+
+
+def _signed(web: Web, token_url: str | None, urls: list[str]) -> list[str]:
+    """Addresses with `{token}`, for which a service issued a query string.
+
+    The token goes only to the origins of these addresses.
+    """
+    if token_url is None:
+        return urls
+    token = web.get_json(token_url).get("token")
+    if not isinstance(token, str) or not token:
+        raise FetchError(f"signing service returned no token: {token_url}")
+    for origin in {origin_of(url) for url in urls}:
+        web.secrets.append(Secret(TOKEN, origin, token.lstrip("?")))
+    return [f"{url}{'&' if '?' in url else '?'}{TOKEN}" for url in urls]
+
+
+def _found(web: Web, spec: SourceSpec, area: Area) -> Iterator[tuple[dict[str, Any], str]]:
+    """Items of a search, page by page, with the address of the page."""
+    west, south, east, north = area.extent_en_m
+    corners = [(west, south), (west, north), (east, south), (east, north)]
+    lat, lon = area.frame.latlon_from_en(corners)
+    box = [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]
+    query: Any = {"bbox": box, "limit": PAGE}
+    query |= {"datetime": spec.options.time} if spec.options.time else {}
+    query |= {"collections": [spec.options.collection]} if spec.options.collection else {}
+    search = _link(web.get_json(spec.url), "search")
+    if search is None:
+        raise FetchError(f"not a STAC API with a search: {spec.url}")
+    url = linked(spec.url, search["href"])
+    for _ in range(MAX_PAGES):
+        page = web.get_json(url, query)
+        features = page.get("features")
+        if not isinstance(features, list) or not all(isinstance(each, dict) for each in features):
+            raise FetchError(f"answer is not a list of items: {url}")
+        yield from ((feature, url) for feature in features)
+        following = _link(page, "next")
+        if following is None:
+            return
+        url = linked(url, following["href"])
+        if str(following.get("method", "GET")).upper() == "POST":
+            more, merged = following.get("body"), query if following.get("merge") else {}
+            query = {**(merged or {}), **(more if isinstance(more, dict) else {})}
+        else:
+            query = None
+    raise FetchError(f"list of items does not end: {spec.url}")
+
+
+def _link(document: dict[str, Any], kind: str) -> dict[str, Any] | None:
+    links = document.get("links")
+    for link in links if isinstance(links, list) else ():
+        if isinstance(link, dict) and link.get("rel") == kind:
+            return link | {"href": str(link.get("href", ""))}
+    return None
+
+
+def _item(feature: dict[str, Any], where: str, options: ImageryOptions) -> tuple[str, str, str]:
+    name, assets = str(feature.get("id", ""))[:200], feature.get("assets")
+    plain = assets if isinstance(assets, dict) else {}
+    known = {key: asset for key, asset in plain.items() if isinstance(asset, dict)}
+    asset = known[_asset(known, options, name)]
+    properties = feature.get("properties")
+    times = properties if isinstance(properties, dict) else {}
+    time = str(times.get("datetime") or times.get("start_datetime") or "")
+    return time, name, linked(where, str(asset.get("href", "")))
+
+
+def _asset(assets: dict[str, dict[str, Any]], options: ImageryOptions, name: str) -> str:
+    """The asset requested, else the only GeoTIFF, or the coarsest that is fine enough."""
+    if options.asset is not None:
+        return choose(list(assets), options.asset, f"item {name} has no asset")
+    tiffs = {
+        key: float(asset.get("gsd") or asset.get("eo:gsd") or 0)
+        for key, asset in assets.items()
+        if _TIFF.search(str(asset.get("type") or asset.get("href")).partition("?")[0])
+        and not {"thumbnail", "metadata", "overview"} & set(asset.get("roles") or [])
+    }
+    if not tiffs:
+        raise FetchError(f"item {name} has no GeoTIFF; available: {listed(list(assets))}")
+    fitting = [
+        key for key, gsd_m in tiffs.items() if 0 < gsd_m <= options.wanted_gsd_m * GSD_TOLERANCE
+    ]
+    if len(tiffs) > 1 and not fitting:
+        raise FetchError(f"choose one with --asset; item {name} has {listed(list(tiffs))}")
+    return max(fitting or tiffs, key=lambda key: tiffs[key])

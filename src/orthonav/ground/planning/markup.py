@@ -16,11 +16,10 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 from orthonav.core.errors import RouteError
-from orthonav.ground.planning.routes.record import (
+from orthonav.ground.planning.record import (
     Height,
     HeightFrame,
     Route,
-    numbers_in,
     parsed,
     require_few_waypoints,
 )
@@ -31,7 +30,6 @@ MAX_KML_BYTES = 20_000_000
 MAX_MEMBERS = 10_000
 _KML_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
 """With other altitude modes, or none, the altitude is ignored, as KML specifies."""
-_POINTLESS = ("Point", "Polygon", "LinearRing", "Model")
 _END = struct.Struct("<4s4H2LH")
 _WPML_FRAMES: dict[str, HeightFrame] = {  # by `executeHeightMode`
     "relativeToStartPoint": "home",
@@ -93,30 +91,18 @@ class _Builder(TreeBuilder):
 
 
 def read_gpx(data: bytes) -> list[Route]:
-    """All routes (`rte`), and after them all tracks (`trk`), the segments of each joined. Heights
-    are above mean sea level."""
+    """All routes (`rte`), else all tracks (`trk`), the segments of each joined. Heights are above
+    mean sea level."""
     root = read_markup(data, "GPX", "gpx")
     planned = [_gpx_route(each, "rtept") for each in root.iterfind("rte[rtept]")]
-    flown = [
+    found = planned or [
         _gpx_route(each, "trkseg/trkpt")
         for each in root.iterfind("trk")
         if each.find("trkseg/trkpt") is not None
     ]
-    if not planned and not flown:
-        waypoints = len(root.findall("wpt"))
-        held = f"only {waypoints} waypoints (wpt) without an order" if waypoints else "nothing else"
-        raise RouteError(f"GPX holds no route (rte) and no track (trk); it holds {held}")
-    points = [
-        (_called("waypoint", each), numbers_in(f"{each.get('lon')},{each.get('lat')}"))
-        for each in root.iterfind("wpt")
-    ]
-    # Planned routes take precedence over recorded tracks.
-    points += [(_called("track", each), []) for each in root.iterfind("trk") if planned]
-    return [route.leaving_out(points) for route in planned or flown]
-
-
-def _called(kind: str, element: Element, tag: str = "name") -> str:
-    return f"{kind} {text_of(element, tag) or f'(no {tag})':.40}"
+    if not found:
+        raise RouteError("GPX holds no route (rte) and no track (trk) with positions")
+    return found
 
 
 def _gpx_route(element: Element, points: str) -> Route:
@@ -159,22 +145,10 @@ def _chosen_members(members: list[str]) -> list[str]:
 
 def read_kml(data: bytes) -> list[Route]:
     root = read_markup(data, "KML", "kml")
-    marks = list(root.iter("Placemark"))
-    found = [route for mark in marks for route in _kml_routes(mark)]
-    if found:
-        points = [
-            (_called("point", mark), numbers_in(text_of(point, "coordinates") or ""))
-            for mark in marks
-            for point in mark.iter("Point")
-        ]
-        return [route.leaving_out(points) for route in found]
-    if any(element.tag == "missionConfig" for element in root.iter()):
-        raise RouteError(
-            "KML is the template of a DJI mission; give its waylines.wpml, or the whole KMZ"
-        )
-    kinds = sorted({each.tag for mark in marks for each in mark.iter()})
-    held = [kind for kind in kinds if kind in _POINTLESS] or ["no placemark with a geometry"]
-    raise RouteError(f"KML holds no LineString and no gx:Track; it holds {', '.join(held)}")
+    found = [route for mark in root.iter("Placemark") for route in _kml_routes(mark)]
+    if not found:
+        raise RouteError("KML holds no LineString and no gx:Track")
+    return found
 
 
 def _kml_routes(mark: Element) -> list[Route]:
@@ -228,17 +202,10 @@ def _check_archive(data: bytes) -> None:
 def read_wpml(data: bytes) -> list[Route]:
     """The waylines of a mission, one route per folder, their waypoints by index."""
     root = read_markup(data, "WPML", "kml")
-    folders = list(root.iter("Folder"))
-    found = [route for folder in folders for route in _waylines(folder)]
+    found = [route for folder in root.iter("Folder") for route in _waylines(folder)]
     if not found:
         raise RouteError("WPML holds no wayline with waypoints")
-    read = {mark for folder in folders for mark in folder.iterfind("Placemark[Point]")}
-    points = [
-        (_called("placemark", mark, "index"), numbers_in(mark.findtext("Point/coordinates") or ""))
-        for mark in root.iterfind(".//Placemark[Point]")
-        if mark not in read
-    ]
-    return [route.leaving_out(points) for route in found]
+    return found
 
 
 def _waylines(folder: Element) -> Iterator[Route]:

@@ -1,20 +1,27 @@
-"""Result types of a check: predictions for places and along a route, and the verdict.
+"""The records of a check: what is asked and assumed, predictions, findings and the verdict.
 
 `orthonav.ground.check.run` computes them and `orthonav.ground.check.write` writes them. A
 probability refers to one view; NaN means unknown (no imagery, or outside the band of the route).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.errors import CheckError
+from orthonav.core.files import with_paths
+from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.changes.record import CellGrid
+from orthonav.ground.changes.record import CellGrid, ChangedGround
+from orthonav.ground.check.estimate import LEARNT, Prediction, Recalibration
+from orthonav.ground.planning.route import Route
+from orthonav.ground.planning.spacing import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
 
 Array = NDArray[np.float64]
 
@@ -30,17 +37,101 @@ class Word(Enum):
         return {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}[self]
 
 
-OF_REQUEST = (
-    *("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift", "tilt_std_deg"),
-    "other_sensor",
-)
+@dataclass(frozen=True)
+class CheckedInputs:
+    """What was checked, as text for reports; empty where it does not apply.
+
+    `map_sha256`: of the manifest; `terms`: attribution and licence of each imagery source.
+    """
+
+    map_name: str = ""
+    imagery: str = ""
+    recipe: str = ""
+    other_date: str = ""
+    route_name: str = ""
+    height: str = ""
+    command: str = ""
+    version: str = ""
+    terms: tuple[str, ...] = ()
+    map_sha256: str = ""
+
+
+@dataclass(frozen=True)
+class CheckRequest:
+    """What to check and under which conditions.
+
+    `map_path`: map file with a registration layer.
+    `route`: planned route; None: the whole map.
+    `band_m`: width of the band for legs without one; None: derived from the prior.
+    `other_date`: orthophoto of the same ground that the map was not built from.
+    `agl_m`: height above ground, 1 to 50,000 m; None: the shorter side of a view covers one tile.
+    `yaw_std_deg`: standard deviation of the reported heading, 0 to 90; None: heading unknown.
+    `agl_std`: standard deviation of the reported height, a fraction of it, 0 to 0.5.
+    `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
+    `accept`: confidence that a fix needs, 0.01 to 0.999.
+    `speed_mps`: ground speed; 20 m/s is the cruise of a small fixed-wing aircraft.
+    `drift`: error of dead reckoning per metre flown, 0 to 1; with an airspeed sensor and a known
+    wind usually 0.02 to 0.05.
+    `relief_m`: standard deviation of the height of houses and trees; 3 m in open country.
+    `effort`: factor on the number of trials, 0.05 to 50.
+    `workers`: processes; None: one per core.
+    `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20; drones
+    that report a level gimbal were tilted by up to 9 deg.
+    `other_sensor`: the camera differs from the map's sensor by more than years do.
+    `changes`: ground that changed since the map was made, as a flight saw it.
+    """
+
+    map_path: Path
+    route: Route | None = None
+    band_m: float | None = None
+    other_date: Path | None = None
+    camera: Camera = DEFAULT_CAMERA
+    agl_m: float | None = None
+    yaw_std_deg: float | None = 5.0
+    agl_std: float = 0.05
+    prior_std_m: float | None = DEFAULT_PRIOR_STD_M
+    accept: float = CONFIDENT
+    speed_mps: float = 20.0
+    drift: float = 0.03
+    relief_m: float = 3.0
+    effort: float = 1.0
+    workers: int | None = None
+    seed: int = 1
+    tilt_std_deg: float = 1.5
+    other_sensor: bool = False
+    recalibration: Recalibration = LEARNT
+    changes: ChangedGround | None = None
+    about: CheckedInputs = field(default_factory=CheckedInputs)
+
+    def __post_init__(self) -> None:
+        with_paths(self, "map_path", "other_date")
+        if self.other_sensor and self.other_date is not None:
+            raise CheckError("--other-sensor is for checks without --other-date, which shows it")
+        limits: dict[str, tuple[float | None, float, float, str]] = {
+            "height above ground": (self.agl_m, 1.0, 50_000.0, " m"),
+            "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, " deg"),
+            "agl_std": (self.agl_std, 0.0, 0.5, " (a fraction of the height: 0.05 is 5 %)"),
+            "prior_std_m": (self.prior_std_m, 0.0, 1e6, " m"),
+            "accept": (self.accept, 0.01, 0.999, ""),
+            "speed_mps": (self.speed_mps, 0.1, 10_000.0, " m/s"),
+            "drift": (self.drift, 0.0, 1.0, " (metres per metre flown: 0.03 is 3 %)"),
+            "tilt_std_deg": (self.tilt_std_deg, 0.0, 20.0, " deg"),
+            "relief_m": (self.relief_m, 0.0, 1000.0, " m"),
+            "effort": (self.effort, 0.05, 50.0, ""),
+            "workers": (self.workers, 1, 1000, " processes"),
+            "seed": (self.seed, 0, 2**63, ""),
+        }
+        for name, (value, low, high, unit) in limits.items():
+            if value is not None and not low <= value <= high:
+                raise CheckError(f"{name} must be {low:g} to {high:g}{unit}, got {value}")
 
 
 @dataclass(frozen=True)
 class Conditions:
     """What a check assumes; fields that are not listed are those of `CheckRequest`.
 
-    `width_m`, `height_m`: footprint of a vertical view; `radius_m`: largest error of a correct fix.
+    `width_m`, `height_m`: footprint of a vertical view along the rows and columns of the image.
+    `radius_m`: largest error of a correct fix.
     """
 
     width_m: float
@@ -56,9 +147,30 @@ class Conditions:
     tilt_std_deg: float = 0.0
     other_sensor: bool = False
 
+    @classmethod
+    def of(cls, request: CheckRequest, agl_m: float, radius_m: float) -> "Conditions":
+        camera = request.camera
+        names = ("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift")
+        return cls(
+            width_m=agl_m * camera.width_px / camera.fx_px,
+            height_m=agl_m * camera.height_px / camera.fy_px,
+            agl_m=agl_m,
+            radius_m=radius_m,
+            **{name: getattr(request, name) for name in (*names, "tilt_std_deg", "other_sensor")},
+        )
 
-@dataclass(frozen=True, eq=False)
-class Cells:
+    @property
+    def side_m(self) -> float:
+        """Side of the square with the area of the footprint."""
+        return math.sqrt(self.width_m * self.height_m)
+
+    @property
+    def footprint_text(self) -> str:
+        return f"a view from {self.agl_m:.0f} m covers {self.width_m:.0f} x {self.height_m:.0f} m"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cells(Prediction):
     """Predictions for square cells; arrays are (rows, cols), row 0 in the north, as `CELL_VALUES`
     says.
 
@@ -68,13 +180,7 @@ class Cells:
     west_m: float
     north_m: float
     side_m: float
-    probability: Array
-    low: Array
-    high: Array
-    error_m: Array
-    wrong: Array
     trials: NDArray[np.int32]
-    persistence: Array
     changed: Array
 
     @property
@@ -84,8 +190,8 @@ class Cells:
 
 CELL_VALUES = {
     "probability": "probability of a correct, confident fix of one view",
-    "low": "lower end of its 80 % interval",
-    "high": "upper end of its 80 % interval",
+    "low": "probability, lower end of its 80 % interval",
+    "high": "probability, upper end of its 80 % interval",
     "error_m": "expected error of such a fix, root mean square, metres",
     "wrong": "fraction of trials that were false fixes",
     "trials": "number of views tried",
@@ -95,9 +201,9 @@ CELL_VALUES = {
 """Arrays of `Cells` and their meaning, in the order of the bands of the raster."""
 
 
-@dataclass(frozen=True, eq=False)
-class Along:
-    """Predictions at points (N,) along the route; fields that are not listed are as in `Cells`.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Along(Prediction):
+    """Predictions at points (N,) along the route.
 
     `points_en_m`: (N, 2) in the plane of the map's sheet.
     `across_low`: lowest probability across the band at that point.
@@ -107,11 +213,7 @@ class Along:
 
     distance_m: Array
     points_en_m: Array
-    probability: Array
-    low: Array
-    high: Array
     across_low: Array
-    error_m: Array
     drift_m: Array
 
 
@@ -160,33 +262,6 @@ class Lookalike:
     within_prior: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Envelope:
-    """Fraction `share` (A, B) of correct, confident fixes over errors added to heading and height.
-
-    `agl_off` (B,): as a fraction of the height.
-    `tolerated_*`: largest error of each alone at which `share` stays at 85 % or more of that
-    without.
-    """
-
-    yaw_off_deg: Array
-    agl_off: Array
-    share: Array
-    tolerated_yaw_deg: float
-    tolerated_agl_low: float
-    tolerated_agl_high: float
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """Mean probability with another value, in metres, of one parameter: "agl_m" or "band_m"."""
-
-    what: str
-    value: float
-    probability: float
-    chosen: bool = False
-
-
 @dataclass(frozen=True)
 class Reason:
     """One finding behind the verdict: a stable code for programs, a sentence for people."""
@@ -202,25 +277,6 @@ class Verdict:
 
     word: Word
     reasons: tuple[Reason, ...]
-
-
-@dataclass(frozen=True)
-class CheckedInputs:
-    """What was checked, as text for reports; empty where it does not apply.
-
-    `map_sha256`: of the manifest; `terms`: attribution and licence of each imagery source.
-    """
-
-    map_name: str = ""
-    imagery: str = ""
-    recipe: str = ""
-    other_date: str = ""
-    route_name: str = ""
-    height: str = ""
-    command: str = ""
-    version: str = ""
-    terms: tuple[str, ...] = ()
-    map_sha256: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,8 +300,6 @@ class CheckResult:
     band_m: float | None = None
     stretches: tuple[BlindStretch, ...] = ()
     lookalikes: tuple[Lookalike, ...] = ()
-    envelope: Envelope | None = None
-    alternatives: tuple[Alternative, ...] = ()
 
 
 def summarize(result: CheckResult) -> dict[str, Any]:
@@ -263,10 +317,8 @@ def summarize(result: CheckResult) -> dict[str, Any]:
         # Length of the route (N,) that each of its points represents.
         lengths_m = np.gradient(along.distance_m) if route_m else np.ones(len(along.distance_m))
         lengths_m[[0, -1]] /= 2 if route_m else 1
-        known = np.isfinite(along.probability)
-        confident = np.where(known, along.probability, 0.0) >= CONFIDENT
-        likely = float(lengths_m[confident].sum() / lengths_m.sum()) if known.any() else math.nan
-        error_m = _rms(along.error_m, lengths_m * np.nan_to_num(along.probability))
+        likely = float(lengths_m[along.probability >= CONFIDENT].sum() / lengths_m.sum())
+        error_m = _rms(along.error_m, lengths_m * along.probability)
     longest = max(stretches, key=lambda each: each.length_m, default=None)
     return {
         "area_km2": result.area_km2,

@@ -13,24 +13,26 @@ Commands and frames: MAV_CMD and MAV_FRAME of MAVLink's common.xml."""
 
 import io
 import itertools
+import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 from orthonav.core.errors import RouteError
 from orthonav.core.tables import TableError, bounded_lines
-from orthonav.ground.planning.routes.record import (
-    MAX_NAMED,
+from orthonav.ground.planning.record import (
     Height,
     HeightFrame,
     Route,
     decoded,
-    json_object,
     number,
     number_or_none,
     parsed,
     require_few_waypoints,
 )
+
+MAX_NAMED = 12
+log = logging.getLogger(__name__)
 
 WAYPOINT, RETURN_HOME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND = 16, 20, 21, 22, 84, 85
 _CIRCLES = (17, 18, 19, 31, 34)
@@ -63,8 +65,8 @@ _HEIGHT_FRAMES: dict[int, HeightFrame] = {
 
 @dataclass(frozen=True)
 class MissionItem:
-    """A mission item. `lat_deg`, `lon_deg`: position, None if it has none. `pattern`: number shared
-    by all items of one survey or corridor, which is flown as a whole."""
+    """`lat_deg`, `lon_deg`: position, None if it has none. `pattern`: number shared by all items of
+    one survey or corridor, which is flown as a whole."""
 
     command: int  # MAV_CMD
     frame: int  # MAV_FRAME, the reference of `height_m`
@@ -76,20 +78,11 @@ class MissionItem:
     band_m: float | None = None  # search band between items of one pattern
 
 
-def height_frame(frame: int) -> HeightFrame:
-    if frame not in _HEIGHT_FRAMES:
-        raise RouteError(
-            f"mission has a waypoint in MAV_FRAME {frame}; expected a global one "
-            f"({', '.join(map(str, sorted(_HEIGHT_FRAMES)))})"
-        )
-    return _HEIGHT_FRAMES[frame]
-
-
 def route_of(items: Iterable[MissionItem], home: MissionItem | None) -> Route:
     """The route of a mission. As in autopilots, a position of 0, 0 or none means the current
     position, so a take-off without a position is at home. A return to launch ends the route at
-    home. Jumps are not followed; a circle is replaced by its centre. Items with a position that are
-    left out are named: those after the return, and those whose command is not known."""
+    home. Jumps are not followed; a circle is replaced by its centre. A warning names items with a
+    position that are left out: those after the return, and those whose command is not known."""
     stops: list[MissionItem] = []
     left_out: list[str] = []
     remaining = iter(items)
@@ -99,27 +92,29 @@ def route_of(items: Iterable[MissionItem], home: MissionItem | None) -> Route:
                 stops.append(replace(home, height_m=None))
             break
         if item.command in FLOWN and _has_place(item):
-            height_frame(item.frame)
             stops.append(item)
         elif item.command in (TAKEOFF, VTOL_TAKEOFF) and home is not None:
             stops.append(replace(home, height_m=None))
         elif _is_lost(item):
             left_out.append(_named(item))
     left_out += [f"{_named(item)} after the return" for item in remaining if _is_lost(item)]
+    named = ", ".join(left_out[:MAX_NAMED]) + (", .." if len(left_out) > MAX_NAMED else "")
     if not stops:
-        held = f"; left out are {', '.join(left_out[:MAX_NAMED])}" if left_out else ""
+        held = f"; left out are {named}" if left_out else ""
         raise RouteError(f"mission holds no waypoint with a position{held}")
-    heights = tuple(_height(stop) for stop in stops)
+    if left_out:
+        log.warning(
+            "positions that are not part of the route, so the map may not cover them: %s", named
+        )
     bands = tuple(
         start.band_m if start.pattern is not None and start.pattern == end.pattern else None
         for start, end in itertools.pairwise(stops)
     )
     return Route(
         tuple((stop.lat_deg or 0.0, stop.lon_deg or 0.0) for stop in stops),
-        heights,
+        tuple(map(_height, stops)),
         bands if any(bands) else (),
         home_amsl_m=None if home is None else home.height_m,
-        left_out=tuple(left_out),
     )
 
 
@@ -138,9 +133,12 @@ def _named(item: MissionItem) -> str:
 
 
 def _height(item: MissionItem) -> Height | None:
-    if item.height_m is None:
-        return None
-    return Height(item.height_m, height_frame(item.frame))
+    if item.frame not in _HEIGHT_FRAMES:
+        raise RouteError(
+            f"mission has a waypoint in MAV_FRAME {item.frame}; expected a global one "
+            f"({', '.join(map(str, sorted(_HEIGHT_FRAMES)))})"
+        )
+    return None if item.height_m is None else Height(item.height_m, _HEIGHT_FRAMES[item.frame])
 
 
 _AMSL, _ABOVE_HOME, _TERRAIN = 0, 3, 10
@@ -151,16 +149,8 @@ _TRANSECTS = ("survey", "CorridorScan")
 _LANDINGS = ("fwLandingPattern", "vtolLandingPattern")
 
 
-def read_plan(data: bytes) -> list[Route]:
-    return [plan_route(json_object(data))]
-
-
-def is_plan(plain: dict[str, Any]) -> bool:
-    return plain.get("fileType") == "Plan"
-
-
 def plan_route(plain: dict[str, Any]) -> Route:
-    if not is_plan(plain):
+    if plain.get("fileType") != "Plan":
         raise RouteError(f"plan must have fileType 'Plan', got {plain.get('fileType')!r:.40}")
     mission = plain["mission"]
     home = _plan_home(mission.get("plannedHomePosition"))
@@ -204,7 +194,6 @@ def _simple(raw: dict[str, Any], item: int, where: str) -> MissionItem:
 
 
 def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]:
-    """Flight lines of a survey or corridor scan; the corridor width is the band of its legs."""
     inner = raw.get("TransectStyleComplexItem") or {}
     points = inner.get("VisualTransectPoints")
     if not points:
@@ -214,13 +203,14 @@ def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]
         )
     frame, height_m = _survey_height(inner.get("CameraCalc") or {}, inner, where)
     width_m = number_or_none(raw.get("CorridorWidth"), f"{where}: CorridorWidth") or None
-    items = []
-    for point in points:
-        lat, lon = _latlon(point, f"{where}: VisualTransectPoints")
-        items.append(
-            MissionItem(WAYPOINT, frame, lat, lon, height_m, pattern=index, band_m=width_m)
+    return [
+        MissionItem(
+            *(WAYPOINT, frame, *_latlon(point, f"{where}: VisualTransectPoints"), height_m),
+            pattern=index,
+            band_m=width_m,
         )
-    return items
+        for point in points
+    ]
 
 
 def _survey_height(

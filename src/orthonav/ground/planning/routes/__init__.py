@@ -1,1 +1,0 @@
-"""Reading and writing routes: one module per file format, all giving `Route`."""

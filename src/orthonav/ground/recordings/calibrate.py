@@ -1,0 +1,405 @@
+"""What `orthonav calibrate` estimates from a flight: constant errors of the telemetry, and latency.
+
+Latency is the time from the exposure of a picture to its arrival. The motion between consecutive
+pictures is compared with the motion that follows from attitude, velocity and height reported at the
+times of arrival less candidates of the latency, over windows of half a minute. What is known only
+nearly (height, direction of the velocity, orientation of the camera) is estimated with it. A window
+in which many candidates fit, as in straight and level flight, gives no number.
+
+For a latency d, the seen turn of a pair of pictures is the reported one, `turn(d)`, and the seen
+shift is
+
+    tilt(d) + scale velocity(d) + across J velocity(d) + mount J tilt(d) + constant seconds
+
+with J the rotation by 90 deg. These five linear parameters have Gaussian priors.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.errors import FlightError
+from orthonav.core.flight.mount import Bias, CameraLatency, Mount
+from orthonav.core.flight.recording import Flight, RecordedView
+from orthonav.core.geo.camera import Camera, enu_from_camera
+from orthonav.core.records import (
+    CONFIDENT,
+    Fix,
+    ViewResult,
+)
+from orthonav.ground.recordings.flightlog import LoggedFlight
+from orthonav.onboard.motion import (
+    LONGEST_S,
+    SHIFT_STD,
+    TURN_STD_RAD,
+    ImageMotion,
+    PictureOdometry,
+    StateHistory,
+    explained_part,
+    varying,
+)
+
+MIN_VIEWS = 5
+MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
+"""A tilt that differs by more than both from that at the end shows that the camera moved."""
+MAD_TO_STD = 1.4826
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
+STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
+"""Lower bounds of the standard deviations of the estimated biases."""
+_EVIDENCE = {
+    "heading_deg": "heading_bias_deg",
+    "log_scale": "log_scale_bias",
+    "pitch_deg": "pitch_bias_deg",
+    "roll_deg": "roll_bias_deg",
+}
+LEAST = 3  # number of estimates that must agree
+AGREE_S, AGREE_SIGMAS = 0.1, 4.0
+NEEDED = (
+    "fly at least two minutes at a height where the ground is textured, with turns of 10 deg/s or "
+    "more or banking every 10 s, and log at least 2 views a second (`orthonav fly --log`)"
+)
+LEAST_S, MOST_S, STEP_S = -0.5, 12.0, 0.1
+"""Candidates of the latency. Below 0: an exposure after the arrival shows clocks that disagree."""
+WINDOW_S = 30.0
+MOST_PAIRS, LEAST_PAIRS = 300, 12
+PAIR_SHARE, KNOWN_SHARE = 0.9, 0.6
+"""Fraction of candidates for which the motion of a pair must be known, and of pairs for one
+candidate."""
+NEAR_S, NEAR_MASS = 0.35, 0.99  # a latency is found where this probability lies this close to it
+LARGEST_STD_S, FLOOR_S = 0.3, 0.025
+"""Largest standard deviation of an answer; least one: half an interval of the stored states."""
+OUTLIER = 3.0  # scale of the Cauchy weights, in standard deviations
+ALIKE = 4.0
+"""Differences of successive pairs are correlated: so many count as one. Chosen so that errors of
+the estimate are as large as stated (tests/onboard/test_calibrate_latency.py)."""
+CANDIDATES_S = np.arange(round((MOST_S - LEAST_S) / STEP_S) + 1) * STEP_S + LEAST_S
+_CANDIDATES_NS = np.round(CANDIDATES_S * 1e9).astype(np.int64)
+Array = NDArray[np.float64]
+Prior = tuple[Array, Array]
+"""Mean (5,) and precision (5, 5) of the linear parameters."""
+
+
+@dataclass(frozen=True)
+class MountCalibration:
+    """Estimated biases, and the views that they are of."""
+
+    mount: Mount
+    first: str  # frame of the first view used
+    last: str  # frame of the last one
+    moved: bool  # whether the camera moved in its mount before `first`
+
+
+def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
+    """Mount at the end of a tracked flight: medians over its confident views.
+
+    Views before a movement of the camera in its mount are excluded. Raises `FlightError` where
+    fewer than `MIN_VIEWS` views are confident.
+    """
+    confident = confident_views(results)
+    if len(confident) < MIN_VIEWS:
+        raise FlightError(
+            f"{len(confident)} of {len(results)} views have a confidence of {CONFIDENT} or more; a "
+            f"calibration needs {MIN_VIEWS}: check the map, the camera and the reported height"
+        )
+    values, spreads = (
+        {
+            name: np.array([each.outcome.evidence[key.replace("bias", bias)] for each in confident])
+            for name, key in _EVIDENCE.items()
+        }
+        for bias in ("bias", "bias_std")
+    )
+    begin = max(_still_from(values[name], spreads[name]) for name in ("pitch_deg", "roll_deg"))
+    begin = min(begin, len(confident) - MIN_VIEWS)
+    used = slice(begin, None)
+    biases = {
+        name: _bias(values[name][used], spreads[name][used], STD_FLOOR[name]) for name in _EVIDENCE
+    }
+    mount = Mount(**biases, views=len(confident) - begin)
+    return MountCalibration(mount, confident[begin].frame, confident[-1].frame, begin > 0)
+
+
+def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
+    return [
+        each
+        for each in results
+        if isinstance(each.outcome, Fix)
+        and each.outcome.confidence >= CONFIDENT
+        and "pitch_bias_deg" in each.outcome.evidence
+    ]
+
+
+def _still_from(values: Array, spreads: Array) -> int:
+    """Index of the first view from which on a value stays close to that at the end."""
+    end = float(np.median(values[-MIN_VIEWS:]))
+    far = np.abs(values - end) > np.maximum(MOVED_SIGMAS * spreads, MOVED_DEG)
+    return int(np.flatnonzero(far)[-1]) + 1 if far.any() else 0
+
+
+def _bias(values: Array, spreads: Array, floor: float) -> Bias:
+    """Median, its standard deviation by the track, and the scatter around it."""
+    middle = float(np.median(values))
+    scatter = MAD_TO_STD * float(np.median(np.abs(values - middle)))
+    return Bias(middle, max(floor, float(np.median(spreads))), scatter)
+
+
+def arrivals_of(flight: Flight) -> Iterator[tuple[RecordedView, float]]:
+    """Views of a recording, and the latency (s) that was subtracted from their arrival."""
+    if isinstance(flight, LoggedFlight):
+        yield from flight.arrivals()
+        return
+    for view in flight.views:
+        yield view, 0.0
+
+
+def calibrate_latency(
+    camera: Camera,
+    views: Iterable[tuple[RecordedView, float]],
+    *,
+    heading_known: bool = True,
+) -> CameraLatency:
+    """Latency of a camera from views and the latency (s) that their times already contain.
+
+    Telemetry is interpolated between the exposures of the views. `heading_known`: whether the
+    reported heading gives the direction of the velocity. Raises `FlightError` where the flight
+    shows too little motion, or estimates disagree.
+    """
+    history = StateHistory(1.0)  # longest interval (s) over which telemetry is interpolated
+    odometry, estimator = PictureOdometry(), LatencyEstimator(heading_known=heading_known)
+    estimates: list[LatencyEstimate | None] = []
+    due_ns: float = -math.inf
+    intervals = []
+    before_ns = None
+    for view, used_s in views:
+        telemetry = view.telemetry
+        known = not telemetry.missing()
+        velocity = None if telemetry.vel_en_mps is None else (*telemetry.vel_en_mps, 0.0)
+        attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg
+        history.add(
+            telemetry.time_ns,
+            enu_from_camera(*attitude) if known else None,
+            velocity,
+            telemetry.agl_m,
+        )
+        arrived_ns = telemetry.time_ns + round(used_s * 1e9)
+        if before_ns is not None:
+            intervals.append((arrived_ns - before_ns) / 1e9)
+        before_ns = arrived_ns
+        try:
+            grey = view.grey()
+        except FlightError:
+            continue
+        estimator.add(odometry.motion(grey, camera, arrived_ns), history)
+        if arrived_ns >= due_ns:
+            due_ns = arrived_ns + 10.0 * 1e9
+            estimates.append(estimator.estimate())
+    estimates.append(estimator.estimate())
+    return _agreed(estimates, intervals)
+
+
+class LatencyEstimate(NamedTuple):
+    """The latency (s) in one window, its standard deviation and the number of compared pairs."""
+
+    delay_s: float
+    std_s: float
+    pairs: int
+
+
+class LatencyEstimator:
+    """Estimates the latency over a sliding window. Mutable; the same values give the same."""
+
+    def __init__(self, *, heading_known: bool = True) -> None:
+        self._heading_known = heading_known
+        self._waiting: deque[ImageMotion] = deque(maxlen=MOST_PAIRS)
+        self._pairs: deque[tuple[ImageMotion, Array]] = deque(maxlen=MOST_PAIRS)
+
+    def add(self, motion: ImageMotion | None, history: StateHistory) -> None:
+        """Add the motion of a pair. It counts once the history reaches beyond all candidates."""
+        if motion is not None:
+            self._waiting.append(motion)
+        reach_ns = round(-LEAST_S * 1e9)
+        while self._waiting and self._waiting[0].end_ns + reach_ns <= history.newest_ns:
+            one = self._waiting.popleft()
+            shown = history.motion(one.start_ns - _CANDIDATES_NS, one.end_ns - _CANDIDATES_NS)
+            if np.isfinite(shown[0]).mean() < PAIR_SHARE:
+                continue
+            self._pairs.append((one, np.column_stack(shown)))
+            while self._pairs[0][0].start_ns < one.end_ns - WINDOW_S * 1e9:
+                self._pairs.popleft()
+
+    def estimate(self) -> LatencyEstimate | None:
+        """The latency in the window, None where it is not observable."""
+        if len(self._pairs) < LEAST_PAIRS:
+            return None
+        motions, reported = zip(*self._pairs, strict=True)
+        pairs = _Pairs(
+            np.array([each.seconds for each in motions]),
+            np.array([each.turn_rad for each in motions]),
+            np.array([each.shift for each in motions]),
+            np.array(reported),
+        )
+        return _estimate(pairs, heading_known=self._heading_known)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """N pairs of pictures and the motion reported for C candidates of the latency.
+
+    `seconds` (N,): duration. `turn` (N,), `shift` (N, 2): seen. `reported` (N, C, 5): turn, tilt
+    (2), velocity (2), NaN where not known.
+    """
+
+    seconds: Array
+    turn: Array
+    shift: Array
+    reported: Array
+
+    def least_noise(self) -> Array:
+        """Least standard deviations (2,) of turn and shift."""
+        some = np.nan_to_num(self.reported[:, ::20, 3:])
+        size = np.sqrt(np.square(some).sum(axis=-1).mean())
+        # Relief and changes of height: 8 % of the shift by velocity.
+        return np.array([TURN_STD_RAD, np.hypot(SHIFT_STD, 0.08 * size)])
+
+    def explained(self, fit: "_Fit") -> float:
+        """Least fraction of the motion that a fit explains, of turn and of the varying part of
+        shift, where it is twice the least standard deviation; NaN where neither is."""
+        turned = explained_part(self.turn[:, None], fit.turn_off[:, None], 2 * TURN_STD_RAD)
+        shifted = explained_part(varying(self.shift, self.seconds), fit.shift_off, 2 * SHIFT_STD)
+        return float(np.fmin(turned, shifted))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Fit of one latency: its `cost`, `linear` (5,), differences `turn_off` (N,) and `shift_off`
+    (N, 2), and `weights` (N,)."""
+
+    cost: float
+    linear: Array
+    turn_off: Array
+    shift_off: Array
+    weights: Array
+
+    def scatter(self) -> Array:
+        """Standard deviations (2,) of turn and shift by the differences."""
+        known = self.weights > 0
+        middle = [np.median(np.abs(off[known])) for off in (self.turn_off, self.shift_off)]
+        return MAD_TO_STD * np.array(middle)
+
+
+def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
+    if (np.isfinite(pairs.reported[..., :3]).all(axis=-1).mean(axis=0) < KNOWN_SHARE).any():
+        return None  # a latency that cannot be excluded
+    prior = _prior(pairs.reported, heading_known=heading_known)
+    noise = least = pairs.least_noise()
+    for _ in range(2):  # the second time with the scatter of the first
+        fits = [_fitted(pairs, each, noise, prior) for each in np.moveaxis(pairs.reported, 1, 0)]
+        cost = np.array([each.cost for each in fits])
+        best = int(np.argmin(cost))
+        fit = fits[best]
+        noise = np.maximum(least, fit.scatter())
+    chance = np.exp((cost[best] - cost) / (2 * ALIKE))
+    near = np.abs(CANDIDATES_S - CANDIDATES_S[best]) <= NEAR_S
+    ambiguous = chance[near].sum() < NEAR_MASS * chance.sum()
+    scale, across = fit.linear[:2].tolist()
+    turned = abs(math.atan2(across, scale)) if heading_known else 0.0
+    usual = 0.5 < math.hypot(scale, across) < 2.0 and turned < 0.6
+    if fit.weights.mean() < 0.5 or ambiguous or not usual:
+        return None
+    # The minimum of a parabola through the least cost and its neighbours, and its curvature.
+    middle = min(max(best, 1), len(cost) - 2)
+    before, least_cost, after = cost[middle - 1 : middle + 2].tolist()
+    bend = before - 2 * least_cost + after
+    if not bend > 0:
+        return None
+    delay_s = float(CANDIDATES_S[middle]) + STEP_S * (before - after) / (2 * bend)
+    std_s = math.hypot(FLOOR_S, STEP_S * math.sqrt(2 * ALIKE / bend))
+    if std_s > LARGEST_STD_S or not pairs.explained(fit) >= 0.6:
+        return None
+    return LatencyEstimate(delay_s, std_s, len(pairs.turn))
+
+
+def _prior(reported: Array, *, heading_known: bool) -> Prior:
+    unknown = ~np.isfinite(reported[..., 3]) & np.isfinite(reported[..., 0])
+    # A constant shift per second: by an unknown velocity, else by the tilt of the mount.
+    constant = 0.5 if unknown.any() else 0.01
+    # Errors of height (fraction), direction of the velocity, orientation of the camera (rad).
+    errors = (0.25, 0.2, 0.08) if heading_known else (1.5, 1.5, 0.08)
+    mean = np.array([1.0 if heading_known else 0.0, 0.0, 0.0, 0.0, 0.0])
+    std = np.array([*errors, constant, constant])
+    return mean, np.diag(1 / np.square(std))
+
+
+def _columns(seconds: Array, reported: Array) -> Array:
+    """Derivatives (..., 2, 5) of the shift by the linear parameters; `reported` (..., 5)."""
+    tilt, velocity = reported[..., 1:3], reported[..., 3:5]
+    made = np.zeros((*reported.shape[:-1], 2, 5))
+    made[..., 0], made[..., 1], made[..., 2] = velocity, _rotated(velocity), _rotated(tilt)
+    made[..., 0, 3] = made[..., 1, 4] = seconds
+    return made
+
+
+def _rotated(vectors: Array) -> Array:
+    return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
+
+
+def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: Prior) -> _Fit:
+    """Fit for `reported` (N, 5), with standard deviations `noise` (2,) of turn and shift."""
+    known = np.asarray(np.isfinite(reported[:, :3]).all(axis=1), np.float64)
+    reported = np.nan_to_num(reported)
+    lines = _columns(pairs.seconds, reported)
+    turn_off = pairs.turn - reported[:, 0]
+    wanted = pairs.shift - reported[:, 1:3]
+    weights: Array = known
+    for _ in range(3):
+        flat = (lines * (weights / noise[1] ** 2)[:, None, None]).reshape(-1, 5)
+        normal = flat.T @ lines.reshape(-1, 5) + prior[1]
+        linear = np.linalg.solve(normal, flat.T @ wanted.reshape(-1) + prior[1] @ prior[0])
+        shift_off = wanted - lines @ linear
+        square: Array = np.square(turn_off / noise[0])
+        square = square + np.square(shift_off / noise[1]).sum(axis=1)
+        weights = known / (1 + square / OUTLIER**2)
+    # Cauchy's loss; where pairs are not known, as if all were.
+    loss = float((known * np.log1p(square / OUTLIER**2)).sum()) * OUTLIER**2
+    off = linear - prior[0]
+    cost = loss * len(known) / max(known.sum(), 1.0) + float(off @ prior[1] @ off)
+    return _Fit(cost, linear, turn_off, shift_off, weights)
+
+
+def _agreed(estimates: list[LatencyEstimate | None], intervals: list[float]) -> CameraLatency:
+    if not intervals or float(np.median(intervals)) > LONGEST_S / 2:
+        usual_s = float(np.median(intervals)) if intervals else math.inf
+        raise FlightError(
+            f"views are {usual_s:.1f} s apart; the latency of a camera needs views at most "
+            f"{LONGEST_S / 2:g} s apart: {NEEDED}"
+        )
+    found = [each for each in estimates if each is not None]
+    if len(found) < LEAST:
+        raise FlightError(
+            f"the flight does not show the latency of the camera: {len(found)} of "
+            f"{len(estimates)} windows give an estimate, {LEAST} are needed. "
+            f"{NEEDED[0].upper()}{NEEDED[1:]}. If it was flown so, images do not move as the "
+            "telemetry reports: check --mount-deg, the height and the heading"
+        )
+    delays = np.array([each.delay_s for each in found])
+    stds = np.array([each.std_s for each in found])
+    middle = float(np.median(delays))
+    far = np.abs(delays - middle) > np.maximum(AGREE_S, AGREE_SIGMAS * stds)
+    if far.mean() > 0.2:
+        raise FlightError(
+            f"the latency of the camera is not constant: {delays.min() * 1e3:.0f} to "
+            f"{delays.max() * 1e3:.0f} ms during the flight"
+        )
+    if not -AGREE_S <= middle <= MOST_S:
+        raise FlightError(
+            f"images seem to be exposed {-middle * 1e3:.0f} ms after they arrived: the clocks of "
+            "images and telemetry disagree"
+        )
+    scatter = float(np.std(delays[~far]))
+    std_s = max(float(np.median(stds)), scatter)
+    pairs = max(each.pairs for each in found)
+    return CameraLatency(max(0.0, middle) * 1e3, std_s * 1e3, pairs)
