@@ -1,7 +1,4 @@
-"""Views of known places, and of none, judged by registration: the rows that trust and integrity use.
-
-A row is a view: where it was taken, how far off its fix is, the covariance that is stated, and the
-evidence for the place."""
+"""Single views of known places and of none, on maps of other dates, as rows for `integrity`."""
 
 import contextlib
 import math
@@ -90,6 +87,27 @@ CASES = (
 )
 
 
+def prepare(pairs: Sequence[Pair], work: Path) -> None:
+    """Make maps and generated imagery, before processes share them."""
+    for each in pairs:
+        past = ortho(each.map, work)
+        map_of(past, work)
+        with contextlib.suppress(AreaError):
+            _western_half(past, work)
+        ortho(each.views, work)
+
+
+def _western_half(path: Path, work: Path) -> tuple[Path, float]:
+    """Map of the western half of an orthophoto, and the meridian where it ends.
+
+    Raises `AreaError` where that has less imagery than a tile.
+    """
+    with rasterio.open(path) as source:
+        west, south, east, north = transform_bounds(source.crs, "EPSG:4326", *source.bounds)
+    middle = (west + east) / 2
+    return map_of(path, work, (west, south, middle, north)), middle
+
+
 def views_of(task: Task) -> list[dict[str, Any]]:
     """Rows of all views of a pair."""
     cv2.setNumThreads(1)
@@ -101,12 +119,10 @@ def _rows(
 ) -> Iterator[dict[str, Any]]:
     past, flown = ortho(pair.map, work), ortho(pair.views, work)
     whole = _registration(map_of(past, work))
-    with rasterio.open(past) as source:
-        west, south, east, north = transform_bounds(source.crs, "EPSG:4326", *source.bounds)
-    middle = (west + east) / 2
-    half = None
-    with contextlib.suppress(AreaError):  # less than a tile of imagery there
-        half = _registration(map_of(past, work, (west, south, middle, north)))
+    half, middle = None, math.nan
+    with contextlib.suppress(AreaError):
+        half_path, middle = _western_half(past, work)
+        half = _registration(half_path)
     seed += zlib.crc32(pair.name.encode()) % 1_000_000  # pairs with the same views fly elsewhere
     other_scenes = [each for each in others if place_of(each) != place_of(pair)]
     for number, case in enumerate(CASES):

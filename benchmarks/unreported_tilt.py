@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.judged_views import is_covered
 from benchmarks.placing import views_in
 from benchmarks.record import Section, Table, number, quantiles, resumed, rows_path, run, say
 from benchmarks.scenes import (
@@ -30,7 +31,6 @@ from benchmarks.scenes import (
     ortho,
     root_agl_of,
 )
-from benchmarks.trust import is_covered
 from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer

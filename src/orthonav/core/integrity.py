@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def probability_beyond(cov_en_m2: Array, limit_m: float) -> float:
-    """Probability that the error of a right place exceeds a limit; NaN for an unknown covariance."""
+    """That the error of a right place exceeds a limit; NaN for an unknown covariance."""
     scales = _scales_m2(cov_en_m2)
     return float(_beyond(scales, limit_m))
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
+from orthonav.core.integrity import DEFAULT_RISK, probability_beyond, protection_level_m
 
 CONFIDENT = 0.9  # from this confidence on: the default of publishing and reports
 PRIOR_SIGMAS = 3.0  # the search ends there: 1.1 % of a round Gaussian lies outside
@@ -178,6 +179,9 @@ class Fix:
     pose_cov: NDArray[np.float64] | None = None
     """Covariance (6, 6) of metres east, north and up and degrees of heading, pitch and roll; None
     where the six were not estimated together."""
+    place_probability: float = math.nan
+    """Probability that the place is right, whatever the error there; NaN where the method states
+    only a confidence, which is then used for it."""
 
     @property
     def is_confident(self) -> bool:
@@ -188,6 +192,21 @@ class Fix:
     def std_m(self) -> float:
         """Standard deviation of the position along the worst direction, m; NaN where unknown."""
         return error_ellipse(self.cov_en_m2)[0]
+
+    def probability_within(self, limit_m: float) -> float:
+        """Probability that the error is at most `limit_m`; NaN where the confidence is unknown."""
+        return self._right * (1 - probability_beyond(self.cov_en_m2, limit_m))
+
+    def protection_level_m(self, risk: float = DEFAULT_RISK) -> float:
+        """The smallest limit that the error exceeds with a probability of at most `risk`, m.
+
+        Infinite where the place alone is wrong with a higher one, or nothing is known of it."""
+        return protection_level_m(self._right, self.cov_en_m2, risk)
+
+    @property
+    def _right(self) -> float:
+        known = math.isfinite(self.place_probability)
+        return self.place_probability if known else self.confidence
 
     def __repr__(self) -> str:
         return (

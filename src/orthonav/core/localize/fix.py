@@ -31,6 +31,7 @@ def fix_of(search: Search, best: Place) -> Fix:
         found = _by_similarity(sheet, search.view, best)
         if orientation is not None:
             middle_en_m = ground.middle_en_m(orientation, pose)
+    place = math.nan if sheet.confidence is None else sheet.confidence(best.scores)
     radius_m = max(sheet.radius_m, RADIUS_SHARE * found.agl_m)
     evidence = best.scores | found.stds
     if found.middle_cov_en_m2 is not None:
@@ -51,7 +52,7 @@ def fix_of(search: Search, best: Place) -> Fix:
         lat_deg=float(lat),
         lon_deg=float(lon),
         cov_en_m2=found.cov_en_m2,
-        confidence=_confidence_within(sheet, best, found, radius_m),
+        confidence=place * within(found.place_en_m, ERROR_VARIANCE * found.cov_en_m2, radius_m),
         radius_m=radius_m,
         heading_deg=heading_deg % 360,
         agl_m=found.agl_m,
@@ -61,17 +62,8 @@ def fix_of(search: Search, best: Place) -> Fix:
         pitch_deg=pitch_deg,
         roll_deg=roll_deg,
         pose_cov=found.pose_cov,
+        place_probability=place,
     )
-
-
-def _confidence_within(
-    sheet: SearchedSheet, best: Place, found: "_Exterior", radius_m: float
-) -> float:
-    """That the place is right and the error within the radius."""
-    if sheet.confidence is None:
-        return math.nan
-    covariance = ERROR_VARIANCE * found.cov_en_m2
-    return sheet.confidence(best.scores) * within(found.place_en_m, covariance, radius_m)
 
 
 def _by_camera(sheet: SearchedSheet, view: PreparedView, camera: CameraFound) -> "_Exterior":

@@ -213,13 +213,15 @@ class State(Enum):
 class Estimate:
     """The best cluster of hypotheses. Its arrays are not to be changed.
 
-    `confidence`: probability of being within the radius asked for; `belief`: however wide the
-    cluster. `recognized`: probability that the last view showed the map there. `confirmed`: enough
-    ground was recognized lately. `followed`: from a confirmed track or a reported position."""
+    `confidence`: probability of being within the radius asked for; `place_probability`: however
+    wide the cluster. Both are limited until the track is confirmed; `belief` is not. `recognized`:
+    probability that the last view showed the map there. `confirmed`: enough ground was recognized
+    lately. `followed`: from a confirmed track or a reported position."""
 
     mean: Array
     covariance: Array
     confidence: float
+    place_probability: float
     state: State
     belief: float
     recognized: float
@@ -415,10 +417,19 @@ class Mixture:
             if self._state is State.TRACKING:
                 self._follow(near)
                 follows = True
-        if self._state is not State.TRACKING:
-            confidence = min(confidence, UNCONFIRMED)
         belief = sum(each.share for each in near)
-        return Estimate(mean, covariance, confidence, self._state, belief, seen, confirmed, follows)
+        most = 1.0 if self._state is State.TRACKING else UNCONFIRMED
+        return Estimate(
+            mean,
+            covariance,
+            min(confidence, most),
+            min(belief, most),
+            self._state,
+            belief,
+            seen,
+            confirmed,
+            follows,
+        )
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map, of hypotheses no farther away than it

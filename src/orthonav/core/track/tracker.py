@@ -244,8 +244,8 @@ class Tracker:
         if isinstance(before, Fix) and spread > float(np.trace(before.cov_en_m2)):
             return before
         inside = within(smoothed.mean, smoothed.covariance, self._radius_m(telemetry))
-        belief = min(smoothed.belief, 1.0) * inside
-        return self._fix(smoothed.mean, smoothed.covariance, belief, telemetry, {})
+        place = min(smoothed.belief, 1.0)
+        return self._fix(smoothed.mean, smoothed.covariance, place, place * inside, telemetry, {})
 
     def _radius_m(self, telemetry: Telemetry) -> float:
         high = RADIUS_SHARE * telemetry.agl_m
@@ -263,7 +263,8 @@ class Tracker:
                 "recognized": estimate.recognized,
             }
             mean, covariance = estimate.mean, estimate.covariance
-            outcome = self._fix(mean, covariance, estimate.confidence, telemetry, more)
+            place = estimate.place_probability
+            outcome = self._fix(mean, covariance, place, estimate.confidence, telemetry, more)
             if not self._heading_known:
                 outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
         if self._history is not None:
@@ -583,6 +584,7 @@ class Tracker:
         self,
         mean: Array,
         covariance: Array,
+        place_probability: float,
         confidence: float,
         telemetry: Telemetry,
         more: dict[str, float],
@@ -609,6 +611,7 @@ class Tracker:
             lon_deg=float(lon),
             cov_en_m2=spread,
             confidence=confidence,
+            place_probability=place_probability,
             radius_m=self._radius_m(telemetry),
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.trust import fit_judge
+from benchmarks.integrity import fit_judge
 
 from orthonav.core.localize.confidence import FEATURES, USUAL_CHANCES, RegisteredConfidence
 
