@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-DEGREES = 4.0
+DEGREES = 5.0
 """Degrees of freedom of the distribution of errors."""
 DEFAULT_RISK = 1e-3
 """Probability of an error beyond the protection level."""
