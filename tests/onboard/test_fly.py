@@ -1040,8 +1040,8 @@ def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_st
     views = [each for each in map(json.loads, done.out.splitlines()) if "frame" in each]
     assert done.code == 0 and views
     texts = [line[12:] for line in done.err.splitlines()]
-    plan = [text.partition(":")[0] for text in texts[:3]]
-    assert plan == ["map", "sends", "camera"]
+    plan = [text.partition(":")[0] for text in texts[:6]]
+    assert plan == ["map", "autopilot", "sends", "start", "GNSS", "camera"]
     assert any(text.startswith("searching -> tracking: 46.") for text in texts)
     found = sum(each["withheld"] is None for each in views)
     end = f"end: {len(views)} views, {found} with a position (none is sent)"

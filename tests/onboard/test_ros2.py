@@ -45,7 +45,7 @@ from orthonav.onboard.ros2.arguments import ros_arguments
 from orthonav.onboard.ros2.graph import Definitions
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
-from orthonav.onboard.ros2.reader import Ros2Reader
+from orthonav.onboard.ros2.reader import Ros2Reader, loses_images
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
 
 S = 10**9
@@ -98,7 +98,7 @@ class Reading:
     def problem(self, topic):
         """What is wrong with a topic, None without a problem."""
         self.node.spin(0.02)
-        self.node.check_graph()
+        self.node.check_graph({})
         return self.node.problems.get(topic)
 
     def read(self, seconds=60.0):
@@ -430,6 +430,23 @@ def test_gnss_is_logged_only(peer, reading):
     assert time_ns == 7 * S and ros.NavSatFix.deserialize(cdr) == message
 
 
+@pytest.mark.parametrize(
+    ("arrives", "is_lost"),
+    [
+        (lambda n: n % 10 != 3, False),  # a tenth
+        (lambda n: n % 3 == 0, False),  # a node passes every third one on
+        (lambda n: n % 10 in (0, 1, 5, 9), True),
+        (lambda n: n in (0, 40, 41, 75, 90), True),
+    ],
+)
+def test_lost_images_are_noticed(arrives, is_lost):
+    order = np.random.default_rng(0).permutation(100)  # what arrives first does not matter
+    infos = [int(number) * S // 10 for number in order]
+    images = [int(number) * S // 10 for number in order if arrives(number)]
+    assert loses_images(images, infos) is is_lost
+    assert not loses_images(images, [])
+
+
 def test_another_type_on_a_topic_is_named(peer, reading, caplog):
     peer.advertise("/cam/image_raw", ros.CompressedImage)
     flying = reading()
@@ -669,7 +686,7 @@ def test_a_subscriber_whose_qos_cannot_match_is_named(env, peer, publishing):
     peer.subscribe("/orthonav/fix", ros.NavSatFix, RELIABLE, TRANSIENT_LOCAL)
 
     def found():
-        flying.node.check_graph()
+        flying.node.check_graph({})
         return flying.node.problems.get("/orthonav/fix")
 
     assert "durability" in wait_for(found)

@@ -138,6 +138,12 @@ def test_a_confident_estimate_is_of_high_confidence_and_tracking(
         ({"lat_deg": 90.01}, "latitude"),
         ({"lat_deg": math.nan}, "latitude"),
         ({"lon_deg": -180.5}, "longitude"),
+        ({"cov_en_m2": np.eye(3)}, "covariance"),
+        ({"vel_cov_en": np.ones(2)}, "covariance of the velocity"),
+        ({"confidence": 1.5}, "confidence"),
+        ({"processing_s": math.inf}, "processing time"),
+        ({"alt_std_m": -1.0}, "altitude"),
+        ({"reset_counter": 256}, "reset counter"),
         ({"utc_ns": None}, "time of exposure"),
     ],
 )

@@ -74,7 +74,7 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     text = "images, telemetry and positions by ROS 2 topics, without SOURCE and --autopilot"
     add("--ros2", action="store_true", help=f"{text} (docs/ros2.md)")
     text = "must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE, "
-    text += "--params-file FILE, --log-level LEVEL"
+    text += "--params-file FILE"
     add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARGS", help=text)
 
 

@@ -84,7 +84,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, least)
     else:
         source, graph = _source(options, clocks, link, camera, stopping), None
-    console.quiet |= logging.getLogger("orthonav").level >= logging.WARNING  # --log-level of ROS
     for line in plan_lines(options, opened, least):
         console.say(line)
     camera = camera or source.wait_for_camera()
@@ -383,6 +382,8 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
     terrain, ground = sheet.terrain, "level ground"
     if terrain is not None:
         ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
+    recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
+    telemetry = ", ".join(each for each in (options.autopilot, recorded) if each)
     kinds = dict.fromkeys(options.send or ["global-position"])
     sent = [outputs.KINDS[kind] for kind in kinds] if options.autopilot else []
     sent += ["ROS 2 topics"] if options.ros2 else []
@@ -391,10 +392,22 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
     sent += [f"NMEA to {url}" for url in options.nmea]
     sent += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
     confident = f"; positions of confidence {least:g} or more"
-    return [
+    start = "anywhere on the map"
+    if options.start:
+        lat_deg, lon_deg, std_m = options.start
+        start = f"{lat_deg:.6f}, {lon_deg:.6f} +- {std_m:g} m"
+    if options.state is not None:
+        start = f"position saved in {options.state}, if it is recent, else {start}"
+    lines = [
         f"map: {options.map}, {area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}",
+        f"autopilot: {'telemetry from ROS 2' if options.ros2 else telemetry}",
         f"sends: {', '.join(sent) + confident if sent else 'nothing'}",
+        f"start: {start}",
+        f"GNSS: {'not used' if options.gnss == 'off' else options.gnss}",
     ]
+    if options.log is not None:
+        lines.append(f"log: {options.log}, views: {options.log_views}")
+    return lines
 
 
 def camera_line(options: argparse.Namespace, camera: Camera) -> str:
@@ -404,7 +417,10 @@ def camera_line(options: argparse.Namespace, camera: Camera) -> str:
     width_deg, height_deg = map(math.degrees, angles)
     size = f"{camera.width_px}x{camera.height_px} px, {width_deg:.0f} x {height_deg:.0f} deg"
     given = options.camera or ("camera_info" if options.ros2 else "flight.json")
-    return f"camera: {size} ({given}); images from {'ROS 2' if options.ros2 else options.source}"
+    source, pace = "ROS 2" if options.ros2 else str(options.source), ""
+    if not options.ros2 and not cameras.is_live(source):
+        pace = ", played" if options.pace == 1 else f", played at {options.pace:g} times real time"
+    return f"camera: {size} ({given}); images from {source}{pace}"
 
 
 def gnss_watch(

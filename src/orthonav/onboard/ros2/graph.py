@@ -11,7 +11,7 @@ import importlib
 import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from orthonav.core.errors import MissingExtraError, described
@@ -192,9 +192,10 @@ class Graph(ABC):
     def _mismatches(self) -> dict[str, str]:
         """Topics whose endpoints cannot match now, and why."""
 
-    def check_graph(self) -> None:
-        """Look for endpoints that cannot match now; each problem is logged once."""
-        self.problems = self._mismatches()
+    def check_graph(self, others: Mapping[str, str]) -> None:
+        """Look for endpoints that cannot match now, beside `others`, further problems by topic;
+        each problem is logged once."""
+        self.problems = {**others, **self._mismatches()}
         for topic, text in self.problems.items():
             if (topic, text) not in self._said:
                 self._said.add((topic, text))
