@@ -48,7 +48,7 @@ from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, NewestImage
 from orthonav.onboard.console import Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.health import Level, TelemetryDiagnosis
+from orthonav.onboard.health import Level
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
@@ -123,9 +123,7 @@ class Flight:
             lines=[JsonOut(self.lines), narrator],
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()
-        rest = {
-            name: options.pop(name) for name in ("diagnosis", "start", "fresh") if name in options
-        }
+        rest = {name: options.pop(name) for name in ("start", "fresh") if name in options}
         options = FlyOptions(**options)
         self.runner = Runner(
             self.newest,
@@ -730,22 +728,10 @@ def test_states_and_faults_are_said_with_their_reason_and_a_summary_ends_it(flig
 
 
 def test_a_start_that_is_contradicted_degrades_for_a_while(begin):
-    """First by the diagnosis, then by the track, and half a minute later no more."""
-
-    class Localizer:
-        def locate(self, view, *, heading_known):
-            assert view.telemetry.prior is None or heading_known
-            return fix(48.02, 2.0, heading_deg=30.0)
-
     locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
-    diagnosis = TelemetryDiagnosis(Localizer(), 0.9, lambda work: work(), has_start=True)
-    flight = begin(locator, diagnosis=diagnosis, start=lambda: Prior(48.0, 2.0, 100.0))
+    flight = begin(locator, start=lambda: Prior(48.0, 2.0, 100.0))
     flight.views(40)
     assert flight.reasons() == {"searching"}
-    flight.views(60)
-    assert flight.reasons() == {"searching", "start_mismatch"}
-    flight.views(700)  # by now it may have come there from the start, as far as its speed goes
-    assert flight.reasons() == {"searching", "start_mismatch"}
     locator.state_name, locator.outcome = "tracking", lambda *_: fix(48.02, 2.0, heading_deg=30.0)
     flight.views(20)
     assert flight.reasons() == {"start_mismatch"}

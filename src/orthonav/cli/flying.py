@@ -37,7 +37,6 @@ from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases, Resumed
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
-from orthonav.onboard.health import TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
@@ -135,9 +134,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         clocks,
         link=link,
         sink=sink,
-        diagnosis=TelemetryDiagnosis(
-            localizer, least, has_start=bool(options.start or options.state)
-        ),
         start=start,
         fresh=locator,
         gnss=gnss,

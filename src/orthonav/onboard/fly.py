@@ -32,7 +32,6 @@ from orthonav.onboard.health import (
     Health,
     HealthReporter,
     StartCheck,
-    TelemetryDiagnosis,
     judge,
     mismatch,
     notify,
@@ -105,7 +104,6 @@ class Runner:
         *,
         link: AutopilotLink | None = None,
         sink: "FlightLog | None" = None,
-        diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         fresh: Callable[[], Locator] | None = None,
         gnss: GnssWatch | None = None,
@@ -115,7 +113,7 @@ class Runner:
         `latency`: of a live camera; None where images carry the time of their exposure."""
         self._newest, self._camera, self._locator = newest, camera, locator
         self._publisher, self.options, self._clocks = publisher, options, clocks
-        self._link, self._sink, self._diagnosis = link, sink, diagnosis
+        self._link, self._sink = link, sink
         self._latency = latency
         self._start: Callable[[], Prior | None] | None = start
         self._start_check: StartCheck | None = None
@@ -296,10 +294,6 @@ class Runner:
         self.counter.add_latency(now_ns, (now_ns - image.exposed_ns) / 1e9)
         self._log(lambda sink: sink.result(result))
         self._note(result, telemetry, image.exposed_ns)
-        if self._diagnosis is not None:
-            corrected = self.options.mount.corrected(telemetry) if self.options.mount else telemetry
-            found = result.state in (None, "tracking") and isinstance(outcome, Fix)
-            self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 
     def _from_start(self, view: View) -> View:
@@ -368,7 +362,7 @@ class Runner:
         self._confident_ns = self._clocks.mono_ns()
         self._count("confident")
         if self._start_check is not None:
-            self._start_check.found(fix, self._confident_ns, self._confident_ns, confirmed=True)
+            self._start_check.found(fix, self._confident_ns)
         mount = self.options.mount
         self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
         if not self.options.heading_known:
@@ -471,7 +465,7 @@ class Runner:
         self._count_changes()
         self._save_state()
         texts = [] if self._gnss is None else self._gnss.tick(now_ns)
-        start_off_m = self._start_off_m(now_ns)
+        start_off_m = 0.0 if self._start_check is None else self._start_check.off_m(now_ns)
         health = self.health = self._judged(now_ns, start_off_m)
         plain = self._plain(health, start_off_m)
         self._publisher.health(plain)
@@ -521,7 +515,6 @@ class Runner:
         needs_origin = link is not None and messenger is not None and messenger.needs_origin
         taken_ns = self._image_taken_ns
         image_ns = self._begun_ns if taken_ns is None else taken_ns
-        found = (0.0, 0.0) if self._diagnosis is None else self._diagnosis.mismatch(now_ns)
         state = self._locator.state_name
         if state is None and taken_ns is None:
             state = "searching"
@@ -537,21 +530,12 @@ class Runner:
             synced=link is None or link.sync.is_exact,
             map_unchanged=_file_id(self.options.map_path) == self._map_id,
             map_intact=self.options.map_change() is None,
-            mismatch=found if any(found) else self._mismatch,
+            mismatch=self._mismatch,
             start_off_m=start_off_m,
             gnss=() if self._gnss is None else self._gnss.reasons,
             has_origin=not needs_origin or (link is not None and link.origin is not None),
             latency=None if self._latency is None or taken_ns is None else self._latency.reason,
         )
-
-    def _start_off_m(self, now_ns: int) -> float:
-        check = self._start_check
-        if check is None:
-            return 0.0
-        place = None if self._diagnosis is None else self._diagnosis.place
-        if place is not None:
-            check.found(*place, now_ns, confirmed=False)
-        return check.off_m(now_ns)
 
     def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:
         total = self.counter.total
