@@ -12,7 +12,7 @@ from test_fly import AHEAD_NS, Flight
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import NoFix
-from orthonav.onboard.gnss.biases import Biases, Fault, Resumed, unknown
+from orthonav.onboard.gnss.biases import Biases, Fault, unknown
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
 from orthonav.onboard.state import SavedState, learnt_biases, save
 
@@ -30,7 +30,7 @@ class Watched(Flight):
     """A flight to the north at 10 m/s, whose autopilot sends GPS_RAW_INT; `off_m` is its error."""
 
     def __init__(self, tmp_path, receiver="gps_raw_int", **options):
-        more = {key: options.pop(key) for key in ("known", "correct", "resumed") if key in options}
+        more = {key: options.pop(key) for key in ("known", "correct") if key in options}
         super().__init__(tmp_path, FakeLocator(lambda view: self.seen()), **options)
         self.off_m, self.fix_type, self.receiver, self.north_m = np.zeros(2), 3, receiver, 0.0
         self.watch = GnssWatch(FRAME, live_solutions(self.link.gnss), digest="d", **more)
@@ -192,18 +192,6 @@ def test_positions_are_moved_only_where_asked_known_before_and_plausible(begin, 
         reasons = flight.health().reasons
         assert ("not_corrected" in reasons) is refused
         assert ("map_displaced" in reasons) is (known is spoofed)
-
-
-def test_an_interrupted_flight_is_not_corrected_by_what_it_learnt(begin):
-    """A spoofer could move the positions by a restart of the computer."""
-    before, dragged = known_biases(0.0, 0.0, 2.0, 3600.0), known_biases(12.0, 0.0, 1.0, 9000.0)
-    flight = begin(known={"d": before}, correct=True, resumed=Resumed(dragged, before))
-    flight.off_m = dragged.en_m
-    assert moved_by_correction(flight) == pytest.approx([0.0, 0.0], abs=0.05)
-    saved = flight.watch.maps()["d"]
-    assert saved["mean"][0] == pytest.approx(12.0, abs=0.5)  # it continues to learn
-    flown = saved["flight"]
-    assert flown["before"] == before.to_plain() == flown["reference"]
 
 
 def test_mount_and_latency_move_a_position_by_heading_height_and_velocity():

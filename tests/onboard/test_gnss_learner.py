@@ -15,10 +15,8 @@ from orthonav.onboard.gnss.biases import (
     Biases,
     BiasLearner,
     Difference,
-    Resumed,
     Rolling,
     at_start,
-    before_flight,
     biases_from_plain,
     design,
     unknown,
@@ -179,21 +177,6 @@ def test_many_flights_that_show_nothing_are_no_damage():
     for _ in range(200):
         known = at_start({"map": biases_from_plain(known.to_plain())}, "map", "camera")
     assert known.stds == pytest.approx(unknown().stds)
-
-
-def test_an_interrupted_flight_keeps_its_reference():
-    """A drag-off that was learnt before the restart is undone after it."""
-    start = replace(unknown(), agreed_s=SETTLED_S)
-    learner = BiasLearner(start)
-    for second in range(400):
-        learner.add(difference(second))
-    saved = Resumed(learner.learnt, learner.reference).to_plain(None)
-    before, resumed = before_flight(saved)
-    assert before is None
-    again = BiasLearner(unknown(), resumed)
-    assert again.learnt.mean == pytest.approx(learner.learnt.mean)
-    again.restore()
-    assert not again.learnt.mean.any() and again.learnt.agreed_s == SETTLED_S
 
 
 def test_rolling_is_seen_by_a_change_of_the_turn_rate():

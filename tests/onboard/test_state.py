@@ -10,10 +10,9 @@ import pytest
 
 from orthonav.cli.flying import _learnt_before
 from orthonav.onboard import state
-from orthonav.onboard.gnss.biases import Resumed, unknown
+from orthonav.onboard.gnss.biases import unknown
 from orthonav.onboard.state import (
     SavedState,
-    before_the_flight,
     boot_id,
     learnt_biases,
     load,
@@ -116,22 +115,20 @@ def test_what_was_learnt_of_maps_is_saved_and_survives_without_the_monitor(tmp_p
 
 
 def test_what_a_flight_learnt_counts_after_it(tmp_path):
-    """A restart in flight begins with what was known before the flight."""
+    """A restart in flight begins with what was known before the flight: a spoofer could move the
+    positions otherwise."""
     path = tmp_path / "state.json"
     before, learnt = replace(unknown("c"), agreed_s=2000.0), replace(unknown("c"), agreed_s=4000.0)
     known = {
-        "flown": Resumed(learnt, before).to_plain(before),
-        "first": Resumed(learnt, before).to_plain(None),
+        "flown": {**learnt.to_plain(), "flight": {"before": before.to_plain()}},
+        "first": {**learnt.to_plain(), "flight": {}},
         "other": learnt.to_plain(),
         "damaged": {**learnt.to_plain(), "flight": 3},
     }
     save(path, SAVED, known)
     assert {each.agreed_s for each in learnt_biases(path).values()} == {4000.0}
-    found, resumed = before_the_flight(path, "flown")
+    found = learnt_biases(path, before_last_flight=True)
     assert {name: each.agreed_s for name, each in found.items()} == {"flown": 2000, "other": 4000}
-    assert (resumed.learnt.agreed_s, resumed.reference.agreed_s) == (4000.0, 2000.0)
-    assert before_the_flight(path, "first")[1] is not None
-    assert before_the_flight(path, "other")[1] is None
 
 
 @pytest.mark.parametrize(
@@ -143,12 +140,12 @@ def test_a_recent_state_is_of_the_same_flight(tmp_path, age_s, ran_s, same_fligh
     path = tmp_path / "state.json"
     before, learnt = replace(unknown("c"), agreed_s=2000.0), replace(unknown("c"), agreed_s=4000.0)
     saved = replace(SAVED, boot_id="", saved_utc_ns=UTC_NS + round(ran_s * S))
-    save(path, saved, {"map": Resumed(learnt, before).to_plain(before)})
+    flight = {"before": before.to_plain()}
+    save(path, saved, {"map": {**learnt.to_plain(), "flight": flight}})
     clocks = Clocks(utc_ns=lambda: SAVED.utc_ns + round(age_s * S))
     options = Namespace(state=path, state_max_age_s=300.0)
-    known, resumed = _learnt_before(options, "map", clocks)
+    known = _learnt_before(options, clocks)
     assert known["map"].agreed_s == (2000.0 if same_flight else 4000.0)
-    assert (resumed is not None) is same_flight
 
 
 def test_what_was_learnt_of_many_maps_fits_into_the_file(tmp_path):

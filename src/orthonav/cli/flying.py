@@ -35,7 +35,7 @@ from orthonav.onboard import cameras, outputs, state
 from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.gnss.biases import Biases, Resumed
+from orthonav.onboard.gnss.biases import Biases
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
@@ -440,13 +440,11 @@ def gnss_watch(
     else:
         source = live_solutions(queue)
 
-    known, resumed = _learnt_before(options, digest, clocks)
     return GnssWatch(
         frame,
         source,
         digest=digest,
-        known=known,
-        resumed=resumed,
+        known=_learnt_before(options, clocks),
         setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
         correct=options.gnss == "correct",
         recorded=recorded,
@@ -455,19 +453,17 @@ def gnss_watch(
     )
 
 
-def _learnt_before(
-    options: argparse.Namespace, digest: str, clocks: Clocks
-) -> tuple[Mapping[str, Biases], Resumed | None]:
-    """What was learnt before this flight, and by it, where it was interrupted: the saving program
+def _learnt_before(options: argparse.Namespace, clocks: Clocks) -> Mapping[str, Biases]:
+    """What was learnt before this flight. It was interrupted where the program that saved the state
     stopped at most `--state-max-age-s` ago, or at an unknown time."""
+    saved = state.load(options.state) if options.state else None
     if options.state is None:
-        return {}, None
-    saved = state.load(options.state)
+        return {}
+    stopped_s = 0.0
     if saved is not None:
         stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
-        if stopped_s > options.state_max_age_s:
-            return state.learnt_biases(options.state), None
-    return state.before_the_flight(options.state, digest)
+    same_flight = stopped_s <= options.state_max_age_s
+    return state.learnt_biases(options.state, before_last_flight=same_flight)
 
 
 def start_of(

@@ -41,7 +41,7 @@ from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.mavlink import dialect, status_texts
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
-from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
+from orthonav.onboard.telemetry import Clocks, VehicleState
 
 if TYPE_CHECKING:
     from orthonav.onboard.log import FlightLog
@@ -127,7 +127,6 @@ class Runner:
         self._image_taken_ns: int | None = None
         self._tracked_ns: int | None = None
         self._withheld_ns = 0
-        self._travelled: Travelled | None = None
         self._heights_said = False
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
@@ -212,7 +211,7 @@ class Runner:
             return
         log.warning("time went back by %.1f s: the track begins again", (before_ns - time_ns) / 1e9)
         self._locator, self._start, self._start_check = self._fresh(), self._begin, None
-        self._tracked_ns = self._travelled = None
+        self._tracked_ns = None
         if self.options.heights is not None:
             self.options.heights.observe(time_ns, NoFix("searching", ""), "searching")
 
@@ -264,11 +263,11 @@ class Runner:
             return self._refused(image, known, vehicle)
         if known.below is not None and math.isnan(vehicle.amsl_m):
             vehicle = replace(vehicle, amsl_m=known.below.height_m + known.agl_m)
-        reported, telemetry = known, self._over_gap(known, image, vehicle)
+        reported, telemetry = known, self._over_gap(known, image.exposed_ns)
         view = replace(view, telemetry=telemetry)
         self._log_view(image, view, latency, withheld=False)
         outcome, latency_ms = self._placed(view, reported)
-        self._tracked_ns, self._travelled = image.exposed_ns, vehicle.travelled
+        self._tracked_ns = image.exposed_ns
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
@@ -318,21 +317,14 @@ class Runner:
         except MapFileError:  # reported when the next view needs it
             return vehicle
 
-    def _over_gap(
-        self, telemetry: Telemetry, image: CameraImage, vehicle: VehicleState
-    ) -> Telemetry:
+    def _over_gap(self, telemetry: Telemetry, exposed_ns: int) -> Telemetry:
         """Telemetry whose velocity is the mean since the view before, where that is long ago."""
         before_ns, link = self._tracked_ns, self._link
-        if before_ns is None or telemetry.vel_en_mps is None or vehicle.travelled is None:
+        if self.options.recorded or before_ns is None or link is None:
             return telemetry
-        gap_ns = image.exposed_ns - before_ns
-        if gap_ns <= LONG_GAP_NS:
+        if telemetry.vel_en_mps is None or exposed_ns - before_ns <= LONG_GAP_NS:
             return telemetry
-        # Samples that followed that view were not known then.
-        again = None if link is None else link.state_at(before_ns).travelled
-        moved = vehicle.travelled.since(again or self._travelled)
-        mean = None if moved is None else (moved[0] * 1e9 / gap_ns, moved[1] * 1e9 / gap_ns)
-        return replace(telemetry, vel_en_mps=mean)
+        return replace(telemetry, vel_en_mps=link.mean_velocity(before_ns, exposed_ns))
 
     def _placed(self, view: View, reported: Telemetry) -> tuple[Fix | NoFix, float]:
         try:

@@ -151,6 +151,14 @@ class AutopilotLink:
             state = self.buffer.at(boot_ns)
             return replace(state, vel_std_mps=vel_std_mps, tilt_std_deg=tilt_std_deg)
 
+    def mean_velocity(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
+        """See `TelemetryBuffer.mean_velocity`; times of our clock."""
+        with self._lock:
+            start, end = self.sync.boot_ns(start_ns), self.sync.boot_ns(end_ns)
+            if start is None or end is None:
+                return None
+            return self.buffer.mean_velocity(start, end)
+
     def boot_ns(self, mono_ns: int) -> int | None:
         """Convert a time of our clock to the autopilot's; None while the offset is unknown."""
         with self._lock:

@@ -19,7 +19,7 @@ from orthonav.core.errors import MapFileError, OutputError
 from orthonav.core.files import write_text
 from orthonav.core.mapfile.signature import MAX_SERIAL, Signature
 from orthonav.core.records import Prior
-from orthonav.onboard.gnss.biases import Biases, Resumed, before_flight, biases_from_plain
+from orthonav.onboard.gnss.biases import Biases, before_flight, biases_from_plain
 
 VERSION = 1
 MAX_BYTES = 100_000
@@ -93,26 +93,16 @@ def save(path: Path, saved: SavedState, maps: Mapping[str, Any] | None = None) -
         raise
 
 
-def learnt_biases(path: Path) -> dict[str, Biases]:
-    """What was learnt of maps, by their digest, the latest last; invalid entries are left out."""
-    found = {}
+def learnt_biases(path: Path, *, before_last_flight: bool = False) -> dict[str, Biases]:
+    """What was learnt of maps, by their digest, the latest last; `before_last_flight`: without the
+    flight that saved the file. Invalid entries are left out."""
+    found, read = {}, before_flight if before_last_flight else biases_from_plain
     for digest, plain in _maps_of(path).items():
-        with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
-            found[digest] = biases_from_plain(plain)
+        with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError, AttributeError):
+            biases = read(plain)
+            if biases is not None:
+                found[digest] = biases
     return found
-
-
-def before_the_flight(path: Path, digest: str) -> tuple[dict[str, Biases], Resumed | None]:
-    """As `learnt_biases`, before the flight that saved the file; what that learnt of `digest`."""
-    known, resumed = {}, None
-    for each, plain in _maps_of(path).items():
-        with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
-            before, flown = before_flight(plain)
-            if before is not None:
-                known[each] = before
-            if each == digest:
-                resumed = flown
-    return known, resumed
 
 
 def _maps_of(path: Path) -> dict[str, Any]:

@@ -450,46 +450,21 @@ _BIAS, _GNSS, _LOCAL, _BODY = slice(0, 5), slice(5, 7), slice(7, 9), slice(9, 11
 _STATES = 11
 
 
-@dataclass(frozen=True, eq=False)
-class Resumed:
-    """What a flight had learnt before its process was restarted.
-
-    `learnt`, `reference`: see `BiasLearner`.
-    """
-
-    learnt: Biases
-    reference: Biases
-
-    def to_plain(self, before: Biases | None) -> dict[str, Any]:
-        """Values for strict JSON. `before`: what was known of the map before the flight, if it was
-        known at all."""
-        flight = {"reference": self.reference.to_plain()}
-        if before is not None:
-            flight["before"] = before.to_plain()
-        return {**self.learnt.to_plain(), "flight": flight}
-
-
-def before_flight(plain: Mapping[str, Any]) -> tuple[Biases | None, Resumed | None]:
-    """Inverse of `Resumed.to_plain`: what was known before the flight, and what it had learnt.
-
-    Values without a flight were known before it. Raises as `biases_from_plain`.
-    """
-    learnt, flight = biases_from_plain(plain), plain.get("flight")
+def before_flight(plain: Mapping[str, Any]) -> Biases | None:
+    """What was known before the flight that saved `plain`; None where nothing was. Values without
+    `flight` were known before it. Raises as `biases_from_plain`."""
+    flight = plain.get("flight")
     if flight is None:
-        return learnt, None
-    before = biases_from_plain(flight["before"]) if "before" in flight else None
-    return before, Resumed(learnt, biases_from_plain(flight["reference"]))
+        return biases_from_plain(plain)
+    return biases_from_plain(flight["before"]) if "before" in flight else None
 
 
 class BiasLearner:
     """Learns the biases of one receiver over one map. Mutable; deterministic."""
 
-    def __init__(self, start: Biases, resumed: Resumed | None = None) -> None:
-        """`start` is what is known before the flight; a `resumed` flight continues to learn with
-        the reference that it had."""
-        resumed = resumed or Resumed(start, start)
-        self._filter = _Filter(resumed.learnt)
-        self._reference = resumed.reference
+    def __init__(self, start: Biases) -> None:
+        """`start`: what is known before the flight."""
+        self._filter, self._reference = _Filter(start), start
         self._waiting: deque[Difference] = deque()
 
     @property

@@ -29,7 +29,6 @@ from orthonav.onboard.gnss.biases import (
     DifferenceWindow,
     Fault,
     Finding,
-    Resumed,
     Rolling,
     unknown,
 )
@@ -266,17 +265,11 @@ PENDING = 100
 class GnssMonitor:
     """Compares one receiver with the map. Mutable."""
 
-    def __init__(
-        self,
-        frame: LocalFrame,
-        start: Biases | None = None,
-        resumed: Resumed | None = None,
-    ) -> None:
-        """`frame`: plane of the map. `start`: biases known before the flight. `resumed`: what it
-        had learnt when it was interrupted."""
+    def __init__(self, frame: LocalFrame, start: Biases | None = None) -> None:
+        """`frame`: plane of the map. `start`: biases known before the flight."""
         self._frame = frame
         self._receiver, self._window = Receiver(), DifferenceWindow()
-        self._learner = BiasLearner(start or unknown(), resumed)
+        self._learner = BiasLearner(start or unknown())
         self._rolling = Rolling()
         self._pending: deque[MapPosition] = deque(maxlen=PENDING)
         self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=SOLVED)

@@ -23,7 +23,6 @@ from orthonav.onboard.gnss.biases import (
     SETTLED_S,
     Array,
     Biases,
-    Resumed,
     at_start,
     design,
 )
@@ -75,7 +74,6 @@ class GnssWatch:
         *,
         digest: str = "",
         known: Mapping[str, Biases] = MappingProxyType({}),
-        resumed: Resumed | None = None,
         setup: str = "",
         correct: bool = False,
         recorded: bool = False,
@@ -83,8 +81,7 @@ class GnssWatch:
         utc_ahead_ns: Callable[[], int] = lambda: 0,
     ) -> None:
         """`frame`: plane of the map. `digest`: of the map; `known`: biases by digest, the latest
-        last. `resumed`: what this flight had learnt when it was interrupted. `setup`: identifies
-        camera, mount and stated latency.
+        last. `setup`: identifies camera, mount and stated latency.
 
         `correct`: correct positions by the biases known before the flight, if they are usable; what
         is learnt in this flight never moves a position, nor after a restart. `recorded`: times are
@@ -100,7 +97,6 @@ class GnssWatch:
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
         self._now_ns, self._has_failed = 0, False
-        self._resumed = resumed if resumed and resumed.learnt.setup == setup else None
         settled = self._start.agreed_s >= SETTLED_S
         self._corrects = correct and settled and self._start.is_usable
         self._refuses = correct and settled and not self._start.is_usable
@@ -184,15 +180,8 @@ class GnssWatch:
 
     @property
     def _learnt(self) -> Biases:
-        return self._resumable.learnt
-
-    @property
-    def _resumable(self) -> Resumed:
-        """What a restart continues from: of the first receiver."""
         first = self._monitors.get(0)
-        if first is None:
-            return self._resumed or Resumed(self._start, self._start)
-        return Resumed(first.learnt, first.reference)
+        return self._start if first is None else first.learnt
 
     @property
     def code(self) -> int:
@@ -206,10 +195,13 @@ class GnssWatch:
         return math.nan if first is None else math.hypot(*first.status.difference_en_m)
 
     def maps(self) -> dict[str, Any]:
-        """Biases for the state file: those of this map, learnt further, after the others."""
+        """Biases for the state file: those of this map after the others, as learnt in this flight
+        and, for a restart, as known before it."""
         made = {name: each.to_plain() for name, each in self._known.items() if name != self._digest}
         if self._digest and self._learnt.agreed_s > 0:
-            made[self._digest] = self._resumable.to_plain(self._known.get(self._digest))
+            before = self._known.get(self._digest)
+            flight = {} if before is None else {"before": before.to_plain()}
+            made[self._digest] = {**self._learnt.to_plain(), "flight": flight}
         return made
 
     def plain(self) -> list[dict[str, Any]]:
@@ -222,9 +214,7 @@ class GnssWatch:
         self._now_ns = max(self._now_ns, now_ns) if not self._recorded else now_ns
         for sample in self._solutions(now_ns):
             if sample.receiver not in self._monitors:
-                resumed = self._resumed if sample.receiver == 0 else None
-                made = GnssMonitor(self._frame, self._start, resumed=resumed)
-                self._monitors[sample.receiver] = made
+                self._monitors[sample.receiver] = GnssMonitor(self._frame, self._start)
             self._monitors[sample.receiver].sample(sample)
             if sample.receiver == 0:
                 self._last = sample

@@ -67,7 +67,8 @@ class NavigationEstimate:
             )
         invalid = {
             "covariance": np.shape(self.cov_en_m2) != (2, 2),
-            "covariance of the velocity": np.shape(self.vel_cov_en) not in ((), (2, 2)),
+            "covariance of the velocity": self.vel_cov_en is not None
+            and np.shape(self.vel_cov_en) != (2, 2),
             "confidence": self.confidence < 0 or self.confidence > 1,  # NaN: not known
             "processing time": not math.isfinite(self.processing_s),
             "standard deviation of the altitude": self.alt_std_m < 0,

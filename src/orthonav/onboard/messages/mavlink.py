@@ -9,9 +9,7 @@ Height, attitude and vertical velocity of messages in the autopilot's local fram
 """
 
 import math
-from bisect import bisect_right
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
 
@@ -51,13 +49,9 @@ _FRAME_GLOBAL = 0
 _CMD_EXTERNAL_POSITION_ESTIMATE, _CMD_REQUEST_MESSAGE = 43003, 512
 TEXT_MAX = 50
 """Characters of one STATUSTEXT."""
-_LEAPS = (
-    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01"),
-    *("1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01"),
-    *("1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
-)
-"""Days that began after a leap second, by IERS Bulletin C; a new one must be added. GPS time
-equalled UTC on 1980-01-06 and has none."""
+_GPS_EPOCH_UNIX_S, _LEAP_S, _LEAP_UNIX_S = 315_964_800, 18, 1_483_228_800
+"""1980-01-06; GPS time minus UTC, and since when: a new leap second (IERS Bulletin C) changes
+both."""
 
 
 @dataclass(frozen=True)
@@ -326,23 +320,14 @@ def _hdop(eph_m: float, hdop_m: float | None) -> float:
     return min(eph_m / hdop_m, 99.99)
 
 
-def _unix_s(day: str) -> int:
-    return int(datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp())
-
-
-_LEAPS_UNIX_S = tuple(_unix_s(day) for day in _LEAPS)
-_EPOCH_UNIX_S = _unix_s("1980-01-06")
 _WEEK_MS = 7 * 86_400_000
 
 
 def gps_time(utc_ns: int) -> tuple[int, int]:
-    """GPS week (without rollover) and time of week in ms; (0, 0), not known, before 1980-01-06."""
-    utc_ms = utc_ns // 1_000_000
-    leaps = bisect_right(_LEAPS_UNIX_S, utc_ms // 1000)
-    since_epoch_ms = utc_ms - _EPOCH_UNIX_S * 1000 + leaps * 1000
-    if since_epoch_ms < 0:
+    """GPS week (without rollover) and time of week in ms; (0, 0), not known, before 2017."""
+    if utc_ns < _LEAP_UNIX_S * 10**9:  # a computer whose clock was not set
         return 0, 0
-    return divmod(since_epoch_ms, _WEEK_MS)
+    return divmod(utc_ns // 1_000_000 + 1000 * (_LEAP_S - _GPS_EPOCH_UNIX_S), _WEEK_MS)
 
 
 # In the local frame of the autopilot.
