@@ -52,7 +52,7 @@ from orthonav.onboard.health import Level
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger, Publisher
+from orthonav.onboard.outputs import JsonOut, Messenger, Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
 from wire import decode
 
@@ -109,7 +109,6 @@ class Flight:
         clocks = self.time.clocks
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
         self.gate = Gate(rules or GateRules(), Clock.BOOT)
-        messages = MessageOptions(kinds)
         self.lines, self.said, self.newest = tmp_path / "lines.jsonl", Said(), NewestImage()
         narrator = Narrator(
             *(self.said, clocks, self.newest, "images from 0", self.link, "udpin:1"),
@@ -119,7 +118,7 @@ class Flight:
         publisher = Publisher(
             self.gate,
             clocks,
-            messenger=Messenger(messages, self.gate, self.link, clocks),
+            messenger=Messenger(self.gate, self.link, clocks, kinds=kinds),
             lines=[JsonOut(self.lines), narrator],
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()

@@ -517,8 +517,8 @@ class Publishing:
         wait_for(self.matched, "discovery")
 
     def matched(self):
-        wanted = [w for w in self.node._writers if not w.topic.endswith("/origin")]
-        return all(w.writer.get_publication_matched_status().current_count for w in wanted)
+        wanted = [w for w in self.node._writers if not w[0].endswith("/origin")]
+        return all(w[2].get_publication_matched_status().current_count for w in wanted)
 
     def publish(self, outcome, stamp_ns=7 * S, reported=None):
         self.time.go(0.2)

@@ -307,17 +307,6 @@ def _publisher(
         send_coasting=options.send_coasting,
     )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
-    chosen = outputs.MessageOptions(
-        kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
-        clock=Clock(options.stamp),
-        sensor_id=options.sensor_id,
-        gps_id=options.gps_id,
-        satellites=options.satellites,
-        hdop_m=options.hdop_m,
-        min_std_m=options.min_std_m,
-        min_confidence=least,
-        origin=Origin(*options.origin) if options.origin else None,
-    )
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [outputs.NmeaOut(outputs.open_sink(url), quality=quality) for url in options.nmea]
@@ -327,7 +316,18 @@ def _publisher(
         ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
-    messenger = None if link is None else outputs.Messenger(chosen, gate, link, clocks)
+    messenger = None
+    if link is not None:
+        messenger = outputs.Messenger(
+            *(gate, link, clocks),
+            kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
+            clock=Clock(options.stamp),
+            sensor_id=options.sensor_id,
+            gps={name: getattr(options, name) for name in ("gps_id", "satellites", "hdop_m")},
+            min_std_m=options.min_std_m,
+            min_confidence=least,
+            origin=Origin(*options.origin) if options.origin else None,
+        )
     return outputs.Publisher(
         gate,
         clocks,

@@ -25,7 +25,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -272,19 +272,12 @@ class Difference:
         return self.en_m - self.design @ known.mean
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A change of the difference that is a fault.
-
-    `onset_s`: time at which it began. `en_m`: size. `std_m`: standard deviation along its
-    direction. `excess`: by how many of them it exceeds what is no fault.
-    """
+class Finding(NamedTuple):
+    """A change of the difference that is a fault: when it began, and its size."""
 
     fault: Fault
     onset_s: float
     en_m: tuple[float, float]
-    std_m: float
-    excess: float
 
 
 class DifferenceWindow:
@@ -353,7 +346,7 @@ class DifferenceWindow:
             return None
         fault, onset = named[best]
         east, north = sizes[best].tolist()
-        return Finding(fault, onset, (east, north), float(std[best]), float(excess[best]))
+        return Finding(fault, onset, (east, north))
 
     def _signatures(self, times: Array) -> tuple[Array, list[tuple[Fault, float]]]:
         """Unit changes (N, K): constant, steps, and ramps that end at 1; their names and onsets."""

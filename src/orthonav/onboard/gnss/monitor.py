@@ -460,7 +460,7 @@ class GnssMonitor:
         if len(recent) < RECENT_S / 2 or off_m < LARGEST_M + AGREE_SIGMAS * std_m:
             return None
         begin_s = self._window.values[0].time_s
-        return Finding(Fault.OFFSET, begin_s, (east, north), std_m, (off_m - LARGEST_M) / std_m)
+        return Finding(Fault.OFFSET, begin_s, (east, north))
 
     def _crept(self, value: Difference) -> Finding | None:
         """A drag-off that was slow enough to be learnt: the biases left their reference."""
@@ -469,10 +469,9 @@ class GnssMonitor:
         east, north = moved.tolist()
         _, cov = reference.correction(value.design)
         std_m = math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
-        excess = (math.hypot(east, north) - MULTIPATH_M) / std_m
-        if excess <= FAULT_SIGMAS:
+        if math.hypot(east, north) <= MULTIPATH_M + FAULT_SIGMAS * std_m:
             return None
-        return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north), std_m, excess)
+        return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north))
 
     def _std_m(self, value: Difference, known: Biases) -> float:
         """Standard deviation of a difference from the known biases, along the worst axis."""

@@ -11,7 +11,6 @@ https://design.ros2.org/articles/Node_to_Participant_mapping.html.
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -21,7 +20,6 @@ import numpy as np
 from orthonav.core.errors import OutputError
 from orthonav.onboard.ros2.arguments import RosArguments
 from orthonav.onboard.ros2.graph import (
-    Definitions,
     Graph,
     Handler,
     Writer,
@@ -33,30 +31,6 @@ TOPIC, KIND = "ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo"
 USER_DATA = b"enclave=/;"
 """Of a participant with nodes of ROS 2."""
 _HUMBLE_BYTES = 24
-
-
-def _node_entities(
-    definitions: Definitions,
-    arguments: RosArguments,
-    participant: Any,
-    readers: Sequence[Any],
-    writers: Sequence[Any],
-) -> Any:
-    """The message with the one node of a DDS participant, its readers and its writers."""
-    count = _HUMBLE_BYTES if arguments.distro == "humble" else 16
-
-    def gid(entity: Any) -> Any:
-        data = np.frombuffer(entity.guid.bytes.ljust(count, b"\0"), np.uint8)
-        return definitions.new("rmw_dds_common/msg/Gid", data=data)
-
-    node = definitions.new(
-        "rmw_dds_common/msg/NodeEntitiesInfo",
-        node_namespace=arguments.namespace,
-        node_name=arguments.node,
-        reader_gid_seq=[gid(each) for each in readers],
-        writer_gid_seq=[gid(each) for each in writers],
-    )
-    return definitions.new(KIND, gid=gid(participant), node_entities_info_seq=[node])
 
 
 log = logging.getLogger(__name__)
@@ -79,26 +53,6 @@ _ALIVE = 16
 """State of an instance in DDS."""
 
 
-@dataclass(frozen=True)
-class Subscription:
-    """A topic that is read: its resolved name, message type, DDS reader and handler."""
-
-    topic: str
-    kind: str
-    reader: Any
-    depth: int
-    handler: Handler
-
-
-@dataclass(frozen=True)
-class Publication:
-    """A topic that is written: its name, message type and DDS writer."""
-
-    topic: str
-    kind: str
-    writer: Any
-
-
 class Node(Graph):
     """Reads and writes topics of one DDS domain."""
 
@@ -111,8 +65,8 @@ class Node(Graph):
         self._domain = self._opened(domain, arguments)
         made = self._qos.Qos(self._qos.Policy.Userdata(USER_DATA))
         self._participant = domain.DomainParticipant(arguments.domain_id, made)
-        self._subscriptions: list[Subscription] = []
-        self._writers: list[Publication] = []
+        self._subscriptions: list[tuple[str, str, Any, int, Handler]] = []
+        self._writers: list[tuple[str, str, Any]] = []
         self._conditions: list[Any] = []
         self._names, _ = self._writer(TOPIC, KIND, depth=1, latched=True)
         self._waitset = self._core.WaitSet(self._participant)
@@ -134,18 +88,18 @@ class Node(Graph):
         mask = states.ViewState.Any | states.InstanceState.Any | states.SampleState.NotRead
         self._conditions.append(states.ReadCondition(reader, mask))
         self._waitset.attach(self._conditions[-1])
-        self._subscriptions.append(Subscription(topic, kind, reader, depth, handler))
+        self._subscriptions.append((topic, kind, reader, depth, handler))
         self._announce()
 
     def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
         write, made = self._writer(f"rt{topic}", kind, depth=depth, latched=latched)
-        self._writers.append(Publication(topic, kind, made))
+        self._writers.append((topic, kind, made))
         self._announce()
         return write
 
     def spin(self, timeout_s: float) -> int:
         self._waitset.wait(round(timeout_s * 1e9))
-        return sum(self._taken(each) for each in self._subscriptions)
+        return sum(self._taken(*each) for each in self._subscriptions)
 
     def close(self) -> None:
         del self._publishers, self._subscribers, self._names
@@ -178,25 +132,33 @@ class Node(Graph):
         found: dict[str, str] = {}
         self._publishers.update()
         self._subscribers.update()
-        for each in self._subscriptions:
-            why = _unmatched(each.reader.get_requested_incompatible_qos_status(), "a publisher")
-            matched = each.reader.get_matched_publications()
-            for other in self._publishers.others(each.topic, matched):
-                self._mismatch(found, each.topic, each.kind, other, why)
-        for writer in self._writers:
-            why = _unmatched(writer.writer.get_offered_incompatible_qos_status(), "a subscriber")
-            matched = writer.writer.get_matched_subscriptions()
-            for other in self._subscribers.others(writer.topic, matched):
-                self._mismatch(found, writer.topic, writer.kind, other, why)
+        for topic, kind, reader, _, _ in self._subscriptions:
+            why = _unmatched(reader.get_requested_incompatible_qos_status(), "a publisher")
+            for other in self._publishers.others(topic, reader.get_matched_publications()):
+                self._mismatch(found, topic, kind, other, why)
+        for topic, kind, writer in self._writers:
+            why = _unmatched(writer.get_offered_incompatible_qos_status(), "a subscriber")
+            for other in self._subscribers.others(topic, writer.get_matched_subscriptions()):
+                self._mismatch(found, topic, kind, other, why)
         return found
 
     def _announce(self) -> None:
         """Tell the graph which readers and writers belong to this node."""
-        readers = [each.reader for each in self._subscriptions]
-        writers = [each.writer for each in self._writers]
-        own = self._participant
-        message = _node_entities(self.definitions, self.arguments, own, readers, writers)
-        self._names(message)
+        count = _HUMBLE_BYTES if self.arguments.distro == "humble" else 16
+
+        def gid(entity: Any) -> Any:
+            data = np.frombuffer(entity.guid.bytes.ljust(count, b"\0"), np.uint8)
+            return self.definitions.new("rmw_dds_common/msg/Gid", data=data)
+
+        node = self.definitions.new(
+            "rmw_dds_common/msg/NodeEntitiesInfo",
+            node_namespace=self.arguments.namespace,
+            node_name=self.arguments.node,
+            reader_gid_seq=[gid(reader) for _, _, reader, _, _ in self._subscriptions],
+            writer_gid_seq=[gid(writer) for _, _, writer in self._writers],
+        )
+        own = gid(self._participant)
+        self._names(self.definitions.new(KIND, gid=own, node_entities_info_seq=[node]))
 
     def _writer(self, name: str, kind: str, *, depth: int, latched: bool) -> tuple[Writer, Any]:
         qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
@@ -225,14 +187,12 @@ class Node(Graph):
             policy.Userdata(self.definitions.type_hash(kind)),
         )
 
-    def _taken(self, subscription: Subscription) -> int:
-        handled = 0
-        for sample in subscription.reader.take(subscription.depth):
-            cdr = getattr(sample, "cdr", None)
-            if cdr is not None:  # else it only says that a writer left
-                self._handle(subscription.topic, subscription.kind, subscription.handler, cdr)
-                handled += 1
-        return handled
+    def _taken(self, topic: str, kind: str, reader: Any, depth: int, handler: Handler) -> int:
+        samples = [getattr(sample, "cdr", None) for sample in reader.take(depth)]
+        received = [cdr for cdr in samples if cdr is not None]  # None only says that a writer left
+        for cdr in received:
+            self._handle(topic, kind, handler, cdr)
+        return len(received)
 
 
 class Endpoints:
