@@ -97,7 +97,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     wanted = None if options.ros2 else f"images from {options.source}"  # ROS 2 has its own text
     narrator = Narrator(
         *(console, clocks, newest, wanted, link, options.autopilot),
-        is_live=options.ros2 or cameras.is_live(options.source),
         sends=not options.dry_run and (link is not None or graph is not None),
     )
     publisher = _publisher(options, clocks, link, least, graph, narrator, digest)

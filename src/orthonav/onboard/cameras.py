@@ -293,15 +293,12 @@ class NewestImage:
         self._condition = threading.Condition()
         self._picture: CameraImage | None = None
         self.taken = self.replaced = self.outages = 0
-        self.size_px: tuple[int, int] | None = None
         self.ended = False
 
     def put(self, image: CameraImage) -> None:
         with self._condition:
             self.replaced += self._picture is not None
             self.taken += 1
-            if image.grey is not None:
-                self.size_px = image.grey.shape[1], image.grey.shape[0]
             self._picture = image
             self._condition.notify()
 
