@@ -275,7 +275,7 @@ class FaultFlight:
         self.time, self.boot_ahead_ns = Time(), AHEAD_NS
         clocks = self.time.clocks
         self.port, self.autopilot, self.other = Port(), Autopilot(), Autopilot(2)
-        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
+        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)  # type: ignore[arg-type]  # a fake of it
         self.gate = Gate(GateRules(), Clock.BOOT)
         messenger = Messenger(self.gate, self.link, clocks)
         publisher = Publisher(self.gate, clocks, messenger=messenger)

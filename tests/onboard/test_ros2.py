@@ -42,8 +42,7 @@ from orthonav.onboard.messages.estimate import (
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
-from orthonav.onboard.ros2.graph import Definitions
-from orthonav.onboard.ros2.node import Node
+from orthonav.onboard.ros2.node import Definitions, Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader, loses_images
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState

@@ -157,8 +157,6 @@ class EventCounter:
 
 
 class HealthReporter:
-    """Decides when a change of health is sent as text. Mutable."""
-
     def __init__(self) -> None:
         self._reported: Health | None = None
         self._reported_ns: int | None = None

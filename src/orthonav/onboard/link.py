@@ -142,7 +142,6 @@ class AutopilotLink:
             return None if newest is None else self.sync.mono_ns(newest)
 
     def state_at(self, exposed_ns: int) -> VehicleState:
-        """State that the autopilot reported for a time of our clock."""
         with self._lock:
             boot_ns = self.sync.boot_ns(exposed_ns)
             if boot_ns is None:
@@ -160,7 +159,6 @@ class AutopilotLink:
             return self.buffer.mean_velocity(start, end)
 
     def boot_ns(self, mono_ns: int) -> int | None:
-        """Convert a time of our clock to the autopilot's; None while the offset is unknown."""
         with self._lock:
             return self.sync.boot_ns(mono_ns)
 

@@ -331,7 +331,6 @@ class ClockSync:
         return False
 
     def _off_ns(self, mono_ns: int, reported_ns: int) -> int:
-        """How far a reported time is from the expected one; 0 where none is expected."""
         expected_ns = self.boot_ns(mono_ns)
         return 0 if expected_ns is None else abs(reported_ns - expected_ns)
 

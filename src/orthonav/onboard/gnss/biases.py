@@ -260,7 +260,6 @@ class Difference:
     rolling_std_m: float = 0.0
 
     def rolling(self, std_m: float) -> "Difference":
-        """The same with at least this error by rolling."""
         return replace(self, rolling_std_m=max(self.rolling_std_m, std_m))
 
     @cached_property
@@ -268,7 +267,6 @@ class Difference:
         return design(self.heading_rad, self.agl_m, self.vel_en_mps)
 
     def residual(self, known: Biases) -> Array:
-        """Difference (2,) that the biases do not explain."""
         return self.en_m - self.design @ known.mean
 
 
@@ -304,7 +302,6 @@ class DifferenceWindow:
             self._old.popleft()
 
     def widen(self, rolling_std_m: float) -> None:
-        """Give the newest value at least this error by rolling."""
         if self._new:
             self._new[-1] = self._new[-1].rolling(rolling_std_m)
 
@@ -419,7 +416,6 @@ class Rolling:
 
 
 def _change_of_rate(first: Difference, middle: Difference, last: Difference) -> float:
-    """Magnitude of the change of the turn rate per second; 0 where it is not known."""
     before_s, after_s = middle.time_s - first.time_s, last.time_s - middle.time_s
     if not (0 < before_s <= LARGEST_GAP_S and 0 < after_s <= LARGEST_GAP_S):
         return 0.0
@@ -479,7 +475,6 @@ class BiasLearner:
             self._reference = self.learnt
 
     def widen(self, rolling_std_m: float) -> None:
-        """Give the newest value at least this error by rolling."""
         if self._waiting:
             self._waiting[-1] = self._waiting[-1].rolling(rolling_std_m)
 

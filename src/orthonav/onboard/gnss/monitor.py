@@ -88,7 +88,6 @@ class GnssStatus:
 
     @property
     def reason(self) -> str | None:
-        """Reason in the health; None while there is no alarm."""
         if self.state is GnssState.RETURNING:
             return RETURNING
         return self.fault.value if self.state is GnssState.ALARM and self.fault else None
@@ -140,8 +139,6 @@ class _Point:
 
 
 class Receiver:
-    """Checks of one receiver. Mutable; deterministic."""
-
     def __init__(self) -> None:
         self._points: list[_Point] = []
         self._heard_ns: int | None = None
@@ -263,8 +260,6 @@ PENDING = 100
 
 
 class GnssMonitor:
-    """Compares one receiver with the map. Mutable."""
-
     def __init__(self, frame: LocalFrame, start: Biases | None = None) -> None:
         """`frame`: plane of the map. `start`: biases known before the flight."""
         self._frame = frame
@@ -453,7 +448,6 @@ class GnssMonitor:
         return found.fault
 
     def _too_far(self, recent: list[Difference], value: Difference) -> Finding | None:
-        """A difference that no displacement of a map explains."""
         others = self._learner.learnt.without_displacement()
         east, north = _residual(recent, others).tolist()
         off_m, std_m = math.hypot(east, north), self._std_m(value, others)
@@ -481,7 +475,6 @@ class GnssMonitor:
         return math.sqrt(worst_m2 + gnss_m**2 + value.map_std_m**2)
 
     def _velocity_fault(self) -> Fault | None:
-        """Whether the receiver's velocity contradicts its positions."""
         gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-VELOCITY_S / GNSS_TAU_S))
         drift_m2 = (VELOCITY_STD_MPS * VELOCITY_S) ** 2
         own_m = self._receiver.residual_over(VELOCITY_S)
@@ -500,7 +493,6 @@ class GnssMonitor:
 
 
 def _jumped(before: MapPosition, now: MapPosition) -> bool:
-    """Whether the map's position left the velocity of its track."""
     seconds = (now.time_ns - before.time_ns) * NANOSECONDS
     velocities = [v for v in (before.vel_en_mps, now.vel_en_mps) if v is not None]
     if not 0 < seconds <= GAP_S or not velocities:
@@ -511,7 +503,6 @@ def _jumped(before: MapPosition, now: MapPosition) -> bool:
 
 
 def _residual(values: list[Difference], known: Biases) -> Array:
-    """Mean (2,) of what the biases do not explain."""
     return np.asarray(np.mean([each.residual(known) for each in values], axis=0))
 
 

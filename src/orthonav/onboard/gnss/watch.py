@@ -44,7 +44,6 @@ Solutions = Callable[[int], list[GnssSample]]
 
 
 def live_solutions(queue: deque[GnssSample]) -> Solutions:
-    """Solutions that another thread puts into a queue."""
     return lambda until_ns: [queue.popleft() for _ in range(len(queue))]
 
 
@@ -185,7 +184,6 @@ class GnssWatch:
 
     @property
     def code(self) -> int:
-        """Code of the first receiver with a fault; 0 without one."""
         return next((m.status.code for m in self._monitors.values() if m.status.code), 0)
 
     @property
@@ -267,7 +265,6 @@ def _velocity(fix: Fix) -> Array | None:
 
 
 def _why_not(known: Biases) -> str:
-    """Why biases known before a flight are not used."""
     if known.agreed_s < SETTLED_S:
         return f"GNSS agreed for {known.agreed_s / 60:.0f} min, {SETTLED_S / 60:.0f} are needed"
     learnt = f"the learnt displacement of the map is {math.hypot(*known.en_m):.0f} m"
@@ -279,7 +276,6 @@ def _why_not(known: Biases) -> str:
 def _change(
     name: str, before: GnssStatus, now: GnssStatus, correction_en_m: Array
 ) -> GnssText | None:
-    """Message about a change; None without one that matters to an operator."""
     if now.state is GnssState.ALARM and (
         before.state is not GnssState.ALARM or before.fault != now.fault
     ):
@@ -332,7 +328,6 @@ def _bias_evidence(learnt: Biases) -> dict[str, float]:
 
 
 def _plain_biases(learnt: Biases) -> dict[str, Any]:
-    """What was learnt, for the line of health."""
     (east, _), (north, _), pitch, roll, latency = _shown(learnt)
     place = {"east_m": east, "north_m": north, "std_m": learnt.std_m, "agreed_s": learnt.agreed_s}
     mount = dict(zip(("pitch_deg", "pitch_std_deg"), pitch, strict=True))

@@ -224,7 +224,6 @@ def _values_of_file(path: Path, full_name: str) -> Iterator[tuple[str, str]]:
 
 
 def _flat(values: Mapping[Any, Any], separator: str) -> Iterator[tuple[str, str]]:
-    """Leaves of nested tables, by their names joined."""
     for name, value in values.items():
         if isinstance(value, dict):
             for inner, leaf in _flat(value, separator):

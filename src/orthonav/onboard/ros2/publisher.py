@@ -17,7 +17,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.onboard.messages.estimate import NavigationEstimate, floored
 from orthonav.onboard.messages.mavlink import require_confident
-from orthonav.onboard.ros2.graph import Graph
+from orthonav.onboard.ros2.node import Graph
 from orthonav.onboard.telemetry import VehicleState
 
 NOT_MEASURED_RAD2 = math.pi**2
@@ -75,7 +75,6 @@ class Ros2Publisher:
         return "NavSatFix", "PoseWithCovarianceStamped"
 
     def health(self, plain: dict[str, Any]) -> None:
-        """Publish the health, and the problems of the topics."""
         new = self._node.definitions.new
         problems = {f"topic {name}": text for name, text in self._node.problems.items()}
         damaged = {f"damaged on {name}": n for name, n in self._node.undecodable.items()}
@@ -112,7 +111,6 @@ class Ros2Publisher:
         )
 
     def _altitude_m(self, vehicle: VehicleState) -> float:
-        """Altitude of the fix, as its parameter asks for; NaN where that is not known."""
         chosen = self._parameters.altitude
         if chosen == "terrain":
             return vehicle.amsl_m

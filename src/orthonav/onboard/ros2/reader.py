@@ -33,7 +33,7 @@ from orthonav.core.geo.attitude import (
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import NoFix
 from orthonav.onboard.cameras import CameraImage
-from orthonav.onboard.ros2.graph import TIME_NS, Graph
+from orthonav.onboard.ros2.node import TIME_NS, Graph
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
 
 log = logging.getLogger(__name__)
@@ -76,8 +76,6 @@ def loses_images(image_stamps_ns: Sequence[int], info_stamps_ns: Sequence[int]) 
 
 @dataclass(frozen=True, eq=False)
 class _WaitingImage:
-    """An image that waits for its telemetry since `arrived_ns` of our clock."""
-
     message: Any
     stamp_ns: int
     arrived_ns: int
