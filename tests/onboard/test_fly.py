@@ -211,9 +211,9 @@ def begin(tmp_path):
 
 
 @pytest.fixture
-def flight(begin, tmp_path):
+def flight(begin):
     """A flight after three seconds without faults."""
-    made = begin(map_path=tmp_path)
+    made = begin()
     made.views(LEAD)
     made.port.gone.clear()
     return made
@@ -476,19 +476,6 @@ def test_a_large_mismatch_of_heading_or_height_degrades(flight):
     assert flight.reasons() == {"height_mismatch"}
 
 
-def test_a_removed_map_file_degrades(begin, tmp_path):
-    path = tmp_path / "area.onav"
-    path.write_bytes(b"map")
-    flight = begin(map_path=path)
-    flight.views(60)
-    assert flight.health().level is Level.OK
-    path.unlink()
-    flight.views(11)
-    assert flight.reasons() == {"map_file_changed"}
-    path.write_bytes(b"another")  # the flight still uses the old one
-    assert flight.health().reasons in ((), ("map_file_changed",))
-
-
 def test_a_map_changed_in_place_fails_and_stops_positions(begin):
     changes = [None]
     flight = begin(map_change=lambda: changes[0])
@@ -568,8 +555,6 @@ def test_the_position_is_saved_about_once_a_second(begin, tmp_path, monkeypatch)
     flight.views(130, grey=BAD["too_dark"])
     later = states.load(path)
     assert later.mono_ns - saved.mono_ns < S
-    clock = flight.time.clocks.utc_ns(), flight.time.now_ns, states.boot_id()
-    assert later.stopped_s(*clock) < 11 < later.age_s(*clock)
     monkeypatch.setattr(states, "save", lambda *a: (_ for _ in ()).throw(OSError("read only")))
     flight.views(11)
     assert "state_not_saved" in flight.reasons()

@@ -37,7 +37,7 @@ FAILED = {
     "no_telemetry": {"telemetry_age_s": 4.0},
     "wrong_camera": counted(wrong_camera=1),
     "internal_errors": counted(internal_error=30),
-    "map_file_changed": {"map_unchanged": False, "map_intact": False},
+    "map_file_changed": {"map_intact": False},
 }
 DEGRADED = {
     "heading_mismatch": {"mismatch": (-170.0, 0.0)},
@@ -51,7 +51,6 @@ DEGRADED = {
     "camera_lost": counted(camera_lost=1),
     "clock_jumped": counted(clock_jump=1),
     "not_synchronized": {"synced": False},
-    "map_file_changed": {"map_unchanged": False},
     "slow_vision": counted(slow_vision=3),
     "no_origin": {"has_origin": False},
     "incomplete_message": counted(incomplete=3),
@@ -80,7 +79,7 @@ def test_every_fault_has_a_reason(level, reason, seen):
 
 
 def test_reasons_of_failed_come_first():
-    seen = judged(image_age_s=4.0, state="lost", map_unchanged=False)
+    seen = judged(image_age_s=4.0, state="lost")
     assert seen == Health(Level.FAILED, ("no_camera", "lost", "map_file_changed"))
 
 

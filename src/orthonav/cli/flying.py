@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -35,7 +35,6 @@ from orthonav.onboard import cameras, outputs, state
 from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.gnss.biases import Biases
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
@@ -119,7 +118,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
-        map_path=options.map,
         map_change=opened.change,
         state_path=options.state,
         logged_options=_logged_options(options, mount),
@@ -428,8 +426,6 @@ def gnss_watch(
 ) -> GnssWatch:
     """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder. After a
     change of what is `used` (camera, mount, latency), what that adds is learnt again."""
-    if options.gnss == "correct" and options.state is None:
-        raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
     recorded = options.recorded_telemetry and not options.ros2
     if recorded:
         source = recorded_solutions(read_gnss(Path(options.source) / FILE))
@@ -442,26 +438,12 @@ def gnss_watch(
         frame,
         source,
         digest=digest,
-        known=_learnt_before(options, clocks),
+        known=state.learnt_biases(options.state) if options.state else {},
         setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
-        correct=options.gnss == "correct",
         recorded=recorded,
         min_confidence=min_confidence,
         utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
     )
-
-
-def _learnt_before(options: argparse.Namespace, clocks: Clocks) -> Mapping[str, Biases]:
-    """What was learnt before this flight. It was interrupted where the program that saved the state
-    stopped at most `--state-max-age-s` ago, or at an unknown time."""
-    saved = state.load(options.state) if options.state else None
-    if options.state is None:
-        return {}
-    stopped_s = 0.0
-    if saved is not None:
-        stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
-    same_flight = stopped_s <= options.state_max_age_s
-    return state.learnt_biases(options.state, before_last_flight=same_flight)
 
 
 def start_of(

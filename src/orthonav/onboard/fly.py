@@ -84,7 +84,6 @@ class FlyOptions:
     recorded: bool = False
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
-    map_path: Path | None = None
     map_change: Callable[[], str | None] = lambda: None
     state_path: Path | None = None
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
@@ -135,7 +134,6 @@ class Runner:
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
         self._seen: dict[str, int] = {}
         self._texts = 0
-        self._map_id = _file_id(options.map_path)
         self._boot_id = states.boot_id()
 
     def run(self, stopping: threading.Event) -> None:
@@ -284,8 +282,6 @@ class Runner:
         if self.options.heights is not None:
             self.options.heights.observe(telemetry.time_ns, outcome, result.state)
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
-        if self._gnss is not None:
-            accepted = self._gnss.corrected(accepted)
         self._publisher.publish(
             replace(result, outcome=accepted), image.exposed_ns, vehicle, judged=True
         )
@@ -520,7 +516,6 @@ class Runner:
             latency_s=self.counter.latency_s(0.95),
             state=state,
             synced=link is None or link.sync.is_exact,
-            map_unchanged=_file_id(self.options.map_path) == self._map_id,
             map_intact=self.options.map_change() is None,
             mismatch=self._mismatch,
             start_off_m=start_off_m,
@@ -550,22 +545,13 @@ class Runner:
         path, last = self.options.state_path, self._last
         if path is None or last is None:
             return
-        utc_ns, mono_ns = self._clocks.utc_ns(), self._clocks.mono_ns()
+        mono_ns = self._clocks.mono_ns()
         if last == self._saved and mono_ns - self._saved_ns < states.SAVE_S * 1e9:
             return
         stamp = self._link.signing_now() if self._link is not None else None
         try:
             maps = None if self._gnss is None else self._gnss.maps()
-            states.save(
-                path,
-                replace(
-                    last,
-                    signing_timestamp_10us=stamp or 0,
-                    saved_utc_ns=utc_ns,
-                    saved_mono_ns=mono_ns,
-                ),
-                maps,
-            )
+            states.save(path, replace(last, signing_timestamp_10us=stamp or 0), maps)
             self._saved, self._saved_ns = last, mono_ns
         except OSError as error:
             if self.counter.total["state_failed"] == 0:
@@ -598,11 +584,3 @@ def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:
     boot_ms = ((link.boot_ns(now_ns) or 0) // 1_000_000) % 2**32
     for name, value in ((b"gnss_fault", float(gnss.code)), (b"gnss_diff", gnss.difference_m)):
         link.send(dialect().MAVLink_named_value_float_message(boot_ms, name, value))
-
-
-def _file_id(path: Path | None) -> tuple[int, int] | None:
-    try:
-        found = path.stat() if path is not None else None
-    except OSError:
-        return None
-    return None if found is None else (found.st_dev, found.st_ino)

@@ -67,7 +67,6 @@ def judge(
     latency_s: float = 0.0,
     state: str | None = "tracking",
     synced: bool = True,
-    map_unchanged: bool = True,
     map_intact: bool = True,
     mismatch: tuple[float, float] = (0.0, 0.0),
     start_off_m: float = 0.0,
@@ -79,8 +78,8 @@ def judge(
 
     `counts`: events within the window by name; `slow_vision` and `incomplete` are seconds in which
     a local message came too late for PX4 or a message could not be built. `latency_s`: 95th
-    percentile from exposure to message. `map_unchanged`: the file of the map's name is the one that
-    was opened; `map_intact`: the open file was not changed. `mismatch`: see there. `start_off_m`:
+    percentile from exposure to message. `map_intact`: the open file was not
+    changed. `mismatch`: see there. `start_off_m`:
     distance by which the ground contradicts the start. `gnss`, `latency`: reasons of the monitors.
     `has_origin`: of the local frame, where messages need it.
     """
@@ -114,7 +113,6 @@ def judge(
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
         "not_synchronized": settled and not synced and not failed["link_down"],
-        "map_file_changed": not map_unchanged and map_intact,
         "output_failed": count["output_failed"] > 0,
         "log_failed": count["log_failed"] > 0,
         "state_not_saved": count["state_failed"] > 0,

@@ -11,7 +11,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,14 @@ from orthonav.core.errors import MapFileError, OutputError
 from orthonav.core.files import write_text
 from orthonav.core.mapfile.signature import MAX_SERIAL, Signature
 from orthonav.core.records import Prior
-from orthonav.onboard.gnss.biases import Biases, before_flight, biases_from_plain
+from orthonav.onboard.gnss.biases import Biases, biases_from_plain
 
 VERSION = 1
 MAX_BYTES = 100_000
 MAX_MAPS = 100
 """Maps of which something is stored, the latest."""
 SAVE_S = 10.0
-"""A state is saved again after so long without a new position: the flight goes on."""
+"""A state is saved again after so long without a new position, for the signing timestamp."""
 SPEED_MPS = 30.0
 """Standard deviation of the speed of the aircraft since the position was saved: assumed."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -39,7 +39,7 @@ class SavedState:
 
     `std_m`: along the worst axis. `utc_ns`, `mono_ns`: time of exposure; the second is valid while
     `boot_id`, that of the operating system, is the same. `signing_timestamp_10us`: see
-    `orthonav.onboard.messages.mavlink.Signing`. `saved_utc_ns`, `saved_mono_ns`: of the last save.
+    `orthonav.onboard.messages.mavlink.Signing`.
     """
 
     lat_deg: float = math.nan
@@ -49,19 +49,12 @@ class SavedState:
     mono_ns: int = 0
     boot_id: str = ""
     signing_timestamp_10us: int = 0
-    saved_utc_ns: int = 0
-    saved_mono_ns: int = 0
 
     def age_s(self, utc_ns: int, mono_ns: int, boot_id: str) -> float:
         """Age of the position in seconds; negative where the clock was set back."""
         if boot_id and boot_id == self.boot_id:
             return (mono_ns - self.mono_ns) / 1e9
         return (utc_ns - self.utc_ns) / 1e9
-
-    def stopped_s(self, utc_ns: int, mono_ns: int, boot_id: str) -> float:
-        """Seconds since the program that saved it ran; negative where the clock was set back."""
-        last = replace(self, utc_ns=self.saved_utc_ns, mono_ns=self.saved_mono_ns)
-        return last.age_s(utc_ns, mono_ns, boot_id)
 
 
 def boot_id() -> str:
@@ -93,15 +86,12 @@ def save(path: Path, saved: SavedState, maps: Mapping[str, Any] | None = None) -
         raise
 
 
-def learnt_biases(path: Path, *, before_last_flight: bool = False) -> dict[str, Biases]:
-    """What was learnt of maps, by their digest, the latest last; `before_last_flight`: without the
-    flight that saved the file. Invalid entries are left out."""
-    found, read = {}, before_flight if before_last_flight else biases_from_plain
+def learnt_biases(path: Path) -> dict[str, Biases]:
+    """What was learnt of maps, by their digest, the latest last; invalid entries are left out."""
+    found = {}
     for digest, plain in _maps_of(path).items():
-        with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError, AttributeError):
-            biases = read(plain)
-            if biases is not None:
-                found[digest] = biases
+        with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
+            found[digest] = biases_from_plain(plain)
     return found
 
 
@@ -124,7 +114,6 @@ def load(path: Path) -> SavedState | None:
     plain = _plain_of(path)
     if plain.get("version") != VERSION:
         return None
-    plain = {"saved_utc_ns": plain.get("utc_ns"), "saved_mono_ns": plain.get("mono_ns"), **plain}
     try:
         return SavedState(
             **{name: type(value)(plain[name]) for name, value in asdict(SavedState()).items()}

@@ -120,13 +120,6 @@ class Biases:
         largest_m = PLAUSIBLE_SIGMAS * MAP_STD_M + 2 * self.std_m
         return float(np.hypot(*self.en_m)) <= largest_m
 
-    @property
-    def is_usable(self) -> bool:
-        """Whether positions may be corrected by them: the displacement is plausible, and known at
-        least as well as every fix assumes it. Otherwise a constant error of a receiver could pass
-        for one of the mount."""
-        return self.is_plausible and self.std_m <= MAP_STD_M
-
     def correction(self, design: Array) -> tuple[Array, Array]:
         """Mean (2,) and covariance (2, 2) of GNSS minus map for the `design` (2, 5) of a view."""
         return design @ self.mean, design @ self.cov @ design.T
@@ -437,15 +430,6 @@ _WALK = np.array([0.02, 0.02, math.radians(0.003), math.radians(0.003), 5e-4])
 displacement of a map is not the same everywhere, the track corrects part of the tilt."""
 _BIAS, _GNSS, _LOCAL, _BODY = slice(0, 5), slice(5, 7), slice(7, 9), slice(9, 11)
 _STATES = 11
-
-
-def before_flight(plain: Mapping[str, Any]) -> Biases | None:
-    """What was known before the flight that saved `plain`; None where nothing was. Values without
-    `flight` were known before it. Raises as `biases_from_plain`."""
-    flight = plain.get("flight")
-    if flight is None:
-        return biases_from_plain(plain)
-    return biases_from_plain(flight["before"]) if "before" in flight else None
 
 
 class BiasLearner:

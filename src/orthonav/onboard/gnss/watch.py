@@ -17,14 +17,12 @@ import numpy as np
 from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import CONFIDENT, Fix, NoFix, ViewResult
+from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.onboard.gnss.biases import (
     NANOSECONDS,
-    SETTLED_S,
     Array,
     Biases,
     at_start,
-    design,
 )
 from orthonav.onboard.gnss.monitor import GnssMonitor, GnssState, GnssStatus, MapPosition
 
@@ -32,8 +30,6 @@ log = logging.getLogger(__name__)
 DISPLACED = "map_displaced"
 """Reason in health: the learnt displacement is larger than that of a map as accurate as fixes
 state, or GNSS was spoofed since the first flight over it."""
-NOT_CORRECTED = "not_corrected"
-"""Reason in health: positions should be corrected, but what was learnt before must not be used."""
 SHOWN_S = 1.0
 """Age up to which a solution is extrapolated to an exposure, for display only."""
 ALARM_SEVERITY, RETURN_SEVERITY = 2, 5  # MAV_SEVERITY_CRITICAL, MAV_SEVERITY_NOTICE
@@ -74,7 +70,6 @@ class GnssWatch:
         digest: str = "",
         known: Mapping[str, Biases] = MappingProxyType({}),
         setup: str = "",
-        correct: bool = False,
         recorded: bool = False,
         min_confidence: float = CONFIDENT,
         utc_ahead_ns: Callable[[], int] = lambda: 0,
@@ -82,8 +77,7 @@ class GnssWatch:
         """`frame`: plane of the map. `digest`: of the map; `known`: biases by digest, the latest
         last. `setup`: identifies camera, mount and stated latency.
 
-        `correct`: correct positions by the biases known before the flight, if they are usable; what
-        is learnt in this flight never moves a position, nor after a restart. `recorded`: times are
+        `recorded`: times are
         those of the recording. `utc_ahead_ns`: what is added to times of solutions in the log.
         `log` gets every solution, as the message of a flight log.
         """
@@ -96,12 +90,6 @@ class GnssWatch:
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
         self._now_ns, self._has_failed = 0, False
-        settled = self._start.agreed_s >= SETTLED_S
-        self._corrects = correct and settled and self._start.is_usable
-        self._refuses = correct and settled and not self._start.is_usable
-        if correct and not self._corrects:
-            log.warning("positions are not corrected: %s", _why_not(self._start))
-        self._correction_en_m = np.zeros(2)
 
     def view(self, result: ViewResult, exposed_ns: int) -> ViewResult:
         """Compare a view; the result with the GNSS position of its exposure as evidence."""
@@ -121,25 +109,6 @@ class GnssWatch:
                 monitor.position(position)
         evidence = MappingProxyType({**fix.evidence, **self._evidence(now_ns)})
         return replace(result, outcome=replace(fix, evidence=evidence))
-
-    def corrected(self, outcome: Fix | NoFix) -> Fix | NoFix:
-        """A fix moved by the biases known before the flight, where they are to be corrected; its
-        covariance includes theirs at its heading, height and velocity. Without a heading or a
-        height nothing is corrected."""
-        if not isinstance(outcome, Fix) or not self._corrects:
-            return outcome
-        if not math.isfinite(outcome.agl_m + outcome.heading_deg):
-            return outcome
-        en_m = np.asarray(self._frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg))
-        velocity = _velocity(outcome)
-        velocity = np.zeros(2) if velocity is None else velocity
-        shown = design(math.radians(outcome.heading_deg), outcome.agl_m, velocity)
-        moved, more = self._start.correction(shown)
-        self._correction_en_m = moved
-        lat, lon = self._frame.latlon_from_en(en_m + moved)
-        cov = outcome.cov_en_m2 + more
-        cov.setflags(write=False)
-        return replace(outcome, lat_deg=float(lat), lon_deg=float(lon), cov_en_m2=cov)
 
     def tick(self, mono_ns: int) -> list[GnssText]:
         """Judge at a time of the monotonic clock; messages about changes since the last call."""
@@ -163,7 +132,7 @@ class GnssWatch:
             before = self._shown.get(number, GnssStatus())
             self._shown[number] = status
             name = "GNSS" if number == 0 else f"GNSS {number + 1}"
-            text = _change(name, before, status, self._correction_en_m)
+            text = _change(name, before, status)
             if text is not None:
                 texts.append(text)
         return texts
@@ -173,8 +142,6 @@ class GnssWatch:
         found = [monitor.status.reason for monitor in self._monitors.values()]
         if not self._learnt.is_plausible:
             found.append(DISPLACED)
-        if self._refuses:
-            found.append(NOT_CORRECTED)
         return tuple(dict.fromkeys(each for each in found if each))
 
     @property
@@ -193,13 +160,10 @@ class GnssWatch:
         return math.nan if first is None else math.hypot(*first.status.difference_en_m)
 
     def maps(self) -> dict[str, Any]:
-        """Biases for the state file: those of this map after the others, as learnt in this flight
-        and, for a restart, as known before it."""
+        """Biases for the state file: those of this map, learnt further, after the others."""
         made = {name: each.to_plain() for name, each in self._known.items() if name != self._digest}
         if self._digest and self._learnt.agreed_s > 0:
-            before = self._known.get(self._digest)
-            flight = {} if before is None else {"before": before.to_plain()}
-            made[self._digest] = {**self._learnt.to_plain(), "flight": flight}
+            made[self._digest] = self._learnt.to_plain()
         return made
 
     def plain(self) -> list[dict[str, Any]]:
@@ -264,18 +228,7 @@ def _velocity(fix: Fix) -> Array | None:
     return made if np.isfinite(made).all() else None
 
 
-def _why_not(known: Biases) -> str:
-    if known.agreed_s < SETTLED_S:
-        return f"GNSS agreed for {known.agreed_s / 60:.0f} min, {SETTLED_S / 60:.0f} are needed"
-    learnt = f"the learnt displacement of the map is {math.hypot(*known.en_m):.0f} m"
-    if known.is_plausible:
-        return f"{learnt}, known to {known.std_m:.0f} m only: fly more headings with GNSS"
-    return f"{learnt}: check the map against a surveyed point, GNSS may have been spoofed"
-
-
-def _change(
-    name: str, before: GnssStatus, now: GnssStatus, correction_en_m: Array
-) -> GnssText | None:
+def _change(name: str, before: GnssStatus, now: GnssStatus) -> GnssText | None:
     if now.state is GnssState.ALARM and (
         before.state is not GnssState.ALARM or before.fault != now.fault
     ):
@@ -285,8 +238,7 @@ def _change(
         GnssState.ALARM,
         GnssState.RETURNING,
     ):
-        east, north = (np.array(now.difference_en_m) - correction_en_m).tolist()
-        return RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size((east, north))}"
+        return RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size(now.difference_en_m)}"
     return None
 
 
