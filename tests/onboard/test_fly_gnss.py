@@ -10,8 +10,9 @@ from fake_autopilot import MS, FakeLocator, S, fix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_fly import AHEAD_NS, Flight
 
+from orthonav.core.flight.gnss import FAULTS
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.onboard.gnss.biases import Biases, Fault, unknown
+from orthonav.onboard.gnss.biases import unknown
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
 from orthonav.onboard.state import SavedState, learnt_biases, save
 
@@ -19,20 +20,14 @@ FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS = 10.0
 
 
-def known_biases(east_m, north_m, std_m, agreed_s, pitch_rad=0.0, latency_s=0.0):
-    """Biases with a displacement known to `std_m`, as learnt before."""
-    mean = np.array([east_m, north_m, pitch_rad, 0.0, latency_s])
-    return Biases(mean, np.diag([std_m, std_m, 1e-3, 1e-3, 0.01]) ** 2, agreed_s)
-
-
 class Watched(Flight):
     """A flight to the north at 10 m/s, whose autopilot sends GPS_RAW_INT; `off_m` is its error."""
 
     def __init__(self, tmp_path, receiver="gps_raw_int", **options):
-        more = {key: options.pop(key) for key in ("known",) if key in options}
+        known = options.pop("known", {})
         super().__init__(tmp_path, FakeLocator(lambda view: self.seen()), **options)
         self.off_m, self.fix_type, self.receiver, self.north_m = np.zeros(2), 3, receiver, 0.0
-        self.watch = GnssWatch(FRAME, live_solutions(self.link.gnss), digest="d", **more)
+        self.watch = GnssWatch(FRAME, live_solutions(self.link.gnss), digest="d", known=known)
         self.runner._gnss = self.watch
         self.frames, write = [], self.port.write
         self.port.write = lambda data: (self.frames.append(bytes(data)), write(data))
@@ -120,7 +115,7 @@ def test_a_step_is_reported_everywhere(begin, receiver):
     flight.views(20, wait_s=0.5)
     assert flight.reasons() >= {"gnss_step"}
     evidence = [each for each in flight.written() if "frame" in each][-1]["evidence"]
-    assert evidence["gnss_fault"] == Fault.STEP.code
+    assert evidence["gnss_fault"] == FAULTS.index("gnss_step") + 1
     assert flight.log.named("health")[-1][0]["gnss"][0]["fault"] == "gnss_step"
 
 
@@ -132,7 +127,9 @@ def test_named_values_are_sent_once_a_second(begin):
     flight.views(20)
     sent = flight.sent("NAMED_VALUE_FLOAT")
     assert {each.name for each in sent} == {"gnss_fault", "gnss_diff"} and len(sent) == 4
-    assert [each.value for each in sent if each.name == "gnss_fault"][-1] == Fault.LOST.code
+    assert [each.value for each in sent if each.name == "gnss_fault"][-1] == FAULTS.index(
+        "gnss_lost"
+    ) + 1
     assert "gnss_lost" in flight.reasons()
 
 

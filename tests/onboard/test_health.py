@@ -80,7 +80,7 @@ def test_every_fault_has_a_reason(level, reason, seen):
 
 def test_reasons_of_failed_come_first():
     seen = judged(image_age_s=4.0, state="lost")
-    assert seen == Health(Level.FAILED, ("no_camera", "lost", "map_file_changed"))
+    assert seen == Health(Level.FAILED, ("no_camera", "lost"))
 
 
 def test_few_faults_are_ok():

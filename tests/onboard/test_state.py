@@ -20,7 +20,7 @@ from orthonav.onboard.state import (
 
 S = 10**9
 UTC_NS, MONO_NS = 1_700_000_000 * S, 500 * S
-SAVED = SavedState(48.1, 2.3, 4.0, UTC_NS, MONO_NS, "run-1", 77, UTC_NS, MONO_NS)
+SAVED = SavedState(48.1, 2.3, 4.0, UTC_NS, MONO_NS, "run-1", 77)
 
 
 def test_a_saved_state_is_loaded(tmp_path, names_in):

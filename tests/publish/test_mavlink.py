@@ -67,7 +67,7 @@ LOW_CONFIDENCE = [
     replace(ESTIMATE, state="lost"),
     replace(ESTIMATE, cov_en_m2=np.full((2, 2), math.nan)),
 ]
-SIGNING = Signing(bytes(range(32)), signing_timestamp(UTC_NS), link_id=7)
+SIGNING = Signing(bytes(range(32)), signing_timestamp(UTC_NS))
 GOLDEN = {
     "global_position_sensor": """
         fd2800000001c5280100c0ea8305165b060080380100870eaf1c15a76cfd0000c07f0000c07f5b5d84400000
@@ -406,7 +406,7 @@ def test_a_signature_is_that_of_the_protocol() -> None:
         assert decode(frame)["signed"] == 1
         link_and_time, signature = frame[-13:-6], frame[-6:]
         expected = hashlib.sha256(SIGNING.secret_key + frame[:-6]).digest()[:6]
-        assert signature == expected and link_and_time[0] == 7
+        assert signature == expected and link_and_time[0] == 0
         stamps.append(int.from_bytes(link_and_time[1:], "little"))
     assert stamps == [SIGNING.timestamp_10us, SIGNING.timestamp_10us + 1]
     assert stamps[0] == (UTC_NS // 10**9 - 1_420_070_400) * 100_000 + 12_345

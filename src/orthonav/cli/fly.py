@@ -37,8 +37,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "source",
         nargs="?",
         metavar="SOURCE",
-        help="images: /dev/video0 or 0, an rtsp:// or http:// stream, a video, a folder of images "
-        "or a flight folder; not with --ros2",
+        help="images: /dev/video0 or 0, an rtsp:// or http:// stream, a video or a flight folder; "
+        "not with --ros2",
     )
     _add_inputs(parser)
     _add_outputs(parser)

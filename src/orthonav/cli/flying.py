@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from orthonav.cli.common import checked_signature, search_plan
 from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
 from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
+from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
 from orthonav.core.flight.fixes import Identity
@@ -191,6 +192,7 @@ def _opened(options: argparse.Namespace) -> MapFile:
 def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLog | None":
     if options.log is None:
         return None
+    needed("mcap", "autopilot", "a flight log")
     from orthonav.onboard.log import FlightLog  # only where it is asked for
 
     info = {"name": options.map.name, "manifest_sha256": digest}

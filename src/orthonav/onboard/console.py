@@ -246,7 +246,6 @@ class Narrator:
             self._console.warn(f"{plain['health']}: {', '.join(self._fault(plain, shown))}")
 
     def _fault(self, plain: Mapping[str, Any], shown: Sequence[str]) -> Iterator[str]:
-        """The reasons of the health, each with its meaning when it comes for the first time."""
         for reason in shown:
             meaning = "" if reason in self._meant else _meaning(reason, plain)
             self._meant.add(reason)

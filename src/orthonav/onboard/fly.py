@@ -393,7 +393,7 @@ class Runner:
             nothing = Telemetry(image.time_ns, math.nan, math.nan, math.nan, math.nan)
             return image.vehicle or VehicleState(None), image.telemetry or nothing
         until_ns = self._clocks.mono_ns() + round(TELEMETRY_WAIT_S * 1e9)
-        while not self._link.covers(image.exposed_ns) and self._clocks.mono_ns() < until_ns:
+        while (self._link.covered_ns or 0) < image.exposed_ns and self._clocks.mono_ns() < until_ns:
             self._clocks.sleep(_POLL_S)
         vehicle = self._link.state_at(image.exposed_ns)
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)

@@ -131,10 +131,6 @@ class AutopilotLink:
                 return False
             return True
 
-    def covers(self, exposed_ns: int) -> bool:
-        covered_ns = self.covered_ns
-        return covered_ns is not None and covered_ns >= exposed_ns
-
     @property
     def covered_ns(self) -> int | None:
         with self._lock:
@@ -357,7 +353,6 @@ class AutopilotLink:
         self.aiding.status(message.flags, now_ns, ardupilot=ardupilot)
 
     def _odometry(self, message: Message, now_ns: int) -> None:
-        """The accuracy of the velocity, along the first two axes of the message."""
         variance = max(message.velocity_covariance[0], message.velocity_covariance[6])
         self.aiding.velocity(math.sqrt(variance) if variance >= 0 else math.nan, now_ns)
 

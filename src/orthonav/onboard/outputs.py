@@ -277,8 +277,6 @@ class JsonOut:
 
 
 class Publisher:
-    """Publishes results to all outputs. Mutable."""
-
     def __init__(
         self,
         gate: Gate,
@@ -336,7 +334,7 @@ class Publisher:
         self._each([*self._lines, *self._graph], lambda out: out.health(plain))
 
     def close(self) -> None:
-        self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
+        self._each([*self._nmea, *self._lines], lambda out: out.close())
 
     def _to_graph(
         self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState, stamp_ns: int

@@ -63,8 +63,6 @@ FIX_3D = 3
 
 @dataclass(frozen=True)
 class Clocks:
-    """Functions that read the clocks and wait; tests replace them."""
-
     mono_ns: Callable[[], int] = time.monotonic_ns
     utc_ns: Callable[[], int] = time.time_ns
     sleep: Callable[[float], None] = time.sleep

@@ -30,7 +30,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthonav.core.flight.gnss import FAULTS
 from orthonav.core.records import MAP_STD_M
 
 Array = NDArray[np.float64]
@@ -56,11 +55,6 @@ class Fault(Enum):
     """The difference from the map is too large, and did not begin within the window."""
     DISAGREES = "gnss_disagrees"
     """The difference changed, but the map jumped too: which of the two is wrong is not known."""
-
-    @property
-    def code(self) -> int:
-        """Number of the fault, from 1, in evidence and NAMED_VALUE_FLOAT."""
-        return FAULTS.index(self.value) + 1
 
 
 NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
@@ -120,9 +114,9 @@ class Biases:
         largest_m = PLAUSIBLE_SIGMAS * MAP_STD_M + 2 * self.std_m
         return float(np.hypot(*self.en_m)) <= largest_m
 
-    def correction(self, design: Array) -> tuple[Array, Array]:
-        """Mean (2,) and covariance (2, 2) of GNSS minus map for the `design` (2, 5) of a view."""
-        return design @ self.mean, design @ self.cov @ design.T
+    def variance_m2(self, design: Array) -> float:
+        """Variance of GNSS minus map along the worst axis, for the `design` (2, 5) of a view."""
+        return float(np.linalg.eigvalsh(design @ self.cov @ design.T)[-1])
 
     def without_displacement(self) -> "Biases":
         mean, cov = self.mean.copy(), self.cov.copy()
@@ -436,7 +430,6 @@ class BiasLearner:
     """Learns the biases of one receiver over one map. Mutable; deterministic."""
 
     def __init__(self, start: Biases) -> None:
-        """`start`: what is known before the flight."""
         self._filter, self._reference = _Filter(start), start
         self._waiting: deque[Difference] = deque()
 

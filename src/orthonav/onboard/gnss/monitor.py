@@ -35,7 +35,6 @@ from orthonav.onboard.gnss.biases import (
 
 RETURNING = FAULTS[-1]
 """Reason in health while GNSS agrees again, but not yet for long enough."""
-RETURNING_CODE = len(FAULTS)
 
 
 class GnssState(Enum):
@@ -94,10 +93,8 @@ class GnssStatus:
 
     @property
     def code(self) -> int:
-        """0 without a fault, else that of the fault, or `RETURNING_CODE`."""
-        if self.state is GnssState.RETURNING:
-            return RETURNING_CODE
-        return self.fault.code if self.state is GnssState.ALARM and self.fault else 0
+        """Number of the reason in `FAULTS`, from 1; 0 without one."""
+        return 0 if self.reason is None else FAULTS.index(self.reason) + 1
 
 
 LOST_STD_M = 50.0
@@ -281,10 +278,6 @@ class GnssMonitor:
     def learnt(self) -> Biases:
         return self._learner.learnt
 
-    @property
-    def reference(self) -> Biases:
-        return self._learner.reference
-
     def sample(self, sample: GnssSample) -> None:
         en_m = np.full(2, math.nan)
         if sample.is_valid:
@@ -310,7 +303,6 @@ class GnssMonitor:
         self._pair(position.time_ns)
 
     def tick(self, now_ns: int) -> GnssStatus:
-        """Judge the receiver at a time; the status."""
         fault = self._receiver.fault(now_ns, self._speed_mps(now_ns))
         named = self.status.fault in (None, Fault.VELOCITY)  # a jump contradicts the velocity too
         if fault is None and named and (now_ns - self._velocity_ns) * NANOSECONDS >= BIN_S:
@@ -322,7 +314,6 @@ class GnssMonitor:
         return self.status
 
     def _pair(self, now_ns: int) -> None:
-        """Differences at the exposures up to the newest sample."""
         while self._solved and self._pending:
             position = self._pending[0]
             if position.time_ns > self._solved[-1][0].time_ns:
@@ -461,8 +452,7 @@ class GnssMonitor:
         reference = self._learner.reference
         moved = value.design @ (self._learner.learnt.mean - reference.mean)
         east, north = moved.tolist()
-        _, cov = reference.correction(value.design)
-        std_m = math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
+        std_m = math.sqrt(reference.variance_m2(value.design))
         if math.hypot(east, north) <= MULTIPATH_M + FAULT_SIGMAS * std_m:
             return None
         return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north))
@@ -470,9 +460,7 @@ class GnssMonitor:
     def _std_m(self, value: Difference, known: Biases) -> float:
         """Standard deviation of a difference from the known biases, along the worst axis."""
         gnss_m = max(value.gnss_std_m, GNSS_STD_M)
-        _, cov = known.correction(value.design)
-        worst_m2 = float(np.linalg.eigvalsh(cov)[-1])
-        return math.sqrt(worst_m2 + gnss_m**2 + value.map_std_m**2)
+        return math.sqrt(known.variance_m2(value.design) + gnss_m**2 + value.map_std_m**2)
 
     def _velocity_fault(self) -> Fault | None:
         gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-VELOCITY_S / GNSS_TAU_S))

@@ -73,16 +73,12 @@ class Signing:
 
     secret_key: bytes = field(repr=False)
     timestamp_10us: int
-    link_id: int = 0
 
     def __post_init__(self) -> None:
         if len(self.secret_key) != 32:
             raise EstimateError(f"a signing key has 32 bytes, got {len(self.secret_key)}")
-        if not (0 <= self.timestamp_10us < 2**48 and 0 <= self.link_id <= 255):
-            raise EstimateError(
-                f"signing needs a timestamp of 48 bits and a link of 8, "
-                f"got {self.timestamp_10us} and {self.link_id}"
-            )
+        if not 0 <= self.timestamp_10us < 2**48:
+            raise EstimateError(f"signing needs a timestamp of 48 bits, got {self.timestamp_10us}")
 
 
 def signing_timestamp(utc_ns: int) -> int:
@@ -108,7 +104,6 @@ class Packer:
         self._mav.seq = sequence % 256
         if signing is not None:
             self._mav.signing.secret_key = signing.secret_key
-            self._mav.signing.link_id = signing.link_id
             self._mav.signing.timestamp = signing.timestamp_10us
             self._mav.signing.sign_outgoing = True
 
@@ -344,8 +339,6 @@ _LEAST_SCALE = 0.01  # ArduPilot's, near the poles
 
 
 class Autopilot(Enum):
-    """Autopilot whose conventions a message in a local frame follows."""
-
     PX4 = "px4"
     ARDUPILOT = "ardupilot"
 

@@ -156,7 +156,6 @@ _Given = tuple[str, str] | Path
 
 
 def _words(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[_Given], list[str]]:
-    """Rules, parameters, and what is passed on to ROS, of the words after `--ros-args`."""
     rules: list[tuple[str, str]] = []
     parameters: list[_Given] = []
     passed: list[str] = []

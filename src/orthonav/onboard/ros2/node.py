@@ -52,8 +52,6 @@ def ros2_module(name: str) -> Any:
 
 
 class Definitions:
-    """The message definitions of one distribution of ROS 2, and their DDS types."""
-
     def __init__(self, distro: str = "") -> None:
         """`distro` as in ROS_DISTRO ("humble"); one that is not known stands for the newest.
 
@@ -549,23 +547,11 @@ class RclNode(Graph):
         found: dict[str, str] = {}
         for made, kind in self._subscriptions:
             for other in self._node.get_publishers_info_by_topic(made.topic_name):
-                why = self._unmatched(other.qos_profile, made.qos_profile, "a publisher")
-                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
+                self._mismatch(found, made.topic_name, kind, other.topic_type, "")
         for made, kind in self._publishers:
             for other in self._node.get_subscriptions_info_by_topic(made.topic_name):
-                why = self._unmatched(made.qos_profile, other.qos_profile, "a subscriber")
-                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
-        return found
-
-    def _unmatched(self, offered: Any, requested: Any, other: str) -> str:
-        """Why a subscription does not match a publisher; "" where it does."""
-        reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
-        policy = ""
-        if requested.reliability == reliability.RELIABLE != offered.reliability:
-            policy = "reliability"
-        elif requested.durability == durability.TRANSIENT_LOCAL != offered.durability:
-            policy = "durability"
-        return f"{other} has QoS that does not match ours: {policy}" if policy else ""
+                self._mismatch(found, made.topic_name, kind, other.topic_type, "")
+        return found  # ROS itself logs QoS that does not match
 
     def _made_qos(self, depth: int, *, reliable: bool, latched: bool = False) -> Any:
         qos = self._qos

@@ -70,7 +70,9 @@ class Ros2Publisher:
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
         self._fix(self._navsatfix(estimate, cov, self._altitude_m(vehicle), stamp_ns))
         east, north = self._frame.en_from_latlon(estimate.lat_deg, estimate.lon_deg).tolist()
-        turn = orientation(vehicle)
+        turn = np.array([0.0, 0.0, 0.0, 1.0])  # where the attitude is not known
+        if vehicle.ned_from_body is not None:
+            turn = ros_xyzw_from_ned(vehicle.ned_from_body)
         self._pose(self._posed((east, north), cov, turn, stamp_ns))
         return "NavSatFix", "PoseWithCovarianceStamped"
 
@@ -93,9 +95,6 @@ class Ros2Publisher:
         )
         header = self._node.definitions.header(self._now_ns(), "")
         self._health(new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status]))
-
-    def close(self) -> None:
-        """Nothing to do: the node is closed by its owner."""
 
     def _send_origin(self) -> None:
         definitions = self._node.definitions
@@ -167,10 +166,3 @@ def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, st
             yield f"{before}{name}", ", ".join(map(str, value))
         else:
             yield f"{before}{name}", "" if value is None else str(value)
-
-
-def orientation(vehicle: VehicleState) -> Array:
-    """Reported attitude as a ROS quaternion x, y, z, w; the identity where it is not known."""
-    if vehicle.ned_from_body is None:
-        return np.array([0.0, 0.0, 0.0, 1.0])
-    return ros_xyzw_from_ned(vehicle.ned_from_body)
