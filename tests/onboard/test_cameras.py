@@ -17,8 +17,6 @@ from orthonav.onboard.cameras import (
     Playback,
     RecordedImage,
     autopilot_pace,
-    is_live,
-    live_name,
     own_pace,
     read_into,
     recorded_images,
@@ -208,12 +206,6 @@ def test_invalid_sources_are_refused(tmp_path):
 def test_a_missing_device_is_gone_for_now():
     with pytest.raises(CameraGoneError):
         LiveCamera(4242, Time().clocks).read()
-
-
-def test_names_of_live_cameras():
-    live = ["0", "/dev/video2", "rtsp://camera/1", "http://camera/live.mjpg"]
-    assert all(map(is_live, live)) and not any(map(is_live, ["flight", "a.mp4", "/tmp/a"]))
-    assert [live_name(each) for each in live[:3]] == [0, 2, "rtsp://camera/1"]
 
 
 def ground(seed=0):

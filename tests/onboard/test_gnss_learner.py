@@ -15,7 +15,6 @@ from orthonav.onboard.gnss.biases import (
     Biases,
     BiasLearner,
     Difference,
-    Rolling,
     at_start,
     biases_from_plain,
     design,
@@ -177,18 +176,3 @@ def test_many_flights_that_show_nothing_are_no_damage():
     for _ in range(200):
         known = at_start({"map": biases_from_plain(known.to_plain())}, "map", "camera")
     assert known.stds == pytest.approx(unknown().stds)
-
-
-def test_rolling_is_seen_by_a_change_of_the_turn_rate():
-    rolling, wide = Rolling(), []
-    turned = np.cumsum([0, 0, 0, 0, 5, 10, 10, 10, 10, 10])
-    for second, heading in enumerate(np.radians(turned)):
-        wide.append(rolling.std_m(difference(second, heading), unknown()) > 3)
-    assert wide == [False] * 4 + [True] * 2 + [False] * 4
-    late = replace(unknown(), mean=np.array([0.0, 0.0, 0.0, 0.0, 0.4]))
-    values = [difference(second, heading) for second, heading in enumerate((0.0, 0.0, 0.1))]
-    stds = []
-    for known in (unknown(), late):
-        rolling = Rolling()
-        stds.append([rolling.std_m(each, known) for each in values][-1])
-    assert 4 * stds[0] < stds[1]  # a latency that is known tilts by as much

@@ -3,24 +3,19 @@
 import math
 import os
 import socket
-from dataclasses import replace
 
 import pytest
-from fake_autopilot import S, fix
+from fake_autopilot import S
 
-from orthonav.core.records import Telemetry
 from orthonav.onboard.health import (
-    EventCounter,
     Health,
     HealthReporter,
     Level,
     judge,
-    mismatch,
     notify,
 )
 
 COUNTS = {"taken": 50, "processed": 50, "confident": 50}
-REPORTED = Telemetry(0, 10.0, 0.0, 0.0, 100.0)
 
 
 def counted(**counts):
@@ -105,16 +100,6 @@ def test_changes_are_reported_at_most_every_five_seconds():
     assert reported == [(0, "OK"), (12, "DEGRADED")]
 
 
-def test_counts_are_those_of_the_window():
-    counter = EventCounter()
-    for second in range(20):
-        counter.add(second * S, "late")
-        counter.add_latency(second * S, second / 10)
-    assert counter.counts(19 * S) == {"late": 11} and counter.total == {"late": 20}
-    assert counter.latency_s(0.5) == pytest.approx(1.4)
-    assert counter.counts(99 * S) == {} and counter.latency_s(0.5) == 0.0
-
-
 @pytest.mark.parametrize("abstract", [False, True])
 def test_systemd_is_notified(tmp_path, abstract, monkeypatch):
     name = f"@orthonav-test-{os.getpid()}" if abstract else str(tmp_path / "notify")
@@ -127,9 +112,3 @@ def test_systemd_is_notified(tmp_path, abstract, monkeypatch):
     assert not notify("WATCHDOG=1")  # the socket is closed
     monkeypatch.delenv("NOTIFY_SOCKET")
     assert not notify("WATCHDOG=1")
-
-
-def test_heading_mismatch_is_between_minus_180_and_180():
-    assert mismatch(fix(heading_deg=350.0, agl_m=200.0), REPORTED) == (-20.0, math.log(2))
-    assert mismatch(fix(), replace(REPORTED, yaw_deg=math.nan))[0] == 0.0
-    assert mismatch(fix(), replace(REPORTED, agl_m=math.nan))[1] == 0.0

@@ -36,13 +36,12 @@ from orthonav.onboard.messages.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
-    floored,
     messages_averaged,
 )
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
-from orthonav.onboard.ros2.node import Definitions, Node
+from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader, loses_images
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
@@ -181,49 +180,6 @@ def send_view(peer, now_ns, angles=(90.0, 0.0, 0.0), **changes):
 
 
 # Messages on the wire.
-
-
-def test_messages_round_trip_through_cyclonedds():
-    definitions, rng = Definitions(), np.random.default_rng(0)
-    messages = Messages()
-    covariance = rng.normal(size=36)
-    pose = definitions.new(
-        "geometry_msgs/msg/Pose",
-        position=definitions.vector("Point", "xyz", (1.5, -2.5, 3.5)),
-        orientation=definitions.vector("Quaternion", "xyzw", (0.1, 0.2, 0.3, 0.4)),
-    )
-    ours = definitions.new(
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        header=definitions.header(5 * S + 7, "map"),
-        pose=definitions.new(
-            "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance
-        ),
-    )
-    theirs = ros.PoseWithCovarianceStamped.deserialize(definitions.encoded(ours))
-    assert theirs == ros.native(ours, ros.PoseWithCovarianceStamped)
-    assert list(theirs.pose.covariance) == covariance.tolist()
-    for kind, message in {
-        ros.Image: messages.image(3 * S, picture(1)),
-        ros.CompressedImage: messages.compressed(3 * S, picture(1)),
-        ros.CameraInfo: messages.camera_info(),
-        ros.Imu: messages.imu(3 * S, messages.turn(30.0)),
-        ros.NavSatFix: messages.fix(3 * S),
-    }.items():
-        name = message.__msgtype__
-        written = ros.native(message, kind).serialize()
-        decoded = definitions.decoded(name, written)
-        assert ros.native(decoded, kind) == ros.native(message, kind)
-        assert definitions.encoded(decoded) == written
-
-
-def test_the_distribution_chooses_the_definitions():
-    """A range has no variance in Humble."""
-    humble, newest = (Definitions(distro).new for distro in ("humble", "a name to come"))
-    fields = ["header", "radiation_type", "field_of_view", "min_range", "max_range", "range"]
-    values = dict.fromkeys(fields, 0)
-    assert humble("sensor_msgs/msg/Range", **values)
-    with pytest.raises(TypeError, match="variance"):
-        newest("sensor_msgs/msg/Range", **values)
 
 
 # Into the program.
@@ -644,13 +600,6 @@ def test_a_dry_run_sends_health_and_no_position(peer, publishing):
     flying.whole.health({"health": "OK", "reasons": []})
     wait_for(lambda: peer.heard("/diagnostics"))
     assert peer.heard("/orthonav/fix") == peer.heard("/orthonav/pose") == []
-
-
-def test_min_std_m_is_a_bound_in_every_direction():
-    assert np.linalg.eigvalsh(floored(COV, 4.5)).tolist() == pytest.approx(
-        [4.5**2, np.linalg.eigvalsh(COV)[1]]
-    )
-    assert floored(COV, 0.0) == pytest.approx(COV)
 
 
 def test_the_origin_is_latched_for_later_subscribers(peer, publishing):

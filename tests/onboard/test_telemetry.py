@@ -209,21 +209,6 @@ def test_a_queue_that_empties_is_no_jump():
     assert (sync.jumps, offset_ns(sync)) == (0, before)
 
 
-def test_heights_above_sea_and_home_are_apart_from_the_one_above_ground():
-    buffer = TelemetryBuffer()
-    buffer.add_height("amsl", 0, 700.0)
-    state = buffer.at(0)
-    assert math.isnan(state.height_m) and state.amsl_m == 700.0
-    telemetry = state.telemetry(0)
-    assert (telemetry.amsl_m, telemetry.home_m) == (700.0, None) and math.isnan(telemetry.agl_m)
-    buffer.add_height("relative", 0, 90.0)
-    telemetry = buffer.at(0).telemetry(0)
-    assert telemetry.agl_m == telemetry.home_m == 90.0  # level ground
-    buffer.add_height("distance", 0, 60.0)
-    telemetry = buffer.at(0).telemetry(0)
-    assert (telemetry.agl_m, telemetry.home_m, telemetry.amsl_m) == (60.0, 90.0, 700.0)
-
-
 @pytest.mark.parametrize("rate", [-0.022, 0.03, 2e-5])
 def test_clocks_of_different_rates(rate):
     """PX4's simulator in lockstep runs 2 % slow."""
