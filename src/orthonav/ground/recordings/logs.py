@@ -184,10 +184,10 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
         if attitude is None:
             damaged = ", and is damaged" if log.file_corruption else ""
             raise FlightError(f"PX4 log has no attitude (vehicle_attitude){damaged}: {path}")
-        damaged = ()
+        warnings: tuple[str, ...] = ()
         if log.file_corruption:
             read_s = float(attitude.time_ns[-1] - attitude.time_ns[0]) / 1e9
-            damaged = (
+            warnings = (
                 f"log is damaged: views from {read_s:.1f} s on, or in gaps, may lack telemetry",
             )
         position, local = _position(gps, topics, shift_us), topics.get("vehicle_local_position", {})
@@ -204,7 +204,7 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
                 local, [local["vy"], local["vx"]], shift_us, _flag(local, "v_xy_valid", 1) != 0
             ),
             origin_ns=int(attitude.time_ns[0]),
-            warnings=damaged,
+            warnings=warnings,
         )
 
 
