@@ -14,6 +14,7 @@ EXTRA_OF = {
     "rasterio": "geo",
     "pyproj": "geo",
     "shapely": "geo",
+    "scipy": "geo",
     "pyogrio": "geo",
     "requests": "fetch",
     "PIL": "flights",

@@ -5,8 +5,7 @@
 
 The stored map and flight lie in `tests/data/golden_flight` beside `fixes.json`; `--make` makes
 them from a generated area. The same bytes go to every machine: imagery and maps made on two
-machines may differ in the last digits. Exit code 1 where a single view is more than 1 cm off, or
-a track more than 5 cm: see `LIMITS_M`.
+machines may differ in the last digits. Exit code 1 where a place is farther off than `LIMITS_M`.
 """
 
 import argparse
@@ -33,9 +32,9 @@ from orthonav.ground.recordings.localize import localize_flight, smoothed_track
 from orthonav.onboard.run import SingleViews
 
 STORED = Path(__file__).resolve().parents[2] / "tests" / "data" / "golden_flight"
-LIMITS_M = {"views": 0.01, "any_heading": 0.01, "track": 0.05, "smoothed": 0.05}
-"""By run. A track carries rounding on from view to view: a heading reported 0.00001 deg larger
-moves it by 3 cm on one and the same machine."""
+LIMITS_M = {"views": 0.2, "any_heading": 0.2, "track": 0.05, "smoothed": 0.05}
+"""By run. Rounding decides whether the camera of a single view is fitted once more, which moves it
+by a tenth of its standard deviation. A track carries rounding on from view to view."""
 RUNS = tuple(LIMITS_M)
 PACKAGES = ("numpy", "opencv-python-headless")
 Places = dict[str, list[float] | str]
