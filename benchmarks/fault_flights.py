@@ -36,7 +36,7 @@ from orthonav.onboard.latency import LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
-from orthonav.onboard.outputs import MessageOptions, Messenger, Publisher
+from orthonav.onboard.outputs import Messenger, Publisher
 from orthonav.onboard.run import Locator
 from orthonav.onboard.telemetry import TelemetryBuffer
 
@@ -275,10 +275,9 @@ class FaultFlight:
         self.time, self.boot_ahead_ns = Time(), AHEAD_NS
         clocks = self.time.clocks
         self.port, self.autopilot, self.other = Port(), Autopilot(), Autopilot(2)
-        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
+        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)  # type: ignore[arg-type]  # a fake of it
         self.gate = Gate(GateRules(), Clock.BOOT)
-        messages = MessageOptions(("global-position",))
-        messenger = Messenger(messages, self.gate, self.link, clocks)
+        messenger = Messenger(self.gate, self.link, clocks)
         publisher = Publisher(self.gate, clocks, messenger=messenger)
         self._camera = LiveCamera(0, clocks, capture=lambda _: Stream(self._seen))
         self._newest = NewestImage()

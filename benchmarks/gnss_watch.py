@@ -322,7 +322,7 @@ def recovery_table(trials: int) -> Table:
             rms = np.sqrt((off**2).mean(axis=0)) * scale
             stated = np.mean([each.stds for each in learnt], axis=0) * scale
             moved = math.sqrt(((off @ leg.T) ** 2).sum(axis=1).mean())
-            spread = np.mean([math.sqrt(np.trace(each.correction(leg)[1])) for each in learnt])
+            spread = np.mean([math.sqrt(np.trace(leg @ each.cov @ leg.T)) for each in learnt])
             displaced = math.hypot(rms[0], rms[1]), math.hypot(stated[0], stated[1])
             pairs = [displaced, (rms[2], stated[2]), (rms[4], stated[4]), (moved, spread)]
             shown = [f"{error:.3g} / {std:.3g}" for error, std in pairs]

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import math
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -57,6 +58,24 @@ def test_csv(tmp_path, terrain, height):
     assert (rows[0]["heading_deg"], rows[1]["heading_deg"]) == ("271.500", "")
 
 
+def test_geojson(tmp_path):
+    features = json.loads(written(tmp_path, "geojson", hill))["features"]
+    assert features[0]["geometry"] == {"type": "Point", "coordinates": [-2.25, 48.5, 425.0]}
+    assert features[0]["properties"]["std_m"] == 5.0
+    assert features[1]["properties"]["heading_deg"] is None
+    level = json.loads(written(tmp_path, "geojson", None))["features"]
+    assert level[0]["geometry"]["coordinates"] == [-2.25, 48.5]
+
+
+def test_exiftool_gets_references_of_both_hemispheres(tmp_path):
+    one, other = csv.DictReader(io.StringIO(written(tmp_path, "exif", hill)))
+    assert one["SourceFile"] == "a.jpg"
+    assert (one["GPSLatitudeRef"], one["GPSLongitudeRef"]) == ("North", "West")
+    assert (one["GPSAltitude"], one["GPSAltitudeRef"]) == ("425.000", "Above Sea Level")
+    assert (other["GPSLatitude"], other["GPSLatitudeRef"]) == ("33.00000000", "South")
+    assert other["GPSAltitudeRef"] == "Below Sea Level" and other["GPSImgDirection"] == ""
+
+
 def test_opendronemap_takes_accuracy_only_after_a_height(tmp_path):
     lines = written(tmp_path, "odm-geo", hill).splitlines()
     assert lines[0] == "EPSG:4326"
@@ -68,7 +87,7 @@ def test_a_trajectory_for_evo(tmp_path):
     """Columns of TUM: seconds, position, and a quaternion that turns camera axes to east, north,
     up."""
     comment, first, second = written(tmp_path, "tum", hill).splitlines()
-    assert comment == "# east, north, up (m) of the first position"
+    assert comment == "# east, north, up (m) of 48.50000000, -2.25000000 (WGS84)"
     numbers = np.array(first.split(), dtype=float)
     assert numbers[:4].tolist() == [0, 0, 0, 425.0] and len(second.split()) == 8
     x, y, z, w = numbers[4:]
@@ -85,8 +104,8 @@ def test_kml_and_gpx_are_xml(tmp_path, terrain):
     kml = ElementTree.fromstring(written(tmp_path, "kml", terrain))
     mode = {each.text for each in kml.iterfind(".//k:altitudeMode", space)}
     assert mode == {"absolute" if terrain else "relativeToGround"}
-    one, _ = (each.text for each in kml.iterfind(".//k:coordinates", space))
-    assert one == f"-2.25000000,48.50000000,{425 if terrain else 120}.00"
+    line, one, _ = (each.text for each in kml.iterfind(".//k:coordinates", space))
+    assert one == line.split()[0] == f"-2.25000000,48.50000000,{425 if terrain else 120}.00"
     gpx = ElementTree.fromstring(written(tmp_path, "gpx", terrain))
     points = gpx.findall(".//g:trkpt", space)
     assert [each.get("lat") for each in points] == ["48.50000000", "-33.00000000"]

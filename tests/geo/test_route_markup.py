@@ -148,6 +148,7 @@ def test_several_waylines_are_picked_by_identifier_or_number(read):
         (wpml_of(wayline("aboveTheMoon")), "a.wpml", "executeHeightMode must be relative"),
         (wpml_of(wayline()).replace("<wpml:index>1", "<wpml:index>x"), "a.wpml", "WPML index"),
         (wpml_of(wayline()).replace("2.5,46.5,0", "2.5"), "a.wpml", "cannot be read"),
+        (wpml_of(), "a.kml", "template of a DJI mission: give its waylines.wpml"),
         ("<gpx/>", "a.wpml", "must begin with <kml>"),
     ],
 )

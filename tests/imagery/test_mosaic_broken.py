@@ -10,6 +10,7 @@ from rasterio.drivers import raster_driver_extensions
 from rasterio.transform import Affine
 
 from orthonav.core.errors import AreaError, ImageryError, MissingFileError
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.imagery.mosaic import Mosaic
 
@@ -139,6 +140,13 @@ def test_a_deep_file_that_was_cut_short(ortho):
     ortho.write_bytes(ortho.read_bytes()[: ortho.stat().st_size // 2])
     with pytest.raises(ImageryError, match=r"cannot be read.*ortho\.tif"):
         Mosaic.open([ortho])
+
+
+def test_a_place_outside_the_area_of_its_system(ortho):
+    """Northings of France in the system of Mayotte."""
+    write(ortho, SCENE, crs="EPSG:4471", transform=Affine(1, 0, 7e5, 0, -1, 66e5 + 60))
+    with pytest.raises(ImageryError, match="does not fit its coordinate system"):
+        read(ortho, frame=LocalFrame(-30.715, 47.089))
 
 
 def test_a_file_that_vanishes_is_named(ortho):

@@ -57,8 +57,7 @@ class ComputedFlight:
         """`delay_s(at_s)`: true latency, by seconds since the start."""
         self.flown, self.delay_s, self.rate_hz = flown, delay_s, rate_hz
         self.rng = np.random.default_rng(seed)
-        self.monitor = latencies.LatencyMonitor(stated_s)
-        self.monitor._odometry = ComputedOdometry(self)
+        self.monitor, self.odometry = latencies.LatencyMonitor(stated_s), ComputedOdometry(self)
         self.interruptions, self.states = 0, {}
         self.wrong = lambda exposed_s: 0.0  # added to the motion that is seen
         self.images = []  # seconds since the start, reason or None, error of the position
@@ -103,6 +102,8 @@ class ComputedFlight:
             lat, lon = FRAME.latlon_from_en(place + self.rng.normal(0, 1.5, 2))
             reason = self.monitor.located(used, (float(lat), float(lon)), 3.5)
         covered_ns = round((BEGIN_S + at_s - 0.02) * S)
+        if self.monitor._odometry is not self.odometry:  # the monitor begins again
+            self.odometry = self.monitor._odometry = ComputedOdometry(self)
         self.monitor.observe(arrived_ns, None, None, self.state_at, covered_ns)
         return reason, error_m
 

@@ -132,11 +132,6 @@ DiagnosticStatus = struct(
 DiagnosticArray = struct(
     "diagnostic_msgs", "DiagnosticArray", header=Header, status=sequence[DiagnosticStatus]
 )
-Transform = struct("geometry_msgs", "Transform", translation=Vector3, rotation=Quaternion)
-TransformStamped = struct(
-    "geometry_msgs", "TransformStamped", header=Header, child_frame_id=str, transform=Transform
-)
-TFMessage = struct("tf2_msgs", "TFMessage", transforms=sequence[TransformStamped])
 
 
 def zeros(kind):

@@ -278,28 +278,6 @@ def value(second, en_m, std_m=3.0):
     return Difference(float(second), np.array(en_m), 2.0, std_m, 0.0, np.array([0.0, 20.0]))
 
 
-def test_the_covariance_is_that_of_the_simulated_errors():
-    """Whitened differences of the model's own errors have unit variance: the test is consistent."""
-    rng = np.random.default_rng(3)
-    path = lawnmower(60)
-    values = [
-        replace(value(t, (0.0, 0.0)), heading_rad=float(path.heading_rad[t])) for t in range(60)
-    ]
-    window = DifferenceWindow()
-    for each in values:
-        window.add(each)
-    used = window.values
-    assert len(used) < 35 and [v.time_s for v in used] == sorted(v.time_s for v in used)
-    found = 0
-    for _ in range(200):
-        offset = rng.normal(0, 1.5, 2)
-        window = DifferenceWindow()
-        for each in values:
-            window.add(replace(each, en_m=offset + rng.normal(0, 1.0, 2)))
-        found += window.finding(KNOWN) is not None
-    assert found == 0
-
-
 @pytest.mark.parametrize("bearing", [0.0, 77.0, 200.0])
 def test_size_and_direction_of_a_step_are_estimated(bearing):
     angle = math.radians(bearing)

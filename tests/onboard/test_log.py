@@ -21,7 +21,6 @@ from orthonav.core.errors import OutputError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.onboard import log as log_module
-from orthonav.onboard import segment as segment_module
 from orthonav.onboard.log import FlightLog
 
 CAMERA = Camera(64, 48, 50.5, 50.25, 32.125, 24.0, (0.1, -0.02, 0.001, 0.002))
@@ -215,7 +214,7 @@ def test_a_slow_disk_does_not_block_the_flight(tmp_path, monkeypatch):
         in_time.append(goes_on.wait(60))
         sync(handle)
 
-    monkeypatch.setattr(segment_module.os, "fsync", stuck)
+    monkeypatch.setattr(log_module.os, "fsync", stuck)
     log = begun(tmp_path)
     log_views(log, range(1))
     wait_for(lambda: not log._queue)
@@ -246,8 +245,8 @@ def full_disk(monkeypatch, room_bytes):
         disk["room"] += os.fstat(handle).st_size - size
         cut(handle, size)
 
-    monkeypatch.setattr(segment_module.os, "write", limited)
-    monkeypatch.setattr(segment_module.os, "ftruncate", shortened)
+    monkeypatch.setattr(log_module.os, "write", limited)
+    monkeypatch.setattr(log_module.os, "ftruncate", shortened)
     return disk
 
 
@@ -290,7 +289,7 @@ def test_a_disk_that_fails(tmp_path, monkeypatch, code):
     def failing(handle, data):
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr(segment_module.os, "write", failing)
+    monkeypatch.setattr(log_module.os, "write", failing)
     log = begun(tmp_path)
     log_views(log, range(3))
     log.close()

@@ -22,7 +22,6 @@ from orthonav.onboard.messages.mavlink import Autopilot, Origin, Packer, Target,
 from orthonav.onboard.outputs import (
     KINDS,
     JsonOut,
-    MessageOptions,
     Messenger,
     NmeaOut,
     open_sink,
@@ -45,8 +44,8 @@ class Sending:
         self.kind, self.target, self.armed = Autopilot.PX4, Target(1, 1), False
         self.origin, self.boot_time_ns = ORIGIN, 61 * S
         self.gate = Gate(rules or GateRules(), Clock.BOOT)
-        options = MessageOptions(kinds=kinds or ("global-position",), **options)
-        self.messenger = Messenger(options, self.gate, self, self.time.clocks)
+        kinds = kinds or ("global-position",)
+        self.messenger = Messenger(self.gate, self, self.time.clocks, kinds=kinds, **options)
         self.packer = Packer()
 
     def boot_ns(self, mono_ns):

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from orthonav.core.errors import MissingFileError, VariantError
 from orthonav.onboard.ros2.arguments import RosArguments, ros_arguments
-from orthonav.onboard.ros2.graph import ros_type_name
+from orthonav.onboard.ros2.node import ros_type_name
 
 
 def parsed(*words, **environment):

@@ -2,29 +2,25 @@
 
 import json
 import math
-from argparse import Namespace
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from orthonav.cli.flying import _learnt_before
 from orthonav.onboard import state
-from orthonav.onboard.gnss.biases import Resumed, unknown
+from orthonav.onboard.gnss.biases import unknown
 from orthonav.onboard.state import (
     SavedState,
-    before_the_flight,
     boot_id,
     learnt_biases,
     load,
     prior_of,
     save,
 )
-from orthonav.onboard.telemetry import Clocks
 
 S = 10**9
 UTC_NS, MONO_NS = 1_700_000_000 * S, 500 * S
-SAVED = SavedState(48.1, 2.3, 4.0, UTC_NS, MONO_NS, "run-1", 77, UTC_NS, MONO_NS)
+SAVED = SavedState(48.1, 2.3, 4.0, UTC_NS, MONO_NS, "run-1", 77)
 
 
 def test_a_saved_state_is_loaded(tmp_path, names_in):
@@ -113,42 +109,6 @@ def test_what_was_learnt_of_maps_is_saved_and_survives_without_the_monitor(tmp_p
     assert (found["digest"].agreed_s, found["digest"].setup) == (3600.0, "camera")
     assert np.array_equal(found["digest"].mean, learnt.mean)
     assert np.array_equal(found["digest"].cov, learnt.cov)
-
-
-def test_what_a_flight_learnt_counts_after_it(tmp_path):
-    """A restart in flight begins with what was known before the flight."""
-    path = tmp_path / "state.json"
-    before, learnt = replace(unknown("c"), agreed_s=2000.0), replace(unknown("c"), agreed_s=4000.0)
-    known = {
-        "flown": Resumed(learnt, before).to_plain(before),
-        "first": Resumed(learnt, before).to_plain(None),
-        "other": learnt.to_plain(),
-        "damaged": {**learnt.to_plain(), "flight": 3},
-    }
-    save(path, SAVED, known)
-    assert {each.agreed_s for each in learnt_biases(path).values()} == {4000.0}
-    found, resumed = before_the_flight(path, "flown")
-    assert {name: each.agreed_s for name, each in found.items()} == {"flown": 2000, "other": 4000}
-    assert (resumed.learnt.agreed_s, resumed.reference.agreed_s) == (4000.0, 2000.0)
-    assert before_the_flight(path, "first")[1] is not None
-    assert before_the_flight(path, "other")[1] is None
-
-
-@pytest.mark.parametrize(
-    ("age_s", "ran_s", "same_flight"),
-    [(100.0, 0.0, True), (-5.0, 0.0, True), (301.0, 0.0, False), (1000.0, 800.0, True)],
-)
-def test_a_recent_state_is_of_the_same_flight(tmp_path, age_s, ran_s, same_flight):
-    """`ran_s`: how long the program ran on without a position."""
-    path = tmp_path / "state.json"
-    before, learnt = replace(unknown("c"), agreed_s=2000.0), replace(unknown("c"), agreed_s=4000.0)
-    saved = replace(SAVED, boot_id="", saved_utc_ns=UTC_NS + round(ran_s * S))
-    save(path, saved, {"map": Resumed(learnt, before).to_plain(before)})
-    clocks = Clocks(utc_ns=lambda: SAVED.utc_ns + round(age_s * S))
-    options = Namespace(state=path, state_max_age_s=300.0)
-    known, resumed = _learnt_before(options, "map", clocks)
-    assert known["map"].agreed_s == (2000.0 if same_flight else 4000.0)
-    assert (resumed is not None) is same_flight
 
 
 def test_what_was_learnt_of_many_maps_fits_into_the_file(tmp_path):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from orthonav.core.flight.telemetry_track import RecordedTrack, Samples, attitude_of_angles
 from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles, wxyz_of_angles
 from orthonav.onboard import telemetry
-from orthonav.onboard.telemetry import ClockSync, TelemetryBuffer, VehicleState
+from orthonav.onboard.telemetry import ClockSync, TelemetryBuffer
 
 ANGLES = st.tuples(st.floats(-180, 180), st.floats(-40, 40), st.floats(-40, 40))
 
@@ -100,39 +100,26 @@ def circling(time_ns):
     return 20 * math.cos(angle), 20 * math.sin(angle), 0.0
 
 
-def test_the_displacement_follows_turns_for_longer_than_samples_are_kept(monkeypatch):
-    monkeypatch.setattr(telemetry, "KEEP_NS", 2 * S)
+def test_the_mean_velocity_follows_turns():
     buffer = TelemetryBuffer()
-    buffer.add_local(0, circling(0), 0.0)
-    first = buffer.at(0).travelled
-    for time_ns in range(40 * MS, 50 * S + 1, 40 * MS):
+    for time_ns in range(0, 50 * S + 1, 40 * MS):
         buffer.add_local(time_ns, circling(time_ns), 0.0)
-    east, north = buffer.at(50 * S).travelled.since(first)
     across_m = 20 * 20 / math.pi  # half a turn more than two
-    assert (east, north) == pytest.approx((across_m, 0.0), abs=0.1)
-    between = buffer.at(50 * S - 30 * MS).travelled
-    moved = buffer.at(50 * S).travelled.since(between)
-    assert moved == pytest.approx((0.0, -0.6), abs=0.01)
+    assert buffer.mean_velocity(0, 50 * S) == pytest.approx((across_m / 50, 0.0), abs=0.01)
+    last = buffer.mean_velocity(50 * S - 30 * MS, 50 * S)
+    assert last == pytest.approx((0.0, -20.0), abs=0.2)
 
 
-def test_the_displacement_is_not_known_across_gaps_and_restarts():
+def test_the_mean_velocity_is_not_known_across_gaps_and_restarts():
     buffer = TelemetryBuffer()
-    buffer.add_local(0, (10.0, 0.0, 0.0), 0.0)
-    first = buffer.at(0).travelled
     later = round(telemetry.SLOW_GAP_S * S) + 1
-    buffer.add_local(later, (10.0, 0.0, 0.0), 0.0)
-    second = buffer.at(later).travelled
-    assert second.since(first) is None and second.since(None) is None
+    for time_ns, speed in ((0, 10.0), (later, 10.0), (later + S, 1e20), (later + 2 * S, 10.0)):
+        buffer.add_local(time_ns, (speed, 0.0, 0.0), 0.0)
+    assert buffer.mean_velocity(0, later) is None
+    assert buffer.mean_velocity(later, later + 2 * S) == (0.0, 10.0)
+    assert buffer.mean_velocity(-S, 0) is None
     buffer.clear()
-    assert buffer.at(later).travelled is None
-    buffer.add_local(0, (10.0, 0.0, 0.0), 0.0)
-    again = buffer.at(0).travelled
-    assert again.since(first) is None and again.since(second) is None
-    for number, speed in enumerate((1e20, 10.0, 10.0, 10.0), 1):
-        buffer.add_local(number * S, (speed, 0.0, 0.0), 0.0)
-    after = buffer.at(4 * S).travelled
-    assert after.since(again) is None and after.since(buffer.at(2 * S).travelled) == (0.0, 20.0)
-    assert VehicleState(None).travelled is None
+    assert buffer.mean_velocity(later, later + 2 * S) is None
 
 
 @pytest.mark.parametrize("wxyz", [(0, 0, 0, 0), (math.nan, 0, 0, 0), (3, 0, 0, 0)])
@@ -220,21 +207,6 @@ def test_a_queue_that_empties_is_no_jump():
     for number in range(150):
         sync.heard(10 * S + number * MS, 7 * S + number * 20 * MS + OFFSET_NS)
     assert (sync.jumps, offset_ns(sync)) == (0, before)
-
-
-def test_heights_above_sea_and_home_are_apart_from_the_one_above_ground():
-    buffer = TelemetryBuffer()
-    buffer.add_height("amsl", 0, 700.0)
-    state = buffer.at(0)
-    assert math.isnan(state.height_m) and state.amsl_m == 700.0
-    telemetry = state.telemetry(0)
-    assert (telemetry.amsl_m, telemetry.home_m) == (700.0, None) and math.isnan(telemetry.agl_m)
-    buffer.add_height("relative", 0, 90.0)
-    telemetry = buffer.at(0).telemetry(0)
-    assert telemetry.agl_m == telemetry.home_m == 90.0  # level ground
-    buffer.add_height("distance", 0, 60.0)
-    telemetry = buffer.at(0).telemetry(0)
-    assert (telemetry.agl_m, telemetry.home_m, telemetry.amsl_m) == (60.0, 90.0, 700.0)
 
 
 @pytest.mark.parametrize("rate", [-0.022, 0.03, 2e-5])

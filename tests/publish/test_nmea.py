@@ -149,10 +149,3 @@ def test_an_unknown_time_is_an_empty_field() -> None:
 def test_course_is_from_north_and_below_360(velocity, speed, course) -> None:
     message = read(rmc(replace(ESTIMATE, vel_en_mps=velocity)))
     assert (message.spd, message.cog) == (speed, course)
-
-
-def test_an_unknown_velocity_has_no_speed_and_a_still_one_no_course() -> None:
-    unknown = read(rmc(replace(ESTIMATE, vel_en_mps=None)))
-    still = read(rmc(replace(ESTIMATE, vel_en_mps=(0.0, 0.0))))
-    assert (unknown.spd, unknown.cog) == ("", "")
-    assert (still.spd, still.cog) == (0.0, "")

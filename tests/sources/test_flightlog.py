@@ -40,9 +40,8 @@ from orthonav.core.records import Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings import SourceOptions, open_source, source_kind
 from orthonav.ground.recordings import flightlog as flightlog_module
-from orthonav.onboard.log import FlightLog
+from orthonav.onboard.log import FlightLog, Segment
 from orthonav.onboard.run import MountCorrected, locate_view, model_of
-from orthonav.onboard.segment import Segment
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 VIEWS = 5

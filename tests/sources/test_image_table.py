@@ -62,7 +62,7 @@ def test_a_table_beside_images_is_found(images):
     ],
 )
 def test_columns_by_many_names(images, header):
-    rows = "a.png,20.5,120\n./sub/B.JPG,21,121\nC:\\dcim\\c.png,22,122\n"
+    rows = "a.png,20.5,120\n./sub/B.JPG,21,121\nC:\\dcim\\c,22,122\n"
     delimiter = max(",;\t", key=header.count)
     found = views_of(images, header + "\n" + rows.replace(",", delimiter))
     assert angles(found.by["a.png"]) == (20.5, 0, 0, 120)

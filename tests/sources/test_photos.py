@@ -424,6 +424,13 @@ def test_photographs_of_another_focal_length_are_left_out(tmp_path, other):
     assert recording.camera.fx_px == pytest.approx(math.hypot(64, 48) * 24 / math.hypot(36, 24))
 
 
+def test_focal_lengths_that_differ_by_rounding_are_one(tmp_path):
+    for number, focal_mm in enumerate((8.8, 8.8, 8.9)):
+        time = f"2023:11:14 22:13:2{number}"
+        photo(tmp_path / f"p/{number}.jpg", time, {0x920A: focal_mm}, xmp=dji())
+    assert len(views_of(tmp_path / "p", sensor_width_mm=13.2)) == 3
+
+
 def test_photographs_without_a_time_go_in_the_order_of_their_names(tmp_path):
     for name in ("IMG_9", "IMG_10", "IMG_11"):
         photo(tmp_path / f"p/{name}.jpg", time=None, xmp=dji())

@@ -54,6 +54,12 @@ def test_a_wrong_heading_is_found(registering, views):
     assert "check the heading column and the mounting of the camera" in said
 
 
+def test_views_that_form_no_track_are_no_wrong_configuration(registering, views):
+    (found,) = tried(registering, views, tracked=True)
+    (said,) = setup_text([found], on_map=True)
+    assert "the configuration is right, but the views do not form a track" in said
+
+
 def test_a_wrong_height_is_found_with_its_ratio(registering, views):
     high = [reported(view, agl_m=view.telemetry.agl_m * 1.9) for view in views[:1]]
     *failed, found = tried(registering, high, heading_known=False)

@@ -68,7 +68,7 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("sheets (set by the first build of an atlas)")
     text = "greatest width of a sheet (default 10)"
     group.add_argument("--sheet-km", type=float, help=text)
-    add_recipe(group)
+    add_recipe(group, any_method=False)
     add_options(group, "--dem", "--dem-datum")
     text = "rebuild sheets that have other imagery or versions"
     group.add_argument("--replace", action="store_true", help=text)

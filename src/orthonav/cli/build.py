@@ -52,9 +52,13 @@ def add(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help=text)
 
 
-def add_recipe(group: argparse._ActionsContainer) -> None:
+def add_recipe(group: argparse._ActionsContainer, *, any_method: bool = True) -> None:
     add_options(group, "--gsd-m", "--tile-px", "--overlap", "--seed")
     add = group.add_argument
+    text = "mirrored views that measure the level of chance on this map (default 24)"
+    add("--calibration-views", type=int, help=text)
+    if not any_method:
+        return
     text = "embedding: gradient (default), autoencoder, caevl, triplet or bovw"
     add("--method", metavar="NAME[:FIELD=VALUE,..]", help=text)
     text = "image representation: gradient, gray, canny (canny:low=100,high=200), segments, "
@@ -62,8 +66,6 @@ def add_recipe(group: argparse._ActionsContainer) -> None:
     add("--edges", metavar="NAME[:FIELD=VALUE,..]", help=f"{text}caevl, gray for triplet and bovw)")
     text = "omit the registration layer: a smaller map, with positions at tile level only"
     add("--no-registration", dest="registration", action="store_const", const=False, help=text)
-    text = "mirrored views that measure the level of chance on this map (default 24)"
-    add("--calibration-views", type=int, help=text)
 
 
 def asked(options: argparse.Namespace) -> dict[str, Any]:
@@ -80,7 +82,7 @@ def asked(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def recipe_of(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: value for name in RECIPE if (value := getattr(options, name)) is not None}
+    return {name: value for name in RECIPE if (value := getattr(options, name, None)) is not None}
 
 
 def run(options: argparse.Namespace) -> None:

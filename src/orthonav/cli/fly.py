@@ -37,8 +37,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "source",
         nargs="?",
         metavar="SOURCE",
-        help="images: /dev/video0 or 0, an rtsp:// or http:// stream, a video, a folder of images "
-        "or a flight folder; not with --ros2",
+        help="images: /dev/video0 or 0, an rtsp:// or http:// stream, a video or a flight folder; "
+        "not with --ros2",
     )
     _add_inputs(parser)
     _add_outputs(parser)
@@ -74,7 +74,7 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     text = "images, telemetry and positions by ROS 2 topics, without SOURCE and --autopilot"
     add("--ros2", action="store_true", help=f"{text} (docs/ros2.md)")
     text = "must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE, "
-    text += "--params-file FILE, --log-level LEVEL"
+    text += "--params-file FILE"
     add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARGS", help=text)
 
 
@@ -126,12 +126,11 @@ def _add_flight(parser: argparse.ArgumentParser) -> None:
     add("--start", type=numbers(3, triple), metavar=triple, help=text)
     text = "save the last position to this file and start from it after a restart"
     add("--state", type=Path, metavar="FILE", help=text)
-    text = "largest age of a saved position that a flight starts from, and of a stop after which "
-    text += "the learning of --gnss continues (default 300)"
+    text = "largest age of a saved position that a flight starts from (default 300)"
     add("--state-max-age-s", type=float, default=300.0, metavar="S", help=text)
     text = "watch: compare GNSS with the map, report faults and learn displacement, mount and "
-    text += "latency; correct: also correct by what --state has of earlier flights (default off)"
-    add("--gnss", choices=("off", "watch", "correct"), default="off", help=text)
+    text += "latency (default off)"
+    add("--gnss", choices=("off", "watch"), default="off", help=text)
     text = "largest age of a view when its processing starts; older ones are dropped (default 500)"
     add("--deadline-ms", type=float, default=500.0, metavar="MS", help=text)
     text = "height above ground from which views are located (default: 60 pixels of the map across)"

@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from orthonav.cli.common import checked_signature, search_plan
 from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
 from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
+from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
 from orthonav.core.flight.fixes import Identity
@@ -35,9 +36,7 @@ from orthonav.onboard import cameras, outputs, state
 from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.gnss.biases import Biases, Resumed
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
-from orthonav.onboard.health import TelemetryDiagnosis
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.estimate import Clock
@@ -84,7 +83,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, least)
     else:
         source, graph = _source(options, clocks, link, camera, stopping), None
-    console.quiet |= logging.getLogger("orthonav").level >= logging.WARNING  # --log-level of ROS
     for line in plan_lines(options, opened, least):
         console.say(line)
     camera = camera or source.wait_for_camera()
@@ -99,7 +97,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     wanted = None if options.ros2 else f"images from {options.source}"  # ROS 2 has its own text
     narrator = Narrator(
         *(console, clocks, newest, wanted, link, options.autopilot),
-        is_live=options.ros2 or cameras.is_live(options.source),
         sends=not options.dry_run and (link is not None or graph is not None),
     )
     publisher = _publisher(options, clocks, link, least, graph, narrator, digest)
@@ -122,7 +119,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
-        map_path=options.map,
         map_change=opened.change,
         state_path=options.state,
         logged_options=_logged_options(options, mount),
@@ -136,9 +132,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         clocks,
         link=link,
         sink=sink,
-        diagnosis=TelemetryDiagnosis(
-            localizer, least, has_start=bool(options.start or options.state)
-        ),
         start=start,
         fresh=locator,
         gnss=gnss,
@@ -157,8 +150,7 @@ def _ros2(
     """Reader and publisher of a new node, which `stack` closes. The centre of `frame` is the origin
     of the ROS map frame unless `--origin` is given."""
     from orthonav.onboard.ros2.arguments import ros_arguments
-    from orthonav.onboard.ros2.graph import Rosout
-    from orthonav.onboard.ros2.node import joined_graph
+    from orthonav.onboard.ros2.node import Rosout, joined_graph
     from orthonav.onboard.ros2.publisher import Ros2Publisher
     from orthonav.onboard.ros2.reader import Ros2Reader
 
@@ -200,6 +192,7 @@ def _opened(options: argparse.Namespace) -> MapFile:
 def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLog | None":
     if options.log is None:
         return None
+    needed("mcap", "autopilot", "a flight log")
     from orthonav.onboard.log import FlightLog  # only where it is asked for
 
     info = {"name": options.map.name, "manifest_sha256": digest}
@@ -312,17 +305,6 @@ def _publisher(
         send_coasting=options.send_coasting,
     )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
-    chosen = outputs.MessageOptions(
-        kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
-        clock=Clock(options.stamp),
-        sensor_id=options.sensor_id,
-        gps_id=options.gps_id,
-        satellites=options.satellites,
-        hdop_m=options.hdop_m,
-        min_std_m=options.min_std_m,
-        min_confidence=least,
-        origin=Origin(*options.origin) if options.origin else None,
-    )
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [outputs.NmeaOut(outputs.open_sink(url), quality=quality) for url in options.nmea]
@@ -332,7 +314,18 @@ def _publisher(
         ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
-    messenger = None if link is None else outputs.Messenger(chosen, gate, link, clocks)
+    messenger = None
+    if link is not None:
+        messenger = outputs.Messenger(
+            *(gate, link, clocks),
+            kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
+            clock=Clock(options.stamp),
+            sensor_id=options.sensor_id,
+            gps={name: getattr(options, name) for name in ("gps_id", "satellites", "hdop_m")},
+            min_std_m=options.min_std_m,
+            min_confidence=least,
+            origin=Origin(*options.origin) if options.origin else None,
+        )
     return outputs.Publisher(
         gate,
         clocks,
@@ -383,6 +376,8 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
     terrain, ground = sheet.terrain, "level ground"
     if terrain is not None:
         ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
+    recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
+    telemetry = ", ".join(each for each in (options.autopilot, recorded) if each)
     kinds = dict.fromkeys(options.send or ["global-position"])
     sent = [outputs.KINDS[kind] for kind in kinds] if options.autopilot else []
     sent += ["ROS 2 topics"] if options.ros2 else []
@@ -391,10 +386,22 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
     sent += [f"NMEA to {url}" for url in options.nmea]
     sent += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
     confident = f"; positions of confidence {least:g} or more"
-    return [
+    start = "anywhere on the map"
+    if options.start:
+        lat_deg, lon_deg, std_m = options.start
+        start = f"{lat_deg:.6f}, {lon_deg:.6f} +- {std_m:g} m"
+    if options.state is not None:
+        start = f"position saved in {options.state}, if it is recent, else {start}"
+    lines = [
         f"map: {options.map}, {area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}",
+        f"autopilot: {'telemetry from ROS 2' if options.ros2 else telemetry}",
         f"sends: {', '.join(sent) + confident if sent else 'nothing'}",
+        f"start: {start}",
+        f"GNSS: {'not used' if options.gnss == 'off' else options.gnss}",
     ]
+    if options.log is not None:
+        lines.append(f"log: {options.log}, views: {options.log_views}")
+    return lines
 
 
 def camera_line(options: argparse.Namespace, camera: Camera) -> str:
@@ -404,7 +411,10 @@ def camera_line(options: argparse.Namespace, camera: Camera) -> str:
     width_deg, height_deg = map(math.degrees, angles)
     size = f"{camera.width_px}x{camera.height_px} px, {width_deg:.0f} x {height_deg:.0f} deg"
     given = options.camera or ("camera_info" if options.ros2 else "flight.json")
-    return f"camera: {size} ({given}); images from {'ROS 2' if options.ros2 else options.source}"
+    source, pace = "ROS 2" if options.ros2 else str(options.source), ""
+    if not options.ros2 and not cameras.is_live(source):
+        pace = ", played" if options.pace == 1 else f", played at {options.pace:g} times real time"
+    return f"camera: {size} ({given}); images from {source}{pace}"
 
 
 def gnss_watch(
@@ -418,8 +428,6 @@ def gnss_watch(
 ) -> GnssWatch:
     """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder. After a
     change of what is `used` (camera, mount, latency), what that adds is learnt again."""
-    if options.gnss == "correct" and options.state is None:
-        raise VariantError("--gnss correct needs --state FILE with biases of earlier flights")
     recorded = options.recorded_telemetry and not options.ros2
     if recorded:
         source = recorded_solutions(read_gnss(Path(options.source) / FILE))
@@ -428,34 +436,16 @@ def gnss_watch(
     else:
         source = live_solutions(queue)
 
-    known, resumed = _learnt_before(options, digest, clocks)
     return GnssWatch(
         frame,
         source,
         digest=digest,
-        known=known,
-        resumed=resumed,
+        known=state.learnt_biases(options.state) if options.state else {},
         setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
-        correct=options.gnss == "correct",
         recorded=recorded,
         min_confidence=min_confidence,
         utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
     )
-
-
-def _learnt_before(
-    options: argparse.Namespace, digest: str, clocks: Clocks
-) -> tuple[Mapping[str, Biases], Resumed | None]:
-    """What was learnt before this flight, and by it, where it was interrupted: the saving program
-    stopped at most `--state-max-age-s` ago, or at an unknown time."""
-    if options.state is None:
-        return {}, None
-    saved = state.load(options.state)
-    if saved is not None:
-        stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
-        if stopped_s > options.state_max_age_s:
-            return state.learnt_biases(options.state), None
-    return state.before_the_flight(options.state, digest)
 
 
 def start_of(

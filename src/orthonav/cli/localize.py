@@ -407,6 +407,7 @@ class SetupAdvice:
             accept.accepts,
             use_prior=self._options.prior == "telemetry",
             heading_known=self._options.heading == "known",
+            tracked=bool(self._options.track or self._options.smooth),
             stop=lambda: time.monotonic() > end_s,
         )
 

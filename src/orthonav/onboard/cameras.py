@@ -19,21 +19,18 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.files import require_file
-from orthonav.core.flight import decode_image, open_flight
+from orthonav.core.flight import open_flight
 from orthonav.core.records import NoFix, Telemetry
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
 RETRY_S = (0.5, 1.0, 2.0, 5.0)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 GAP_S, GAP_INTERVALS = 0.5, 3.0
 """A longer time without images, also in usual intervals, may change the latency."""
 FROZEN_LEVELS = 0.25
 """Mean difference in grey levels below which two images are the same; noise is four times that."""
 FROZEN_SIDE_PX = 64
-FOLDER_RATE_HZ = 2.0
-"""Rate at which a folder of images without times is played."""
 Grey = NDArray[np.uint8]
 
 
@@ -224,14 +221,14 @@ def live_name(name: str) -> int | str:
 
 
 def recorded_images(path: Path) -> Iterator[RecordedImage]:
-    """Images of a flight folder, a video or a folder. Raises `FlightError`, `MissingFileError`."""
+    """Images of a flight folder or a video. Raises `FlightError`, `MissingFileError`."""
     if (path / "telemetry.csv").is_file():
         views = open_flight(path).views
         return iter(
             [RecordedImage(v.frame, v.telemetry.time_ns, v.grey, v.telemetry) for v in views]
         )
     if path.is_dir():
-        return _images(path)
+        raise FlightError(f"not a flight folder (no telemetry.csv): {path}")
     if not path.is_file():
         raise MissingFileError(f"no such camera, stream, folder or file: {path}")
     require_file(path, "video")
@@ -239,20 +236,6 @@ def recorded_images(path: Path) -> Iterator[RecordedImage]:
     if not capture.isOpened():
         raise FlightError(f"video cannot be opened: cut short, or not a video: {path}")
     return _video(capture)
-
-
-def _images(folder: Path) -> Iterator[RecordedImage]:
-    paths = sorted(each for each in folder.iterdir() if each.suffix.lower() in SUFFIXES)
-    if not paths:
-        raise FlightError(f"no images ({', '.join(SUFFIXES)}) in the folder: {folder}")
-
-    def load(path: Path) -> Grey:
-        return decode_image(path.read_bytes(), str(path))
-
-    return iter(
-        RecordedImage(path.name, round(number / FOLDER_RATE_HZ * 1e9), partial(load, path))
-        for number, path in enumerate(paths)
-    )
 
 
 def _video(capture: Any) -> Iterator[RecordedImage]:
@@ -293,15 +276,12 @@ class NewestImage:
         self._condition = threading.Condition()
         self._picture: CameraImage | None = None
         self.taken = self.replaced = self.outages = 0
-        self.size_px: tuple[int, int] | None = None
         self.ended = False
 
     def put(self, image: CameraImage) -> None:
         with self._condition:
             self.replaced += self._picture is not None
             self.taken += 1
-            if image.grey is not None:
-                self.size_px = image.grey.shape[1], image.grey.shape[0]
             self._picture = image
             self._condition.notify()
 

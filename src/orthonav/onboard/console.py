@@ -2,6 +2,7 @@
 few seconds, a summary. It is an output of `Publisher`, like the lines of JSON."""
 
 import contextlib
+import io
 import logging
 import math
 import os
@@ -16,7 +17,7 @@ import numpy as np
 
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.onboard.cameras import NewestImage
-from orthonav.onboard.health import IMAGE_AGE_S, LINK_AGE_S, STATUSTEXT_INTERVAL_NS, Level
+from orthonav.onboard.health import STATUSTEXT_INTERVAL_NS, Level
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.mavlink import Autopilot
 from orthonav.onboard.telemetry import Clocks
@@ -33,6 +34,8 @@ _STATES = {
     "lost": "the track does not fit the map any more",
 }
 _FAULTS = {
+    "no_camera": "no image any more",
+    "link_down": "no message from the autopilot any more",
     "no_telemetry": "no attitude; set the stream rates of the autopilot",
     "wrong_camera": "images do not fit --camera",
     "motion_mismatch": "check the camera, --mount-deg, height and heading",
@@ -44,7 +47,6 @@ _FAULTS = {
     "slow": "positions are late; see --budget-ms and --threads",
 }
 """What a reason of the health means, where its name does not say so."""
-_SAID_BY_OTHERS = {*_STATES, "no_camera", "camera_lost", "link_down"}
 MOST_LINES = 1000
 """Lines that wait for a slow reader; later ones are dropped."""
 CLOSE_S = 1.0
@@ -86,24 +88,20 @@ class Console:
     @contextlib.contextmanager
     def in_place_of_stderr(self) -> Iterator[None]:
         """Write log records meanwhile which otherwise go to stderr, at least warnings."""
-        root = logging.getLogger()
-        handlers, level = list(root.handlers), root.level
+        root, streams = logging.getLogger(), []
+        level = root.level
+        for handler in root.handlers if self.is_open else ():
+            if isinstance(handler, logging.StreamHandler) and handler.stream is sys.stderr:
+                handler.setStream(_Lines(self.put))
+                streams.append(handler)
         if self.is_open:
-            root.handlers = [self._in_place_of(each) for each in handlers]
             root.setLevel(min(level, logging.WARNING))
         try:
             yield
         finally:
-            if self.is_open:
-                root.handlers = handlers
-                root.setLevel(level)
-
-    def _in_place_of(self, handler: logging.Handler) -> logging.Handler:
-        if getattr(handler, "stream", None) is not sys.stderr:
-            return handler
-        made = _Records(self.put)
-        made.setFormatter(handler.formatter)
-        return made
+            root.setLevel(level)
+            for handler in streams:
+                handler.setStream(sys.stderr)
 
     def _write(self, descriptor: int | None) -> None:
         # Not by the stream: a thread that holds its lock at the end would abort the interpreter.
@@ -114,13 +112,15 @@ class Console:
                     data = data[os.write(descriptor, data) :]
 
 
-class _Records(logging.Handler):
+class _Lines(io.TextIOBase):
+    """A stream that passes what is written on without its line end."""
+
     def __init__(self, put: Callable[[str], None]) -> None:
-        super().__init__()
         self._put = put
 
-    def emit(self, record: logging.LogRecord) -> None:
-        self._put(self.format(record))
+    def write(self, text: str) -> int:
+        self._put(text.rstrip("\n"))
+        return len(text)
 
 
 class Narrator:
@@ -133,20 +133,16 @@ class Narrator:
         link: AutopilotLink | None,
         url: str | None,
         *,
-        is_live: bool,
         sends: bool,
     ) -> None:
-        """`images`: where they come from; None: their source says what it waits for. `is_live`:
-        from a camera, which can be lost. `sends`: positions, to an autopilot or to ROS 2."""
+        """`images`: where they come from; None: their source says what it waits for. `sends`:
+        positions, to an autopilot or to ROS 2."""
         self._console, self._clocks, self._sends = console, clocks, sends
-        self._newest, self._images, self._is_live = newest, images, is_live
-        self._link, self._url = link, url
+        self._newest, self._images, self._link, self._url = newest, images, link, url
         self._interval_ns = round((TERMINAL_S if console.is_terminal else FILE_S) * 1e9)
         self._status_ns = clocks.mono_ns() + self._interval_ns
         self._reminded: dict[str, int] = {}
-        self._taken = self._outages = self._image_ns = 0
-        self._has_camera = False
-        self._autopilot = _AutopilotWatch(console)
+        self._heard: set[str] = set()
         self._faults: tuple[str, ...] = ()
         self._faults_ns, self._is_faulty = 0, False
         self._result: ViewResult | None = None
@@ -210,19 +206,26 @@ class Narrator:
 
     def _watch(self, now_ns: int) -> None:
         if self._link is not None:
-            self._remind(self._autopilot.waits(self._link, self._url), now_ns)
-        newest, waits = self._newest, self._images
-        is_gone = newest.outages > self._outages or now_ns - self._image_ns > IMAGE_AGE_S * 1e9
-        if self._has_camera and is_gone and self._is_live:
-            self._console.warn("camera lost: no image any more")
-            self._has_camera = False
-        self._outages = newest.outages
-        if newest.taken != self._taken:
-            self._taken, self._image_ns = newest.taken, now_ns
-            if not self._has_camera and newest.size_px is not None:
-                self._console.say("camera {}x{}".format(*newest.size_px))
-            self._has_camera = True
-        self._remind(None if self._has_camera else waits, now_ns)
+            self._remind(self._missing_of(self._link), now_ns)
+        self._remind(None if self._newest.taken else self._images, now_ns)
+
+    def _missing_of(self, link: AutopilotLink) -> str | None:
+        """What is waited for from the autopilot; None where telemetry came."""
+        for each in list(link.others):
+            self._say_heard(f"{each.system_id}/{each.component_id}", ", not used (see --system-id)")
+        if link.target is None:
+            why = "" if link.is_open else ", which cannot be opened"
+            if link.counts["damaged"]:
+                why += "; messages are damaged, or not signed with this key"
+            return f"heartbeat on {self._url}{why}"
+        ids = f"{link.target.system_id}/{link.target.component_id}"
+        self._say_heard(f"{ids}{_KINDS[link.kind]}", "")
+        return None if math.isfinite(link.attitude_age_s) else f"ATTITUDE of autopilot {ids}"
+
+    def _say_heard(self, name: str, use: str) -> None:
+        if name not in self._heard:
+            self._heard.add(name)
+            self._console.say(f"autopilot {name} heard on {self._url}{use}")
 
     def _remind(self, waits: str | None, now_ns: int) -> None:
         if waits is not None and now_ns >= self._reminded.get(waits, now_ns):
@@ -230,10 +233,7 @@ class Narrator:
             self._console.say(f"waiting for {waits}")
 
     def _say_faults(self, plain: Mapping[str, Any], now_ns: int) -> None:
-        hidden = _SAID_BY_OTHERS
-        if self._link is not None and not self._autopilot.is_heard:
-            hidden = {*hidden, "no_telemetry", "telemetry_gaps"}
-        shown = tuple(each for each in plain["reasons"] if each not in hidden)
+        shown = tuple(each for each in plain["reasons"] if each not in _STATES)
         if self._is_faulty and plain["health"] == Level.OK.name:
             self._is_faulty = False
             self._console.say("health OK")
@@ -246,7 +246,6 @@ class Narrator:
             self._console.warn(f"{plain['health']}: {', '.join(self._fault(plain, shown))}")
 
     def _fault(self, plain: Mapping[str, Any], shown: Sequence[str]) -> Iterator[str]:
-        """The reasons of the health, each with its meaning when it comes for the first time."""
         for reason in shown:
             meaning = "" if reason in self._meant else _meaning(reason, plain)
             self._meant.add(reason)
@@ -276,34 +275,6 @@ class Narrator:
         elif self._counts["views"]:
             parts.append("no position in the whole flight")
         return "end: " + "; ".join(parts)
-
-
-class _AutopilotWatch:
-    def __init__(self, console: Console) -> None:
-        self._console, self.is_heard, self._others = console, False, 0
-
-    def waits(self, link: AutopilotLink, url: str | None) -> str | None:
-        """Note the status of the link; what is waited for, None where telemetry comes."""
-        others, target = list(link.others), link.target
-        for each in others[self._others :]:
-            ids = f"{each.system_id}/{each.component_id}"
-            self._console.say(f"autopilot {ids} heard on {url}, not used (see --system-id)")
-        self._others = len(others)
-        if target is None:
-            why = "" if link.is_open else ", which cannot be opened"
-            if link.counts["damaged"]:
-                why += "; messages are damaged, or not signed with this key"
-            return f"heartbeat on {url}{why}"
-        ids = f"{target.system_id}/{target.component_id}"
-        is_heard = link.heard_age_s <= LINK_AGE_S
-        if self.is_heard and not is_heard:
-            self._console.warn(f"heartbeat lost: nothing heard from autopilot {ids} on {url}")
-        elif is_heard and not self.is_heard:
-            self._console.say(f"autopilot {ids}{_KINDS[link.kind]} heard on {url}")
-        self.is_heard = is_heard
-        if not is_heard:
-            return f"autopilot {ids} on {url}"
-        return None if math.isfinite(link.attitude_age_s) else f"ATTITUDE of autopilot {ids}"
 
 
 def _meaning(reason: str, plain: Mapping[str, Any]) -> str:

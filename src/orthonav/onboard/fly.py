@@ -32,7 +32,6 @@ from orthonav.onboard.health import (
     Health,
     HealthReporter,
     StartCheck,
-    TelemetryDiagnosis,
     judge,
     mismatch,
     notify,
@@ -42,7 +41,7 @@ from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.mavlink import dialect, status_texts
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
-from orthonav.onboard.telemetry import Clocks, Travelled, VehicleState
+from orthonav.onboard.telemetry import Clocks, VehicleState
 
 if TYPE_CHECKING:
     from orthonav.onboard.log import FlightLog
@@ -85,7 +84,6 @@ class FlyOptions:
     recorded: bool = False
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
-    map_path: Path | None = None
     map_change: Callable[[], str | None] = lambda: None
     state_path: Path | None = None
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
@@ -105,7 +103,6 @@ class Runner:
         *,
         link: AutopilotLink | None = None,
         sink: "FlightLog | None" = None,
-        diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         fresh: Callable[[], Locator] | None = None,
         gnss: GnssWatch | None = None,
@@ -115,7 +112,7 @@ class Runner:
         `latency`: of a live camera; None where images carry the time of their exposure."""
         self._newest, self._camera, self._locator = newest, camera, locator
         self._publisher, self.options, self._clocks = publisher, options, clocks
-        self._link, self._sink, self._diagnosis = link, sink, diagnosis
+        self._link, self._sink = link, sink
         self._latency = latency
         self._start: Callable[[], Prior | None] | None = start
         self._start_check: StartCheck | None = None
@@ -129,7 +126,6 @@ class Runner:
         self._image_taken_ns: int | None = None
         self._tracked_ns: int | None = None
         self._withheld_ns = 0
-        self._travelled: Travelled | None = None
         self._heights_said = False
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
@@ -138,7 +134,6 @@ class Runner:
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
         self._seen: dict[str, int] = {}
         self._texts = 0
-        self._map_id = _file_id(options.map_path)
         self._boot_id = states.boot_id()
 
     def run(self, stopping: threading.Event) -> None:
@@ -214,7 +209,7 @@ class Runner:
             return
         log.warning("time went back by %.1f s: the track begins again", (before_ns - time_ns) / 1e9)
         self._locator, self._start, self._start_check = self._fresh(), self._begin, None
-        self._tracked_ns = self._travelled = None
+        self._tracked_ns = None
         if self.options.heights is not None:
             self.options.heights.observe(time_ns, NoFix("searching", ""), "searching")
 
@@ -266,11 +261,11 @@ class Runner:
             return self._refused(image, known, vehicle)
         if known.below is not None and math.isnan(vehicle.amsl_m):
             vehicle = replace(vehicle, amsl_m=known.below.height_m + known.agl_m)
-        reported, telemetry = known, self._over_gap(known, image, vehicle)
+        reported, telemetry = known, self._over_gap(known, image.exposed_ns)
         view = replace(view, telemetry=telemetry)
         self._log_view(image, view, latency, withheld=False)
         outcome, latency_ms = self._placed(view, reported)
-        self._tracked_ns, self._travelled = image.exposed_ns, vehicle.travelled
+        self._tracked_ns = image.exposed_ns
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
@@ -287,8 +282,6 @@ class Runner:
         if self.options.heights is not None:
             self.options.heights.observe(telemetry.time_ns, outcome, result.state)
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
-        if self._gnss is not None:
-            accepted = self._gnss.corrected(accepted)
         self._publisher.publish(
             replace(result, outcome=accepted), image.exposed_ns, vehicle, judged=True
         )
@@ -296,10 +289,6 @@ class Runner:
         self.counter.add_latency(now_ns, (now_ns - image.exposed_ns) / 1e9)
         self._log(lambda sink: sink.result(result))
         self._note(result, telemetry, image.exposed_ns)
-        if self._diagnosis is not None:
-            corrected = self.options.mount.corrected(telemetry) if self.options.mount else telemetry
-            found = result.state in (None, "tracking") and isinstance(outcome, Fix)
-            self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 
     def _from_start(self, view: View) -> View:
@@ -324,21 +313,14 @@ class Runner:
         except MapFileError:  # reported when the next view needs it
             return vehicle
 
-    def _over_gap(
-        self, telemetry: Telemetry, image: CameraImage, vehicle: VehicleState
-    ) -> Telemetry:
+    def _over_gap(self, telemetry: Telemetry, exposed_ns: int) -> Telemetry:
         """Telemetry whose velocity is the mean since the view before, where that is long ago."""
         before_ns, link = self._tracked_ns, self._link
-        if before_ns is None or telemetry.vel_en_mps is None or vehicle.travelled is None:
+        if self.options.recorded or before_ns is None or link is None:
             return telemetry
-        gap_ns = image.exposed_ns - before_ns
-        if gap_ns <= LONG_GAP_NS:
+        if telemetry.vel_en_mps is None or exposed_ns - before_ns <= LONG_GAP_NS:
             return telemetry
-        # Samples that followed that view were not known then.
-        again = None if link is None else link.state_at(before_ns).travelled
-        moved = vehicle.travelled.since(again or self._travelled)
-        mean = None if moved is None else (moved[0] * 1e9 / gap_ns, moved[1] * 1e9 / gap_ns)
-        return replace(telemetry, vel_en_mps=mean)
+        return replace(telemetry, vel_en_mps=link.mean_velocity(before_ns, exposed_ns))
 
     def _placed(self, view: View, reported: Telemetry) -> tuple[Fix | NoFix, float]:
         try:
@@ -368,7 +350,7 @@ class Runner:
         self._confident_ns = self._clocks.mono_ns()
         self._count("confident")
         if self._start_check is not None:
-            self._start_check.found(fix, self._confident_ns, self._confident_ns, confirmed=True)
+            self._start_check.found(fix, self._confident_ns)
         mount = self.options.mount
         self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
         if not self.options.heading_known:
@@ -411,7 +393,7 @@ class Runner:
             nothing = Telemetry(image.time_ns, math.nan, math.nan, math.nan, math.nan)
             return image.vehicle or VehicleState(None), image.telemetry or nothing
         until_ns = self._clocks.mono_ns() + round(TELEMETRY_WAIT_S * 1e9)
-        while not self._link.covers(image.exposed_ns) and self._clocks.mono_ns() < until_ns:
+        while (self._link.covered_ns or 0) < image.exposed_ns and self._clocks.mono_ns() < until_ns:
             self._clocks.sleep(_POLL_S)
         vehicle = self._link.state_at(image.exposed_ns)
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
@@ -471,7 +453,7 @@ class Runner:
         self._count_changes()
         self._save_state()
         texts = [] if self._gnss is None else self._gnss.tick(now_ns)
-        start_off_m = self._start_off_m(now_ns)
+        start_off_m = 0.0 if self._start_check is None else self._start_check.off_m(now_ns)
         health = self.health = self._judged(now_ns, start_off_m)
         plain = self._plain(health, start_off_m)
         self._publisher.health(plain)
@@ -521,7 +503,6 @@ class Runner:
         needs_origin = link is not None and messenger is not None and messenger.needs_origin
         taken_ns = self._image_taken_ns
         image_ns = self._begun_ns if taken_ns is None else taken_ns
-        found = (0.0, 0.0) if self._diagnosis is None else self._diagnosis.mismatch(now_ns)
         state = self._locator.state_name
         if state is None and taken_ns is None:
             state = "searching"
@@ -535,23 +516,13 @@ class Runner:
             latency_s=self.counter.latency_s(0.95),
             state=state,
             synced=link is None or link.sync.is_exact,
-            map_unchanged=_file_id(self.options.map_path) == self._map_id,
             map_intact=self.options.map_change() is None,
-            mismatch=found if any(found) else self._mismatch,
+            mismatch=self._mismatch,
             start_off_m=start_off_m,
             gnss=() if self._gnss is None else self._gnss.reasons,
             has_origin=not needs_origin or (link is not None and link.origin is not None),
             latency=None if self._latency is None or taken_ns is None else self._latency.reason,
         )
-
-    def _start_off_m(self, now_ns: int) -> float:
-        check = self._start_check
-        if check is None:
-            return 0.0
-        place = None if self._diagnosis is None else self._diagnosis.place
-        if place is not None:
-            check.found(*place, now_ns, confirmed=False)
-        return check.off_m(now_ns)
 
     def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:
         total = self.counter.total
@@ -574,22 +545,13 @@ class Runner:
         path, last = self.options.state_path, self._last
         if path is None or last is None:
             return
-        utc_ns, mono_ns = self._clocks.utc_ns(), self._clocks.mono_ns()
+        mono_ns = self._clocks.mono_ns()
         if last == self._saved and mono_ns - self._saved_ns < states.SAVE_S * 1e9:
             return
         stamp = self._link.signing_now() if self._link is not None else None
         try:
             maps = None if self._gnss is None else self._gnss.maps()
-            states.save(
-                path,
-                replace(
-                    last,
-                    signing_timestamp_10us=stamp or 0,
-                    saved_utc_ns=utc_ns,
-                    saved_mono_ns=mono_ns,
-                ),
-                maps,
-            )
+            states.save(path, replace(last, signing_timestamp_10us=stamp or 0), maps)
             self._saved, self._saved_ns = last, mono_ns
         except OSError as error:
             if self.counter.total["state_failed"] == 0:
@@ -622,11 +584,3 @@ def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:
     boot_ms = ((link.boot_ns(now_ns) or 0) // 1_000_000) % 2**32
     for name, value in ((b"gnss_fault", float(gnss.code)), (b"gnss_diff", gnss.difference_m)):
         link.send(dialect().MAVLink_named_value_float_message(boot_ms, name, value))
-
-
-def _file_id(path: Path | None) -> tuple[int, int] | None:
-    try:
-        found = path.stat() if path is not None else None
-    except OSError:
-        return None
-    return None if found is None else (found.st_dev, found.st_ino)

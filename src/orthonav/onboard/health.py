@@ -1,25 +1,20 @@
-"""Health of a flight with reasons (docs/onboard.md); diagnosis of telemetry and start."""
+"""Health of a flight with reasons (docs/onboard.md)."""
 
-import logging
 import math
 import os
 import socket
-import threading
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
-from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.localize.localizer import Localizer
-from orthonav.core.records import Fix, Prior, Telemetry, View
+from orthonav.core.records import Fix, Prior, Telemetry
 from orthonav.core.track.motion import usual_velocity_std_mps
 from orthonav.onboard.state import SPEED_MPS
 
-log = logging.getLogger(__name__)
 WINDOW_S = 10.0
 """Counts cover so many seconds."""
 IMAGE_AGE_S, TELEMETRY_AGE_S, LINK_AGE_S = 3.0, 3.0, 5.0
@@ -33,9 +28,6 @@ HEADING_DEG, LOG_SCALE = 20.0, 0.2
 GRACE_S = 5.0
 """Missing inputs are no reason for so long after the start."""
 STATUSTEXT_INTERVAL_NS = 5 * 10**9
-DIAGNOSIS_INTERVAL_S = 5.0
-DIAGNOSIS_VALID_S = 30.0
-"""A finding of `TelemetryDiagnosis` expires after this time."""
 SIGMAS = 3.0
 """A place farther from the start than this many deviations contradicts it."""
 SHOWN_S = 30.0
@@ -75,7 +67,6 @@ def judge(
     latency_s: float = 0.0,
     state: str | None = "tracking",
     synced: bool = True,
-    map_unchanged: bool = True,
     map_intact: bool = True,
     mismatch: tuple[float, float] = (0.0, 0.0),
     start_off_m: float = 0.0,
@@ -87,8 +78,8 @@ def judge(
 
     `counts`: events within the window by name; `slow_vision` and `incomplete` are seconds in which
     a local message came too late for PX4 or a message could not be built. `latency_s`: 95th
-    percentile from exposure to message. `map_unchanged`: the file of the map's name is the one that
-    was opened; `map_intact`: the open file was not changed. `mismatch`: see there. `start_off_m`:
+    percentile from exposure to message. `map_intact`: the open file was not
+    changed. `mismatch`: see there. `start_off_m`:
     distance by which the ground contradicts the start. `gnss`, `latency`: reasons of the monitors.
     `has_origin`: of the local frame, where messages need it.
     """
@@ -122,7 +113,6 @@ def judge(
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
         "not_synchronized": settled and not synced and not failed["link_down"],
-        "map_file_changed": not map_unchanged and map_intact,
         "output_failed": count["output_failed"] > 0,
         "log_failed": count["log_failed"] > 0,
         "state_not_saved": count["state_failed"] > 0,
@@ -165,8 +155,6 @@ class EventCounter:
 
 
 class HealthReporter:
-    """Decides when a change of health is sent as text. Mutable."""
-
     def __init__(self) -> None:
         self._reported: Health | None = None
         self._reported_ns: int | None = None
@@ -203,83 +191,14 @@ def mismatch(fix: Fix, telemetry: Telemetry) -> tuple[float, float]:
     return (heading if math.isfinite(heading) else 0.0), scale
 
 
-class TelemetryDiagnosis:
-    """Finds out whether a wrong heading, height or start is why no position is found.
-
-    While a track finds nothing, a view is located again on the whole map with any heading and half
-    and twice the height. A confident fix shows which value is wrong; it is never used as a
-    position. It takes seconds, so it runs in a thread. Mutable.
-    """
-
-    HYPOTHESES = ((False, 1.0), (True, 0.5), (True, 2.0))  # heading known, factor of the height
-
-    def __init__(
-        self,
-        localizer: Localizer,
-        min_confidence: float,
-        start: Callable[[Callable[[], None]], None] | None = None,
-        *,
-        has_start: bool = False,
-    ) -> None:
-        """`start` runs a function, by default in a thread. `has_start`: the track begins at a
-        start position, so the telemetry as reported is a hypothesis too."""
-        self._localizer, self._least = localizer, min_confidence
-        self._start = start or _in_a_thread
-        self._hypotheses = ((True, 1.0), *self.HYPOTHESES) if has_start else self.HYPOTHESES
-        self._busy = False
-        self._since_ns: int | None = None
-        self._number = 0
-        self._found: tuple[int, Fix, Telemetry] | None = None
-
-    def observe(self, view: View, found: bool, now_ns: int) -> None:
-        if found or self._since_ns is None:
-            self._since_ns = now_ns
-            self._found = None if found else self._found
-            return
-        if self._busy or now_ns - self._since_ns < DIAGNOSIS_INTERVAL_S * 1e9:
-            return
-        self._since_ns, self._busy = now_ns, True
-        heading_known, factor = self._hypotheses[self._number % len(self._hypotheses)]
-        self._number += 1
-        telemetry = view.telemetry
-        assumed = replace(view, telemetry=replace(telemetry, agl_m=telemetry.agl_m * factor))
-
-        def locate() -> None:
-            try:
-                outcome = self._localizer.locate(assumed, heading_known=heading_known)
-                if isinstance(outcome, Fix) and outcome.confidence >= self._least:
-                    self._found = now_ns, outcome, telemetry
-            except MapFileError as error:
-                log.warning("diagnosis of telemetry failed: %s", error)
-            except Exception:  # the flight does not depend on it
-                log.exception("diagnosis of telemetry failed")
-            finally:
-                self._busy = False
-
-        self._start(locate)
-
-    def mismatch(self, now_ns: int) -> tuple[float, float]:
-        if self._found is None or now_ns - self._found[0] > DIAGNOSIS_VALID_S * 1e9:
-            return 0.0, 0.0
-        return mismatch(*self._found[1:])
-
-    @property
-    def place(self) -> tuple[Fix, int] | None:
-        return None if self._found is None else (self._found[1], self._found[0])
-
-
-def _in_a_thread(work: Callable[[], None]) -> None:
-    threading.Thread(target=work, name="telemetry diagnosis", daemon=True).start()
-
-
 class StartCheck:
-    """Whether the first place that is found contradicts the start."""
+    """Whether the first place that the track finds contradicts the start."""
 
     def __init__(self, start: Prior, time_ns: int) -> None:
         self._start, self._time_ns = start, time_ns
         self._moved_en_m, self._free_m = np.zeros(2), 0.0
         self._off_m: float | None = None
-        self._seen_ns, self._is_confirmed = 0, False
+        self._found_ns = 0
 
     def moved(self, telemetry: Telemetry) -> None:
         seconds = max(telemetry.time_ns - self._time_ns, 0) / 1e9
@@ -292,20 +211,16 @@ class StartCheck:
         self._moved_en_m += np.array(velocity) * seconds
         self._free_m += SIGMAS * std_mps * seconds
 
-    def found(self, fix: Fix, seen_ns: int, now_ns: int, *, confirmed: bool) -> None:
-        """A place by the diagnosis, or, `confirmed`, by the track. The first one decides: later an
-        aircraft may have come to any place from the start."""
-        if self._is_confirmed:
-            return
-        self._seen_ns, self._is_confirmed = seen_ns, confirmed
+    def found(self, fix: Fix, now_ns: int) -> None:
+        """Only the first place counts: later an aircraft may have come to any from the start."""
         if self._off_m is None:
             plane = LocalFrame(fix.lat_deg, fix.lon_deg)
             start_en_m = plane.en_from_latlon(self._start.lat_deg, self._start.lon_deg)
             off_m = float(np.hypot(*(start_en_m + self._moved_en_m)))
             std_m = math.hypot(self._start.std_m, fix.radius_m)
-            free_m = self._free_m + SPEED_MPS * (now_ns - seen_ns) / 1e9
-            self._off_m = off_m if off_m > SIGMAS * std_m + free_m else 0.0
+            self._off_m = off_m if off_m > SIGMAS * std_m + self._free_m else 0.0
+            self._found_ns = now_ns
 
     def off_m(self, now_ns: int) -> float:
         """Distance by which the place contradicts the start; 0 within the deviations."""
-        return self._off_m or 0.0 if now_ns - self._seen_ns < SHOWN_S * 1e9 else 0.0
+        return self._off_m or 0.0 if now_ns - self._found_ns < SHOWN_S * 1e9 else 0.0

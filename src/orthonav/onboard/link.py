@@ -131,10 +131,6 @@ class AutopilotLink:
                 return False
             return True
 
-    def covers(self, exposed_ns: int) -> bool:
-        covered_ns = self.covered_ns
-        return covered_ns is not None and covered_ns >= exposed_ns
-
     @property
     def covered_ns(self) -> int | None:
         with self._lock:
@@ -142,7 +138,6 @@ class AutopilotLink:
             return None if newest is None else self.sync.mono_ns(newest)
 
     def state_at(self, exposed_ns: int) -> VehicleState:
-        """State that the autopilot reported for a time of our clock."""
         with self._lock:
             boot_ns = self.sync.boot_ns(exposed_ns)
             if boot_ns is None:
@@ -151,8 +146,15 @@ class AutopilotLink:
             state = self.buffer.at(boot_ns)
             return replace(state, vel_std_mps=vel_std_mps, tilt_std_deg=tilt_std_deg)
 
+    def mean_velocity(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
+        """See `TelemetryBuffer.mean_velocity`; times of our clock."""
+        with self._lock:
+            start, end = self.sync.boot_ns(start_ns), self.sync.boot_ns(end_ns)
+            if start is None or end is None:
+                return None
+            return self.buffer.mean_velocity(start, end)
+
     def boot_ns(self, mono_ns: int) -> int | None:
-        """Convert a time of our clock to the autopilot's; None while the offset is unknown."""
         with self._lock:
             return self.sync.boot_ns(mono_ns)
 
@@ -351,7 +353,6 @@ class AutopilotLink:
         self.aiding.status(message.flags, now_ns, ardupilot=ardupilot)
 
     def _odometry(self, message: Message, now_ns: int) -> None:
-        """The accuracy of the velocity, along the first two axes of the message."""
         variance = max(message.velocity_covariance[0], message.velocity_covariance[6])
         self.aiding.velocity(math.sqrt(variance) if variance >= 0 else math.nan, now_ns)
 

@@ -6,9 +6,10 @@ import json
 import logging
 import math
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from orthonav.core.errors import VariantError
@@ -66,36 +67,30 @@ _GPS_GLOBAL_ORIGIN = 49
 _MOST_REASONS = 20
 
 
-@dataclass(frozen=True)
-class MessageOptions:
-    """Messages to send, keys of `KINDS`, and their fields (docs/autopilots.md). `origin`: of the
-    local frame, set on the ground where the autopilot has none."""
-
-    kinds: tuple[str, ...] = ("global-position",)
-    clock: Clock = Clock.UTC
-    sensor_id: int = 1
-    gps_id: int = 0
-    satellites: int = 0
-    hdop_m: float | None = None
-    min_std_m: float = 0.0
-    min_confidence: float = CONFIDENT
-    origin: Origin | None = None
-
-    def __post_init__(self) -> None:
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
-        if unknown:
-            raise VariantError(f"messages are {', '.join(KINDS)}, got '{unknown[0]}'")
-
-
 class Messenger:
     """Builds and sends the messages that are due; counts those that are `incomplete`, and local
     ones that are `too_slow` for PX4. Mutable."""
 
     def __init__(
-        self, options: MessageOptions, gate: Gate, link: AutopilotLink, clocks: Clocks
+        self,
+        gate: Gate,
+        link: AutopilotLink,
+        clocks: Clocks,
+        *,
+        kinds: Sequence[str] = ("global-position",),
+        clock: Clock = Clock.UTC,
+        sensor_id: int = 1,
+        gps: Mapping[str, Any] = MappingProxyType({}),
+        min_std_m: float = 0.0,
+        min_confidence: float = CONFIDENT,
+        origin: Origin | None = None,
     ) -> None:
-        self.options, self._gate, self._link, self._clocks = options, gate, link, clocks
-        self._covariance = FilterCovariance(options.min_std_m)
+        """`kinds`: keys of `KINDS`. `gps`: fields of GPS_INPUT (docs/autopilots.md). `origin`: of
+        the local frame, set on the ground where the autopilot has none."""
+        self._gate, self._link, self._clocks = gate, link, clocks
+        self._kinds, self._sensor_id, self._gps, self._own_origin = kinds, sensor_id, gps, origin
+        self._common: dict[str, Any] = {"clock": clock, "min_confidence": min_confidence}
+        self._covariance = FilterCovariance(min_std_m)
         self.incomplete = self.too_slow = 0
         self._said: set[str] = set()
         self._origin_due_ns = self._requests = 0
@@ -106,7 +101,7 @@ class Messenger:
         """Names of the messages sent."""
         sent = []
         boot_ns = self._link.boot_ns(exposed_ns)
-        for name in self.options.kinds:
+        for name in self._kinds:
             if estimate.dead_reckoned and name != "global-position":
                 continue  # only this message can mark it
             now_ns = self._clocks.mono_ns()
@@ -136,12 +131,12 @@ class Messenger:
 
     @property
     def needs_origin(self) -> bool:
-        return any(kind in LOCAL for kind in self.options.kinds)
+        return any(kind in LOCAL for kind in self._kinds)
 
     def find_origin(self) -> None:
-        """Ask for the origin of the local frame until it is known. Where there is none, set that of
-        the options, unless armed: an origin that moves in flight moves the aircraft."""
-        now_ns, origin, link = self._clocks.mono_ns(), self.options.origin, self._link
+        """Ask for the origin of the local frame until it is known. Where there is none, set our own
+        unless armed: an origin that moves in flight moves the aircraft."""
+        now_ns, origin, link = self._clocks.mono_ns(), self._own_origin, self._link
         if link.origin is not None:
             self._requests = 0
             return
@@ -153,36 +148,20 @@ class Messenger:
         self._requests += link.send(request_message(_GPS_GLOBAL_ORIGIN, link.target))
 
     def _make(self, name: str, estimate: NavigationEstimate, vehicle: VehicleState) -> Message:
-        chosen = self.options
-        clock, least = chosen.clock, chosen.min_confidence
-        target = self._link.target or AUTOPILOT
+        common, target = self._common, self._link.target or AUTOPILOT
         if name == "global-position":
             return global_position_sensor(
-                estimate,
-                clock=clock,
-                sensor_id=chosen.sensor_id,
-                target=target,
-                min_confidence=least,
+                estimate, sensor_id=self._sensor_id, target=target, **common
             )
         if name == "gps-input":
             if math.isfinite(vehicle.amsl_m) and math.isnan(estimate.alt_amsl_m):
                 estimate = replace(estimate, alt_amsl_m=vehicle.amsl_m, alt_std_m=DOWN_STD_M)
-            return gps_input(
-                estimate,
-                clock=clock,
-                gps_id=chosen.gps_id,
-                satellites=chosen.satellites,
-                hdop_m=chosen.hdop_m,
-                min_confidence=least,
-            )
+            return gps_input(estimate, **self._gps, **common)
         if name == "external-position":
-            return external_position_estimate(
-                estimate, clock=clock, target=target, min_confidence=least
-            )
+            return external_position_estimate(estimate, target=target, **common)
         make = odometry if name == "odometry" else vision_position_estimate
         pose = _pose(vehicle, self._link.origin)
-        kind = self._link.kind or Autopilot.PX4
-        return make(estimate, pose, kind, clock=clock, min_confidence=least)
+        return make(estimate, pose, self._link.kind or Autopilot.PX4, **common)
 
 
 def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
@@ -298,8 +277,6 @@ class JsonOut:
 
 
 class Publisher:
-    """Publishes results to all outputs. Mutable."""
-
     def __init__(
         self,
         gate: Gate,
@@ -357,7 +334,7 @@ class Publisher:
         self._each([*self._lines, *self._graph], lambda out: out.health(plain))
 
     def close(self) -> None:
-        self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
+        self._each([*self._nmea, *self._lines], lambda out: out.close())
 
     def _to_graph(
         self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState, stamp_ns: int

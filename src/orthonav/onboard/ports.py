@@ -12,29 +12,12 @@ import termios
 import time
 import tty
 from collections.abc import Callable
-from typing import Protocol
 
 from orthonav.core.errors import VariantError
 
 LOOPBACK = "127.0.0.1"
 DEFAULT_BAUD = 57_600
 _MAX_BYTES = 4096
-
-
-class Transport(Protocol):
-    """Bytes in and out without blocking. `read` and `write` raise `OSError` on failure."""
-
-    def fileno(self) -> int: ...
-
-    def read(self) -> bytes:
-        """Available data; empty where there is none."""
-
-    def write(self, data: bytes) -> None:
-        """Send one message; it is dropped while no receiver is known."""
-
-    def heard(self) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class Udp:
@@ -110,6 +93,11 @@ class Descriptor:
 
     def close(self) -> None:
         os.close(self._fd)
+
+
+Transport = Udp | Descriptor
+"""Bytes in and out without blocking. `read` gives what is there, `write` sends one message; both
+raise `OSError` on failure."""
 
 
 def open_serial(device: str, baud: int) -> Descriptor:

@@ -21,8 +21,6 @@ LEAST_TILT_DEG = 0.1
 
 
 class Locator(Protocol):
-    """Locates the views of one flight, one by one or as a track."""
-
     def locate(self, view: View) -> Fix | NoFix:
         """Position of a view. Raises `CameraError` where the image has not the camera's size."""
 

@@ -11,7 +11,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,14 @@ from orthonav.core.errors import MapFileError, OutputError
 from orthonav.core.files import write_text
 from orthonav.core.mapfile.signature import MAX_SERIAL, Signature
 from orthonav.core.records import Prior
-from orthonav.onboard.gnss.biases import Biases, Resumed, before_flight, biases_from_plain
+from orthonav.onboard.gnss.biases import Biases, biases_from_plain
 
 VERSION = 1
 MAX_BYTES = 100_000
 MAX_MAPS = 100
 """Maps of which something is stored, the latest."""
 SAVE_S = 10.0
-"""A state is saved again after so long without a new position: the flight goes on."""
+"""A state is saved again after so long without a new position, for the signing timestamp."""
 SPEED_MPS = 30.0
 """Standard deviation of the speed of the aircraft since the position was saved: assumed."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -39,7 +39,7 @@ class SavedState:
 
     `std_m`: along the worst axis. `utc_ns`, `mono_ns`: time of exposure; the second is valid while
     `boot_id`, that of the operating system, is the same. `signing_timestamp_10us`: see
-    `orthonav.onboard.messages.mavlink.Signing`. `saved_utc_ns`, `saved_mono_ns`: of the last save.
+    `orthonav.onboard.messages.mavlink.Signing`.
     """
 
     lat_deg: float = math.nan
@@ -49,19 +49,12 @@ class SavedState:
     mono_ns: int = 0
     boot_id: str = ""
     signing_timestamp_10us: int = 0
-    saved_utc_ns: int = 0
-    saved_mono_ns: int = 0
 
     def age_s(self, utc_ns: int, mono_ns: int, boot_id: str) -> float:
         """Age of the position in seconds; negative where the clock was set back."""
         if boot_id and boot_id == self.boot_id:
             return (mono_ns - self.mono_ns) / 1e9
         return (utc_ns - self.utc_ns) / 1e9
-
-    def stopped_s(self, utc_ns: int, mono_ns: int, boot_id: str) -> float:
-        """Seconds since the program that saved it ran; negative where the clock was set back."""
-        last = replace(self, utc_ns=self.saved_utc_ns, mono_ns=self.saved_mono_ns)
-        return last.age_s(utc_ns, mono_ns, boot_id)
 
 
 def boot_id() -> str:
@@ -102,19 +95,6 @@ def learnt_biases(path: Path) -> dict[str, Biases]:
     return found
 
 
-def before_the_flight(path: Path, digest: str) -> tuple[dict[str, Biases], Resumed | None]:
-    """As `learnt_biases`, before the flight that saved the file; what that learnt of `digest`."""
-    known, resumed = {}, None
-    for each, plain in _maps_of(path).items():
-        with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
-            before, flown = before_flight(plain)
-            if before is not None:
-                known[each] = before
-            if each == digest:
-                resumed = flown
-    return known, resumed
-
-
 def _maps_of(path: Path) -> dict[str, Any]:
     maps = _plain_of(path).get("maps")
     return maps if isinstance(maps, dict) else {}
@@ -134,7 +114,6 @@ def load(path: Path) -> SavedState | None:
     plain = _plain_of(path)
     if plain.get("version") != VERSION:
         return None
-    plain = {"saved_utc_ns": plain.get("utc_ns"), "saved_mono_ns": plain.get("mono_ns"), **plain}
     try:
         return SavedState(
             **{name: type(value)(plain[name]) for name, value in asdict(SavedState()).items()}

@@ -34,10 +34,9 @@ _SECOND_AMSL = "altitude"
 """Height above sea level of a second message, where the first gives none."""
 _MS = 1_000_000
 _NAN3 = (math.nan, math.nan, math.nan)
-TRAVELLED = slice(4, 7)
-"""The displacement in a sample of the local frame, after velocity and down position."""
-KEEP_NS = 20 * 10**9
-"""Samples are kept for so long: the longest latency of a camera, and some more."""
+KEEP_NS, KEEP_LOCAL_NS = 20 * 10**9, 60 * 10**9
+"""Samples are kept for so long: the longest latency of a camera, and some more; velocities for the
+longest gap between views that their mean bridges."""
 ATTITUDE_GAP_S, SLOW_GAP_S = 0.5, 2.0
 """Longest interval that is interpolated: of attitudes, which change fast, and of the rest."""
 ATTITUDE_HOLD_S, SLOW_HOLD_S = 0.1, 1.5
@@ -45,7 +44,7 @@ ATTITUDE_HOLD_S, SLOW_HOLD_S = 0.1, 1.5
 ATTITUDE_AHEAD_NS = 30_000_000
 """Longest extrapolation of the attitude."""
 FASTEST_MPS = 300.0
-"""A faster velocity is an error and is not integrated."""
+"""A faster velocity is an error."""
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
 UNAIDED_VEL_STD_MPS = 5.0
@@ -64,25 +63,9 @@ FIX_3D = 3
 
 @dataclass(frozen=True)
 class Clocks:
-    """Functions that read the clocks and wait; tests replace them."""
-
     mono_ns: Callable[[], int] = time.monotonic_ns
     utc_ns: Callable[[], int] = time.time_ns
     sleep: Callable[[float], None] = time.sleep
-
-
-class Travelled(NamedTuple):
-    """Integral of the reported velocity over an uninterrupted `part` of the telemetry."""
-
-    part: int
-    north_m: float
-    east_m: float
-
-    def since(self, before: "Travelled | None") -> tuple[float, float] | None:
-        """Metres east and north; None where the velocity in between is not known."""
-        if before is None or before.part != self.part:
-            return None
-        return self.east_m - before.east_m, self.north_m - before.north_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +84,6 @@ class VehicleState:
     down_m: float = math.nan
     home_m: float = math.nan
     amsl_m: float = math.nan
-    travelled: Travelled | None = None
     vel_std_mps: float = math.nan
     tilt_std_deg: float = math.nan
 
@@ -188,7 +170,6 @@ class TelemetryBuffer:
     def __init__(self, heights: Sequence[str] = HEIGHT_SOURCES) -> None:
         """`heights` are those of `HEIGHT_SOURCES` that may be used, the best first."""
         self._order = tuple(heights)
-        self._parts = 0
         self.clear()
 
     def clear(self) -> None:
@@ -198,7 +179,6 @@ class TelemetryBuffer:
         if "amsl" in self._order:
             self._heights[_SECOND_AMSL] = _Samples(*slow)
         self._local = _Samples(*slow)
-        self._parts += 1
 
     def add_attitude(self, time_ns: int, wxyz: Sequence[float]) -> None:
         """Add a rotation from body (forward, right, down) to NED; invalid ones are dropped."""
@@ -223,19 +203,9 @@ class TelemetryBuffer:
                 self.add_height("distance", time_ns, distance_m * float(down))
 
     def add_local(self, time_ns: int, velocity_ned_mps: Triple, down_m: float) -> None:
-        values = np.array([*velocity_ned_mps, down_m, 0.0, 0.0, 0.0])
-        if not np.isfinite(values).all():
-            return
-        local = self._local
-        values[TRAVELLED] = self._parts, 0.0, 0.0
-        if local.times and time_ns > local.times[-1]:
-            fastest = np.abs([local.values[-1][:2], values[:2]]).max()
-            if time_ns - local.times[-1] > local.gap_ns or fastest > FASTEST_MPS:
-                self._parts += 1
-                values[TRAVELLED] = self._parts, 0.0, 0.0
-            else:
-                values[TRAVELLED] = self._travelled_at(time_ns, values[:2])
-        local.add(time_ns, values, KEEP_NS)
+        values = np.array([*velocity_ned_mps, down_m])
+        if np.isfinite(values).all() and np.abs(values[:3]).max() <= FASTEST_MPS:
+            self._local.add(time_ns, values, KEEP_LOCAL_NS)
 
     @property
     def covered_ns(self) -> int | None:
@@ -256,22 +226,21 @@ class TelemetryBuffer:
         local = self._local.at(time_ns)
         if local is None:
             return state
-        north, east, down, below = local[:4].tolist()
-        return replace(
-            state,
-            velocity_ned_mps=(north, east, down),
-            down_m=below,
-            travelled=self._travelled_at(time_ns, local[:2]),
-        )
+        north, east, down, below = local.tolist()
+        return replace(state, velocity_ned_mps=(north, east, down), down_m=below)
 
-    def _travelled_at(self, time_ns: int, velocity_ne_mps: Array) -> Travelled:
-        """Displacement up to a time at which the velocity (2,) is known."""
-        times, values = self._local.times, self._local.values
-        last = bisect_right(times, time_ns) - 1
-        part, north, east = values[last][TRAVELLED].tolist()
-        seconds = (time_ns - times[last]) / 1e9
-        mean_n, mean_e = ((values[last][:2] + velocity_ne_mps) / 2).tolist()
-        return Travelled(round(part), north + seconds * mean_n, east + seconds * mean_e)
+    def mean_velocity(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
+        """East and north (m/s); None where it is not known throughout."""
+        local = self._local
+        inner = slice(bisect_right(local.times, start_ns), bisect_left(local.times, end_ns))
+        ends = local.at(start_ns), local.at(end_ns)
+        times = np.array([start_ns, *local.times[inner], end_ns])
+        if ends[0] is None or ends[1] is None or np.diff(times).max() > local.gap_ns:
+            return None
+        velocities = np.array([ends[0], *local.values[inner], ends[1]])[:, 1::-1]
+        east, north = np.trapezoid(velocities, times / 1e9, axis=0).tolist()
+        seconds = (end_ns - start_ns) / 1e9
+        return east / seconds, north / seconds
 
     def _height(self, names: Sequence[str], time_ns: int) -> float:
         found = (self._heights[name].at(time_ns) for name in names if name in self._heights)
@@ -360,7 +329,6 @@ class ClockSync:
         return False
 
     def _off_ns(self, mono_ns: int, reported_ns: int) -> int:
-        """How far a reported time is from the expected one; 0 where none is expected."""
         expected_ns = self.boot_ns(mono_ns)
         return 0 if expected_ns is None else abs(reported_ns - expected_ns)
 

@@ -162,7 +162,7 @@ class SearchedSheet:
 
     def floor_m(self, view: PreparedView) -> float:
         """Agreement of maps of two dates at the view's final level."""
-        # Coarse imagery of another date is displaced by more (benchmarks/pixel_ellipses.py).
+        # Coarse imagery of another date is displaced by more (docs/terrain.md).
         return self.floor_px * self.grid.gsd_m * 2.0**view.levels.final
 
     def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:

@@ -199,7 +199,7 @@ def read_changes(path: Path) -> ChangedGround:
     ) as error:
         raise FlightError(
             f"not a report of changed ground ({described(error)}); give a file written by "
-            f"localize or evaluate --report-changes: {path}"
+            f"localize --report-changes: {path}"
         ) from error
 
 

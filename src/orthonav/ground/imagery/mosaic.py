@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio._err import CPLE_BaseError
 from rasterio.dtypes import dtype_rev, typename_fwd
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
@@ -466,8 +467,14 @@ class SheetRaster:
         stretch = self._mosaic.stretches[lattice.members[0]]
         picture = _in_colours(values if stretch is None else stretch.apply(values), colours)
         _fill_holes(picture, mask)
-        warped = self._resampled(lattice, picture, transform, target, shape, True)
-        warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
+        try:
+            warped = self._resampled(lattice, picture, transform, target, shape, True)
+            warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
+        except CPLE_BaseError as error:
+            raise ImageryError(
+                "orthophoto does not fit its coordinate system; assign the correct one (for "
+                f"example: gdal_edit.py -a_srs EPSG:2154 FILE): {lattice.first.path}"
+            ) from error
         return warped, warped_mask[..., 0]
 
     def _resampled(

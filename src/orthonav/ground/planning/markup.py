@@ -147,7 +147,9 @@ def read_kml(data: bytes) -> list[Route]:
     root = read_markup(data, "KML", "kml")
     found = [route for mark in root.iter("Placemark") for route in _kml_routes(mark)]
     if not found:
-        raise RouteError("KML holds no LineString and no gx:Track")
+        dji = "; it is the template of a DJI mission: give its waylines.wpml, or the whole KMZ"
+        hint = dji if root.find(".//missionConfig") is not None else ""
+        raise RouteError(f"KML holds no LineString and no gx:Track{hint}")
     return found
 
 

@@ -5,8 +5,9 @@ Only confident positions are written: photogrammetry takes what it is given as m
 
 import csv
 import io
+import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -26,6 +27,11 @@ from orthonav.core.records import MAP_STD_M, Fix, ViewResult
 _XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
 _YEAR_2000_NS = 946_684_800 * 10**9  # earlier times count from something else than 1970
 CSV_COLUMNS = ("frame", "lat_deg", "lon_deg", "height_m", "agl_m", "heading_deg", "std_m")
+EXIF_COLUMNS = (
+    *("SourceFile", "GPSLatitude", "GPSLatitudeRef", "GPSLongitude", "GPSLongitudeRef"),
+    *("GPSAltitude", "GPSAltitudeRef", "GPSImgDirection", "GPSImgDirectionRef"),
+    *("GPSHPositioningError", "GPSMapDatum"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +54,9 @@ class CameraPosition:
     def up_m(self) -> float:
         """Height above sea where all are known, else above ground."""
         return self.height_m if self.above_sea else self.fix.agl_m
+
+
+Positions = Sequence[CameraPosition]
 
 
 def camera_positions(
@@ -98,84 +107,147 @@ def export_all(
     """Write the camera positions of a flight in formats and to paths of `export_of`."""
     positions = camera_positions(results, terrain) if exports else []
     for name, path in exports:
-        head, line_of, tail = FORMATS[name]
-        write_text(path, "\n".join([head, *map(line_of, positions), *tail]) + "\n")
+        write_text(path, "\n".join(FORMATS[name](positions)) + "\n")
 
 
-def _csv(each: CameraPosition) -> str:
-    values = each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m
-    known = ("" if math.isnan(value) else f"{value:.3f}" for value in values)
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     out = io.StringIO()
-    csv.writer(out, lineterminator="").writerow(
-        [each.view.frame, f"{each.fix.lat_deg:.8f}", f"{each.fix.lon_deg:.8f}", *known]
+    csv.writer(out, lineterminator="\n").writerows([columns, *rows])
+    return out.getvalue().splitlines()
+
+
+def _text(value: float, decimals: int = 3) -> str:
+    return "" if math.isnan(value) else f"{value:.{decimals}f}"
+
+
+def _csv(positions: Positions) -> list[str]:
+    return _table(
+        CSV_COLUMNS,
+        (
+            [
+                *(each.view.frame, f"{each.fix.lat_deg:.8f}", f"{each.fix.lon_deg:.8f}"),
+                *map(_text, (each.height_m, each.fix.agl_m, each.fix.heading_deg, each.std_m)),
+            ]
+            for each in positions
+        ),
     )
-    return out.getvalue()
 
 
-def _odm_geo(each: CameraPosition) -> str:
-    """A line of OpenDroneMap's image geolocation file, https://docs.opendronemap.org/geo.
+def _geojson(positions: Positions) -> list[str]:
+    features = []
+    for each in positions:
+        place = each.fix.lon_deg, each.fix.lat_deg, each.height_m
+        numbers = {
+            "agl_m": each.fix.agl_m,
+            "heading_deg": each.fix.heading_deg,
+            "std_m": each.std_m,
+            "confidence": each.fix.confidence,
+        }
+        known = {name: None if math.isnan(x) else round(x, 4) for name, x in numbers.items()}
+        point = [round(value, 8) for value in place if math.isfinite(value)]
+        geometry = {"type": "Point", "coordinates": point}
+        about = {"frame": each.view.frame, **known}
+        features.append({"type": "Feature", "geometry": geometry, "properties": about})
+    return [json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False)]
+
+
+def _exif(positions: Positions) -> list[str]:
+    """A table that ExifTool writes into photographs (`exiftool -csv=TABLE FOLDER`)."""
+    rows = []
+    for each in positions:
+        lat, lon, height_m = each.fix.lat_deg, each.fix.lon_deg, each.height_m
+        heading = _text(each.fix.heading_deg, 2)
+        level = f"{'Below' if height_m < 0 else 'Above'} Sea Level"
+        rows.append(
+            [
+                *(each.view.frame, f"{abs(lat):.8f}", "North" if lat >= 0 else "South"),
+                *(f"{abs(lon):.8f}", "East" if lon >= 0 else "West"),
+                *(_text(abs(height_m)), "" if math.isnan(height_m) else level),
+                *(heading, heading and "True North", _text(each.std_m), "WGS-84"),
+            ]
+        )
+    return _table(EXIF_COLUMNS, rows)
+
+
+def _odm_geo(positions: Positions) -> list[str]:
+    """OpenDroneMap's image geolocation file, https://docs.opendronemap.org/geo.
 
     Accuracy follows angles, and angles follow the height: without a height it is left out. Angles
     are 0, which means not available. Names must have no spaces.
     """
-    if any(character.isspace() for character in each.view.frame):
-        raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.view.frame!r}")
-    line = f"{each.view.frame} {each.fix.lon_deg:.8f} {each.fix.lat_deg:.8f}"
-    if math.isnan(each.height_m):
-        return line
-    return f"{line} {each.height_m:.3f} 0 0 0 {each.std_m:.3f}"
+    lines = ["EPSG:4326"]
+    for each in positions:
+        if any(character.isspace() for character in each.view.frame):
+            raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.view.frame!r}")
+        height = "" if math.isnan(each.height_m) else f" {each.height_m:.3f} 0 0 0 {each.std_m:.3f}"
+        lines.append(f"{each.view.frame} {each.fix.lon_deg:.8f} {each.fix.lat_deg:.8f}{height}")
+    return lines
 
 
-def _tum(each: CameraPosition) -> str:
-    """A pose as evo reads it: `timestamp tx ty tz qx qy qz qw`, metres and a quaternion.
+def _tum(positions: Positions) -> list[str]:
+    """A trajectory as evo reads it: `timestamp tx ty tz qx qy qz qw`, metres and a quaternion.
 
     The quaternion turns camera axes (x to the right of the image, y down the image, z along the
     optical axis) to east, north and up. Unknown angles count as 0.
     """
-    angles = np.nan_to_num([each.fix.heading_deg, each.fix.pitch_deg, each.fix.roll_deg])
-    w, *xyz = wxyz_of_matrices(enu_from_camera(*angles.tolist())).tolist()
-    numbers = " ".join(f"{math.copysign(1, w) * value:.9f}" for value in (*xyz, w))
-    place = f"{each.en_m[0]:.4f} {each.en_m[1]:.4f} {each.up_m:.4f}"
-    return f"{Decimal(each.view.time_ns).scaleb(-9):f} {place} {numbers}"
+    lines = [
+        f"# east, north, up (m) of {each.fix.lat_deg:.8f}, {each.fix.lon_deg:.8f} (WGS84)"
+        for each in positions[:1]
+    ]
+    for each in positions:
+        angles = np.nan_to_num([each.fix.heading_deg, each.fix.pitch_deg, each.fix.roll_deg])
+        w, *xyz = wxyz_of_matrices(enu_from_camera(*angles.tolist())).tolist()
+        numbers = " ".join(f"{math.copysign(1, w) * value:.9f}" for value in (*xyz, w))
+        place = f"{each.en_m[0]:.4f} {each.en_m[1]:.4f} {each.up_m:.4f}"
+        lines.append(f"{Decimal(each.view.time_ns).scaleb(-9):f} {place} {numbers}")
+    return lines
 
 
-def _kml(each: CameraPosition) -> str:
-    mode = "absolute" if each.above_sea else "relativeToGround"
-    return (
-        f"<Placemark><name>{escape(each.view.frame)}</name>"
-        f"<description>std {each.std_m:.1f} m</description>"
-        f"<Point><altitudeMode>{mode}</altitudeMode><coordinates>"
-        f"{each.fix.lon_deg:.8f},{each.fix.lat_deg:.8f},{each.up_m:.2f}"
-        "</coordinates></Point></Placemark>"
-    )
-
-
-def _gpx(each: CameraPosition) -> str:
-    """A point of a track (GPX 1.1); with height above sea and date where they are known."""
-    height = f"<ele>{each.height_m:.2f}</ele>" if math.isfinite(each.height_m) else ""
-    time = ""
-    if each.view.time_ns >= _YEAR_2000_NS:
-        whole = datetime.fromtimestamp(each.view.time_ns // 10**9, UTC)
-        milliseconds = each.view.time_ns % 10**9 // 10**6
-        time = f"<time>{whole:%Y-%m-%dT%H:%M:%S}.{milliseconds:03d}Z</time>"
-    place = f'lat="{each.fix.lat_deg:.8f}" lon="{each.fix.lon_deg:.8f}"'
-    return f"<trkpt {place}>{height}{time}<name>{escape(each.view.frame)}</name></trkpt>"
-
-
-FORMATS: dict[str, tuple[str, Callable[[CameraPosition], str], tuple[str, ...]]] = {
-    "csv": (",".join(CSV_COLUMNS), _csv, ()),
-    "odm-geo": ("EPSG:4326", _odm_geo, ()),
-    "tum": ("# east, north, up (m) of the first position", _tum, ()),
-    "kml": (
+def _kml(positions: Positions) -> list[str]:
+    """The track, and a place for each picture."""
+    mode = "absolute" if any(each.above_sea for each in positions) else "relativeToGround"
+    points = [f"{x.fix.lon_deg:.8f},{x.fix.lat_deg:.8f},{x.up_m:.2f}" for x in positions]
+    marks = [("track", f"{len(points)} positions", "LineString", " ".join(points))]
+    for each, point in zip(positions, points, strict=True):
+        marks.append((escape(each.view.frame), f"std {each.std_m:.1f} m", "Point", point))
+    return [
         f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document>',
-        _kml,
-        ("</Document></kml>",),
-    ),
-    "gpx": (
+        *(
+            f"<Placemark><name>{name}</name><description>{about}</description><{kind}>"
+            f"<altitudeMode>{mode}</altitudeMode><coordinates>{coordinates}</coordinates>"
+            f"</{kind}></Placemark>"
+            for name, about, kind, coordinates in marks
+        ),
+        "</Document></kml>",
+    ]
+
+
+def _gpx(positions: Positions) -> list[str]:
+    """A track (GPX 1.1); with heights above sea and dates where they are known."""
+    lines = [
         f'{_XML}<gpx version="1.1" creator="orthonav" xmlns="http://www.topografix.com/GPX/1/1">'
-        "<trk><trkseg>",
-        _gpx,
-        ("</trkseg></trk></gpx>",),
-    ),
+        "<trk><trkseg>"
+    ]
+    for each in positions:
+        height = f"<ele>{each.height_m:.2f}</ele>" if math.isfinite(each.height_m) else ""
+        time = ""
+        if each.view.time_ns >= _YEAR_2000_NS:
+            whole = datetime.fromtimestamp(each.view.time_ns // 10**9, UTC)
+            milliseconds = each.view.time_ns % 10**9 // 10**6
+            time = f"<time>{whole:%Y-%m-%dT%H:%M:%S}.{milliseconds:03d}Z</time>"
+        place = f'lat="{each.fix.lat_deg:.8f}" lon="{each.fix.lon_deg:.8f}"'
+        name = f"<name>{escape(each.view.frame)}</name>"
+        lines.append(f"<trkpt {place}>{height}{time}{name}</trkpt>")
+    return [*lines, "</trkseg></trk></gpx>"]
+
+
+FORMATS: dict[str, Callable[[Positions], list[str]]] = {
+    "csv": _csv,
+    "geojson": _geojson,
+    "kml": _kml,
+    "gpx": _gpx,
+    "tum": _tum,
+    "odm-geo": _odm_geo,
+    "exif": _exif,
 }
-"""First line, a line for each position, and last line, by the name of the format."""
+"""Lines of a file by the name of its format."""

@@ -72,7 +72,8 @@ class ImageTable:
     warnings: tuple[str, ...]
 
     def row(self, name: str) -> ImageRow | None:
-        """The row of an image by its path below the folder; None where there is none, or several.
+        """The row of an image by its path below the folder, with or without its suffix; None where
+        there is none, or several.
 
         Tables and folders begin at different levels, so the shorter path must be the end of the
         other one.
@@ -80,8 +81,9 @@ class ImageTable:
         image = f"/{name.lower()}"
         fitting = [
             path
-            for path in self._by_name.get(PurePosixPath(image).name, ())
-            if image.endswith(f"/{path}") or f"/{path}".endswith(image)
+            for end in {image, str(PurePosixPath(image).with_suffix(""))}
+            for path in self._by_name.get(PurePosixPath(end).name, ())
+            if end.endswith(f"/{path}") or f"/{path}".endswith(end)
         ]
         if image[1:] in fitting:
             return self.rows[image[1:]]

@@ -59,7 +59,6 @@ _TOPICS = [
     "distance_sensor",
     "home_position",
 ]
-DAMAGED = "log is damaged: views from the damage on may lack telemetry"
 Columns = dict[str, NDArray[Any]]
 
 
@@ -185,6 +184,12 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
         if attitude is None:
             damaged = ", and is damaged" if log.file_corruption else ""
             raise FlightError(f"PX4 log has no attitude (vehicle_attitude){damaged}: {path}")
+        warnings: tuple[str, ...] = ()
+        if log.file_corruption:
+            read_s = float(attitude.time_ns[-1] - attitude.time_ns[0]) / 1e9
+            warnings = (
+                f"log is damaged: views from {read_s:.1f} s on, or in gaps, may lack telemetry",
+            )
         position, local = _position(gps, topics, shift_us), topics.get("vehicle_local_position", {})
         return RecordedTrack(
             attitude=attitude,
@@ -199,7 +204,7 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
                 local, [local["vy"], local["vx"]], shift_us, _flag(local, "v_xy_valid", 1) != 0
             ),
             origin_ns=int(attitude.time_ns[0]),
-            warnings=(DAMAGED,) if log.file_corruption else (),
+            warnings=warnings,
         )
 
 
@@ -293,7 +298,9 @@ _TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\
 _ENDS = (">", "]", ")")  # what blocks end with that are whole, besides the end of a line
 _TAG = re.compile(r"<[^<>]*>")
 _FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
-_GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)")
+_GPS = re.compile(
+    rf"\b(?:GPS|RTK)\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)"
+)
 _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
 _HOME = re.compile(r"\bHOME\s*\(")
 _HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")

@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from orthonav.core.errors import CameraError, FlightError, lfs_pointer
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_image
@@ -60,6 +62,7 @@ _EDITOR = re.compile(
 )
 """Programs that show, turn or develop photographs."""
 _FIRMWARE = re.compile(r"[vV]?\d+(?:\.\d+)+")
+ROUNDED = 0.02  # focal lengths of EXIF that differ by less, as a fraction, are of one lens
 _BY_NAME_NS = 10**9  # spacing of photographs without a time, which are ordered by name
 
 
@@ -210,7 +213,7 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     photos, warnings = _taken(chosen, options)
     if options.camera is None and options.fov_deg is None:
         focal_px = [_focal_px(photo, options) for photo in photos]
-        photos, zoomed = _alike(photos, focal_px, "of another focal length than most")
+        photos, zoomed = _alike(photos, focal_px, "of another focal length than most", ROUNDED)
         warnings += zoomed
     camera, note = _camera(photos[0], options)
     track = None
@@ -303,14 +306,16 @@ def _left_out(all_of_them: Sequence[Path | Photo], bad: Sequence[Path], reason: 
     return [f"{count}, {reason}, the first: {bad[0].name}"]
 
 
-def _alike(photos: list[Photo], keys: Sequence[Any], reason: str) -> tuple[list[Photo], list[str]]:
+def _alike(
+    photos: list[Photo], keys: Sequence[Any], reason: str, tolerance: float = 0.0
+) -> tuple[list[Photo], list[str]]:
     """The photographs with the most frequent key or without one, and a warning about others, which
-    include those with NaN. All of them where none has a key."""
+    include those with NaN. All of them where none has a key. `tolerance`: as a fraction."""
     counted = Counter(key for key in keys if key is not None and key == key)
     if not counted:
         return photos, []
     usual = max(counted, key=lambda key: (counted[key], key))
-    fits = [key is None or key == usual for key in keys]
+    fits = [key is None or np.allclose(key, usual, rtol=tolerance, atol=0.0) for key in keys]
     odd = [photo.path for photo, fit in zip(photos, fits, strict=True) if not fit]
     alike = [photo for photo, fit in zip(photos, fits, strict=True) if fit]
     return alike, _left_out(photos, odd, reason)

@@ -48,6 +48,7 @@ class Setup:
         return replace(view, telemetry=telemetry)
 
 
+_AS_REPORTED = Setup("as reported")
 _SETUPS = (
     Setup("any heading", any_heading=True),
     Setup("twice the height", factor=2.0),
@@ -119,17 +120,19 @@ def try_setups(
     *,
     use_prior: bool,
     heading_known: bool,
+    tracked: bool = False,
     stop: Callable[[], bool] = lambda: False,
 ) -> list[Tried]:
     """What each change of the configuration does to the views, in the order of the trials.
 
     `stop` is asked before each view and ends the search: the last change may then have been tried
     on fewer views, and may be missing. `accepts` says whether an outcome is confident. The first
-    change that explains it ends the search; each is tried on at most `SAMPLE` views.
+    change that explains it ends the search; each is tried on at most `SAMPLE` views. `tracked`: the
+    views were judged as a track, so they are first placed one by one as reported.
     """
     setups = [
         setup
-        for setup in _SETUPS
+        for setup in ((_AS_REPORTED, *_SETUPS) if tracked else _SETUPS)
         if (heading_known or not setup.any_heading)
         and (not setup.without_prior or (use_prior and any(v.telemetry.prior for v in views)))
     ]
@@ -212,7 +215,11 @@ def setup_text(tried: Sequence[Tried], *, on_map: bool) -> list[str]:
         tested = f"{names}: at most {most} of {last.views} views of low confidence become confident"
         return [f"no other configuration explains it ({tested}); {where}"]
     off, ratio = last.heading_off_deg, last.height_ratio
-    if last.setup.without_prior:
+    if last.setup == _AS_REPORTED:
+        cause = (
+            "if localized one by one: the configuration is right, but the views do not form a track"
+        )
+    elif last.setup.without_prior:
         cause = "without the prior; check the prior positions"
     elif last.setup.any_heading:
         apart = "" if math.isnan(off) else f", {off:+.0f} deg from the reported one"

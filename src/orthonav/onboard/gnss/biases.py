@@ -25,12 +25,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthonav.core.flight.gnss import FAULTS
 from orthonav.core.records import MAP_STD_M
 
 Array = NDArray[np.float64]
@@ -56,11 +55,6 @@ class Fault(Enum):
     """The difference from the map is too large, and did not begin within the window."""
     DISAGREES = "gnss_disagrees"
     """The difference changed, but the map jumped too: which of the two is wrong is not known."""
-
-    @property
-    def code(self) -> int:
-        """Number of the fault, from 1, in evidence and NAMED_VALUE_FLOAT."""
-        return FAULTS.index(self.value) + 1
 
 
 NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
@@ -120,16 +114,9 @@ class Biases:
         largest_m = PLAUSIBLE_SIGMAS * MAP_STD_M + 2 * self.std_m
         return float(np.hypot(*self.en_m)) <= largest_m
 
-    @property
-    def is_usable(self) -> bool:
-        """Whether positions may be corrected by them: the displacement is plausible, and known at
-        least as well as every fix assumes it. Otherwise a constant error of a receiver could pass
-        for one of the mount."""
-        return self.is_plausible and self.std_m <= MAP_STD_M
-
-    def correction(self, design: Array) -> tuple[Array, Array]:
-        """Mean (2,) and covariance (2, 2) of GNSS minus map for the `design` (2, 5) of a view."""
-        return design @ self.mean, design @ self.cov @ design.T
+    def variance_m2(self, design: Array) -> float:
+        """Variance of GNSS minus map along the worst axis, for the `design` (2, 5) of a view."""
+        return float(np.linalg.eigvalsh(design @ self.cov @ design.T)[-1])
 
     def without_displacement(self) -> "Biases":
         mean, cov = self.mean.copy(), self.cov.copy()
@@ -260,7 +247,6 @@ class Difference:
     rolling_std_m: float = 0.0
 
     def rolling(self, std_m: float) -> "Difference":
-        """The same with at least this error by rolling."""
         return replace(self, rolling_std_m=max(self.rolling_std_m, std_m))
 
     @cached_property
@@ -268,23 +254,15 @@ class Difference:
         return design(self.heading_rad, self.agl_m, self.vel_en_mps)
 
     def residual(self, known: Biases) -> Array:
-        """Difference (2,) that the biases do not explain."""
         return self.en_m - self.design @ known.mean
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A change of the difference that is a fault.
-
-    `onset_s`: time at which it began. `en_m`: size. `std_m`: standard deviation along its
-    direction. `excess`: by how many of them it exceeds what is no fault.
-    """
+class Finding(NamedTuple):
+    """A change of the difference that is a fault: when it began, and its size."""
 
     fault: Fault
     onset_s: float
     en_m: tuple[float, float]
-    std_m: float
-    excess: float
 
 
 class DifferenceWindow:
@@ -311,7 +289,6 @@ class DifferenceWindow:
             self._old.popleft()
 
     def widen(self, rolling_std_m: float) -> None:
-        """Give the newest value at least this error by rolling."""
         if self._new:
             self._new[-1] = self._new[-1].rolling(rolling_std_m)
 
@@ -353,7 +330,7 @@ class DifferenceWindow:
             return None
         fault, onset = named[best]
         east, north = sizes[best].tolist()
-        return Finding(fault, onset, (east, north), float(std[best]), float(excess[best]))
+        return Finding(fault, onset, (east, north))
 
     def _signatures(self, times: Array) -> tuple[Array, list[tuple[Fault, float]]]:
         """Unit changes (N, K): constant, steps, and ramps that end at 1; their names and onsets."""
@@ -426,7 +403,6 @@ class Rolling:
 
 
 def _change_of_rate(first: Difference, middle: Difference, last: Difference) -> float:
-    """Magnitude of the change of the turn rate per second; 0 where it is not known."""
     before_s, after_s = middle.time_s - first.time_s, last.time_s - middle.time_s
     if not (0 < before_s <= LARGEST_GAP_S and 0 < after_s <= LARGEST_GAP_S):
         return 0.0
@@ -450,46 +426,11 @@ _BIAS, _GNSS, _LOCAL, _BODY = slice(0, 5), slice(5, 7), slice(7, 9), slice(9, 11
 _STATES = 11
 
 
-@dataclass(frozen=True, eq=False)
-class Resumed:
-    """What a flight had learnt before its process was restarted.
-
-    `learnt`, `reference`: see `BiasLearner`.
-    """
-
-    learnt: Biases
-    reference: Biases
-
-    def to_plain(self, before: Biases | None) -> dict[str, Any]:
-        """Values for strict JSON. `before`: what was known of the map before the flight, if it was
-        known at all."""
-        flight = {"reference": self.reference.to_plain()}
-        if before is not None:
-            flight["before"] = before.to_plain()
-        return {**self.learnt.to_plain(), "flight": flight}
-
-
-def before_flight(plain: Mapping[str, Any]) -> tuple[Biases | None, Resumed | None]:
-    """Inverse of `Resumed.to_plain`: what was known before the flight, and what it had learnt.
-
-    Values without a flight were known before it. Raises as `biases_from_plain`.
-    """
-    learnt, flight = biases_from_plain(plain), plain.get("flight")
-    if flight is None:
-        return learnt, None
-    before = biases_from_plain(flight["before"]) if "before" in flight else None
-    return before, Resumed(learnt, biases_from_plain(flight["reference"]))
-
-
 class BiasLearner:
     """Learns the biases of one receiver over one map. Mutable; deterministic."""
 
-    def __init__(self, start: Biases, resumed: Resumed | None = None) -> None:
-        """`start` is what is known before the flight; a `resumed` flight continues to learn with
-        the reference that it had."""
-        resumed = resumed or Resumed(start, start)
-        self._filter = _Filter(resumed.learnt)
-        self._reference = resumed.reference
+    def __init__(self, start: Biases) -> None:
+        self._filter, self._reference = _Filter(start), start
         self._waiting: deque[Difference] = deque()
 
     @property
@@ -511,7 +452,6 @@ class BiasLearner:
             self._reference = self.learnt
 
     def widen(self, rolling_std_m: float) -> None:
-        """Give the newest value at least this error by rolling."""
         if self._waiting:
             self._waiting[-1] = self._waiting[-1].rolling(rolling_std_m)
 

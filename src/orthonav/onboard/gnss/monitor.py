@@ -29,14 +29,12 @@ from orthonav.onboard.gnss.biases import (
     DifferenceWindow,
     Fault,
     Finding,
-    Resumed,
     Rolling,
     unknown,
 )
 
 RETURNING = FAULTS[-1]
 """Reason in health while GNSS agrees again, but not yet for long enough."""
-RETURNING_CODE = len(FAULTS)
 
 
 class GnssState(Enum):
@@ -89,17 +87,14 @@ class GnssStatus:
 
     @property
     def reason(self) -> str | None:
-        """Reason in the health; None while there is no alarm."""
         if self.state is GnssState.RETURNING:
             return RETURNING
         return self.fault.value if self.state is GnssState.ALARM and self.fault else None
 
     @property
     def code(self) -> int:
-        """0 without a fault, else that of the fault, or `RETURNING_CODE`."""
-        if self.state is GnssState.RETURNING:
-            return RETURNING_CODE
-        return self.fault.code if self.state is GnssState.ALARM and self.fault else 0
+        """Number of the reason in `FAULTS`, from 1; 0 without one."""
+        return 0 if self.reason is None else FAULTS.index(self.reason) + 1
 
 
 LOST_STD_M = 50.0
@@ -141,8 +136,6 @@ class _Point:
 
 
 class Receiver:
-    """Checks of one receiver. Mutable; deterministic."""
-
     def __init__(self) -> None:
         self._points: list[_Point] = []
         self._heard_ns: int | None = None
@@ -264,19 +257,11 @@ PENDING = 100
 
 
 class GnssMonitor:
-    """Compares one receiver with the map. Mutable."""
-
-    def __init__(
-        self,
-        frame: LocalFrame,
-        start: Biases | None = None,
-        resumed: Resumed | None = None,
-    ) -> None:
-        """`frame`: plane of the map. `start`: biases known before the flight. `resumed`: what it
-        had learnt when it was interrupted."""
+    def __init__(self, frame: LocalFrame, start: Biases | None = None) -> None:
+        """`frame`: plane of the map. `start`: biases known before the flight."""
         self._frame = frame
         self._receiver, self._window = Receiver(), DifferenceWindow()
-        self._learner = BiasLearner(start or unknown(), resumed)
+        self._learner = BiasLearner(start or unknown())
         self._rolling = Rolling()
         self._pending: deque[MapPosition] = deque(maxlen=PENDING)
         self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=SOLVED)
@@ -292,10 +277,6 @@ class GnssMonitor:
     @property
     def learnt(self) -> Biases:
         return self._learner.learnt
-
-    @property
-    def reference(self) -> Biases:
-        return self._learner.reference
 
     def sample(self, sample: GnssSample) -> None:
         en_m = np.full(2, math.nan)
@@ -322,7 +303,6 @@ class GnssMonitor:
         self._pair(position.time_ns)
 
     def tick(self, now_ns: int) -> GnssStatus:
-        """Judge the receiver at a time; the status."""
         fault = self._receiver.fault(now_ns, self._speed_mps(now_ns))
         named = self.status.fault in (None, Fault.VELOCITY)  # a jump contradicts the velocity too
         if fault is None and named and (now_ns - self._velocity_ns) * NANOSECONDS >= BIN_S:
@@ -334,7 +314,6 @@ class GnssMonitor:
         return self.status
 
     def _pair(self, now_ns: int) -> None:
-        """Differences at the exposures up to the newest sample."""
         while self._solved and self._pending:
             position = self._pending[0]
             if position.time_ns > self._solved[-1][0].time_ns:
@@ -460,36 +439,30 @@ class GnssMonitor:
         return found.fault
 
     def _too_far(self, recent: list[Difference], value: Difference) -> Finding | None:
-        """A difference that no displacement of a map explains."""
         others = self._learner.learnt.without_displacement()
         east, north = _residual(recent, others).tolist()
         off_m, std_m = math.hypot(east, north), self._std_m(value, others)
         if len(recent) < RECENT_S / 2 or off_m < LARGEST_M + AGREE_SIGMAS * std_m:
             return None
         begin_s = self._window.values[0].time_s
-        return Finding(Fault.OFFSET, begin_s, (east, north), std_m, (off_m - LARGEST_M) / std_m)
+        return Finding(Fault.OFFSET, begin_s, (east, north))
 
     def _crept(self, value: Difference) -> Finding | None:
         """A drag-off that was slow enough to be learnt: the biases left their reference."""
         reference = self._learner.reference
         moved = value.design @ (self._learner.learnt.mean - reference.mean)
         east, north = moved.tolist()
-        _, cov = reference.correction(value.design)
-        std_m = math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
-        excess = (math.hypot(east, north) - MULTIPATH_M) / std_m
-        if excess <= FAULT_SIGMAS:
+        std_m = math.sqrt(reference.variance_m2(value.design))
+        if math.hypot(east, north) <= MULTIPATH_M + FAULT_SIGMAS * std_m:
             return None
-        return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north), std_m, excess)
+        return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north))
 
     def _std_m(self, value: Difference, known: Biases) -> float:
         """Standard deviation of a difference from the known biases, along the worst axis."""
         gnss_m = max(value.gnss_std_m, GNSS_STD_M)
-        _, cov = known.correction(value.design)
-        worst_m2 = float(np.linalg.eigvalsh(cov)[-1])
-        return math.sqrt(worst_m2 + gnss_m**2 + value.map_std_m**2)
+        return math.sqrt(known.variance_m2(value.design) + gnss_m**2 + value.map_std_m**2)
 
     def _velocity_fault(self) -> Fault | None:
-        """Whether the receiver's velocity contradicts its positions."""
         gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-VELOCITY_S / GNSS_TAU_S))
         drift_m2 = (VELOCITY_STD_MPS * VELOCITY_S) ** 2
         own_m = self._receiver.residual_over(VELOCITY_S)
@@ -508,7 +481,6 @@ class GnssMonitor:
 
 
 def _jumped(before: MapPosition, now: MapPosition) -> bool:
-    """Whether the map's position left the velocity of its track."""
     seconds = (now.time_ns - before.time_ns) * NANOSECONDS
     velocities = [v for v in (before.vel_en_mps, now.vel_en_mps) if v is not None]
     if not 0 < seconds <= GAP_S or not velocities:
@@ -519,7 +491,6 @@ def _jumped(before: MapPosition, now: MapPosition) -> bool:
 
 
 def _residual(values: list[Difference], known: Biases) -> Array:
-    """Mean (2,) of what the biases do not explain."""
     return np.asarray(np.mean([each.residual(known) for each in values], axis=0))
 
 

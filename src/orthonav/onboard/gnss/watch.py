@@ -17,15 +17,12 @@ import numpy as np
 from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import CONFIDENT, Fix, NoFix, ViewResult
+from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.onboard.gnss.biases import (
     NANOSECONDS,
-    SETTLED_S,
     Array,
     Biases,
-    Resumed,
     at_start,
-    design,
 )
 from orthonav.onboard.gnss.monitor import GnssMonitor, GnssState, GnssStatus, MapPosition
 
@@ -33,8 +30,6 @@ log = logging.getLogger(__name__)
 DISPLACED = "map_displaced"
 """Reason in health: the learnt displacement is larger than that of a map as accurate as fixes
 state, or GNSS was spoofed since the first flight over it."""
-NOT_CORRECTED = "not_corrected"
-"""Reason in health: positions should be corrected, but what was learnt before must not be used."""
 SHOWN_S = 1.0
 """Age up to which a solution is extrapolated to an exposure, for display only."""
 ALARM_SEVERITY, RETURN_SEVERITY = 2, 5  # MAV_SEVERITY_CRITICAL, MAV_SEVERITY_NOTICE
@@ -45,7 +40,6 @@ Solutions = Callable[[int], list[GnssSample]]
 
 
 def live_solutions(queue: deque[GnssSample]) -> Solutions:
-    """Solutions that another thread puts into a queue."""
     return lambda until_ns: [queue.popleft() for _ in range(len(queue))]
 
 
@@ -75,19 +69,15 @@ class GnssWatch:
         *,
         digest: str = "",
         known: Mapping[str, Biases] = MappingProxyType({}),
-        resumed: Resumed | None = None,
         setup: str = "",
-        correct: bool = False,
         recorded: bool = False,
         min_confidence: float = CONFIDENT,
         utc_ahead_ns: Callable[[], int] = lambda: 0,
     ) -> None:
         """`frame`: plane of the map. `digest`: of the map; `known`: biases by digest, the latest
-        last. `resumed`: what this flight had learnt when it was interrupted. `setup`: identifies
-        camera, mount and stated latency.
+        last. `setup`: identifies camera, mount and stated latency.
 
-        `correct`: correct positions by the biases known before the flight, if they are usable; what
-        is learnt in this flight never moves a position, nor after a restart. `recorded`: times are
+        `recorded`: times are
         those of the recording. `utc_ahead_ns`: what is added to times of solutions in the log.
         `log` gets every solution, as the message of a flight log.
         """
@@ -100,13 +90,6 @@ class GnssWatch:
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
         self._now_ns, self._has_failed = 0, False
-        self._resumed = resumed if resumed and resumed.learnt.setup == setup else None
-        settled = self._start.agreed_s >= SETTLED_S
-        self._corrects = correct and settled and self._start.is_usable
-        self._refuses = correct and settled and not self._start.is_usable
-        if correct and not self._corrects:
-            log.warning("positions are not corrected: %s", _why_not(self._start))
-        self._correction_en_m = np.zeros(2)
 
     def view(self, result: ViewResult, exposed_ns: int) -> ViewResult:
         """Compare a view; the result with the GNSS position of its exposure as evidence."""
@@ -126,25 +109,6 @@ class GnssWatch:
                 monitor.position(position)
         evidence = MappingProxyType({**fix.evidence, **self._evidence(now_ns)})
         return replace(result, outcome=replace(fix, evidence=evidence))
-
-    def corrected(self, outcome: Fix | NoFix) -> Fix | NoFix:
-        """A fix moved by the biases known before the flight, where they are to be corrected; its
-        covariance includes theirs at its heading, height and velocity. Without a heading or a
-        height nothing is corrected."""
-        if not isinstance(outcome, Fix) or not self._corrects:
-            return outcome
-        if not math.isfinite(outcome.agl_m + outcome.heading_deg):
-            return outcome
-        en_m = np.asarray(self._frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg))
-        velocity = _velocity(outcome)
-        velocity = np.zeros(2) if velocity is None else velocity
-        shown = design(math.radians(outcome.heading_deg), outcome.agl_m, velocity)
-        moved, more = self._start.correction(shown)
-        self._correction_en_m = moved
-        lat, lon = self._frame.latlon_from_en(en_m + moved)
-        cov = outcome.cov_en_m2 + more
-        cov.setflags(write=False)
-        return replace(outcome, lat_deg=float(lat), lon_deg=float(lon), cov_en_m2=cov)
 
     def tick(self, mono_ns: int) -> list[GnssText]:
         """Judge at a time of the monotonic clock; messages about changes since the last call."""
@@ -168,7 +132,7 @@ class GnssWatch:
             before = self._shown.get(number, GnssStatus())
             self._shown[number] = status
             name = "GNSS" if number == 0 else f"GNSS {number + 1}"
-            text = _change(name, before, status, self._correction_en_m)
+            text = _change(name, before, status)
             if text is not None:
                 texts.append(text)
         return texts
@@ -178,25 +142,15 @@ class GnssWatch:
         found = [monitor.status.reason for monitor in self._monitors.values()]
         if not self._learnt.is_plausible:
             found.append(DISPLACED)
-        if self._refuses:
-            found.append(NOT_CORRECTED)
         return tuple(dict.fromkeys(each for each in found if each))
 
     @property
     def _learnt(self) -> Biases:
-        return self._resumable.learnt
-
-    @property
-    def _resumable(self) -> Resumed:
-        """What a restart continues from: of the first receiver."""
         first = self._monitors.get(0)
-        if first is None:
-            return self._resumed or Resumed(self._start, self._start)
-        return Resumed(first.learnt, first.reference)
+        return self._start if first is None else first.learnt
 
     @property
     def code(self) -> int:
-        """Code of the first receiver with a fault; 0 without one."""
         return next((m.status.code for m in self._monitors.values() if m.status.code), 0)
 
     @property
@@ -209,7 +163,7 @@ class GnssWatch:
         """Biases for the state file: those of this map, learnt further, after the others."""
         made = {name: each.to_plain() for name, each in self._known.items() if name != self._digest}
         if self._digest and self._learnt.agreed_s > 0:
-            made[self._digest] = self._resumable.to_plain(self._known.get(self._digest))
+            made[self._digest] = self._learnt.to_plain()
         return made
 
     def plain(self) -> list[dict[str, Any]]:
@@ -222,9 +176,7 @@ class GnssWatch:
         self._now_ns = max(self._now_ns, now_ns) if not self._recorded else now_ns
         for sample in self._solutions(now_ns):
             if sample.receiver not in self._monitors:
-                resumed = self._resumed if sample.receiver == 0 else None
-                made = GnssMonitor(self._frame, self._start, resumed=resumed)
-                self._monitors[sample.receiver] = made
+                self._monitors[sample.receiver] = GnssMonitor(self._frame, self._start)
             self._monitors[sample.receiver].sample(sample)
             if sample.receiver == 0:
                 self._last = sample
@@ -276,20 +228,7 @@ def _velocity(fix: Fix) -> Array | None:
     return made if np.isfinite(made).all() else None
 
 
-def _why_not(known: Biases) -> str:
-    """Why biases known before a flight are not used."""
-    if known.agreed_s < SETTLED_S:
-        return f"GNSS agreed for {known.agreed_s / 60:.0f} min, {SETTLED_S / 60:.0f} are needed"
-    learnt = f"the learnt displacement of the map is {math.hypot(*known.en_m):.0f} m"
-    if known.is_plausible:
-        return f"{learnt}, known to {known.std_m:.0f} m only: fly more headings with GNSS"
-    return f"{learnt}: check the map against a surveyed point, GNSS may have been spoofed"
-
-
-def _change(
-    name: str, before: GnssStatus, now: GnssStatus, correction_en_m: Array
-) -> GnssText | None:
-    """Message about a change; None without one that matters to an operator."""
+def _change(name: str, before: GnssStatus, now: GnssStatus) -> GnssText | None:
     if now.state is GnssState.ALARM and (
         before.state is not GnssState.ALARM or before.fault != now.fault
     ):
@@ -299,8 +238,7 @@ def _change(
         GnssState.ALARM,
         GnssState.RETURNING,
     ):
-        east, north = (np.array(now.difference_en_m) - correction_en_m).tolist()
-        return RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size((east, north))}"
+        return RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size(now.difference_en_m)}"
     return None
 
 
@@ -342,7 +280,6 @@ def _bias_evidence(learnt: Biases) -> dict[str, float]:
 
 
 def _plain_biases(learnt: Biases) -> dict[str, Any]:
-    """What was learnt, for the line of health."""
     (east, _), (north, _), pitch, roll, latency = _shown(learnt)
     place = {"east_m": east, "north_m": north, "std_m": learnt.std_m, "agreed_s": learnt.agreed_s}
     mount = dict(zip(("pitch_deg", "pitch_std_deg"), pitch, strict=True))

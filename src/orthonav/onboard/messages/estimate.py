@@ -65,6 +65,18 @@ class NavigationEstimate:
                 f"a position needs a latitude within 90 and a longitude within 180 degrees, "
                 f"got {self.lat_deg}, {self.lon_deg}"
             )
+        invalid = {
+            "covariance": np.shape(self.cov_en_m2) != (2, 2),
+            "covariance of the velocity": self.vel_cov_en is not None
+            and np.shape(self.vel_cov_en) != (2, 2),
+            "confidence": self.confidence < 0 or self.confidence > 1,  # NaN: not known
+            "processing time": not math.isfinite(self.processing_s),
+            "standard deviation of the altitude": self.alt_std_m < 0,
+            "reset counter": not 0 <= self.reset_counter <= 255,
+        }
+        for name, applies in invalid.items():
+            if applies:
+                raise EstimateError(f"the {name} of an estimate is out of range")
         if self.utc_ns is None and self.boot_ns is None:
             raise EstimateError("the time of exposure is missing: give utc_ns or boot_ns")
 

@@ -9,9 +9,7 @@ Height, attitude and vertical velocity of messages in the autopilot's local fram
 """
 
 import math
-from bisect import bisect_right
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
 
@@ -51,13 +49,9 @@ _FRAME_GLOBAL = 0
 _CMD_EXTERNAL_POSITION_ESTIMATE, _CMD_REQUEST_MESSAGE = 43003, 512
 TEXT_MAX = 50
 """Characters of one STATUSTEXT."""
-_LEAPS = (
-    *("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01"),
-    *("1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01"),
-    *("1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01"),
-)
-"""Days that began after a leap second, by IERS Bulletin C; a new one must be added. GPS time
-equalled UTC on 1980-01-06 and has none."""
+_GPS_EPOCH_UNIX_S, _LEAP_S, _LEAP_UNIX_S = 315_964_800, 18, 1_483_228_800
+"""1980-01-06; GPS time minus UTC, and since when: a new leap second (IERS Bulletin C) changes
+both."""
 
 
 @dataclass(frozen=True)
@@ -79,16 +73,12 @@ class Signing:
 
     secret_key: bytes = field(repr=False)
     timestamp_10us: int
-    link_id: int = 0
 
     def __post_init__(self) -> None:
         if len(self.secret_key) != 32:
             raise EstimateError(f"a signing key has 32 bytes, got {len(self.secret_key)}")
-        if not (0 <= self.timestamp_10us < 2**48 and 0 <= self.link_id <= 255):
-            raise EstimateError(
-                f"signing needs a timestamp of 48 bits and a link of 8, "
-                f"got {self.timestamp_10us} and {self.link_id}"
-            )
+        if not 0 <= self.timestamp_10us < 2**48:
+            raise EstimateError(f"signing needs a timestamp of 48 bits, got {self.timestamp_10us}")
 
 
 def signing_timestamp(utc_ns: int) -> int:
@@ -114,7 +104,6 @@ class Packer:
         self._mav.seq = sequence % 256
         if signing is not None:
             self._mav.signing.secret_key = signing.secret_key
-            self._mav.signing.link_id = signing.link_id
             self._mav.signing.timestamp = signing.timestamp_10us
             self._mav.signing.sign_outgoing = True
 
@@ -326,23 +315,14 @@ def _hdop(eph_m: float, hdop_m: float | None) -> float:
     return min(eph_m / hdop_m, 99.99)
 
 
-def _unix_s(day: str) -> int:
-    return int(datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp())
-
-
-_LEAPS_UNIX_S = tuple(_unix_s(day) for day in _LEAPS)
-_EPOCH_UNIX_S = _unix_s("1980-01-06")
 _WEEK_MS = 7 * 86_400_000
 
 
 def gps_time(utc_ns: int) -> tuple[int, int]:
-    """GPS week (without rollover) and time of week in ms; (0, 0), not known, before 1980-01-06."""
-    utc_ms = utc_ns // 1_000_000
-    leaps = bisect_right(_LEAPS_UNIX_S, utc_ms // 1000)
-    since_epoch_ms = utc_ms - _EPOCH_UNIX_S * 1000 + leaps * 1000
-    if since_epoch_ms < 0:
+    """GPS week (without rollover) and time of week in ms; (0, 0), not known, before 2017."""
+    if utc_ns < _LEAP_UNIX_S * 10**9:  # a computer whose clock was not set
         return 0, 0
-    return divmod(since_epoch_ms, _WEEK_MS)
+    return divmod(utc_ns // 1_000_000 + 1000 * (_LEAP_S - _GPS_EPOCH_UNIX_S), _WEEK_MS)
 
 
 # In the local frame of the autopilot.
@@ -359,8 +339,6 @@ _LEAST_SCALE = 0.01  # ArduPilot's, near the poles
 
 
 class Autopilot(Enum):
-    """Autopilot whose conventions a message in a local frame follows."""
-
     PX4 = "px4"
     ARDUPILOT = "ardupilot"
 

@@ -103,15 +103,6 @@ class RosArguments:
         return full
 
 
-@dataclass
-class _Words:
-    """What stands after `--ros-args`. `parameters`: names and values, or files of them."""
-
-    rules: list[tuple[str, str]] = field(default_factory=list)
-    parameters: list[tuple[str, str] | Path] = field(default_factory=list)
-    passed: list[str] = field(default_factory=list)
-
-
 def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosArguments:
     """Arguments after `--ros-args`, and variables of the environment.
 
@@ -121,10 +112,10 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
     ROS, an unknown parameter is ignored. Raises `VariantError` for an argument that ROS does not
     have either, and `MissingFileError`.
     """
-    given = _words(words)
+    given, parameters, passed = _words(words)
     node, namespace = "orthonav", environment.get("ROS_NAMESPACE", "") or "/"
     rules = []
-    for before, after in given.rules:
+    for before, after in given:
         name = _for_node(before, node)
         if name in ("__node", "__name"):
             node = after
@@ -145,14 +136,14 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
         node,
         namespace,
         tuple(rules),
-        _parameters(list(_values(given.parameters, node, full_name))),
+        _parameters(list(_values(parameters, node, full_name))),
         _domain_id(environment.get("ROS_DOMAIN_ID", "")),
         only_local or scope == "LOCALHOST",
         environment.get("ROS_DISTRO", ""),
         is_alone=not only_local and scope == "OFF",
         peers=tuple(peer.strip() for peer in peers if peer.strip()),
         cyclonedds_uri=environment.get("CYCLONEDDS_URI", ""),
-        passed=tuple(given.passed),
+        passed=tuple(passed),
     )
     for rule in rules:
         for name in rule:
@@ -160,32 +151,38 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
     return made
 
 
-def _words(words: Sequence[str]) -> _Words:
-    found = _Words()
+_Given = tuple[str, str] | Path
+"""Name and value of a parameter, or a file of them."""
+
+
+def _words(words: Sequence[str]) -> tuple[list[tuple[str, str]], list[_Given], list[str]]:
+    rules: list[tuple[str, str]] = []
+    parameters: list[_Given] = []
+    passed: list[str] = []
     waiting = list(words)
     while waiting:
         flag = waiting.pop(0)
         if flag in ("--ros-args", "--") and (flag == "--ros-args" or not waiting):
             continue
         if _STREAMS.fullmatch(flag):
-            found.passed.append(flag)
+            passed.append(flag)
             continue
         text = waiting.pop(0) if waiting else ""
         name, separator, value = text.partition(":=")
         if flag in ("-r", "--remap") and name and separator and value:
-            found.rules.append((name, value))
+            rules.append((name, value))
         elif flag in ("-p", "--param") and name and separator and value:
-            found.parameters.append((name, value))
+            parameters.append((name, value))
         elif flag == "--params-file" and text:
-            found.parameters.append(Path(text))
+            parameters.append(Path(text))
         elif flag in _PASSED and text:
-            found.passed += [flag, text]
+            passed += [flag, text]
         else:
             raise VariantError(
                 "after --ros-args expected -r FROM:=TO, -p NAME:=VALUE or --params-file FILE, got "
                 f"'{' '.join((flag, text)).strip()}'"
             )
-    return found
+    return rules, parameters, passed
 
 
 def _for_node(name: str, node: str) -> str | None:
@@ -196,9 +193,7 @@ def _for_node(name: str, node: str) -> str | None:
     return rest if target == node else None
 
 
-def _values(
-    given: Sequence[tuple[str, str] | Path], node: str, full_name: str
-) -> Iterator[tuple[str, str]]:
+def _values(given: Sequence[_Given], node: str, full_name: str) -> Iterator[tuple[str, str]]:
     """Names and values of the parameters that are meant for the node, in their order."""
     for each in given:
         if isinstance(each, Path):
@@ -228,7 +223,6 @@ def _values_of_file(path: Path, full_name: str) -> Iterator[tuple[str, str]]:
 
 
 def _flat(values: Mapping[Any, Any], separator: str) -> Iterator[tuple[str, str]]:
-    """Leaves of nested tables, by their names joined."""
     for name, value in values.items():
         if isinstance(value, dict):
             for inner, leaf in _flat(value, separator):

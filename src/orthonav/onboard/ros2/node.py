@@ -1,33 +1,263 @@
-"""Nodes: over DDS, without ROS, and by `rclpy`.
+"""Nodes of a ROS 2 graph, over DDS, without ROS, and by `rclpy`, and the messages themselves.
 
-Over DDS: readers and writers under the names, types and QoS of ROS 2.
-
-QoS profiles: https://docs.ros.org/en/rolling/Concepts/Intermediate/About-Quality-of-Service-Settings.html.
+DDS types and CDR come from the definitions that `rosbags` has: a message is decoded by the code
+that decodes it from a recorded bag. Over DDS: readers and writers under the names, types and QoS of
+ROS 2: https://design.ros2.org/articles/topic_and_service_names.html (`rt/NAME`),
+https://design.ros2.org/articles/mapping_dds_types.html (`PACKAGE::msg::dds_::NAME_`) and
+https://docs.ros.org/en/rolling/Concepts/Intermediate/About-Quality-of-Service-Settings.html.
 For `ros2 node list` and `ros2 node info` a participant says by a topic of its own which readers and
 writers belong to which node, as `rmw_dds_common` does:
 https://design.ros2.org/articles/Node_to_Participant_mapping.html.
 """
 
+import contextlib
+import importlib
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from importlib import import_module
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from orthonav.core.errors import OutputError
+from orthonav.core.errors import MissingExtraError, OutputError, described
 from orthonav.onboard.ros2.arguments import RosArguments
-from orthonav.onboard.ros2.graph import (
-    Definitions,
-    Graph,
-    Handler,
-    Writer,
-    ros2_module,
-    ros_type_name,
+
+TIME_NS = 10**9
+_LOG = "rcl_interfaces/msg/Log"
+_GEOGRAPHIC = {
+    "geographic_msgs/msg/GeoPoint": "float64 latitude\nfloat64 longitude\nfloat64 altitude\n",
+    "geographic_msgs/msg/GeoPointStamped": (
+        "std_msgs/Header header\ngeographic_msgs/GeoPoint position\n"
+    ),
+}
+_SAME_NAME = (
+    *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
+    *("float32", "float64", "byte"),
 )
+
+
+def ros2_module(name: str) -> Any:
+    """A module of the extra `ros2`. Raises `MissingExtraError` where it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0]
+        raise MissingExtraError(
+            f"--ros2 needs {package}: pip install 'orthonav[ros2]'; where cyclonedds has no wheel "
+            f"(docs/ros2.md), source a ROS 2 environment ({error})"
+        ) from error
+
+
+class Definitions:
+    def __init__(self, distro: str = "") -> None:
+        """`distro` as in ROS_DISTRO ("humble"); one that is not known stands for the newest.
+
+        Raises `MissingExtraError`.
+        """
+        typesys = ros2_module("rosbags.typesys")
+        stores = {store.value: store for store in typesys.Stores}
+        self._store = typesys.get_typestore(stores.get(f"ros2_{distro}", typesys.Stores.LATEST))
+        for name, text in _GEOGRAPHIC.items():
+            self._store.register(typesys.get_types_from_msg(text, name))
+        self._nested: dict[str, Any] = {}
+
+    def new(self, name: str, /, **values: Any) -> Any:
+        """A message of the type `name` ("sensor_msgs/msg/NavSatFix")."""
+        return self._store.types[name](**values)
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        return self.new("std_msgs/msg/Header", stamp=self.time(stamp_ns), frame_id=frame)
+
+    def time(self, stamp_ns: int) -> Any:
+        sec, nanosec = divmod(stamp_ns, TIME_NS)
+        return self.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+
+    def vector(self, kind: str, names: str, values: Sequence[float]) -> Any:
+        """A message of `geometry_msgs` of plain numbers, such as Point and Quaternion."""
+        numbers = map(float, values)
+        return self.new(f"geometry_msgs/msg/{kind}", **dict(zip(names, numbers, strict=True)))
+
+    def decoded(self, name: str, cdr: bytes) -> Any:
+        return self._store.deserialize_cdr(cdr, name)
+
+    def encoded(self, message: Any) -> bytes:
+        return bytes(self._store.serialize_cdr(message, message.__msgtype__))
+
+    def type_hash(self, name: str) -> bytes:
+        """The type hash (REP 2016) as ROS 2 announces it in the user data of a DDS endpoint."""
+        return f"typehash={self._store.hash_rihs01(name)};".encode("ascii")
+
+    def dds_type(self, name: str) -> Any:
+        """A DDS type whose samples hold their CDR bytes in `cdr`, encoded already.
+
+        Cyclone DDS checks what comes in against the type before anybody reads it.
+        """
+        idl = ros2_module("cyclonedds.idl")
+        made = idl.make_idl_struct(
+            name.rpartition("/")[2], _dotted(name), self._members(name), dataclassify=False
+        )
+        made.serialize = lambda self, **_: self.cdr
+        made.deserialize = classmethod(_sample)
+        made.deserialize_key = classmethod(lambda kind, data, **_: kind())  # of a writer that left
+        return made
+
+    def _members(self, name: str) -> dict[str, Any]:
+        return {member: self._idl(kind) for member, kind in self._store.fielddefs[name][1]}
+
+    def _idl(self, kind: Any) -> Any:
+        """The type of a member as `cyclonedds.idl` writes it."""
+        types = ros2_module("cyclonedds.idl.types")
+        node, detail = kind
+        if node.name == "NAME":
+            return self._nested_struct(detail)
+        if node.name == "ARRAY":
+            return types.array[self._idl(detail[0]), detail[1]]
+        if node.name == "SEQUENCE":
+            return types.sequence[self._idl(detail[0])]
+        plain = {"bool": bool, "string": str, "char": types.uint8}
+        plain |= {each: getattr(types, each) for each in _SAME_NAME}
+        return plain[detail[0]]
+
+    def _nested_struct(self, name: str) -> Any:
+        if name not in self._nested:
+            idl = ros2_module("cyclonedds.idl")
+            self._nested[name] = idl.make_idl_struct(
+                name.rpartition("/")[2], _dotted(name), self._members(name)
+            )
+        return self._nested[name]
+
+
+def ros_type_name(dds_name: str) -> str:
+    """The message type of a name in DDS ("sensor_msgs::msg::dds_::Image_"); others stay."""
+    parts = dds_name.split("::")
+    if len(parts) != 4 or parts[2] != "dds_":
+        return dds_name
+    return "/".join((parts[0], parts[1], parts[3].removesuffix("_")))
+
+
+def _dotted(name: str) -> str:
+    package, kind, short = name.split("/")
+    return f"{package}.{kind}.dds_.{short}_"
+
+
+def _sample(kind: Any, /, data: bytes, **_: Any) -> Any:
+    sample = kind()
+    sample.cdr = data
+    return sample
+
+
+log = logging.getLogger(__name__)
+Handler = Callable[[Any, bytes], None]
+
+
+Writer = Callable[[Any], None]
+"""Sends one message. Raises `OSError` where the middleware does not take it."""
+
+
+class Graph(ABC):
+    """Reads and writes topics. `spin` is for one thread, writers are for any.
+
+    `problems` says by topic why little or nothing can flow there: another type, QoS that does not
+    match. `undecodable` counts damaged messages by topic.
+    """
+
+    def __init__(self, arguments: RosArguments) -> None:
+        """Raises `MissingExtraError` without the message definitions."""
+        self.arguments, self.definitions = arguments, Definitions(arguments.distro)
+        self.problems: dict[str, str] = {}
+        self.undecodable: Counter[str] = Counter()
+        self._said: set[tuple[str, str]] = set()
+
+    @abstractmethod
+    def subscribe(
+        self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
+    ) -> None:
+        """Hand each message on `topic` (resolved already) to `handler`, with its raw sample.
+
+        The QoS is that of sensor data: best effort, volatile, the last `depth` messages.
+        """
+
+    @abstractmethod
+    def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
+        """A writer of `topic` (resolved already): reliable, and transient local if `latched`."""
+
+    @abstractmethod
+    def spin(self, timeout_s: float) -> int:
+        """Wait at most so long for messages and handle those that are there; how many."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave the graph."""
+
+    @abstractmethod
+    def _mismatches(self) -> dict[str, str]:
+        """Topics whose endpoints cannot match now, and why."""
+
+    def check_graph(self, others: Mapping[str, str]) -> None:
+        """Look for endpoints that cannot match now, beside `others`, further problems by topic;
+        each problem is logged once."""
+        self.problems = {**others, **self._mismatches()}
+        for topic, text in self.problems.items():
+            if (topic, text) not in self._said:
+                self._said.add((topic, text))
+                log.warning("topic %s %s", topic, text)
+
+    def _mismatch(
+        self, found: dict[str, str], topic: str, kind: str, other_kind: str, why: str
+    ) -> None:
+        """Note that an endpoint of our topic has another type, or `why` it does not match."""
+        if other_kind != kind:
+            why = f"is of type {other_kind}; expected {kind}"
+        if why:
+            found.setdefault(topic, why)
+
+    def _writing(self, topic: str, send: Callable[[bytes], None]) -> Writer:
+        def write(message: Any) -> None:
+            try:
+                send(self.definitions.encoded(message))
+            except Exception as error:  # of the middleware
+                raise OSError(f"cannot publish on {topic} ({error})") from error
+
+        return write
+
+    def _handle(self, topic: str, kind: str, handler: Handler, cdr: bytes) -> None:
+        """Decode a sample and hand it on; one odd message never ends a flight."""
+        try:
+            handler(self.definitions.decoded(kind, cdr), cdr)
+        except Exception as error:
+            if not self.undecodable[topic]:
+                log.warning("message on %s cannot be used (%s)", topic, described(error))
+            self.undecodable[topic] += 1
+
+
+class Rosout(logging.Handler):
+    """Publishes records as `rcl_interfaces/Log`, whose levels are those of Python."""
+
+    def __init__(self, node: Graph) -> None:
+        super().__init__()
+        self._node = node
+        self._write = node.advertise(
+            node.arguments.resolved("/rosout"), _LOG, depth=100, latched=True
+        )
+
+    def emit(self, record: logging.LogRecord) -> None:
+        definitions = self._node.definitions
+        with contextlib.suppress(Exception):  # the code that logs must not fail
+            message = definitions.new(
+                _LOG,
+                stamp=definitions.time(round(record.created * 1e9)),
+                level=min(record.levelno, logging.CRITICAL),
+                name=self._node.arguments.full_name.strip("/").replace("/", "."),
+                msg=record.getMessage(),
+                file=record.pathname,
+                function=record.funcName or "",
+                line=record.lineno,
+            )
+            self._write(message)
+
 
 TOPIC, KIND = "ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo"
 USER_DATA = b"enclave=/;"
@@ -35,31 +265,6 @@ USER_DATA = b"enclave=/;"
 _HUMBLE_BYTES = 24
 
 
-def _node_entities(
-    definitions: Definitions,
-    arguments: RosArguments,
-    participant: Any,
-    readers: Sequence[Any],
-    writers: Sequence[Any],
-) -> Any:
-    """The message with the one node of a DDS participant, its readers and its writers."""
-    count = _HUMBLE_BYTES if arguments.distro == "humble" else 16
-
-    def gid(entity: Any) -> Any:
-        data = np.frombuffer(entity.guid.bytes.ljust(count, b"\0"), np.uint8)
-        return definitions.new("rmw_dds_common/msg/Gid", data=data)
-
-    node = definitions.new(
-        "rmw_dds_common/msg/NodeEntitiesInfo",
-        node_namespace=arguments.namespace,
-        node_name=arguments.node,
-        reader_gid_seq=[gid(each) for each in readers],
-        writer_gid_seq=[gid(each) for each in writers],
-    )
-    return definitions.new(KIND, gid=gid(participant), node_entities_info_seq=[node])
-
-
-log = logging.getLogger(__name__)
 CONFIGURATION = """<CycloneDDS><Domain>
 <Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>
 <Internal><SocketReceiveBufferSize min="default" max="10MB"/></Internal>
@@ -79,29 +284,7 @@ _ALIVE = 16
 """State of an instance in DDS."""
 
 
-@dataclass(frozen=True)
-class Subscription:
-    """A topic that is read: its resolved name, message type, DDS reader and handler."""
-
-    topic: str
-    kind: str
-    reader: Any
-    depth: int
-    handler: Handler
-
-
-@dataclass(frozen=True)
-class Publication:
-    """A topic that is written: its name, message type and DDS writer."""
-
-    topic: str
-    kind: str
-    writer: Any
-
-
 class Node(Graph):
-    """Reads and writes topics of one DDS domain."""
-
     def __init__(self, arguments: RosArguments) -> None:
         """Raises `MissingExtraError`, or `OutputError` where DDS has no network interface."""
         super().__init__(arguments)
@@ -111,8 +294,8 @@ class Node(Graph):
         self._domain = self._opened(domain, arguments)
         made = self._qos.Qos(self._qos.Policy.Userdata(USER_DATA))
         self._participant = domain.DomainParticipant(arguments.domain_id, made)
-        self._subscriptions: list[Subscription] = []
-        self._writers: list[Publication] = []
+        self._subscriptions: list[tuple[str, str, Any, int, Handler]] = []
+        self._writers: list[tuple[str, str, Any]] = []
         self._conditions: list[Any] = []
         self._names, _ = self._writer(TOPIC, KIND, depth=1, latched=True)
         self._waitset = self._core.WaitSet(self._participant)
@@ -134,18 +317,18 @@ class Node(Graph):
         mask = states.ViewState.Any | states.InstanceState.Any | states.SampleState.NotRead
         self._conditions.append(states.ReadCondition(reader, mask))
         self._waitset.attach(self._conditions[-1])
-        self._subscriptions.append(Subscription(topic, kind, reader, depth, handler))
+        self._subscriptions.append((topic, kind, reader, depth, handler))
         self._announce()
 
     def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
         write, made = self._writer(f"rt{topic}", kind, depth=depth, latched=latched)
-        self._writers.append(Publication(topic, kind, made))
+        self._writers.append((topic, kind, made))
         self._announce()
         return write
 
     def spin(self, timeout_s: float) -> int:
         self._waitset.wait(round(timeout_s * 1e9))
-        return sum(self._taken(each) for each in self._subscriptions)
+        return sum(self._taken(*each) for each in self._subscriptions)
 
     def close(self) -> None:
         del self._publishers, self._subscribers, self._names
@@ -154,49 +337,52 @@ class Node(Graph):
         self._waitset = self._participant = self._domain = None
 
     def _opened(self, domain: Any, arguments: RosArguments) -> Any:
-        """The DDS domain by our configuration, then that of the user.
-
-        None where this process has joined it already.
-        """
-        first, own = [CONFIGURATION, _discovery(arguments)], [arguments.cyclonedds_uri]
-        attempts = [first + own]
-        if arguments.is_local:  # an interface must not be named twice
-            attempts.insert(0, [*first, LOOPBACK_ONLY, *own])
-        for attempt in attempts:
-            try:
-                return domain.Domain(arguments.domain_id, ",".join(filter(None, attempt)))
-            except self._core.DDSException as error:
-                if error.code == error.DDS_RETCODE_PRECONDITION_NOT_MET:
-                    return None
-                failed = error
-        where = f"DDS domain {arguments.domain_id}"
-        if arguments.cyclonedds_uri:
-            where += f" with CYCLONEDDS_URI={arguments.cyclonedds_uri}"
-        raise OutputError(f"cannot join {where}: {failed}") from failed
+        """The DDS domain by our configuration, then that of the user; None where this process has
+        joined it already."""
+        own = arguments.cyclonedds_uri
+        # An interface must not be named twice.
+        local = LOOPBACK_ONLY if arguments.is_local and "NetworkInterface" not in own else ""
+        parts = filter(None, (CONFIGURATION, _discovery(arguments), local, own))
+        try:
+            return domain.Domain(arguments.domain_id, ",".join(parts))
+        except self._core.DDSException as error:
+            if error.code == error.DDS_RETCODE_PRECONDITION_NOT_MET:
+                return None
+            where = f"DDS domain {arguments.domain_id}"
+            if own:
+                where += f" with CYCLONEDDS_URI={own}"
+            raise OutputError(f"cannot join {where}: {error}") from error
 
     def _mismatches(self) -> dict[str, str]:
         found: dict[str, str] = {}
         self._publishers.update()
         self._subscribers.update()
-        for each in self._subscriptions:
-            why = _unmatched(each.reader.get_requested_incompatible_qos_status(), "a publisher")
-            matched = each.reader.get_matched_publications()
-            for other in self._publishers.others(each.topic, matched):
-                self._mismatch(found, each.topic, each.kind, other, why)
-        for writer in self._writers:
-            why = _unmatched(writer.writer.get_offered_incompatible_qos_status(), "a subscriber")
-            matched = writer.writer.get_matched_subscriptions()
-            for other in self._subscribers.others(writer.topic, matched):
-                self._mismatch(found, writer.topic, writer.kind, other, why)
+        for topic, kind, reader, _, _ in self._subscriptions:
+            why = _unmatched(reader.get_requested_incompatible_qos_status(), "a publisher")
+            for other in self._publishers.others(topic, reader.get_matched_publications()):
+                self._mismatch(found, topic, kind, other, why)
+        for topic, kind, writer in self._writers:
+            why = _unmatched(writer.get_offered_incompatible_qos_status(), "a subscriber")
+            for other in self._subscribers.others(topic, writer.get_matched_subscriptions()):
+                self._mismatch(found, topic, kind, other, why)
         return found
 
     def _announce(self) -> None:
-        """Tell the graph which readers and writers belong to this node."""
-        readers = [each.reader for each in self._subscriptions]
-        writers = [each.writer for each in self._writers]
-        own = self._participant
-        message = _node_entities(self.definitions, self.arguments, own, readers, writers)
-        self._names(message)
+        count = _HUMBLE_BYTES if self.arguments.distro == "humble" else 16
+
+        def gid(entity: Any) -> Any:
+            data = np.frombuffer(entity.guid.bytes.ljust(count, b"\0"), np.uint8)
+            return self.definitions.new("rmw_dds_common/msg/Gid", data=data)
+
+        node = self.definitions.new(
+            "rmw_dds_common/msg/NodeEntitiesInfo",
+            node_namespace=self.arguments.namespace,
+            node_name=self.arguments.node,
+            reader_gid_seq=[gid(reader) for _, _, reader, _, _ in self._subscriptions],
+            writer_gid_seq=[gid(writer) for _, _, writer in self._writers],
+        )
+        own = gid(self._participant)
+        self._names(self.definitions.new(KIND, gid=own, node_entities_info_seq=[node]))
 
     def _writer(self, name: str, kind: str, *, depth: int, latched: bool) -> tuple[Writer, Any]:
         qos = self._made_qos(kind, reliable=True, depth=depth, latched=latched)
@@ -225,14 +411,12 @@ class Node(Graph):
             policy.Userdata(self.definitions.type_hash(kind)),
         )
 
-    def _taken(self, subscription: Subscription) -> int:
-        handled = 0
-        for sample in subscription.reader.take(subscription.depth):
-            cdr = getattr(sample, "cdr", None)
-            if cdr is not None:  # else it only says that a writer left
-                self._handle(subscription.topic, subscription.kind, subscription.handler, cdr)
-                handled += 1
-        return handled
+    def _taken(self, topic: str, kind: str, reader: Any, depth: int, handler: Handler) -> int:
+        samples = [getattr(sample, "cdr", None) for sample in reader.take(depth)]
+        received = [cdr for cdr in samples if cdr is not None]  # None only says that a writer left
+        for cdr in received:
+            self._handle(topic, kind, handler, cdr)
+        return len(received)
 
 
 class Endpoints:
@@ -290,7 +474,10 @@ class RclNode(Graph):
 
     def __init__(self, arguments: RosArguments) -> None:
         super().__init__(arguments)
-        self._rclpy, self._qos = import_module("rclpy"), import_module("rclpy.qos")
+        self._rclpy, self._qos = (
+            importlib.import_module("rclpy"),
+            importlib.import_module("rclpy.qos"),
+        )
         self._subscriptions: list[tuple[Any, str]] = []
         self._handled = 0
         self._publishers: list[tuple[Any, str]] = []
@@ -299,7 +486,9 @@ class RclNode(Graph):
             self._rclpy.init(
                 args=["--ros-args", *arguments.passed],
                 context=self._context,
-                signal_handler_options=import_module("rclpy.signals").SignalHandlerOptions.NO,
+                signal_handler_options=importlib.import_module(
+                    "rclpy.signals"
+                ).SignalHandlerOptions.NO,
             )
             self._node = self._rclpy.create_node(
                 arguments.node,
@@ -310,7 +499,7 @@ class RclNode(Graph):
             )
         except Exception as error:  # of the middleware
             raise OutputError(f"cannot join the ROS graph: {error}") from error
-        self._executor = import_module("rclpy.executors").SingleThreadedExecutor(
+        self._executor = importlib.import_module("rclpy.executors").SingleThreadedExecutor(
             context=self._context
         )
         self._executor.add_node(self._node)
@@ -358,23 +547,11 @@ class RclNode(Graph):
         found: dict[str, str] = {}
         for made, kind in self._subscriptions:
             for other in self._node.get_publishers_info_by_topic(made.topic_name):
-                why = self._unmatched(other.qos_profile, made.qos_profile, "a publisher")
-                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
+                self._mismatch(found, made.topic_name, kind, other.topic_type, "")
         for made, kind in self._publishers:
             for other in self._node.get_subscriptions_info_by_topic(made.topic_name):
-                why = self._unmatched(made.qos_profile, other.qos_profile, "a subscriber")
-                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
-        return found
-
-    def _unmatched(self, offered: Any, requested: Any, other: str) -> str:
-        """Why a subscription does not match a publisher; "" where it does."""
-        reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
-        policy = ""
-        if requested.reliability == reliability.RELIABLE != offered.reliability:
-            policy = "reliability"
-        elif requested.durability == durability.TRANSIENT_LOCAL != offered.durability:
-            policy = "durability"
-        return f"{other} has QoS that does not match ours: {policy}" if policy else ""
+                self._mismatch(found, made.topic_name, kind, other.topic_type, "")
+        return found  # ROS itself logs QoS that does not match
 
     def _made_qos(self, depth: int, *, reliable: bool, latched: bool = False) -> Any:
         qos = self._qos
@@ -390,9 +567,8 @@ class RclNode(Graph):
 
 
 def _message(kind: str) -> Any:
-    """The class of a message type of ROS. Raises `ImportError` where ROS does not have it."""
     package, _, name = kind.split("/")
-    return getattr(import_module(f"{package}.msg"), name)
+    return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 _NEEDS_ROS = {
@@ -407,7 +583,7 @@ def joined_graph(arguments: RosArguments, environment: Mapping[str, str]) -> Gra
     """A node by `rclpy` where a ROS environment is sourced, else over DDS."""
     if environment.get("AMENT_PREFIX_PATH"):
         try:
-            import_module("rclpy")
+            importlib.import_module("rclpy")
         except ImportError as error:
             log.warning("rclpy of the sourced ROS environment cannot be used (%s)", error)
         else:

@@ -17,7 +17,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.onboard.messages.estimate import NavigationEstimate, floored
 from orthonav.onboard.messages.mavlink import require_confident
-from orthonav.onboard.ros2.graph import Graph
+from orthonav.onboard.ros2.node import Graph
 from orthonav.onboard.telemetry import VehicleState
 
 NOT_MEASURED_RAD2 = math.pi**2
@@ -70,12 +70,13 @@ class Ros2Publisher:
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
         self._fix(self._navsatfix(estimate, cov, self._altitude_m(vehicle), stamp_ns))
         east, north = self._frame.en_from_latlon(estimate.lat_deg, estimate.lon_deg).tolist()
-        turn = orientation(vehicle)
+        turn = np.array([0.0, 0.0, 0.0, 1.0])  # where the attitude is not known
+        if vehicle.ned_from_body is not None:
+            turn = ros_xyzw_from_ned(vehicle.ned_from_body)
         self._pose(self._posed((east, north), cov, turn, stamp_ns))
         return "NavSatFix", "PoseWithCovarianceStamped"
 
     def health(self, plain: dict[str, Any]) -> None:
-        """Publish the health, and the problems of the topics."""
         new = self._node.definitions.new
         problems = {f"topic {name}": text for name, text in self._node.problems.items()}
         damaged = {f"damaged on {name}": n for name, n in self._node.undecodable.items()}
@@ -95,9 +96,6 @@ class Ros2Publisher:
         header = self._node.definitions.header(self._now_ns(), "")
         self._health(new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status]))
 
-    def close(self) -> None:
-        """Nothing to do: the node is closed by its owner."""
-
     def _send_origin(self) -> None:
         definitions = self._node.definitions
         place = definitions.new(
@@ -112,7 +110,6 @@ class Ros2Publisher:
         )
 
     def _altitude_m(self, vehicle: VehicleState) -> float:
-        """Altitude of the fix, as its parameter asks for; NaN where that is not known."""
         chosen = self._parameters.altitude
         if chosen == "terrain":
             return vehicle.amsl_m
@@ -169,10 +166,3 @@ def _flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, st
             yield f"{before}{name}", ", ".join(map(str, value))
         else:
             yield f"{before}{name}", "" if value is None else str(value)
-
-
-def orientation(vehicle: VehicleState) -> Array:
-    """Reported attitude as a ROS quaternion x, y, z, w; the identity where it is not known."""
-    if vehicle.ned_from_body is None:
-        return np.array([0.0, 0.0, 0.0, 1.0])
-    return ros_xyzw_from_ned(vehicle.ned_from_body)

@@ -6,10 +6,12 @@ header stamps; for a message without a stamp the time of arrival is used.
 
 import logging
 import math
+from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 from orthonav.core.errors import CameraError, FlightError, StoppedError
@@ -31,7 +33,7 @@ from orthonav.core.geo.attitude import (
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import NoFix
 from orthonav.onboard.cameras import CameraImage
-from orthonav.onboard.ros2.graph import TIME_NS, Graph
+from orthonav.onboard.ros2.node import TIME_NS, Graph
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
 
 log = logging.getLogger(__name__)
@@ -46,12 +48,34 @@ MOST_LINES = 100
 _SPIN_S = 0.05
 _TELEMETRY_DEPTH = 200
 IMAGES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/CompressedImage"}
+LOST_WINDOW_NS, LOST_SHARE, LEAST_IMAGES = 10 * TIME_NS, 0.2, 5
+"""Share of the last seconds' images that may be lost, and the least number that shows it."""
+IRREGULAR = 2
+"""A node between passes every n-th image on where steps from image to image, in messages of the
+camera, differ by less."""
+_LOSES = (
+    "loses images: use compressed ones, image_reliability:=reliable, or a larger net.core.rmem_max"
+)
+
+
+def loses_images(image_stamps_ns: Sequence[int], info_stamps_ns: Sequence[int]) -> bool:
+    """Whether more than `LOST_SHARE` of the images are missing beside their `camera_info`.
+
+    A camera gives both the same stamp. An image is sent in many parts and lost with one of them,
+    its `camera_info` is a single part.
+    """
+    images, infos = sorted(image_stamps_ns), sorted(info_stamps_ns)
+    if images:
+        images = images[bisect_left(images, images[-1] - LOST_WINDOW_NS) :]
+    if len(images) < LEAST_IMAGES:
+        return False
+    steps = [bisect_right(infos, b) - bisect_right(infos, a) for a, b in pairwise(images)]
+    lost = sum(max(step - 1, 0) for step in steps)
+    return lost > LOST_SHARE * (lost + len(images)) and max(steps) - min(steps) >= IRREGULAR
 
 
 @dataclass(frozen=True, eq=False)
 class _WaitingImage:
-    """An image that waits for its telemetry since `arrived_ns` of our clock."""
-
     message: Any
     stamp_ns: int
     arrived_ns: int
@@ -79,6 +103,8 @@ class Ros2Reader:
         self._camera: Camera | None = None
         self._camera_error: CameraError | None = None
         self._images: deque[_WaitingImage] = deque()
+        self._image_stamps: deque[int] = deque(maxlen=1000)
+        self._info_stamps: deque[int] = deque(maxlen=1000)
         self._clock: tuple[int, int] | None = None
         self._number, self._image_ns, self._attitude_ns = 0, 0, 0
         self._checked_ns = self._reminded_ns = clocks.mono_ns()
@@ -155,7 +181,8 @@ class Ros2Reader:
         now_ns = self._clocks.mono_ns()
         if now_ns - self._checked_ns >= TIME_NS:
             self._checked_ns = now_ns
-            self._node.check_graph()
+            lost = loses_images(self._image_stamps, self._info_stamps)
+            self._node.check_graph({self._image_topic: _LOSES} if lost else {})
 
     def _ahead_ns(self) -> int | None:
         """ROS time minus our monotonic clock; None before the first `/clock`."""
@@ -187,12 +214,14 @@ class Ros2Reader:
                 return
             self._restart(self._image_topic, self._image_ns - time_ns)
         self._image_ns = time_ns
+        self._image_stamps.append(time_ns)
         while len(self._images) > 1:
             self._images.pop()
         self._images.append(_WaitingImage(message, time_ns, self._clocks.mono_ns()))
 
     def _take_camera_info(self, message: Any, cdr: bytes) -> None:
         """Use the first one: the camera does not change in flight."""
+        self._info_stamps.append(stamp_ns(message, 0))
         if self._camera is None:
             try:
                 self._camera = camera_of_info(message)
@@ -275,7 +304,8 @@ class Ros2Reader:
         """Discard telemetry and images: time went back, they belong to an earlier run."""
         log.warning("ROS time went back by %.1f s (%s); telemetry is cleared", back_ns / 1e9, what)
         self._buffer.clear()
-        self._images.clear()
+        for held in (self._images, self._image_stamps, self._info_stamps):
+            held.clear()
         self._image_ns = self._attitude_ns = 0
 
     def _remind(self, text: str) -> None:
