@@ -1,6 +1,6 @@
 """How likely a fix is right: a probability from scores, and acceptance by a threshold.
 
-Weights of registration are from real imagery of two dates (`python -m benchmarks.trust`), chance
+Weights of registration are from real imagery of two dates (`python -m benchmarks.integrity`), chance
 scores from the map; weights of tiles are learnt when the map is built."""
 
 import math
