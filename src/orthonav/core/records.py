@@ -255,7 +255,8 @@ class ViewResult:
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
     `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
     track (`searching`, `tracking`, `coasting`, `lost`), None where views are localized one by one.
-    `accepted`: whether a fix met the criterion of `--accept`, None where none was given."""
+    `accepted`: whether a fix met the criterion of `--accept` or `--alert-limit-m`, None where none
+    was given. `risk`: of the protection level that the line states."""
 
     frame: str
     time_ns: int
@@ -263,6 +264,7 @@ class ViewResult:
     latency_ms: float
     state: str | None = None
     accepted: bool | None = None
+    risk: float = DEFAULT_RISK
 
     @property
     def is_confident(self) -> bool:
