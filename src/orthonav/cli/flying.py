@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import checked_signature, search_plan
+from orthonav.cli.common import acceptance, checked_signature, search_plan
 from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
 from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
 from orthonav.core.files import require_file
@@ -65,8 +65,9 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     stack.callback(console.close)
     stack.enter_context(console.in_place_of_stderr())
     opened = _opened(options)
-    accept = Acceptance.parse(options.accept)
+    accept = acceptance(options)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
+    least = 0.0 if options.alert_limit_m else least
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
     localizer = Localizer(opened, plan=search_plan(options))
@@ -85,7 +86,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     else:
         source, graph = _source(options, clocks, link, camera, stopping), None
     console.quiet |= logging.getLogger("orthonav").level >= logging.WARNING  # --log-level of ROS
-    for line in plan_lines(options, opened, least):
+    for line in plan_lines(options, opened, accept):
         console.say(line)
     camera = camera or source.wait_for_camera()
     console.say(camera_line(options, camera))
@@ -94,7 +95,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     if options.gnss != "off":
         queue = source.gnss if options.ros2 else None if link is None else link.gnss
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
-        gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, least, clocks)
+        gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, clocks)
     newest = NewestImage()
     wanted = None if options.ros2 else f"images from {options.source}"  # ROS 2 has its own text
     narrator = Narrator(
@@ -122,6 +123,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
+        risk=accept.risk,
         map_path=options.map,
         map_change=opened.change,
         state_path=options.state,
@@ -137,7 +139,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         link=link,
         sink=sink,
         diagnosis=TelemetryDiagnosis(
-            localizer, least, has_start=bool(options.start or options.state)
+            localizer, least or CONFIDENT, has_start=bool(options.start or options.state)
         ),
         start=start,
         fresh=locator,
@@ -305,11 +307,16 @@ def _publisher(
     narrator: Narrator,
     digest: str,
 ) -> outputs.Publisher:
+    alert_limit_m = options.alert_limit_m or math.inf
+    max_std_m = options.max_std_m
+    if max_std_m is None:
+        max_std_m = math.inf if options.alert_limit_m else GateRules().max_std_m
     rules = GateRules(
         least,
-        options.max_std_m,
+        max_std_m,
         min_interval_s=_intervals_s(options),
         send_coasting=options.send_coasting,
+        alert_limit_m=alert_limit_m,
     )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
     chosen = outputs.MessageOptions(
@@ -372,13 +379,15 @@ def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[st
         "prior": "telemetry",
         "registration": "on",
         "accept": None,
+        "alert_limit_m": options.alert_limit_m,
+        "risk": options.risk,
         "track": True,
         "mount": None if mount is None else asdict(mount),
         "fly": line,
     }
 
 
-def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> list[str]:
+def plan_lines(options: argparse.Namespace, opened: MapFile, accept: Acceptance) -> list[str]:
     sheet, area_km2 = opened.manifest.sheets[0], opened.manifest.area_km2
     terrain, ground = sheet.terrain, "level ground"
     if terrain is not None:
@@ -390,7 +399,7 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
         sent = ["nothing to the autopilot (--dry-run)"]
     sent += [f"NMEA to {url}" for url in options.nmea]
     sent += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
-    confident = f"; positions of confidence {least:g} or more"
+    confident = f"; positions of {accept.text()}"
     return [
         f"map: {options.map}, {area_km2:.2f} km2, {sheet.grid.gsd_m:g} m per pixel, {ground}",
         f"sends: {', '.join(sent) + confident if sent else 'nothing'}",
@@ -413,7 +422,6 @@ def gnss_watch(
     digest: str,
     used: tuple[Any, ...],
     queue: deque[GnssSample] | None,
-    min_confidence: float,
     clocks: Clocks,
 ) -> GnssWatch:
     """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder. After a
@@ -438,7 +446,6 @@ def gnss_watch(
         setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
         correct=options.gnss == "correct",
         recorded=recorded,
-        min_confidence=min_confidence,
         utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
     )
 

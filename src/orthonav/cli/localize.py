@@ -436,9 +436,12 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
         for name in (*LOCALIZE_CHOICES, "track"):
             setattr(options, name, flown.get(name, getattr(options, name)))
         options.accept = flown.get("accept") or options.accept
+        options.alert_limit_m = flown.get("alert_limit_m", options.alert_limit_m)
+        options.risk = flown.get("risk", options.risk)
         options.skip_bad_images = True  # a flight continues after an image that cannot be decoded
         return flown.get("mount", mount)
-    chosen = {name: getattr(options, name) for name in (*LOCALIZE_CHOICES, "accept")}
+    names = (*LOCALIZE_CHOICES, "accept", "alert_limit_m", "risk")
+    chosen = {name: getattr(options, name) for name in names}
     chosen |= {"track": options.track or options.smooth, "mount": mount}
     if flown.get("accept") is None:  # the runner logs every fix, so the default applies
         flown.pop("accept", None)

@@ -21,6 +21,7 @@ from orthonav.core.flight.mount import Mount
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles
 from orthonav.core.geo.camera import Camera
+from orthonav.core.integrity import DEFAULT_RISK
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.localize.view import check_picture
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
@@ -39,6 +40,7 @@ from orthonav.onboard.health import (
 )
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.gate import unavailable_text
 from orthonav.onboard.messages.mavlink import dialect, status_texts
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
@@ -72,7 +74,8 @@ class FlyOptions:
     `mount_deg`: yaw, pitch, roll of the camera in the body. `mount`: calibrated one, for the health
     only: the locator applies it. `heights`: None where the map has no terrain. `deadline_s`: older
     images are dropped. `min_agl_m`: lower views are not located. `recorded`: telemetry comes with
-    the image, from a recording or ROS. `accept`: in addition to the gate. `map_change`: how the
+    the image, from a recording or ROS. `accept`: of fixes, in addition to `min_confidence`; None:
+    that alone. `map_change`: how the
     open map file was changed in place. `logged_options`: for a replay of the log.
     """
 
@@ -85,6 +88,7 @@ class FlyOptions:
     recorded: bool = False
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
+    risk: float = DEFAULT_RISK
     map_path: Path | None = None
     map_change: Callable[[], str | None] = lambda: None
     state_path: Path | None = None
@@ -286,12 +290,10 @@ class Runner:
             return result
         if self.options.heights is not None:
             self.options.heights.observe(telemetry.time_ns, outcome, result.state)
-        accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
+        sent = result
         if self._gnss is not None:
-            accepted = self._gnss.corrected(accepted)
-        self._publisher.publish(
-            replace(result, outcome=accepted), image.exposed_ns, vehicle, judged=True
-        )
+            sent = replace(result, outcome=self._gnss.corrected(result.outcome))
+        self._publisher.publish(sent, image.exposed_ns, vehicle, judged=True)
         now_ns = self._clocks.mono_ns()
         self.counter.add_latency(now_ns, (now_ns - image.exposed_ns) / 1e9)
         self._log(lambda sink: sink.result(result))
@@ -357,7 +359,7 @@ class Runner:
 
     def _confident_fix(self, result: ViewResult) -> Fix | None:
         fix = result.outcome
-        if not isinstance(fix, Fix) or not fix.confidence >= self.options.min_confidence:
+        if not isinstance(fix, Fix) or not result.is_confident:
             return None
         return fix if result.state in (None, "tracking") else None
 
@@ -379,12 +381,12 @@ class Runner:
         )
 
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
-        accept, accepted = self.options.accept, None
+        accept, state = self.options.accept, self._locator.state_name
+        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
         if isinstance(outcome, Fix):
             accepted = outcome.confidence >= self.options.min_confidence
             accepted = accepted and (accept is None or accept.accepts(outcome))
-        state = self._locator.state_name
-        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, accepted)
+            result = replace(result, accepted=accepted, risk=self.options.risk)
         return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
 
     def _map_changed(self) -> NoFix | None:
@@ -542,6 +544,7 @@ class Runner:
             gnss=() if self._gnss is None else self._gnss.reasons,
             has_origin=not needs_origin or (link is not None and link.origin is not None),
             latency=None if self._latency is None or taken_ns is None else self._latency.reason,
+            unavailable=unavailable_text(self._publisher.gate.availability(now_ns)),
         )
 
     def _start_off_m(self, now_ns: int) -> float:
@@ -566,6 +569,7 @@ class Runner:
             "age_p50_ms": round(self.counter.latency_s(0.5) * 1e3, 1),
             "age_p95_ms": round(self.counter.latency_s(0.95) * 1e3, 1),
             **({"start_off_m": round(start_off_m, 1)} if start_off_m else {}),
+            **self._publisher.gate.availability(self._clocks.mono_ns()),
             **({} if self._gnss is None else {"gnss": self._gnss.plain()}),
             **({} if self._latency is None else self._latency.plain()),
         }

@@ -236,7 +236,7 @@ class Acceptance:
 
     def text(self) -> str:
         if self.criterion == ALERT_LIMIT:
-            return f"protection level at most {self.threshold:g} m (risk {self.risk:g})"
+            return f"a protection level of at most {self.threshold:g} m at a risk of {self.risk:g}"
         return f"{self.criterion.replace('_', ' ')} {self.threshold:g} or more"
 
     def accepts(self, outcome: Fix | NoFix) -> bool:
