@@ -195,16 +195,17 @@ class Fix:
 
     def probability_within(self, limit_m: float) -> float:
         """Probability that the error is at most `limit_m`; NaN where the confidence is unknown."""
-        return self._right * (1 - probability_beyond(self.cov_en_m2, limit_m))
+        return self.right_probability * (1 - probability_beyond(self.cov_en_m2, limit_m))
 
     def protection_level_m(self, risk: float = DEFAULT_RISK) -> float:
         """The smallest limit that the error exceeds with a probability of at most `risk`, m.
 
         Infinite where the place alone is wrong with a higher one, or nothing is known of it."""
-        return protection_level_m(self._right, self.cov_en_m2, risk)
+        return protection_level_m(self.right_probability, self.cov_en_m2, risk)
 
     @property
-    def _right(self) -> float:
+    def right_probability(self) -> float:
+        """`place_probability`, or the confidence where it is unknown."""
         known = math.isfinite(self.place_probability)
         return self.place_probability if known else self.confidence
 

@@ -16,6 +16,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from orthonav.core import integrity
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import FlightFolder, read_truth
 from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
@@ -324,13 +325,26 @@ def compare(
         place_probability=frozen(
             [each.place_probability if isinstance(each, Fix) else math.nan for each in outcomes]
         ),
-        protection_levels_m=frozen(
-            [each.protection_level_m(risk) if _is_fix(each) else math.nan for each in outcomes]
-        ),
+        protection_levels_m=protection_levels_m(matched, risk),
         risk=risk,
         n_without_truth=len(results) - len(matched),
         n_without_result=len(known) - len(matched),
     )
+
+
+def protection_levels_m(results: Sequence[ViewResult], risk: float | None = None) -> FloatArray:
+    """(N,) m, infinite where the place is too uncertain, NaN without a fix; `risk`: None: that of
+    each result."""
+    levels_m = np.full(len(results), math.nan)
+    risks = np.array([each.risk if risk is None else risk for each in results])
+    outcomes = [each.outcome for each in results]
+    is_fix = np.array([_is_fix(each) for each in outcomes], np.bool_)
+    place = np.array([each.right_probability if _is_fix(each) else 0.0 for each in outcomes])
+    covs = np.array([_covariance(each) for each in outcomes]).reshape(-1, 2, 2)
+    for each in np.unique(risks):
+        chosen = is_fix & (risks == each)
+        levels_m[chosen] = integrity.protection_levels_m(place[chosen], covs[chosen], float(each))
+    return frozen(levels_m)
 
 
 def pool(comparisons: Sequence[Comparison]) -> Comparison:
