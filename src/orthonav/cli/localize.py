@@ -313,18 +313,19 @@ def _print_summary(
         if options.json:
             print_json(plain)
             return
+        others = "above the alert limit" if options.alert_limit_m else "of low confidence"
         named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
         why = f" ({named})" if named else ""
         print(
             f"{counted(counts.views, 'view')}: {counts.confident} confident ({accept.text()}), "
-            f"{counts.low} of low confidence, {counts.none} without a position{why}; "
+            f"{counts.low} {others}, {counts.none} without a position{why}; "
             f"median {median_ms or 0:.1f} ms per view"
         )
         lines = [f"! {line}" for line in advice]
         lines += [f"{counted(counts.confident, 'camera position')}: {path}" for path in exported]
         if out is not None:
             where = "stdout" if is_stdout(out) else out
-            guesses = "; positions of low confidence are best guesses, marked as such"
+            guesses = f"; positions {others} are best guesses, marked as such"
             lines.append(f"written to {where}{guesses * bool(counts.low)}")
         for line in (*lines, *changed[1]):
             print(line)
@@ -364,8 +365,13 @@ class SetupAdvice:
         Both are empty where enough views are confident.
         """
         from orthonav.core.geo.headings import RADIANS, seem_radians
+        from orthonav.core.localize.confidence import Acceptance
+        from orthonav.core.records import CONFIDENT
         from orthonav.ground.recordings.setups import Counts, setup_text
 
+        if math.isfinite(accept.alert_limit_m):  # a high level is no sign of a wrong setup
+            accept = Acceptance("confidence", CONFIDENT)
+            results = [accept.judged(each) for each in results]
         counts, known = Counts.of(results), self._options.heading == "known"
         lines = [RADIANS] if known and seem_radians(self._yaw_deg) else []
         if not counts.few:
