@@ -571,7 +571,7 @@ def test_positions_beyond_the_alert_limit_are_withheld_and_said(begin):
     locator = FakeLocator(outcome)
     accept = Acceptance(ALERT_LIMIT, 35.0, 1e-3)
     rules = GateRules(min_confidence=0.0, alert_limit_m=35.0)
-    flight = begin(locator, rules, accept=accept, min_confidence=0.0)
+    flight = begin(locator, rules, accept=accept)
     assert flight.views(30)[-1].is_confident and flight.health().level is Level.OK
     told = flight.written()
     assert told[-2]["sent"] and told[-2]["protection_level_m"] < 35 and told[-2]["risk"] == 1e-3

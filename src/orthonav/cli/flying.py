@@ -67,7 +67,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     opened = _opened(options)
     accept = acceptance(options)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
-    least = 0.0 if options.alert_limit_m else least
+    sent_least = 0.0 if options.alert_limit_m else least  # monitors need a confidence all the same
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
     localizer = Localizer(opened, plan=search_plan(options))
@@ -82,7 +82,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     if options.ros2:
-        source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, least)
+        source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, sent_least)
     else:
         source, graph = _source(options, clocks, link, camera, stopping), None
     console.quiet |= logging.getLogger("orthonav").level >= logging.WARNING  # --log-level of ROS
@@ -95,7 +95,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     if options.gnss != "off":
         queue = source.gnss if options.ros2 else None if link is None else link.gnss
         used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
-        gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, clocks)
+        gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, least, clocks)
     newest = NewestImage()
     wanted = None if options.ros2 else f"images from {options.source}"  # ROS 2 has its own text
     narrator = Narrator(
@@ -103,7 +103,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         is_live=options.ros2 or cameras.is_live(options.source),
         sends=not options.dry_run and (link is not None or graph is not None),
     )
-    publisher = _publisher(options, clocks, link, least, graph, narrator, digest)
+    publisher = _publisher(options, clocks, link, sent_least, graph, narrator, digest)
     if link is not None:
         stack.callback(LinkThread(link).stop)
     sink = _sink(options, camera, digest)
@@ -139,7 +139,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         link=link,
         sink=sink,
         diagnosis=TelemetryDiagnosis(
-            localizer, least or CONFIDENT, has_start=bool(options.start or options.state)
+            localizer, least, has_start=bool(options.start or options.state)
         ),
         start=start,
         fresh=locator,
@@ -422,6 +422,7 @@ def gnss_watch(
     digest: str,
     used: tuple[Any, ...],
     queue: deque[GnssSample] | None,
+    min_confidence: float,
     clocks: Clocks,
 ) -> GnssWatch:
     """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder. After a
@@ -446,6 +447,7 @@ def gnss_watch(
         setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
         correct=options.gnss == "correct",
         recorded=recorded,
+        min_confidence=min_confidence,
         utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
     )
 

@@ -74,9 +74,9 @@ class FlyOptions:
     `mount_deg`: yaw, pitch, roll of the camera in the body. `mount`: calibrated one, for the health
     only: the locator applies it. `heights`: None where the map has no terrain. `deadline_s`: older
     images are dropped. `min_agl_m`: lower views are not located. `recorded`: telemetry comes with
-    the image, from a recording or ROS. `accept`: of fixes, in addition to `min_confidence`; None:
-    that alone. `map_change`: how the
-    open map file was changed in place. `logged_options`: for a replay of the log.
+    the image, from a recording or ROS. `min_confidence`: of fixes that monitors use and that are
+    accepted. `accept`: in addition; an alert limit replaces it for acceptance. `map_change`: how
+    the open map file was changed in place. `logged_options`: for a replay of the log.
     """
 
     mount_deg: Angles = LOOKS_DOWN
@@ -359,18 +359,20 @@ class Runner:
 
     def _confident_fix(self, result: ViewResult) -> Fix | None:
         fix = result.outcome
-        if not isinstance(fix, Fix) or not result.is_confident:
+        if not isinstance(fix, Fix) or not fix.confidence >= self.options.min_confidence:
             return None
         return fix if result.state in (None, "tracking") else None
 
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
+        now_ns = self._clocks.mono_ns()
+        if result.is_confident and result.state in (None, "tracking"):
+            self._confident_ns = now_ns
+            self._count("confident")
         fix = self._confident_fix(result)
         if fix is None:
             return
-        self._confident_ns = self._clocks.mono_ns()
-        self._count("confident")
         if self._start_check is not None:
-            self._start_check.found(fix, self._confident_ns, self._confident_ns, confirmed=True)
+            self._start_check.found(fix, now_ns, now_ns, confirmed=True)
         mount = self.options.mount
         self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
         if not self.options.heading_known:
@@ -381,13 +383,17 @@ class Runner:
         )
 
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
-        accept, state = self.options.accept, self._locator.state_name
-        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
-        if isinstance(outcome, Fix):
-            accepted = outcome.confidence >= self.options.min_confidence
-            accepted = accepted and (accept is None or accept.accepts(outcome))
-            result = replace(result, accepted=accepted, risk=self.options.risk)
+        state, risk = self._locator.state_name, self.options.risk
+        accepted = self._accepts(outcome) if isinstance(outcome, Fix) else None
+        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, accepted, risk)
         return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
+
+    def _accepts(self, fix: Fix) -> bool:
+        accept = self.options.accept
+        if accept is not None and math.isfinite(accept.alert_limit_m):
+            return accept.accepts(fix)
+        confident = fix.confidence >= self.options.min_confidence
+        return confident and (accept is None or accept.accepts(fix))
 
     def _map_changed(self) -> NoFix | None:
         # Parts in memory would still give positions; stopping shows the fault at once.

@@ -223,15 +223,22 @@ def radius_key(radius_m: float) -> str:
     return f"acc_at_{radius_m:g}m"
 
 
-def evaluate(fixes: Path | str, truth: Path | str, radius_m: float = 15.0) -> Metrics:
+def evaluate(
+    fixes: Path | str,
+    truth: Path | str,
+    radius_m: float = 15.0,
+    alert_limit_m: float = math.nan,
+    risk: float = DEFAULT_RISK,
+) -> Metrics:
     """Metrics of a file of fixes (`fixes.jsonl`) against the true positions of a `truth.csv`.
 
+    `alert_limit_m`: largest error that the mission allows, NaN: none; `risk`: of protection levels.
     Raises `MissingFileError`, `FlightError`, also where latitudes and longitudes of the file seem
     to be swapped, or `ValueError` for a radius that is not positive.
     """
     known, results = read_truth(Path(truth)), read_results(Path(fixes))
     check_truth(known, results, None, Path(truth))
-    return measure(compare(known, results), radius_m)
+    return measure(compare(known, results, risk=risk), radius_m, alert_limit_m)
 
 
 def check_truth(

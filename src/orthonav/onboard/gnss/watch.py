@@ -17,7 +17,7 @@ import numpy as np
 from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.core.records import CONFIDENT, Fix, NoFix, ViewResult
 from orthonav.onboard.gnss.biases import (
     NANOSECONDS,
     SETTLED_S,
@@ -79,6 +79,7 @@ class GnssWatch:
         setup: str = "",
         correct: bool = False,
         recorded: bool = False,
+        min_confidence: float = CONFIDENT,
         utc_ahead_ns: Callable[[], int] = lambda: 0,
     ) -> None:
         """`frame`: plane of the map. `digest`: of the map; `known`: biases by digest, the latest
@@ -94,7 +95,7 @@ class GnssWatch:
         self.log: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self._digest, self._known = digest, dict(known)
         self._start = at_start(known, digest, setup)
-        self._recorded = recorded
+        self._recorded, self._least = recorded, min_confidence
         self._monitors: dict[int, GnssMonitor] = {}
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
@@ -119,8 +120,7 @@ class GnssWatch:
     def _compared(self, result: ViewResult, now_ns: int) -> ViewResult:
         self._take(now_ns)
         fix = result.outcome
-        confident = result.is_confident and result.state in (None, "tracking")
-        if isinstance(fix, Fix) and confident and math.isfinite(fix.std_m + fix.heading_deg):
+        if isinstance(fix, Fix) and self._is_confident(fix, result.state):
             position = self._position(fix, now_ns)
             for monitor in self._monitors.values():
                 monitor.position(position)
@@ -234,6 +234,10 @@ class GnssWatch:
         time_ns = sample.time_ns + self._utc_ahead_ns()
         with contextlib.suppress(ValueError):  # a position that is not finite
             self.log(time_ns, gnss_message(sample, time_ns))
+
+    def _is_confident(self, fix: Fix, state: str | None) -> bool:
+        known = math.isfinite(fix.std_m + fix.heading_deg)
+        return known and fix.confidence >= self._least and state in (None, "tracking")
 
     def _position(self, fix: Fix, now_ns: int) -> MapPosition:
         return MapPosition(
