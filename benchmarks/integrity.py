@@ -28,7 +28,7 @@ from scipy.special import expit
 from benchmarks.judged_views import prepare, views_of
 from benchmarks.record import Section, Table, percent, resumed, rows_path, run, say
 from benchmarks.scenes import all_pairs, chosen, place_of
-from orthonav.core.integrity import DEFAULT_RISK, protection_level_m
+from orthonav.core.integrity import DEFAULT_RISK, protection_levels_m
 from orthonav.core.localize.confidence import (
     ALONE,
     FEATURES,
@@ -78,12 +78,9 @@ class Judged:
             inside = scenes == scene
             judge = fit_judge(features[~inside], right[~inside])
             place[inside] = [judge.of(each) for each in features[inside]]
-        levels = [
-            protection_level_m(each, _covariance(row), DEFAULT_RISK)
-            for each, row in zip(place, rows, strict=True)
-        ]
+        levels = protection_levels_m(place, _covariances(rows), DEFAULT_RISK)
         errors = np.array([math.hypot(*row["off_en_m"]) for row in rows])
-        return cls(rows, features, right, place, errors, np.array(levels))
+        return cls(rows, features, right, place, errors, levels)
 
     def where(self, **wanted: Any) -> Mask:
         """Mask (N,) of the rows that have these values."""
@@ -105,13 +102,13 @@ class Judged:
     def nees(self) -> Array:
         """Normalized errors squared (N,): 2 is right."""
         off = np.array([each["off_en_m"] for each in self.rows])
-        inverse = np.linalg.inv([_covariance(each) for each in self.rows])
+        inverse = np.linalg.inv(_covariances(self.rows))
         return np.asarray(np.einsum("ni,nij,nj->n", off, inverse, off))
 
 
-def _covariance(row: dict[str, Any]) -> Array:
-    east, both, north = row["cov_en_m2"]
-    return np.array([[east, both], [both, north]])
+def _covariances(rows: Sequence[dict[str, Any]]) -> Array:
+    east, both, north = np.array([each["cov_en_m2"] for each in rows]).T
+    return np.stack([east, both, both, north], axis=1).reshape(-1, 2, 2)
 
 
 def fit_judge(features: Array, right: Mask) -> RegisteredConfidence:
@@ -217,10 +214,7 @@ def _name(width_px: int, known: bool, prior_px: float | None, tracked: bool) -> 
 
 
 def _gaps(judged: Judged) -> list[tuple[str, Mask]]:
-    years = [
-        [int(year) for year in re.findall(r"(?:19|20)\d\d", row["pair"])] for row in judged.rows
-    ]
-    apart = np.array([abs(each[-1] - each[-2]) if len(each) > 1 else -1 for each in years])
+    apart = np.array([_years_apart(each["pair"]) for each in judged.rows])
     return [
         (f"{least} to {most - 1}", (apart >= least) & (apart < most) & judged.found)
         for least, most in GAPS

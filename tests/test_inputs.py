@@ -1,6 +1,7 @@
 """Inputs as they are: other runs, missing and resized images, odd arrays, wrong options."""
 
 import json
+import math
 import shutil
 from dataclasses import astuple, replace
 from pathlib import Path
@@ -49,6 +50,8 @@ def test_the_truth_is_that_of_the_flight(run, fixes, few):
     assert run("evaluate", fixes, "--truth", few / "truth.csv").out == done.out
     both = run("evaluate", fixes, fixes, "--flight", few, "--json")
     assert json.loads(both.out)["n_views"] == 8
+    limited = run("evaluate", fixes, "--flight", few, "--alert-limit-m", "35", "--risk", "0.01")
+    assert "available at the alert limit of 35 m" in limited.out and "risk of 0.01" in limited.out
 
 
 def test_fixes_state_their_map_and_flight(fixes, few, map_path):
@@ -140,6 +143,41 @@ def test_images_of_another_size_are_scaled_in_a_flight_folder(run, few, map_path
     cv2.imwrite(str(flight / "frames" / "0002.jpg"), GREY[:20])
     done = run("localize", map_path, flight, "--out", out)
     assert done.code == 1 and "another aspect ratio" in done.err and "0002.jpg" in done.err
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *(["--alert-limit-m", text] for text in ("0.9", "100001", "nan", "far")),
+        *(["--risk", text] for text in ("1e-7", "0.6", "0", "nan")),
+        ["--alert-limit-m", "35", "--accept", "confidence:0.9"],
+    ],
+)
+def test_an_alert_limit_and_a_risk_are_limited_and_replace_the_criterion(run, few, fixes, options):
+    for command in (["localize", "m", few], ["fly", "m", few], ["evaluate", fixes]):
+        done = run(*command, *options)
+        assert done.code == 2 and options[0] in done.err
+
+
+def test_a_fix_is_confident_up_to_the_alert_limit(run, few, map_path, tmp_path):
+    """Others are written too; risk and limit change no position."""
+    out, command = tmp_path / "f.jsonl", ["localize", map_path, few, "--risk", "0.1", "--out"]
+
+    def lines(*options):
+        done = run(*command, out, *options)
+        assert done.code == 0, done.err
+        return done.out, [json.loads(line) for line in out.read_text().splitlines()]
+
+    _, before = lines()
+    levels_m = sorted(line["protection_level_m"] or math.inf for line in before)
+    assert levels_m[0] < levels_m[1]
+    limit_m = (levels_m[0] + min(levels_m[1], 2 * levels_m[0])) / 2
+    said, after = lines("--alert-limit-m", str(limit_m))
+    assert [line["confident"] for line in after].count(True) == 1
+    for one, other in zip(before, after, strict=True):
+        assert other["confident"] is ((other["protection_level_m"] or math.inf) <= limit_m)
+        assert (one["lat_deg"], one["risk"]) == (other["lat_deg"], 0.1)
+    assert "1 confident (a protection level of at most" in said and "above the alert limit" in said
 
 
 @pytest.mark.parametrize(

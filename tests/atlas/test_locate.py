@@ -75,6 +75,7 @@ def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, r
     for fix in fixes:
         place = (fix["lat_deg"], fix["lon_deg"])
         assert distances_m([place], [truth[fix["frame"]]])[0] < 25
+        assert fix["place_probability"] <= fix["evidence"]["recognized"]
     assert fixes[-1]["confidence"] > 0.9 and fixes[-1]["state"] == "tracking"
 
 

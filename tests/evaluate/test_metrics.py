@@ -19,7 +19,7 @@ from orthonav.ground.evaluate.metrics import (
     worst_views,
 )
 from orthonav.ground.evaluate.statistics import standard_figures, upper_bound
-from orthonav.ground.evaluate.tables import verdict
+from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, verdict
 
 CENTRE = LocalFrame(48.0, -4.5)
 TRUTH_EN_M = {"a": (0.0, 0.0), "b": (100.0, 0.0), "c": (200.0, 50.0), "d": (300.0, 50.0)}
@@ -184,3 +184,47 @@ def test_relative_errors_do_not_cross_flights() -> None:
     apart = standard_figures(*two, starts=(0, 5))
     assert (apart.rpe_frames.n, apart.rpe_frames.max_m) == (8, pytest.approx(0.0))
     assert apart.rpe_distance.n == 2 and apart.ape.n == 10
+
+
+def placed(frame: str, second: int, std_m: float, error_m: float, place: float) -> ViewResult:
+    result = fix(frame, (error_m, 0.0))
+    outcome = replace(result.outcome, cov_en_m2=np.eye(2) * std_m**2, place_probability=place)
+    return replace(result, outcome=outcome, time_ns=second * 10**9)
+
+
+def test_availability_and_false_fixes_at_an_alert_limit() -> None:
+    """Five views, 1, 1, 1 and 7 s apart: two of them available, one of these false, one of three
+    errors beyond its protection level; an outage from the second view to the fourth."""
+    truth = TRUTH_EN_M | {"e": (300.0, 150.0)}
+    lost = replace(no_fix("c"), time_ns=2 * 10**9)
+    last = replace(no_fix("e"), time_ns=10 * 10**9)
+    results = [
+        placed("a", 0, 1.0, 40.0, 0.9999),
+        placed("b", 1, 20.0, 3.0, 0.9999),
+        lost,
+        placed("d", 3, 1.0, 3.0, 0.9999),
+        last,
+    ]
+    found = measure(compare(truth_of(truth), results), 15.0, 35.0).integrity
+    assert found is not None and found.risk == 1e-3
+    assert (found.n_levels, found.n_beyond, found.beyond) == (3, 1, pytest.approx(1 / 3))
+    assert found.beyond_upper_95 == pytest.approx(upper_bound(1, 3))
+    assert (found.n_available, found.availability) == (2, 0.4)
+    assert found.availability_of_time == pytest.approx(0.8)
+    assert found.outage.seconds_s == 2.0 and found.outage.path_m == pytest.approx(211.8, abs=0.1)
+    assert (found.n_false, found.false_upper_95) == (1, pytest.approx(upper_bound(1, 2)))
+    flight = FlightReport("f", compare(truth_of(truth), results), measure(three_fixes()))
+    assert flight.metrics.integrity is None  # they state no place probability
+    plain = metrics_to_json(measure(flight.comparison, 15.0, 35.0))["integrity"]
+    assert plain["alert_limit_m"] == 35.0 and plain["outage"]["seconds_s"] == 2.0
+    without = measure(compare(truth_of(truth), results, risk=1e-5)).integrity
+    assert without is not None and without.n_levels == 0  # wrong places are likelier
+    assert math.isnan(without.availability) and math.isnan(without.outage.seconds_s)
+
+
+def test_fixes_of_earlier_files_are_judged_by_their_confidence() -> None:
+    sure = fix("a", (3.0, 4.0), confidence=0.9999)
+    unsure = fix("b", (3.0, 4.0), confidence=0.95)
+    found = measure(compare(truth_of(TRUTH_EN_M), [sure, unsure]), 15.0, 35.0).integrity
+    assert found is not None and (found.n_available, found.availability) == (1, 0.25)
+    assert math.isnan(found.availability_of_time)  # two views have no result

@@ -94,6 +94,19 @@ def test_the_page_holds_metrics_and_provenance(tmp_path: Path, no_plots) -> None
         assert said in html
 
 
+def test_protection_levels_are_drawn_where_they_are_known(tmp_path: Path, no_plots) -> None:
+    flight = made_flight(30)
+    comparison = replace(
+        flight.comparison,
+        place_probability=np.full(30, 0.9999),
+        protection_levels_m=np.full(30, 20.0),
+    )
+    limited = replace(flight, comparison=comparison, metrics=measure(comparison, 15.0, 35.0))
+    html = write_report(tmp_path, [limited]).read_text("utf-8")
+    assert stems(tmp_path) == {*FIGURES, "stanford"}
+    assert "<h3>Integrity</h3>" in html and "available at the alert limit of 35 m" in html
+
+
 def test_several_flights_have_a_total_and_files_of_their_own(tmp_path: Path, no_plots) -> None:
     flights = [made_flight(n, name=name) for n, name in ((30, "../x"), (20, "a b"), (10, "a: b"))]
     whole = total(flights)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.fixes import (
     GROUND_KEYS,
+    INTEGRITY_KEYS,
     KEYS,
     POSE_KEYS,
     read_results,
@@ -67,6 +68,7 @@ fixes = st.builds(
     pitch_deg=numbers,
     roll_deg=numbers,
     pose_cov=pose_covariances | st.none(),
+    place_probability=st.floats(0, 1) | st.just(math.nan),
 )
 fixes |= st.builds(replace, fixes, ground_latlon_deg=grounds, ground_cov_en_m2=covariances)
 no_fixes = st.builds(NoFix, reason=st.text(), detail=st.text(), evidence=evidences)
@@ -76,6 +78,7 @@ view_results = st.builds(
     time_ns=st.integers(-(2**62), 2**62),
     outcome=fixes | no_fixes,
     latency_ms=numbers,
+    risk=st.floats(1e-6, 0.5),
 )
 
 
@@ -84,6 +87,8 @@ def fields(result: ViewResult) -> dict:
     outcome = {name: getattr(result.outcome, name) for name in vars(result.outcome)}
     outcome["evidence"] = dict(outcome["evidence"])
     values = [type(result.outcome).__name__, result.frame, result.time_ns, result.latency_ms]
+    if isinstance(result.outcome, Fix):
+        values.append(result.risk)
     for key in ("cov_en_m2", "ground_cov_en_m2", "pose_cov"):
         if outcome.get(key) is not None:
             outcome[key] = outcome[key].tolist()
@@ -104,7 +109,7 @@ def test_a_result_survives_the_round_trip(result: ViewResult) -> None:
 def test_a_line_is_strict_json_with_the_keys_in_order(result: ViewResult) -> None:
     line = result_to_json(result)
     values = json.loads(line, parse_constant=refuse)
-    more = [keys for keys in (GROUND_KEYS, POSE_KEYS) if keys[0] in values]
+    more = [keys for keys in (INTEGRITY_KEYS, GROUND_KEYS, POSE_KEYS) if keys[0] in values]
     assert tuple(values) == sum(more, start=KEYS)
     assert "\n" not in line and line.isascii()
     assert values["time_s"] == result.time_ns / 10**9  # rounded once
@@ -122,11 +127,29 @@ def test_a_line_without_a_ground_or_an_attitude_is_read() -> None:
     fix = result_from_json(json.dumps(FIX_LINE)).outcome
     assert isinstance(fix, Fix) and math.isnan(fix.pitch_deg) and math.isnan(fix.roll_deg)
     assert fix.ground_latlon_deg is fix.ground_cov_en_m2 is fix.pose_cov is None
-    assert tuple(json.loads(result_to_json(ViewResult("a", 0, fix, 1.0)))) == KEYS
+    plain = json.loads(result_to_json(ViewResult("a", 0, fix, 1.0)))
+    assert tuple(plain) == KEYS + INTEGRITY_KEYS
+    assert plain["place_probability"] is plain["protection_level_m"] is None  # 0.93 is too little
     ground = {"ground_lat_deg": 48.0, "ground_lon_deg": -4.0}
     fix = result_from_json(json.dumps({**FIX_LINE, **ground})).outcome
     assert isinstance(fix, Fix) and fix.ground_latlon_deg == (48.0, -4.0)
     assert fix.ground_cov_en_m2 is None
+
+
+def test_a_line_states_the_protection_level_and_its_risk() -> None:
+    fix = result_from_json(json.dumps({**FIX_LINE, "place_probability": 0.9999})).outcome
+    assert isinstance(fix, Fix) and fix.place_probability == 0.9999
+    levels = {}
+    for risk in (1e-3, 1e-2):
+        line = result_to_json(ViewResult("a", 0, fix, 1.0, risk=risk))
+        plain = json.loads(line)
+        assert plain["protection_level_m"] == fix.protection_level_m(risk) and plain["risk"] == risk
+        assert result_from_json(line).risk == risk
+        levels[risk] = plain["protection_level_m"]
+    assert levels[1e-3] > levels[1e-2] > 3
+    for wrong in ({"place_probability": 1.1}, {"risk": 2}, {"risk": "low"}):
+        with pytest.raises(FlightError, match=next(iter(wrong))):
+            result_from_json(json.dumps({**FIX_LINE, **wrong}))
 
 
 def test_the_camera_of_a_line_can_be_read_by_anyone() -> None:

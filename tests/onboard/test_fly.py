@@ -41,6 +41,7 @@ from orthonav.core.flight.fixes import result_from_json
 from orthonav.core.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
 from orthonav.core.flight.heights import FlownHeights
 from orthonav.core.geo.camera import Camera
+from orthonav.core.localize.confidence import ALERT_LIMIT, Acceptance
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 from orthonav.onboard import cameras
 from orthonav.onboard import fly as loop
@@ -540,6 +541,43 @@ def test_results_are_confident_by_the_criterion_of_the_flight(begin, least, conf
     flight = begin(min_confidence=least)
     result = flight.views(3)[-1]
     assert reason_of(result) == "fix" and result.is_confident is confident
+
+
+def test_positions_beyond_the_alert_limit_are_withheld_and_said(begin):
+    """While the place is uncertain, and again while the position is."""
+    shown = {"place": 0.9999, "std_m": 2.0}
+
+    def outcome(view):
+        found = fix(std_m=shown["std_m"], heading_deg=view.telemetry.yaw_deg)
+        return replace(found, place_probability=shown["place"])
+
+    locator = FakeLocator(outcome)
+    accept = Acceptance(ALERT_LIMIT, 35.0, 1e-3)
+    rules = GateRules(min_confidence=0.0, alert_limit_m=35.0)
+    flight = begin(locator, rules, accept=accept)
+    assert flight.views(30)[-1].is_confident and flight.health().level is Level.OK
+    told = flight.written()
+    assert told[-2]["sent"] and told[-2]["protection_level_m"] < 35 and told[-2]["risk"] == 1e-3
+    sent = flight.gate.sent.copy()
+    shown["std_m"] = 20.0
+    result = flight.views(60)[-1]
+    level_m = result.outcome.protection_level_m(1e-3)
+    assert 35 < level_m < math.inf and not result.is_confident
+    assert flight.gate.sent == sent and flight.gate.withheld["alert_limit"] == 60
+    assert flight.health().reasons == ("unavailable",)
+    text = f"protection level {level_m:.0f} m above the alert limit 35 m for "
+    assert f"unavailable: {text}" in flight.runner.health.text()
+    assert f"unavailable ({text}" in flight.said.warnings[-1]
+    health = [line for line in flight.written() if "health" in line][-1]
+    assert health["alert_limit_m"] == 35 and 5.5 < health["unavailable_s"] < 8
+    assert health["protection_level_m"] == pytest.approx(level_m, abs=0.1)
+    shown.update(place=0.99, std_m=2.0)
+    flight.views(10)
+    assert flight.gate.sent == sent and "protection level unknown" in flight.health().text()
+    shown["place"] = 0.9999
+    assert flight.views(20)[-1].is_confident
+    assert flight.health().level is Level.OK and flight.gate.sent != sent
+    assert flight.gate.resets == 0
 
 
 def test_the_position_is_saved_about_once_a_second(begin, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
-from orthonav.onboard.messages.gate import Gate, GateRules
+from orthonav.onboard.messages.gate import Gate, GateRules, unavailable_text
 
 START_NS = 1_789_000_000_000_000_000
 SECOND = 10**9
@@ -37,6 +37,7 @@ def now(seconds: float) -> int:
         ("not_tracking", {"state": "searching"}, 0.1),
         ("not_tracking", {"state": "lost"}, 0.1),
         ("coasting", {"state": "coasting"}, 0.1),
+        ("low_confidence", {"accepted": False}, 0.1),
         ("no_covariance", {"cov_en_m2": np.full((2, 2), math.nan)}, 0.1),
         ("too_uncertain", {"cov_en_m2": np.diag([1.0, 51.0**2])}, 0.1),
         ("stale", {}, 1.01),
@@ -47,6 +48,18 @@ def test_positions_in_doubt_are_withheld_and_counted(reason, change, later_s) ->
     gate = Gate()
     assert gate.admit(estimate_at(0.0, **change), now(later_s)) is None
     assert gate.withheld == {reason: 1}
+
+
+@pytest.mark.parametrize("level_m", [35.1, math.inf, math.nan])
+def test_a_protection_level_above_the_alert_limit_is_withheld(level_m) -> None:
+    gate = Gate(GateRules(alert_limit_m=35.0, send_coasting=True))
+    for state in ("tracking", "coasting"):
+        estimate = estimate_at(0.0, protection_level_m=level_m, state=state)
+        assert gate.admit(estimate, now(0.1)) is None
+    assert gate.withheld == {"alert_limit": 2}
+    assert gate.availability(now(3.1))["unavailable_s"] == 3.0
+    assert gate.admit(estimate_at(1.0, protection_level_m=35.0), now(1.0)) is not None
+    assert unavailable_text(gate.availability(now(1.0))) == ""
 
 
 def test_views_out_of_order_are_withheld() -> None:
@@ -180,7 +193,13 @@ def test_the_rate_limit_works_after_a_clock_was_set_back() -> None:
 
 
 @pytest.mark.parametrize(
-    "rules", [{"max_std_m": 0.0}, {"min_interval_s": {"A": 0.0}}, {"min_confidence": 1.1}]
+    "rules",
+    [
+        {"max_std_m": 0.0},
+        {"alert_limit_m": math.nan},
+        {"min_interval_s": {"A": 0.0}},
+        {"min_confidence": 1.1},
+    ],
 )
 def test_invalid_rules_are_refused(rules: dict) -> None:
     with pytest.raises(EstimateError):

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from orthonav.core.errors import AreaError, VariantError
 
 if TYPE_CHECKING:
+    from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.localize.policy import SearchPlan
     from orthonav.core.mapfile.signature import Signature
     from orthonav.ground.planning.area import Area
@@ -35,12 +36,31 @@ def bounds(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
+def _within(least: float, most: float) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"expected {least:g} to {most:g}, got '{text}'")
+        return value
+
+    return number
+
+
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "--accept": {
         "default": "confidence:0.9",
         "metavar": "NAME:MIN",
         "help": "criterion of a confident fix and its threshold: confidence:0.9 (default) or "
         "peak_ratio:1.3",
+    },
+    "--alert-limit-m": {
+        "type": _within(1.0, 100_000.0),
+        "metavar": "M",
+        "help": "largest horizontal error that the mission allows: a fix is confident if its "
+        "protection level is at most that (replaces --accept)",
     },
     "--agl-m": {"type": float, "help": "height above ground"},
     "--allow-holes": {"action": "store_true", "help": "write the file even if imagery is missing"},
@@ -132,6 +152,12 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "metavar": "public.pem",
         "help": "refuse a map that was not signed with this key (see `orthonav sign`)",
     },
+    "--risk": {
+        "type": _within(1e-6, 0.5),
+        "default": 1e-3,
+        "metavar": "P",
+        "help": "probability with which the error exceeds the protection level (default 0.001)",
+    },
     "--route": {
         "type": Path,
         "metavar": "FILE",
@@ -174,6 +200,23 @@ def area_of(options: argparse.Namespace) -> "Area":
         require_one_area(None, options.band_m, options.bounds)
         return Area.from_bounds(options.bounds)
     return Area.from_route(read_route(options.route), options.band_m)
+
+
+def add_acceptance(parser: argparse._ActionsContainer, **accept: Any) -> None:
+    """Add `--accept`, which `accept` changes, `--alert-limit-m` and `--risk`."""
+    one = parser.add_mutually_exclusive_group()
+    add_options(one, "--accept", **accept)
+    add_options(one, "--alert-limit-m")
+    add_options(parser, "--risk")
+
+
+def acceptance(options: argparse.Namespace) -> "Acceptance":
+    """The rule that the options of `add_acceptance` name; raises `VariantError`."""
+    from orthonav.core.localize.confidence import ALERT_LIMIT, Acceptance
+
+    if options.alert_limit_m is not None:
+        return Acceptance(ALERT_LIMIT, options.alert_limit_m, options.risk)
+    return Acceptance.parse(options.accept, options.risk)
 
 
 def search_plan(options: argparse.Namespace) -> "SearchPlan":

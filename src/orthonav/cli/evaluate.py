@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import shlex
 import sys
 from contextlib import suppress
@@ -28,7 +29,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "ground truth: the true positions (default: truth.csv of --flight); one for all files "
     text += "of fixes, or one for each in the same order"
     add("--truth", **each, metavar="truth.csv", help=text)
+    text = "largest horizontal error that the mission allows: availability and false fixes at it"
     add_options(parser, "--radius-m", "--json")
+    add_options(parser, "--alert-limit-m", help=text)
+    add_options(parser, "--risk")
     add("--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file")
     text = "write an HTML report with its figures as SVG and PNG"
     add("--report", type=Path, metavar="REPORT/", help=text)
@@ -121,14 +125,14 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
         results, known = read_results(fixes), read_truth(truth)
-        comparison = compare(known, results, local)
+        comparison = compare(known, results, local, options.risk)
         check_truth(known, results, place, truth)
         warn_of_another_run(fixes, opened, folders[i] if folders else _flight_of(truth))
         flights.append(
             FlightReport(
                 names[i],
                 comparison,
-                measure(comparison, options.radius_m),
+                measure(comparison, options.radius_m, options.alert_limit_m or math.nan),
                 background,
                 measure_track(comparison, results, options.radius_m),
                 measure_gnss(comparison, results),

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from orthonav.cli.common import add_options
+from orthonav.cli.common import add_acceptance, add_options
 
 EXAMPLE = "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550"
 EVERYDAY = (
     *("--camera", "--camera-latency-ms", "--mount", "--autopilot", "--recorded-telemetry"),
-    *("--ros2", "--send", "--nmea", "--jsonl", "--accept", "--dry-run", "--heading", "--start"),
-    *("--state", "--gnss", "--log"),
+    *("--ros2", "--send", "--nmea", "--jsonl", "--accept", "--alert-limit-m", "--dry-run"),
+    *("--heading", "--start", "--state", "--gnss", "--log"),
 )
 SEND = ("global-position", "gps-input", "odometry", "vision", "external-position")
 HEIGHTS = ("distance", "terrain", "amsl", "home", "relative")
@@ -89,9 +89,10 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     add("--jsonl", action="append", default=[], metavar="FILE|-", help=text)
     text = "maximum rate of each message (default: one per view)"
     add("--send-rate-hz", type=float, metavar="HZ", help=text)
-    add_options(group, "--accept")
-    text = "largest standard deviation of a position that is sent (default 50)"
-    add("--max-std-m", type=float, default=50.0, metavar="M", help=text)
+    add_acceptance(group)
+    text = "largest standard deviation of a position that is sent (default 50; with "
+    text += "--alert-limit-m any)"
+    add("--max-std-m", type=float, metavar="M", help=text)
     text = "also send dead-reckoned positions, as GLOBAL_POSITION_SENSOR with the flag UNHEALTHY"
     add("--send-coasting", action="store_true", help=f"{text}, which PX4 ignores")
     text = "lower bound of the standard deviation that messages state (default 0)"

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import checked_signature, search_plan
+from orthonav.cli.common import acceptance, checked_signature, search_plan
 from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
 from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
 from orthonav.core.extras import needed
@@ -64,8 +64,9 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     stack.callback(console.close)
     stack.enter_context(console.in_place_of_stderr())
     opened = _opened(options)
-    accept = Acceptance.parse(options.accept)
+    accept = acceptance(options)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
+    sent_least = 0.0 if options.alert_limit_m else least  # monitors need a confidence all the same
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
     localizer = Localizer(opened, plan=search_plan(options))
@@ -80,10 +81,10 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     if options.ros2:
-        source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, least)
+        source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, sent_least)
     else:
         source, graph = _source(options, clocks, link, camera, stopping), None
-    for line in plan_lines(options, opened, least):
+    for line in plan_lines(options, opened, accept):
         console.say(line)
     camera = camera or source.wait_for_camera()
     console.say(camera_line(options, camera))
@@ -99,7 +100,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         *(console, clocks, newest, wanted, link, options.autopilot),
         sends=not options.dry_run and (link is not None or graph is not None),
     )
-    publisher = _publisher(options, clocks, link, least, graph, narrator, digest)
+    publisher = _publisher(options, clocks, link, sent_least, graph, narrator, digest)
     if link is not None:
         stack.callback(LinkThread(link).stop)
     sink = _sink(options, camera, digest)
@@ -119,6 +120,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
+        risk=accept.risk,
         map_change=opened.change,
         state_path=options.state,
         logged_options=_logged_options(options, mount),
@@ -298,11 +300,16 @@ def _publisher(
     narrator: Narrator,
     digest: str,
 ) -> outputs.Publisher:
+    alert_limit_m = options.alert_limit_m or math.inf
+    max_std_m = options.max_std_m
+    if max_std_m is None:
+        max_std_m = math.inf if options.alert_limit_m else GateRules().max_std_m
     rules = GateRules(
         least,
-        options.max_std_m,
+        max_std_m,
         min_interval_s=_intervals_s(options),
         send_coasting=options.send_coasting,
+        alert_limit_m=alert_limit_m,
     )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
@@ -365,13 +372,15 @@ def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[st
         "prior": "telemetry",
         "registration": "on",
         "accept": None,
+        "alert_limit_m": options.alert_limit_m,
+        "risk": options.risk,
         "track": True,
         "mount": None if mount is None else asdict(mount),
         "fly": line,
     }
 
 
-def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> list[str]:
+def plan_lines(options: argparse.Namespace, opened: MapFile, accept: Acceptance) -> list[str]:
     sheet, area_km2 = opened.manifest.sheets[0], opened.manifest.area_km2
     terrain, ground = sheet.terrain, "level ground"
     if terrain is not None:
@@ -385,7 +394,7 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, least: float) -> li
         sent = ["nothing to the autopilot (--dry-run)"]
     sent += [f"NMEA to {url}" for url in options.nmea]
     sent += [f"JSON lines to {'stdout' if each == '-' else each}" for each in options.jsonl]
-    confident = f"; positions of confidence {least:g} or more"
+    confident = f"; positions of {accept.text()}"
     start = "anywhere on the map"
     if options.start:
         lat_deg, lon_deg, std_m = options.start

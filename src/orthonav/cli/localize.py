@@ -6,12 +6,13 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import (
     Progress,
+    acceptance,
+    add_acceptance,
     add_options,
     beside,
     checked_signature,
@@ -48,8 +49,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = "area.onav flight --out fixes.jsonl"
 EVERYDAY = (
-    *("--heading", "--prior", "--track", "--smooth", "--accept", "--mount", "--atlas"),
-    *("--camera", "--fov-deg", "--agl-m", "--dem", "--json"),
+    *("--heading", "--prior", "--track", "--smooth", "--accept", "--alert-limit-m", "--mount"),
+    *("--atlas", "--camera", "--fov-deg", "--agl-m", "--dem", "--json"),
 )
 BUDGET_S = 15.0
 """After so long no further view is localized: the search for the cause takes at most 20 s."""
@@ -80,7 +81,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "criterion of a confident fix and its threshold: confidence:0.9 (default), "
     text += "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (with --registration off); other fixes "
     text += 'are written too, marked "confident": false'
-    add_options(group, "--accept", help=text)
+    add_acceptance(group, help=text)
     text = "the first argument is an atlas (folder or URL); no prior is used, and a fix needs the "
     add("--atlas", action="store_true", help=f"{text}agreement of several views")
     text = "on: positions within a pixel, where the map has a registration layer (default); off: "
@@ -120,7 +121,6 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.errors import VariantError
     from orthonav.core.flight.fixes import FlightDigest, Identity
     from orthonav.core.flight.mount import MountedFlight
-    from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.track.tracker import Tracker
@@ -138,7 +138,7 @@ def _on_map(options: argparse.Namespace) -> None:
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
     flight = open_source(options.flight, options, over_terrain=over_terrain)
     mount = _take_flown(options, flight)
-    accept = Acceptance.parse(options.accept)
+    accept = acceptance(options)
     localizer = _localizer(options, opened, accept)
     warn_if_far_from_map(flight, localizer)
     how = {
@@ -230,7 +230,6 @@ def _on_atlas(options: argparse.Namespace) -> None:
     require_extras("localize --atlas")
     from orthonav.core.errors import VariantError
     from orthonav.core.flight.fixes import FlightDigest, Identity
-    from orthonav.core.localize.confidence import Acceptance
     from orthonav.ground.atlas.catalog import Atlas
     from orthonav.ground.atlas.locate import AtlasLocator
     from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
@@ -248,7 +247,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     if asked or options.registration == "off":
         named = ", ".join(f"--{name.replace('_', '-')}" for name in asked) or "--registration off"
         raise VariantError(f"{named} needs a map: cut one out of the atlas (orthonav atlas cut)")
-    accept = Acceptance.parse(options.accept)
+    accept = acceptance(options)
     if accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio needs a map and --registration off")
     exports = [export_of(each) for each in options.export]
@@ -300,7 +299,9 @@ def _print_summary(
         "n_low_confidence": counts.low,
         "n_none": counts.none,
         "reasons": dict(counts.reasons),
-        "accept": options.accept,
+        "accept": None if options.alert_limit_m else options.accept,
+        "alert_limit_m": options.alert_limit_m,
+        "risk": options.risk,
         "median_latency_ms": None if median_ms is None else round(median_ms, 3),
         "advice": list(advice),
         "setups": list(tried),
@@ -312,19 +313,19 @@ def _print_summary(
         if options.json:
             print_json(plain)
             return
-        least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
+        others = "above the alert limit" if options.alert_limit_m else "of low confidence"
         named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
         why = f" ({named})" if named else ""
         print(
-            f"{counted(counts.views, 'view')}: {counts.confident} confident ({least}), "
-            f"{counts.low} of low confidence, {counts.none} without a position{why}; "
+            f"{counted(counts.views, 'view')}: {counts.confident} confident ({accept.text()}), "
+            f"{counts.low} {others}, {counts.none} without a position{why}; "
             f"median {median_ms or 0:.1f} ms per view"
         )
         lines = [f"! {line}" for line in advice]
         lines += [f"{counted(counts.confident, 'camera position')}: {path}" for path in exported]
         if out is not None:
             where = "stdout" if is_stdout(out) else out
-            guesses = "; positions of low confidence are best guesses, marked as such"
+            guesses = f"; positions {others} are best guesses, marked as such"
             lines.append(f"written to {where}{guesses * bool(counts.low)}")
         for line in (*lines, *changed[1]):
             print(line)
@@ -364,17 +365,20 @@ class SetupAdvice:
         Both are empty where enough views are confident.
         """
         from orthonav.core.geo.headings import RADIANS, seem_radians
+        from orthonav.core.localize.confidence import Acceptance
+        from orthonav.core.records import CONFIDENT
         from orthonav.ground.recordings.setups import Counts, setup_text
 
+        if math.isfinite(accept.alert_limit_m):  # a high level is no sign of a wrong setup
+            accept = Acceptance("confidence", CONFIDENT)
+            results = [accept.judged(each) for each in results]
         counts, known = Counts.of(results), self._options.heading == "known"
         lines = [RADIANS] if known and seem_radians(self._yaw_deg) else []
         if not counts.few:
             return lines, []
         if self._nearest is not None and self._nearest[0] > FAR_M:
             return [*lines, far_text("the recorded positions are", *self._nearest)], []
-        # Whether the number that the criterion compares is known of any view.
-        any_value = replace(accept, threshold=-math.inf)
-        if counts.low and not any(any_value.accepts(result.outcome) for result in results):
+        if counts.low and not any(accept.knows(result.outcome) for result in results):
             silent = f"no fix states the criterion {accept.criterion}, so none can be confident; "
             silent += "build the map from a larger or more varied area, or give --accept "
             return [*lines, f"{silent}peak_ratio:1.3"], []
@@ -439,9 +443,12 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
         for name in (*LOCALIZE_CHOICES, "track"):
             setattr(options, name, flown.get(name, getattr(options, name)))
         options.accept = flown.get("accept") or options.accept
+        options.alert_limit_m = flown.get("alert_limit_m", options.alert_limit_m)
+        options.risk = flown.get("risk", options.risk)
         options.skip_bad_images = True  # a flight continues after an image that cannot be decoded
         return flown.get("mount", mount)
-    chosen = {name: getattr(options, name) for name in (*LOCALIZE_CHOICES, "accept")}
+    names = (*LOCALIZE_CHOICES, "accept", "alert_limit_m", "risk")
+    chosen = {name: getattr(options, name) for name in names}
     chosen |= {"track": options.track or options.smooth, "mount": mount}
     if flown.get("accept") is None:  # the runner logs every fix, so the default applies
         flown.pop("accept", None)
@@ -478,15 +485,15 @@ def _write_positions(
         write_results(options.out, results, identity)
     elif not options.json:
         for result in results:
-            print(_position_text(result))
+            print(_position_text(result, options.alert_limit_m))
 
 
-def _position_text(result: "ViewResult") -> str:
+def _position_text(result: "ViewResult", alert_limit_m: float | None) -> str:
     from orthonav.core.records import Fix
 
     outcome = result.outcome
     if isinstance(outcome, Fix):
-        lines = _lines(outcome, result.is_confident)
+        lines = _lines(outcome, result, alert_limit_m)
     else:
         hints = {
             "yaw_deg": "give --heading unknown",
@@ -498,15 +505,21 @@ def _position_text(result: "ViewResult") -> str:
     return "\n".join([result.frame, *(f"  {name:<11}{text}" for name, text in lines.items())])
 
 
-def _lines(fix: "Fix", confident: bool) -> dict[str, str]:
+def _lines(fix: "Fix", result: "ViewResult", alert_limit_m: float | None) -> dict[str, str]:
     east_m, north_m = (math.sqrt(float(fix.cov_en_m2[i, i])) for i in (0, 1))
-    judged = "confident" if confident else "low confidence: this is a best guess"
+    level_m = fix.protection_level_m(result.risk)
+    level = f"{level_m:.0f} m" if math.isfinite(level_m) else "infinite"
+    low = "low confidence"
+    if alert_limit_m is not None:
+        low = f"protection level {level}, at most {alert_limit_m:g} m is allowed"
+    judged = "confident" if result.is_confident else f"{low}: this is a best guess"
     if math.isfinite(fix.confidence):
         judged = f"{fix.confidence:.2f} that the error is below {fix.radius_m:.0f} m ({judged})"
     return {
         "position": f"{fix.lat_deg:.7f}, {fix.lon_deg:.7f} (latitude, longitude, WGS 84)",
         "deviation": f"{east_m:.1f} m east, {north_m:.1f} m north (1 sigma)",
         "confidence": judged,
+        "protection": f"{level}, which the error exceeds with a probability of {result.risk:g}",
         "heading": f"{fix.heading_deg:.1f} deg from true north, of the top of the image",
         "height": f"{fix.agl_m:.1f} m above ground",
     }

@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 
 def probability_beyond(cov_en_m2: Array, limit_m: float) -> float:
     """That the error of a right place exceeds a limit; NaN for an unknown covariance."""
-    scales = _scales_m2(cov_en_m2)
-    return float(_beyond(scales, limit_m))
+    if not np.isfinite(cov_en_m2).all():
+        return math.nan
+    return float(_beyond(_scales_m2(np.asarray(cov_en_m2)[None]), np.array([limit_m]))[0])
 
 
 def protection_level_m(place_probability: float, cov_en_m2: Array, risk: float) -> float:
@@ -30,28 +31,34 @@ def protection_level_m(place_probability: float, cov_en_m2: Array, risk: float) 
 
     `place_probability`: that the place is right. Infinite where a wrong place alone is likelier
     than that, and for an unknown covariance."""
-    scales = _scales_m2(cov_en_m2)
-    if not (place_probability > 0 and np.isfinite(scales).all()):
-        return math.inf
-    allowed = (risk - (1 - place_probability)) / place_probability
-    if not allowed > 0:
-        return math.inf
-    deviations = math.sqrt(DEGREES * (allowed ** (-2 / DEGREES) - 1)) if allowed < 1 else 0.0
-    low, high = (math.sqrt(float(each)) * deviations for each in (scales.min(), scales.max()))
+    place, covs = np.array([place_probability]), np.asarray(cov_en_m2)[None]
+    return float(protection_levels_m(place, covs, risk)[0])
+
+
+def protection_levels_m(place_probability: Array, covs_en_m2: Array, risk: float) -> Array:
+    """The same (N,) of many: probabilities (N,) and covariances (N, 2, 2)."""
+    levels = np.full(len(place_probability), math.inf)
+    finite = np.isfinite(covs_en_m2).all(axis=(1, 2)) & (risk - (1 - place_probability) > 0)
+    place, scales = place_probability[finite], _scales_m2(covs_en_m2[finite])
+    allowed = np.minimum((risk - (1 - place)) / place, 1.0)
+    deviations = np.sqrt(DEGREES * (allowed ** (-2 / DEGREES) - 1))
+    low, high = (np.sqrt(each(axis=1)) * deviations for each in (scales.min, scales.max))
     for _ in range(STEPS):
         middle = (low + high) / 2
-        low, high = (low, middle) if _beyond(scales, middle) <= allowed else (middle, high)
-    return high
+        met = _beyond(scales, middle) <= allowed
+        low, high = np.where(met, low, middle), np.where(met, middle, high)
+    levels[finite] = high
+    return levels
 
 
-def _scales_m2(cov_en_m2: Array) -> Array:
-    """Squared scale (16,) of the error along directions that are equally likely."""
-    if not np.isfinite(cov_en_m2).all():
-        return np.full(1, math.nan)
-    minor, major = np.maximum(np.linalg.eigvalsh(cov_en_m2), 0.0)
+def _scales_m2(covs_en_m2: Array) -> Array:
+    """Squared scales (N, 16) of errors along directions that are equally likely."""
+    values = np.maximum(np.linalg.eigvalsh(covs_en_m2), 0.0)[:, :, None]
+    minor, major = values[:, 0], values[:, 1]
     return np.asarray((minor + (major - minor) * _QUADRANT) * (DEGREES - 2) / DEGREES)
 
 
-def _beyond(scales_m2: Array, limit_m: float) -> float:
-    squares = limit_m**2 / (DEGREES * np.maximum(scales_m2, 1e-12))
-    return float(((1 + squares) ** (-DEGREES / 2)).mean())
+def _beyond(scales_m2: Array, limits_m: Array) -> Array:
+    """Probability (N,) that errors of these scales (N, 16) exceed their limits (N,)."""
+    squares = limits_m[:, None] ** 2 / (DEGREES * np.maximum(scales_m2, 1e-12))
+    return np.asarray(((1 + squares) ** (-DEGREES / 2)).mean(axis=1))

@@ -195,16 +195,17 @@ class Fix:
 
     def probability_within(self, limit_m: float) -> float:
         """Probability that the error is at most `limit_m`; NaN where the confidence is unknown."""
-        return self._right * (1 - probability_beyond(self.cov_en_m2, limit_m))
+        return self.right_probability * (1 - probability_beyond(self.cov_en_m2, limit_m))
 
     def protection_level_m(self, risk: float = DEFAULT_RISK) -> float:
         """The smallest limit that the error exceeds with a probability of at most `risk`, m.
 
         Infinite where the place alone is wrong with a higher one, or nothing is known of it."""
-        return protection_level_m(self._right, self.cov_en_m2, risk)
+        return protection_level_m(self.right_probability, self.cov_en_m2, risk)
 
     @property
-    def _right(self) -> float:
+    def right_probability(self) -> float:
+        """`place_probability`, or the confidence where it is unknown."""
         known = math.isfinite(self.place_probability)
         return self.place_probability if known else self.confidence
 
@@ -255,7 +256,8 @@ class ViewResult:
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
     `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
     track (`searching`, `tracking`, `coasting`, `lost`), None where views are localized one by one.
-    `accepted`: whether a fix met the criterion of `--accept`, None where none was given."""
+    `accepted`: whether a fix met the criterion of `--accept` or `--alert-limit-m`, None where none
+    was given. `risk`: of the protection level that the line states."""
 
     frame: str
     time_ns: int
@@ -263,6 +265,7 @@ class ViewResult:
     latency_ms: float
     state: str | None = None
     accepted: bool | None = None
+    risk: float = DEFAULT_RISK
 
     @property
     def is_confident(self) -> bool:

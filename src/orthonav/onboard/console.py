@@ -19,6 +19,7 @@ from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.onboard.cameras import NewestImage
 from orthonav.onboard.health import STATUSTEXT_INTERVAL_NS, Level
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.gate import unavailable_text
 from orthonav.onboard.messages.mavlink import Autopilot
 from orthonav.onboard.telemetry import Clocks
 
@@ -247,7 +248,8 @@ class Narrator:
 
     def _fault(self, plain: Mapping[str, Any], shown: Sequence[str]) -> Iterator[str]:
         for reason in shown:
-            meaning = "" if reason in self._meant else _meaning(reason, plain)
+            is_told = reason in self._meant and reason != "unavailable"  # its figures change
+            meaning = "" if is_told else _meaning(reason, plain)
             self._meant.add(reason)
             yield f"{reason} ({meaning})" if meaning else reason
 
@@ -261,6 +263,8 @@ class Narrator:
         parts = [f"{plain['state']}{place}", _counted(since, self._sends)]
         if plain["age_p50_ms"]:
             parts.append(f"latency {plain['age_p50_ms']:.0f} ms, p95 {plain['age_p95_ms']:.0f} ms")
+        unavailable = unavailable_text(plain)
+        parts += [f"unavailable: {unavailable}"] if unavailable else []
         return "; ".join([*parts, f"health {plain['health']}"])
 
     def _summary(self) -> str:
@@ -280,6 +284,8 @@ class Narrator:
 def _meaning(reason: str, plain: Mapping[str, Any]) -> str:
     if reason == "start_mismatch":
         return f"{_FAULTS[reason]}, {plain['start_off_m']:,.0f} m from the place found"
+    if reason == "unavailable":
+        return unavailable_text(plain)
     of_camera = str(plain.get("latency"))
     if of_camera.startswith(f"{reason}: "):
         return of_camera.removeprefix(f"{reason}: ")

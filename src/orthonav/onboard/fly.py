@@ -21,6 +21,7 @@ from orthonav.core.flight.mount import Mount
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles
 from orthonav.core.geo.camera import Camera
+from orthonav.core.integrity import DEFAULT_RISK
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.localize.view import check_picture
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
@@ -38,6 +39,7 @@ from orthonav.onboard.health import (
 )
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.messages.gate import unavailable_text
 from orthonav.onboard.messages.mavlink import dialect, status_texts
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
@@ -71,8 +73,9 @@ class FlyOptions:
     `mount_deg`: yaw, pitch, roll of the camera in the body. `mount`: calibrated one, for the health
     only: the locator applies it. `heights`: None where the map has no terrain. `deadline_s`: older
     images are dropped. `min_agl_m`: lower views are not located. `recorded`: telemetry comes with
-    the image, from a recording or ROS. `accept`: in addition to the gate. `map_change`: how the
-    open map file was changed in place. `logged_options`: for a replay of the log.
+    the image, from a recording or ROS. `min_confidence`: of fixes that monitors use and that are
+    accepted. `accept`: in addition; an alert limit replaces it for acceptance. `map_change`: how
+    the open map file was changed in place. `logged_options`: for a replay of the log.
     """
 
     mount_deg: Angles = LOOKS_DOWN
@@ -84,6 +87,7 @@ class FlyOptions:
     recorded: bool = False
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
+    risk: float = DEFAULT_RISK
     map_change: Callable[[], str | None] = lambda: None
     state_path: Path | None = None
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
@@ -281,10 +285,7 @@ class Runner:
             return result
         if self.options.heights is not None:
             self.options.heights.observe(telemetry.time_ns, outcome, result.state)
-        accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
-        self._publisher.publish(
-            replace(result, outcome=accepted), image.exposed_ns, vehicle, judged=True
-        )
+        self._publisher.publish(result, image.exposed_ns, vehicle, judged=True)
         now_ns = self._clocks.mono_ns()
         self.counter.add_latency(now_ns, (now_ns - image.exposed_ns) / 1e9)
         self._log(lambda sink: sink.result(result))
@@ -344,13 +345,15 @@ class Runner:
         return fix if result.state in (None, "tracking") else None
 
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
+        now_ns = self._clocks.mono_ns()
+        if result.is_confident and result.state in (None, "tracking"):
+            self._confident_ns = now_ns
+            self._count("confident")
         fix = self._confident_fix(result)
         if fix is None:
             return
-        self._confident_ns = self._clocks.mono_ns()
-        self._count("confident")
         if self._start_check is not None:
-            self._start_check.found(fix, self._confident_ns)
+            self._start_check.found(fix, now_ns)
         mount = self.options.mount
         self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
         if not self.options.heading_known:
@@ -361,13 +364,17 @@ class Runner:
         )
 
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
-        accept, accepted = self.options.accept, None
-        if isinstance(outcome, Fix):
-            accepted = outcome.confidence >= self.options.min_confidence
-            accepted = accepted and (accept is None or accept.accepts(outcome))
-        state = self._locator.state_name
-        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, accepted)
+        state, risk = self._locator.state_name, self.options.risk
+        accepted = self._accepts(outcome) if isinstance(outcome, Fix) else None
+        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, accepted, risk)
         return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
+
+    def _accepts(self, fix: Fix) -> bool:
+        accept = self.options.accept
+        if accept is not None and math.isfinite(accept.alert_limit_m):
+            return accept.accepts(fix)
+        confident = fix.confidence >= self.options.min_confidence
+        return confident and (accept is None or accept.accepts(fix))
 
     def _map_changed(self) -> NoFix | None:
         # Parts in memory would still give positions; stopping shows the fault at once.
@@ -522,6 +529,7 @@ class Runner:
             gnss=() if self._gnss is None else self._gnss.reasons,
             has_origin=not needs_origin or (link is not None and link.origin is not None),
             latency=None if self._latency is None or taken_ns is None else self._latency.reason,
+            unavailable=unavailable_text(self._publisher.gate.availability(now_ns)),
         )
 
     def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:
@@ -537,6 +545,7 @@ class Runner:
             "age_p50_ms": round(self.counter.latency_s(0.5) * 1e3, 1),
             "age_p95_ms": round(self.counter.latency_s(0.95) * 1e3, 1),
             **({"start_off_m": round(start_off_m, 1)} if start_off_m else {}),
+            **self._publisher.gate.availability(self._clocks.mono_ns()),
             **({} if self._gnss is None else {"gnss": self._gnss.plain()}),
             **({} if self._latency is None else self._latency.plain()),
         }

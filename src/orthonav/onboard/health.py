@@ -5,7 +5,7 @@ import os
 import socket
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -50,10 +50,12 @@ class Level(Enum):
 class Health:
     level: Level
     reasons: tuple[str, ...] = ()
+    detail: str = field(default="", compare=False)  # of the last reason
 
     def text(self) -> str:
         text = f"orthonav {self.level.name}"
-        return f"{text}: {', '.join(self.reasons)}" if self.reasons else text
+        text = f"{text}: {', '.join(self.reasons)}" if self.reasons else text
+        return f"{text}: {self.detail}" if self.detail else text
 
 
 def judge(
@@ -73,6 +75,7 @@ def judge(
     gnss: Sequence[str] = (),
     has_origin: bool = True,
     latency: str | None = None,
+    unavailable: str = "",
 ) -> Health:
     """Ages are in seconds, infinite for "never".
 
@@ -81,7 +84,8 @@ def judge(
     percentile from exposure to message. `map_intact`: the open file was not
     changed. `mismatch`: see there. `start_off_m`:
     distance by which the ground contradicts the start. `gnss`, `latency`: reasons of the monitors.
-    `has_origin`: of the local frame, where messages need it.
+    `has_origin`: of the local frame, where messages need it. `unavailable`: how the alert limit is
+    exceeded, "" where it is not.
     """
     count = Counter(counts)
     many = SHARE * max(count["taken"], 1)
@@ -102,7 +106,8 @@ def judge(
         "searching": state == "searching",
         "coasting": state == "coasting" and low_confidence_s > COASTING_S,
         "low_confidence": state not in ("lost", "searching", "coasting")
-        and low_confidence_s > LOW_CONFIDENCE_S,
+        and low_confidence_s > LOW_CONFIDENCE_S
+        and not unavailable,
         "frozen_image": count["frozen"] > many,
         "bad_images": count["bad_image"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
@@ -118,13 +123,14 @@ def judge(
         "state_not_saved": count["state_failed"] > 0,
         "internal_error": count["internal_error"] > 0 and not failed["internal_errors"],
         **dict.fromkeys(gnss, True),
+        "unavailable": bool(unavailable),
     }
     if latency is not None:
         degraded = {latency: True, **degraded}  # the cause of others, so it comes first
     worst = tuple(name for name, applies in failed.items() if applies)
     others = tuple(name for name, applies in degraded.items() if applies)
     level = Level.FAILED if worst else Level.DEGRADED if others else Level.OK
-    return Health(level, worst + others)
+    return Health(level, worst + others, unavailable)
 
 
 class EventCounter:

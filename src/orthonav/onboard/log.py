@@ -60,7 +60,7 @@ from orthonav.core.flight.logged import (
 )
 from orthonav.core.flight.recording import fitted
 from orthonav.core.geo.camera import Camera
-from orthonav.core.records import CONFIDENT, Fix, Telemetry, ViewResult
+from orthonav.core.records import Fix, Telemetry, ViewResult
 
 log = logging.getLogger(__name__)
 
@@ -375,8 +375,7 @@ def _result(result: ViewResult, index: int) -> list[Message]:
         with contextlib.suppress(ValueError):  # a value that is not finite
             data = position_message(result.outcome, result.time_ns)
             messages.append(_message(POSITION, result.time_ns, data, index))
-            confident = result.outcome.confidence >= CONFIDENT
-            confident = confident and result.state in (None, "tracking")
+            confident = result.is_confident and result.state in (None, "tracking")
             data = navsat_message(result.outcome, result.time_ns, confident=confident)
             messages.append(_message(NAVSAT, result.time_ns, data, index))
     return messages

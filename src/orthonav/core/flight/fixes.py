@@ -1,7 +1,8 @@
 """`fixes.jsonl`, written and read: one JSON object per view, in order of the flight.
 
-The keys of a line and their order are those of `KEYS`, then `GROUND_KEYS` where the ground seen is
-known, `POSE_KEYS` where the attitude is, and `TRACK_KEYS` in a track.
+The keys of a line and their order are those of `KEYS`, then of a fix `INTEGRITY_KEYS`,
+`GROUND_KEYS` where the ground seen is known, `POSE_KEYS` where the attitude is, and `TRACK_KEYS` in
+a track.
 Unknown numbers (NaN, infinite) are written as null and read as NaN. `time_s` is written with up to
 nine decimals, so that nanoseconds since 1970 are exact, which a float64 of seconds cannot hold.
 """
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
+from orthonav.core.integrity import DEFAULT_RISK
 from orthonav.core.records import Fix, NoFix, ViewResult
 
 KEYS = (
@@ -41,6 +43,11 @@ KEYS = (
     "detail",  # one sentence for people; null for a fix
     "evidence",  # names and numbers
     "latency_ms",
+)
+INTEGRITY_KEYS = (  # absent in earlier files
+    "place_probability",  # that the place is right, 0 to 1; null: unknown
+    "protection_level_m",  # the error exceeds it with a probability of risk; null: infinite
+    "risk",
 )
 GROUND_KEYS = (
     "ground_lat_deg",  # what the middle of the picture shows
@@ -149,11 +156,14 @@ def result_to_json(result: ViewResult) -> str:
         "latency_ms": _or_none(result.latency_ms),
     }
     if isinstance(result.outcome, Fix):
+        fix, risk = result.outcome, result.risk
         values["confident"] = result.is_confident
+        stated = fix.place_probability, fix.protection_level_m(risk), risk
+        values |= zip(INTEGRITY_KEYS, map(_or_none, stated), strict=True)
     texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
     texts["time_s"] = _seconds(result.time_ns)
     keys: tuple[str, ...] = KEYS
-    for more in (GROUND_KEYS, POSE_KEYS):
+    for more in (INTEGRITY_KEYS, GROUND_KEYS, POSE_KEYS):
         if more[0] in values:
             keys += more
     if result.state is not None:
@@ -186,6 +196,7 @@ def result_from_json(line: str) -> ViewResult:
             latency_ms=_number(values, "latency_ms"),
             state=state,
             accepted=confident,
+            risk=_share(values, "risk") if values.get("risk") is not None else DEFAULT_RISK,
         )
     except KeyError as error:
         raise FlightError(f"key {error.args[0]} is missing") from error
@@ -284,8 +295,6 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
         reason = _checked(values, "reason", "text", isinstance(values["reason"], str))
         return NoFix(reason=reason, detail=str(values.get("detail") or ""), evidence=evidence)
     _checked(values, "status", "'fix' or 'no_fix'", status == "fix")
-    confidence = _number(values, "confidence")
-    _checked(values, "confidence", "0 to 1", math.isnan(confidence) or 0.0 <= confidence <= 1.0)
     ground = None
     if GROUND_KEYS[0] in values:
         ground = _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
@@ -293,7 +302,7 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
         lat_deg=_angle(values, "lat_deg", 90.0),
         lon_deg=_angle(values, "lon_deg", 180.0),
         cov_en_m2=_numbers(values, "cov_en_m2", (2, 2), [[None] * 2] * 2),
-        confidence=confidence,
+        confidence=_share(values, "confidence"),
         radius_m=_number(values, "radius_m"),
         heading_deg=_number(values, "heading_deg"),
         agl_m=_number(values, "agl_m"),
@@ -305,6 +314,9 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
         pitch_deg=_number(values, "pitch_deg") if "pitch_deg" in values else math.nan,
         roll_deg=_number(values, "roll_deg") if "roll_deg" in values else math.nan,
         pose_cov=_pose_covariance(values) if values.get(POSE_KEYS[2]) is not None else None,
+        place_probability=_share(values, INTEGRITY_KEYS[0])
+        if INTEGRITY_KEYS[0] in values
+        else math.nan,
     )
 
 
@@ -333,6 +345,12 @@ def _checked(values: Mapping[str, Any], key: str, expected: str, sound: bool) ->
 
 def _number(values: Mapping[str, Any], key: str) -> float:
     return _as_float(values[key], key)
+
+
+def _share(values: Mapping[str, Any], key: str) -> float:
+    share = _number(values, key)
+    _checked(values, key, "0 to 1", math.isnan(share) or 0.0 <= share <= 1.0)
+    return share
 
 
 def _as_float(value: Any, name: str) -> float:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError, described
+from orthonav.core.flight.fixes import INTEGRITY_KEYS
 from orthonav.core.flight.folder import BROKEN, camera_from_plain
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.camera import Camera
@@ -144,6 +145,7 @@ RESULT = Topic(
         {
             **dict.fromkeys(("lat_deg", "lon_deg", "confidence", "radius_m"), _NUMBER),
             **dict.fromkeys(("heading_deg", "agl_m", "latency_ms"), _NUMBER),
+            **dict.fromkeys(INTEGRITY_KEYS, _NUMBER),
             **dict.fromkeys(("reason", "detail", "state"), _TEXT),
         },
     ),

@@ -1,18 +1,19 @@
 """How likely a fix is right: a probability from scores, and acceptance by a threshold.
 
-Weights of registration are from real imagery of two dates (`python -m benchmarks.integrity`), chance
+Weights of registration are from real imagery of two dates (`benchmarks.integrity`), chance
 scores from the map; weights of tiles are learnt when the map is built."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
-from orthonav.core.records import Fix, NoFix
+from orthonav.core.integrity import DEFAULT_RISK
+from orthonav.core.records import Fix, NoFix, ViewResult
 
 FEATURES = (
     "log_strength",
@@ -193,19 +194,23 @@ def logit(likely: float, least: float) -> float:
 
 CRITERIA = {"confidence": (0.01, 1.0), "peak_ratio": (1.0, 1000.0), "lowe_ratio": (1.0, 1000.0)}
 """Sensible thresholds: best over second best is at least 1."""
+ALERT_LIMIT = "alert_limit"
 
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Withholds fixes whose `criterion` is below `threshold`.
+    """Accepts fixes whose `criterion` is at least `threshold`, or, for `ALERT_LIMIT`, those whose
+    protection level at `risk` is at most that many metres.
 
-    `lowe_ratio`: best over second best tile (Di Piazza et al. 2024: 1.13), of tile search only."""
+    `lowe_ratio`: best over second best tile (Di Piazza et al. 2024: 1.13), of tile search only.
+    `risk`: also of the protection levels that results state, whatever the criterion."""
 
     criterion: str
     threshold: float
+    risk: float = DEFAULT_RISK
 
     @classmethod
-    def parse(cls, text: str) -> "Acceptance":
+    def parse(cls, text: str, risk: float = DEFAULT_RISK) -> "Acceptance":
         """From `name:threshold`, the value of `--accept`; raises `VariantError`."""
         name, _, value = text.partition(":")
         try:
@@ -222,20 +227,35 @@ class Acceptance:
             raise VariantError(
                 f"--accept {name}: the threshold must be {least:g} to {most:g}, got {value}"
             )
-        return cls(name, threshold)
+        return cls(name, threshold, risk)
 
-    def __call__(self, outcome: Fix | NoFix) -> Fix | NoFix:
-        if isinstance(outcome, NoFix) or self.accepts(outcome):
-            return outcome
-        value = self._value(outcome)
-        value_text = "unknown" if math.isnan(value) else f"{value:.3g}"
-        detail = f"{self.criterion} is {value_text}, at least {self.threshold:g} is required"
-        return NoFix("low_confidence", detail, outcome.evidence)
+    @property
+    def alert_limit_m(self) -> float:
+        """Infinite where another criterion decides."""
+        return self.threshold if self.criterion == ALERT_LIMIT else math.inf
+
+    def text(self) -> str:
+        if self.criterion == ALERT_LIMIT:
+            return f"a protection level of at most {self.threshold:g} m at a risk of {self.risk:g}"
+        return f"{self.criterion.replace('_', ' ')} {self.threshold:g} or more"
 
     def accepts(self, outcome: Fix | NoFix) -> bool:
-        return isinstance(outcome, Fix) and self._value(outcome) >= self.threshold
+        if not isinstance(outcome, Fix):
+            return False
+        if self.criterion == ALERT_LIMIT:
+            return self._value(outcome) <= self.threshold
+        return self._value(outcome) >= self.threshold
+
+    def judged(self, result: ViewResult) -> ViewResult:
+        return replace(result, accepted=self.accepts(result.outcome), risk=self.risk)
+
+    def knows(self, outcome: Fix | NoFix) -> bool:
+        """Whether a fix states the number that is compared."""
+        return isinstance(outcome, Fix) and not math.isnan(self._value(outcome))
 
     def _value(self, fix: Fix) -> float:
+        if self.criterion == ALERT_LIMIT:
+            return fix.protection_level_m(self.risk)
         if self.criterion == "confidence":
             return fix.confidence
         return fix.evidence.get(self.criterion, math.nan)

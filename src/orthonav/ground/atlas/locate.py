@@ -427,8 +427,10 @@ class LocalTrack:
     def _take(self, seen: Fix | NoFix, telemetry: Telemetry, most: float = 1.0) -> None:
         assert isinstance(seen, Fix)  # a track with a start always has an estimate
         self._time_ns, self._last = telemetry.time_ns, seen
-        confidence = min(seen.confidence, seen.evidence["recognized"], most)
-        self.fix = replace(seen, confidence=confidence) if confidence >= LIKELY else None
+        most = min(seen.evidence["recognized"], most)
+        confidence, place = min(seen.confidence, most), min(seen.place_probability, most)
+        limited = replace(seen, confidence=confidence, place_probability=place)
+        self.fix = limited if confidence >= LIKELY else None
 
     def _can_follow(self, telemetry: Telemetry, half_view_m: float) -> bool:
         """Whether the aircraft is near enough to the expected place to be sought there. A view that

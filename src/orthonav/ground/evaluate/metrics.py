@@ -12,15 +12,17 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
+from orthonav.core import integrity
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import FlightFolder, read_truth
 from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import HINT
+from orthonav.core.integrity import DEFAULT_RISK
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.statistics import (
@@ -74,6 +76,8 @@ class Comparison:
     `cov_en_m2` (N, 2, 2), `own_radius_m` (N,): as each fix states, NaN where unknown.
     `criteria`: for each name of `CRITERIA` values (N,), NaN where unknown or without a fix.
     `reasons`: code of each view without a fix, "" for a fix.
+    `place_probability`, `protection_levels_m` (N,): NaN where unknown or without a fix; the level,
+    at `risk`, is infinite where the place is too uncertain.
     `n_without_truth`, `n_without_result`: results without truth, and the reverse.
     `starts`: index at which each pooled flight begins.
     """
@@ -91,6 +95,9 @@ class Comparison:
     criteria: Mapping[str, FloatArray]
     reasons: tuple[str, ...]
     latency_ms: FloatArray
+    place_probability: FloatArray
+    protection_levels_m: FloatArray
+    risk: float
     n_without_truth: int
     n_without_result: int
     starts: tuple[int, ...] = (0,)
@@ -99,6 +106,11 @@ class Comparison:
     def n_views(self) -> int:
         """Number of true positions: views without a result have no fix either."""
         return self.errors_m.size + self.n_without_result
+
+    @property
+    def flights(self) -> list[slice]:
+        """The views of each flight."""
+        return [slice(*ends) for ends in pairwise((*self.starts, len(self.frames)))]
 
     def confident_wrong(self, least_m: float) -> BoolArray:
         """(N,): confident fixes with an error above `least_m` and above the stated radius."""
@@ -126,6 +138,34 @@ class CriterionRow:
     wrong_by_35m: float
 
 
+@dataclass(frozen=True)
+class Integrity:
+    """Protection levels of one flight, or of several pooled; NaN where undefined.
+
+    `risk`: of the levels. `n_levels`: fixes with a finite one; `n_beyond`, `beyond`,
+    `beyond_upper_95`: errors larger than their own level, their fraction of these fixes, and its
+    one-sided 95 % bound for independent views.
+    `alert_limit_m`: NaN where none was given, and then all that follows. `n_available`,
+    `availability`, `availability_of_time`: fixes whose level is at most the limit, their fraction
+    of the true positions, and that of the time. `outage`: longest without one, time and path each
+    by itself. `n_false`, `false_upper_95`: available fixes with an error beyond the limit, and the
+    bound of their fraction.
+    """
+
+    risk: float
+    n_levels: int
+    n_beyond: int
+    beyond: float
+    beyond_upper_95: float
+    alert_limit_m: float
+    n_available: int
+    availability: float
+    availability_of_time: float
+    outage: Longest
+    n_false: int
+    false_upper_95: float
+
+
 @dataclass(frozen=True, eq=False)
 class Metrics:
     """Metrics of one flight, or of several pooled; undefined ones are NaN.
@@ -140,6 +180,7 @@ class Metrics:
     `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
     `reasons`: number of views without a fix by reason.
     `standard`, `of_confident`: errors of all and of confident fixes.
+    `integrity`: None where no fix states a place probability and no alert limit was given.
     """
 
     radius_m: float
@@ -165,6 +206,7 @@ class Metrics:
     consistency: CovarianceConsistency
     standard: StandardFigures
     of_confident: StandardFigures
+    integrity: Integrity | None = None
 
     @property
     def accuracy(self) -> float:
@@ -181,15 +223,22 @@ def radius_key(radius_m: float) -> str:
     return f"acc_at_{radius_m:g}m"
 
 
-def evaluate(fixes: Path | str, truth: Path | str, radius_m: float = 15.0) -> Metrics:
+def evaluate(
+    fixes: Path | str,
+    truth: Path | str,
+    radius_m: float = 15.0,
+    alert_limit_m: float = math.nan,
+    risk: float = DEFAULT_RISK,
+) -> Metrics:
     """Metrics of a file of fixes (`fixes.jsonl`) against the true positions of a `truth.csv`.
 
+    `alert_limit_m`: largest error that the mission allows, NaN: none; `risk`: of protection levels.
     Raises `MissingFileError`, `FlightError`, also where latitudes and longitudes of the file seem
     to be swapped, or `ValueError` for a radius that is not positive.
     """
     known, results = read_truth(Path(truth)), read_results(Path(fixes))
     check_truth(known, results, None, Path(truth))
-    return measure(compare(known, results), radius_m)
+    return measure(compare(known, results, risk=risk), radius_m, alert_limit_m)
 
 
 def check_truth(
@@ -237,13 +286,16 @@ def warn_of_another_run(fixes: Path, opened: MapFile | None, flight: FlightFolde
 
 
 def compare(
-    truth: Positions, results: Sequence[ViewResult], local: LocalFrame | None = None
+    truth: Positions,
+    results: Sequence[ViewResult],
+    local: LocalFrame | None = None,
+    risk: float = DEFAULT_RISK,
 ) -> Comparison:
     """Results matched with ground truth by frame name.
 
-    `local` is the plane of the positions, by default centred on the first true position. A true
-    position that is not finite counts as missing. Raises `FlightError` where no result has a
-    truth or a frame has two results.
+    `local` is the plane of the positions, by default centred on the first true position; `risk` is
+    that of the protection levels. A true position that is not finite counts as missing. Raises
+    `FlightError` where no result has a truth or a frame has two results.
     """
     known = {name: at for name, at in truth.items() if all(map(math.isfinite, at))}
     twice = [name for name, n in Counter(result.frame for result in results).items() if n > 1]
@@ -277,9 +329,29 @@ def compare(
         criteria={n: frozen([_criterion(each, n) for each in outcomes]) for n in CRITERIA},
         reasons=tuple(_reason(outcome) for outcome in outcomes),
         latency_ms=frozen([result.latency_ms for result in matched]),
+        place_probability=frozen(
+            [each.place_probability if isinstance(each, Fix) else math.nan for each in outcomes]
+        ),
+        protection_levels_m=protection_levels_m(matched, risk),
+        risk=risk,
         n_without_truth=len(results) - len(matched),
         n_without_result=len(known) - len(matched),
     )
+
+
+def protection_levels_m(results: Sequence[ViewResult], risk: float | None = None) -> FloatArray:
+    """(N,) m, infinite where the place is too uncertain, NaN without a fix; `risk`: None: that of
+    each result."""
+    levels_m = np.full(len(results), math.nan)
+    risks = np.array([each.risk if risk is None else risk for each in results])
+    outcomes = [each.outcome for each in results]
+    is_fix = np.array([_is_fix(each) for each in outcomes], np.bool_)
+    place = np.array([each.right_probability if _is_fix(each) else 0.0 for each in outcomes])
+    covs = np.array([_covariance(each) for each in outcomes]).reshape(-1, 2, 2)
+    for each in np.unique(risks):
+        chosen = is_fix & (risks == each)
+        levels_m[chosen] = integrity.protection_levels_m(place[chosen], covs[chosen], float(each))
+    return frozen(levels_m)
 
 
 def pool(comparisons: Sequence[Comparison]) -> Comparison:
@@ -292,7 +364,7 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
         field.name: _joined([getattr(part, field.name) for part in comparisons])
         for field in fields(Comparison)
     }
-    joined |= {"lat_deg": comparisons[0].lat_deg, "lon_deg": comparisons[0].lon_deg}
+    joined |= {name: getattr(comparisons[0], name) for name in ("lat_deg", "lon_deg", "risk")}
     joined["starts"] = tuple(
         first + start
         for first, part in zip(firsts, comparisons, strict=True)
@@ -309,8 +381,11 @@ def _joined(values: list[Any]) -> Any:
     return sum(values, start=type(values[0])())
 
 
-def measure(comparison: Comparison, radius_m: float = 15.0) -> Metrics:
-    """All metrics of `comparison`; `radius_m` defines right fixes and joins `RADII_M`.
+def measure(
+    comparison: Comparison, radius_m: float = 15.0, alert_limit_m: float = math.nan
+) -> Metrics:
+    """All metrics of `comparison`; `radius_m` defines right fixes and joins `RADII_M`;
+    `alert_limit_m`: largest error that the mission allows, NaN: none.
 
     Raises `ValueError` for a radius that is not a positive finite number, and for a confidence that
     is not 0 to 1.
@@ -348,7 +423,7 @@ def measure(comparison: Comparison, radius_m: float = 15.0) -> Metrics:
         availability=share(n_confident, n_views),
         availability_95=wilson(n_confident, n_views),
         coverage=share(of_fixes_m.size, n_views),
-        gap=_longest_gap(comparison),
+        gap=_longest_without(comparison, comparison.confident),
         acc_at_m={r: share_of(of_fixes_m <= r, n_views) for r in radii},
         acc_fixes_at_m={r: share_of(of_fixes_m <= r) for r in radii},
         latency_median_ms=percentile(comparison.latency_ms, 50.0),
@@ -367,6 +442,37 @@ def measure(comparison: Comparison, radius_m: float = 15.0) -> Metrics:
         ),
         standard=standard,
         of_confident=of_confident,
+        integrity=measure_integrity(comparison, alert_limit_m),
+    )
+
+
+def measure_integrity(comparison: Comparison, alert_limit_m: float) -> Integrity | None:
+    limited = math.isfinite(alert_limit_m)
+    if not (limited or np.isfinite(comparison.place_probability).any()):
+        return None
+    levels_m, errors_m = comparison.protection_levels_m, comparison.errors_m
+    finite = np.isfinite(levels_m) & np.isfinite(errors_m)
+    available = finite & (levels_m <= alert_limit_m)
+    n_levels, n_beyond, n_available, n_false = (
+        int(np.count_nonzero(each))
+        for each in (
+            *(finite, finite & (errors_m > levels_m)),
+            *(available, available & (errors_m > alert_limit_m)),
+        )
+    )
+    return Integrity(
+        risk=comparison.risk,
+        n_levels=n_levels,
+        n_beyond=n_beyond,
+        beyond=share(n_beyond, n_levels),
+        beyond_upper_95=upper_bound(n_beyond, n_levels),
+        alert_limit_m=alert_limit_m,
+        n_available=n_available,
+        availability=share(n_available, comparison.n_views) if limited else math.nan,
+        availability_of_time=_share_of_time(comparison, available) if limited else math.nan,
+        outage=_longest_without(comparison, available) if limited else Longest(math.nan, math.nan),
+        n_false=n_false,
+        false_upper_95=upper_bound(n_false, n_available),
     )
 
 
@@ -400,16 +506,29 @@ def _criterion_row(
     )
 
 
-def _longest_gap(comparison: Comparison) -> Longest:
-    """The longest stretch without a confident fix of any flight, time and path each by itself; NaN
+def _share_of_time(comparison: Comparison, flags: BoolArray) -> float:
+    """Of the views with `flags` (N,), each up to the next view of its flight; NaN where views have
+    no result or times do not rise."""
+    if comparison.n_without_result:
+        return math.nan
+    part_s = whole_s = 0.0
+    for views in comparison.flights:
+        steps_s = np.diff(seconds_since_first(comparison.time_ns[views]))
+        part_s += float(steps_s[flags[views][:-1]].sum())
+        whole_s += float(steps_s.sum())
+    return part_s / whole_s if whole_s else math.nan
+
+
+def _longest_without(comparison: Comparison, flags: BoolArray) -> Longest:
+    """The longest stretch of any flight without `flags` (N,), time and path each by itself; NaN
     where views have no result or a flight does not tell."""
     if comparison.n_without_result:
         return Longest(math.nan, math.nan)
     gaps: list[tuple[float, float]] = []
-    for first, last in pairwise((*comparison.starts, len(comparison.frames))):
-        seconds_s = seconds_since_first(comparison.time_ns[first:last])
-        path_m = path_so_far_m(comparison.truth_en_m[first:last])
-        gap = longest(~comparison.confident[first:last], seconds_s, path_m)
+    for views in comparison.flights:
+        seconds_s = seconds_since_first(comparison.time_ns[views])
+        path_m = path_so_far_m(comparison.truth_en_m[views])
+        gap = longest(~flags[views], seconds_s, path_m)
         gaps.append((gap.seconds_s, gap.path_m))
     return Longest(*(float(value) for value in np.max(gaps, axis=0)))
 
@@ -424,7 +543,7 @@ def _position(outcome: Fix | NoFix) -> tuple[float, float]:
     return (outcome.lat_deg, outcome.lon_deg) if isinstance(outcome, Fix) else (math.nan, math.nan)
 
 
-def _is_fix(outcome: Fix | NoFix) -> bool:
+def _is_fix(outcome: Fix | NoFix) -> TypeGuard[Fix]:
     return all(map(math.isfinite, _position(outcome)))
 
 

@@ -4,6 +4,7 @@ Colour shows confidence and the mark shows the error; false fixes stand out by b
 track differ in colour and in mark.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from orthonav.ground.evaluate.tables import (
     criteria_header,
     criteria_rows,
     gnss_rows,
+    integrity_rows,
     percentiles_text,
     standard_rows,
     table_header,
@@ -189,6 +191,7 @@ def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
         "criteria": criteria_rows(metrics),
         "confidence": confidence_text(metrics),
         "covariance": covariance_text(metrics.consistency),
+        "integrity": integrity_rows(metrics),
     }
 
 
@@ -237,6 +240,18 @@ def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
             reliability_picture(metrics.calibration),
         ),
     ]
+    if metrics.integrity is not None:
+        (_, beyond), *_ = integrity_rows(metrics)
+        figures.append(
+            (
+                "stanford",
+                f"Stanford diagram; errors beyond the protection level: {beyond}",
+                "Stanford diagram: error and protection level of each fix that has one, at a risk "
+                f"of {metrics.integrity.risk:g}. Below the diagonal the error is beyond the level; "
+                "dotted: the alert limit.",
+                stanford_picture(comparison, metrics.integrity.alert_limit_m),
+            )
+        )
     if flight.gnss:
         figures.append(
             (
@@ -417,6 +432,31 @@ def _draw_bins(axes: "Axes", calibration: ConfidenceCalibration) -> None:
         f"fraction correct {calibration.share_right:.2f}"
     )
     axes.set_title(title, fontsize=9, color=SOFT, linespacing=1.4)
+
+
+def stanford_picture(comparison: Comparison, alert_limit_m: float) -> Drawing:
+    levels_m, errors_m = comparison.protection_levels_m, comparison.errors_m
+    shown = np.isfinite(levels_m + errors_m)
+    levels_m, errors_m = levels_m[shown], np.maximum(errors_m[shown], 0.01)
+    beyond = errors_m > levels_m
+
+    def draw(axes: "Axes") -> None:
+        seen = [*levels_m, *errors_m, *([alert_limit_m] if math.isfinite(alert_limit_m) else [1.0])]
+        low, high = min(seen) / 1.5, max(seen) * 1.5
+        axes.plot([low, high], [low, high], color=GREY, linewidth=1.2)
+        for chosen, colour, mark in ((~beyond, RIGHT, "."), (beyond, WRONG, "X")):
+            dots: dict[str, Any] = {"color": colour, "markersize": 5, "alpha": 0.6}
+            axes.plot(errors_m[chosen], levels_m[chosen], mark, **dots)
+        if math.isfinite(alert_limit_m):
+            for line in (axes.axhline, axes.axvline):
+                line(alert_limit_m, color=SOFT, linewidth=1.2, linestyle=":")
+        axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high))
+        axes.set(xlabel="error (m)", ylabel="protection level (m)")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("")
+
+    return draw_axes((6.2, 5.0), draw)
 
 
 def gnss_picture(found: GnssMetrics) -> Drawing:

@@ -17,6 +17,7 @@ from orthonav.ground.evaluate.statistics import (
     nees_bound,
     nees_mean_bounds,
     percentile,
+    share,
 )
 from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
 from orthonav.ground.report import aligned, measure_text, percent_text, to_plain
@@ -64,7 +65,8 @@ def total(flights: Sequence[FlightReport]) -> Metrics:
     first = flights[0].metrics
     if len(flights) == 1:
         return first
-    return measure(pool([flight.comparison for flight in flights]), first.radius_m)
+    limit_m = math.nan if first.integrity is None else first.integrity.alert_limit_m
+    return measure(pool([flight.comparison for flight in flights]), first.radius_m, limit_m)
 
 
 # JSON.
@@ -100,6 +102,7 @@ def metrics_to_json(metrics: Metrics) -> Plain:
             "standard": _standard_to_json(standard),
             "standard_of_confident": _standard_to_json(confident),
             "calibration": metrics.calibration,
+            **({} if metrics.integrity is None else {"integrity": metrics.integrity}),
             "covariance": {
                 "n_right": found.n_right,
                 "n_nees": found.nees.size,
@@ -209,6 +212,7 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
         "",
         f"confidence: {confidence_text(whole)}",
         f"covariance: {covariance_text(whole.consistency)}",
+        *(f"{name}: {text}" for name, text in integrity_rows(whole)),
     ]
     for flight in flights:
         rows: list[tuple[str, str]] = []
@@ -233,6 +237,36 @@ def confidence_text(metrics: Metrics) -> str:
         f"{stated} a mean confidence of {calibration.mean_confidence:.3f}; the fraction within the "
         f"stated radius is {calibration.share_right:.3f}{default}; "
         f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
+    )
+
+
+def integrity_rows(metrics: Metrics) -> list[tuple[str, str]]:
+    found = metrics.integrity
+    if found is None:
+        return []
+    beyond = _bounded(found.n_beyond, found.n_levels, found.beyond_upper_95)
+    rows = [("errors beyond the protection level", f"{beyond}, at a risk of {found.risk:g}")]
+    if math.isfinite(found.alert_limit_m):
+        views, of_time = map(percent_text, (found.availability, found.availability_of_time))
+        outage = found.outage
+        longest = f"{measure_text(outage.seconds_s, ' s')}, {measure_text(outage.path_m, ' m')}"
+        limit = f"alert limit of {found.alert_limit_m:g} m"
+        false = _bounded(found.n_false, found.n_available, found.false_upper_95)
+        rows += [
+            (
+                f"available at the {limit}",
+                f"{views} of views, {of_time} of the time; longest outage {longest}",
+            ),
+            (f"available and beyond the {limit}", false),
+        ]
+    return rows
+
+
+def _bounded(part: int, whole: int, upper_95: float) -> str:
+    if not whole:
+        return "none of 0"
+    return (
+        f"{part} of {whole} ({100 * share(part, whole):.2g} %; 95 % bound {100 * upper_95:.2g} %)"
     )
 
 

@@ -385,10 +385,11 @@ def logged_options(logged: Any) -> dict[str, Any]:
     if not isinstance(logged, dict):
         return {}
     found: dict[str, Any] = {}
-    for name in ("accept", "track", *LOCALIZE_CHOICES):
+    kinds_of = {"accept": str | None, "track": bool, "alert_limit_m": float | None, "risk": float}
+    for name in (*kinds_of, *LOCALIZE_CHOICES):
         if name in logged:
             value = logged[name]
-            kinds = {"accept": str | None, "track": bool}.get(name, str)
+            kinds = kinds_of.get(name, str)
             if not isinstance(value, kinds) or value not in LOCALIZE_CHOICES.get(name, (value,)):
                 raise FlightError(f"flight log: invalid option {name}: {value!r:.40}")
             found[name] = value

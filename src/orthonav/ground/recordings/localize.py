@@ -25,7 +25,8 @@ def localize_flight(
     """Results of the views of a recorded flight, in order, as they are computed.
 
     `heights`: turns reported heights into heights above ground; None: they are used as reported.
-    With `accept` each result says whether its fix meets it. Raises `FlightError` or
+    With `accept` each result says whether its fix meets it, and states the protection level at its
+    risk. Raises `FlightError` or
     `MissingFileError` at an image that cannot be decoded or is missing, unless `skip_bad_images`
     makes it a `NoFix`; raises `CameraError` where an image has not the camera's aspect ratio.
     """
@@ -48,19 +49,16 @@ def localize_flight(
                 raise CameraError(f"{error}: {view.where}") from error
         if heights is not None:
             heights.observe(telemetry.time_ns, outcome, locator.state_name)
-        accepted = None if accept is None else accept.accepts(outcome)
-        yield ViewResult(
-            view.frame, telemetry.time_ns, outcome, latency_ms, locator.state_name, accepted
-        )
+        state, time_ns = locator.state_name, telemetry.time_ns
+        result = ViewResult(view.frame, time_ns, outcome, latency_ms, state)
+        yield result if accept is None else accept.judged(result)
 
 
 def smoothed_track(
     tracker: Tracker, results: Sequence[ViewResult], accept: Acceptance | None
 ) -> list[ViewResult]:
     placed = [finite(outcome) for outcome in tracker.smoothed_track()]
-    return [
-        replace(
-            result, outcome=outcome, accepted=None if accept is None else accept.accepts(outcome)
-        )
-        for result, outcome in zip(results, placed, strict=True)
+    smoothed = [
+        replace(result, outcome=outcome) for result, outcome in zip(results, placed, strict=True)
     ]
+    return smoothed if accept is None else [accept.judged(each) for each in smoothed]

@@ -27,7 +27,12 @@ from orthonav.core.flight.mount import Mount, read_mount
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult, error_ellipse
-from orthonav.ground.evaluate.metrics import FAR_M, check_truth, warn_of_another_run
+from orthonav.ground.evaluate.metrics import (
+    FAR_M,
+    check_truth,
+    protection_levels_m,
+    warn_of_another_run,
+)
 from orthonav.ground.recordings.flightlog import is_flight_log
 from orthonav.ground.report import to_plain
 from orthonav.ground.report.imagery import (
@@ -247,7 +252,8 @@ def columns_of(
     `x`, `y`, `tx`, `ty`: fix and true position in pixels of the sheet.
     `gx`, `gy`, `gerr`, `gdiff`: GNSS in pixels of the sheet, its error, and its distance from the
     fix in metres; `gfault`: reason of the GNSS monitor, "" without one.
-    `err`: error in metres; `conf`, `radius`: confidence and radius (m) that the fix states.
+    `err`: error in metres; `conf`, `radius`: confidence and radius (m) that the fix states;
+    `level`: its protection level (m) at `risk`.
     `a`, `b`, `turn`: axes of one standard deviation (m), and the angle of the longer one in degrees
     counter-clockwise from east.
     `head`, `agl`: heading (deg) and height (m).
@@ -284,6 +290,8 @@ def columns_of(
         "err": to_plain(error_m, 4),
         "conf": to_plain(stated("confidence"), 4),
         "radius": to_plain(radii_m, 1),
+        "level": to_plain(protection_levels_m(results), 1),
+        "risk": [r.risk for r in results],
         "a": to_plain(major_m, 2),
         "b": to_plain(minor_m, 2),
         "turn": to_plain((90.0 - direction_deg) % 180.0, 1),

@@ -35,6 +35,8 @@ class NavigationEstimate:
 
     `cov_en_m2`: covariance (2, 2) of east and north, given that the fix is correct.
     `confidence`: 0 to 1; NaN: not known.
+    `protection_level_m`: the error exceeds it with the risk of the result; infinite: not known.
+    `accepted`: whether it met a criterion beside the rules of the gate.
     `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
     `processing_s`: from exposure until the message is sent.
     `alt_amsl_m`, `alt_std_m`: above mean sea level; NaN where not known.
@@ -58,6 +60,8 @@ class NavigationEstimate:
     state: str | None = None
     reset_counter: int = 0
     dead_reckoned: bool = False
+    protection_level_m: float = math.inf
+    accepted: bool = True
 
     def __post_init__(self) -> None:
         if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # NaN too
@@ -142,6 +146,8 @@ def estimate_from_result(
         vel_en_mps=_velocity(fix) if result.state is not None else None,
         vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,
         state=result.state,
+        protection_level_m=fix.protection_level_m(result.risk),
+        accepted=result.accepted is not False,
     )
 
 

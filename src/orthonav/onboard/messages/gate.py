@@ -44,16 +44,19 @@ class GateRules:
 
     `min_confidence`: 0 to 1. `max_std_m`: along the worst direction. `min_interval_s`: shortest
     time between two messages, by name. `send_coasting`: admit dead reckoning; messages mark it.
+    `alert_limit_m`: of the protection level, 1 or more; infinite: none.
     """
 
     min_confidence: float = CONFIDENT
     max_std_m: float = 50.0
     min_interval_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     send_coasting: bool = False
+    alert_limit_m: float = math.inf
 
     def __post_init__(self) -> None:
         limits = {
             "max_std_m": self.max_std_m,
+            "alert_limit_m": self.alert_limit_m,
             **{f"min_interval_s[{key}]": value for key, value in self.min_interval_s.items()},
         }
         for name, value in limits.items():
@@ -66,10 +69,11 @@ class GateRules:
 class Gate:
     """Checks the estimates of one flight in order. Mutable; for one thread.
 
-    `withheld`: counts by reason: `no_fix`, `not_tracking`, `low_confidence`, `no_covariance`,
-    `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `coasting` for dead reckoning,
-    `jump` for an impossible one that no other view has confirmed, `rate:NAME` for a message that
-    would exceed its rate, and the reasons of views that the flight loop does not locate.
+    `withheld`: counts by reason: `no_fix`, `not_tracking`, `alert_limit`, `low_confidence`,
+    `no_covariance`, `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `coasting` for
+    dead reckoning, `jump` for an impossible one that no other view has confirmed, `rate:NAME` for a
+    message that would exceed its rate, and the reasons of views that the flight loop does not
+    locate.
     `resets`: number of admitted jumps of the position, and of tracks found again.
     """
 
@@ -83,6 +87,8 @@ class Gate:
         self._interrupted = False
         self._jumped_to: list[NavigationEstimate] = []
         self._due_ns: dict[str, int] = {}
+        self._protection_level_m = math.inf
+        self._unavailable_ns: int | None = None
 
     def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> NavigationEstimate | None:
         """The estimate with its reset counter set, or None where it must not be sent.
@@ -91,6 +97,10 @@ class Gate:
         """
         reason = self._reason(estimate, now_ns)
         self._watch(estimate)
+        if estimate is not None:
+            self._protection_level_m = estimate.protection_level_m
+        if reason == "alert_limit" and self._unavailable_ns is None:
+            self._unavailable_ns = now_ns
         if estimate is None or reason is not None:
             self.withheld[reason or "no_fix"] += 1
             return None
@@ -99,7 +109,7 @@ class Gate:
         if jumped and (coasting or not self._is_confirmed(estimate)):
             self.withheld["jump"] += 1
             return None
-        self._jumped_to = []
+        self._jumped_to, self._unavailable_ns = [], None
         if jumped or (self._last is not None and self._interrupted):
             self.resets += 1
         self._interrupted = False
@@ -107,6 +117,22 @@ class Gate:
         if not coasting:
             self._last = made
         return made
+
+    def availability(self, now_ns: int) -> dict[str, float | None]:
+        """The alert limit, the last protection level (None: infinite), and for how long it has kept
+        positions from being sent; empty without a limit."""
+        limit_m, level_m, since_ns = (
+            self.rules.alert_limit_m,
+            self._protection_level_m,
+            self._unavailable_ns,
+        )
+        if not math.isfinite(limit_m):
+            return {}
+        return {
+            "alert_limit_m": limit_m,
+            "protection_level_m": round(level_m, 1) if math.isfinite(level_m) else None,
+            "unavailable_s": 0.0 if since_ns is None else round((now_ns - since_ns) / 1e9, 1),
+        }
 
     def _is_confirmed(self, estimate: NavigationEstimate) -> bool:
         if self._jumped_to and self._jumped(self._jumped_to[-1], estimate):
@@ -142,8 +168,9 @@ class Gate:
         refusals = {
             "coasting": estimate.state == "coasting" and not self.rules.send_coasting,
             "not_tracking": estimate.state not in (None, "tracking", "coasting"),
+            "alert_limit": not estimate.protection_level_m <= self.rules.alert_limit_m,
             "low_confidence": estimate.state != "coasting"
-            and not estimate.confidence >= self.rules.min_confidence,  # NaN too
+            and not (estimate.accepted and estimate.confidence >= self.rules.min_confidence),
             "no_covariance": math.isnan(std_m),
             "too_uncertain": std_m > self.rules.max_std_m,
             "from_the_future": age_s < -FUTURE_S,
@@ -183,3 +210,15 @@ def _moved_en_m(before: NavigationEstimate, now: NavigationEstimate) -> Array:
     frame = LocalFrame(limited, before.lon_deg)
     start = frame.en_from_latlon(before.lat_deg, before.lon_deg)
     return np.asarray(frame.en_from_latlon(now.lat_deg, now.lon_deg) - start)
+
+
+def unavailable_text(availability: Mapping[str, float | None]) -> str:
+    """Why and how long positions are withheld, of `Gate.availability`; "" while they pass."""
+    if not availability.get("unavailable_s"):
+        return ""
+    level_m = availability["protection_level_m"]
+    level = "unknown" if level_m is None else f"{level_m:.0f} m"
+    return (
+        f"protection level {level} above the alert limit {availability['alert_limit_m']:g} m "
+        f"for {availability['unavailable_s']:.0f} s"
+    )

@@ -240,6 +240,7 @@ export function sentence(store, i) {
   if (Number.isFinite(c.err[i])) parts.push(`error ${metres(c.err[i])}`);
   if (c.wrong[i]) parts.push("FALSE FIX");
   if (Number.isFinite(c.conf[i])) parts.push(`confidence ${number(c.conf[i], 3)} within ${metres(c.radius[i])}`);
+  if (Number.isFinite(c.level[i])) parts.push(`protection level ${metres(c.level[i])} at a risk of ${c.risk[i]}`);
   if (Number.isFinite(c.a[i])) parts.push(`σ ${metres(c.a[i])}`);
   if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} above ground`);
   if (Number.isFinite(c.ms[i])) parts.push(`${number(c.ms[i], 0)} ms`);

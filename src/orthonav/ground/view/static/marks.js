@@ -206,6 +206,8 @@ export class Chosen {
     if (known(truth)) add(ring(truth, 7, colour("truth")));
     if (!known(fix)) return;
     if (c.a[i] > 0) line(ellipse(fix, c.a[i], c.b[i], c.turn[i], run.sheet.gsd_m), { color: colour("strong"), weight: 2 });
+    const level = c.level[i] / BOUND_95; // a circle
+    if (level > 0) line(ellipse(fix, level, level, 0, run.sheet.gsd_m), { color: colour("strong"), weight: 1.5, dashArray: "6 5" });
     add(ring(fix, 10, "#ffffff", 6));
     add(ring(fix, 10, colour("strong"), 3));
   }

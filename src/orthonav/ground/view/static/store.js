@@ -1,7 +1,7 @@
 // The views of the run, the selected one, and the filter. Events: "data" (new views, or all replaced),
 // "select", "filter".
 
-const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "a", "b", "turn", "head", "agl", "ms",
+const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "level", "a", "b", "turn", "head", "agl", "ms",
   "gx", "gy", "gerr", "gdiff", "x2", "y2", "err2"];
 export const CONFIDENT = 0.9;
 

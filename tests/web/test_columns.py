@@ -1,5 +1,6 @@
-"""GNSS of views as columns of the page: its place, error, difference and fault."""
+"""GNSS and protection levels of views as columns of the page."""
 
+from dataclasses import replace
 from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
@@ -23,6 +24,15 @@ def view(number, gnss_en_m, fault):
         evidence |= {"gnss_lat_deg": float(place[0]), "gnss_lon_deg": float(place[1])}
     fix = Fix(float(lat), float(lon), COV_EN_M2, 0.95, 35.0, 0.0, 60.0, MappingProxyType(evidence))
     return ViewResult(f"{number}", number * 10**9, fix, 1.0, "tracking")
+
+
+def test_the_protection_level_is_that_of_the_risk_of_the_run():
+    sure = view(0, None, 0.0)
+    sure = replace(sure, outcome=replace(sure.outcome, place_probability=0.9999), risk=0.01)
+    columns = columns_of([sure, view(1, None, 0.0)], 0, {}, SHEET, 15.0)
+    level_m = sure.outcome.protection_level_m(0.01)
+    assert columns["level"] == [pytest.approx(level_m, abs=0.1), None]  # none at 0.95
+    assert columns["risk"] == [0.01, 1e-3]
 
 
 def test_gnss_is_shown_beside_the_fix():
