@@ -13,6 +13,7 @@ from rasterio.transform import Affine
 
 from orthonav.core.errors import FetchError
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.fetch.files import _asset
 from orthonav.ground.fetch.presets import ImageryOptions, parse_source, presets
 from orthonav.ground.fetch.run import FetchRequest, fetch
 from orthonav.ground.imagery.terrain import open_dem
@@ -208,6 +209,14 @@ def test_a_file_off_the_grid_is_resampled(take, placed, catalogue):
         url.append(server.url)
         _, path = take(f"stac:{server.url}/api/", gsd_m=None)
     placed(path, worst=8)
+
+
+def test_the_picture_of_several_files_is_that_of_the_usual_name():
+    kinds = {"B04": "image/tiff", "B08": "image/tiff", "visual": "image/tiff"}
+    assets = {name: {"type": kind, "gsd": 10} for name, kind in kinds.items()}
+    assert _asset(assets, ImageryOptions(gsd_m=10), "one") == "visual"
+    del assets["visual"]["gsd"]
+    assert _asset(assets, ImageryOptions(), "one") == "visual"
 
 
 def test_signed_files(catalogue, tmp_path):

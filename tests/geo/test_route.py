@@ -96,6 +96,10 @@ def test_a_mission_of_litchi_states_what_its_heights_count_from(tmp_path):
     header = "latitude,longitude,altitude({}),heading(deg),altitudemode,poi_altitude(m)\n"
     path.write_text(header.format("m") + "46.5,2.5,100,90,0,7\n46.51,2.53,120,90,1,7\n")
     assert read_route(path).heights == (Height(100, "home"), Height(120, "agl"))
+    path.write_text(
+        header.format("m").replace("altitudemode", "altitude_mode") + "46.5,2.5,9,0,1,7\n"
+    )
+    assert read_route(path).heights == (Height(9, "agl"),)
     path.write_text(header.format("ft") + "46.5,2.5,100,90,0,7\n")
     assert read_route(path).heights == (Height(30.48, "home"),)
     path.write_text(header.format("m") + "46.5,2.5,100,90,2,7\n")

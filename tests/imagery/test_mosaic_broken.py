@@ -56,6 +56,10 @@ def test_ground_control_points_only(ortho, assigned):
         ({"transform": Affine.identity()}, "no georeference"),
         ({"crs": 'LOCAL_CS["mine",UNIT["metre",1]]'}, "border cannot be converted to latitude"),
         ({"crs": "EPSG:4326"}, "border cannot be converted to latitude"),
+        (
+            {"crs": "EPSG:4326", "transform": Affine(1e-5, 0, 179.9999, 0, -1e-5, -17)},
+            "beyond longitude 180",
+        ),
     ],
 )
 def test_places_that_cannot_be_used(ortho, profile, message):

@@ -1,6 +1,7 @@
 """`orthonav fly --gnss`: solutions of an autopilot are compared, faults are reported."""
 
 import math
+from argparse import Namespace
 from collections import deque
 from dataclasses import replace
 
@@ -10,11 +11,13 @@ from fake_autopilot import MS, FakeLocator, S, fix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_fly import AHEAD_NS, Flight
 
-from orthonav.core.flight.gnss import FAULTS
+from orthonav.cli.flying import gnss_watch
+from orthonav.core.flight.gnss import FAULTS, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import unknown
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
-from orthonav.onboard.state import SavedState, learnt_biases, save
+from orthonav.onboard.state import SavedState, learnt_biases, reference_biases, save
+from orthonav.onboard.telemetry import Clocks
 
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS = 10.0
@@ -155,6 +158,33 @@ def test_what_was_learnt_is_reported_and_saved_by_the_digest_of_the_map(
     assert evidence["gnss_map_east_m"] == pytest.approx(place["east_m"], abs=0.1)
     assert evidence["gnss_mount_pitch_std_deg"] > 1
     assert "map_displaced" in flight.reasons()  # by more than maps usually are
+
+
+@pytest.mark.parametrize("age_s, east_m", [(299, 0.0), (301, 14.0)])
+def test_the_reference_survives_a_restart_in_flight(tmp_path, age_s, east_m):
+    """What a flight learnt, perhaps a drag-off, is the reference of the next flight only."""
+    path, before = tmp_path / "state.json", replace(unknown(), agreed_s=7200.0)
+    dragged = replace(before, mean=np.array([14.0, 0, 0, 0, 0]))
+    saved = {**dragged.to_plain(), "reference": before.to_plain()}
+    save(path, SavedState(48.0, 2.0, 5.0, utc_ns=1000 * S), {"d": saved})
+    options = Namespace(state=path, state_max_age_s=300.0, recorded_telemetry=False, ros2=False)
+    clocks = Clocks(utc_ns=lambda: (1000 + age_s) * S)
+    for _ in range(2):
+        solutions = deque()
+        watch = gnss_watch(options, FRAME, "d", (), solutions, 0.9, clocks)
+        made = watch.maps()
+        solutions.append(GnssSample(S, S, 48.0, 2.0, 3))
+        watch.tick(S)
+        assert watch.plain() and watch.maps() == made
+        assert made["d"]["mean"][0] == 14 and made["d"]["reference"]["mean"][0] == east_m
+        save(path, SavedState(48.0, 2.0, 5.0, utc_ns=1000 * S), made)
+
+
+def test_a_state_file_without_a_reference_is_used(tmp_path):
+    path = tmp_path / "state.json"
+    save(path, SavedState(), {"d": unknown().to_plain(), "odd": {"reference": 3}})
+    assert list(learnt_biases(path)) == ["d"]
+    assert [reference_biases(path, each) for each in ("d", "odd", "other")] == [None] * 3
 
 
 def test_neither_heading_nor_mount_is_learnt_from_a_position_without_heading(begin):

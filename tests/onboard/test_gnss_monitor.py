@@ -36,8 +36,9 @@ KNOWN = Biases(np.zeros(5), np.diag([1.5, 1.5, 0.01, 0.01, 0.1]) ** 2, 3600.0)
 class Air:
     """A straight flight to the north at 20 m/s over a perfect map, one step a second."""
 
-    def __init__(self, start=None, speed_mps=20.0):
-        self.monitor, self.now_s, self.speed = GnssMonitor(FRAME, start), 1000, speed_mps
+    def __init__(self, start=None, speed_mps=20.0, reference=None):
+        self.monitor, self.now_s = GnssMonitor(FRAME, start, reference), 1000
+        self.speed = speed_mps
         self.north_m, self.rng, self.states = 0.0, np.random.default_rng(0), []
 
     def fly(self, seconds, gnss_m=(0.0, 0.0), map_m=(0.0, 0.0), silent=False, **sample):
@@ -200,6 +201,14 @@ def test_an_outage_needs_agreement_too():
     assert air.fly(int(RETURN_S) + 10).state is GnssState.GOOD
     air.fly(5, fix_type=1)
     assert air.fly(30, gnss_m=(50.0, 0.0)).reason == "gnss_offset"  # it came back elsewhere
+
+
+def test_a_drag_off_that_was_learnt_before_a_restart_is_found():
+    dragged = replace(KNOWN, mean=np.array([30.0, 0, 0, 0, 0]))
+    assert Air(dragged).fly(30, gnss_m=(30.0, 0.0)).fault is None
+    air = Air(dragged, reference=KNOWN)
+    assert air.fly(30, gnss_m=(30.0, 0.0)).fault is Fault.OFFSET
+    assert air.monitor.learnt is air.monitor.reference is KNOWN
 
 
 def test_a_jump_of_the_map_is_not_blamed_on_gnss():

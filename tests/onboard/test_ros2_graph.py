@@ -149,6 +149,26 @@ def test_a_flight_in_a_graph(flown, env, tmp_path, distribution, sourced):
     assert "QoS" not in flying.said() and "invalid" not in flying.said()
 
 
+@pytest.mark.parametrize("sourced", [False, True], ids=["dds", "rclpy"])
+def test_qos_that_does_not_match_is_named(flown, env, tmp_path, distribution, sourced):
+    """The program wants every part of an image, and the camera publishes with best effort."""
+    path, _, flight, _ = flown
+    words = [*FLY, path, "--ros2", "--ros-args", "-r", "image:=/cam/image_raw"]
+    words += ["-p", "image_reliability:=reliable"]
+    flying = Flying(env, tmp_path, distribution, sourced, *words)
+    camera = subprocess.Popen([distribution[1], PEER, flight], env=env)
+    named = "topic /cam/image_raw a publisher has QoS that does not match ours: reliability"
+    try:
+        deadline = time.monotonic() + LONGEST_S
+        while named not in flying.said():
+            assert time.monotonic() < deadline and flying.process.poll() is None, flying.said()
+            time.sleep(0.1)
+    finally:
+        camera.kill()
+        camera.wait()
+        flying.interrupt()
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_the_wait_for_a_camera(flown, env, tmp_path, distribution, number):
     words = [*FLY, flown[0], "--ros2", "--ros-args", "-r", "image:=/cam/image_raw"]

@@ -9,6 +9,7 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from helpers import textured
@@ -16,7 +17,7 @@ from orthonav.core.errors import ImageryError, OutputError
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import RegistrationCalibration
-from orthonav.ground.build.sheet import AHEAD, BlockCache, in_order
+from orthonav.ground.build.sheet import AHEAD, Block, BlockCache, in_order
 
 BLOCKS = 9
 SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
@@ -222,3 +223,16 @@ def test_the_first_error_is_raised_and_no_thread_stays(workers):
         for item in in_order(range(20), failing, workers):
             found.append(item)
     assert found == list(range(7)) and threading.active_count() == before
+
+
+def test_what_others_keep_in_the_folder_stays(tmp_path):
+    folder = tmp_path / "map.onav.work"
+    cache = BlockCache(folder, "ab12")
+    cache.store(Block(0, 0, 4, 4), {"grey": np.zeros(3)})
+    (folder / "checkpoints").mkdir()
+    (folder / "mine.npz").write_bytes(b"mine")
+    later = BlockCache(folder, "cd34")
+    assert later.load(Block(0, 0, 4, 4)) is None and not list(folder.glob("r0*"))
+    later.store(Block(0, 0, 4, 4), {"grey": np.zeros(3)})
+    later.discard()
+    assert sorted(each.name for each in folder.iterdir()) == ["checkpoints", "mine.npz"]

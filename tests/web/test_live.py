@@ -149,6 +149,17 @@ def test_another_flight_of_that_name(tmp_path):
     assert len(LogReader(tmp_path / "flight_0001.mcap").poll().results) == 2
 
 
+def test_another_flight_in_files_of_the_same_name(tmp_path):
+    write_log(tmp_path, range(4), close=False)
+    reader = LogReader(tmp_path / "flight.mcap", live=True)
+    gathered(reader, 4)
+    for path in tmp_path.glob("*.mcap"):
+        path.unlink()
+    write_log(tmp_path, range(4, 5))
+    batch = reader.poll()
+    assert batch.restarted and [each.frame for each in batch.results] == [result(4).frame]
+
+
 def test_files_deleted_to_make_room_are_not_missed(tmp_path):
     log = write_log(tmp_path, range(2))
     reader = LogReader(tmp_path, live=True)

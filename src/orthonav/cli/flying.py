@@ -36,6 +36,7 @@ from orthonav.onboard import cameras, outputs, state
 from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
+from orthonav.onboard.gnss.biases import Biases
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
 from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
@@ -450,11 +451,24 @@ def gnss_watch(
         source,
         digest=digest,
         known=state.learnt_biases(options.state) if options.state else {},
+        reference=_interrupted(options, digest, clocks),
         setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
         recorded=recorded,
         min_confidence=min_confidence,
         utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
     )
+
+
+def _interrupted(options: argparse.Namespace, digest: str, clocks: Clocks) -> Biases | None:
+    """Reference of the flight that this one continues: its last position is at most
+    `--state-max-age-s` old, or of unknown age because a clock was set back."""
+    saved = state.load(options.state) if options.state else None
+    if saved is None:
+        return None
+    age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
+    if age_s > options.state_max_age_s:
+        return None
+    return state.reference_biases(options.state, digest)
 
 
 def start_of(

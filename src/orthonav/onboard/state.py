@@ -95,6 +95,13 @@ def learnt_biases(path: Path) -> dict[str, Biases]:
     return found
 
 
+def reference_biases(path: Path, digest: str) -> Biases | None:
+    """Reference of the flight that saved the file over a map; None where none is stored."""
+    with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
+        return biases_from_plain(_maps_of(path)[digest]["reference"])
+    return None
+
+
 def _maps_of(path: Path) -> dict[str, Any]:
     maps = _plain_of(path).get("maps")
     return maps if isinstance(maps, dict) else {}

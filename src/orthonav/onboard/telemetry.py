@@ -238,9 +238,9 @@ class TelemetryBuffer:
         if ends[0] is None or ends[1] is None or np.diff(times).max() > local.gap_ns:
             return None
         velocities = np.array([ends[0], *local.values[inner], ends[1]])[:, 1::-1]
-        east, north = np.trapezoid(velocities, times / 1e9, axis=0).tolist()
-        seconds = (end_ns - start_ns) / 1e9
-        return east / seconds, north / seconds
+        means, steps_ns = (velocities[1:] + velocities[:-1]) / 2, np.diff(times)[:, None]
+        east, north = ((means * steps_ns).sum(axis=0) / (end_ns - start_ns)).tolist()
+        return east, north
 
     def _height(self, names: Sequence[str], time_ns: int) -> float:
         found = (self._heights[name].at(time_ns) for name in names if name in self._heights)

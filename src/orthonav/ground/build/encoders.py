@@ -41,6 +41,9 @@ LEARNT_WITH = {
 """Modules of the extra "train"."""
 USUAL_EDGES = {"autoencoder": "canny", "caevl": "canny", "triplet": "gray", "bovw": "gray"}
 LOCAL_FIELDS = ("weights", "cache")
+CHECKED_TILES, SAME = 32, 4e-3
+"""Tiles on which a device is compared with flight, and the largest difference, relative to the
+largest value: four times that of float16."""
 
 
 def usual_edges(method: str) -> str:
@@ -143,7 +146,21 @@ def learn_encoder(
         positive = positive or _changed_tiles(tiles, representation)
         trained = training.learn_network(recipe, tiles, positive=positive, **how)
     embedded = _embedded(lambda of: trained.views(tiles.batch(of)), tiles, progress)
+    _require_as_in_flight(trained.embedder, tiles, embedded)
     return trained.embedder, embedded
+
+
+def _require_as_in_flight(
+    embedder: NetworkEmbedder, tiles: SheetTiles, embedded: NDArray[np.float16]
+) -> None:
+    some = np.unique(np.linspace(0, len(tiles) - 1, CHECKED_TILES).astype(np.intp))
+    flown, found = embedder.views(tiles.batch(some)), embedded[some].astype(np.float32)
+    away = float(np.abs(flown - found).max())
+    if away > SAME * max(float(np.abs(flown).max()), 1e-6):
+        raise VariantError(
+            f"the device embeds tiles otherwise than the encoder in flight, by {away:.2g}; "
+            "learn with --device cpu"
+        )
 
 
 def _changed_tiles(

@@ -5,12 +5,13 @@ blocks, so the map is the same for any number of threads. The result of a block 
 arrays, one file in a cache from which an interrupted build resumes.
 """
 
+import contextlib
 import hashlib
 import json
 import logging
 import math
 import queue
-import shutil
+import re
 import threading
 import zipfile
 from collections import deque
@@ -331,6 +332,9 @@ def digest(values: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+_BLOCK = re.compile(r"\.?r\d+-c\d+-[0-9a-f]+\.npz(\..*)?$")
+
+
 class BlockCache:
     """Finished blocks of one request, as files in a folder of their own.
 
@@ -340,12 +344,14 @@ class BlockCache:
     def __init__(self, folder: Path, request: str) -> None:
         """`request`: digest of everything that determines the blocks; removes other blocks."""
         self._folder, self._request = folder, request
-        there = list(folder.glob("*.npz"))
-        found = [path for path in there if request in path.name]
-        for path in set(there) - set(found):
-            path.unlink()
+        found = 0
+        for path in self._blocks():
+            if request in path.name and not path.name.startswith("."):
+                found += 1
+            else:
+                path.unlink()
         if found:
-            log.warning("resuming: %d blocks are cached in %s", len(found), folder)
+            log.warning("resuming: %d blocks are cached in %s", found, folder)
 
     def load(self, block: "Block") -> Parts | None:
         """None if it is not cached or damaged."""
@@ -364,7 +370,14 @@ class BlockCache:
             np.savez(temporary, **parts)  # type: ignore[arg-type]  # none is `allow_pickle`
 
     def discard(self) -> None:
-        shutil.rmtree(self._folder, ignore_errors=True)
+        """Remove all blocks, and the folder unless it holds something else."""
+        for path in self._blocks():
+            path.unlink()
+        with contextlib.suppress(OSError):
+            self._folder.rmdir()
+
+    def _blocks(self) -> list[Path]:
+        return [path for path in self._folder.glob("*.npz") if _BLOCK.match(path.name)]
 
     def _path(self, block: "Block") -> Path:
         return self._folder / f"r{block.row}-c{block.col}-{self._request}.npz"

@@ -48,6 +48,7 @@ from orthonav.ground.planning.area import Area
 MAX_ITEMS = 500  # files of one fetch: an open dataset each, per thread
 PAGE = 100  # items per page; APIs allow at least this many
 MAX_PAGES = 200
+_USUAL_ASSETS = ("visual", "image", "ortho", "data", "rgb")
 _TIFF = re.compile(r"image/(tiff|vnd\.stac\.geotiff)|\.tiff?$", re.IGNORECASE)
 CELL_PX = 512  # GDAL's block size for COG, so a cell is usually one block
 MAX_BLOCK_BYTES = 64 * 2**20
@@ -285,6 +286,9 @@ def _asset(assets: dict[str, dict[str, Any]], options: ImageryOptions, name: str
     }
     if not tiffs:
         raise FetchError(f"item {name} has no GeoTIFF; available: {listed(list(assets))}")
+    usual = [key for key in _USUAL_ASSETS if key in tiffs]
+    if usual:
+        return usual[0]
     fitting = [
         key for key, gsd_m in tiffs.items() if 0 < gsd_m <= options.wanted_gsd_m * GSD_TOLERANCE
     ]

@@ -332,7 +332,9 @@ def _profile(source: CellSource, selection: Selection) -> dict[str, Any]:
 
 
 def _pack(raw: Path, out: Path, request: FetchRequest) -> None:
-    """Copy into a cloud-optimized file; JPEG takes one or three bands of bytes only."""
+    """Copy into a cloud-optimized file; JPEG takes one or three bands of bytes only.
+
+    Raises `OutputError` unless its size, place and bands are those of the raw one."""
     options: dict[str, Any] = {
         "BLOCKSIZE": 512,
         "BIGTIFF": "IF_SAFER",
@@ -346,7 +348,11 @@ def _pack(raw: Path, out: Path, request: FetchRequest) -> None:
         bytes_only = set(written.dtypes) == {"uint8"} and written.count in (1, 3)
         if request.compress == "jpeg" and bytes_only:
             options |= {"COMPRESS": "JPEG", "QUALITY": request.quality, "PREDICTOR": "NO"}
-    rasterio.shutil.copy(raw, out, driver="COG", **options)
+        rasterio.shutil.copy(raw, out, driver="COG", **options)
+        with rasterio.open(out) as packed:
+            for name in ("shape", "transform", "crs", "count"):
+                if getattr(packed, name) != getattr(written, name):
+                    raise OutputError(f"the packed file differs from the mosaic: {out}")
 
 
 def _tags(provenance: Provenance, selection: Selection) -> dict[str, str]:

@@ -335,6 +335,11 @@ def _outline(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
             "coordinate system; assign the correct one (for example: gdal_edit.py -a_srs EPSG:2154 "
             f"FILE): {path}"
         )
+    if system.is_geographic and max(-float(x.min()), float(x.max())) > 180 + 1e-6:
+        raise ImageryError(
+            "orthophoto in degrees lies beyond longitude 180, where GDAL reads one side only; "
+            f"reproject it to metres, such as UTM (gdalwarp -t_srs EPSG:32760): {path}"
+        )
     return latlon
 
 

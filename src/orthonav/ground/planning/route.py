@@ -150,7 +150,7 @@ _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
     ("hae", ("hae_m",)),
     (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
 )
-_MODE = "altitudemode"  # column of Litchi
+_MODES = ("altitudemode", "altitude_mode")  # columns of Litchi
 _FRAME_OF_MODE: dict[float | None, HeightFrame] = {0: "home", 1: "agl"}
 _UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
 _METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
@@ -204,10 +204,11 @@ def _heights(names: dict[str, str], values: _Values) -> tuple[Height | None, ...
     factor = 1.0 if unit is None else _METRES[unit[1]]
     heights = values(name)
     frames = [frame] * len(heights)
-    if frame is None and _MODE in names:
-        modes = values(_MODE)
+    mode = next((each for each in _MODES if each in names), None)
+    if frame is None and mode is not None:
+        modes = values(mode)
         if not {None, 0, 1}.issuperset(modes):
-            raise RouteError(f"{names[_MODE]} must be 0 (above take-off) or 1 (above ground)")
+            raise RouteError(f"{names[mode]} must be 0 (above take-off) or 1 (above ground)")
         frames = [_FRAME_OF_MODE.get(mode) for mode in modes]
     return tuple(
         None if height is None else Height(factor * height, each)

@@ -201,12 +201,12 @@ class LogReader:
 
     def _rescan(self, batch: Batch) -> None:
         self._scanned_s = time.monotonic()
-        names = set(_candidates(self._path))
-        if self._files and names == self._names:
+        names, cut = set(_candidates(self._path)), any(_was_cut(file) for file in self._files)
+        if self._files and names == self._names and not cut:
             return
         found = _files_of(self._path, live=self._live)
         run = run_of(found[-1]) if found else None
-        if self._files and run not in (None, self._run):
+        if self._files and (cut or run not in (None, self._run)):
             self._files, batch.restarted = [], True
             self._reset()
         self._names, self._run = names, run or self._run
@@ -267,3 +267,11 @@ def _candidates(path: Path) -> Iterator[Path]:
         return path.glob("*.mcap")
     pattern = "*.mcap" if path.is_file() else f"{path.stem}_*.mcap"
     return path.parent.glob(pattern)
+
+
+def _was_cut(file: McapFile) -> bool:
+    """Whether another flight has written a file of this name."""
+    try:
+        return file.path.stat().st_size < file.next_offset and not file.ended
+    except OSError:
+        return False  # deleted to make room

@@ -429,8 +429,9 @@ _STATES = 11
 class BiasLearner:
     """Learns the biases of one receiver over one map. Mutable; deterministic."""
 
-    def __init__(self, start: Biases) -> None:
-        self._filter, self._reference = _Filter(start), start
+    def __init__(self, start: Biases, reference: Biases | None = None) -> None:
+        """`reference`: of a flight that was interrupted; else it is the `start`."""
+        self._filter, self._reference = _Filter(start), reference or start
         self._waiting: deque[Difference] = deque()
 
     @property

@@ -257,11 +257,13 @@ PENDING = 100
 
 
 class GnssMonitor:
-    def __init__(self, frame: LocalFrame, start: Biases | None = None) -> None:
-        """`frame`: plane of the map. `start`: biases known before the flight."""
+    def __init__(
+        self, frame: LocalFrame, start: Biases | None = None, reference: Biases | None = None
+    ) -> None:
+        """`frame`: plane of the map. `start`, `reference`: see `BiasLearner`."""
         self._frame = frame
         self._receiver, self._window = Receiver(), DifferenceWindow()
-        self._learner = BiasLearner(start or unknown())
+        self._learner = BiasLearner(start or unknown(), reference)
         self._rolling = Rolling()
         self._pending: deque[MapPosition] = deque(maxlen=PENDING)
         self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=SOLVED)
@@ -277,6 +279,10 @@ class GnssMonitor:
     @property
     def learnt(self) -> Biases:
         return self._learner.learnt
+
+    @property
+    def reference(self) -> Biases:
+        return self._learner.reference
 
     def sample(self, sample: GnssSample) -> None:
         en_m = np.full(2, math.nan)

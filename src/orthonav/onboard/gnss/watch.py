@@ -69,13 +69,15 @@ class GnssWatch:
         *,
         digest: str = "",
         known: Mapping[str, Biases] = MappingProxyType({}),
+        reference: Biases | None = None,
         setup: str = "",
         recorded: bool = False,
         min_confidence: float = CONFIDENT,
         utc_ahead_ns: Callable[[], int] = lambda: 0,
     ) -> None:
         """`frame`: plane of the map. `digest`: of the map; `known`: biases by digest, the latest
-        last. `setup`: identifies camera, mount and stated latency.
+        last. `reference`: of this flight, where it was interrupted. `setup`: identifies camera,
+        mount and stated latency.
 
         `recorded`: times are
         those of the recording. `utc_ahead_ns`: what is added to times of solutions in the log.
@@ -84,7 +86,9 @@ class GnssWatch:
         self._frame, self._solutions, self._utc_ahead_ns = frame, solutions, utc_ahead_ns
         self.log: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self._digest, self._known = digest, dict(known)
-        self._start = at_start(known, digest, setup)
+        self._start = self._reference = at_start(known, digest, setup)
+        if reference is not None:
+            self._reference = at_start({**known, digest: reference}, digest, setup)
         self._recorded, self._least = recorded, min_confidence
         self._monitors: dict[int, GnssMonitor] = {}
         self._shown: dict[int, GnssStatus] = {}
@@ -163,7 +167,9 @@ class GnssWatch:
         """Biases for the state file: those of this map, learnt further, after the others."""
         made = {name: each.to_plain() for name, each in self._known.items() if name != self._digest}
         if self._digest and self._learnt.agreed_s > 0:
-            made[self._digest] = self._learnt.to_plain()
+            first = self._monitors.get(0)
+            reference = self._reference if first is None else first.reference
+            made[self._digest] = {**self._learnt.to_plain(), "reference": reference.to_plain()}
         return made
 
     def plain(self) -> list[dict[str, Any]]:
@@ -176,7 +182,8 @@ class GnssWatch:
         self._now_ns = max(self._now_ns, now_ns) if not self._recorded else now_ns
         for sample in self._solutions(now_ns):
             if sample.receiver not in self._monitors:
-                self._monitors[sample.receiver] = GnssMonitor(self._frame, self._start)
+                made = GnssMonitor(self._frame, self._start, self._reference)
+                self._monitors[sample.receiver] = made
             self._monitors[sample.receiver].sample(sample)
             if sample.receiver == 0:
                 self._last = sample

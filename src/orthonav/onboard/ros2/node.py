@@ -547,11 +547,23 @@ class RclNode(Graph):
         found: dict[str, str] = {}
         for made, kind in self._subscriptions:
             for other in self._node.get_publishers_info_by_topic(made.topic_name):
-                self._mismatch(found, made.topic_name, kind, other.topic_type, "")
+                why = self._unmatched(other.qos_profile, made.qos_profile, "a publisher")
+                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
         for made, kind in self._publishers:
             for other in self._node.get_subscriptions_info_by_topic(made.topic_name):
-                self._mismatch(found, made.topic_name, kind, other.topic_type, "")
-        return found  # ROS itself logs QoS that does not match
+                why = self._unmatched(made.qos_profile, other.qos_profile, "a subscriber")
+                self._mismatch(found, made.topic_name, kind, other.topic_type, why)
+        return found
+
+    def _unmatched(self, offered: Any, requested: Any, other: str) -> str:
+        """Why a subscription does not match a publisher; "" where it does."""
+        reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
+        policy = ""
+        if requested.reliability == reliability.RELIABLE != offered.reliability:
+            policy = "reliability"
+        elif requested.durability == durability.TRANSIENT_LOCAL != offered.durability:
+            policy = "durability"
+        return f"{other} has QoS that does not match ours: {policy}" if policy else ""
 
     def _made_qos(self, depth: int, *, reliable: bool, latched: bool = False) -> Any:
         qos = self._qos
