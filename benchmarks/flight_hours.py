@@ -232,7 +232,8 @@ def _table(title: str, key: str, flights: Sequence[Judged], notes: Sequence[str]
 
 
 def tasks_of(options: argparse.Namespace) -> Iterator[tuple[str, Task]]:
-    """Flights in rounds, without end: each scene in each scenario, over a pair of the round."""
+    """Flights in rounds, without end: each scene in each scenario, over a pair of the round. The
+    first ones are of all scenes and scenarios."""
     past, present = (str(IMAGERY / f"{date}.tif") for date in (PAST, PRESENT))
     demo = Pair("demo", past, present, 1.0)
     places: dict[str, list[Pair]] = {}
@@ -254,8 +255,9 @@ def tasks_of(options: argparse.Namespace) -> Iterator[tuple[str, Task]]:
     while True:
         chance = np.random.default_rng([number, 9])
         pairs = [each[chance.integers(len(each))] for each in large.values() if each]
-        for name in names:
-            for pair in pairs:
+        for turn in range(len(names)):
+            for place, pair in enumerate(pairs):
+                name = names[(turn + place) % len(names)]
                 vehicle, autopilot = chance.choice(list(VEHICLES)), chance.choice(list(FILTERS))
                 about = f"{number} {name}, {pair.name}, {vehicle}, {autopilot}"
                 yield (
