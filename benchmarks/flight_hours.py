@@ -208,7 +208,7 @@ def _cells(name: str, flights: Sequence[Judged]) -> list[str]:
         f"{false / hours:.2g}",
         f"{upper_bound(false, views) * views / hours:.2g}",
         f"{beyond} ({events(lambda each: each.beyond)}) of {leveled}",
-        f"{1e3 * upper_bound(beyond, leveled):.2g}",
+        f"{1e3 * upper_bound(beyond, leveled):.2g}" if leveled else "-",
         percent(available / views, 1),
         f"{wrong} of {available}",
         f"{max(each.longest_s(~each.available) for each in flights):.0f}",
