@@ -176,7 +176,7 @@ def measure(options: argparse.Namespace) -> Section:
         judge = fit_judge(judged.features, judged.right)
         print("USUAL_BIASES =", tuple(round(each, 2) for each in judge.biases))
         print("USUAL_WEIGHTS =", tuple(round(each, 2) for each in judge.weights))
-    diagram(judged, options.out / "integrity.png")
+    diagram(judged.error_m, judged.level_m, options.out / "integrity.png")
     tables = [
         _groups_table(judged, "By scene, left out", _scenes(judged)),
         _groups_table(judged, "By kind of view", _kinds(judged)),
@@ -283,12 +283,10 @@ def _tail_table(judged: Judged) -> Table:
     return Table("Tail of the place probability, scenes left out", header, rows)
 
 
-def diagram(judged: Judged, out: Path) -> None:
-    """A Stanford diagram: error against protection level, one pixel for so many fixes."""
-    shown = np.isfinite(judged.level_m)
-    levels, errors = (
-        np.clip(each[shown], 0.1, LARGEST_M) for each in (judged.level_m, judged.error_m)
-    )
+def diagram(error_m: Array, level_m: Array, out: Path) -> None:
+    """A Stanford diagram: errors (N,) against protection levels, one pixel for so many fixes."""
+    shown = np.isfinite(level_m)
+    levels, errors = (np.clip(each[shown], 0.1, LARGEST_M) for each in (level_m, error_m))
     figure = Figure(figsize=(6.5, 5.5), layout="constrained")
     axes = figure.add_subplot()
     edges = np.geomspace(0.1, LARGEST_M, 121)

@@ -24,7 +24,7 @@ from benchmarks.closed_loop.physics import (
     euler_rad,
     increments,
 )
-from benchmarks.closed_loop.replays import CAMERA, Demo, Grey, Rule, is_wrong, plain, stated
+from benchmarks.closed_loop.replays import CAMERA, Area, Grey, Rule, is_wrong, plain, stated
 from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.record import Section, Table, number, quantiles, say
 from orthonav.core.geo.frames import LocalFrame
@@ -40,15 +40,17 @@ from orthonav.onboard.messages.estimate import (
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import locate_view
 
-AGL_M, WIND_MPS = 250.0, 5.0
+WIND_MPS = 5.0
 ROUTE_EN_M = np.array(
     [(-550, -550), (-550, 450), (-150, 550), (0, -450), (350, -550), (550, 250), (100, 550)], float
 )
 """Corners over the demo area, flown round and round."""
+REACH_M = 550.0
+"""Of `ROUTE_EN_M`, from the middle."""
 CARROT_M, CORNER_M = 70.0, 60.0
 """Distance of the point that is steered to; corners count as reached from so far away."""
-VIEW_STEPS, LATENCY_S = 10, 0.1
-"""A view every 0.2 s; what it gives reaches the filter so late."""
+LATENCY_S = 0.1
+"""What a view gives reaches the filter so late."""
 GRADES = {"px4": CONSUMER, "ardupilot": CALM}
 START_STD_M, PRIOR_STD_M = 30.0, 100.0
 """Error of the position at a start without GNSS, and the deviation of every prior."""
@@ -79,6 +81,24 @@ class Scenario:
         return self.fault_s <= time_s < self.fault_s + self.lasts_s
 
 
+@dataclass(frozen=True)
+class Course:
+    """How an area is flown: height, half the sides of the rectangle that the route fills, and the
+    time between views."""
+
+    agl_m: float = 250.0
+    reach_en_m: tuple[float, float] = (REACH_M, REACH_M)
+    view_s: float = 0.2
+
+    @property
+    def corners_ne_m(self) -> Array:
+        """Corners (N, 2) of the route, north and east."""
+        return (ROUTE_EN_M * self.reach_en_m / REACH_M)[:, ::-1]
+
+
+DEMO_COURSE = Course()
+
+
 @dataclass(frozen=True, eq=False)
 class Sample:
     """The autopilot at one exposure: true and estimated motion, and its claimed std, m."""
@@ -95,8 +115,8 @@ class Located:
 
     `tilt_off_m` (2,): displacement, ahead and right, that the error of the stated tilt makes of a
     fix that trusts it. `error_m` (2,): of the fix, ahead and right, NaN without one. `nees`: by its
-    covariance. `is_wrong`: see `replays`. `sent_std_m`: as stated in the message, NaN where none
-    was sent.
+    covariance. `level_m`: its protection level, infinite without a fix. `is_wrong`: see `replays`.
+    `sent_std_m`: as stated in the message, NaN where none was sent.
     """
 
     time_s: float
@@ -104,6 +124,7 @@ class Located:
     error_m: Array
     tilt_off_m: Array
     nees: float
+    level_m: float
     is_wrong: bool
     sent_std_m: float
 
@@ -125,13 +146,13 @@ class Flown:
 class Route:
     """The point ahead on the route that is steered to."""
 
-    def __init__(self) -> None:
-        self._leg = 0
+    def __init__(self, course: Course) -> None:
+        self._corners_ne_m, self._leg = course.corners_ne_m, 0
 
     def carrot_ne(self, place_ne: Array) -> Array | None:
         """North and east (2,) of it, by the estimated position."""
-        count = len(ROUTE_EN_M)
-        begin, end = ROUTE_EN_M[self._leg, ::-1], ROUTE_EN_M[(self._leg + 1) % count, ::-1]
+        corners, count = self._corners_ne_m, len(self._corners_ne_m)
+        begin, end = corners[self._leg], corners[(self._leg + 1) % count]
         length = float(np.hypot(*(end - begin)))
         along = float((place_ne - begin) @ (end - begin)) / length
         if along > length - CORNER_M:
@@ -145,19 +166,19 @@ class Sight:
 
     def __init__(
         self,
-        demo: Demo,
+        area: Area,
         scenario: Scenario,
         rule: Callable[[Telemetry, bool], Telemetry],
         seed: int,
     ) -> None:
-        self._demo, self._scenario, self._rule, self._seed = demo, scenario, rule, seed
-        self._tracker, self.gate = Tracker(demo.localizer), Gate(clock=Clock.BOOT)
+        self._area, self._scenario, self._rule, self._seed = area, scenario, rule, seed
+        self._tracker, self.gate = Tracker(area.localizer), Gate(clock=Clock.BOOT)
         self._frozen, self._covariance = FrozenCheck(), FilterCovariance()
         self._before: Grey | None = None
 
     @property
     def frame(self) -> LocalFrame:
-        return self._demo.frame
+        return self._area.frame
 
     def look(
         self, time_s: float, truth: Motion, estimate: Motion, *, gnss: bool
@@ -199,7 +220,7 @@ class Sight:
         place = truth.position[[1, 0]] + [300.0 if fault == "shifted" else 0.0, 0.0]
         rng = np.random.default_rng([self._seed, round(time_s * 1e3)])
         height_m = float(-truth.position[2])
-        grey = self._demo.picture(place, (yaw, pitch, roll), height_m, rng)
+        grey = self._area.picture(place, (yaw, pitch, roll), height_m, rng)
         self._before = np.ascontiguousarray(grey[:, ::-1]) if fault == "mirrored" else grey
         return self._before
 
@@ -211,7 +232,7 @@ class Sight:
         outcome: Fix | NoFix,
         stated: NavigationEstimate | None,
     ) -> Located:
-        error, nees, wrong = np.full(2, np.nan), math.nan, False
+        error, nees, level_m, wrong = np.full(2, np.nan), math.nan, math.inf, False
         yaw, _, _ = euler_rad(truth.rotation)
         ahead_right = about(2, yaw)[:2, :2].T
         if isinstance(outcome, Fix):
@@ -219,6 +240,7 @@ class Sight:
             off = place - truth.position[[1, 0]]
             nees = float(off @ np.linalg.solve(outcome.cov_en_m2, off))
             error = ahead_right @ off[::-1]
+            level_m = outcome.protection_level_m()
             wrong = is_wrong(float(np.hypot(*off)), outcome.cov_en_m2)
         return Located(
             time_s,
@@ -226,6 +248,7 @@ class Sight:
             error,
             ahead_right @ _tilt_off_m(truth, estimate),
             nees,
+            level_m,
             wrong,
             math.nan if stated is None else stated.horizontal_std_m(),
         )
@@ -249,29 +272,31 @@ def _tilt_off_m(truth: Motion, estimate: Motion) -> Array:
 
 def fly(
     scenario: Scenario,
-    demo: Demo | None,
+    area: Area | None,
     *,
     vehicle: str,
     autopilot: str,
     seed: int,
     rule: Rule,
     grade: Grade | None = None,
+    course: Course = DEMO_COURSE,
 ) -> Flown:
     """Fly a scenario with a vehicle of `VEHICLES` and a filter of `FILTERS`.
 
-    `demo` is needed where orthonav sends. `rule`: deviations of the telemetry (`replays.Rule`).
+    `area` is needed where orthonav sends. `rule`: deviations of the telemetry (`replays.Rule`).
     """
     rng = np.random.default_rng([seed, 3])
     wind = Wind(rng, np.array([*(WIND_MPS * _direction(rng)), 0.0]))
-    place = np.array([*ROUTE_EN_M[0, ::-1], -AGL_M])
+    place = np.array([*course.corners_ne_m[0], -course.agl_m])
     aircraft: Vehicle = VEHICLES[vehicle](rng, place, 0.0)
     aircraft.step(wind.next())
     instruments = Instruments(rng, grade or GRADES[autopilot])
     estimator = _started(rng, aircraft, instruments, autopilot, scenario.gnss_s > 0)
     sight = None
-    if scenario.send is not None and demo is not None:
-        sight = Sight(demo, scenario, partial(rule, autopilot), seed)
-    flown, route = Flown(scenario), Route()
+    if scenario.send is not None and area is not None:
+        sight = Sight(area, scenario, partial(rule, autopilot), seed)
+    flown, route = Flown(scenario), Route(course)
+    view_steps = round(course.view_s / STEP_S)
     for step in range(round(scenario.seconds / STEP_S)):
         time_s = step * STEP_S
         gnss = time_s < scenario.gnss_s
@@ -280,8 +305,8 @@ def fly(
             carrot_ne = route.carrot_ne(estimate.position[:2])
             if estimator.is_alone and not aircraft.has_airspeed:
                 carrot_ne = None  # the failsafe of a vehicle that does not know its velocity
-            aircraft.steer(estimate, carrot_ne, AGL_M)
-        if step % VIEW_STEPS == 0:
+            aircraft.steer(estimate, carrot_ne, course.agl_m)
+        if step % view_steps == 0:
             truth = aircraft.motion
             claimed_m = math.sqrt(float(np.diag(estimator.covariance)[6:8].mean()))
             flown.samples.append(Sample(time_s, truth, estimate, claimed_m))
@@ -448,12 +473,12 @@ def cells(flown: Flown) -> list[str]:
 
 def measure(options: argparse.Namespace) -> Section:
     """All scenarios of a vehicle with a filter, or only some, each with each seed."""
-    demo, rows = Demo(options.work), []
+    area, rows = Area.demo(options.work), []
     for seed in options.seed:
         for name in options.only or SCENARIOS:
             flown = fly(
                 scenario(name, options.minutes, options.send),
-                demo,
+                area,
                 vehicle=options.vehicle,
                 autopilot=options.filter,
                 seed=seed,

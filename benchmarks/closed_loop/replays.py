@@ -59,14 +59,25 @@ Angles = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Demo:
-    """The area of `orthonav demo`; its map lies in a folder of work."""
+class Area:
+    """A map of one date and pictures of another; the map lies in a folder of work.
 
+    `mount_deg`: unreported pitch and roll of the camera in the body.
+    """
+
+    past: Path
+    present: Path
     work: Path
+    mount_deg: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def demo(cls, work: Path) -> "Area":
+        """The area of `orthonav demo`."""
+        return cls(IMAGERY / f"{PAST}.tif", IMAGERY / f"{PRESENT}.tif", work)
 
     @cached_property
     def localizer(self) -> Localizer:
-        return Localizer(open_map(map_of(IMAGERY / f"{PAST}.tif", self.work)))
+        return Localizer(open_map(map_of(self.past, self.work)))
 
     @property
     def frame(self) -> LocalFrame:
@@ -74,13 +85,15 @@ class Demo:
 
     @cached_property
     def _ground(self) -> Ground:
-        return Ground(IMAGERY / f"{PRESENT}.tif", self.localizer)
+        return Ground(self.present, self.localizer)
 
     def picture(
         self, place_en_m: Array, attitude_deg: Angles, agl_m: float, rng: np.random.Generator
     ) -> Grey:
         """What the camera sees at a place (2,), with heading, pitch and roll, and a height."""
-        return self._ground.picture(place_en_m, attitude_deg, agl_m, rng, CAMERA, EFFECTS)
+        yaw, pitch, roll = attitude_deg
+        angles = yaw, pitch + self.mount_deg[0], roll + self.mount_deg[1]
+        return self._ground.picture(place_en_m, angles, agl_m, rng, CAMERA, EFFECTS)
 
 
 GROUND_AMSL_M = 40.0
@@ -185,12 +198,12 @@ class Recorded:
             yield exposure, replace(telemetry, prior=Prior(lat, lon, PRIOR_STD_M))
 
     def views(
-        self, demo: Demo, cache: Path, rule: Callable[[Telemetry, bool], Telemetry]
+        self, area: Area, cache: Path, rule: Callable[[Telemetry, bool], Telemetry]
     ) -> Iterator[tuple[Exposure, View]]:
         """Exposures and their views. `rule`: sets the deviations of the telemetry, given whether
         GNSS is on."""
         for exposure, telemetry in self.stated():
-            grey = _shown(demo, exposure, cache / self.folder.name)
+            grey = _shown(area, exposure, cache / self.folder.name)
             yield exposure, View(grey, CAMERA, rule(telemetry, exposure.phase == ON))
 
 
@@ -203,16 +216,16 @@ def _give(buffer: TelemetryBuffer, time_ns: int, value: dict[str, float]) -> Non
     buffer.add_local(time_ns, velocity, -value["home_m"])
 
 
-def _shown(demo: Demo, exposure: Exposure, cache: Path) -> Grey:
+def _shown(area: Area, exposure: Exposure, cache: Path) -> Grey:
     """The picture of an exposure, rendered once."""
     path = cache / f"{exposure.number:04d}.jpg"
     if not path.is_file():
         cache.mkdir(parents=True, exist_ok=True)
         rng = np.random.default_rng([1, exposure.number])
-        place = demo.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
+        place = area.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
         if exposure.phase == SHIFTED:
             place = place + SHIFT_EN_M
-        grey = demo.picture(place, exposure.attitude_deg, exposure.agl_m, rng)
+        grey = area.picture(place, exposure.attitude_deg, exposure.agl_m, rng)
         if exposure.phase == MIRRORED:
             grey = np.asarray(grey[:, ::-1])
         cv2.imwrite(str(path), grey, (cv2.IMWRITE_JPEG_QUALITY, EFFECTS.jpeg_quality))
@@ -312,15 +325,15 @@ def replay(
     `rule` sets the deviations of the telemetry. `views`: only the first so many without GNSS.
     Without `disturbed` the flight ends before the first disturbance of the camera.
     """
-    recorded, demo = Recorded(flight), Demo(work)
+    recorded, area = Recorded(flight), Area.demo(work)
     locators: dict[str, Locator] = {
-        "single": SingleViews(demo.localizer),
-        "track": Tracker(demo.localizer),
+        "single": SingleViews(area.localizer),
+        "track": Tracker(area.localizer),
     }
     gates = {name: Gate(clock=Clock.BOOT) for name in methods}
     autopilot, _, _ = flight.name.partition("_")
     rows, alone = [], 0
-    for exposure, view in recorded.views(demo, work / "views", partial(rule, autopilot)):
+    for exposure, view in recorded.views(area, work / "views", partial(rule, autopilot)):
         alone += exposure.phase == OFF
         too_late = not disturbed and exposure.phase not in (ON, OFF)
         if too_late or (views is not None and alone > views):
@@ -330,13 +343,13 @@ def replay(
         for name in methods:
             if name != "track" and exposure.phase == ON:
                 continue  # the track begins with GNSS; single views are judged without it
-            rows.append(_row(recorded, demo, name, locators[name], gates[name], exposure, view))
+            rows.append(_row(recorded, area, name, locators[name], gates[name], exposure, view))
     return rows
 
 
 def _row(
     recorded: Recorded,
-    demo: Demo,
+    area: Area,
     method: str,
     locator: Locator,
     gate: Gate,
@@ -350,8 +363,8 @@ def _row(
     error = cov = None
     confidence, velocity_off = 0.0, np.nan
     if isinstance(outcome, Fix):
-        place = demo.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
-        error = place - demo.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
+        place = area.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
+        error = place - area.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
         cov, confidence = outcome.cov_en_m2, outcome.confidence
         own = [outcome.evidence.get(f"vel_{axis}_mps", np.nan) for axis in ("east", "north")]
         velocity_off = float(np.hypot(*(own - recorded.velocity_en_mps(exposure.time_s))))
