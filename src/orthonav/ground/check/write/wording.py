@@ -4,9 +4,8 @@ import math
 import textwrap
 from collections.abc import Callable
 
-from orthonav.ground.check.findings import percent
 from orthonav.ground.check.records import CheckResult, Conditions, Outage, Range, Word, summarize
-from orthonav.ground.report import aligned, metres_text
+from orthonav.ground.report import aligned, metres_text, percent_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -101,30 +100,48 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
 def key_figures(result: CheckResult) -> list[tuple[str, str]]:
     """Values and what they are, of page and terminal."""
     flights, limit = result.flights, metres_text(result.conditions.alert_limit_m)
+    median, between = probability_text(result.mean.median), _ends(result.mean, probability_text)
+    mean = (median, f"mean probability of a fix per view ({between})")
     if flights is None:
         shown = [
-            (percent(result.mean), f"mean probability of a fix over {result.area_km2:.3g} km²"),
+            mean,
+            (f"{result.area_km2:.3g} km²", "checked"),
             (metres_text(summarize(result)["error_m"]), "expected error of a correct fix"),
             (str(int(result.cells.trials.sum())), "trial views"),
         ]
     else:
         given = "" if result.conditions.limit_given else ", the default"
-        median, _, high = flights.false_fix
+        available, outage_m, outage_s = flights.availability, flights.outage_m, flights.outage_s
+        error, wrong = flights.error_95_m, flights.false_fix
         shown = [
-            (percent(flights.availability), f"availability (alert limit {limit}{given})"),
-            (_between(flights.outage_m, metres_text), "longest outage"),
-            (_between(flights.outage_s, seconds_text), "the same in time"),
-            (_between(flights.error_95_m, metres_text), "largest position error (95 %)"),
-            (f"{100 * median:.1f} % (up to {100 * high:.1f} %)", "probability of a false fix"),
-            (percent(flights.probability), "mean probability of a fix per view"),
+            (
+                probability_text(available.median),
+                f"availability ({_ends(available, probability_text)}) at the alert limit of {limit}"
+                f"{given}",
+            ),
+            (
+                seconds_text(outage_s.median),
+                f"longest outage ({_ends(outage_s, seconds_text)}), "
+                f"{metres_text(outage_m.median)} ({_ends(outage_m, metres_text)})",
+            ),
+            (
+                metres_text(error.median),
+                f"largest position error, 95 % ({_ends(error, metres_text)})",
+            ),
+            (
+                percent_text(wrong.median),
+                f"probability of a false fix on this route ({_ends(wrong, percent_text)})",
+            ),
+            mean,
         ]
     near = sum(each.within_prior for each in result.lookalikes)
     pairs = f"pairs of ambiguous places, {near} within the prior"
     return [*shown, (str(len(result.lookalikes)), pairs)]
 
 
-def _between(figure: Range, as_text: Callable[[float], str]) -> str:
-    return f"{as_text(figure.median)} ({as_text(figure.low)} to {as_text(figure.high)})"
+def _ends(figure: Range, as_text: Callable[[float], str]) -> str:
+    """Its 80 % interval."""
+    return f"{as_text(figure.low)} to {as_text(figure.high)}"
 
 
 def text(result: CheckResult) -> str:

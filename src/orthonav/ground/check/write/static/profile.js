@@ -44,8 +44,8 @@ class Profile extends Chart {
     this.rules(context, levels, this.levelY, this.colour("line"), { text: (v) => `${v} m` });
     this.area(context, xs, route.protection_m, route.protection_high_m, this.levelY, "rgb(213 94 0 / 22%)", bottom);
     this.rules(context, [limit], this.levelY, this.colour("strong"), { dash: [5, 3] });
-    this.label(context, `alert limit ${metres(limit)}`, this.right - 4, this.levelY(limit) - 5, "right");
     this.line(context, xs, route.protection_m, this.levelY, "#d55e00");
+    this.label(context, `alert limit ${metres(limit)}`, this.right - 4, this.levelY(limit) - 5, "right");
     this.#axes(context, height);
   }
 
