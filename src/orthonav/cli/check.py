@@ -19,6 +19,8 @@ EVERYDAY = (
     *("--dem", "--alert-limit-m", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior"),
     *("--quick", "--json"),
 )
+FIRST_SHARE = 0.1
+"""Fraction of the trials from which their duration is estimated."""
 log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
@@ -104,17 +106,20 @@ def run(options: argparse.Namespace) -> int:
 
 
 class _Lines:
-    """Says on stderr every 10 s how much is done and how long the rest will take."""
+    """Says on stderr how long the check will take, and every 10 s how far it is."""
 
     def __init__(self) -> None:
-        self._start_s = time.monotonic()
-        self._next_s = self._start_s + 5
+        self._first: tuple[float, float] | None = None
+        self._next_s = 0.0
 
     def __call__(self, stage: str, share: float) -> None:
         now_s = time.monotonic()
-        if now_s < self._next_s or not 0 < share < 1:
+        if self._first is None:  # the start of the workers tells nothing
+            self._first, self._next_s = (now_s, share), now_s + 4
+        done = share - self._first[1]
+        if now_s < self._next_s or done < FIRST_SHARE or share >= 1:
             return
-        left_s = (now_s - self._start_s) * (1 - share) / share
+        left_s = (now_s - self._first[0]) * (1 - share) / done
         print(f"{stage}: {100 * share:.0f} %, about {left_s:.0f} s left", file=sys.stderr)
         self._next_s = now_s + 10
 
