@@ -142,7 +142,7 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
         "flights": flights,
         "route_en_m": waypoints,
         "band_m": band_m,
-        "outages": () if along is None else likely_outages(along, flights.available, CONDITIONS),
+        "outages": () if along is None else likely_outages(along, flights, CONDITIONS),
         "lookalikes": lookalikes,
     }
     return CheckResult(frame=frame, cells=cells, **{**parts, **changed})

@@ -1,6 +1,7 @@
 """Along a route: probability, simulated flights, outages."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import made_trials
 import numpy as np
@@ -95,7 +96,8 @@ GOOD, BAD = [1.0] * 8, [0.2] * 12
 )
 def test_where_outages_begin_and_end(available, expected):
     along = along_of(np.full(len(available), 0.8))
-    found = likely_outages(along, np.array(available), CONDITIONS)
+    flown = SimpleNamespace(available=np.array(available))
+    found = likely_outages(along, flown, CONDITIONS)
     assert [(each.start_m, each.end_m) for each in found] == expected
     assert all(each.available == pytest.approx(0.2) for each in found)
 

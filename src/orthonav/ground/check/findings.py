@@ -138,11 +138,9 @@ def predicted_along(
     )
 
 
-def likely_outages(along: Along, available: Array, conditions: Conditions) -> tuple[Outage, ...]:
-    """Stretches of at least half a side of a view where most flights have no available position.
-
-    `available` (N,): fraction of the flights that have one at the points of the route.
-    """
+def likely_outages(along: Along, flights: Flights, conditions: Conditions) -> tuple[Outage, ...]:
+    """Stretches of at least half a side of a view where most flights have no available position."""
+    available = flights.available
     out = np.concatenate([[False], available < LIKELY_OUTAGE, [False]]).astype(int)
     last = len(available) - 1
     found = []

@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,10 +37,7 @@ from orthonav.ground.check.records import (
     CheckRequest,
     CheckResult,
     Conditions,
-    Flights,
-    Lookalike,
     Range,
-    Verdict,
 )
 from orthonav.ground.check.trials import (
     MIN_VALID,
@@ -117,6 +114,7 @@ class _Check:
             require_overlap(request.other_date, self.sheet)
         self.extent = self.coverage.extent_en_m if self.area is None else self.area.extent_en_m
         self.checked_m2 = checked_m2(self.coverage, self.area)
+        self.wanted = self._limited(0.0)
 
     def _require_views(self) -> None:
         footprint = self.conditions.footprint_text
@@ -151,51 +149,27 @@ class _Check:
         return Area(self.sheet.frame, extent, route, half * 2)
 
     def result(self) -> CheckResult:
-        request, frame = self.request, self.sheet.frame
-        found = self._judged_trials()
-        along, flights = found.along, found.flights
-        known = np.isfinite(found.cells.probability)
-        return CheckResult(
-            about=replace(request.about, map_sha256=self.opened.manifest.sha256),
-            conditions=self.conditions,
-            frame=frame,
-            cells=found.cells,
-            verdict=found.verdict,
-            area_km2=float(known.sum()) * found.cells.side_m**2 / 1e6,
-            mean=found.mean,
-            second_date=request.other_date is not None,
-            along=along,
-            flights=flights,
-            route_en_m=None if request.route is None else request.route.points_en_m(frame),
-            band_m=None if self.area is None else self.area.band_m,
-            outages=()
-            if along is None or flights is None
-            else likely_outages(along, flights.available, self.conditions),
-            lookalikes=found.lookalikes,
-        )
-
-    def _judged_trials(self) -> "_Judged":
-        """Trials, until more of them would not change the answer, and what they say."""
-        request, effort = self.request, self.request.effort
+        """What trials say, made until more of them would not change the answer."""
+        request = self.request
         workers = request.workers or usable_cores()
         own: list[Trial] = []
         other: list[Trial] = []
-        judged, words = None, []
-        tried, self.wanted = 0, self.fewest
+        result, tried = None, 0
         trials = run_trials(request, self.conditions, self._batches(), workers, self._show)
         with closing(trials):
             for count, mine, others in trials:
                 own, other, tried = [*own, *mine], [*other, *others], tried + count
                 if len(own) < MIN_VIEWS:
                     continue
-                judged = self._judged(own, other)
-                words.append(judged.verdict.word)
-                aim = PRECISE * judged.predictor.scenes_std / math.sqrt(effort)
-                self.wanted = self._limited(tried * (judged.predictor.mean_std / aim) ** 2)
-                if tried >= self.wanted and len(set(words[-2:])) == 1:
+                before, predictor = result, self._predictor(own, other)
+                result = self._judged(predictor, own, other)
+                aim = PRECISE * predictor.scenes_std / math.sqrt(request.effort)
+                self.wanted = self._limited(tried * (predictor.mean_std / aim) ** 2)
+                same = before is not None and before.verdict.word is result.verdict.word
+                if same and tried >= self.wanted:
                     break
         self.progress("trials", 1.0)
-        if judged is None:
+        if result is None:
             raise AreaError(
                 f"only {len(own)} of {tried} trial views fit on the map: "
                 f"{self.conditions.footprint_text}; fly lower, or build a larger map"
@@ -205,20 +179,17 @@ class _Check:
                 "the orthophoto of the other date does not cover the checked area: "
                 f"{request.other_date}"
             )
-        return judged
+        return result
 
     def _show(self, done: int) -> None:
         self.progress("trials", min(done / self.wanted, 0.99))
 
-    @property
-    def fewest(self) -> int:
-        return self._limited(TRIALS_PER_VIEW * self.checked_m2 / self.conditions.side_m**2)
-
     def _limited(self, trials: float) -> int:
-        """A number of trials within what the effort allows."""
-        effort = self.request.effort
-        least, most = (max(each * effort, FEWEST_TRIALS) for each in (MIN_TRIALS, MAX_TRIALS))
-        return round(float(np.clip(trials, least, most)))
+        """A number of trials within what area and effort ask for."""
+        least = max(MIN_TRIALS, TRIALS_PER_VIEW * self.checked_m2 / self.conditions.side_m**2)
+        ends = (min(least, MAX_TRIALS), MAX_TRIALS)
+        least, most = (max(each * self.request.effort, FEWEST_TRIALS) for each in ends)
+        return round(min(max(trials, least), most))
 
     def _batches(self) -> Iterator[Array]:
         """Places of trials, every batch spread over all of the checked area."""
@@ -229,40 +200,52 @@ class _Check:
             yield trial_places(self.coverage, self.area, self.extent, self.checked_m2, count, rng)
             done += count
 
-    def _judged(self, own: Sequence[Trial], other: Sequence[Trial]) -> "_Judged":
-        conditions = self.conditions
-        predictor = self._predictor(own, other)
+    def _judged(
+        self, predictor: Predictor, own: Sequence[Trial], other: Sequence[Trial]
+    ) -> CheckResult:
+        request, conditions, frame = self.request, self.conditions, self.sheet.frame
         cells, along = self._cells(predictor, own), self._along(predictor)
         shifts = scene_shifts(math.hypot(predictor.scenes_std, predictor.mean_std))
-        lookalikes = found_lookalikes([*own, *other], self.sheet.frame, conditions)
         wrong, flights, outside = int(predictor.wrong.sum()), None, 0.0
         known = np.isfinite(cells.probability)
-        errors_m = (cells if along is None else along).error_m
-        usual_m = float(np.nanmedian(errors_m)) if np.isfinite(errors_m).any() else math.inf
         if along is not None:
-            rng = np.random.default_rng([self.request.seed, 5])
+            rng = np.random.default_rng([request.seed, 5])
             flights = simulated(along.distance_m, along, conditions, shifts, wrong, rng)
             outside = float(np.mean(~self.coverage.covers(along.points_en_m)))
-            mean = flights.probability
-        elif not known.any():
-            mean = Range(0.0, 0.0, 0.0)
-        else:
-            mean = Range.of(shifted(cells.probability[known], shifts).mean(axis=1))
+        chances = cells.probability[known] if known.any() else np.zeros(1)
+        mean = Range.of(shifted(chances, shifts).mean(axis=1))
+        errors_m = (cells if along is None else along).error_m
+        error_m = float(np.nanmedian(errors_m)) if np.isfinite(errors_m).any() else math.inf
         findings = Findings(
-            mean=mean,
+            mean=flights.probability if flights else mean,
             flights=flights,
             conditions=conditions,
-            lookalikes=lookalikes,
+            lookalikes=found_lookalikes([*own, *other], frame, conditions),
             calibrated=self.calibrated,
             wrong=wrong,
             trials=len(own) + len(other),
             outside=outside,
             changed=float(cells.changed[known].mean()) if known.any() else 0.0,
-            after_fix_m=float(level_m(usual_m, conditions.risk)),
+            after_fix_m=float(level_m(error_m, conditions.risk)),
             view_px=conditions.side_m / self.sheet.grid.gsd_m,
             second_date=bool(other),
         )
-        return _Judged(predictor, cells, along, flights, mean, lookalikes, verdict_of(findings))
+        return CheckResult(
+            about=replace(request.about, map_sha256=self.opened.manifest.sha256),
+            conditions=conditions,
+            frame=frame,
+            cells=cells,
+            verdict=verdict_of(findings),
+            area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
+            mean=findings.mean,
+            second_date=bool(other),
+            along=along,
+            flights=flights,
+            route_en_m=None if request.route is None else request.route.points_en_m(frame),
+            band_m=None if self.area is None else self.area.band_m,
+            outages=likely_outages(along, flights, conditions) if along and flights else (),
+            lookalikes=findings.lookalikes,
+        )
 
     def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:
         request, side_m = self.request, self.conditions.side_m
@@ -338,18 +321,6 @@ class _Check:
         return predicted_along(
             self.area, self.conditions, lambda at: self._predict(predictor, at, covers(at))
         )
-
-
-class _Judged(NamedTuple):
-    """What trials say."""
-
-    predictor: Predictor
-    cells: Cells
-    along: Along | None
-    flights: Flights | None
-    mean: Range
-    lookalikes: tuple[Lookalike, ...]
-    verdict: Verdict
 
 
 @dataclass(frozen=True, eq=False)

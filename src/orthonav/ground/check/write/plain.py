@@ -32,8 +32,6 @@ Array = NDArray[np.float64]
 Plain = dict[str, Any]
 
 
-FLOWN = ("available", "protection_m", "protection_high_m")
-"""Columns of the points of the route that the simulated flights give."""
 RISKS = {"confident": CONFIDENT, "likely": 0.7, "doubtful": 0.5, "unlikely": 0.0}
 """Classes of places along the route, and the lowest probability of each."""
 
@@ -118,7 +116,9 @@ def _route_to_plain(result: CheckResult) -> Plain | None:
         "lat_deg": lat,
         "lon_deg": lon,
         **{name: getattr(along, name) for name in names},
-        **{name: getattr(flights, name) for name in FLOWN},
+        "available": flights.available,
+        "protection_m": flights.protection_m,
+        "protection_high_m": flights.protection_high_m,
     }
     return {
         **to_plain({"name": result.about.route_name, "band_m": result.band_m}, BY_UNIT),
