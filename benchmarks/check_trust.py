@@ -36,7 +36,7 @@ from benchmarks.scenes import (
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
-from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration, expit, logit
+from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration
 from orthonav.ground.check.findings import FIXES, MOST_UNCERTAIN
 from orthonav.ground.check.flights import scene_shifts, shifted
 from orthonav.ground.check.records import CheckRequest, Range
@@ -48,10 +48,12 @@ NAME = "check_trust"
 WIDTHS_PX = (256, 160, 112)
 PRIOR_PX, EFFORT = 60.0, 0.05
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
-STDS, STDS_NARROW = np.arange(2, 31, 2) / 10, np.arange(0, 21, 2) / 10
+STDS, STDS_NARROW = np.arange(4, 25, 2) / 10, np.arange(0, 15, 2) / 10
 """Standard deviations between scenes, and what a halving of the width adds, that are compared."""
 RIDGE = Recalibration(0.1, 2.0, 0.5, 0.5, 0.0)
 """Ridge of the fit, per unit of the mean log likelihood, over 100."""
+HOLDS, MISSED = 0.8, 100.0
+"""Wanted fraction of intervals that hold, and the weight of what is missing of it."""
 Array = NDArray[np.float64]
 
 
@@ -216,30 +218,23 @@ def _recalibration(values: Array) -> Recalibration:
 
 
 def _between_scenes(found: Sequence[Outcome], by: Recalibration) -> tuple[float, float]:
-    """Standard deviation of the logit of measured less predicted, beyond that of few views, and
-    what every halving of the width adds to it.
+    """Standard deviation of the logit between scenes, and what every halving of the width adds.
 
-    The likeliest one, if the logit of each condition differs from the predicted one by a normal
-    deviate and views come out right independently.
+    Those of the narrowest intervals that hold in 80 % of the conditions of every width of views.
     """
-    nodes, weights = np.polynomial.hermite_e.hermegauss(41)
-    weights = weights / weights.sum()
+    above = [each for each in found if each.right]
 
-    def likelihood(stds: tuple[float, float]) -> float:
-        spread, total = replace(by, std=stds[0], std_narrow=stds[1]), 0.0
-        for each in found:
-            if not each.right:
-                continue
-            middle = logit(each.predicted(by))
-            shifts = spread.std_of(each.side_px) * nodes[:, None]
-            share = np.clip(expit(middle + shifts).mean(axis=1), 1e-4, 1 - 1e-4)
-            right = sum(each.right)
-            chance = share**right * (1 - share) ** (len(each.right) - right)
-            total += math.log(float(weights @ chance))
-        return total
+    def width(stds: tuple[float, float]) -> float:
+        spread = replace(by, std=stds[0], std_narrow=stds[1])
+        held: dict[int, list[bool]] = {}
+        for each in above:
+            held.setdefault(each.width_px, []).append(each.holds(spread))
+        missing = sum(max(0.0, HOLDS - float(np.mean(each))) for each in held.values())
+        means = [each.mean(spread) for each in above]
+        return missing * MISSED + float(np.mean([mean.high - mean.low for mean in means]))
 
     every = [(float(std), float(narrow)) for std in STDS for narrow in STDS_NARROW]
-    return max(every, key=likelihood)
+    return min(every, key=width)
 
 
 def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]:
