@@ -162,7 +162,7 @@ class Predictor:
     def mean_std(self) -> float:
         """Standard error of the logit of the predicted mean chance, by the number of trials."""
         count = len(self.right)
-        mean = min(max((int(self.right.sum()) + 0.5) / (count + 1), 0.02), 0.98)
+        mean = min(max((int(self.right.sum()) + 0.5) / (count + 1), 0.05), 0.95)
         low, high = logit(self._recalibrated(np.array([mean - 0.01, mean + 0.01])))
         return float(high - low) / 0.02 * math.sqrt(mean * (1 - mean) / (count + 1))
 

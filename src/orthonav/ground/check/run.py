@@ -62,8 +62,8 @@ CELLS_PER_VIEW = 4.0
 BATCH, BATCH_SHARE = 32, 0.34
 """Trials of a batch: at least so many, and this fraction of those before."""
 MIN_TRIALS, MAX_TRIALS = 96, 1500
-TRIALS_PER_VIEW = 0.25
-"""Trials per area of a view that are made in any case: one for two views by two."""
+TRIALS_PER_VIEW = 0.2
+"""Trials per area of a view that are made in any case."""
 FEWEST_TRIALS = 40
 PRECISE = 0.25
 """Enough trials: the standard error of the mean chance is this fraction of the deviation from scene
