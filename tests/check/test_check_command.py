@@ -9,6 +9,7 @@ from made_trials import lost, right
 
 from helpers import write_dem
 from orthonav.cli import main
+from orthonav.cli.check import _Lines
 from orthonav.core.errors import AreaError, CameraError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
@@ -124,6 +125,11 @@ def test_a_route_over_both_halves(checked, frame):
     assert west == pytest.approx(-450, abs=1) and cells.north_m == pytest.approx(100, abs=1)
     corners = cells.probability[[0, 0, -1, -1], [0, -1, 0, -1]]
     assert np.isnan(corners).all()  # of the box, outside the round ends of the band
+
+
+def test_trials_end_when_the_answer_holds(checked):
+    few, many = (checked(effort=each).cells.trials.sum() for each in (0.25, 1.0))
+    assert 20 <= few < many < 500
 
 
 @pytest.mark.parametrize(
@@ -294,6 +300,17 @@ def test_bad_input_is_one_line(run, half_blank, tmp_path, names_in, options, sai
     assert done.code == 1 and done.out == "" and done.err.count("\n") == 1
     assert done.err.startswith("orthonav: error: ") and said in done.err
     assert names_in(tmp_path) == []
+
+
+def test_the_time_left_is_said_without_a_terminal(monkeypatch, capsys):
+    now = iter(range(0, 400, 3))
+    monkeypatch.setattr("orthonav.cli.check.time.monotonic", lambda: float(next(now)))
+    lines = _Lines()
+    for done in range(1, 101):
+        lines("trials", done / 100)
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "trials: 11 %, about 267 s left" and said[1].startswith("trials: 15 %")
+    assert len(said) == 23
 
 
 def test_an_interrupt_writes_nothing(run, half_blank, tmp_path, names_in, monkeypatch):

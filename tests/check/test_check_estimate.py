@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_trials import lost, misplaced, right
 
-from orthonav.ground.check.estimate import Predictor
+from orthonav.ground.check.estimate import LEARNT, Predictor
 
 SIDE_M = 1000.0
 
@@ -78,3 +78,7 @@ def test_error_of_fixes():
     assert predictor(trials, least_error_m=4.0).at(WEST).error_m[0] == pytest.approx(5.0)
     stated = [replace(each, stated_m=12.0) for each in trials]
     assert predictor(stated).at(WEST).error_m[0] == pytest.approx(12.0)
+
+
+def test_scenes_differ_more_for_narrow_views():
+    assert LEARNT.std_of(64) > LEARNT.std_of(128) > LEARNT.std_of(256) == LEARNT.std_of(400)
