@@ -101,6 +101,8 @@ MIN_WEIGHT, WIDER = 0.05, 4.0
 MIN_REGRESSION = 20
 """Fewer trials than this do not support a regression."""
 RIDGE = 1e-2
+MOST_STATED = 2.0
+"""An error counts as at most so many times what its covariance states."""
 UNSEEN_WRONG, UNSEEN_TRIALS = 0.05, 500.0
 """False fixes that are presumed in so many trials more: of some 4,600 views of other dates none was
 a false fix."""
@@ -146,9 +148,11 @@ class Predictor:
         """
         every = [*trials, *other_date]
         self._points = np.array([each.en_m for each in every], np.float64).reshape(-1, 2)
-        # A fix may be better than its covariance by chance: the larger one counts.
-        errors = [(each.error_m, each.stated_m) for each in every]
-        self._error = np.fmax(*np.array(errors, np.float64).reshape(-1, 2).T)
+        # A fix may be better than its covariance by chance. The protection level allows for tails:
+        # they do not count twice.
+        errors = np.array([(each.error_m, each.stated_m) for each in every], np.float64)
+        error, stated = errors.reshape(-1, 2).T
+        self._error = np.fmin(np.fmax(error, stated), MOST_STATED * stated)
         self.right = np.array([each.right for each in every], np.bool_)
         self.wrong = np.array([each.wrong for each in every], np.bool_)
         self._weight = np.array([1.0] * len(trials) + [OTHER_DATE_WEIGHT] * len(other_date))
@@ -210,7 +214,9 @@ class Predictor:
         years = INTERVAL_SIGMAS * self.scenes_std
         squares = np.where(self.right, np.nan_to_num(self._error) ** 2, 0.0)
         overall = float(squares.sum() / max(self.right.sum(), 1))
-        square_error = (near @ squares + overall) / (near @ self.right + 1.0)
+        square_error = (near @ squares + PRIOR_TRIALS * overall) / (
+            near @ self.right + PRIOR_TRIALS
+        )
         overall_wrong = float(np.average(self.wrong, weights=self._weight))
         unseen_wrong = UNSEEN_WRONG / (float(self._weight.sum()) + UNSEEN_TRIALS)
         return Prediction(
