@@ -36,9 +36,10 @@ from benchmarks.scenes import (
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
-from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration, expit, logit
-from orthonav.ground.check.findings import GO_LOW, NARROW_PX
-from orthonav.ground.check.records import CheckRequest
+from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration
+from orthonav.ground.check.findings import FIXES, MOST_UNCERTAIN
+from orthonav.ground.check.flights import scene_shifts, shifted
+from orthonav.ground.check.records import CheckRequest, Range
 from orthonav.ground.check.run import check_map
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 from orthonav.onboard.run import SingleViews, locate_view
@@ -47,12 +48,12 @@ NAME = "check_trust"
 WIDTHS_PX = (256, 160, 112)
 PRIOR_PX, EFFORT = 60.0, 0.05
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
-SPREAD = 1.2816
-"""Standard deviations of the logit from the middle to the ends of an 80 % interval."""
-STDS = np.arange(1, 31) / 10
-"""Standard deviations between scenes that are compared."""
+STDS, STDS_NARROW = np.arange(4, 25, 2) / 10, np.arange(0, 15, 2) / 10
+"""Standard deviations between scenes, and what a halving of the width adds, that are compared."""
 RIDGE = Recalibration(0.1, 2.0, 0.5, 0.5, 0.0)
 """Ridge of the fit, per unit of the mean log likelihood, over 100."""
+HOLDS, MISSED = 0.8, 100.0
+"""Wanted fraction of intervals that hold, and the weight of what is missing of it."""
 Array = NDArray[np.float64]
 
 
@@ -89,12 +90,18 @@ class Outcome:
 
     def is_go(self, by: Recalibration) -> bool:
         """Whether a check of nothing else would say *go*."""
-        is_wide = self.prior or self.side_px >= NARROW_PX
-        return is_wide and self.low(by) >= GO_LOW
+        mean = self.mean(by)
+        return mean.low >= FIXES.go and mean.high - mean.low <= MOST_UNCERTAIN
 
-    def low(self, by: Recalibration) -> float:
-        """Lower end of the 80 % interval of the mean."""
-        return float(expit(logit(self.predicted(by)) - SPREAD * by.std).mean())
+    def mean(self, by: Recalibration) -> Range:
+        """Of the predicted shares, with its interval, as a check states it."""
+        shifts = scene_shifts(by.std_of(self.side_px))
+        return Range.of(shifted(self.predicted(by), shifts).mean(axis=1))
+
+    def holds(self, by: Recalibration) -> bool:
+        """Whether the measured share is in the interval, to half a view."""
+        mean, half = self.mean(by), 0.5 / len(self.right)
+        return bool(mean.low - half <= np.mean(self.right) <= mean.high + half)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -200,7 +207,8 @@ def fitted(found: Sequence[Outcome]) -> Recalibration:
 
     values = minimize(loss, np.array(astuple(PLAIN)[:4]), method="Nelder-Mead").x
     by = _recalibration(np.round(values, 2))
-    return replace(by, std=round(_between_scenes(found, by), 2))
+    std, narrow = _between_scenes(found, by)
+    return replace(by, std=std, std_narrow=narrow)
 
 
 def _recalibration(values: Array) -> Recalibration:
@@ -209,28 +217,24 @@ def _recalibration(values: Array) -> Recalibration:
     return Recalibration(shift, slope, narrow, no_prior, 0.0)
 
 
-def _between_scenes(found: Sequence[Outcome], by: Recalibration) -> float:
-    """Standard deviation of the logit of measured less predicted, beyond that of few views.
+def _between_scenes(found: Sequence[Outcome], by: Recalibration) -> tuple[float, float]:
+    """Standard deviation of the logit between scenes, and what every halving of the width adds.
 
-    The likeliest one, if the logit of each condition differs from the predicted one by a normal
-    deviate and views come out right independently.
+    Those of the narrowest intervals that hold in 80 % of the conditions of every width of views.
     """
-    nodes, weights = np.polynomial.hermite_e.hermegauss(41)
-    weights = weights / weights.sum()
+    above = [each for each in found if each.right]
 
-    def likelihood(std: float) -> float:
-        total = 0.0
-        for each in found:
-            if not each.right:
-                continue
-            middle = logit(each.predicted(by))
-            share = np.clip(expit(middle + std * nodes[:, None]).mean(axis=1), 1e-4, 1 - 1e-4)
-            right = sum(each.right)
-            chance = share**right * (1 - share) ** (len(each.right) - right)
-            total += math.log(float(weights @ chance))
-        return total
+    def width(stds: tuple[float, float]) -> float:
+        spread = replace(by, std=stds[0], std_narrow=stds[1])
+        held: dict[int, list[bool]] = {}
+        for each in above:
+            held.setdefault(each.width_px, []).append(each.holds(spread))
+        missing = sum(max(0.0, HOLDS - float(np.mean(each))) for each in held.values())
+        means = [each.mean(spread) for each in above]
+        return missing * MISSED + float(np.mean([mean.high - mean.low for mean in means]))
 
-    return float(max(STDS, key=likelihood))
+    every = [(float(std), float(narrow)) for std in STDS for narrow in STDS_NARROW]
+    return min(every, key=width)
 
 
 def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]:
@@ -239,41 +243,60 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
     by = {s: fitted([each for each in found if each.scene != s]) for s in scenes}
     rows = [_row(each, by[each.scene]) for each in found if each.right]
     header = (
-        *("scene, map", "views", "n", "predicted", "80 % low", "measured", "verdict alone"),
+        *("scene, map", "views", "n", "predicted", "80 % interval", "measured", "holds"),
         *("error m expected", "measured", "false"),
     )
-    gone = [each for each in found if each.right and each.is_go(by[each.scene])]
-    bad = [each for each in gone if np.mean(each.right) < GO_LOW]
     above = [each for each in found if each.right]
-    under = sum(np.mean(each.right) < each.low(by[each.scene]) for each in above)
+    gone = [each for each in above if each.is_go(by[each.scene])]
+    bad = [each for each in gone if np.mean(each.right) < FIXES.go]
     notes = (
         f"heading sd 10 deg, height sd 10 %, prior {PRIOR_PX:g} px or none; "
         f"{options.views} views over the later date each, those beside the map left out, checks of "
         f"effort {EFFORT:g} (40 trials); recalibrated by the other scenes",
-        f"go by the low bound and the width: {len(gone)} of {len(above)}, of which {len(bad)} "
-        f"measured below {GO_LOW:g}; measured below the low bound: {under} of {len(above)}",
+        f"go by the mean chance alone: {len(gone)} of {len(above)}, of which {len(bad)} measured "
+        f"below {FIXES.go:g}",
     )
     return [
         Table("Checks and what came out", header, rows, notes),
+        _widths_table(above, by),
         _bins_table(found, lambda each: each.predicted(by[each.scene]), "by the other scenes"),
         _bins_table(found, lambda each: each.predicted(PLAIN), "without recalibration"),
     ]
 
 
 def _row(found: Outcome, by: Recalibration) -> list[str]:
-    low = found.low(by)
+    mean = found.mean(by)
     return [
         f"{found.scene}, {Path(found.map).stem}",
         f"{found.width_px} px{', prior' * found.prior}",
         str(len(found.right)),
-        f"{float(found.predicted(by).mean()):.2f}" if found.right else "-",
-        f"{low:.2f}",
+        f"{mean.median:.2f}" if found.right else "-",
+        f"{mean.low:.2f} to {mean.high:.2f}" if found.right else "-",
         f"{float(np.mean(found.right)):.2f}" if found.right else "-",
-        "go" if found.is_go(by) else "not go",
+        "yes" if found.right and found.holds(by) else "no",
         f"{found.error_m:.1f}",
         f"{found.measured_m:.1f}",
         str(found.wrong),
     ]
+
+
+def _widths_table(found: Sequence[Outcome], by: dict[str, Recalibration]) -> Table:
+    """How far predictions are off, and how often intervals hold, by the width of views."""
+    rows = []
+    for width_px in (*WIDTHS_PX, None):
+        some = [each for each in found if width_px in (each.width_px, None)]
+        if not some:
+            continue
+        means = [each.mean(by[each.scene]) for each in some]
+        measured = [float(np.mean(each.right)) for each in some]
+        pairs = zip(means, measured, strict=True)
+        off = [abs(mean.median - share) for mean, share in pairs]
+        held = sum(each.holds(by[each.scene]) for each in some)
+        wide = float(np.mean([mean.high - mean.low for mean in means]))
+        name = "all" if width_px is None else f"{width_px} px"
+        rows.append([name, str(len(some)), f"{np.mean(off):.2f}", f"{wide:.2f}", f"{held}"])
+    header = ("views", "conditions", "mean error", "mean width of the interval", "intervals hold")
+    return Table("By the width of views", header, rows)
 
 
 def _bins_table(

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from orthonav.ground.check.findings import blind_stretches, expected_drift
+from orthonav.ground.check.findings import likely_outages
+from orthonav.ground.check.flights import scene_shifts, shifted, simulated
 from orthonav.ground.check.records import (
     Along,
     Cells,
@@ -12,6 +13,7 @@ from orthonav.ground.check.records import (
     CheckResult,
     Conditions,
     Lookalike,
+    Range,
     Reason,
     Verdict,
     Word,
@@ -31,12 +33,13 @@ CONDITIONS = Conditions(
     radius_m=35.0,
     speed_mps=22.0,
     drift=0.02,
+    alert_limit_m=50.0,
 )
 GO = Verdict(Word.GO, (Reason("fixes", "A fix is likely along nearly all of the route.", Word.GO),))
 NO_GO = Verdict(
     Word.NO_GO,
     (
-        Reason("lost", "In stretch 3 dead reckoning drifts farther than is allowed.", Word.NO_GO),
+        Reason("availability", "Positions are rarely available.", Word.NO_GO),
         Reason("dates", "Only the map's own date was tried.", Word.MARGINAL),
         Reason("mean", "The mean probability is high.", Word.GO),
         Reason("lookalikes", "One pair of ambiguous places costs fixes.", Word.GO),
@@ -97,15 +100,21 @@ def along_of(cells, waypoints, step_m=25.0):
         error_m=cells.error_m[rows, cols],
         wrong=cells.wrong[rows, cols],
         persistence=cells.persistence[rows, cols],
-        drift_m=expected_drift(distance, probability, cells.error_m[rows, cols], 0.02, 100.0),
     )
+
+
+def flown(along, conditions=CONDITIONS, scenes_std=0.8, false_fixes=0):
+    """Flights along the route."""
+    shifts, rng = scene_shifts(scenes_std), np.random.default_rng(1)
+    return simulated(along.distance_m, along, conditions, shifts, false_fixes, rng)
 
 
 def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", route="", **changed):
     """A check of cells, along a route where there is one."""
     along = None if waypoints is None else along_of(cells, waypoints)
-    stretches = () if along is None else blind_stretches(along, CONDITIONS)
+    flights = None if along is None else flown(along)
     known = np.isfinite(cells.probability)
+    mean = Range.of(shifted(cells.probability[known], scene_shifts(0.8)).sum(axis=1) / known.sum())
     here = frame.latlon_from_en(np.array([[0.0, 0.0], [400.0, 250.0], [-300.0, 100.0]]))
     places = list(zip(*here, strict=True))
     lookalikes = (
@@ -127,12 +136,13 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
         "conditions": CONDITIONS,
         "verdict": NO_GO,
         "area_km2": float(known.sum() * cells.side_m**2 / 1e6),
-        "mean": float(cells.probability[known].mean()) if known.any() else math.nan,
+        "mean": mean if flights is None else flights.probability,
         "second_date": True,
         "along": along,
+        "flights": flights,
         "route_en_m": waypoints,
         "band_m": band_m,
-        "stretches": stretches,
+        "outages": () if along is None else likely_outages(along, flights, CONDITIONS),
         "lookalikes": lookalikes,
     }
     return CheckResult(frame=frame, cells=cells, **{**parts, **changed})
@@ -144,11 +154,11 @@ def tiny(frame):
 
 
 def small_route(frame, **changed):
-    """A route of some kilometres that ends in a gap, in a band of 300 m."""
+    """A route of some kilometres that ends in an outage, in a band of 300 m."""
     cells = made_cells(20, 20, 50.0, seed=3)
-    cells.probability[:, 17:] = 0.2
-    cells.low[:, 17:] = 0.1
-    cells.high[:, 17:] = 0.35
+    cells.probability[:, 14:] = 0.02
+    cells.low[:, 14:] = 0.01
+    cells.high[:, 14:] = 0.04
     waypoints = np.array([(-420.0, -400.0), (-100.0, 300.0), (150.0, -350.0), (440.0, 350.0)])
     return made_check(frame, cells, waypoints, 300.0, route="north loop", **changed)
 

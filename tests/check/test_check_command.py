@@ -9,6 +9,7 @@ from made_trials import lost, right
 
 from helpers import write_dem
 from orthonav.cli import main
+from orthonav.cli.check import _Lines
 from orthonav.core.errors import AreaError, CameraError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
@@ -72,21 +73,22 @@ def test_the_half_that_shows_something_is_where_views_are_placed(tried):
     result, said = tried
     west, east = halves(result.cells)
     assert west > 0.5 and east < 0.3 and west > 2 * east
-    assert east < result.mean < west
+    assert east < result.mean.median < west
     assert {what for what, _ in said} == {"trials"} and said[-1][1] == 1.0
 
 
 # With synthetic trials.
 
 
-def made_up(request, conditions, places, workers, progress):
+def made_up(request, conditions, batches, workers, progress):
     """Views of the west are placed, those of the east and of a second date are not."""
-    own = [
-        right(tuple(place), expected=0.6) if place[0] < 0 else lost(tuple(place), expected=0.1)
-        for place in places
-    ]
-    other = [] if request.other_date is None else [lost(tuple(place)) for place in places]
-    return own, other
+    for places in batches:
+        own = [
+            right(tuple(place), expected=0.6) if place[0] < 0 else lost(tuple(place), expected=0.1)
+            for place in places
+        ]
+        other = [] if request.other_date is None else [lost(tuple(place)) for place in places]
+        yield len(places), own, other
 
 
 @pytest.fixture
@@ -116,13 +118,18 @@ def test_a_route_over_both_halves(checked, frame):
     result = checked(route=route_of(frame, [[-350, 0], [350, 0]]), band_m=200.0)
     along = result.along
     assert along.probability[0] > 0.8 and along.probability[-1] < 0.2
-    assert len(result.stretches) == 1 and result.stretches[0].ends_lost
-    assert result.stretches[0].start_m == pytest.approx(350, abs=100)
+    assert along.distance_m[-1] - 100 < result.outages[-1].end_m <= along.distance_m[-1]
+    assert result.outages[-1].start_m > 250 and result.flights.availability.low < 0.6
     assert result.verdict.word is not Word.GO and result.band_m == 200.0
     cells, west = result.cells, result.cells.west_m
     assert west == pytest.approx(-450, abs=1) and cells.north_m == pytest.approx(100, abs=1)
     corners = cells.probability[[0, 0, -1, -1], [0, -1, 0, -1]]
     assert np.isnan(corners).all()  # of the box, outside the round ends of the band
+
+
+def test_trials_end_when_the_answer_holds(checked):
+    few, many = (checked(effort=each).cells.trials.sum() for each in (0.25, 1.0))
+    assert 20 <= few < many < 500
 
 
 @pytest.mark.parametrize(
@@ -140,7 +147,7 @@ def test_odd_routes(checked, frame, points, changed):
     result = checked(route=route_of(frame, points), **changed)
     cells, along = result.cells, result.along
     assert np.isfinite(cells.probability).any() and cells.trials.sum() >= 20
-    assert np.isfinite(along.probability).all() and np.isfinite(along.drift_m).all()
+    assert np.isfinite(along.probability).all() and np.isfinite(result.flights.protection_m).all()
     assert (along.across_low <= along.probability).all()
     assert cells.probability.size < 300_000
     json.loads(to_json(result))
@@ -293,6 +300,17 @@ def test_bad_input_is_one_line(run, half_blank, tmp_path, names_in, options, sai
     assert done.code == 1 and done.out == "" and done.err.count("\n") == 1
     assert done.err.startswith("orthonav: error: ") and said in done.err
     assert names_in(tmp_path) == []
+
+
+def test_the_time_left_is_said_without_a_terminal(monkeypatch, capsys):
+    now = iter(range(0, 400, 3))
+    monkeypatch.setattr("orthonav.cli.check.time.monotonic", lambda: float(next(now)))
+    lines = _Lines()
+    for done in range(1, 101):
+        lines("trials", done / 100)
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "trials: 11 %, about 267 s left" and said[1].startswith("trials: 15 %")
+    assert len(said) == 23
 
 
 def test_an_interrupt_writes_nothing(run, half_blank, tmp_path, names_in, monkeypatch):

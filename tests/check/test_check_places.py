@@ -9,8 +9,7 @@ from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.changes.record import CellGrid
 from orthonav.ground.check.run import (
-    FEWEST_TRIALS,
-    MIN_TRIALS,
+    BATCH,
     MapCoverage,
     checked_m2,
     trial_places,
@@ -62,10 +61,10 @@ def test_a_band_outside_the_map_is_refused():
         checked_m2(holes, area_of([[0, 0], [100, 0]], [300.0]))
 
 
-def places(area=None, coverage=WHOLE, view_side_m=150.0, effort=1.0, seed=1):
+def places(area=None, coverage=WHOLE, count=BATCH, seed=1):
     extent = coverage.extent_en_m if area is None else area.extent_en_m
     rng, wanted_m2 = np.random.default_rng(seed), checked_m2(coverage, area)
-    return trial_places(coverage, area, extent, wanted_m2, view_side_m, effort, rng)
+    return trial_places(coverage, area, extent, wanted_m2, count, rng)
 
 
 @pytest.mark.parametrize("band_m", [2.0, 60.0, 500.0])
@@ -75,5 +74,6 @@ def test_places_lie_in_the_band_and_on_the_map(band_m):
     coverage = covering(-1000.0, 1000.0, 2.0, valid)
     area = area_of([[-1500, -900], [900, 800]], [band_m])
     found = places(area, coverage)
-    assert len(found) >= FEWEST_TRIALS and len(found) < 3 * MIN_TRIALS
+    assert BATCH / 2 < len(found) <= BATCH
     assert area.contains(found).all() and coverage.covers(found).all()
+    assert np.ptp(found, axis=0) == pytest.approx([1900, 1350], rel=0.25)  # over all of it

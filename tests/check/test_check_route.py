@@ -1,17 +1,18 @@
-"""Along a route: probability, drift, blind stretches."""
+"""Along a route: probability, simulated flights, outages."""
 
-import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import made_trials
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.integrity import protection_level_m
+from orthonav.ground.check import flights
 from orthonav.ground.check.estimate import Prediction
-from orthonav.ground.check.findings import BLIND, blind_stretches, expected_drift, predicted_along
+from orthonav.ground.check.findings import LIKELY_OUTAGE, likely_outages, predicted_along
+from orthonav.ground.check.flights import scene_shifts, simulated
 from orthonav.ground.check.records import Along
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
@@ -25,28 +26,6 @@ def area_of(points_en_m, bands_m=()):
     lat, lon = FRAME.latlon_from_en(np.array(points_en_m, float))
     route = Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
     return Area(FRAME, (-5000.0, -5000.0, 5000.0, 5000.0), route, 200.0)
-
-
-def of_many_flights(chances, errors_m, drift, side_m):
-    """Root mean square error at every view over all flights, by the view of their last fix."""
-    squares = []
-    for here in range(len(chances)):
-        weight, total = 1.0, 0.0  # of the flights without a fix since
-        for last in range(here, 0, -1):
-            error_m = errors_m[last] + (here - last) * drift * side_m
-            total += weight * chances[last] * error_m**2
-            weight *= 1 - chances[last]
-        squares.append(total + weight * (errors_m[0] + here * drift * side_m) ** 2)
-    return np.sqrt(squares)
-
-
-@given(st.lists(st.tuples(st.floats(0, 1), st.floats(0, 12)), min_size=2, max_size=25))
-def test_drift_is_that_of_many_flights(views):
-    chances, errors = (np.array(each) for each in zip(*views, strict=True))
-    distance = np.arange(len(views)) * SIDE_M
-    found = expected_drift(distance, chances, errors, 0.05, SIDE_M)
-    truth = of_many_flights(chances, errors, 0.05, SIDE_M)
-    np.testing.assert_allclose(found, truth, rtol=1e-6, atol=1e-6)
 
 
 def predicted(probability, error_m):
@@ -85,7 +64,7 @@ def test_the_route_ends_at_its_last_waypoint():
     assert along.distance_m == pytest.approx([0, 25, 50, 75, 100, 125, 150, 160], abs=1e-3)
     np.testing.assert_allclose(along.points_en_m[-1], [100, 60], atol=0.01)
     whole = predicted_along(area_of([[0, 0], [100, 0]]), CONDITIONS, even)
-    assert along.drift_m.shape == (8,) and len(whole.distance_m) in (5, 6)
+    assert len(whole.distance_m) in (5, 6)
 
 
 def along_of(probability, step_m=25.0):
@@ -95,50 +74,80 @@ def along_of(probability, step_m=25.0):
     points = np.stack([distance, np.zeros_like(distance)], axis=1)
     error = np.full_like(distance, 3.0)
     place = predicted(probability, error)
-    extra = {"across_low": probability, "drift_m": error}
+    extra = {"across_low": probability}
     return Along(distance_m=distance, points_en_m=points, **extra, **vars(place))
 
 
-GOOD, BAD = [0.9] * 8, [0.2] * 12
-
-
-def test_blind_stretches():
-    along = along_of(GOOD + BAD + GOOD + BAD + [0.9])
-    first, second = blind_stretches(along, CONDITIONS)
-    assert (first.start_m, first.end_m) == (200, 500) and (second.start_m, second.end_m) == (
-        700,
-        1000,
-    )
-    assert (first.start_s, first.end_s) == (10, 25) and first.length_m == 300
-    assert first.probability == pytest.approx(0.2) and first.drift_m == pytest.approx(9)
-    assert first.allowed_m == CONDITIONS.prior_std_m and first.recoverable and second.recoverable
+GOOD, BAD = [1.0] * 8, [0.2] * 12
 
 
 @pytest.mark.parametrize(
-    "probability, expected",
+    "available, expected",
     [
         (GOOD, []),
-        (GOOD + BAD[:3] + GOOD, []),
-        (GOOD + BAD[:4] + GOOD, [(200.0, 300.0, False)]),
-        (BAD + GOOD, [(0.0, 300.0, False)]),
-        (GOOD + BAD, [(200.0, 475.0, True)]),
-        (BAD, [(0.0, 275.0, True)]),
-        ([BLIND] * 9, []),
+        (GOOD + BAD[:1] + GOOD, []),
+        (GOOD + BAD[:4] + GOOD, [(200.0, 300.0)]),
+        (GOOD + BAD + GOOD + BAD + [0.9], [(200.0, 500.0), (700.0, 1000.0)]),
+        (BAD + GOOD, [(0.0, 300.0)]),
+        (GOOD + BAD, [(200.0, 475.0)]),
+        ([LIKELY_OUTAGE] * 9, []),
     ],
-    ids=["none", "shorter than a view", "a view", "at first", "at last", "all", "on the border"],
+    ids=["none", "short", "one", "two", "at first", "at last", "on the border"],
 )
-def test_where_stretches_begin_and_end(probability, expected):
-    found = blind_stretches(along_of(probability), CONDITIONS)
-    assert [(each.start_m, each.end_m, each.ends_lost) for each in found] == expected
+def test_where_outages_begin_and_end(available, expected):
+    along = along_of(np.full(len(available), 0.8))
+    flown = SimpleNamespace(available=np.array(available))
+    found = likely_outages(along, flown, CONDITIONS)
+    assert [(each.start_m, each.end_m) for each in found] == expected
+    assert all(each.available == pytest.approx(0.2) for each in found)
 
 
-def test_what_dead_reckoning_bears():
-    far = along_of(GOOD + [0.1] * 100 + GOOD)
-    (stretch,) = blind_stretches(far, CONDITIONS)
-    assert stretch.drift_m == pytest.approx(75) and not stretch.recoverable
-    (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=80.0))
-    assert stretch.recoverable
-    (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=None))
-    assert stretch.recoverable and math.isinf(stretch.allowed_m)
-    (stretch,) = blind_stretches(along_of(GOOD + BAD), CONDITIONS)
-    assert not stretch.recoverable
+def flights_over(probability, *, limit_m=40.0, drift=0.03, std=0.0, wrong=0.0, step_m=25.0):
+    along = along_of(probability, step_m)
+    along = replace(along, wrong=np.full(len(along.wrong), wrong))
+    conditions = replace(CONDITIONS, alert_limit_m=limit_m, drift=drift)
+    rng = np.random.default_rng(7)
+    return simulated(along.distance_m, along, conditions, scene_shifts(std), 0, rng)
+
+
+def test_flights_with_certain_fixes_are_always_available():
+    found = flights_over([0.99] * 400)
+    assert found.availability.low > 0.99 and found.outage_m.high < 2 * SIDE_M
+    assert found.false_fix.high == 0
+    assert found.protection_m.min() == pytest.approx(
+        protection_level_m(1.0, 4.5 * np.eye(2), 1e-3)  # of a fix, whose error is 3 m
+    )
+
+
+def test_without_fixes_the_protection_level_follows_the_drift():
+    found = flights_over([0.0] * 101)
+    rms_m = np.hypot(3.0, 0.03 * 2500)
+    level_m = protection_level_m(1.0, np.eye(2) * rms_m**2 / 2, 1e-3)
+    assert found.protection_m[-1] == pytest.approx(level_m, rel=1e-6)
+    assert found.probability == (0, 0, 0)
+    reach_m = np.sqrt((40.0 / level_m * rms_m) ** 2 - 9) / 0.03
+    assert found.availability.median == pytest.approx(reach_m / 2500, abs=0.015)
+    assert found.outage_m.median == pytest.approx(2500 - reach_m, abs=40)
+
+
+def test_a_limit_below_the_error_of_a_fix_is_never_met():
+    found = flights_over([0.99] * 100, limit_m=10.0)
+    assert found.availability == (0, 0, 0)
+    assert found.outage_m.median == pytest.approx(99 * 25.0)
+
+
+def test_scenes_widen_the_interval():
+    narrow, wide = flights_over([0.5] * 400), flights_over([0.5] * 400, std=1.5)
+    assert wide.probability.high - wide.probability.low > 0.5 > 0.05 > np.ptp(narrow.probability)
+
+
+def test_neighbouring_views_fail_together(monkeypatch):
+    alike = flights_over([0.5] * 400).outage_m.median
+    monkeypatch.setattr(flights, "CORRELATION", 0.0)
+    assert alike > 1.2 * flights_over([0.5] * 400).outage_m.median
+
+
+def test_false_fixes_add_up_along_the_route():
+    short, far = (flights_over([0.9] * n, wrong=1e-4).false_fix for n in (100, 1000))
+    assert 8 * short.median < far.median < 12 * short.median
+    assert flights_over([0.9] * 9, wrong=1.0).false_fix.high <= 1

@@ -42,7 +42,14 @@ def registration(half_blank):
 
 
 def run_trials(request, places, workers=1, **more):
-    return trials.run_trials(request, Conditions.of(request, 120.0, 35.0), places, workers, **more)
+    """Trials of the map's date and of the other, the places in two batches."""
+    batches, found = [places[:3], places[3:]], ([], [])
+    conditions = Conditions.of(request, 120.0, 35.0)
+    for count, *both in trials.run_trials(request, conditions, batches, workers, **more):
+        assert count >= max(map(len, both))
+        for all_of, here in zip(found, both, strict=True):
+            all_of += here
+    return found
 
 
 def plain(found):
@@ -80,17 +87,16 @@ def test_places_off_the_map_are_left_out(asked):
 
 
 @pytest.mark.long
-def test_the_same_whatever_the_number_of_workers(asked, half_blank, monkeypatch):
+def test_the_same_whatever_the_number_of_workers(asked, half_blank):
     """And of another date: what is beside a trial changes nothing."""
-    monkeypatch.setattr(trials, "AT_ONCE", 2)
     both = replace(asked, other_date=half_blank.present)
     places = np.concatenate([WEST[:2], EAST[:1], [[9e4, 0]]])
-    assert len(places) * 2 >= 4 * trials.AT_ONCE
-    shares = []
+    counts = []
     alone = run_trials(both, places)
-    together = run_trials(both, places, 2, progress=shares.append)
+    together = run_trials(both, places, 2, progress=counts.append)
     assert plain(alone) == plain(together) and len(alone[0]) == len(places) - 1
-    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) == 2 * len(places)
+    assert counts == sorted(counts) and counts[-1] == len(places)
+    assert len(counts) == 2 * len(places)
     assert plain(run_trials(asked, places[:2])) == plain([alone[0][:2], []])
     assert multiprocessing.active_children() == []
 

@@ -1,41 +1,47 @@
-"""Go, marginal or no-go: every rule alone."""
+"""Go, marginal or no-go: every rule alone, and figures that agree with the verdict."""
 
+import json
+import re
 from dataclasses import replace
 
+import made_check
 import numpy as np
 import pytest
+from made_check import CONDITIONS, flown
 
-from orthonav.ground.check.findings import Findings, verdict_of
-from orthonav.ground.check.records import Along, BlindStretch, Word
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.check.findings import AVAILABILITY, FIXES, OUTAGE_S, Findings, verdict_of
+from orthonav.ground.check.records import Along, Range, Word
+from orthonav.ground.check.write.plain import to_json
+from orthonav.ground.check.write.wording import text
 
-ZEROS = np.zeros(11)
+ZEROS = np.zeros(201)
 ALONG = Along(
-    distance_m=np.linspace(0, 5000, 11),
-    points_en_m=np.zeros((11, 2)),
-    probability=ZEROS + 0.9,
-    low=ZEROS + 0.8,
-    high=ZEROS + 0.95,
+    distance_m=np.linspace(0, 10_000, 201),
+    points_en_m=np.stack([np.linspace(0, 10_000, 201), ZEROS], axis=1),
+    probability=ZEROS + 0.95,
+    low=ZEROS + 0.9,
+    high=ZEROS + 0.97,
     across_low=ZEROS + 0.8,
-    error_m=ZEROS + 3,
-    drift_m=ZEROS + 8,
+    error_m=ZEROS + 4,
     wrong=ZEROS,
     persistence=ZEROS + 0.5,
 )
+FLOWN = flown(ALONG)
 FINE = dict(
-    mean=0.9,
-    low=0.8,
+    mean=Range(0.9, 0.8, 0.95),
+    flights=None,
+    conditions=CONDITIONS,
+    lookalikes=(),
     calibrated=True,
     wrong=0,
     trials=1000,
     outside=0.0,
-    along=None,
-    stretches=(),
-    lookalikes=(),
     changed=0.0,
-    allowed_m=50.0,
-    predicted_px=256.0,
+    after_fix_m=30.0,
+    view_px=200.0,
+    second_date=False,
 )
-FLOWN = FINE | {"along": ALONG}
 
 
 def judged(findings):
@@ -47,15 +53,8 @@ def judged(findings):
     return verdict.word, {each.code: each.word for each in verdict.reasons}
 
 
-def stretch(length_m, drift_m, *, ends_lost=False, allowed_m=50.0, start_m=1000.0):
-    end_m = start_m + length_m
-    return BlindStretch(
-        start_m, end_m, start_m / 20, end_m / 20, 0.2, drift_m, allowed_m, ends_lost=ends_lost
-    )
-
-
-def drifting(drift_m):
-    return replace(ALONG, drift_m=np.where(np.arange(11) == 4, drift_m, 3.0))
+def flights(**changed):
+    return dict(flights=replace(FLOWN, **changed))
 
 
 GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
@@ -64,29 +63,31 @@ GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
 @pytest.mark.parametrize(
     ("findings", "code", "word"),
     [
-        (dict(allowed_m=None, predicted_px=130.0), "narrow_views", MARGINAL),
-        (dict(allowed_m=None, predicted_px=150.0), "narrow_views", None),
-        (dict(allowed_m=50.0, predicted_px=130.0), "narrow_views", None),
-        (dict(allowed_m=None, predicted_px=None), "narrow_views", None),
-        (dict(mean=0.7, low=0.6), "fixes", GO),
-        (dict(mean=0.99, low=0.59), "few_fixes", MARGINAL),
-        (dict(mean=0.2, low=0.1), "few_fixes", MARGINAL),
-        (dict(mean=0.19, low=0.1), "few_fixes", NO_GO),
-        (dict(mean=0.0, low=0.0), "few_fixes", NO_GO),
+        (dict(mean=Range(0.7, 0.6, 0.8)), "fixes", GO),
+        (dict(mean=Range(0.9, 0.59, 0.95)), "few_fixes", MARGINAL),
+        (dict(mean=Range(0.15, 0.1, 0.21)), "few_fixes", MARGINAL),
+        (dict(mean=Range(0.1, 0.05, 0.19)), "few_fixes", NO_GO),
+        (dict(mean=Range(0.9, 0.61, 0.99)), "uncertain", None),
+        (dict(mean=Range(0.7, 0.3, 0.9)), "uncertain", MARGINAL),
+        (dict(mean=Range(0.7, 0.3, 0.9), second_date=True), "uncertain", None),
         (dict(calibrated=False), "no_confidence", NO_GO),
         (dict(wrong=1, trials=10), "wrong", None),
-        (dict(wrong=2), "wrong", None),
-        (dict(wrong=5), "wrong", MARGINAL),
-        (dict(wrong=19), "wrong", MARGINAL),
-        (dict(wrong=20), "wrong", NO_GO),
-        (dict(wrong=0, trials=0), "wrong", None),
-        (dict(along=ALONG, outside=0.004), "outside_map", None),
-        (dict(along=ALONG, outside=0.05), "outside_map", MARGINAL),
-        (dict(along=ALONG, outside=0.11), "outside_map", NO_GO),
-        (dict(along=drifting(50.0)), "drift", GO),
-        (dict(along=drifting(51.0)), "drift", MARGINAL),
-        (dict(along=drifting(101.0)), "drift", NO_GO),
-        (dict(along=drifting(5000.0), allowed_m=None), "drift", GO),
+        (dict(wrong=4), "wrong", None),
+        (dict(wrong=10), "wrong", MARGINAL),
+        (dict(wrong=21), "wrong", NO_GO),
+        (flights() | dict(outside=0.004), "outside_map", None),
+        (flights() | dict(outside=0.05), "outside_map", MARGINAL),
+        (flights() | dict(outside=0.11), "outside_map", NO_GO),
+        (flights(), "availability", GO),
+        (flights(availability=Range(0.9, 0.79, 0.95)), "availability", MARGINAL),
+        (flights(availability=Range(0.3, 0.2, 0.49)), "availability", NO_GO),
+        (flights(outage_s=Range(20, 10, 59)), "outage", GO),
+        (flights(outage_s=Range(20, 10, 61)), "outage", MARGINAL),
+        (flights(outage_s=Range(900, 601, 1000)), "outage", NO_GO),
+        (flights(false_fix=Range(0.005, 0, 0.05)), "wrong", GO),
+        (flights(false_fix=Range(0.05, 0, 0.2)), "wrong", MARGINAL),
+        (flights(false_fix=Range(0.2, 0, 0.3)), "wrong", NO_GO),
+        (dict(after_fix_m=51.0), "availability", NO_GO),
         (dict(changed=0.05), "changed_ground", GO),
         (dict(changed=0.2), "changed_ground", MARGINAL),
     ],
@@ -94,28 +95,51 @@ GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
 )
 def test_every_rule(findings, code, word):
     found, reasons = judged(FINE | findings)
-    assert reasons.get(code) is word and found is (word or GO)
+    assert reasons.get(code) is word
+    assert found is (word or found)
+
+
+LOW = replace(CONDITIONS, width_m=66.0, height_m=50.0, agl_m=60.0, speed_mps=20.0)
 
 
 @pytest.mark.parametrize(
-    "stretches, expected, said",
+    ("probability", "limit_m", "scenes_std", "word"),
     [
-        (
-            (stretch(400, 12),),
-            Word.GO,
-            "Gaps without fixes: 1, the longest 400 m (20 s), from km 1.0; dead",
-        ),
-        ((stretch(400, 12), stretch(900, 27)), Word.GO, "2, the longest 900 m"),
-        ((stretch(2000, 60),), Word.MARGINAL, "dead reckoning drifts by 60 m (limit 50 m)"),
-        ((stretch(4000, 120),), Word.NO_GO, "drifts by 120 m (limit 50 m)"),
-        ((stretch(400, 12, ends_lost=True),), Word.MARGINAL, "the route ends in a gap"),
-        ((stretch(400, 12), stretch(4000, 120)), Word.NO_GO, "fixes: 2"),
-        ((stretch(9000, 270, allowed_m=float("inf")),), Word.GO, "bridges"),
+        (0.97, 80.0, 0.3, GO),
+        (0.7, 35.0, 0.8, None),
+        (0.1, 35.0, 0.5, NO_GO),
+        (0.25, 35.0, 1.5, None),
+        (0.97, 20.0, 0.3, NO_GO),
     ],
-    ids=["one", "two", "long", "longer", "at the end", "one of two", "whole map searched"],
+    ids=["good", "fair", "low and narrow", "uncertain", "a fix beyond the limit"],
 )
-def test_gaps(stretches, expected, said):
-    findings = FLOWN | dict(stretches=stretches)
-    word, reasons = judged(findings)
-    assert word is expected and reasons["blind"] is expected
-    assert any(said in each.text for each in verdict_of(Findings(**findings)).reasons)
+def test_nothing_contradicts_the_verdict(probability, limit_m, scenes_std, word):
+    """Figures, reasons and JSON are of the same flights: GO only if all meet its thresholds."""
+    along = replace(ALONG, probability=ZEROS + probability)
+    conditions = replace(LOW, alert_limit_m=limit_m)
+    found = flown(along, conditions, scenes_std)
+    findings = FINE | dict(mean=found.probability, flights=found, conditions=conditions)
+    verdict = verdict_of(Findings(**findings))
+    assert verdict.word is word or (word is None and verdict.word is not GO)
+    cells = made_check.made_cells(4, 4, 50.0)
+    result = made_check.made_check(LocalFrame(48.0, 2.0), cells, along.points_en_m[[0, -1]])
+    result = replace(
+        result, conditions=conditions, along=along, flights=found, outages=(), verdict=verdict
+    )
+    plain = json.loads(to_json(replace(result, mean=found.probability)))
+    flown_in, points = plain["flights"], plain["route"]["points"]
+    assert plain["summary"]["mean_probability"] == pytest.approx(
+        flown_in["probability"]["median"], abs=1e-3
+    )
+    lengths_m = np.gradient(points["distance_m"])
+    mean = np.average(points["available"], weights=lengths_m)
+    low, high = (flown_in["availability"][end] for end in ("low", "high"))
+    assert low - 0.05 <= mean <= high + 0.05
+    meets = low >= AVAILABILITY.go and flown_in["outage_s"]["high"] <= OUTAGE_S.go
+    meets = meets and flown_in["probability"]["low"] >= FIXES.go
+    assert (verdict.word is GO) == meets
+    said = text(result)
+    assert ("can be flown" in said) == (verdict.word is GO)
+    shown, low, high = re.search(r"(\d+ %)  availability \((\d+) % to (\d+) %", said).groups()
+    reason = next(each.text for each in verdict.reasons if each.code == "availability")
+    assert f"{shown} ({low} to {high} %)" in reason

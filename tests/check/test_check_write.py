@@ -11,11 +11,11 @@ from dataclasses import replace
 import made_check
 import numpy as np
 import pytest
-from made_check import EVIL, FILES, lost_in, made_cells, small_route
+from made_check import EVIL, FILES, made_cells, small_route
 
 from orthonav.core.errors import MissingExtraError, OutputError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.check.records import CELL_VALUES, Conditions
+from orthonav.ground.check.records import CELL_VALUES
 from orthonav.ground.check.write import require_free, write_check
 from orthonav.ground.check.write.plain import check_to_plain, features, to_json
 from orthonav.ground.check.write.wording import text
@@ -79,20 +79,22 @@ def test_json_holds_what_was_found():
     corners = FRAME.en_from_latlon(*np.array(plain["cells"]["corners_latlon_deg"]).T)
     square = [(-500, 500), (500, 500), (500, -500), (-500, -500)]
     np.testing.assert_allclose(corners, square, atol=0.02)
-    assert plain["summary"]["longest_stretch"] == len(result.stretches)
-    assert plain["stretches"][-1]["ends_lost"] and not plain["stretches"][-1]["recoverable"]
+    assert plain["summary"]["longest_stretch"] == len(result.outages) == len(plain["stretches"])
+    assert plain["stretches"][-1]["end_m"] == pytest.approx(points["distance_m"][-1])
+    assert plain["flights"]["availability"]["low"] < plain["flights"]["availability"]["high"]
+    np.testing.assert_allclose(points["available"], result.flights.available, atol=6e-4)
     assert plain["verdict"]["exit_code"] == 4
 
 
 def test_unknown_values_are_null():
-    unknown = Conditions(240, 180, 200.0, None, 0.05, None, 0.9, 35, 20, 0.02)
+    unknown = replace(made_check.CONDITIONS, yaw_std_deg=None, prior_std_m=None)
     plain = check_to_plain(made_check.nearly_empty(FRAME))
     assert plain["cells"]["probability"][0][0] is None and plain["route"] is None
-    empty = lost_in(made_cells(4, 4, 50.0), np.ones((4, 4), bool))
-    result = made_check.made_check(FRAME, empty, conditions=unknown)
+    cells = made_cells(4, 4, 50.0)
+    cells.error_m[:] = np.nan
+    result = made_check.made_check(FRAME, cells, conditions=unknown)
     plain = strict(to_json(result))
-    assert plain["summary"]["mean_probability"] is None
-    assert plain["summary"]["error_m"] is None
+    assert plain["flights"] is None and plain["summary"]["error_m"] is None
     assert plain["conditions"]["prior_std_m"] is None
 
 
@@ -150,7 +152,7 @@ def test_shapes_lie_where_things_are(written, layers):
     )
     assert {name: len(shapes) for name, (shapes, _) in layers.items()} == {
         **{"cells": 400, "lookalikes": 2, "waypoints": 4},
-        **{"route": len(result.along.distance_m) - 1, "blind": len(result.stretches)},
+        **{"route": len(result.along.distance_m) - 1, "blind": len(result.outages)},
     }
     for shapes, _ in layers.values():
         assert shapely.is_valid(shapes).all() and not shapely.is_empty(shapes).any()
@@ -164,7 +166,9 @@ def test_shapes_lie_where_things_are(written, layers):
     ends = shapely.get_coordinates(shapely.get_point(blind[-1:], -1))
     last = result.frame.en_from_latlon(*ends[0][::-1])
     np.testing.assert_allclose(last, result.along.points_en_m[-1], atol=0.05)
-    assert [row["ends_lost"] for row in rows] == [each.ends_lost for each in result.stretches]
+    np.testing.assert_allclose(
+        [row["available"] for row in rows], [each.available for each in result.outages], atol=6e-4
+    )
 
 
 # The folder

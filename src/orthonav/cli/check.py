@@ -5,6 +5,7 @@ import json
 import logging
 import shlex
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,8 +16,11 @@ from orthonav.cli.common import add_options, print_json, progress
 EXAMPLE = "area.onav --route route.kml --agl-m 120 --out check"
 EVERYDAY = (
     *("--route", "--band-m", "--other-date", "--other-sensor", "--changes", "--camera", "--agl-m"),
-    *("--dem", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
+    *("--dem", "--alert-limit-m", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior"),
+    *("--quick", "--json"),
 )
+FIRST_SHARE = 0.1
+"""Fraction of the trials from which their duration is estimated."""
 log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
@@ -36,6 +40,14 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "height above ground (default: the lowest of the route; without one, the height from "
     text += "which the shorter side of a view covers a tile of the map)"
     add_options(group, "--agl-m", help=text)
+    group = parser.add_argument_group("requirement")
+    text = (
+        "alert limit: the largest position error that the mission allows (default: 2.5 %% of the "
+    )
+    text += "height, at least 35 m)"
+    group.add_argument("--alert-limit-m", type=float, metavar="L", help=text)
+    text = "allowed probability of an error beyond the protection level (default 0.001)"
+    group.add_argument("--risk", type=float, default=1e-3, metavar="R", help=text)
     group = parser.add_argument_group("ground")
     text = "orthophoto of another date than the map's, which improves the prediction"
     group.add_argument("--other-date", type=Path, metavar="TIF", help=text)
@@ -44,9 +56,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--changes", type=Path, metavar="FILE.geojson", help=text)
     _add_errors(parser.add_argument_group("camera, telemetry and motion"))
     group = parser.add_argument_group("trials")
-    text = "factor on the number of trials (default 1)"
+    text = "factor on the number of trials (default 1), which end when more would not change the "
+    text += "answer"
     group.add_argument("--effort", type=float, default=1.0, metavar="FACTOR", help=text)
-    text = "a quarter of the trials, as --effort 0.25"
+    text = "about a quarter of the trials, as --effort 0.25"
     group.add_argument("--quick", dest="effort", action="store_const", const=0.25, help=text)
     add_options(group, "--workers")
 
@@ -81,7 +94,8 @@ def run(options: argparse.Namespace) -> int:
     require_free(options.out)
     request = _request(options)
     with progress(options) as shown:
-        result, opened = check_map(request, shown)
+        told = options.quiet or sys.stderr.isatty()
+        result, opened = check_map(request, shown if told else _Lines())
     page = write_check(result, opened, options.out)
     if options.json:
         print_json(json.loads(to_json(result)))
@@ -89,6 +103,25 @@ def run(options: argparse.Namespace) -> int:
         print(text(result))
         print(f"\nreport: {page}")
     return result.verdict.word.exit_code
+
+
+class _Lines:
+    """Says on stderr how long the check will take, and every 10 s how far it is."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, float] | None = None
+        self._next_s = 0.0
+
+    def __call__(self, stage: str, share: float) -> None:
+        now_s = time.monotonic()
+        if self._first is None:  # the start of the workers tells nothing
+            self._first, self._next_s = (now_s, share), now_s + 4
+        done = share - self._first[1]
+        if now_s < self._next_s or done < FIRST_SHARE or share >= 1:
+            return
+        left_s = (now_s - self._first[0]) * (1 - share) / done
+        print(f"{stage}: {100 * share:.0f} %, about {left_s:.0f} s left", file=sys.stderr)
+        self._next_s = now_s + 10
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
@@ -112,6 +145,8 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         yaw_std_deg=None if options.heading == "unknown" else options.yaw_std_deg,
         agl_std=options.agl_std,
         prior_std_m=None if options.prior == "none" else options.prior_std_m,
+        alert_limit_m=options.alert_limit_m,
+        risk=options.risk,
         speed_mps=options.speed_mps,
         relief_m=options.relief_m,
         effort=options.effort,

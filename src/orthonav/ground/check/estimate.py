@@ -32,7 +32,8 @@ class Recalibration:
     """Logit of the predicted rate: `shift` + `slope` times that of trials + corrections.
 
     `narrow`: for every halving of the width of a view below `FULL_VIEW_PX`; `no_prior`: without a
-    prior position; `std`: standard deviation of the logit from scene to scene, 0 or more.
+    prior position; `std`: standard deviation of the logit from scene to scene, and `std_narrow`
+    what every such halving adds to it, both 0 or more.
     """
 
     shift: float
@@ -40,16 +41,25 @@ class Recalibration:
     narrow: float
     no_prior: float
     std: float
+    std_narrow: float = 0.0
 
     def __call__(self, share: Array, view_px: float, has_prior: bool) -> Array:
         """Predicted rates (N,) from those of trials, for views `view_px` pixels of the map."""
-        octaves = max(0.0, math.log2(FULL_VIEW_PX / max(view_px, 1.0)))
-        added = self.shift + self.narrow * octaves + self.no_prior * (not has_prior)
+        added = self.shift + self.narrow * _octaves(view_px) + self.no_prior * (not has_prior)
         return np.asarray(np.clip(expit(self.slope * logit(share) + added), LEAST, MOST))
+
+    def std_of(self, view_px: float) -> float:
+        """Standard deviation of the logit from scene to scene for views of this width."""
+        return self.std + self.std_narrow * _octaves(view_px)
 
     def other_sensor(self) -> "Recalibration":
         std = math.hypot(self.std, OTHER_SENSOR_STD)
         return replace(self, shift=self.shift + OTHER_SENSOR_SHIFT, std=std)
+
+
+def _octaves(view_px: float) -> float:
+    """Halvings of the width of a view from `FULL_VIEW_PX` to `view_px`."""
+    return max(0.0, math.log2(FULL_VIEW_PX / max(view_px, 1.0)))
 
 
 def logit(share: Array) -> Array:
@@ -64,8 +74,9 @@ def expit(value: Array) -> Array:
 
 PLAIN = Recalibration(0.0, 1.0, 0.0, 0.0, 0.6)
 """Trials as they are; between dates of generated and NAIP imagery the logit differs by 0.6."""
-LEARNT = Recalibration(0.85, 0.54, -0.51, -0.2, 0.8)
-"""What checks use: fitted to 57 conditions of nine scenes of two dates (docs/check.md)."""
+LEARNT = Recalibration(0.85, 0.54, -0.51, -0.2, 0.8, 0.4)
+"""What checks use: fitted to 57 conditions of nine scenes of two dates; the spread is wider for
+narrow views than these ask for (docs/check.md)."""
 OTHER_SENSOR_SHIFT, OTHER_SENSOR_STD = -0.8, 0.8
 """An assumption that rests on one flight: a drone over two satellite maps was placed less often
 than predicted by 0.6 and 1.0 (docs/check.md)."""
@@ -90,6 +101,11 @@ MIN_WEIGHT, WIDER = 0.05, 4.0
 MIN_REGRESSION = 20
 """Fewer trials than this do not support a regression."""
 RIDGE = 1e-2
+MOST_STATED = 2.0
+"""An error counts as at most so many times what its covariance states."""
+UNSEEN_WRONG, UNSEEN_TRIALS = 0.05, 500.0
+"""False fixes that are presumed in so many trials more: of some 4,600 views of other dates none was
+a false fix."""
 _PAIRS_AT_ONCE = 2**20
 
 
@@ -132,7 +148,11 @@ class Predictor:
         """
         every = [*trials, *other_date]
         self._points = np.array([each.en_m for each in every], np.float64).reshape(-1, 2)
-        self._error = np.array([each.error_m for each in every], np.float64)
+        # A fix may be better than its covariance by chance. The protection level allows for tails:
+        # they do not count twice.
+        errors = np.array([(each.error_m, each.stated_m) for each in every], np.float64)
+        error, stated = errors.reshape(-1, 2).T
+        self._error = np.fmin(np.fmax(error, stated), MOST_STATED * stated)
         self.right = np.array([each.right for each in every], np.bool_)
         self.wrong = np.array([each.wrong for each in every], np.bool_)
         self._weight = np.array([1.0] * len(trials) + [OTHER_DATE_WEIGHT] * len(other_date))
@@ -140,8 +160,16 @@ class Predictor:
         self._least_error_m = least_error_m
         self._coverage_at, self._coverage = coverage, coverage(self._points)
         self._persistence = self._persistence_of(trials, other_date)
-        self._recalibrated, self._scenes_std = recalibrated, scenes_std
+        self._recalibrated, self.scenes_std = recalibrated, scenes_std
         self._expected = self._regression()
+
+    @property
+    def mean_std(self) -> float:
+        """Standard error of the logit of the predicted mean chance, by the number of trials."""
+        count = len(self.right)
+        mean = min(max((int(self.right.sum()) + 0.5) / (count + 1), 0.05), 0.95)
+        low, high = logit(self._recalibrated(np.array([mean - 0.01, mean + 0.01])))
+        return float(high - low) / 0.02 * math.sqrt(mean * (1 - mean) / (count + 1))
 
     def _persistence_of(self, trials: "Sequence[Trial]", other: "Sequence[Trial]") -> Array:
         """Expected persistence at every trial; a trial of the second date takes the nearest."""
@@ -183,17 +211,20 @@ class Predictor:
         probability = good / (good + bad)
         low, high = (beta.ppf(end, good + JEFFREYS, bad + JEFFREYS) for end in INTERVAL)
         probability, low, high = (self._recalibrated(each) for each in (probability, low, high))
-        years = INTERVAL_SIGMAS * self._scenes_std
+        years = INTERVAL_SIGMAS * self.scenes_std
         squares = np.where(self.right, np.nan_to_num(self._error) ** 2, 0.0)
         overall = float(squares.sum() / max(self.right.sum(), 1))
-        square_error = (near @ squares + overall) / (near @ self.right + 1.0)
+        square_error = (near @ squares + PRIOR_TRIALS * overall) / (
+            near @ self.right + PRIOR_TRIALS
+        )
         overall_wrong = float(np.average(self.wrong, weights=self._weight))
+        unseen_wrong = UNSEEN_WRONG / (float(self._weight.sum()) + UNSEEN_TRIALS)
         return Prediction(
             probability=probability,
             low=np.minimum(_widened(probability, low, -years), probability),
             high=np.maximum(_widened(probability, high, years), probability),
             error_m=np.sqrt(square_error + self._least_error_m**2),
-            wrong=(near @ self.wrong + overall_wrong) / (total + 1.0),
+            wrong=np.minimum((near @ self.wrong + overall_wrong) / (total + 1.0) + unseen_wrong, 1),
             persistence=kind @ self._persistence,
         )
 

@@ -1,4 +1,4 @@
-"""What trials and predictions say: ambiguous places, predictions along a route, gaps; the verdict.
+"""What trials and predictions say: ambiguous places, a route with its outages, the verdict.
 
 docs/check.md lists the rules of the verdict.
 """
@@ -14,9 +14,11 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.records import (
     Along,
-    BlindStretch,
     Conditions,
+    Flights,
     Lookalike,
+    Outage,
+    Range,
     Reason,
     Verdict,
     Word,
@@ -93,16 +95,14 @@ def _lookalike(group: Sequence[_Pair], frame: LocalFrame, prior_std_m: float | N
     )
 
 
-BLIND = 0.5
-"""A gap lies below this probability: more likely no fix than a fix."""
+LIKELY_OUTAGE = 0.5
+"""Fraction of the flights with an available position below which there is an outage."""
 POINTS_PER_VIEW = 4.0
 """Points along the route per side of a view, as many as cells."""
 MAX_POINTS = 4000
 _REACHED = 1e-6
 """A shorter rest of the route, as a fraction of the distance between points, is none."""
 ACROSS = 5
-NEGLIGIBLE = 1e-9
-"""Chances below this no longer change the expected drift."""
 
 
 def predicted_along(
@@ -134,129 +134,116 @@ def predicted_along(
         distance_m=distance_m,
         points_en_m=points,
         across_low=np.minimum(lowest, middle.probability),
-        drift_m=expected_drift(
-            distance_m, middle.probability, middle.error_m, conditions.drift, conditions.side_m
-        ),
         **vars(middle),
     )
 
 
-def expected_drift(
-    distance_m: Array, probability: Array, error_m: Array, drift: float, view_side_m: float
-) -> Array:
-    """Expected position error (N,), root mean square, when fixes arrive as predicted.
-
-    An independent view every `view_side_m` gives a fix with its probability; between fixes the
-    error grows by `drift` per metre. The position is known before the first view.
-    """
-    length_m = float(distance_m[-1])
-    stops = np.arange(0.0, length_m + view_side_m, view_side_m)
-    chance = np.interp(stops, distance_m, probability)
-    error = np.interp(stops, distance_m, np.nan_to_num(error_m, nan=0.0))
-    expected = np.zeros(len(stops))
-    # Chance that the last fix was k views ago, and the square of the error that has grown since.
-    since: Array = np.array([1.0])
-    grown: Array = np.array([error[0] ** 2])
-    for i in range(len(stops)):
-        if i:
-            grown = (np.sqrt(grown) + drift * view_side_m) ** 2
-        since = np.concatenate([[since.sum() * chance[i]], since * (1 - chance[i])])
-        grown = np.concatenate([[error[i] ** 2], grown])
-        counts = since > NEGLIGIBLE
-        counts[-1] = True
-        since, grown = since[counts], grown[counts]
-        expected[i] = math.sqrt(float((since * grown).sum() / since.sum()))
-    return np.interp(distance_m, stops, expected)
-
-
-def blind_stretches(along: Along, conditions: Conditions) -> tuple[BlindStretch, ...]:
-    """Gaps: stretches of at least one side of a view with a probability below `BLIND`, in order."""
-    blind = along.probability < BLIND
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], blind.astype(int), [0]])))
-    last = len(blind) - 1
-    allowed_m = math.inf if conditions.prior_std_m is None else conditions.prior_std_m
+def likely_outages(along: Along, flights: Flights, conditions: Conditions) -> tuple[Outage, ...]:
+    """Stretches of at least half a side of a view where most flights have no available position."""
+    available = flights.available
+    out = np.concatenate([[False], available < LIKELY_OUTAGE, [False]]).astype(int)
+    last = len(available) - 1
     found = []
-    for first, end in edges.reshape(-1, 2):
-        start_m = float(along.distance_m[first])
-        end_m = float(along.distance_m[min(end, last)])
-        if end_m - start_m < conditions.side_m:
+    for first, end in np.flatnonzero(np.diff(out)).reshape(-1, 2):
+        start_m, end_m = (float(along.distance_m[min(i, last)]) for i in (first, end))
+        if end_m - start_m < conditions.side_m / 2:
             continue
-        stretch = BlindStretch(
-            start_m=start_m,
-            end_m=end_m,
-            start_s=start_m / conditions.speed_mps,
-            end_s=end_m / conditions.speed_mps,
-            probability=float(along.probability[first:end].mean()),
-            drift_m=conditions.drift * (end_m - start_m),
-            allowed_m=allowed_m,
-            ends_lost=bool(end > last),
+        found.append(
+            Outage(
+                start_m=start_m,
+                end_m=end_m,
+                start_s=start_m / conditions.speed_mps,
+                end_s=end_m / conditions.speed_mps,
+                probability=float(along.probability[first:end].mean()),
+                available=float(available[first:end].mean()),
+            )
         )
-        found.append(stretch)
     return tuple(found)
 
 
-# Thresholds of a planner's judgement, not of a measurement.
-GO_LOW, NO_GO_MEAN = 0.6, 0.2
-"""Go from this lower end of the mean probability on, no-go below this mean probability."""
-GO_OUTSIDE, NO_GO_OUTSIDE = 0.005, 0.1
+class Threshold(NamedTuple):
+    """GO up to `go` at the cautious end of the interval, NO-GO beyond `no_go` at the other end.
+
+    Where more is better `go` is the larger one.
+    """
+
+    go: float
+    no_go: float
+
+    def word(self, figure: Range) -> Word:
+        more = self.go > self.no_go
+        cautious, other = (figure.low, figure.high) if more else (figure.high, figure.low)
+        sign = 1 if more else -1
+        if sign * (other - self.no_go) < 0:
+            return Word.NO_GO
+        return Word.GO if sign * (cautious - self.go) >= 0 else Word.MARGINAL
+
+
+# A planner's judgement, not a measurement.
+FIXES = Threshold(0.6, 0.2)
+"""Mean chance of a fix per view."""
+AVAILABILITY = Threshold(0.8, 0.5)
+"""Fraction of the route with a protection level within the alert limit."""
+OUTAGE_S = Threshold(60.0, 600.0)
+"""Longest outage."""
+FALSE_FIX = Threshold(0.01, 0.1)
+"""Probability of a false fix on the route: its median."""
+WRONG = Threshold(0.005, 0.02)
+"""Fraction of trials that were false fixes, without a route; at least two."""
+OUTSIDE = Threshold(0.005, 0.1)
 """Fraction of the route outside the map."""
-GO_WRONG, NO_GO_WRONG = 0.005, 0.02
-"""Fraction of trials that were false fixes."""
-MAX_CHANGED = 0.1
-"""Fraction of the ground that changed since the map was made, beyond which a route is marginal."""
-NARROW_PX = 140.0
-"""Views that show fewer pixels of the map across, without a prior, were located far less often than
-predicted on two of nine scenes: no go by predictions alone."""
+CHANGED = Threshold(0.1, math.inf)
+"""Fraction of the ground that changed since the map was made."""
+MOST_UNCERTAIN = 0.5
+"""Width of the interval of the mean chance beyond which the map alone cannot tell."""
 MIN_WRONG = 2
-"""A single wrong trial may be chance."""
-TOO_FAR = 2.0
-"""No-go where a drift is more than so many times the allowed one."""
 _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
 
 
 class Findings(NamedTuple):
     """What the verdict follows from.
 
-    `mean`, `low`: mean probability along the route, or over the map, and the low end of its
-    interval.
+    `mean`: chance of a fix along the route, or over the map; `flights`: along the route.
     `calibrated`: the map carries a confidence model.
     `wrong`: number of false fixes among `trials`.
     `outside`: fraction of the route outside the map; `changed`: of the area since the map was made.
-    `allowed_m`: standard deviation of the prior, None without one.
-    `predicted_px`: width of a view in pixels of the map, None if tried on a second date.
+    `after_fix_m`: protection level right after a fix, median.
+    `view_px`: width of a view in pixels of the map; `second_date`: tried on one.
     """
 
-    along: Along | None
-    stretches: tuple[BlindStretch, ...]
+    mean: Range
+    flights: Flights | None
+    conditions: Conditions
     lookalikes: tuple[Lookalike, ...]
-    mean: float
-    low: float
     calibrated: bool
     wrong: int
     trials: int
     outside: float
     changed: float
-    allowed_m: float | None
-    predicted_px: float | None
+    after_fix_m: float
+    view_px: float
+    second_date: bool
 
 
 def verdict_of(found: Findings) -> Verdict:
     """The worst of all reasons, worst first."""
-    where = "on the map" if found.along is None else "along the route"
-    reasons = [*_trust(found), _mean(found, where)]
-    if found.along is not None:
-        reasons += [*_outside(found.outside), _drift(found.along, found.allowed_m)]
-        reasons += _blind(found.stretches)
-    if found.allowed_m is None and found.predicted_px and found.predicted_px < NARROW_PX:
-        text = f"Views are {found.predicted_px:.0f} map pixels wide and there is no prior: they "
-        text += "may be localized far less often than predicted. Fly higher, give a prior, or "
-        text += "check with a second date."
-        reasons += [Reason("narrow_views", text, Word.MARGINAL)]
+    where = "on the map" if found.flights is None else "along the route"
+    reasons = [*_trust(found), _mean(found.mean, where)]
+    limit_m = found.conditions.alert_limit_m
+    level = f"Even right after a fix the protection level is {found.after_fix_m:.0f} m"
+    if found.flights is not None:
+        even = f". {level}" if found.after_fix_m > limit_m else ""
+        reasons += [*_outside(found.outside), *_flown(found.flights, limit_m, even)]
+    elif found.after_fix_m > limit_m:
+        reasons += [Reason("availability", f"{level}; alert limit: {limit_m:g} m.", Word.NO_GO)]
+    if found.mean.high - found.mean.low > MOST_UNCERTAIN and not found.second_date:
+        text = f"The map alone cannot tell how often views of {found.view_px:.0f} map pixels are "
+        text += "localized: the interval is too wide. A second date (--other-date) would help."
+        reasons += [Reason("uncertain", text, Word.MARGINAL)]
     if found.changed > 0:  # a warning: it lowers the probability already
         text = f"At least {100 * found.changed:.1f} % of the ground {where} changed since the map "
         text += "was made: fixes are less likely there; build the map from newer imagery."
-        word = Word.MARGINAL if found.changed > MAX_CHANGED else Word.GO
-        reasons += [Reason("changed_ground", text, word)]
+        reasons += [Reason("changed_ground", text, CHANGED.word(_exact(found.changed)))]
     near = sum(each.within_prior and each.trials > 1 for each in found.lookalikes)
     if near:
         text = f"Ambiguous places within the prior, with fewer fixes (see the list): {near} pairs."
@@ -265,61 +252,54 @@ def verdict_of(found: Findings) -> Verdict:
     return Verdict(reasons[0].word, tuple(reasons))
 
 
+def _exact(value: float) -> Range:
+    return Range(value, value, value)
+
+
+def percent(figure: Range) -> str:
+    """Median and interval of a fraction, as `62 % (41 to 78 %)`."""
+    median, low, high = (f"{100 * each:.0f}" for each in figure)
+    return f"{median} % ({low} to {high} %)"
+
+
 def _trust(found: Findings) -> list[Reason]:
     if not found.calibrated:
         text = "The map states no confidence, so no fix would be accepted. Build it again."
         return [Reason("no_confidence", text, Word.NO_GO)]
-    fraction = found.wrong / max(found.trials, 1)
-    if found.wrong < MIN_WRONG or fraction < GO_WRONG:
+    if found.flights is not None:
         return []
-    text = f"False fixes: {found.wrong} of {found.trials} trial views. Limit: {100 * GO_WRONG:g} %."
-    return [Reason("wrong", text, Word.NO_GO if fraction >= NO_GO_WRONG else Word.MARGINAL)]
+    fraction = found.wrong / max(found.trials, 1)
+    word = WRONG.word(_exact(fraction))
+    text = f"False fixes: {found.wrong} of {found.trials} trial views. Limit: {100 * WRONG.go:g} %."
+    return [Reason("wrong", text, word)] if found.wrong >= MIN_WRONG and word is not Word.GO else []
 
 
-def _mean(found: Findings, where: str) -> Reason:
-    text = f"Mean probability of a confident, correct fix per image {where}: "
-    text += f"{100 * found.mean:.0f} % (90 % lower bound {100 * found.low:.0f} %"
-    if found.low >= GO_LOW:
-        return Reason("fixes", f"{text}).", Word.GO)
-    text += f"; GO requires {100 * GO_LOW:.0f} %)."
-    return Reason("few_fixes", text, Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL)
-
-
-def _word(value: float, go: float, no_go: float) -> Word:
-    if value > no_go:
-        return Word.NO_GO
-    return Word.MARGINAL if value > go else Word.GO
+def _mean(mean: Range, where: str) -> Reason:
+    word = FIXES.word(mean)
+    text = f"Mean probability of a confident, correct fix per image {where}: {percent(mean)}"
+    text += "" if word is Word.GO else f"; GO requires {100 * FIXES.go:.0f} % at the lower end"
+    return Reason("fixes" if word is Word.GO else "few_fixes", f"{text}.", word)
 
 
 def _outside(fraction: float) -> list[Reason]:
-    word = _word(fraction, GO_OUTSIDE, NO_GO_OUTSIDE)
-    text = f"{100 * fraction:.0f} % of the route is outside the map. Limit: {100 * GO_OUTSIDE:g} %."
+    word = OUTSIDE.word(_exact(fraction))
+    text = f"{100 * fraction:.0f} % of the route is outside the map. Limit: {100 * OUTSIDE.go:g} %."
     return [] if word is Word.GO else [Reason("outside_map", text, word)]
 
 
-def _drift(along: Along, allowed_m: float | None) -> Reason:
-    worst = int(np.argmax(along.drift_m))
-    drift_m, word = float(along.drift_m[worst]), Word.GO
-    text = f"Largest predicted position error (1 sigma): {drift_m:.0f} m, "
-    text += f"at km {along.distance_m[worst] / 1000:.1f}."
-    if allowed_m is not None:
-        text += f" Limit: {allowed_m:.0f} m (--prior-std-m)."
-        word = _word(drift_m, allowed_m, TOO_FAR * allowed_m)
-    return Reason("drift", text, word)
-
-
-def _blind(stretches: tuple[BlindStretch, ...]) -> list[Reason]:
-    if not stretches:
-        return []
-    longest = max(stretches, key=lambda each: each.length_m)
-    hard = [each for each in stretches if not each.recoverable]
-    word, end = Word.GO, "dead reckoning bridges them"
-    if hard:
-        worst = max(hard, key=lambda each: each.drift_m)
-        word = Word.NO_GO if worst.drift_m > TOO_FAR * worst.allowed_m else Word.MARGINAL
-        end = f"dead reckoning drifts by {worst.drift_m:.0f} m (limit {worst.allowed_m:.0f} m)"
-        if worst.ends_lost and word is Word.MARGINAL:
-            end = "the route ends in a gap"
-    text = f"Gaps without fixes: {len(stretches)}, the longest {longest.length_m:.0f} m "
-    text += f"({longest.end_s - longest.start_s:.0f} s), from km {longest.start_m / 1000:.1f}"
-    return [Reason("blind", f"{text}; {end}.", word)]
+def _flown(flights: Flights, limit_m: float, even: str) -> list[Reason]:
+    """What the simulated flights say; `even`: about positions that are never available."""
+    text = f"Availability, the fraction of the route with a protection level within {limit_m:g} m: "
+    text += percent(flights.availability)
+    word = AVAILABILITY.word(flights.availability)
+    if word is not Word.GO:
+        text += f"; GO requires {100 * AVAILABILITY.go:.0f} % at the lower end{even}"
+    reasons = [Reason("availability", f"{text}.", word)]
+    _, low_s, high_s = flights.outage_s
+    text = f"Longest outage: {flights.outage_m.median:.0f} m, {flights.outage_s.median:.0f} s "
+    text += f"({low_s:.0f} to {high_s:.0f} s). Limit: {OUTAGE_S.go:g} s at the upper end."
+    reasons += [Reason("outage", text, OUTAGE_S.word(flights.outage_s))]
+    word = FALSE_FIX.word(_exact(flights.false_fix.median))
+    text = f"Probability of a false fix on this route: {100 * flights.false_fix.median:.1f} % (up "
+    text += f"to {100 * flights.false_fix.high:.1f} %). Limit: {100 * FALSE_FIX.go:g} %."
+    return [*reasons, Reason("wrong", text, word)]

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,16 @@ from orthonav.core.errors import CheckError
 from orthonav.core.files import with_paths
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.integrity import DEFAULT_RISK
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.changes.record import CellGrid, ChangedGround
-from orthonav.ground.check.estimate import LEARNT, Prediction, Recalibration
+from orthonav.ground.check.estimate import INTERVAL, LEARNT, Prediction, Recalibration
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
 
 Array = NDArray[np.float64]
+LEAST_LIMIT_M, LIMIT_SHARE = 35.0, 0.025
+"""The alert limit that is not given: at least so many metres, and this fraction of the height."""
 
 
 class Word(Enum):
@@ -75,6 +78,8 @@ class CheckRequest:
     `relief_m`: standard deviation of the height of houses and trees; 3 m in open country.
     `effort`: factor on the number of trials, 0.05 to 50.
     `workers`: processes; None: one per core.
+    `alert_limit_m`: largest error that the mission allows; None: 2.5 % of the height, at least 35.
+    `risk`: allowed probability of an error beyond it.
     `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20; drones
     that report a level gimbal were tilted by up to 9 deg.
     `other_sensor`: the camera differs from the map's sensor by more than years do.
@@ -91,6 +96,8 @@ class CheckRequest:
     agl_std: float = 0.05
     prior_std_m: float | None = DEFAULT_PRIOR_STD_M
     accept: float = CONFIDENT
+    alert_limit_m: float | None = None
+    risk: float = DEFAULT_RISK
     speed_mps: float = 20.0
     drift: float = 0.03
     relief_m: float = 3.0
@@ -113,6 +120,8 @@ class CheckRequest:
             "agl_std": (self.agl_std, 0.0, 0.5, " (a fraction of the height: 0.05 is 5 %)"),
             "prior_std_m": (self.prior_std_m, 0.0, 1e6, " m"),
             "accept": (self.accept, 0.01, 0.999, ""),
+            "alert_limit_m": (self.alert_limit_m, 0.1, 1e6, " m"),
+            "risk": (self.risk, 1e-9, 0.5, ""),
             "speed_mps": (self.speed_mps, 0.1, 10_000.0, " m/s"),
             "drift": (self.drift, 0.0, 1.0, " (metres per metre flown: 0.03 is 3 %)"),
             "tilt_std_deg": (self.tilt_std_deg, 0.0, 20.0, " deg"),
@@ -131,7 +140,7 @@ class Conditions:
     """What a check assumes; fields that are not listed are those of `CheckRequest`.
 
     `width_m`, `height_m`: footprint of a vertical view along the rows and columns of the image.
-    `radius_m`: largest error of a correct fix.
+    `radius_m`: largest error of a correct fix. `limit_given`: whether the alert limit was given.
     """
 
     width_m: float
@@ -144,18 +153,24 @@ class Conditions:
     radius_m: float
     speed_mps: float
     drift: float
+    alert_limit_m: float
+    limit_given: bool = False
+    risk: float = DEFAULT_RISK
     tilt_std_deg: float = 0.0
     other_sensor: bool = False
 
     @classmethod
     def of(cls, request: CheckRequest, agl_m: float, radius_m: float) -> "Conditions":
         camera = request.camera
-        names = ("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift")
+        names = ("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift", "risk")
+        given_m = request.alert_limit_m
         return cls(
             width_m=agl_m * camera.width_px / camera.fx_px,
             height_m=agl_m * camera.height_px / camera.fy_px,
             agl_m=agl_m,
             radius_m=radius_m,
+            alert_limit_m=given_m or max(LEAST_LIMIT_M, LIMIT_SHARE * agl_m),
+            limit_given=given_m is not None,
             **{name: getattr(request, name) for name in (*names, "tilt_std_deg", "other_sensor")},
         )
 
@@ -207,24 +222,57 @@ class Along(Prediction):
 
     `points_en_m`: (N, 2) in the plane of the map's sheet.
     `across_low`: lowest probability across the band at that point.
-    `drift_m`: expected position error (one standard deviation) when each fix arrives with its
-    probability and dead reckoning drifts in between.
     """
 
     distance_m: Array
     points_en_m: Array
     across_low: Array
-    drift_m: Array
+
+
+class Range(NamedTuple):
+    """Median and 80 % interval over the flights."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Array) -> "Range":
+        low, median, high = np.quantile(values, (INTERVAL[0], 0.5, INTERVAL[1]))
+        return cls(float(median), float(low), float(high))
+
+
+@dataclass(frozen=True, eq=False)
+class Flights:
+    """What happens along the route in `count` simulated flights.
+
+    `probability`: mean chance of a fix per view.
+    `availability`: fraction of the route with a protection level of at most the alert limit.
+    `outage_m`, `outage_s`: longest stretch without.
+    `error_95_m`: largest position error along the route (95 %).
+    `false_fix`: probability of at least one false fix.
+    `available` (N,): fraction of the flights with an available position at a point of the route.
+    `protection_m`, `protection_high_m` (N,): protection level there, median and 90 %.
+    """
+
+    count: int
+    probability: Range
+    availability: Range
+    outage_m: Range
+    outage_s: Range
+    error_95_m: Range
+    false_fix: Range
+    available: Array
+    protection_m: Array
+    protection_high_m: Array
 
 
 @dataclass(frozen=True)
-class BlindStretch:
-    """A gap: a part of the route where a fix is unlikely; distance and time are from its start.
+class Outage:
+    """A stretch where most simulated flights have no available position.
 
-    `drift_m`: error of dead reckoning at its end.
-    `allowed_m`: largest error there at which the next view is still searched in the right place;
-    infinite without a prior.
-    `ends_lost`: the route ends inside the gap.
+    Distance and time are from the start of the route. `probability`: mean chance of a fix per view.
+    `available`: mean fraction of the flights with an available position.
     """
 
     start_m: float
@@ -232,17 +280,11 @@ class BlindStretch:
     start_s: float
     end_s: float
     probability: float
-    drift_m: float
-    allowed_m: float
-    ends_lost: bool = False
+    available: float
 
     @property
     def length_m(self) -> float:
         return self.end_m - self.start_m
-
-    @property
-    def recoverable(self) -> bool:
-        return not self.ends_lost and self.drift_m <= self.allowed_m
 
 
 @dataclass(frozen=True)
@@ -283,7 +325,9 @@ class Verdict:
 class CheckResult:
     """Everything that a check found; `frame` is the plane of the map's sheet.
 
-    `mean`: mean probability over `area_km2`; `second_date`: views of a second date were tried too.
+    `mean`: mean probability along the route, or over `area_km2` without one.
+    `second_date`: views of a second date were tried too.
+    `flights`: simulated along the route; `outages`: from them.
     `route_en_m`: waypoints (M, 2); `band_m`: width of the widest band.
     """
 
@@ -293,22 +337,23 @@ class CheckResult:
     cells: Cells
     verdict: Verdict
     area_km2: float
-    mean: float
+    mean: Range
     second_date: bool
     along: Along | None = None
+    flights: Flights | None = None
     route_en_m: Array | None = None
     band_m: float | None = None
-    stretches: tuple[BlindStretch, ...] = ()
+    outages: tuple[Outage, ...] = ()
     lookalikes: tuple[Lookalike, ...] = ()
 
 
 def summarize(result: CheckResult) -> dict[str, Any]:
     """The key figures of a check, which the page, the terminal and `check.json` share.
 
-    `longest_stretch`: number of the longest gap, from 1. Without a route its figures are NaN, 0 or
-    None.
+    `longest_stretch`: number of the longest outage, from 1. Without a route its figures are NaN, 0
+    or None.
     """
-    along, cells, stretches = result.along, result.cells, result.stretches
+    along, cells, outages = result.along, result.cells, result.outages
     route_m = likely = math.nan
     if along is None or not len(along.distance_m):
         error_m = _rms(cells.error_m, cells.probability)
@@ -319,18 +364,17 @@ def summarize(result: CheckResult) -> dict[str, Any]:
         lengths_m[[0, -1]] /= 2 if route_m else 1
         likely = float(lengths_m[along.probability >= CONFIDENT].sum() / lengths_m.sum())
         error_m = _rms(along.error_m, lengths_m * along.probability)
-    longest = max(stretches, key=lambda each: each.length_m, default=None)
+    longest = max(outages, key=lambda each: each.length_m, default=None)
     return {
         "area_km2": result.area_km2,
         "second_date": result.second_date,
-        "mean_probability": result.mean,
+        "mean_probability": result.mean.median,
         "error_m": error_m,
         "route_m": route_m,
         "route_s": route_m / result.conditions.speed_mps,
         "route_share_from_0_9": likely,
-        "blind_stretches": len(stretches),
-        "unrecoverable_stretches": sum(not each.recoverable for each in stretches),
-        "longest_stretch": None if longest is None else stretches.index(longest) + 1,
+        "blind_stretches": len(outages),
+        "longest_stretch": None if longest is None else outages.index(longest) + 1,
     }
 
 

@@ -1,7 +1,8 @@
 """The check of a map: trials, predictions for all of it and along a route, verdict."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,12 +25,20 @@ from orthonav.ground.changes.record import CellGrid, ChangedGround
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
     Findings,
-    blind_stretches,
     found_lookalikes,
+    likely_outages,
     predicted_along,
     verdict_of,
 )
-from orthonav.ground.check.records import Along, Cells, CheckRequest, CheckResult, Conditions
+from orthonav.ground.check.flights import level_m, scene_shifts, shifted, simulated
+from orthonav.ground.check.records import (
+    Along,
+    Cells,
+    CheckRequest,
+    CheckResult,
+    Conditions,
+    Range,
+)
 from orthonav.ground.check.trials import (
     MIN_VALID,
     Trial,
@@ -50,10 +59,15 @@ MAX_CELLS_AROUND = 250_000
 MAX_CELLS = 4000
 CELLS_PER_VIEW = 4.0
 """Cells per side of a view, unless that gives too many."""
-MIN_TRIALS, MAX_TRIALS = 240, 1500
-TRIALS_PER_VIEW = 4.0
-"""Trials per area of a view, within those limits."""
+BATCH, BATCH_SHARE = 32, 0.34
+"""Trials of a batch: at least so many, and this fraction of those before."""
+MIN_TRIALS, MAX_TRIALS = 96, 1500
+TRIALS_PER_VIEW = 0.2
+"""Trials per area of a view that are made in any case."""
 FEWEST_TRIALS = 40
+PRECISE = 0.25
+"""Enough trials: the standard error of the mean chance is this fraction of the deviation from scene
+to scene, and the last batch did not change the verdict."""
 MASK_PX = 2048
 """The coverage of the map is read at the finest level no larger than this."""
 _REDRAWS = 6
@@ -91,7 +105,6 @@ class _Check:
         registration = registration_of(opened)
         self.sheet = registration.sheet
         self.coverage = MapCoverage.of(registration.pyramid, self.sheet.grid)
-        self.floor_px = registration.floor_px
         self.calibrated = registration.confidence is not None
         agl_m = request.agl_m or self.sheet.grid.tile_m / min(request.camera.extent)
         self.conditions = Conditions.of(request, agl_m, registration.radius_m)
@@ -101,6 +114,7 @@ class _Check:
             require_overlap(request.other_date, self.sheet)
         self.extent = self.coverage.extent_en_m if self.area is None else self.area.extent_en_m
         self.checked_m2 = checked_m2(self.coverage, self.area)
+        self.wanted = self._limited(0.0)
 
     def _require_views(self) -> None:
         footprint = self.conditions.footprint_text
@@ -135,31 +149,86 @@ class _Check:
         return Area(self.sheet.frame, extent, route, half * 2)
 
     def result(self) -> CheckResult:
+        """What trials say, made until more of them would not change the answer."""
+        request = self.request
+        workers = request.workers or usable_cores()
+        own: list[Trial] = []
+        other: list[Trial] = []
+        result, tried = None, 0
+        trials = run_trials(request, self.conditions, self._batches(), workers, self._show)
+        with closing(trials):
+            for count, mine, others in trials:
+                own, other, tried = [*own, *mine], [*other, *others], tried + count
+                if len(own) < MIN_VIEWS:
+                    continue
+                before, predictor = result, self._predictor(own, other)
+                result = self._judged(predictor, own, other)
+                aim = PRECISE * predictor.scenes_std / math.sqrt(request.effort)
+                self.wanted = self._limited(tried * (predictor.mean_std / aim) ** 2)
+                same = before is not None and before.verdict.word is result.verdict.word
+                if same and tried >= self.wanted:
+                    break
+        self.progress("trials", 1.0)
+        if result is None:
+            raise AreaError(
+                f"only {len(own)} of {tried} trial views fit on the map: "
+                f"{self.conditions.footprint_text}; fly lower, or build a larger map"
+            )
+        if request.other_date is not None and not other:
+            raise AreaError(
+                "the orthophoto of the other date does not cover the checked area: "
+                f"{request.other_date}"
+            )
+        return result
+
+    def _show(self, done: int) -> None:
+        self.progress("trials", min(done / self.wanted, 0.99))
+
+    def _limited(self, trials: float) -> int:
+        """A number of trials within what area and effort ask for."""
+        least = max(MIN_TRIALS, TRIALS_PER_VIEW * self.checked_m2 / self.conditions.side_m**2)
+        ends = (min(least, MAX_TRIALS), MAX_TRIALS)
+        least, most = (max(each * self.request.effort, FEWEST_TRIALS) for each in ends)
+        return round(min(max(trials, least), most))
+
+    def _batches(self) -> Iterator[Array]:
+        """Places of trials, every batch spread over all of the checked area."""
+        rng = np.random.default_rng([self.request.seed, 4])
+        done, most = 0, self._limited(math.inf)
+        while done < most:
+            count = min(max(BATCH, round(BATCH_SHARE * done)), most - done)
+            yield trial_places(self.coverage, self.area, self.extent, self.checked_m2, count, rng)
+            done += count
+
+    def _judged(
+        self, predictor: Predictor, own: Sequence[Trial], other: Sequence[Trial]
+    ) -> CheckResult:
         request, conditions, frame = self.request, self.conditions, self.sheet.frame
-        own, other = self._trials()
-        predictor = self._predictor(own, other)
         cells, along = self._cells(predictor, own), self._along(predictor)
+        shifts = scene_shifts(math.hypot(predictor.scenes_std, predictor.mean_std))
+        wrong, flights, outside = int(predictor.wrong.sum()), None, 0.0
         known = np.isfinite(cells.probability)
-        mean, low, changed = (
-            float(each[known].mean()) if known.any() else 0.0
-            for each in (cells.probability, cells.low, cells.changed)
-        )
-        stretches = () if along is None else blind_stretches(along, conditions)
-        outside = 0.0 if along is None else np.mean(~self.coverage.covers(along.points_en_m))
-        lookalikes = found_lookalikes([*own, *other], frame, conditions)
+        if along is not None:
+            rng = np.random.default_rng([request.seed, 5])
+            flights = simulated(along.distance_m, along, conditions, shifts, wrong, rng)
+            outside = float(np.mean(~self.coverage.covers(along.points_en_m)))
+        chances = cells.probability[known] if known.any() else np.zeros(1)
+        mean = Range.of(shifted(chances, shifts).mean(axis=1))
+        errors_m = (cells if along is None else along).error_m
+        error_m = float(np.nanmedian(errors_m)) if np.isfinite(errors_m).any() else math.inf
         findings = Findings(
-            along,
-            stretches,
-            lookalikes,
-            mean=mean if along is None else float(along.probability.mean()),
-            low=low if along is None else float(along.low.mean()),
+            mean=flights.probability if flights else mean,
+            flights=flights,
+            conditions=conditions,
+            lookalikes=found_lookalikes([*own, *other], frame, conditions),
             calibrated=self.calibrated,
-            wrong=int(predictor.wrong.sum()),
+            wrong=wrong,
             trials=len(own) + len(other),
-            outside=float(outside),
-            changed=changed,
-            allowed_m=request.prior_std_m,
-            predicted_px=None if other else conditions.side_m / self.sheet.grid.gsd_m,
+            outside=outside,
+            changed=float(cells.changed[known].mean()) if known.any() else 0.0,
+            after_fix_m=float(level_m(error_m, conditions.risk)),
+            view_px=conditions.side_m / self.sheet.grid.gsd_m,
+            second_date=bool(other),
         )
         return CheckResult(
             about=replace(request.about, map_sha256=self.opened.manifest.sha256),
@@ -168,40 +237,15 @@ class _Check:
             cells=cells,
             verdict=verdict_of(findings),
             area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
-            mean=mean,
+            mean=findings.mean,
             second_date=bool(other),
             along=along,
+            flights=flights,
             route_en_m=None if request.route is None else request.route.points_en_m(frame),
             band_m=None if self.area is None else self.area.band_m,
-            stretches=stretches,
-            lookalikes=lookalikes,
+            outages=likely_outages(along, flights, conditions) if along and flights else (),
+            lookalikes=findings.lookalikes,
         )
-
-    def _trials(self) -> tuple[list[Trial], list[Trial]]:
-        request, conditions = self.request, self.conditions
-        places = trial_places(
-            self.coverage,
-            self.area,
-            self.extent,
-            self.checked_m2,
-            conditions.side_m,
-            request.effort,
-            np.random.default_rng([request.seed, 4]),
-        )
-        workers = request.workers or usable_cores()
-        report = partial(self.progress, "trials")
-        own, other = run_trials(request, conditions, places, workers, report)
-        if len(own) < MIN_VIEWS:
-            raise AreaError(
-                f"only {len(own)} of {len(places)} trial views fit on the map: "
-                f"{conditions.footprint_text}; fly lower, or build a larger map"
-            )
-        if request.other_date is not None and not other:
-            raise AreaError(
-                "the orthophoto of the other date does not cover the checked area: "
-                f"{request.other_date}"
-            )
-        return own, other
 
     def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:
         request, side_m = self.request, self.conditions.side_m
@@ -210,29 +254,21 @@ class _Check:
         if request.other_sensor:
             recalibration = recalibration.other_sensor()
         recalibrated: Callable[[Array], Array] = np.asarray  # a second date needs no recalibration
+        scenes_std = recalibration.std
         if request.other_date is None:
             view_px, has_prior = side_m / self.sheet.grid.gsd_m, request.prior_std_m is not None
             recalibrated = partial(recalibration, view_px=view_px, has_prior=has_prior)
+            scenes_std = recalibration.std_of(view_px)
         return Predictor(
             own,
             view_side_m=side_m,
             spacing_m=math.sqrt(self.checked_m2 / max(len(own), 1)),
             other_date=other,
-            least_error_m=self._least_error_m,
+            least_error_m=math.sqrt(2) * MAP_STD_M,
             coverage=lambda points: lasting.seen_share(points, side_m),
             recalibrated=recalibrated,
-            scenes_std=recalibration.std,
+            scenes_std=scenes_std,
         )
-
-    @property
-    def _least_error_m(self) -> float:
-        """Errors of a fix that trials do not show, root mean square: two orthophotos against each
-        other, the displacement of the map as a whole, the unreported tilt at a height that may be
-        off."""
-        floor_m = self.floor_px * self.sheet.grid.gsd_m
-        high_m = self.conditions.agl_m * math.hypot(1.0, self.request.agl_std)
-        tilt_m = high_m * math.tan(math.radians(self.request.tilt_std_deg))
-        return math.sqrt(2) * math.hypot(floor_m, MAP_STD_M, tilt_m)
 
     def _predict(
         self, predictor: Predictor, points: Array, covered: NDArray[np.bool_]
@@ -368,14 +404,11 @@ def trial_places(
     area: Area | None,
     extent: Extent,
     wanted_m2: float,
-    view_side_m: float,
-    effort: float,
+    count: int,
     rng: np.random.Generator,
 ) -> Array:
-    """Places (N, 2) of trials, spread evenly at random over `wanted_m2` of checked imagery."""
-    per_view = wanted_m2 / view_side_m**2
-    count = min(max(TRIALS_PER_VIEW * per_view, MIN_TRIALS), MAX_TRIALS) * effort
-    side_m = math.sqrt(wanted_m2 / max(count, FEWEST_TRIALS))
+    """Some `count` places (N, 2), spread evenly at random over `wanted_m2` of checked imagery."""
+    side_m = math.sqrt(wanted_m2 / count)
     all_m2 = (extent[2] - extent[0]) * (extent[3] - extent[1])
     cells = CellGrid.over(extent, max(side_m, math.sqrt(all_m2 / _MAX_POINTS)))
 
@@ -390,4 +423,7 @@ def trial_places(
         better = ~good & usable(again)
         points[better] = again[better]
         good |= better
-    return points[good]
+    found = points[good]
+    if len(found) > count:  # of a band that is narrower than a cell
+        found = found[np.linspace(0, len(found) - 1, count).round().astype(int)]
+    return found

@@ -4,12 +4,12 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -157,8 +157,8 @@ def view_of(
     return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
 
 
-AT_ONCE = 8
-"""Trials that a worker takes at a time: about a second of work."""
+AT_ONCE = 2
+"""Trials that a worker takes at a time: up to two seconds of work."""
 RELIEF_CELL_M = 15.0
 """Distance over which the height of objects changes: a house or a group of trees."""
 NOWHERE = (math.nan, math.nan)
@@ -168,7 +168,8 @@ NOWHERE = (math.nan, math.nan)
 class Trial:
     """The outcome of one trial. Positions are metres in the plane of the map's sheet.
 
-    `error_m`: error of the fix, NaN without one; `confidence`: 0 without one.
+    `error_m`: error of the fix, NaN without one; `stated_m`: the same as its covariance states it
+    (root mean square), NaN without; `confidence`: 0 without one.
     `expected`: mean persistence of the view; NaN for a second date.
     `right`, `wrong`: the fix is accepted, and within the radius of the map or not.
     `rival_en_m`: best other place at least a quarter of a view away; `rival_share`: its score
@@ -184,53 +185,55 @@ class Trial:
     found_en_m: tuple[float, float] = NOWHERE
     rival_en_m: tuple[float, float] = NOWHERE
     rival_share: float = math.nan
+    stated_m: float = math.nan
 
 
 def run_trials(
     request: CheckRequest,
     conditions: Conditions,
-    places_en_m: Points,
+    batches: Iterable[Points],
     workers: int,
-    progress: Callable[[float], None] = lambda share: None,
-) -> tuple[list[Trial], list[Trial]]:
-    """Trials at places (N, 2) in the plane of the map's sheet, in their order: of the map's own
-    imagery with simulated ageing, and of the second date, if any. Places off the map are left out.
+    progress: Callable[[int], None] = lambda done: None,
+) -> Generator[tuple[int, list[Trial], list[Trial]], None, None]:
+    """Trials at batches of places (N, 2) in the plane of the map's sheet, in their order: of the
+    map's own imagery with simulated ageing, and of the second date, if any, after the number of
+    places; those off the map are left out.
 
-    `progress` is called with 0..1. The result does not depend on the number of `workers`
-    (processes). Raises `WorkerError` where one of them ends unexpectedly.
+    `progress` is called with the number of places done. The result does not depend on the number of
+    `workers` (processes). Raises `WorkerError` where one of them ends unexpectedly.
     """
-    jobs = [
-        (second_date, index, float(east), float(north))
-        for second_date in ((False,) if request.other_date is None else (False, True))
-        for index, (east, north) in enumerate(places_en_m)
-    ]
-    own: list[Trial] = []
-    other: list[Trial] = []
-    with closing(_run_jobs(request, conditions, jobs, workers)) as outcomes:
-        for done, (job, trial) in enumerate(zip(jobs, outcomes, strict=True)):
-            if trial is not None:
-                (other if job[0] else own).append(trial)
-            progress((done + 1) / len(jobs))
-    return own, other
+    dates = (False,) if request.other_date is None else (False, True)
+    number = 0
+    with _runner(request, conditions, workers) as run:
+        for places in batches:
+            here = list(enumerate(places.tolist(), number))
+            jobs = [(date, index, east, north) for index, (east, north) in here for date in dates]
+            found: tuple[list[Trial], list[Trial]] = [], []
+            for done, (job, trial) in enumerate(zip(jobs, run(jobs), strict=True), 1):
+                if trial is not None:
+                    found[job[0]].append(trial)
+                progress(number + done // len(dates))
+            number += len(places)
+            yield len(places), *found
 
 
 _Job = tuple[bool, int, float, float]
 """Whether it is of the second date, its number, and its place."""
+_Run = Callable[[list[_Job]], Iterable[Trial | None]]
 
 
-def _run_jobs(
-    request: CheckRequest, conditions: Conditions, jobs: list[_Job], workers: int
-) -> Generator[Trial | None, None, None]:
-    if workers <= 1 or len(jobs) < 4 * AT_ONCE:
+@contextmanager
+def _runner(request: CheckRequest, conditions: Conditions, workers: int) -> Iterator[_Run]:
+    """Runs jobs, in this process if `workers` is 1."""
+    if workers <= 1:
         with closing(Trier(request, conditions)) as trier:
-            yield from map(trier, jobs)
+            yield partial(map, trier)
         return
     context = get_context("spawn")  # forking a process with threads is not safe
-    workers = min(workers, -(-len(jobs) // AT_ONCE))
     stop = context.Event()
     with ProcessPoolExecutor(workers, context, _start_worker, (request, conditions, stop)) as pool:
         try:
-            yield from _submit(pool, jobs)
+            yield partial(_submit, pool)
         except BrokenProcessPool as error:
             raise WorkerError(
                 f"one of the {workers} worker processes ended unexpectedly, perhaps for lack of "
@@ -403,4 +406,5 @@ class Trier:
             found_en_m=(float(found[0]), float(found[1])),
             rival_en_m=rival,
             rival_share=share,
+            stated_m=math.sqrt(float(np.trace(fix.cov_en_m2))),
         )

@@ -24,12 +24,12 @@ from orthonav.ground.check.write.plain import (
     writable,
 )
 from orthonav.ground.check.write.wording import (
-    GAP_COLUMNS,
+    OUTAGE_COLUMNS,
     SIMULATED,
     SYMBOLS,
     conditions_text,
     key_figures,
-    stretch_row,
+    outage_row,
     verdict_sentence,
 )
 from orthonav.ground.report import BY_UNIT, metres_text, to_plain
@@ -66,7 +66,7 @@ MAX_LOOKALIKES = 20
 """Shown on map and page, the most similar ones; the files hold all."""
 LAYERS = ("probability", "low", "error_m", "wrong", "persistence", "changed")
 DOWNLOADS = {
-    "check.geojson": "GeoJSON: route, gaps, cells, ambiguous places",
+    "check.geojson": "GeoJSON: route, outages, cells, ambiguous places",
     "check.tif": "GeoTIFF: a band per layer of the map",
     "check.json": "JSON: all results and conditions",
 }
@@ -142,9 +142,9 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "cards": key_figures(result),
         "note": "" if result.second_date else SIMULATED,
         "layers": {name: CELL_VALUES[name] for name in LAYERS},
-        "gap_columns": GAP_COLUMNS,
-        "stretches": [
-            stretch_row(number, each) for number, each in enumerate(result.stretches, start=1)
+        "outage_columns": OUTAGE_COLUMNS,
+        "outages": [
+            outage_row(number, each) for number, each in enumerate(result.outages, start=1)
         ],
         "lookalikes": _lookalike_rows(result),
         "max_rows": MAX_ROWS,

@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.changes.record import lonlat
-from orthonav.ground.check.records import CELL_VALUES, Along, Cells, CheckResult, summarize
+from orthonav.ground.check.records import (
+    CELL_VALUES,
+    Along,
+    Cells,
+    CheckResult,
+    Flights,
+    Range,
+    summarize,
+)
 from orthonav.ground.report import BY_UNIT, to_plain
 
 FORMAT, VERSION = "orthonav-check", 1
@@ -49,6 +57,7 @@ def check_to_plain(result: CheckResult) -> Plain:
         "verdict": {**to_plain(verdict), "exit_code": verdict.word.exit_code},
         "conditions": to_plain(result.conditions, 6),
         "summary": to_plain(summarize(result), BY_UNIT),
+        "flights": _flights(result),
         "plane": {
             "origin_lat_deg": float(frame.lat_deg),
             "origin_lon_deg": float(frame.lon_deg),
@@ -61,14 +70,18 @@ def check_to_plain(result: CheckResult) -> Plain:
     }
 
 
+def _flights(result: CheckResult) -> Plain | None:
+    if result.flights is None:
+        return None
+    known = vars(result.flights).items()
+    ranges = {name: value._asdict() for name, value in known if isinstance(value, Range)}
+    return {"count": result.flights.count, **to_plain(ranges, 4)}
+
+
 def _stretches(result: CheckResult) -> list[Plain]:
     return [
-        {
-            "number": number,
-            **to_plain({**vars(each), "length_m": each.length_m}, BY_UNIT),
-            "recoverable": each.recoverable,
-        }
-        for number, each in enumerate(result.stretches, start=1)
+        {"number": number, **to_plain({**vars(each), "length_m": each.length_m}, BY_UNIT)}
+        for number, each in enumerate(result.outages, start=1)
     ]
 
 
@@ -92,17 +105,20 @@ def _cells_to_plain(frame: LocalFrame, cells: Cells) -> Plain:
 
 
 def _route_to_plain(result: CheckResult) -> Plain | None:
-    along = result.along
-    if along is None or result.route_en_m is None:
+    along, flights = result.along, result.flights
+    if along is None or flights is None or result.route_en_m is None:
         return None
     lat, lon = result.frame.latlon_from_en(along.points_en_m)
-    names = ("probability", "low", "high", "across_low", "error_m", "drift_m")
+    names = ("probability", "low", "high", "across_low", "error_m")
     points = {
         "distance_m": along.distance_m,
         "time_s": along.distance_m / result.conditions.speed_mps,
         "lat_deg": lat,
         "lon_deg": lon,
         **{name: getattr(along, name) for name in names},
+        "available": flights.available,
+        "protection_m": flights.protection_m,
+        "protection_high_m": flights.protection_high_m,
     }
     return {
         **to_plain({"name": result.about.route_name, "band_m": result.band_m}, BY_UNIT),
@@ -127,11 +143,11 @@ def to_geojson(result: CheckResult) -> str:
 
 
 def features(result: CheckResult) -> Iterator[Plain]:
-    frame, along = result.frame, result.along
+    frame, along, flights = result.frame, result.along, result.flights
     yield from _cell_features(result)
-    if along is not None:
-        yield from _route_features(result, along)
-        for each, properties in zip(result.stretches, _stretches(result), strict=True):
+    if along is not None and flights is not None:
+        yield from _route_features(result, along, flights)
+        for each, properties in zip(result.outages, _stretches(result), strict=True):
             inside = (along.distance_m >= each.start_m) & (along.distance_m <= each.end_m)
             yield _feature(frame, "blind", "LineString", along.points_en_m[inside], properties)
     for properties in _lookalikes(result):
@@ -154,7 +170,7 @@ def _cell_features(result: CheckResult) -> Iterator[Plain]:
         yield _feature(result.frame, "cells", "Polygon", ring, {"row": row, "col": col, **values})
 
 
-def _route_features(result: CheckResult, along: Along) -> Iterator[Plain]:
+def _route_features(result: CheckResult, along: Along, flights: Flights) -> Iterator[Plain]:
     """A line from each point to the next, with the worse values of the two."""
     for i in range(len(along.distance_m) - 1):
         pair = slice(i, i + 2)
@@ -168,7 +184,8 @@ def _route_features(result: CheckResult, along: Along) -> Iterator[Plain]:
             "probability": probability,
             "across_low": float(along.across_low[pair].min()),
             "error_m": float(along.error_m[pair].max()),
-            "drift_m": float(along.drift_m[pair].max()),
+            "available": float(flights.available[pair].min()),
+            "protection_m": float(flights.protection_m[pair].max()),
             "risk": risk_of(probability),
         }
         line = along.points_en_m[pair]

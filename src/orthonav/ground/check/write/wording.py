@@ -2,10 +2,10 @@
 
 import math
 import textwrap
+from collections.abc import Callable
 
-from orthonav.core.records import CONFIDENT
-from orthonav.ground.check.records import BlindStretch, CheckResult, Conditions, Word, summarize
-from orthonav.ground.report import aligned, metres_text
+from orthonav.ground.check.records import CheckResult, Conditions, Outage, Range, Word, summarize
+from orthonav.ground.report import aligned, metres_text, percent_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -13,16 +13,14 @@ VERDICTS = {
     Word.MARGINAL: "This {} does not meet all requirements for GO; see the reasons.",
     Word.NO_GO: "Do not rely on this map for this {}; see the reasons.",
 }
-GAP_COLUMNS = (
+OUTAGE_COLUMNS = (
     "no.",
     "from",
     "to",
     "length",
     "duration",
-    "probability",
-    "error",
-    "limit",
-    "outcome",
+    "probability of a fix",
+    "available",
 )
 SIMULATED = "Predicted from this map alone, with simulated ageing."
 
@@ -52,26 +50,24 @@ def seconds_text(value: float) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02d} h"
 
 
-def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
-    outcome = "recovers" if stretch.recoverable else "lost"
+def outage_row(number: int, outage: Outage) -> tuple[str, ...]:
     return (
         str(number),
-        f"{stretch.start_m / 1000:.2f} km",
-        f"{stretch.end_m / 1000:.2f} km",
-        metres_text(stretch.length_m),
-        seconds_text(stretch.end_s - stretch.start_s),
-        probability_text(stretch.probability),
-        metres_text(stretch.drift_m),
-        metres_text(stretch.allowed_m),
-        "the route ends in it" if stretch.ends_lost else outcome,
+        f"{outage.start_m / 1000:.2f} km",
+        f"{outage.end_m / 1000:.2f} km",
+        metres_text(outage.length_m),
+        seconds_text(outage.end_s - outage.start_s),
+        probability_text(outage.probability),
+        probability_text(outage.available),
     )
 
 
 def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, str]:
     yaw, prior = conditions.yaw_std_deg, conditions.prior_std_m
-    # root mean square of both axes
-    off_m = math.sqrt(2) * conditions.agl_m * math.tan(math.radians(conditions.tilt_std_deg))
+    given = "as given" if conditions.limit_given else "default: give yours with --alert-limit-m"
     rows = {
+        "alert limit": f"{conditions.alert_limit_m:g} m ({given})",
+        "risk": f"{conditions.risk:g} (probability of an error beyond the protection level)",
         "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
         "height above ground": f"{conditions.agl_m:.0f} m",
         "error of reported height": f"{100 * conditions.agl_std:.1f} % (standard deviation)",
@@ -85,8 +81,7 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
             if prior is None
             else f"{metres_text(prior)} per axis (standard deviation)"
         ),
-        "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)"
-        f", displaces fixes by {metres_text(off_m)}",
+        "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)",
         "sensor": (
             "of another kind than the map's (assumed)"
             if conditions.other_sensor
@@ -95,7 +90,7 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
         "confident fix": f"confidence of {conditions.accept:g} or more",
         "correct fix": f"error of at most {metres_text(conditions.radius_m)}",
         "ground speed": f"{conditions.speed_mps:g} m/s",
-        "drift without fixes": f"{100 * conditions.drift:g} % of the distance flown",
+        "drift between fixes": f"{100 * conditions.drift:g} % of the distance flown",
     }
     if band_m is not None:
         rows["band along the route"] = f"{metres_text(band_m)} wide"
@@ -104,30 +99,53 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
 
 def key_figures(result: CheckResult) -> list[tuple[str, str]]:
     """Values and what they are, of page and terminal."""
-    summary, along = summarize(result), result.along
-    error = (metres_text(summary["error_m"]), "expected error of a correct fix")
-    mean = probability_text(result.mean)
-    shown = [(mean, f"mean probability of a fix over {result.area_km2:.3g} km²")]
-    if along is None:
-        shown += [error, (str(int(result.cells.trials.sum())), "trial views")]
+    flights, limit = result.flights, metres_text(result.conditions.alert_limit_m)
+    median, between = probability_text(result.mean.median), _ends(result.mean, probability_text)
+    mean = (median, f"mean probability of a fix per view ({between})")
+    if flights is None:
+        shown = [
+            mean,
+            (f"{result.area_km2:.3g} km²", "checked"),
+            (metres_text(summarize(result)["error_m"]), "expected error of a correct fix"),
+            (str(int(result.cells.trials.sum())), "trial views"),
+        ]
     else:
-        likely = probability_text(summary["route_share_from_0_9"])
-        route = f"of {metres_text(summary['route_m'])} at a probability of {CONFIDENT:g} or more"
-        gaps = result.stretches
-        longest_m = max((each.length_m for each in gaps), default=0.0)
-        shown += [
-            (likely, route),
-            (metres_text(longest_m), f"longest gap without fixes, of {len(gaps)}"),
-            error,
-            (metres_text(along.drift_m.max()), "largest predicted position error along the route"),
+        given = "" if result.conditions.limit_given else ", the default"
+        available, outage_m, outage_s = flights.availability, flights.outage_m, flights.outage_s
+        error, wrong = flights.error_95_m, flights.false_fix
+        shown = [
+            (
+                probability_text(available.median),
+                f"availability ({_ends(available, probability_text)}) at the alert limit of {limit}"
+                f"{given}",
+            ),
+            (
+                seconds_text(outage_s.median),
+                f"longest outage ({_ends(outage_s, seconds_text)}), "
+                f"{metres_text(outage_m.median)} ({_ends(outage_m, metres_text)})",
+            ),
+            (
+                metres_text(error.median),
+                f"largest position error, 95 % ({_ends(error, metres_text)})",
+            ),
+            (
+                percent_text(wrong.median),
+                f"probability of a false fix on this route ({_ends(wrong, percent_text)})",
+            ),
+            mean,
         ]
     near = sum(each.within_prior for each in result.lookalikes)
     pairs = f"pairs of ambiguous places, {near} within the prior"
     return [*shown, (str(len(result.lookalikes)), pairs)]
 
 
+def _ends(figure: Range, as_text: Callable[[float], str]) -> str:
+    """Its 80 % interval."""
+    return f"{as_text(figure.low)} to {as_text(figure.high)}"
+
+
 def text(result: CheckResult) -> str:
-    """Verdict, reasons, key figures and gaps; control characters in names are replaced."""
+    """Verdict, reasons, key figures and outages; control characters in names are replaced."""
     lines = [f"{result.verdict.word.value.upper()}: {verdict_sentence(result)}"]
     lines += [line for each in result.verdict.reasons for line in _item(each.text)]
     rows = key_figures(result)
@@ -135,12 +153,11 @@ def text(result: CheckResult) -> str:
     lines += ["", *(f"{value:>{width}}  {name}" for value, name in rows)]
     if not result.second_date:
         lines += ["", SIMULATED]
-    if result.stretches:
-        worst_first = sorted(result.stretches, key=lambda each: (each.recoverable, -each.length_m))
-        worst = worst_first[:7]
-        numbered = enumerate(result.stretches, start=1)
-        rows_of_gaps = [stretch_row(number, each) for number, each in numbered if each in worst]
-        lines += ["", "gaps without fixes, the worst:", *aligned([GAP_COLUMNS, *rows_of_gaps])]
+    if result.outages:
+        worst = sorted(result.outages, key=lambda each: -each.length_m)[:7]
+        numbered = enumerate(result.outages, start=1)
+        rows_of_outages = [outage_row(number, each) for number, each in numbered if each in worst]
+        lines += ["", "outages, the longest:", *aligned([OUTAGE_COLUMNS, *rows_of_outages])]
     return "\n".join("".join(c if c.isprintable() else "\ufffd" for c in line) for line in lines)
 
 

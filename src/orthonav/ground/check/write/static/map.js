@@ -106,13 +106,12 @@ function addRoute(map) {
   for (const place of drawn.waypoints) {
     L.circleMarker(at(place), { ...quiet, radius: 4, color: "#1a1a1a", weight: 2, fillColor: "#fff", fillOpacity: 1 }).addTo(group);
   }
-  data.stretches.forEach((blind) => {
-    const inside = (_, k) => route.distance_m[k] >= blind.start_m && route.distance_m[k] <= blind.end_m;
+  data.stretches.forEach((outage) => {
+    const inside = (_, k) => route.distance_m[k] >= outage.start_m && route.distance_m[k] <= outage.end_m;
     L.polyline(line.filter(inside), { ...quiet, color: "#1a1a1a", weight: 2.5 }).addTo(group);
-    const middle = nearestAlong((blind.start_m + blind.end_m) / 2);
-    const outcome = blind.recoverable ? "recovers" : "lost";
-    const description = `Gap ${blind.number}: ${metres(blind.length_m)}, probability ${percent(blind.probability)}, ${outcome}.`;
-    numbered(drawn.route[middle], String(blind.number), blind.recoverable ? "blind" : "lost", description, () => {
+    const middle = nearestAlong((outage.start_m + outage.end_m) / 2);
+    const description = `Outage ${outage.number}: ${metres(outage.length_m)}, probability of a fix ${percent(outage.probability)}, available ${percent(outage.available)}.`;
+    numbered(drawn.route[middle], String(outage.number), "lost", description, () => {
       selectAlong(middle, false);
       announce(description);
     }).addTo(group);

@@ -16,9 +16,10 @@ function rowsOf(east, north, index) {
     rows.push(["probability", between(route.probability[index], route.low[index], route.high[index])]);
     rows.push(["lowest across the band", percent(route.across_low[index])]);
     rows.push(["error of a fix", metres(route.error_m[index])]);
-    rows.push(["position error", metres(route.drift_m[index])]);
-    const blind = data.stretches.find(({ start_m: start, end_m: end }) => far >= start && far <= end);
-    if (blind) rows.push(["gap", `${blind.number}${blind.recoverable ? "" : ", not recovered"}`]);
+    rows.push(["protection level", metres(route.protection_m[index])]);
+    rows.push(["available", percent(route.available[index])]);
+    const outage = data.stretches.find(({ start_m: start, end_m: end }) => far >= start && far <= end);
+    if (outage) rows.push(["outage", String(outage.number)]);
   }
   if (cell < 0) return [...rows, ["cell", "not checked"]];
   const here = (name) => grids[name][cell];

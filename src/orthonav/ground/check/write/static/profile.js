@@ -1,4 +1,4 @@
-// The profile along the route: probability above, predicted position error below.
+// The profile along the route: probability above, protection level below.
 
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const COLOURS = { strong: "ink", mark: "mark", soft: "soft", line: "line", paper: "paper" };
@@ -28,29 +28,32 @@ class Profile extends Chart {
     const split = Math.round(height * 0.52);
     const [top, bottom] = [split + 16, height - 40];
     const xs = this.xs(route.distance_m);
-    this.#blind(context, split, bottom);
+    this.#outages(context, split, bottom);
     this.probabilityY = (v) => split - v * (split - 8);
     this.rules(context, [0, 0.5, 1], this.probabilityY, this.colour("line"), { text: String });
     this.rules(context, [RISKS[0].least], this.probabilityY, this.colour("soft"), { text: String, dash: [5, 4] });
     this.area(context, xs, route.low, route.high, this.probabilityY, "rgb(0 114 178 / 22%)", split);
     this.line(context, xs, route.across_low, this.probabilityY, this.colour("soft"), { width: 1 });
     this.line(context, xs, route.probability, this.probabilityY, this.colour("mark"));
-    const most = Math.max(1, ...[...route.drift_m, ...route.error_m].filter(known)) * 1.08;
-    this.driftY = (v) => bottom - (v / most) * (bottom - top);
+    const limit = data.conditions.alert_limit_m;
+    const highest = Math.max(...route.protection_high_m.filter(known), 0);
+    const most = Math.min(Math.max(highest * 1.08, 1.6 * limit), 4 * limit); // the limit stays visible
+    this.levelY = (v) => bottom - (Math.min(v, most) / most) * (bottom - top);
     const step = roundStep(most / 3);
     const levels = Array.from({ length: Math.floor(most / step) + 1 }, (_, k) => k * step);
-    this.rules(context, levels, this.driftY, this.colour("line"), { text: (v) => `${v} m` });
-    this.line(context, xs, route.error_m, this.driftY, this.colour("soft"), { width: 1.2, dash: [5, 3] });
-    this.line(context, xs, route.drift_m, this.driftY, "#d55e00");
+    this.rules(context, levels, this.levelY, this.colour("line"), { text: (v) => `${v} m` });
+    this.area(context, xs, route.protection_m, route.protection_high_m, this.levelY, "rgb(213 94 0 / 22%)", bottom);
+    this.rules(context, [limit], this.levelY, this.colour("strong"), { dash: [5, 3] });
+    this.line(context, xs, route.protection_m, this.levelY, "#d55e00");
+    this.label(context, `alert limit ${metres(limit)}`, this.right - 4, this.levelY(limit) - 5, "right");
     this.#axes(context, height);
   }
 
-  #blind(context, split, bottom) {
+  #outages(context, split, bottom) {
     let free = 0; // numbers are written up to here
-    for (const { number: name, start_m: start, end_m: end, recoverable } of data.stretches) {
+    for (const { number: name, start_m: start, end_m: end } of data.stretches) {
       const [from, to] = [this.x(start), this.x(end)];
-      const fill = recoverable ? "rgb(128 128 128 / 28%)" : "rgb(213 94 0 / 28%)";
-      this.span(context, from, to, 8, bottom - 8, fill);
+      this.span(context, from, to, 8, bottom - 8, "rgb(128 128 128 / 28%)");
       const [middle, half] = [(from + to) / 2, 4 * String(name).length + 1];
       if (middle - half < free) continue;
       free = middle + half;
@@ -75,7 +78,7 @@ class Profile extends Chart {
     }
     const { index } = this;
     const context = this.cursorAt(route.distance_m[index], this.box.clientHeight - 40);
-    for (const [value, y] of [[route.probability[index], this.probabilityY], [route.drift_m[index], this.driftY]]) {
+    for (const [value, y] of [[route.probability[index], this.probabilityY], [route.protection_m[index], this.levelY]]) {
       if (!known(value)) continue;
       context.beginPath();
       context.arc(this.x(route.distance_m[index]), y(value), 4, 0, 2 * Math.PI);
