@@ -109,7 +109,7 @@ LOW = replace(CONDITIONS, width_m=66.0, height_m=50.0, agl_m=60.0, speed_mps=20.
         (0.7, 35.0, 0.8, None),
         (0.1, 35.0, 0.5, NO_GO),
         (0.25, 35.0, 1.5, None),
-        (0.97, 20.0, 0.3, NO_GO),
+        (0.97, 10.0, 0.3, NO_GO),
     ],
     ids=["good", "fair", "low and narrow", "uncertain", "a fix beyond the limit"],
 )

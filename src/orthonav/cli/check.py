@@ -41,13 +41,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     text += "which the shorter side of a view covers a tile of the map)"
     add_options(group, "--agl-m", help=text)
     group = parser.add_argument_group("requirement")
-    text = (
-        "alert limit: the largest position error that the mission allows (default: 2.5 %% of the "
-    )
-    text += "height, at least 35 m)"
-    group.add_argument("--alert-limit-m", type=float, metavar="L", help=text)
-    text = "allowed probability of an error beyond the protection level (default 0.001)"
-    group.add_argument("--risk", type=float, default=1e-3, metavar="R", help=text)
+    text = "largest horizontal error that the mission allows (default: 2.5 %% of the height, at "
+    add_options(group, "--alert-limit-m", help=f"{text}least 35 m)")
+    add_options(group, "--risk")
     group = parser.add_argument_group("ground")
     text = "orthophoto of another date than the map's, which improves the prediction"
     group.add_argument("--other-date", type=Path, metavar="TIF", help=text)
