@@ -11,12 +11,13 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from lab.clouds import Clouds
 from numpy.typing import NDArray
 
 from benchmarks.looped_flight import read_rows, route_of, write_rows
@@ -131,7 +132,7 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> tuple[P
             errors=errors,
             seed=SEED + plan.number,
             turn_radius_m=TURN_RADIUS_M,
-            cloud_share=CLOUD_SHARE,
+            clouds=partial(Clouds, CLOUD_SHARE),
         )
         simulate_flight(request)
     first_after = _kidnap(folder, plan, localizer, rng) if plan.kidnapped else ""

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -15,6 +16,7 @@ from unittest import mock
 import cv2
 import numpy as np
 import rasterio
+from lab.clouds import Clouds
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
@@ -122,7 +124,7 @@ FLIGHTS = {
     "narrow views, clouds": Flight(
         "narrow",
         2,
-        {"random": 50, "agl_m": 135.0, "cloud_share": 0.2},
+        {"random": 50, "agl_m": 135.0, "clouds": partial(Clouds, 0.2)},
         {"yaw_std_deg": 5.0, "agl_std": 0.05},
     ),
     "terrain, with prior": Flight(
@@ -141,7 +143,7 @@ FLIGHTS = {
     "track, clouds": Flight(
         "usual",
         6,
-        {"spacing_m": 60.0, "agl_m": 270.0, "turn_radius_m": 60.0, "cloud_share": 0.3},
+        {"spacing_m": 60.0, "agl_m": 270.0, "turn_radius_m": 60.0, "clouds": partial(Clouds, 0.3)},
         {"yaw_std_deg": 5.0, "agl_std": 0.05, "velocity_drift": 0.05},
         track=True,
     ),

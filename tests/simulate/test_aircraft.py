@@ -1,9 +1,12 @@
 """Simulated flights of a real aircraft: biases, clouds, corners as arcs, odometry off as stated."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lab.clouds import Clouds
 from scipy.spatial.transform import Rotation
 from test_flight import PLAIN, SMALL, plane_of, route_of
 
@@ -14,7 +17,6 @@ from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
-from orthonav.ground.simulate.render import Clouds
 
 SEEN = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
 CORNERS = np.array([[-300.0, -200.0], [-300.0, 100.0], [200.0, 100.0]])
@@ -85,7 +87,7 @@ def test_biases_are_constant(fly):
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.77, 1.0])
 @pytest.mark.parametrize("count", [1, 7, 500])
 def test_the_share_of_views_with_clouds(count, share):
-    clouds = Clouds(count, share, 0)
+    clouds = Clouds(share, count, 0)
     degree = np.array([clouds.degree(number) for number in range(count)])
     assert (degree > 0).sum() == round(share * count)
     assert degree.min() >= 0 and degree.max() <= 1
@@ -94,12 +96,12 @@ def test_the_share_of_views_with_clouds(count, share):
 def test_clouds_hide_some_views_and_leave_the_others(fly):
     kinds = {"camera": SEEN, "spacing_m": 25.0, "seed": 3}
     clear, truth = fly("clear", **kinds)
-    hidden, same = fly("hidden", **kinds, cloud_share=0.4)
+    hidden, same = fly("hidden", **kinds, clouds=partial(Clouds, 0.4))
     assert truth == same
     fields = ("yaw_deg", "time_ns", "agl_m")
     assert (reported(clear, *fields) == reported(hidden, *fields)).all()
     pairs = list(zip(pictures(clear), pictures(hidden), strict=True))
-    clouds = Clouds(len(pairs), 0.4, 3)
+    clouds = Clouds(0.4, len(pairs), 3)
     degree = np.array([clouds.degree(number) for number in range(len(pairs))])
     assert [not np.array_equal(a, b) for a, b in pairs] == (degree > 0).tolist()
     spread = np.array([b.std() for _, b in pairs])

@@ -193,7 +193,6 @@ REFUSED = {
     "none": ({"random": 0}, FlightError, "number of random positions"),
     "neither": ({"random": None}, FlightError, "either a route or"),
     "turn": ({"turn_radius_m": -1.0}, FlightError, "turn radius"),
-    "cloud nan": ({"cloud_share": math.nan}, FlightError, "cloud_share must be 0 to 1"),
 }
 
 

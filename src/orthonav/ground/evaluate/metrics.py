@@ -109,7 +109,6 @@ class Comparison:
 
     @property
     def flights(self) -> list[slice]:
-        """The views of each flight."""
         return [slice(*ends) for ends in pairwise((*self.starts, len(self.frames)))]
 
     def confident_wrong(self, least_m: float) -> BoolArray:

@@ -215,7 +215,6 @@ def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
 
 
 def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
-    """Name, description, caption and drawing of each figure of a flight."""
     comparison, metrics, radius_m = flight.comparison, flight.metrics, flight.metrics.radius_m
     bounds = " Shaded below: 1 sigma and the 95 % bound that the covariance states."
     figures = [
@@ -324,7 +323,6 @@ def map_picture(
 
 
 def view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, float, float]:
-    """West, east, south, north of the flight and of the fixes near it."""
     truth, fixes = comparison.truth_en_m, comparison.fix_en_m
     low, high = truth.min(axis=0), truth.max(axis=0)
     reach = max(float((high - low).max()) * 0.35, 5 * radius_m)

@@ -59,8 +59,6 @@ _DTYPES = ("uint8", "uint16", "int16", "float32")
 
 @dataclass(frozen=True, eq=False)
 class CogLevel:
-    """One file at the resolution that is read."""
-
     url: str  # may hold `{key}` or `{token}`
     level: int | None  # index of the overview; None is the full resolution
     transform: Affine
@@ -225,7 +223,6 @@ def _signed(web: Web, token_url: str | None, urls: list[str]) -> list[str]:
 
 
 def _found(web: Web, spec: SourceSpec, area: Area) -> Iterator[tuple[dict[str, Any], str]]:
-    """Items of a search, page by page, with the address of the page."""
     west, south, east, north = area.extent_en_m
     corners = [(west, south), (west, north), (east, south), (east, north)]
     lat, lon = area.frame.latlon_from_en(corners)

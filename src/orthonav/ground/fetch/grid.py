@@ -50,7 +50,6 @@ class CellGrid:
         return Affine(self.res_x, 0, west, 0, -self.res_y, north)
 
     def bounds(self, row: int, col: int) -> tuple[float, float, float, float]:
-        """West, south, east, north of a cell."""
         west, south, east, north = array_bounds(
             self.cell_h_px, self.cell_w_px, self.transform(row, col)
         )
@@ -73,7 +72,6 @@ class Selection:
 
     @property
     def shape_px(self) -> tuple[int, int]:
-        """Height and width in pixels of the box around all cells."""
         rows, cols = (np.ptp(self.cells, axis=0) + 1).tolist()
         return int(rows) * self.grid.cell_h_px, int(cols) * self.grid.cell_w_px
 

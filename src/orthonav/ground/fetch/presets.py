@@ -68,8 +68,6 @@ class ImageryOptions:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Origin and terms of imagery, written into the file."""
-
     source: str  # address without keys
     layer: str  # or STAC collection
     date: str | None = None  # acquisition: YYYY[-MM[-DD]], or first and last with a slash between
@@ -81,8 +79,6 @@ class Provenance:
 
 @dataclass(frozen=True)
 class SourceSpec:
-    """A service and the imagery requested of it."""
-
     protocol: str  # one of `PROTOCOLS`
     url: str  # with `{key}` in place of a key
     options: ImageryOptions
@@ -178,7 +174,6 @@ class Preset:
 
 @cache
 def presets() -> dict[str, Preset]:
-    """All services by name."""
     text = resources.files(__package__).joinpath("presets.toml").read_text(encoding="utf-8")
     return {name: _preset(name, values) for name, values in tomllib.loads(text).items()}
 

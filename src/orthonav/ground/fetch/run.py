@@ -60,8 +60,6 @@ class FetchRequest:
 
 @dataclass(frozen=True)
 class CostEstimate:
-    """Expected cost of a fetch, from usual tiles."""
-
     tiles: int
     gsd_m: float
     width_px: int
@@ -71,7 +69,6 @@ class CostEstimate:
     provenance: Provenance
 
     def text(self) -> str:
-        """One line for people."""
         minutes = "less than a minute" if self.minutes < 1 else f"about {self.minutes:.0f} minutes"
         return (
             f"{self.tiles} tiles, {self.width_px} x {self.height_px} px of {self.gsd_m:.3g} m, "
@@ -81,8 +78,6 @@ class CostEstimate:
 
 @dataclass(eq=False)
 class FetchResult:
-    """What became of the cells of a selection."""
-
     estimate: CostEstimate
     images: int = 0
     not_covered: int = 0  # without imagery, as the service reports
@@ -101,7 +96,6 @@ class FetchResult:
         return ", ".join(f"{number} {name}" for number, name in counted if number)
 
     def describe(self) -> dict[str, Any]:
-        """Plain values for JSON."""
         own = {name: value for name, value in vars(self).items() if name != "example"}
         estimate = own.pop("estimate")
         return {

@@ -300,7 +300,6 @@ class Mosaic:
         return [list(each) for each in sorted(found)]
 
     def describe(self) -> tuple[dict[str, Any], ...]:
-        """Entries of the map's manifest: one per file, and one per kind of files of a folder."""
         kinds: dict[Any, list[Source]] = {}
         for index, source in enumerate(self.sources):
             alike: Any = index

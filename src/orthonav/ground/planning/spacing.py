@@ -47,8 +47,6 @@ class Caution:
 
 @dataclass(frozen=True)
 class ViewPlan:
-    """Footprint of a vertical view of flat ground."""
-
     agl_m: float  # height above ground
     width_m: float
     height_m: float

@@ -86,8 +86,6 @@ Prior = tuple[Array, Array]
 
 @dataclass(frozen=True)
 class MountCalibration:
-    """Estimated biases, and the views that they are of."""
-
     mount: Mount
     first: str  # frame of the first view used
     last: str  # frame of the last one

@@ -85,8 +85,6 @@ class BrokenLogError(FlightError):
 
 
 class LogContent:
-    """What the files of one flight hold, collected as they are read."""
-
     def __init__(self) -> None:
         self.session: dict[str, Any] = {}  # of the last message
         self.views: list[LoggedView] = []
@@ -156,7 +154,6 @@ class LogContent:
 
 
 def is_flight_log(path: Path) -> bool:
-    """Whether a file is a flight log, complete or not, or a folder holds one."""
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     return any(file.is_file() and profile_of(file) == PROFILE for file in files)
 

@@ -63,8 +63,6 @@ Columns = dict[str, NDArray[Any]]
 
 
 class _Collected:
-    """Samples collected from a log."""
-
     def __init__(self, mount_deg: Angles) -> None:
         self.mount = mount_deg
         self.attitude, self.velocity, self.position = Samples(3), Samples(2), Samples(3)

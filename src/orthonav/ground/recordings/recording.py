@@ -161,7 +161,6 @@ def _rounded(value: Any) -> Any:
 def known_at(
     track: RecordedTrack, time_ns: int, options: SourceOptions
 ) -> tuple[Telemetry, tuple[float, float] | None]:
-    """Telemetry and true position at a time of the track's own clock."""
     truth = track.latlon_deg(time_ns)
     telemetry = track.telemetry(time_ns, options.ground_alt_m)
     return rounded(with_options(telemetry, truth, options)), truth

@@ -118,7 +118,6 @@ def _order(path: Path) -> tuple[str, int]:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[tuple[Any, list[str]]]:
-    """A reader of the recording, and warnings about its files."""
     bound_inflation()
     with contextlib.ExitStack() as stack:
         stack.enter_context(reading("ROS recording", path))
@@ -372,7 +371,6 @@ def all_on(reader: Any, connection: Any) -> list[Any]:
 
 
 def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
-    """The topics of a recording by role."""
     counted = {one.topic: one for one in reader.connections if one.msgcount}
     found: dict[str, list[Any]] = {}
     for role, types in TYPES.items():

@@ -112,7 +112,6 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> None:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether a folder holds files of its list alone, unchanged."""
     try:
         listed = (folder / LIST).read_text(encoding="utf-8", errors="replace").splitlines()
         found = [path for path in folder.iterdir() if path.name != LIST]

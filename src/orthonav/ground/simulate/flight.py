@@ -142,7 +142,7 @@ class SimulateRequest:
     effects: ViewEffects = USUAL_EFFECTS
     seed: int = 0  # of all random draws, 0 or more; equal requests give equal bytes
     turn_radius_m: float = 0.0
-    cloud_share: float = 0.0  # fraction of the views with clouds, 0..1
+    clouds: Callable[[int, int], Clouds] | None = None  # by the number of views and the seed
     terrain: TerrainHeights | None = None
     terrain_posting_m: float = 5.0  # resolution of the terrain
     camera_pitch_deg: float = 0.0
@@ -215,8 +215,7 @@ def simulate_flight(
         if request.in_perspective:
             posting_m = request.terrain_posting_m
             surface = surface_of(request.terrain, area.frame, area.extent_en_m, posting_m)
-        cloudy = request.cloud_share > 0
-        clouds = Clouds(len(poses), request.cloud_share, request.seed) if cloudy else None
+        clouds = request.clouds(len(poses), request.seed) if request.clouds else None
         note = f"simulated over {mosaic.sources[0].path.name}, seed {request.seed}"
         writer = FlightWriter(folder, request.camera, note)
         digits = max(4, len(str(len(poses))))
@@ -248,13 +247,12 @@ def _check(request: SimulateRequest) -> None:
         "height above ground": (request.agl_m, 1, 50_000),
         "seed": (request.seed, 0, math.inf),
         "turn radius": (request.turn_radius_m, 0, 100_000),
-        "cloud_share": (request.cloud_share, 0, 1),  # of the views
         "camera pitch": (request.camera_pitch_deg, 0, MAX_PITCH_DEG),
     }
     for what, (value, least, most) in limits.items():
         if value is not None and not least <= value <= most:
             raise FlightError(f"{what} must be {least:,} to {most:,g}, got {value}")
-    if request.cloud_share and request.camera_pitch_deg:
+    if request.clouds and request.camera_pitch_deg:
         raise FlightError("clouds are simulated below cameras that look straight down only")
     on_a_route = {
         "turn_radius_m": request.turn_radius_m > 0,

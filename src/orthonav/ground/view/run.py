@@ -404,8 +404,6 @@ def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
 
 
 class FolderImages:
-    """Views of a flight folder by frame."""
-
     def __init__(self, path: Path) -> None:
         self.folder = open_flight(path, images_needed=False)
         self._views = {view.frame: view for view in self.folder.views}
