@@ -33,7 +33,7 @@ CONDITIONS = Conditions(
     radius_m=35.0,
     speed_mps=22.0,
     drift=0.02,
-    alert_limit_m=50.0,
+    alert_limit_m=40.0,
 )
 GO = Verdict(Word.GO, (Reason("fixes", "A fix is likely along nearly all of the route.", Word.GO),))
 NO_GO = Verdict(

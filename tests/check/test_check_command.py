@@ -115,7 +115,8 @@ def test_another_sensor_lowers_what_is_predicted(checked):
 
 
 def test_a_route_over_both_halves(checked, frame):
-    result = checked(route=route_of(frame, [[-350, 0], [350, 0]]), band_m=200.0)
+    route = route_of(frame, [[-350, 0], [350, 0]])
+    result = checked(route=route, band_m=200.0, alert_limit_m=25.0)
     along = result.along
     assert along.probability[0] > 0.8 and along.probability[-1] < 0.2
     assert along.distance_m[-1] - 100 < result.outages[-1].end_m <= along.distance_m[-1]

@@ -119,13 +119,25 @@ def test_flights_with_certain_fixes_are_always_available():
     )
 
 
+@pytest.mark.parametrize("side_m", [61.3, 299.7, 2000.1])
+def test_views_of_any_size_are_available_where_fixes_are_certain(side_m):
+    """With a limit that is below the growth over a view of the largest size."""
+    along = replace(along_of([0.99] * 200, side_m / 4), wrong=np.zeros(200))
+    wide = replace(CONDITIONS, width_m=side_m, height_m=side_m, alert_limit_m=20.0, drift=0.03)
+    shifts, rng = scene_shifts(0.0), np.random.default_rng(7)
+    assert simulated(along.distance_m, along, wide, shifts, 0, rng).availability.low > 0.95
+
+
+HELD_M = 50.0  # a fix holds for half the side of a view
+
+
 def test_without_fixes_the_protection_level_follows_the_drift():
     found = flights_over([0.0] * 101)
-    rms_m = np.hypot(3.0, 0.03 * 2500)
+    rms_m = np.hypot(3.0, 0.03 * (2500 - HELD_M))
     level_m = protection_level_m(1.0, np.eye(2) * rms_m**2 / 2, 1e-3)
     assert found.protection_m[-1] == pytest.approx(level_m, rel=1e-6)
     assert found.probability == (0, 0, 0)
-    reach_m = np.sqrt((40.0 / level_m * rms_m) ** 2 - 9) / 0.03
+    reach_m = HELD_M + np.sqrt((40.0 / level_m * rms_m) ** 2 - 9) / 0.03
     assert found.availability.median == pytest.approx(reach_m / 2500, abs=0.015)
     assert found.outage_m.median == pytest.approx(2500 - reach_m, abs=40)
 

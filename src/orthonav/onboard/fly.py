@@ -333,9 +333,10 @@ class Runner:
         return outcome, latency_ms
 
     def _doubt(self, result: ViewResult, latency: Latency | None) -> str | None:
-        fix = self._confident_fix(result)
-        if self._latency is None or latency is None or fix is None:
+        fix, followed = result.outcome, result.state in (None, "tracking")
+        if self._latency is None or latency is None or not (result.is_confident and followed):
             return None
+        assert isinstance(fix, Fix)
         return self._latency.located(latency, (fix.lat_deg, fix.lon_deg), fix.std_m)
 
     def _confident_fix(self, result: ViewResult) -> Fix | None:

@@ -187,7 +187,7 @@ AVAILABILITY = Threshold(0.8, 0.5)
 OUTAGE_S = Threshold(60.0, 600.0)
 """Longest outage."""
 FALSE_FIX = Threshold(0.01, 0.1)
-"""Probability of a false fix on the route: its median."""
+"""Probability of a false fix on the route."""
 WRONG = Threshold(0.005, 0.02)
 """Fraction of trials that were false fixes, without a route; at least two."""
 OUTSIDE = Threshold(0.005, 0.1)
@@ -232,7 +232,7 @@ def verdict_of(found: Findings) -> Verdict:
     limit_m = found.conditions.alert_limit_m
     level = f"Even right after a fix the protection level is {found.after_fix_m:.0f} m"
     if found.flights is not None:
-        even = f". {level}" if found.after_fix_m > limit_m else ""
+        even = f". {level}" if limit_m < found.after_fix_m < math.inf else ""
         reasons += [*_outside(found.outside), *_flown(found.flights, limit_m, even)]
     elif found.after_fix_m > limit_m:
         reasons += [Reason("availability", f"{level}; alert limit: {limit_m:g} m.", Word.NO_GO)]
@@ -299,7 +299,8 @@ def _flown(flights: Flights, limit_m: float, even: str) -> list[Reason]:
     text = f"Longest outage: {flights.outage_m.median:.0f} m, {flights.outage_s.median:.0f} s "
     text += f"({low_s:.0f} to {high_s:.0f} s). Limit: {OUTAGE_S.go:g} s at the upper end."
     reasons += [Reason("outage", text, OUTAGE_S.word(flights.outage_s))]
-    word = FALSE_FIX.word(_exact(flights.false_fix.median))
+    word = FALSE_FIX.word(flights.false_fix)
     text = f"Probability of a false fix on this route: {100 * flights.false_fix.median:.1f} % (up "
-    text += f"to {100 * flights.false_fix.high:.1f} %). Limit: {100 * FALSE_FIX.go:g} %."
+    text += f"to {100 * flights.false_fix.high:.1f} %). Limit: {100 * FALSE_FIX.go:g} % at the "
+    text += "upper end."
     return [*reasons, Reason("wrong", text, word)]

@@ -238,7 +238,7 @@ class Range(NamedTuple):
 
     @classmethod
     def of(cls, values: Array) -> "Range":
-        low, median, high = np.quantile(values, (INTERVAL[0], 0.5, INTERVAL[1]))
+        low, median, high = np.quantile(values, (INTERVAL[0], 0.5, INTERVAL[1]), method="nearest")
         return cls(float(median), float(low), float(high))
 
 

@@ -275,7 +275,7 @@ class _Check:
     ) -> Prediction:
         """Predictions for places (N, 2): probability 0 and no error where the map is empty."""
         found = predictor.at(points)
-        for values in (found.probability, found.low, found.high, found.wrong):
+        for values in (found.probability, found.low, found.high):
             values[~covered] = 0.0
         found.error_m[~covered] = np.nan
         return found

@@ -99,7 +99,9 @@ class Gate:
         self._watch(estimate)
         if estimate is not None:
             self._protection_level_m = estimate.protection_level_m
-        if reason == "alert_limit" and self._unavailable_ns is None:
+        if estimate is None or self._protection_level_m <= self.rules.alert_limit_m:
+            self._unavailable_ns = None
+        elif self._unavailable_ns is None:
             self._unavailable_ns = now_ns
         if estimate is None or reason is not None:
             self.withheld[reason or "no_fix"] += 1
@@ -109,7 +111,7 @@ class Gate:
         if jumped and (coasting or not self._is_confirmed(estimate)):
             self.withheld["jump"] += 1
             return None
-        self._jumped_to, self._unavailable_ns = [], None
+        self._jumped_to = []
         if jumped or (self._last is not None and self._interrupted):
             self.resets += 1
         self._interrupted = False
