@@ -274,6 +274,11 @@ class ViewResult:
             return False
         return self.outcome.is_confident if self.accepted is None else self.accepted
 
+    @property
+    def is_recognized(self) -> bool:
+        """Whether it is confident, and not of a track that searches, coasts or is lost."""
+        return self.is_confident and self.state in (None, "tracking")
+
 
 EXPECTED = (
     "expected (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA; uint8, uint16 (white is 65535) or "

@@ -333,8 +333,8 @@ class Runner:
         return outcome, latency_ms
 
     def _doubt(self, result: ViewResult, latency: Latency | None) -> str | None:
-        fix, followed = result.outcome, result.state in (None, "tracking")
-        if self._latency is None or latency is None or not (result.is_confident and followed):
+        fix = result.outcome
+        if self._latency is None or latency is None or not result.is_recognized:
             return None
         assert isinstance(fix, Fix)
         return self._latency.located(latency, (fix.lat_deg, fix.lon_deg), fix.std_m)
@@ -347,7 +347,7 @@ class Runner:
 
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
         now_ns = self._clocks.mono_ns()
-        if result.is_confident and result.state in (None, "tracking"):
+        if result.is_recognized:
             self._confident_ns = now_ns
             self._count("confident")
         fix = self._confident_fix(result)

@@ -375,7 +375,7 @@ def _result(result: ViewResult, index: int) -> list[Message]:
         with contextlib.suppress(ValueError):  # a value that is not finite
             data = position_message(result.outcome, result.time_ns)
             messages.append(_message(POSITION, result.time_ns, data, index))
-            confident = result.is_confident and result.state in (None, "tracking")
+            confident = result.is_recognized
             data = navsat_message(result.outcome, result.time_ns, confident=confident)
             messages.append(_message(NAVSAT, result.time_ns, data, index))
     return messages
