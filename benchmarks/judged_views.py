@@ -5,7 +5,8 @@ import math
 import shutil
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,7 @@ def _rows(
         half_path, middle = _western_half(past, work)
         half = _registration(half_path)
     seed += zlib.crc32(pair.name.encode()) % 1_000_000  # pairs with the same views fly elsewhere
+    flights: dict[tuple[Any, ...], Path] = {}
     other_scenes = [each for each in others if place_of(each) != place_of(pair)]
     for number, case in enumerate(CASES):
         count = max(1, round(case.share * views))
@@ -134,11 +136,16 @@ def _rows(
         localizer = half if case.kind == "beside" else whole
         if localizer is None:
             continue
+        # Mirrored views, and those with another prior, are the views of the map once more.
+        kind = "found" if case.kind in ("mirrored", "other prior") else case.kind
+        key = (kind, *astuple(replace(case, share=0.0))[1:])
         try:
-            folder = _flight(over, case, count, seed + number, work)
+            if key not in flights:
+                flights[key] = _flight(over, case, count, seed + number, work)
         except AreaError:  # wider than the imagery
             continue
-        for name, view, truth in _flown_for(case, folder, gsd_of(over), middle):
+        taken = _flown_for(case, flights[key], gsd_of(over), middle)
+        for name, view, truth in islice(taken, count):
             if gsd_m is not None:
                 scale = localizer.grid.gsd_m / gsd_m
                 view = replace(view, telemetry=_scaled(view.telemetry, scale))
@@ -146,6 +153,7 @@ def _rows(
             if case.kind == "found" and not is_covered(localizer, truth, case.width_px):
                 about["kind"] = "beside"
             yield {**about, **_placed(localizer, case, view, truth)}
+    for folder in flights.values():
         shutil.rmtree(folder)
 
 
