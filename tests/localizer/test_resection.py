@@ -9,6 +9,7 @@ from blots import AGL_M, CAMERA, GROUND, as_grey, known_map, rendered
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
+from orthonav.core.localize.camera import _scaled, camera_found
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Prior, Telemetry, View
 
@@ -132,3 +133,32 @@ def test_tilt_of_an_oblique_view_is_found(localizer):
     off = error(localizer, fix, place, attitude, 100.0)
     assert np.hypot(*off[:2]) < 1.0 and np.abs(off[4:]).max() < 0.4
     assert fix.confidence > 0.9
+
+
+@pytest.mark.parametrize("variance", [0.25, 1.0, 2.8])
+def test_errors_of_blocks_scale_all_but_what_telemetry_says(variance):
+    # Shown by the picture; by telemetry only; by both alike.
+    shown, reported = np.array([1e4, 0.0, 3.0]), np.array([0.0, 0.2, 3.0])
+    covariance = np.diag(1 / (shown + reported))
+    scaled = np.diag(_scaled(covariance, np.diag(reported), variance))
+    assert scaled[:2] == pytest.approx([variance * 1e-4, 5.0])
+    # A mean of two errors with standard deviations of sqrt(variance / 3) and sqrt(1 / 3).
+    assert scaled[2] == pytest.approx((variance / 3 + 1 / 3) / 4)
+
+
+def test_a_place_that_stands_out_is_known_better(localizer):
+    attitude = (20.0, 0.0, 0.0)
+    view = View(
+        as_grey(rendered(GROUND, np.zeros(2), attitude, AGL_M)),
+        CAMERA,
+        Telemetry(0, *attitude, AGL_M),
+    )
+    search = localizer.registration.search(view, None, True)
+    place = search.run()
+    alike, alone = (
+        camera_found(search.ground, search.sheet.reference, place.fit.pose, ratio)
+        for ratio in (1.0, 10.0)
+    )
+    assert (alone.orientation.position_m == alike.orientation.position_m).all()
+    stds = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in (alone, alike)]
+    assert 0.3 < stds[0] / stds[1] < 0.7

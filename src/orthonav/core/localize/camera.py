@@ -283,6 +283,9 @@ FIRST_REACH_PX, REACH_PX = 7, 4
 """Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
 FITS = 3  # at most,
 SMALL_SHARE = 0.2  # until a correction is below this fraction of its standard deviations
+VARIANCE, VARIANCE_POWER, LEAST_RATIO = 1.6, -0.8, 0.5
+"""Of the errors of blocks over what their curvature says, by the local ratio of the place, at least
+the third (docs/decisions/camera.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,6 +293,7 @@ class CameraFound:
     """The camera of a view; `agl_m`: above the ground below it; `alone`: without telemetry.
 
     - covariances (6, 6): m east, north, up, deg heading, pitch, roll; `WEAK` where not shown.
+    - `variance`: of the errors of blocks over what their curvature says.
     - `middle_en_m`, `middle_covariance` (2, 2): ground in the middle of the picture, None: unknown.
     """
 
@@ -298,12 +302,17 @@ class CameraFound:
     covariance: Array
     alone: Orientation
     alone_covariance: Array
+    variance: float
     middle_en_m: tuple[float, float]
     middle_covariance: Array | None
 
 
-def camera_found(seen: ViewOverGround, reference: Reference, pose: Pose) -> CameraFound | None:
-    """Of a view at `pose`; None where the tilt is exact or too few blocks are seen."""
+def camera_found(
+    seen: ViewOverGround, reference: Reference, pose: Pose, local_ratio: float | None
+) -> CameraFound | None:
+    """Of a view at `pose`; None where the tilt is exact or too few blocks are seen.
+
+    `local_ratio`: of the scores of the place; None: unknown."""
     if tilt_std_deg(seen.view.telemetry) == 0:
         return None
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
@@ -326,15 +335,25 @@ def camera_found(seen: ViewOverGround, reference: Reference, pose: Pose) -> Came
     agl_m = above_sea_m - float(seen.relief.terrain.at_en_m([east, north]))
     if not agl_m > 0:
         return None
+    variance = 1.0
+    if local_ratio is not None:
+        variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
+    covariance = _scaled(found.covariance, _prior(seen, pose, start)[1], variance)
     return CameraFound(
         orientation,
         agl_m,
-        found.covariance,
+        covariance,
         start.moved(found.alone),
-        found.alone_covariance,
+        _scaled(found.alone_covariance, np.diag(WEAK**-2), variance),
+        variance,
         seen.middle_en_m(orientation, pose),
-        _middle_covariance(seen, orientation, found.covariance),
+        _middle_covariance(seen, orientation, covariance),
     )
+
+
+def _scaled(covariance: Array, information: Array, variance: float) -> Array:
+    """With so many times the variance of all that is not the prior's `information` (6, 6)."""
+    return variance * covariance + (1 - variance) * covariance @ information @ covariance
 
 
 def tilt_std_deg(telemetry: Telemetry) -> float:

@@ -7,16 +7,14 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.integrity import probability_beyond
 from orthonav.core.localize.camera import CameraFound, tilt_std_deg
-from orthonav.core.localize.confidence import within
 from orthonav.core.localize.ground import SearchedSheet
 from orthonav.core.localize.place import Place
 from orthonav.core.localize.rectify import off_nadir_deg
 from orthonav.core.localize.search import Search
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import RADIUS_SHARE, Fix
-
-ERROR_VARIANCE = 1.5  # their tails are heavier than a Gaussian's (docs/decisions/camera.md)
 
 
 def fix_of(search: Search, best: Place) -> Fix:
@@ -52,7 +50,7 @@ def fix_of(search: Search, best: Place) -> Fix:
         lat_deg=float(lat),
         lon_deg=float(lon),
         cov_en_m2=found.cov_en_m2,
-        confidence=place * within(found.place_en_m, ERROR_VARIANCE * found.cov_en_m2, radius_m),
+        confidence=place * (1 - probability_beyond(found.cov_en_m2, radius_m)),
         radius_m=radius_m,
         heading_deg=heading_deg % 360,
         agl_m=found.agl_m,
@@ -70,7 +68,8 @@ def _by_camera(sheet: SearchedSheet, view: PreparedView, camera: CameraFound) ->
     """From the blocks of the view."""
     heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
     _, _, up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)).tolist()
-    floor_m2, covariance = np.eye(2) * sheet.floor_m(view) ** 2, camera.covariance.copy()
+    floor_m2 = np.eye(2) * sheet.floor_m(view) ** 2 * camera.variance
+    covariance = camera.covariance.copy()
     covariance[:2, :2] += floor_m2
     middle = camera.middle_covariance
     return _Exterior(

@@ -167,7 +167,8 @@ class Search:
 
     def camera(self, place: Place) -> CameraFound | None:
         """None where the reported tilt is exact or the view does not show it."""
-        return camera_found(self.ground, self.sheet.reference, place.fit.pose)
+        ratio = place.scores.get("local_ratio")
+        return camera_found(self.ground, self.sheet.reference, place.fit.pose, ratio)
 
     # What is tried
 

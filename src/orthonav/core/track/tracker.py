@@ -558,7 +558,7 @@ class Tracker:
         order = [0, 1, 3, 2, 4, 5]
         covariance = (units @ camera.alone_covariance @ units)[np.ix_(order, order)]
         floor_m = self._registration.floor_m(prepared)
-        covariance[:2, :2] += np.eye(2) * floor_m**2
+        covariance[:2, :2] += np.eye(2) * floor_m**2 * camera.variance
         return np.array([east, north, heading, scale, pitch, roll]), covariance
 
     def _by_similarity(
