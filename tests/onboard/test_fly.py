@@ -575,7 +575,7 @@ def test_positions_beyond_the_alert_limit_are_withheld_and_said(begin):
     assert health["protection_level_m"] == pytest.approx(level_m, abs=0.1)
     shown.update(place=0.99, std_m=2.0)
     flight.views(10)
-    assert flight.gate.sent == sent and "protection level unknown" in flight.health().text()
+    assert flight.gate.sent == sent and "protection level infinite above" in flight.health().text()
     shown["place"] = 0.9999
     assert flight.views(20)[-1].is_confident
     assert flight.health().level is Level.OK and flight.gate.sent != sent

@@ -131,7 +131,7 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     return (
         (
             percent_text(metrics.availability),
-            f"availability: {metrics.n_confident} of {metrics.n_views} views have a confident fix "
+            f"{metrics.n_confident} of {metrics.n_views} views have a confident fix "
             f"(95 % interval {low:.0f} to {high:.0f} %)",
         ),
         (

@@ -219,7 +219,7 @@ def unavailable_text(availability: Mapping[str, float | None]) -> str:
     if not availability.get("unavailable_s"):
         return ""
     level_m = availability["protection_level_m"]
-    level = "unknown" if level_m is None else f"{level_m:.0f} m"
+    level = "infinite" if level_m is None else f"{level_m:.0f} m"
     return (
         f"protection level {level} above the alert limit {availability['alert_limit_m']:g} m "
         f"for {availability['unavailable_s']:.0f} s"
