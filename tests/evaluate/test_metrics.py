@@ -19,7 +19,7 @@ from orthonav.ground.evaluate.metrics import (
     worst_views,
 )
 from orthonav.ground.evaluate.statistics import standard_figures, upper_bound
-from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, verdict
+from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, summary, verdict
 
 CENTRE = LocalFrame(48.0, -4.5)
 TRUTH_EN_M = {"a": (0.0, 0.0), "b": (100.0, 0.0), "c": (200.0, 50.0), "d": (300.0, 50.0)}
@@ -220,6 +220,38 @@ def test_availability_and_false_fixes_at_an_alert_limit() -> None:
     without = measure(compare(truth_of(truth), results, risk=1e-5)).integrity
     assert without is not None and without.n_levels == 0  # wrong places are likelier
     assert math.isnan(without.availability) and math.isnan(without.outage.seconds_s)
+
+
+def test_an_image_that_was_dropped_counts_as_an_outage_up_to_the_next_view() -> None:
+    """One of four views, 1 s apart, has no result: the outage lasts from the view before it to
+    the view after it. Beyond the first and the last result the times are unknown."""
+    results = [placed(name, second, 1.0, 3.0, 0.9999) for name, second in (("a", 0), ("b", 1))]
+    results.append(placed("d", 3, 1.0, 3.0, 0.9999))
+    comparison = compare(truth_of(TRUTH_EN_M), results)
+    found = measure(comparison, 15.0, 35.0).integrity
+    assert found is not None and found.availability == 0.75
+    assert found.availability_of_time == pytest.approx(1 / 3)
+    assert found.outage.seconds_s == 2.0 and found.outage.path_m == pytest.approx(206.2, abs=0.1)
+    two = measure(pool([comparison, comparison]), 15.0, 35.0).integrity
+    assert two is not None and two.outage == found.outage
+    for ends in (results[:2], results[1:]):
+        cut = measure(compare(truth_of(TRUTH_EN_M), ends), 15.0, 35.0).integrity
+        assert cut is not None and math.isnan(cut.outage.seconds_s + cut.availability_of_time)
+
+
+def test_availability_is_the_word_of_the_alert_limit_alone() -> None:
+    """Fixes are confident by their own criterion, whatever the alert limit of the evaluation."""
+    results = [placed(name, i, 1.0, 3.0, 0.99) for i, name in enumerate("abcd")]
+    results = [replace(each, accepted=True) for each in results]
+    comparison = compare(truth_of(TRUTH_EN_M), results)
+    flight = FlightReport("f", comparison, measure(comparison, 15.0, 35.0))
+    said = summary([flight], flight.metrics)
+    assert "views with a confident fix: 100.0 % (" in said
+    assert [line for line in said.splitlines() if "availab" in line] == [
+        "available at the alert limit of 35 m: 0.0 % of views, 0.0 % of the time; longest outage "
+        "3.0 s, 312 m",
+        "available and beyond the alert limit of 35 m: none of 0",
+    ]
 
 
 def test_fixes_of_earlier_files_are_judged_by_their_confidence() -> None:

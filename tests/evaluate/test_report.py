@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 from html_page import Page
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.ground.evaluate import report
 from orthonav.ground.evaluate.metrics import compare, measure
 from orthonav.ground.evaluate.report import MadeFrom, write_report
 from orthonav.ground.evaluate.tables import (
@@ -96,15 +98,31 @@ def test_the_page_holds_metrics_and_provenance(tmp_path: Path, no_plots) -> None
 
 def test_protection_levels_are_drawn_where_they_are_known(tmp_path: Path, no_plots) -> None:
     flight = made_flight(30)
+    fixes = np.isfinite(flight.comparison.errors_m)
+    levels_m = np.where(fixes, np.where(np.arange(30) % 2, 20.0, np.inf), np.nan)
     comparison = replace(
         flight.comparison,
         place_probability=np.full(30, 0.9999),
-        protection_levels_m=np.full(30, 20.0),
+        protection_levels_m=levels_m,
     )
     limited = replace(flight, comparison=comparison, metrics=measure(comparison, 15.0, 35.0))
     html = write_report(tmp_path, [limited]).read_text("utf-8")
     assert stems(tmp_path) == {*FIGURES, "stanford"}
     assert "<h3>Integrity</h3>" in html and "available at the alert limit of 35 m" in html
+    counted = f"{np.isfinite(levels_m).sum()} of {fixes.sum()} fixes at a risk of 0.001"
+    assert f"{counted}; the level of the others is infinite" in html
+
+
+def test_a_stanford_diagram_without_any_level_has_axes_that_can_be_read(monkeypatch) -> None:
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(report, "draw_axes", lambda size_in, draw: draw)
+    comparison = replace(made_flight(30).comparison, protection_levels_m=np.full(30, np.inf))
+    for limit_m in (35.0, math.nan):
+        axes = Figure().add_subplot()
+        report.stanford_picture(comparison, limit_m)(axes)
+        for low, high in (axes.get_xlim(), axes.get_ylim()):
+            assert low < 1 < 10 < high
 
 
 def test_several_flights_have_a_total_and_files_of_their_own(tmp_path: Path, no_plots) -> None:

@@ -51,3 +51,13 @@ def test_without_a_place_probability_the_confidence_counts():
 def test_what_is_unknown_protects_nothing(unknown):
     fix = replace(FIX, place_probability=math.nan, **unknown)
     assert math.isinf(fix.protection_level_m(0.5)) and math.isnan(fix.probability_within(10))
+
+
+@pytest.mark.parametrize("risk", [-0.1, 1.1, math.nan])
+def test_a_risk_that_is_no_probability_is_refused(risk):
+    with pytest.raises(ValueError, match="0 to 1"):
+        FIX.protection_level_m(risk)
+
+
+def test_no_error_is_within_a_negative_limit():
+    assert FIX.probability_within(-1.0) == FIX.probability_within(0.0) == 0.0

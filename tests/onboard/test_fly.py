@@ -566,7 +566,7 @@ def test_positions_beyond_the_alert_limit_are_withheld_and_said(begin):
     assert 35 < level_m < math.inf and not result.is_confident
     assert flight.gate.sent == sent and flight.gate.withheld["alert_limit"] == 60
     assert flight.health().reasons == ("unavailable",)
-    text = r"protection level (\d+) m above the alert limit 35 m for \d"
+    text = r"protection level (\d+) m, above the alert limit 35 m for \d"
     said = re.search(f"unavailable: {text}", flight.runner.health.text())
     assert said is not None and abs(int(said[1]) - level_m) < 2
     assert re.search(rf"unavailable \({text}", flight.said.warnings[-1])
@@ -575,7 +575,7 @@ def test_positions_beyond_the_alert_limit_are_withheld_and_said(begin):
     assert health["protection_level_m"] == pytest.approx(level_m, abs=0.1)
     shown.update(place=0.99, std_m=2.0)
     flight.views(10)
-    assert flight.gate.sent == sent and "protection level unknown" in flight.health().text()
+    assert flight.gate.sent == sent and "protection level infinite, above" in flight.health().text()
     shown["place"] = 0.9999
     assert flight.views(20)[-1].is_confident
     assert flight.health().level is Level.OK and flight.gate.sent != sent

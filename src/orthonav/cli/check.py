@@ -19,7 +19,7 @@ EVERYDAY = (
     *("--dem", "--alert-limit-m", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior"),
     *("--quick", "--json"),
 )
-FIRST_SHARE = 0.1
+FIRST_SHARE = 0.03
 """Fraction of the trials from which their duration is estimated."""
 log = logging.getLogger(__name__)
 

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import (
@@ -281,17 +282,15 @@ def _print_summary(
     changed: tuple[dict[str, Any], list[str]] = ({}, []),
 ) -> None:
     """Print, on stderr where an output is stdout, how many views have positions and why not."""
-    import numpy as np
-
     from orthonav.core.files import is_stdout
     from orthonav.core.flight.fixes import result_to_json
+    from orthonav.core.records import Fix
     from orthonav.ground.recordings.setups import Counts
 
     counts, out = Counts.of(results), options.out
     exported = [Path(each.partition("=")[2]) for each in options.export]
-    latencies = np.array([result.latency_ms for result in results])
-    latencies = latencies[np.isfinite(latencies)]
-    median_ms = float(np.median(latencies)) if latencies.size else None
+    latencies = [each.latency_ms for each in results if math.isfinite(each.latency_ms)]
+    median_ms = median(latencies) if latencies else None
     plain = {
         "fixes": None if out is None else str(out),
         "views": counts.views,
@@ -314,11 +313,14 @@ def _print_summary(
             print_json(plain)
             return
         others = "above the alert limit" if options.alert_limit_m else "of low confidence"
+        fixes = [each.outcome for each in results if isinstance(each.outcome, Fix)]
+        infinite = sum(math.isinf(each.protection_level_m(accept.risk)) for each in fixes)
+        doubt = f" ({infinite} infinite: place in doubt)" * bool(options.alert_limit_m)
         named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
         why = f" ({named})" if named else ""
         print(
             f"{counted(counts.views, 'view')}: {counts.confident} confident ({accept.text()}), "
-            f"{counts.low} {others}, {counts.none} without a position{why}; "
+            f"{counts.low} {others}{doubt}, {counts.none} without a position{why}; "
             f"median {median_ms or 0:.1f} ms per view"
         )
         lines = [f"! {line}" for line in advice]

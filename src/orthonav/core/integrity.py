@@ -30,13 +30,15 @@ def protection_level_m(place_probability: float, cov_en_m2: Array, risk: float) 
     """Smallest limit that the error exceeds with a probability of at most `risk`.
 
     `place_probability`: that the place is right. Infinite where a wrong place alone is likelier
-    than that, and for an unknown covariance."""
+    than that, and for an unknown covariance. Raises `ValueError` unless `risk` is 0 to 1."""
     place, covs = np.array([place_probability]), np.asarray(cov_en_m2)[None]
     return float(protection_levels_m(place, covs, risk)[0])
 
 
 def protection_levels_m(place_probability: Array, covs_en_m2: Array, risk: float) -> Array:
     """The same (N,) of many: probabilities (N,) and covariances (N, 2, 2)."""
+    if not 0 <= risk <= 1:
+        raise ValueError(f"a risk is a probability, 0 to 1, got {risk}")
     levels = np.full(len(place_probability), math.inf)
     finite = np.isfinite(covs_en_m2).all(axis=(1, 2)) & (risk - (1 - place_probability) > 0)
     place, scales = place_probability[finite], _scales_m2(covs_en_m2[finite])

@@ -195,7 +195,7 @@ class Fix:
 
     def probability_within(self, limit_m: float) -> float:
         """Probability that the error is at most `limit_m`; NaN where the confidence is unknown."""
-        return self.right_probability * (1 - probability_beyond(self.cov_en_m2, limit_m))
+        return self.right_probability * (1 - probability_beyond(self.cov_en_m2, max(limit_m, 0.0)))
 
     def protection_level_m(self, risk: float = DEFAULT_RISK) -> float:
         """The smallest limit that the error exceeds with a probability of at most `risk`, m.

@@ -8,7 +8,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -78,6 +78,8 @@ class Comparison:
     `reasons`: code of each view without a fix, "" for a fix.
     `place_probability`, `protection_levels_m` (N,): NaN where unknown or without a fix; the level,
     at `risk`, is infinite where the place is too uncertain.
+    `followed` (N,): 1, or 0 where true positions without a result come next; NaN at the end of a
+    flight whose first or last true position has none.
     `n_without_truth`, `n_without_result`: results without truth, and the reverse.
     `starts`: index at which each pooled flight begins.
     """
@@ -98,6 +100,7 @@ class Comparison:
     place_probability: FloatArray
     protection_levels_m: FloatArray
     risk: float
+    followed: FloatArray
     n_without_truth: int
     n_without_result: int
     starts: tuple[int, ...] = (0,)
@@ -310,6 +313,10 @@ def compare(
             f"(first {first_known}); are these of the same flight?"
         )
     local = local or LocalFrame(*known[matched[0].frame])
+    frames = {result.frame for result in matched}
+    missing = dict(zip(known, np.cumsum([name not in frames for name in known]), strict=True))
+    before = [missing[result.frame] for result in matched]  # true positions without a result
+    is_whole = before[0] == 0 and before[-1] == len(known) - len(matched)
     outcomes = [result.outcome for result in matched]
     truth_en_m = _local(local, [known[result.frame] for result in matched])
     fix_en_m = _local(local, [_position(outcome) for outcome in outcomes])
@@ -333,6 +340,7 @@ def compare(
         ),
         protection_levels_m=protection_levels_m(matched, risk),
         risk=risk,
+        followed=frozen([*(np.diff(before) == 0), 1.0 if is_whole else math.nan]),
         n_without_truth=len(results) - len(matched),
         n_without_result=len(known) - len(matched),
     )
@@ -354,21 +362,15 @@ def protection_levels_m(results: Sequence[ViewResult], risk: float | None = None
 
 
 def pool(comparisons: Sequence[Comparison]) -> Comparison:
-    """Several flights as one, for metrics; positions stay in their own planes."""
+    """Several comparisons of one flight each as one, for metrics; each stays in its own plane."""
     if not comparisons:
         raise ValueError("no results: expected at least one flight")
-    lengths = [len(part.frames) for part in comparisons]
-    firsts = np.cumsum([0, *lengths[:-1]]).tolist()
     joined: dict[str, Any] = {
         field.name: _joined([getattr(part, field.name) for part in comparisons])
         for field in fields(Comparison)
     }
     joined |= {name: getattr(comparisons[0], name) for name in ("lat_deg", "lon_deg", "risk")}
-    joined["starts"] = tuple(
-        first + start
-        for first, part in zip(firsts, comparisons, strict=True)
-        for start in part.starts
-    )
+    joined["starts"] = tuple(np.cumsum([0, *(len(each.frames) for each in comparisons[:-1])]))
     return Comparison(**joined)
 
 
@@ -506,30 +508,29 @@ def _criterion_row(
 
 
 def _share_of_time(comparison: Comparison, flags: BoolArray) -> float:
-    """Of the views with `flags` (N,), each up to the next view of its flight; NaN where views have
-    no result or times do not rise."""
-    if comparison.n_without_result:
+    """Of the views with `flags` (N,), each up to the next view of its flight, none where a view
+    between has no result; NaN where a flight has no result at an end or its times do not rise."""
+    if np.isnan(comparison.followed).any():
         return math.nan
     part_s = whole_s = 0.0
     for views in comparison.flights:
         steps_s = np.diff(seconds_since_first(comparison.time_ns[views]))
-        part_s += float(steps_s[flags[views][:-1]].sum())
+        part_s += float(steps_s[(flags & (comparison.followed > 0))[views][:-1]].sum())
         whole_s += float(steps_s.sum())
     return part_s / whole_s if whole_s else math.nan
 
 
 def _longest_without(comparison: Comparison, flags: BoolArray) -> Longest:
-    """The longest stretch of any flight without `flags` (N,), time and path each by itself; NaN
-    where views have no result or a flight does not tell."""
-    if comparison.n_without_result:
+    """The longest stretch of any flight without `flags` (N,), as `_share_of_time` counts them, time
+    and path each by itself; NaN likewise."""
+    if np.isnan(comparison.followed).any():
         return Longest(math.nan, math.nan)
-    gaps: list[tuple[float, float]] = []
+    without, gaps = ~(flags & (comparison.followed > 0)), []
     for views in comparison.flights:
         seconds_s = seconds_since_first(comparison.time_ns[views])
         path_m = path_so_far_m(comparison.truth_en_m[views])
-        gap = longest(~flags[views], seconds_s, path_m)
-        gaps.append((gap.seconds_s, gap.path_m))
-    return Longest(*(float(value) for value in np.max(gaps, axis=0)))
+        gaps.append(astuple(longest(without[views], seconds_s, path_m)))
+    return Longest(*map(float, np.max(gaps, axis=0)))
 
 
 def _covariance(outcome: Fix | NoFix) -> FloatArray:

@@ -131,7 +131,7 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     return (
         (
             percent_text(metrics.availability),
-            f"availability: {metrics.n_confident} of {metrics.n_views} views have a confident fix "
+            f"{metrics.n_confident} of {metrics.n_views} views have a confident fix "
             f"(95 % interval {low:.0f} to {high:.0f} %)",
         ),
         (
@@ -245,8 +245,9 @@ def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
             (
                 "stanford",
                 f"Stanford diagram; errors beyond the protection level: {beyond}",
-                "Stanford diagram: error and protection level of each fix that has one, at a risk "
-                f"of {metrics.integrity.risk:g}. Below the diagonal the error is beyond the level; "
+                f"Stanford diagram: error and protection level of {metrics.integrity.n_levels} of "
+                f"{metrics.n_fixes} fixes at a risk of {metrics.integrity.risk:g}; the level of "
+                "the others is infinite. Below the diagonal the error is beyond the level; "
                 "dotted: the alert limit.",
                 stanford_picture(comparison, metrics.integrity.alert_limit_m),
             )
@@ -439,7 +440,7 @@ def stanford_picture(comparison: Comparison, alert_limit_m: float) -> Drawing:
     beyond = errors_m > levels_m
 
     def draw(axes: "Axes") -> None:
-        seen = [*levels_m, *errors_m, *([alert_limit_m] if math.isfinite(alert_limit_m) else [1.0])]
+        seen = [*levels_m, *errors_m, 1.0, 10.0, np.nan_to_num(alert_limit_m, nan=1.0)]
         low, high = min(seen) / 1.5, max(seen) * 1.5
         axes.plot([low, high], [low, high], color=GREY, linewidth=1.2)
         for chosen, colour, mark in ((~beyond, RIGHT, "."), (beyond, WRONG, "X")):

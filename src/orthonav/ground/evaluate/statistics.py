@@ -134,12 +134,10 @@ def longest_stretch(flags: BoolArray, until: FloatArray) -> float:
     """The largest rise of `until` from the start of a run to its end; 0 without runs."""
     last = len(flags) - 1
     steps = [until[min(stop, last)] - until[start] for start, stop in runs(flags)]
-    return float(max(steps, default=0.0 if np.isfinite(until).all() else math.nan))
+    return float(max(steps, default=0.0 if until.size and np.isfinite(until).all() else math.nan))
 
 
 def longest(flags: BoolArray, seconds_s: FloatArray, path_m: FloatArray) -> Longest:
-    if not flags.size:
-        return Longest(math.nan, math.nan)
     return Longest(longest_stretch(flags, seconds_s), longest_stretch(flags, path_m))
 
 

@@ -203,8 +203,8 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
     low, high = map(percent_text, whole.availability_95)
     gap = f"{measure_text(whole.gap.seconds_s, ' s')}, {measure_text(whole.gap.path_m, ' m')}"
     lines = [
-        f"availability: {percent_text(whole.availability)} of views have a confident fix (95 % "
-        f"interval {low} to {high}); longest gap {gap}",
+        f"views with a confident fix: {percent_text(whole.availability)} (95 % interval {low} to "
+        f"{high}); longest gap {gap}",
         "",
         *aligned([STANDARD_HEADER, *standard_rows(whole)]),
         "",

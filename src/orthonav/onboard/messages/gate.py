@@ -44,7 +44,7 @@ class GateRules:
 
     `min_confidence`: 0 to 1. `max_std_m`: along the worst direction. `min_interval_s`: shortest
     time between two messages, by name. `send_coasting`: admit dead reckoning; messages mark it.
-    `alert_limit_m`: of the protection level, 1 or more; infinite: none.
+    `alert_limit_m`: of the protection level, above 0; infinite: none.
     """
 
     min_confidence: float = CONFIDENT
@@ -219,8 +219,8 @@ def unavailable_text(availability: Mapping[str, float | None]) -> str:
     if not availability.get("unavailable_s"):
         return ""
     level_m = availability["protection_level_m"]
-    level = "unknown" if level_m is None else f"{level_m:.0f} m"
+    level = "infinite" if level_m is None else f"{level_m:.0f} m"
     return (
-        f"protection level {level} above the alert limit {availability['alert_limit_m']:g} m "
+        f"protection level {level}, above the alert limit {availability['alert_limit_m']:g} m "
         f"for {availability['unavailable_s']:.0f} s"
     )
