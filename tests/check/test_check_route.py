@@ -131,15 +131,15 @@ def test_views_of_any_size_are_available_where_fixes_are_certain(side_m):
 HELD_M = 50.0  # a fix holds for half the side of a view
 
 
-def test_without_fixes_the_protection_level_follows_the_drift():
-    found = flights_over([0.0] * 101)
-    rms_m = np.hypot(3.0, 0.03 * (2500 - HELD_M))
+def test_without_fixes_the_level_follows_the_drift_until_the_flight_coasts():
+    found = flights_over([0.0] * 101, limit_m=1e3)
+    rms_m = np.hypot(3.0, 0.03 * HELD_M)  # one side of a view past the last fix
     level_m = protection_level_m(1.0, np.eye(2) * rms_m**2 / 2, 1e-3)
-    assert found.protection_m[-1] == pytest.approx(level_m, rel=1e-6)
+    assert found.protection_m[4] == pytest.approx(level_m, rel=1e-6)
+    assert np.isinf(found.protection_m[5:]).all()
     assert found.probability == (0, 0, 0)
-    reach_m = HELD_M + np.sqrt((40.0 / level_m * rms_m) ** 2 - 9) / 0.03
-    assert found.availability.median == pytest.approx(reach_m / 2500, abs=0.015)
-    assert found.outage_m.median == pytest.approx(2500 - reach_m, abs=40)
+    assert found.availability.median == pytest.approx(SIDE_M / 2500, abs=0.015)
+    assert found.outage_m.median == pytest.approx(2500 - SIDE_M, abs=40)
 
 
 def test_a_limit_below_the_error_of_a_fix_is_never_met():

@@ -32,7 +32,6 @@ FINE = dict(
     mean=Range(0.9, 0.8, 0.95),
     flights=None,
     conditions=CONDITIONS,
-    lookalikes=(),
     calibrated=True,
     wrong=0,
     trials=1000,

@@ -20,6 +20,9 @@ DRAWS_PER_VIEW = 2.0
 """Draws per side of a view: views that overlap by more than half are hardly independent."""
 CORRELATION = 0.5
 """Of the latent normal values of neighbouring draws, whose views share half of their ground."""
+COASTING_SIDES = 0.5 + 1e-6
+"""Sides of a view past the last one with a fix, from where on the flight coasts: dead reckoning
+does not confirm the place, so that its protection level is infinite (core/track/mixture.py)."""
 ROUNDING = 1e-9
 TAIL = 0.05
 """Probability of an error beyond the stated position error of 95 %."""
@@ -74,6 +77,7 @@ def simulated(
     since_m = np.maximum(distance_m - stops_m[last] - step_m, 0.0)
     errors_m = np.hypot(error_m[last], conditions.drift * since_m)
     levels_m = level_m(errors_m, conditions.risk)
+    levels_m[since_m > COASTING_SIDES * conditions.side_m] = np.inf
     available = levels_m <= conditions.alert_limit_m
     # Each point stands for the route half-way to its neighbours.
     lengths_m = np.gradient(distance_m) if length_m > 0 else np.ones(1)

@@ -25,7 +25,6 @@ from orthonav.ground.changes.record import CellGrid, ChangedGround
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
     Findings,
-    found_lookalikes,
     likely_outages,
     predicted_along,
     verdict_of,
@@ -220,7 +219,6 @@ class _Check:
             mean=flights.probability if flights else mean,
             flights=flights,
             conditions=conditions,
-            lookalikes=found_lookalikes([*own, *other], frame, conditions),
             calibrated=self.calibrated,
             wrong=wrong,
             trials=len(own) + len(other),
@@ -244,7 +242,6 @@ class _Check:
             route_en_m=None if request.route is None else request.route.points_en_m(frame),
             band_m=None if self.area is None else self.area.band_m,
             outages=likely_outages(along, flights, conditions) if along and flights else (),
-            lookalikes=findings.lookalikes,
         )
 
     def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:
