@@ -126,6 +126,9 @@ CHANGED = Threshold(0.1, math.inf)
 """Fraction of the ground that changed since the map was made."""
 MOST_UNCERTAIN = 0.5
 """Width of the interval of the mean chance beyond which the map alone cannot tell."""
+NARROW_PX, WIDE_PRIOR_PX = 140.0, 100.0
+"""Views narrower than this (root of their area), searched for more widely than in a prior of this
+standard deviation: a second date has to show that they are found (docs/check.md)."""
 MIN_WRONG = 2
 _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
 
@@ -138,7 +141,8 @@ class Findings(NamedTuple):
     `wrong`: number of false fixes among `trials`.
     `outside`: fraction of the route outside the map; `changed`: of the area since the map was made.
     `after_fix_m`: protection level right after a fix, median.
-    `view_px`: width of a view in pixels of the map; `second_date`: tried on one.
+    `view_px`: root of the area of a view in pixels of the map; `prior_px`: standard deviation of
+    the prior position, infinite without one; `second_date`: tried on one.
     """
 
     mean: Range
@@ -151,6 +155,7 @@ class Findings(NamedTuple):
     changed: float
     after_fix_m: float
     view_px: float
+    prior_px: float
     second_date: bool
 
 
@@ -165,9 +170,10 @@ def verdict_of(found: Findings) -> Verdict:
         reasons += [*_outside(found.outside), *_flown(found.flights, limit_m, even)]
     elif found.after_fix_m > limit_m:
         reasons += [Reason("availability", f"{level}; alert limit: {limit_m:g} m.", Word.NO_GO)]
-    if found.mean.high - found.mean.low > MOST_UNCERTAIN and not found.second_date:
+    why = uncertainty(found.mean, found.view_px, found.prior_px)
+    if why and not found.second_date:
         text = f"The map alone cannot tell how often views of {found.view_px:.0f} map pixels are "
-        text += "localized: the interval is too wide. A second date (--other-date) would help."
+        text += f"localized: {why}. A second date (--other-date) would help."
         reasons += [Reason("uncertain", text, Word.MARGINAL)]
     if found.changed > 0:  # a warning: it lowers the probability already
         text = f"At least {100 * found.changed:.1f} % of the ground {where} changed since the map "
@@ -175,6 +181,15 @@ def verdict_of(found: Findings) -> Verdict:
         reasons += [Reason("changed_ground", text, CHANGED.word(_exact(found.changed)))]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
+
+
+def uncertainty(mean: Range, view_px: float, prior_px: float) -> str:
+    """Why the map alone does not support a GO; empty where it does."""
+    if mean.high - mean.low > MOST_UNCERTAIN:
+        return "the interval is too wide"
+    if view_px < NARROW_PX and prior_px > WIDE_PRIOR_PX:
+        return f"they are narrow, and searched for without a prior within {WIDE_PRIOR_PX:.0f} pixels"
+    return ""
 
 
 def _exact(value: float) -> Range:

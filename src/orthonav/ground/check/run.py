@@ -203,6 +203,7 @@ class _Check:
         self, predictor: Predictor, own: Sequence[Trial], other: Sequence[Trial]
     ) -> CheckResult:
         request, conditions, frame = self.request, self.conditions, self.sheet.frame
+        prior_m = conditions.prior_std_m
         cells, along = self._cells(predictor, own), self._along(predictor)
         shifts = scene_shifts(math.hypot(predictor.scenes_std, predictor.mean_std))
         wrong, flights, outside = int(predictor.wrong.sum()), None, 0.0
@@ -226,6 +227,7 @@ class _Check:
             changed=float(cells.changed[known].mean()) if known.any() else 0.0,
             after_fix_m=float(level_m(error_m, conditions.risk)),
             view_px=conditions.side_m / self.sheet.grid.gsd_m,
+            prior_px=math.inf if prior_m is None else prior_m / self.sheet.grid.gsd_m,
             second_date=bool(other),
         )
         return CheckResult(
