@@ -188,7 +188,7 @@ def uncertainty(mean: Range, view_px: float, prior_px: float) -> str:
     if mean.high - mean.low > MOST_UNCERTAIN:
         return "the interval is too wide"
     if view_px < NARROW_PX and prior_px > WIDE_PRIOR_PX:
-        return f"they are narrow, and searched for without a prior within {WIDE_PRIOR_PX:.0f} pixels"
+        return f"they are narrow, and no prior is within {WIDE_PRIOR_PX:.0f} pixels"
     return ""
 
 

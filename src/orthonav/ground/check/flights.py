@@ -3,8 +3,9 @@
 The ground of a flight is easier or harder than predicted as a whole: one shift of the logit for all
 of it. One draw for every half side of a view decides whether views there are localized;
 neighbouring draws are correlated (a Gauss-Markov process behind a threshold), because their views
-show much of the same ground. Between fixes the error grows with the distance. The protection level
-is that of a right place (core/integrity.py); wrong places count as false fixes.
+show much of the same ground. Between fixes the error grows with the distance, until the flight coasts.
+The protection level is that of a right place (core/integrity.py), as the views of a track confirm
+each other; wrong places count as false fixes.
 """
 
 import numpy as np
@@ -21,8 +22,8 @@ DRAWS_PER_VIEW = 2.0
 CORRELATION = 0.5
 """Of the latent normal values of neighbouring draws, whose views share half of their ground."""
 COASTING_SIDES = 0.5 + 1e-6
-"""Sides of a view past the last one with a fix, from where on the flight coasts: dead reckoning
-does not confirm the place, so that its protection level is infinite (core/track/mixture.py)."""
+"""Sides of a view past the half one that a fix holds for, from where on the flight coasts: nothing
+confirms its place, so that its protection level is infinite (core/track/mixture.py)."""
 ROUNDING = 1e-9
 TAIL = 0.05
 """Probability of an error beyond the stated position error of 95 %."""
