@@ -3,8 +3,8 @@
 The ground of a flight is easier or harder than predicted as a whole: one shift of the logit for all
 of it. One draw for every half side of a view decides whether views there are localized;
 neighbouring draws are correlated (a Gauss-Markov process behind a threshold), because their views
-show much of the same ground. Between fixes the error grows with the distance, until the flight
-coasts. The protection level is that of a right place (core/integrity.py), as the views of a track
+show much of the same ground. Between fixes the error grows with the distance, and no
+position is available. The protection level is that of a right place (core/integrity.py), as the views of a track
 confirm each other; wrong places count as false fixes.
 """
 
@@ -21,9 +21,6 @@ DRAWS_PER_VIEW = 2.0
 """Draws per side of a view: views that overlap by more than half are hardly independent."""
 CORRELATION = 0.5
 """Of the latent normal values of neighbouring draws, whose views share half of their ground."""
-COASTING_SIDES = 0.5 + 1e-6
-"""Sides of a view past the half one that a fix holds for, from where on the flight coasts: nothing
-confirms its place, so that its protection level is infinite (core/track/mixture.py)."""
 ROUNDING = 1e-9
 TAIL = 0.05
 """Probability of an error beyond the stated position error of 95 %."""
@@ -78,7 +75,8 @@ def simulated(
     since_m = np.maximum(distance_m - stops_m[last] - step_m, 0.0)
     errors_m = np.hypot(error_m[last], conditions.drift * since_m)
     levels_m = level_m(errors_m, conditions.risk)
-    levels_m[since_m > COASTING_SIDES * conditions.side_m] = np.inf
+    # Past that the flight coasts: nothing confirms its place (core/track/mixture.py).
+    levels_m[since_m > ROUNDING] = np.inf
     available = levels_m <= conditions.alert_limit_m
     # Each point stands for the route half-way to its neighbours.
     lengths_m = np.gradient(distance_m) if length_m > 0 else np.ones(1)
