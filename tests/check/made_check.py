@@ -1,7 +1,5 @@
 """Synthetic check results for tests of the output files."""
 
-import math
-
 import numpy as np
 
 from orthonav.ground.check.findings import likely_outages
@@ -12,7 +10,6 @@ from orthonav.ground.check.records import (
     CheckedInputs,
     CheckResult,
     Conditions,
-    Lookalike,
     Range,
     Reason,
     Verdict,
@@ -42,7 +39,6 @@ NO_GO = Verdict(
         Reason("availability", "Positions are rarely available.", Word.NO_GO),
         Reason("dates", "Only the map's own date was tried.", Word.MARGINAL),
         Reason("mean", "The mean probability is high.", Word.GO),
-        Reason("lookalikes", "One pair of ambiguous places costs fixes.", Word.GO),
     ),
 )
 
@@ -115,12 +111,6 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
     flights = None if along is None else flown(along)
     known = np.isfinite(cells.probability)
     mean = Range.of(shifted(cells.probability[known], scene_shifts(0.8)).sum(axis=1) / known.sum())
-    here = frame.latlon_from_en(np.array([[0.0, 0.0], [400.0, 250.0], [-300.0, 100.0]]))
-    places = list(zip(*here, strict=True))
-    lookalikes = (
-        Lookalike(places[0], places[1], math.hypot(400, 250), 0.91, 14, True),
-        Lookalike(places[0], places[2], math.hypot(300, 100), 0.62, 9, False),
-    )
     parts = {
         "about": CheckedInputs(
             map_name=name,
@@ -143,7 +133,6 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
         "route_en_m": waypoints,
         "band_m": band_m,
         "outages": () if along is None else likely_outages(along, flights, CONDITIONS),
-        "lookalikes": lookalikes,
     }
     return CheckResult(frame=frame, cells=cells, **{**parts, **changed})
 
@@ -168,4 +157,4 @@ def nearly_empty(frame):
     cells = made_cells(20, 20, 50.0)
     mask = np.ones((20, 20), dtype=bool)
     mask[3, 4:6] = False
-    return made_check(frame, lost_in(cells, mask), lookalikes=())
+    return made_check(frame, lost_in(cells, mask))

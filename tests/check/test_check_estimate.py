@@ -80,5 +80,18 @@ def test_error_of_fixes():
     assert predictor(stated).at(WEST).error_m[0] == pytest.approx(12.0)
 
 
+def test_a_trial_of_another_date_is_one_trial():
+    """It weighs three times as much, but three trials would be more certain."""
+    at = places(200)
+    own, other = [right(en) for en in at], [right(en) for en in at]
+    for half in (own, other):
+        half[::2] = [replace(each, right=False) for each in half[::2]]
+    both, three = predictor(own, other), predictor([*own, *other, *other, *other])
+    one, many = both.at(WEST), three.at(WEST)
+    assert one.probability[0] == pytest.approx(many.probability[0], abs=0.02)
+    assert one.high[0] - one.low[0] > 1.05 * (many.high[0] - many.low[0])
+    assert both.mean_std > 1.1 * predictor([*own, *other]).mean_std
+
+
 def test_scenes_differ_more_for_narrow_views():
     assert LEARNT.std_of(64) > LEARNT.std_of(128) > LEARNT.std_of(256) == LEARNT.std_of(400)

@@ -1,6 +1,7 @@
 """Go, marginal or no-go: every rule alone, and figures that agree with the verdict."""
 
 import json
+import math
 import re
 from dataclasses import replace
 
@@ -32,7 +33,6 @@ FINE = dict(
     mean=Range(0.9, 0.8, 0.95),
     flights=None,
     conditions=CONDITIONS,
-    lookalikes=(),
     calibrated=True,
     wrong=0,
     trials=1000,
@@ -40,6 +40,7 @@ FINE = dict(
     changed=0.0,
     after_fix_m=30.0,
     view_px=200.0,
+    prior_px=50.0,
     second_date=False,
 )
 
@@ -70,6 +71,10 @@ GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
         (dict(mean=Range(0.9, 0.61, 0.99)), "uncertain", None),
         (dict(mean=Range(0.7, 0.3, 0.9)), "uncertain", MARGINAL),
         (dict(mean=Range(0.7, 0.3, 0.9), second_date=True), "uncertain", None),
+        (dict(view_px=130.0), "uncertain", None),
+        (dict(view_px=130.0, prior_px=math.inf), "uncertain", MARGINAL),
+        (dict(view_px=130.0, prior_px=150.0), "uncertain", MARGINAL),
+        (dict(view_px=130.0, prior_px=150.0, second_date=True), "uncertain", None),
         (dict(calibrated=False), "no_confidence", NO_GO),
         (dict(wrong=1, trials=10), "wrong", None),
         (dict(wrong=4), "wrong", None),

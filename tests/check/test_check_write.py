@@ -151,7 +151,7 @@ def test_shapes_lie_where_things_are(written, layers):
         [-500, -500, 500, 500], abs=0.02
     )
     assert {name: len(shapes) for name, (shapes, _) in layers.items()} == {
-        **{"cells": 400, "lookalikes": 2, "waypoints": 4},
+        **{"cells": 400, "waypoints": 4},
         **{"route": len(result.along.distance_m) - 1, "blind": len(result.outages)},
     }
     for shapes, _ in layers.values():

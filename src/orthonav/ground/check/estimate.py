@@ -166,8 +166,9 @@ class Predictor:
     @property
     def mean_std(self) -> float:
         """Standard error of the logit of the predicted mean chance, by the number of trials."""
-        count = len(self.right)
-        mean = min(max((int(self.right.sum()) + 0.5) / (count + 1), 0.05), 0.95)
+        count = float(self._weight.sum() ** 2 / (self._weight**2).sum())  # Kish 1965
+        mean = count * float(np.average(self.right, weights=self._weight))
+        mean = min(max((mean + 0.5) / (count + 1), 0.05), 0.95)
         low, high = logit(self._recalibrated(np.array([mean - 0.01, mean + 0.01])))
         return float(high - low) / 0.02 * math.sqrt(mean * (1 - mean) / (count + 1))
 
@@ -209,7 +210,10 @@ class Predictor:
         good = PRIOR_TRIALS * expected + near @ self.right
         bad = PRIOR_TRIALS * (1 - expected) + near @ ~self.right
         probability = good / (good + bad)
-        low, high = (beta.ppf(end, good + JEFFREYS, bad + JEFFREYS) for end in INTERVAL)
+        # A trial of the second date counts more for the rate, but is one trial.
+        alone = (near @ (1 / self._weight) + PRIOR_TRIALS) / (total + PRIOR_TRIALS)
+        counts = good * alone + JEFFREYS, bad * alone + JEFFREYS
+        low, high = (beta.ppf(end, *counts) for end in INTERVAL)
         probability, low, high = (self._recalibrated(each) for each in (probability, low, high))
         years = INTERVAL_SIGMAS * self.scenes_std
         squares = np.where(self.right, np.nan_to_num(self._error) ** 2, 0.0)

@@ -1,100 +1,30 @@
-"""What trials and predictions say: ambiguous places, a route with its outages, the verdict.
+"""What predictions say: a route with its outages, the verdict.
 
 docs/check.md lists the rules of the verdict.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.records import (
     Along,
     Conditions,
     Flights,
-    Lookalike,
     Outage,
     Range,
     Reason,
     Verdict,
     Word,
 )
-from orthonav.ground.check.trials import Trial
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import along_polyline_en_m
 
 Array = NDArray[np.float64]
-SIMILAR = 0.8
-MAX_PAIRS = 40
-_WRONG_CONFIDENCE = 0.5
-"""One wrong trial of this confidence is enough; otherwise a second trial must agree."""
-
-
-class _Pair(NamedTuple):
-    place: tuple[float, float]
-    other: tuple[float, float]
-    similarity: float
-    confident: bool
-
-
-def found_lookalikes(
-    trials: Sequence[Trial], frame: LocalFrame, conditions: Conditions
-) -> tuple[Lookalike, ...]:
-    """Pairs of places, most similar first; pairs whose ends lie within half a view are merged.
-
-    A misplaced view pairs its true place with where it was placed; a correctly placed view pairs
-    it with its best rival, if that scores high enough.
-    """
-    # Within a quarter of a view it is the same place, only located badly.
-    far_m = max(conditions.radius_m, conditions.side_m / 4)
-    pairs = [pair for each in trials if (pair := _pair(each, far_m)) is not None]
-    pairs.sort(key=lambda pair: -pair.similarity)
-    groups: list[list[_Pair]] = []
-    for pair in pairs:
-        group = next((g for g in groups if _same(g[0], pair, conditions.side_m / 2)), None)
-        if group is None:
-            groups.append([pair])
-        else:
-            group.append(pair)
-    groups = [group for group in groups if len(group) > 1 or group[0].confident]
-    groups.sort(key=lambda group: (-min(len(group), 3), -group[0].similarity))
-    return tuple(_lookalike(group, frame, conditions.prior_std_m) for group in groups[:MAX_PAIRS])
-
-
-def _pair(trial: Trial, far_m: float) -> _Pair | None:
-    if not math.isfinite(trial.error_m):
-        return None
-    if trial.error_m > far_m:
-        return _Pair(trial.en_m, trial.found_en_m, 1.0, trial.confidence >= _WRONG_CONFIDENCE)
-    if math.isfinite(trial.rival_share) and trial.rival_share >= SIMILAR:
-        return _Pair(trial.en_m, trial.rival_en_m, min(trial.rival_share, 1.0), False)
-    return None
-
-
-def _same(one: _Pair, two: _Pair, within_m: float) -> bool:
-    straight = max(math.dist(one.place, two.place), math.dist(one.other, two.other))
-    swapped = max(math.dist(one.place, two.other), math.dist(one.other, two.place))
-    return min(straight, swapped) <= within_m
-
-
-def _lookalike(group: Sequence[_Pair], frame: LocalFrame, prior_std_m: float | None) -> Lookalike:
-    first = group[0]
-    apart_m = math.dist(first.place, first.other)
-    lat, lon = frame.latlon_from_en(np.array([first.place, first.other]))
-    return Lookalike(
-        place_latlon_deg=(float(lat[0]), float(lon[0])),
-        other_latlon_deg=(float(lat[1]), float(lon[1])),
-        apart_m=apart_m,
-        similarity=float(np.mean([pair.similarity for pair in group])),
-        trials=len(group),
-        within_prior=prior_std_m is None or apart_m <= 3 * prior_std_m,
-    )
-
-
 LIKELY_OUTAGE = 0.5
 """Fraction of the flights with an available position below which there is an outage."""
 POINTS_PER_VIEW = 4.0
@@ -196,6 +126,9 @@ CHANGED = Threshold(0.1, math.inf)
 """Fraction of the ground that changed since the map was made."""
 MOST_UNCERTAIN = 0.5
 """Width of the interval of the mean chance beyond which the map alone cannot tell."""
+NARROW_PX, WIDE_PRIOR_PX = 140.0, 100.0
+"""Views narrower than this (root of their area), searched for more widely than in a prior of this
+standard deviation: a second date has to show that they are found (docs/check.md)."""
 MIN_WRONG = 2
 _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
 
@@ -208,13 +141,13 @@ class Findings(NamedTuple):
     `wrong`: number of false fixes among `trials`.
     `outside`: fraction of the route outside the map; `changed`: of the area since the map was made.
     `after_fix_m`: protection level right after a fix, median.
-    `view_px`: width of a view in pixels of the map; `second_date`: tried on one.
+    `view_px`: root of the area of a view in pixels of the map; `prior_px`: standard deviation of
+    the prior position, infinite without one; `second_date`: tried on one.
     """
 
     mean: Range
     flights: Flights | None
     conditions: Conditions
-    lookalikes: tuple[Lookalike, ...]
     calibrated: bool
     wrong: int
     trials: int
@@ -222,6 +155,7 @@ class Findings(NamedTuple):
     changed: float
     after_fix_m: float
     view_px: float
+    prior_px: float
     second_date: bool
 
 
@@ -236,20 +170,26 @@ def verdict_of(found: Findings) -> Verdict:
         reasons += [*_outside(found.outside), *_flown(found.flights, limit_m, even)]
     elif found.after_fix_m > limit_m:
         reasons += [Reason("availability", f"{level}; alert limit: {limit_m:g} m.", Word.NO_GO)]
-    if found.mean.high - found.mean.low > MOST_UNCERTAIN and not found.second_date:
+    why = uncertainty(found.mean, found.view_px, found.prior_px)
+    if why and not found.second_date:
         text = f"The map alone cannot tell how often views of {found.view_px:.0f} map pixels are "
-        text += "localized: the interval is too wide. A second date (--other-date) would help."
+        text += f"localized: {why}. A second date (--other-date) would help."
         reasons += [Reason("uncertain", text, Word.MARGINAL)]
     if found.changed > 0:  # a warning: it lowers the probability already
         text = f"At least {100 * found.changed:.1f} % of the ground {where} changed since the map "
         text += "was made: fixes are less likely there; build the map from newer imagery."
         reasons += [Reason("changed_ground", text, CHANGED.word(_exact(found.changed)))]
-    near = sum(each.within_prior and each.trials > 1 for each in found.lookalikes)
-    if near:
-        text = f"Ambiguous places within the prior, with fewer fixes (see the list): {near} pairs."
-        reasons += [Reason("lookalikes", text, Word.GO)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
+
+
+def uncertainty(mean: Range, view_px: float, prior_px: float) -> str:
+    """Why the map alone does not support a GO; empty where it does."""
+    if mean.high - mean.low > MOST_UNCERTAIN:
+        return "the interval is too wide"
+    if view_px < NARROW_PX and prior_px > WIDE_PRIOR_PX:
+        return f"they are narrow, and no prior is within {WIDE_PRIOR_PX:.0f} pixels"
+    return ""
 
 
 def _exact(value: float) -> Range:
@@ -258,8 +198,16 @@ def _exact(value: float) -> Range:
 
 def percent(figure: Range) -> str:
     """Median and interval of a fraction, as `62 % (41 to 78 %)`."""
-    median, low, high = (f"{100 * each:.0f}" for each in figure)
-    return f"{median} % ({low} to {high} %)"
+    median, low, high = map(probability_text, figure)
+    return f"{median} ({low.removesuffix(' %')} to {high})"
+
+
+def probability_text(value: float) -> str:
+    """A probability in whole percent, `-` if unknown; 100 % only if it really is."""
+    if not math.isfinite(value):
+        return "-"
+    percent = round(100 * value)
+    return f"{99 if percent == 100 and value < 0.9995 else percent} %"
 
 
 def _trust(found: Findings) -> list[Reason]:

@@ -3,8 +3,9 @@
 The ground of a flight is easier or harder than predicted as a whole: one shift of the logit for all
 of it. One draw for every half side of a view decides whether views there are localized;
 neighbouring draws are correlated (a Gauss-Markov process behind a threshold), because their views
-show much of the same ground. Between fixes the error grows with the distance. The protection level
-is that of a right place (core/integrity.py); wrong places count as false fixes.
+show much of the same ground. Between fixes the error grows with the distance, and no position is
+available. The protection level is that of a right place (core/integrity.py), as the views of a
+track confirm each other; wrong places count as false fixes.
 """
 
 import numpy as np
@@ -74,6 +75,8 @@ def simulated(
     since_m = np.maximum(distance_m - stops_m[last] - step_m, 0.0)
     errors_m = np.hypot(error_m[last], conditions.drift * since_m)
     levels_m = level_m(errors_m, conditions.risk)
+    # Past that the flight coasts: nothing confirms its place (core/track/mixture.py).
+    levels_m[since_m > ROUNDING] = np.inf
     available = levels_m <= conditions.alert_limit_m
     # Each point stands for the route half-way to its neighbours.
     lengths_m = np.gradient(distance_m) if length_m > 0 else np.ones(1)

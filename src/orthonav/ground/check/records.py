@@ -288,23 +288,6 @@ class Outage:
 
 
 @dataclass(frozen=True)
-class Lookalike:
-    """A pair of ambiguous places, which can be mistaken for each other.
-
-    `similarity`: score of the other place divided by that of the true one, 0 to 1.
-    `trials`: number of trials that found the pair.
-    `within_prior`: a view of one place would also be searched at the other.
-    """
-
-    place_latlon_deg: tuple[float, float]
-    other_latlon_deg: tuple[float, float]
-    apart_m: float
-    similarity: float
-    trials: int
-    within_prior: bool
-
-
-@dataclass(frozen=True)
 class Reason:
     """One finding behind the verdict: a stable code for programs, a sentence for people."""
 
@@ -344,7 +327,6 @@ class CheckResult:
     route_en_m: Array | None = None
     band_m: float | None = None
     outages: tuple[Outage, ...] = ()
-    lookalikes: tuple[Lookalike, ...] = ()
 
 
 def summarize(result: CheckResult) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from orthonav.ground.changes.record import CellGrid, ChangedGround
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
     Findings,
-    found_lookalikes,
     likely_outages,
     predicted_along,
     verdict_of,
@@ -204,6 +203,7 @@ class _Check:
         self, predictor: Predictor, own: Sequence[Trial], other: Sequence[Trial]
     ) -> CheckResult:
         request, conditions, frame = self.request, self.conditions, self.sheet.frame
+        prior_m = conditions.prior_std_m
         cells, along = self._cells(predictor, own), self._along(predictor)
         shifts = scene_shifts(math.hypot(predictor.scenes_std, predictor.mean_std))
         wrong, flights, outside = int(predictor.wrong.sum()), None, 0.0
@@ -220,7 +220,6 @@ class _Check:
             mean=flights.probability if flights else mean,
             flights=flights,
             conditions=conditions,
-            lookalikes=found_lookalikes([*own, *other], frame, conditions),
             calibrated=self.calibrated,
             wrong=wrong,
             trials=len(own) + len(other),
@@ -228,6 +227,7 @@ class _Check:
             changed=float(cells.changed[known].mean()) if known.any() else 0.0,
             after_fix_m=float(level_m(error_m, conditions.risk)),
             view_px=conditions.side_m / self.sheet.grid.gsd_m,
+            prior_px=math.inf if prior_m is None else prior_m / self.sheet.grid.gsd_m,
             second_date=bool(other),
         )
         return CheckResult(
@@ -244,7 +244,6 @@ class _Check:
             route_en_m=None if request.route is None else request.route.points_en_m(frame),
             band_m=None if self.area is None else self.area.band_m,
             outages=likely_outages(along, flights, conditions) if along and flights else (),
-            lookalikes=findings.lookalikes,
         )
 
     def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:

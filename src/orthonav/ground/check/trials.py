@@ -161,7 +161,6 @@ AT_ONCE = 2
 """Trials that a worker takes at a time: up to two seconds of work."""
 RELIEF_CELL_M = 15.0
 """Distance over which the height of objects changes: a house or a group of trees."""
-NOWHERE = (math.nan, math.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,22 +168,16 @@ class Trial:
     """The outcome of one trial. Positions are metres in the plane of the map's sheet.
 
     `error_m`: error of the fix, NaN without one; `stated_m`: the same as its covariance states it
-    (root mean square), NaN without; `confidence`: 0 without one.
+    (root mean square), NaN without.
     `expected`: mean persistence of the view; NaN for a second date.
     `right`, `wrong`: the fix is accepted, and within the radius of the map or not.
-    `rival_en_m`: best other place at least a quarter of a view away; `rival_share`: its score
-    divided by the best score.
     """
 
     en_m: tuple[float, float]
     error_m: float
-    confidence: float
     expected: float
     right: bool = False
     wrong: bool = False
-    found_en_m: tuple[float, float] = NOWHERE
-    rival_en_m: tuple[float, float] = NOWHERE
-    rival_share: float = math.nan
     stated_m: float = math.nan
 
 
@@ -383,28 +376,16 @@ class Trier:
         search = registration.search(view, prior, conditions.yaw_std_deg is not None)
         best = search if isinstance(search, NoFix) else search.run()
         if isinstance(search, NoFix) or isinstance(best, NoFix):
-            return Trial(here, math.nan, 0.0, expected)
+            return Trial(here, math.nan, expected)
         fix = fix_of(search, best)
         found = registration.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
-        far_px = conditions.side_m / 4 / registration.grid.gsd_m
-        rivals = [each for each in best.rivals if each.apart_px(best) > far_px]
-        rival, share = NOWHERE, math.nan
-        if rivals:
-            strongest = max(rivals, key=lambda each: each.score)
-            east, north = registration.camera_en_m(search.view, strongest.pose)
-            rival, share = (float(east), float(north)), strongest.score / max(best.score, 1e-6)
         error_m = float(np.hypot(*(found - place_en_m)))
-        confidence = fix.confidence if math.isfinite(fix.confidence) else 0.0
-        accepted, near = confidence >= conditions.accept, error_m <= fix.radius_m
+        accepted, near = fix.confidence >= conditions.accept, error_m <= fix.radius_m
         return Trial(
             en_m=here,
             error_m=error_m,
-            confidence=confidence,
             expected=expected,
             right=accepted and near,
             wrong=accepted and not near,
-            found_en_m=(float(found[0]), float(found[1])),
-            rival_en_m=rival,
-            rival_share=share,
             stated_m=math.sqrt(float(np.trace(fix.cov_en_m2))),
         )

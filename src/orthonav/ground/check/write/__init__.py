@@ -62,11 +62,9 @@ PACKAGE = "orthonav.ground.check.write"
 _SHARED = ("format.js", "plane.js", "chart.js")
 _SCRIPTS = ("data.js", "map.js", "profile.js", "page.js")
 MAX_ROWS = 200
-MAX_LOOKALIKES = 20
-"""Shown on map and page, the most similar ones; the files hold all."""
 LAYERS = ("probability", "low", "error_m", "wrong", "persistence", "changed")
 DOWNLOADS = {
-    "check.geojson": "GeoJSON: route, outages, cells, ambiguous places",
+    "check.geojson": "GeoJSON: route, outages, cells",
     "check.tif": "GeoTIFF: a band per layer of the map",
     "check.json": "JSON: all results and conditions",
 }
@@ -137,7 +135,7 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
         "kind": "Check before take-off",
         "result": result,
-        "symbols": {"info": "i", **{word.value: symbol for word, symbol in SYMBOLS.items()}},
+        "symbols": {word.value: symbol for word, symbol in SYMBOLS.items()},
         "sentence": verdict_sentence(result),
         "cards": key_figures(result),
         "note": "" if result.second_date else SIMULATED,
@@ -146,9 +144,7 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "outages": [
             outage_row(number, each) for number, each in enumerate(result.outages, start=1)
         ],
-        "lookalikes": _lookalike_rows(result),
         "max_rows": MAX_ROWS,
-        "max_lookalikes": MAX_LOOKALIKES,
         "radius": metres_text(result.conditions.radius_m),
         "conditions": conditions_text(result.conditions, result.band_m),
         "downloads": DOWNLOADS,
@@ -158,21 +154,6 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
     }
     style += static_text("check.css", PACKAGE)
     return render(PACKAGE, "page.html", values, style=style, scripts=scripts)
-
-
-def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:
-    return [
-        (
-            str(number),
-            "{:.5f}, {:.5f}".format(*each.place_latlon_deg),
-            "{:.5f}, {:.5f}".format(*each.other_latlon_deg),
-            metres_text(each.apart_m),
-            f"{each.similarity:.2f}",
-            str(each.trials),
-            "yes" if each.within_prior else "no",
-        )
-        for number, each in enumerate(result.lookalikes, start=1)
-    ]
 
 
 def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
@@ -210,10 +191,6 @@ def _page_data(result: CheckResult) -> str:
         },
         "route": None if along is None else along.points_en_m,
         "waypoints": [] if result.route_en_m is None else result.route_en_m,
-        "lookalikes": [
-            [result.frame.en_from_latlon(*at) for at in (p.place_latlon_deg, p.other_latlon_deg)]
-            for p in result.lookalikes[:MAX_LOOKALIKES]
-        ],
     }
     values = {**check_to_plain(result), "drawn": to_plain(drawn, 2)}
     values["cells"] |= {

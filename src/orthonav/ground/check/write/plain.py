@@ -66,7 +66,6 @@ def check_to_plain(result: CheckResult) -> Plain:
         "cells": _cells_to_plain(frame, result.cells),
         "route": _route_to_plain(result),
         "stretches": _stretches(result),
-        "lookalikes": _lookalikes(result),
     }
 
 
@@ -82,13 +81,6 @@ def _stretches(result: CheckResult) -> list[Plain]:
     return [
         {"number": number, **to_plain({**vars(each), "length_m": each.length_m}, BY_UNIT)}
         for number, each in enumerate(result.outages, start=1)
-    ]
-
-
-def _lookalikes(result: CheckResult) -> list[Plain]:
-    return [
-        {"number": number, **to_plain(each, BY_UNIT)}
-        for number, each in enumerate(result.lookalikes, start=1)
     ]
 
 
@@ -150,10 +142,6 @@ def features(result: CheckResult) -> Iterator[Plain]:
         for each, properties in zip(result.outages, _stretches(result), strict=True):
             inside = (along.distance_m >= each.start_m) & (along.distance_m <= each.end_m)
             yield _feature(frame, "blind", "LineString", along.points_en_m[inside], properties)
-    for properties in _lookalikes(result):
-        ends = [properties.pop(name) for name in ("place_latlon_deg", "other_latlon_deg")]
-        geometry = {"type": "LineString", "coordinates": [[lon, lat] for lat, lon in ends]}
-        yield _as_feature("lookalikes", geometry, properties)
     if result.route_en_m is not None:
         legs_m = np.hypot(*np.diff(result.route_en_m, axis=0).T)
         for i, point in enumerate(result.route_en_m):

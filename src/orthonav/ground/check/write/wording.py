@@ -1,9 +1,9 @@
 """Words and sentences of page and terminal, and a check as text for a terminal."""
 
-import math
 import textwrap
 from collections.abc import Callable
 
+from orthonav.ground.check.findings import probability_text
 from orthonav.ground.check.records import CheckResult, Conditions, Outage, Range, Word, summarize
 from orthonav.ground.report import aligned, metres_text, percent_text
 
@@ -30,14 +30,6 @@ def verdict_sentence(result: CheckResult) -> str:
     origin = f", {result.about.height}" if result.about.height else ""
     height = f"Checked at {result.conditions.agl_m:.0f} m above ground{origin}."
     return f"{sentence} {height}"
-
-
-def probability_text(value: float) -> str:
-    """A probability in whole percent, `-` if unknown; 100 % only if it really is."""
-    if not math.isfinite(value):
-        return "-"
-    percent = round(100 * value)
-    return f"{99 if percent == 100 and value < 0.9995 else percent} %"
 
 
 def seconds_text(value: float) -> str:
@@ -134,9 +126,7 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
             ),
             mean,
         ]
-    near = sum(each.within_prior for each in result.lookalikes)
-    pairs = f"pairs of ambiguous places, {near} within the prior"
-    return [*shown, (str(len(result.lookalikes)), pairs)]
+    return shown
 
 
 def _ends(figure: Range, as_text: Callable[[float], str]) -> str:

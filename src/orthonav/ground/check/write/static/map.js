@@ -119,23 +119,6 @@ function addRoute(map) {
   return group;
 }
 
-function addLookalikes(map) {
-  const group = L.layerGroup().addTo(map);
-  drawn.lookalikes.forEach((ends, k) => {
-    const { number: name, within_prior: near, apart_m: apart } = data.lookalikes[k];
-    const description = `Ambiguous places ${name}: ${metres(apart)} apart, ${near ? "within" : "outside"} the prior.`;
-    L.polyline(ends.map(at), { color: "#8a2f63", weight: 2, dashArray: "3 6", interactive: false }).addTo(group);
-    ends.forEach((place, i) => {
-      const kind = near ? "twin near" : "twin";
-      numbered(place, `${name}${"ab"[i]}`, kind, description, () => {
-        select(...place, -1, false);
-        announce(description);
-      }).addTo(group);
-    });
-  });
-  return group;
-}
-
 function toggle(id, map, group) {
   document.getElementById(id)?.addEventListener("change", (event) => {
     if (event.target.checked) group.addTo(map);

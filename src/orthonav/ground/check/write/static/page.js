@@ -96,7 +96,6 @@ function start() {
   const map = makeMap();
   addCells(map);
   if (route) toggle("show-route", map, addRoute(map));
-  toggle("show-lookalikes", map, addLookalikes(map));
   selectFromMap(map);
   showSelected(map);
   const box = document.getElementById("profile");

@@ -42,9 +42,12 @@ class Profile extends Chart {
     const step = roundStep(most / 3);
     const levels = Array.from({ length: Math.floor(most / step) + 1 }, (_, k) => k * step);
     this.rules(context, levels, this.levelY, this.colour("line"), { text: (v) => `${v} m` });
-    this.area(context, xs, route.protection_m, route.protection_high_m, this.levelY, "rgb(213 94 0 / 22%)", bottom);
+    const [middle, high] = [route.protection_m, route.protection_high_m].map(
+      (column) => column.map((v) => v ?? Number.MAX_VALUE), // infinite: along the upper edge
+    );
+    this.area(context, xs, middle, high, this.levelY, "rgb(213 94 0 / 22%)", bottom);
     this.rules(context, [limit], this.levelY, this.colour("strong"), { dash: [5, 3] });
-    this.line(context, xs, route.protection_m, this.levelY, "#d55e00");
+    this.line(context, xs, middle, this.levelY, "#d55e00");
     this.label(context, `alert limit ${metres(limit)}`, this.right - 4, this.levelY(limit) - 5, "right");
     this.#axes(context, height);
   }
