@@ -61,7 +61,7 @@ COMPARED[range(6), [0, 1, 2, 3, 6, 7]] = COMPARED[[4, 5], [8, 9]] = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One hypothesis of the track, with probability `share`, `mean` (10,), `covariance` (10, 10).
+    """One hypothesis of the track, with probability `share`, `mean` (16,), `covariance` (16, 16).
 
     `sighted`: new ground that it recognized, in views; `uncounted`: since the last view that
     counted. `parent`, `expected`: of the last view; -1, None where it was born now. `recognized`:
@@ -136,7 +136,7 @@ def _divergence(means: Array, covariances: Array) -> Array:
 
 
 def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
-    """As one Gaussian, (10,) and (10, 10); not to be changed."""
+    """As one Gaussian, (16,) and (16, 16); not to be changed."""
     if len(group) == 1:
         return group[0].mean, group[0].covariance
     shares = np.array([each.share for each in group])
@@ -297,14 +297,17 @@ class Mixture:
         velocity: ReportedVelocity | None = None,
         camera: CameraDisplacement | None = None,
         telemetry_noise: Array | None = None,
+        overlap: float = 0.0,
     ) -> None:
         """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
-        (rad), log scale, horizon (rad), None: the model's."""
+        (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         stays = 1 - self.model.lost
         made = []
         for each in self.hypotheses:
-            for share, expected in self._predictions(each, seconds, velocity, camera, noise):
+            for share, expected in self._predictions(
+                each, seconds, velocity, camera, noise, overlap
+            ):
                 on_map = held_to_map(self.model, expected, self.area_m2)
                 made.append(self._from(each, on_map, each.share * share * stays))
         self.hypotheses = made
@@ -317,13 +320,14 @@ class Mixture:
         velocity: ReportedVelocity | None,
         camera: CameraDisplacement | None,
         telemetry_noise: Array,
+        overlap: float,
     ) -> Iterator[tuple[float, Expected]]:
         """With their probabilities: with odometry, which may be an outlier, and without.
 
         Where no velocity is reported, the aircraft may also have made an unexpected turn."""
         model, likely = self.model, 1 - self.model.odometry_outlier
         coasting = self._state in (State.COASTING, State.LOST)
-        step = partial(predicted, model, each.mean, coasting=coasting)
+        step = partial(predicted, model, each.mean, coasting=coasting, overlap=overlap)
         dead_reckoned = step(each.covariance, seconds, velocity, telemetry_noise)
         if camera is None:
             chance = 0.0
@@ -524,9 +528,7 @@ class Mixture:
         expected = SEEN @ before @ SEEN.T
         spreads = expected + seen.noise
         log_weights = (seen.log_odds + log_densities(innovations, spreads)).tolist()
-        means, covariances = updated(
-            np.array([each.mean for each in near]), before, innovations, spreads
-        )
+        means, covariances = updated(np.array([each.mean for each in near]), before, seen)
         shown = recognition(seen, expected, innovations, self.model.most_agreement).tolist()
         for number, each in enumerate(near):
             sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
@@ -555,12 +557,13 @@ class Mixture:
         return bool(math.dist(seen.mean[:2], each.mean[:2]) ** 2 <= GATE * reach)
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
-        """Mean (10,) and covariance (10, 10), anywhere on the map."""
+        """Mean (16,) and covariance (16, 16), anywhere on the map."""
         place, speed = self.area_m2, self.model.speed_mps**2
         horizon = self.model.horizon_rad**2
         variances = [
             *(place, place, speed, speed),
             *(*self.model.initial_bias(tilt_rad), horizon, horizon),
+            *[1.0] * 6,
         ]
         return np.zeros(STATE), np.diag(np.array(variances))
 
@@ -577,7 +580,7 @@ class Mixture:
             spread = SEEN @ covariance @ SEEN.T + seen.noise
             log_weight = seen.log_odds - math.log(self.area_m2)
             log_weight += log_density(seen.mean[2:], spread[2:, 2:])
-            mean, covariance = updated(mean, covariance, seen.mean, spread)
+            mean, covariance = updated(mean, covariance, seen)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
             yield Hypothesis(

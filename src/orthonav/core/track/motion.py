@@ -7,6 +7,7 @@ import numpy as np
 
 from orthonav.core.track.likelihood import log_density
 from orthonav.core.track.model import (
+    COMMON,
     HEADING,
     HORIZON,
     POSITION,
@@ -64,9 +65,9 @@ class CameraDisplacement:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """A predicted state (10,), with the one before it by the odometry in between too.
+    """A predicted state (16,), with the one before it by the odometry in between too.
 
-    `cross` (10, 10): covariance of the state before (rows) and the prediction (columns)."""
+    `cross` (16, 16): covariance of the state before (rows) and the prediction (columns)."""
 
     mean: Array
     covariance: Array
@@ -94,13 +95,15 @@ def predicted(
     camera: CameraDisplacement | None = None,
     *,
     coasting: bool = False,
+    overlap: float = 0.0,
 ) -> Expected:
     """The state after so many seconds, by the reported velocity or else its own.
 
     `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view, added to
     their biases unless the `camera` measured the change, and of the horizon (Gauss-Markov,
     `Model.horizon_s`). The displacement itself is added by `by_camera`. While `coasting`, the error
-    of a reported velocity drifts (`Model.coasting_walk`)."""
+    of a reported velocity drifts (`Model.coasting_walk`). `overlap`: share of the
+    ground in view that the last view showed."""
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)
@@ -114,6 +117,9 @@ def predicted(
     after[HORIZON] *= left
     step[HORIZON, HORIZON] = left * np.eye(2)
     noise[range(8, 10), range(8, 10)] = telemetry_noise[2] * (1 - left**2)
+    after[COMMON] *= overlap
+    step[COMMON, COMMON] *= overlap
+    noise[COMMON, COMMON] = (1 - overlap**2) * np.eye(6)
     if velocity is None:
         after[POSITION] += seconds * mean[VELOCITY]
         step[0, 2] = step[1, 3] = seconds
@@ -172,7 +178,7 @@ def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected,
     ):
         state = mean[first : first + STATE]
         innovation -= sign * lever @ (state[TILT] + state[HORIZON] - known)
-        observes[:, first + TILT.start : first + STATE] += sign * np.hstack([lever, lever])
+        observes[:, first + TILT.start : first + HORIZON.stop] += sign * np.hstack([lever, lever])
     spread = observes @ joint @ observes.T + turn @ camera.covariance @ turn.T
     gain = np.linalg.solve(spread, observes @ joint).T
     mean = mean + gain @ innovation
