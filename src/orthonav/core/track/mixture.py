@@ -241,6 +241,7 @@ class Mixture:
         self._state = State.SEARCHING
         self._blind = 0.0
         self._numbers = 0
+        self._last: Hypothesis | None = None  # of the track, dead-reckoned since
 
     def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
         self._extent = np.array(extent_en_m)
@@ -251,6 +252,7 @@ class Mixture:
     ) -> None:
         """Continue between two views in another plane, on a map of this extent there."""
         self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
+        self._last = None if self._last is None else moved(self._last, plane, other)
         self._set_extent(extent_en_m)
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
@@ -270,6 +272,7 @@ class Mixture:
         if not self.hypotheses:
             self.start(mean_en_m, std_m)
             return
+        self._last = None  # what dead reckoning contradicts, other means confirm
         made, noise = [], np.eye(2) * std_m**2
         for each in self.hypotheses:
             spread = each.covariance[POSITION, POSITION] + noise
@@ -310,6 +313,10 @@ class Mixture:
             ):
                 on_map = held_to_map(self.model, expected, self.area_m2)
                 made.append(self._from(each, on_map, each.share * share * stays))
+        if self._last is not None:
+            splits = self._predictions(self._last, seconds, velocity, camera, noise, overlap)
+            _, expected = max(splits, key=lambda split: split[0])
+            self._last = self._from(self._last, held_to_map(self.model, expected, self.area_m2), 1)
         self.hypotheses = made
         self.elsewhere += (1 - stays) * (1 - self.elsewhere)
 
@@ -421,19 +428,28 @@ class Mixture:
             if self._state is State.TRACKING:
                 self._follow(near)
                 follows = True
+                self._last = self._reached(mean, covariance)
         belief = sum(each.share for each in near)
         most = 1.0 if self._state is State.TRACKING else UNCONFIRMED
         return Estimate(
             mean,
             covariance,
             min(confidence, most),
-            min(belief, most),
+            min(belief, most if self._last is None or self._last.followed else UNCONFIRMED),
             self._state,
             belief,
             seen,
             confirmed,
             follows,
         )
+
+    def _reached(self, mean: Array, covariance: Array) -> Hypothesis:
+        """The track here; if it cannot have come here from where it was, that, not `followed`."""
+        here = Hypothesis(1.0, mean, covariance, 0.0, 0, followed=True)
+        last = self._last or here
+        trace = np.trace((last.covariance + covariance)[POSITION, POSITION])
+        near = distance(last, here) ** 2 <= GATE * trace
+        return here if near else replace(last, followed=False)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map, of hypotheses no farther away than it
