@@ -11,7 +11,6 @@ from orthonav.core.localize.place import Place
 from orthonav.core.track.model import (
     COMMON,
     HEADING_FLOOR_RAD,
-    LEAST_NEW,
     SCALE_FLOOR,
     SEEN,
     WHITE_SHARE,
@@ -23,6 +22,8 @@ from orthonav.core.track.model import (
 
 TRUSTED = (0.1, 0.5)
 """Views with less probability of their own do not count, above the second fully."""
+LEAST_NEW = 0.15
+"""Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
 MOST_OF_ONE = 0.75  # of a single view: less than `CONFIRMED`
 POSE = slice(2, 4)
 SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end
@@ -80,16 +81,13 @@ def _as_rival(best: Place, place: Place) -> dict[str, float]:
 class Measurement:
     """A sighting as a measurement of `model.SEEN`: `mean` (6,).
 
-    `noise` (6, 6): tempered, as evidence for its place. `log_odds`: over the density of what only
-    looks alike. `own_noise` (6, 6): without regard to earlier views of the same ground;
-    `independent` (6, 6): what they do not have in common. `seen` (6, 16): what is measured, with
-    the common error. `alone`: probability by the view alone. `log_chance`: log density of what
-    chance finds in the area searched."""
+    `noise` (6, 6): tempered. `log_odds`: over the density of what only looks alike. `independent`
+    (6, 6): not in common with views of the same ground. `seen` (6, 16): what it measures. `alone`:
+    probability by the view alone. `log_chance`: log density of chance in the area searched."""
 
     mean: Array
     noise: Array
     log_odds: float
-    own_noise: Array
     independent: Array
     seen: Array
     alone: float
@@ -118,11 +116,10 @@ def measurement(
 
 def updated(mean: Array, covariance: Array, measured: Measurement) -> tuple[Array, Array]:
     """Kalman update of states (.., 16), (.., 16, 16)."""
-    seen = measured.seen
-    spread = seen @ covariance @ seen.T + measured.independent
-    gain = np.linalg.solve(spread, seen @ covariance).swapaxes(-1, -2)
+    spread = measured.seen @ covariance @ measured.seen.T + measured.independent
+    gain = np.linalg.solve(spread, measured.seen @ covariance).swapaxes(-1, -2)
     after = covariance - gain @ spread @ gain.swapaxes(-1, -2)
-    moved = mean + (gain @ (measured.mean - mean @ seen.T)[..., None])[..., 0]
+    moved = mean + (gain @ (measured.mean - mean @ measured.seen.T)[..., None])[..., 0]
     return moved, (after + after.swapaxes(-1, -2)) / 2
 
 
@@ -174,7 +171,6 @@ def tempered(
         mean,
         noise / newness + independent,
         odds,
-        noise + independent,
         LEAST_NEW * noise + independent,
         seen,
         sighting.alone,
@@ -191,7 +187,8 @@ def recognition(
     with `covariances` (K, 6, 6), between a right place and one that chance finds in the area
     searched, at most `most_agreement`. A place within the gate is never less likely for its
     distance."""
-    spreads = covariances[:, :4, :4] + seen.own_noise[:4, :4]
+    common = seen.seen[:4, COMMON]
+    spreads = covariances[:, :4, :4] + common @ common.T + seen.independent[:4, :4]
     ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
     agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
     odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement

@@ -305,17 +305,14 @@ class Mixture:
         """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
         (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
-        stays = 1 - self.model.lost
+        stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
         made = []
         for each in self.hypotheses:
-            for share, expected in self._predictions(
-                each, seconds, velocity, camera, noise, overlap
-            ):
+            for share, expected in self._predictions(each, *moves):
                 on_map = held_to_map(self.model, expected, self.area_m2)
                 made.append(self._from(each, on_map, each.share * share * stays))
         if self._last is not None:
-            splits = self._predictions(self._last, seconds, velocity, camera, noise, overlap)
-            _, expected = max(splits, key=lambda split: split[0])
+            _, expected = max(self._predictions(self._last, *moves), key=lambda split: split[0])
             self._last = self._from(self._last, held_to_map(self.model, expected, self.area_m2), 1)
         self.hypotheses = made
         self.elsewhere += (1 - stays) * (1 - self.elsewhere)
@@ -447,9 +444,8 @@ class Mixture:
         """The track here; if it cannot have come here from where it was, that, not `followed`."""
         here = Hypothesis(1.0, mean, covariance, 0.0, 0, followed=True)
         last = self._last or here
-        trace = np.trace((last.covariance + covariance)[POSITION, POSITION])
-        near = distance(last, here) ** 2 <= GATE * trace
-        return here if near else replace(last, followed=False)
+        reach = GATE * np.trace((last.covariance + covariance)[POSITION, POSITION])
+        return here if distance(last, here) ** 2 <= reach else replace(last, followed=False)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map, of hypotheses no farther away than it
@@ -574,14 +570,9 @@ class Mixture:
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
         """Mean (16,) and covariance (16, 16), anywhere on the map."""
-        place, speed = self.area_m2, self.model.speed_mps**2
-        horizon = self.model.horizon_rad**2
-        variances = [
-            *(place, place, speed, speed),
-            *(*self.model.initial_bias(tilt_rad), horizon, horizon),
-            *[1.0] * 6,
-        ]
-        return np.zeros(STATE), np.diag(np.array(variances))
+        place, speed, horizon = self.area_m2, self.model.speed_mps**2, self.model.horizon_rad**2
+        values = [place, speed, *self.model.initial_bias(tilt_rad), horizon, 1.0]
+        return np.zeros(STATE), np.diag(np.repeat(values, [2, 2, 1, 1, 1, 1, 2, 6]))
 
     def _mounts(self) -> Iterator[tuple[float, Array, Array]]:
         """Good and bad mount: probability, and a state anywhere on the map."""

@@ -3,8 +3,7 @@
 A state has 16 components: position and velocity (m, m/s; east and north), and the errors of the
 telemetry: heading (rad, added to the reported one), log scale (true over reported height, focal
 length included), pitch and roll of the mount (rad, constant) and of the horizon (rad, for seconds);
-and the error that sightings of the same ground have in common, in standard deviations of a
-sighting (Cholesky).
+and the error that sightings of the same ground have in common, in standard deviations (Cholesky).
 """
 
 import math
@@ -19,6 +18,7 @@ Array = NDArray[np.float64]
 STATE = 16
 POSITION, VELOCITY, BIASES = slice(0, 2), slice(2, 4), slice(4, 8)
 HEADING, SCALE, TILT, HORIZON, COMMON = 4, 5, slice(6, 8), slice(8, 10), slice(10, 16)
+CHANGING = slice(HORIZON.start, COMMON.stop)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 """Least standard deviations of heading and log scale of a registered view."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
@@ -29,8 +29,6 @@ SEEN: Array = np.zeros((6, STATE))
 """What a sighting measures: position, heading, log scale, and the whole tilt."""
 SEEN[range(6), [0, 1, 4, 5, 6, 7]] = SEEN[[4, 5], [8, 9]] = 1.0
 SEEN.flags.writeable = False
-LEAST_NEW = 0.15
-"""Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
 WHITE_SHARE = 0.2  # fraction of the error of a reported tilt that is independent at every view
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from orthonav.core.track.likelihood import log_density
 from orthonav.core.track.model import (
-    COMMON,
+    CHANGING,
     HEADING,
     HORIZON,
     POSITION,
@@ -102,8 +102,7 @@ def predicted(
     `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view, added to
     their biases unless the `camera` measured the change, and of the horizon (Gauss-Markov,
     `Model.horizon_s`). The displacement itself is added by `by_camera`. While `coasting`, the error
-    of a reported velocity drifts (`Model.coasting_walk`). `overlap`: share of the
-    ground in view that the last view showed."""
+    of a reported velocity drifts (`Model.coasting_walk`). `overlap`: of ground in view."""
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)
@@ -113,13 +112,11 @@ def predicted(
         after[[HEADING, SCALE]] += [camera.turned_rad, camera.scaled]
         noise[HEADING, HEADING] += camera.turned_std_rad**2
         noise[SCALE, SCALE] += camera.scaled_std**2
-    left = math.exp(-seconds / model.horizon_s)
-    after[HORIZON] *= left
-    step[HORIZON, HORIZON] = left * np.eye(2)
-    noise[range(8, 10), range(8, 10)] = telemetry_noise[2] * (1 - left**2)
-    after[COMMON] *= overlap
-    step[COMMON, COMMON] *= overlap
-    noise[COMMON, COMMON] = (1 - overlap**2) * np.eye(6)
+    left = np.repeat([math.exp(-seconds / model.horizon_s), overlap], [2, 6])
+    after[CHANGING] *= left
+    step[CHANGING, CHANGING] = np.diag(left)
+    noise[CHANGING, CHANGING] = np.diag(1 - left**2)
+    noise[HORIZON, HORIZON] *= telemetry_noise[2]
     if velocity is None:
         after[POSITION] += seconds * mean[VELOCITY]
         step[0, 2] = step[1, 3] = seconds

@@ -35,12 +35,11 @@ from orthonav.core.track import (
     Sighting,
     State,
 )
-from orthonav.core.track.likelihood import places_of
+from orthonav.core.track.likelihood import LEAST_NEW, places_of
 from orthonav.core.track.model import (
     BIASES,
     HEADING,
     HORIZON,
-    LEAST_NEW,
     POSITION,
     SCALE,
     SEEN,
@@ -314,10 +313,9 @@ class Tracker:
         camera = None if moved is None else moved.displacement
         if camera is not None:
             self._learn_velocity(velocity, camera, seconds)
-        if moved is not None:
-            ground = 1 - moved.overlap
-        else:  # clouds do not fit each other, but show no new ground either
-            ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
+        # Clouds do not fit each other, but show no new ground either.
+        ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
+        ground = ground if moved is None else 1 - moved.overlap
         self.mixture.predict(seconds, velocity, camera, noise, 1 - ground)
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
