@@ -168,7 +168,7 @@ def test_a_place_that_dead_reckoning_contradicts_is_not_believed(away_m):
     """A camera that consistently shows a place 300 m away; the aircraft cannot have come there."""
     flight, mixture, places = Flight(5), Mixture(MODEL, EXTENT), []
     for view in range(40):
-        shown = flight.place + [away_m if view > 10 else 0.0, 0.0]
+        shown = flight.place + np.array([away_m if view > 10 else 0.0, 0.0])
         mixture.update(flight.reported(), [flight.sighting(4.0, shown)])
         found = mixture.estimate(RADIUS_M)
         if view > 10 and found.state is State.TRACKING and math.dist(found.mean[:2], shown) < 30:

@@ -194,6 +194,7 @@ MOST_SIGHTED = 3.0  # highest count, in views
 FORGOTTEN = 0.5
 """Factor on the count with every view at which the position is less certain than `Model.wide_m`."""
 GATE = 36.0  # largest squared innovation of the position over the trace of its covariance
+REACHED = 13.8  # squared error over its covariance, exceeded with a probability of 0.001
 
 
 class State(Enum):
@@ -444,8 +445,9 @@ class Mixture:
         """The track here; if it cannot have come here from where it was, that, not `followed`."""
         here = Hypothesis(1.0, mean, covariance, 0.0, 0, followed=True)
         last = self._last or here
-        reach = GATE * np.trace((last.covariance + covariance)[POSITION, POSITION])
-        return here if distance(last, here) ** 2 <= reach else replace(last, followed=False)
+        off, spread = (mean - last.mean)[POSITION], (last.covariance + covariance)[:2, :2]
+        reached = off @ np.linalg.solve(spread, off) < REACHED
+        return here if reached else replace(last, followed=False)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map, of hypotheses no farther away than it

@@ -18,7 +18,6 @@ Array = NDArray[np.float64]
 STATE = 16
 POSITION, VELOCITY, BIASES = slice(0, 2), slice(2, 4), slice(4, 8)
 HEADING, SCALE, TILT, HORIZON, COMMON = 4, 5, slice(6, 8), slice(8, 10), slice(10, 16)
-CHANGING = slice(HORIZON.start, COMMON.stop)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 """Least standard deviations of heading and log scale of a registered view."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))

@@ -7,7 +7,6 @@ import numpy as np
 
 from orthonav.core.track.likelihood import log_density
 from orthonav.core.track.model import (
-    CHANGING,
     HEADING,
     HORIZON,
     POSITION,
@@ -113,9 +112,9 @@ def predicted(
         noise[HEADING, HEADING] += camera.turned_std_rad**2
         noise[SCALE, SCALE] += camera.scaled_std**2
     left = np.repeat([math.exp(-seconds / model.horizon_s), overlap], [2, 6])
-    after[CHANGING] *= left
-    step[CHANGING, CHANGING] = np.diag(left)
-    noise[CHANGING, CHANGING] = np.diag(1 - left**2)
+    after[8:] *= left
+    step[8:, 8:] = np.diag(left)
+    noise[8:, 8:] = np.diag(1 - left**2)
     noise[HORIZON, HORIZON] *= telemetry_noise[2]
     if velocity is None:
         after[POSITION] += seconds * mean[VELOCITY]
