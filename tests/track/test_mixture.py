@@ -140,6 +140,44 @@ def test_views_of_the_same_ground_are_not_new():
     assert believed[0] < 0.9 < believed[1]
 
 
+def test_overlapping_views_repeat_their_error_and_a_track_is_no_less_certain_than_one_view():
+    """Views that all show the same ground, with one error."""
+    values = []
+    for seed in range(40):
+        flight, mixture = Flight(seed), Mixture(MODEL, EXTENT)
+        first = flight.sighting(4.0)
+        off = first.mean - np.concatenate([flight.place, BIAS])
+        for view in range(8):
+            if view:
+                velocity = ReportedVelocity(SPEED, SPEED if view > 1 else None, 5.0)
+                flight.moved()
+                mixture.predict(1.0, velocity, overlap=1.0)
+            here = np.concatenate([flight.place, BIAS]) + off
+            sighting = Sighting(here, first.covariance, 4.0)
+            mixture.update(flight.reported(), [sighting], 1.0 if view == 0 else 0.15)
+        found = mixture.estimate(RADIUS_M)
+        error = found.mean[:2] - flight.place
+        values.append(error @ np.linalg.solve(found.covariance[:2, :2], error))
+        own_m2 = first.covariance[0, 0] + MODEL.sighting_noise_m**2
+        assert 0.7 * own_m2 < found.covariance[0, 0] < 1.05 * own_m2
+    assert 1.2 < np.mean(values) < 3
+
+
+@pytest.mark.parametrize("away_m", [300.0, 0.0])
+def test_a_place_that_dead_reckoning_contradicts_is_not_believed(away_m):
+    """A camera that consistently shows a place 300 m away; the aircraft cannot have come there."""
+    flight, mixture, places = Flight(5), Mixture(MODEL, EXTENT), []
+    for view in range(40):
+        shown = flight.place + np.array([away_m if view > 10 else 0.0, 0.0])
+        mixture.update(flight.reported(), [flight.sighting(4.0, shown)])
+        found = mixture.estimate(RADIUS_M)
+        if view > 10 and found.state is State.TRACKING and math.dist(found.mean[:2], shown) < 30:
+            places.append(found.place_probability)
+        mixture.predict(1.0, ReportedVelocity(SPEED, None, 1.0), flight.moved())
+    assert len(places) > 5
+    assert max(places) <= 0.8 if away_m else min(places) > 0.999
+
+
 def test_without_sightings_it_becomes_lost_and_its_covariance_grows():
     flight, mixture, _ = flown(3)
     spread = [np.trace(mixture.estimate(RADIUS_M).covariance[:2, :2])]

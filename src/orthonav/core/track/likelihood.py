@@ -9,6 +9,7 @@ import numpy as np
 from orthonav.core.localize.confidence import RegisteredConfidence, logit
 from orthonav.core.localize.place import Place
 from orthonav.core.track.model import (
+    COMMON,
     HEADING_FLOOR_RAD,
     SCALE_FLOOR,
     SEEN,
@@ -21,6 +22,8 @@ from orthonav.core.track.model import (
 
 TRUSTED = (0.1, 0.5)
 """Views with less probability of their own do not count, above the second fully."""
+LEAST_NEW = 0.15
+"""Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
 MOST_OF_ONE = 0.75  # of a single view: less than `CONFIRMED`
 POSE = slice(2, 4)
 SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end
@@ -76,16 +79,17 @@ def _as_rival(best: Place, place: Place) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A sighting as a measurement of `model.SEEN`: `mean` (6,), `noise` (6, 6).
+    """A sighting as a measurement of `model.SEEN`: `mean` (6,).
 
-    `log_odds`: over the density of what only looks alike. `own_noise` (6, 6): without regard to
-    earlier views of the same ground. `alone`: probability by the view alone. `log_chance`: log
-    density of what chance finds in the area searched."""
+    `noise` (6, 6): tempered. `log_odds`: over the density of what only looks alike. `independent`
+    (6, 6): not in common with views of the same ground. `seen` (6, 16): what it measures. `alone`:
+    probability by the view alone. `log_chance`: log density of chance in the area searched."""
 
     mean: Array
     noise: Array
     log_odds: float
-    own_noise: Array
+    independent: Array
+    seen: Array
     alone: float
     log_chance: float
 
@@ -110,13 +114,12 @@ def measurement(
     return seen, noise, independent
 
 
-def updated(
-    mean: Array, covariance: Array, innovation: Array, spread: Array
-) -> tuple[Array, Array]:
-    """Kalman update (.., 10), (.., 10, 10) by an innovation (.., 6), covariance (.., 6, 6)."""
-    gain = np.linalg.solve(spread, SEEN @ covariance).swapaxes(-1, -2)
+def updated(mean: Array, covariance: Array, measured: Measurement) -> tuple[Array, Array]:
+    """Kalman update of states (.., 16), (.., 16, 16)."""
+    spread = measured.seen @ covariance @ measured.seen.T + measured.independent
+    gain = np.linalg.solve(spread, measured.seen @ covariance).swapaxes(-1, -2)
     after = covariance - gain @ spread @ gain.swapaxes(-1, -2)
-    moved = mean + (gain @ innovation[..., None])[..., 0]
+    moved = mean + (gain @ (measured.mean - mean @ measured.seen.T)[..., None])[..., 0]
     return moved, (after + after.swapaxes(-1, -2)) / 2
 
 
@@ -141,7 +144,7 @@ def tempered(
 ) -> Measurement:
     """A sighting as a measurement, tempered by the fraction of it that is new.
 
-    `mounts`: probability and covariance (10, 10) of the initial state of each kind. `areas_m2`: of
+    `mounts`: probability and covariance (16, 16) of the initial state of each kind. `areas_m2`: of
     the map, and of the part searched. A likelihood to the power `newness` has a broader peak; the
     telemetry noise, independent at every view, is excluded."""
     mean, noise, independent = measurement(model, reported, sighting)
@@ -162,11 +165,14 @@ def tempered(
     _, log_det = np.linalg.slogdet(2 * math.pi * (noise + independent))
     odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
     odds += (1 - newness) * float(log_det) / 2 - len(mean) / 2 * math.log(newness)
+    seen = SEEN.copy()
+    seen[:, COMMON] = np.linalg.cholesky((1 - LEAST_NEW) * noise)
     return Measurement(
         mean,
         noise / newness + independent,
         odds,
-        noise + independent,
+        LEAST_NEW * noise + independent,
+        seen,
         sighting.alone,
         -math.log(searched_m2) - poses,
     )
@@ -181,7 +187,8 @@ def recognition(
     with `covariances` (K, 6, 6), between a right place and one that chance finds in the area
     searched, at most `most_agreement`. A place within the gate is never less likely for its
     distance."""
-    spreads = covariances[:, :4, :4] + seen.own_noise[:4, :4]
+    common = seen.seen[:4, COMMON]
+    spreads = covariances[:, :4, :4] + common @ common.T + seen.independent[:4, :4]
     ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
     agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
     odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement

@@ -61,7 +61,7 @@ COMPARED[range(6), [0, 1, 2, 3, 6, 7]] = COMPARED[[4, 5], [8, 9]] = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One hypothesis of the track, with probability `share`, `mean` (10,), `covariance` (10, 10).
+    """One hypothesis of the track, with probability `share`, `mean` (16,), `covariance` (16, 16).
 
     `sighted`: new ground that it recognized, in views; `uncounted`: since the last view that
     counted. `parent`, `expected`: of the last view; -1, None where it was born now. `recognized`:
@@ -136,7 +136,7 @@ def _divergence(means: Array, covariances: Array) -> Array:
 
 
 def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
-    """As one Gaussian, (10,) and (10, 10); not to be changed."""
+    """As one Gaussian, (16,) and (16, 16); not to be changed."""
     if len(group) == 1:
         return group[0].mean, group[0].covariance
     shares = np.array([each.share for each in group])
@@ -194,6 +194,7 @@ MOST_SIGHTED = 3.0  # highest count, in views
 FORGOTTEN = 0.5
 """Factor on the count with every view at which the position is less certain than `Model.wide_m`."""
 GATE = 36.0  # largest squared innovation of the position over the trace of its covariance
+REACHED = 13.8  # squared error over its covariance, exceeded with a probability of 0.001
 
 
 class State(Enum):
@@ -241,6 +242,7 @@ class Mixture:
         self._state = State.SEARCHING
         self._blind = 0.0
         self._numbers = 0
+        self._last: Hypothesis | None = None  # of the track, dead-reckoned since
 
     def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
         self._extent = np.array(extent_en_m)
@@ -251,6 +253,7 @@ class Mixture:
     ) -> None:
         """Continue between two views in another plane, on a map of this extent there."""
         self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
+        self._last = None if self._last is None else moved(self._last, plane, other)
         self._set_extent(extent_en_m)
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
@@ -270,6 +273,7 @@ class Mixture:
         if not self.hypotheses:
             self.start(mean_en_m, std_m)
             return
+        self._last = None  # what dead reckoning contradicts, other means confirm
         made, noise = [], np.eye(2) * std_m**2
         for each in self.hypotheses:
             spread = each.covariance[POSITION, POSITION] + noise
@@ -297,16 +301,20 @@ class Mixture:
         velocity: ReportedVelocity | None = None,
         camera: CameraDisplacement | None = None,
         telemetry_noise: Array | None = None,
+        overlap: float = 0.0,
     ) -> None:
         """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
-        (rad), log scale, horizon (rad), None: the model's."""
+        (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
-        stays = 1 - self.model.lost
+        stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
         made = []
         for each in self.hypotheses:
-            for share, expected in self._predictions(each, seconds, velocity, camera, noise):
+            for share, expected in self._predictions(each, *moves):
                 on_map = held_to_map(self.model, expected, self.area_m2)
                 made.append(self._from(each, on_map, each.share * share * stays))
+        if self._last is not None:
+            _, expected = max(self._predictions(self._last, *moves), key=lambda split: split[0])
+            self._last = self._from(self._last, held_to_map(self.model, expected, self.area_m2), 1)
         self.hypotheses = made
         self.elsewhere += (1 - stays) * (1 - self.elsewhere)
 
@@ -317,13 +325,14 @@ class Mixture:
         velocity: ReportedVelocity | None,
         camera: CameraDisplacement | None,
         telemetry_noise: Array,
+        overlap: float,
     ) -> Iterator[tuple[float, Expected]]:
         """With their probabilities: with odometry, which may be an outlier, and without.
 
         Where no velocity is reported, the aircraft may also have made an unexpected turn."""
         model, likely = self.model, 1 - self.model.odometry_outlier
         coasting = self._state in (State.COASTING, State.LOST)
-        step = partial(predicted, model, each.mean, coasting=coasting)
+        step = partial(predicted, model, each.mean, coasting=coasting, overlap=overlap)
         dead_reckoned = step(each.covariance, seconds, velocity, telemetry_noise)
         if camera is None:
             chance = 0.0
@@ -417,19 +426,28 @@ class Mixture:
             if self._state is State.TRACKING:
                 self._follow(near)
                 follows = True
+                self._last = self._reached(mean, covariance)
         belief = sum(each.share for each in near)
         most = 1.0 if self._state is State.TRACKING else UNCONFIRMED
         return Estimate(
             mean,
             covariance,
             min(confidence, most),
-            min(belief, most),
+            min(belief, most if self._last is None or self._last.followed else UNCONFIRMED),
             self._state,
             belief,
             seen,
             confirmed,
             follows,
         )
+
+    def _reached(self, mean: Array, covariance: Array) -> Hypothesis:
+        """The track here; if it cannot have come here from where it was, that, not `followed`."""
+        here = Hypothesis(1.0, mean, covariance, 0.0, 0, followed=True)
+        last = self._last or here
+        off, spread = (mean - last.mean)[POSITION], (last.covariance + covariance)[:2, :2]
+        reached = off @ np.linalg.solve(spread, off) < REACHED
+        return here if reached else replace(last, followed=False)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map, of hypotheses no farther away than it
@@ -524,9 +542,7 @@ class Mixture:
         expected = SEEN @ before @ SEEN.T
         spreads = expected + seen.noise
         log_weights = (seen.log_odds + log_densities(innovations, spreads)).tolist()
-        means, covariances = updated(
-            np.array([each.mean for each in near]), before, innovations, spreads
-        )
+        means, covariances = updated(np.array([each.mean for each in near]), before, seen)
         shown = recognition(seen, expected, innovations, self.model.most_agreement).tolist()
         for number, each in enumerate(near):
             sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
@@ -555,14 +571,10 @@ class Mixture:
         return bool(math.dist(seen.mean[:2], each.mean[:2]) ** 2 <= GATE * reach)
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
-        """Mean (10,) and covariance (10, 10), anywhere on the map."""
-        place, speed = self.area_m2, self.model.speed_mps**2
-        horizon = self.model.horizon_rad**2
-        variances = [
-            *(place, place, speed, speed),
-            *(*self.model.initial_bias(tilt_rad), horizon, horizon),
-        ]
-        return np.zeros(STATE), np.diag(np.array(variances))
+        """Mean (16,) and covariance (16, 16), anywhere on the map."""
+        place, speed, horizon = self.area_m2, self.model.speed_mps**2, self.model.horizon_rad**2
+        values = [place, speed, *self.model.initial_bias(tilt_rad), horizon, 1.0]
+        return np.zeros(STATE), np.diag(np.repeat(values, [2, 2, 1, 1, 1, 1, 2, 6]))
 
     def _mounts(self) -> Iterator[tuple[float, Array, Array]]:
         """Good and bad mount: probability, and a state anywhere on the map."""
@@ -577,7 +589,7 @@ class Mixture:
             spread = SEEN @ covariance @ SEEN.T + seen.noise
             log_weight = seen.log_odds - math.log(self.area_m2)
             log_weight += log_density(seen.mean[2:], spread[2:, 2:])
-            mean, covariance = updated(mean, covariance, seen.mean, spread)
+            mean, covariance = updated(mean, covariance, seen)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
             yield Hypothesis(

@@ -1,8 +1,9 @@
 """The state of a track, and the model of aircraft and instruments.
 
-A state has 10 components: position and velocity (m, m/s; east and north), and the errors of the
+A state has 16 components: position and velocity (m, m/s; east and north), and the errors of the
 telemetry: heading (rad, added to the reported one), log scale (true over reported height, focal
-length included), pitch and roll of the mount (rad, constant) and of the horizon (rad, for seconds).
+length included), pitch and roll of the mount (rad, constant) and of the horizon (rad, for seconds);
+and the error that sightings of the same ground have in common, in standard deviations (Cholesky).
 """
 
 import math
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 from orthonav.core.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG, MAP_STD_M
 
 Array = NDArray[np.float64]
-STATE = 10
+STATE = 16
 POSITION, VELOCITY, BIASES = slice(0, 2), slice(2, 4), slice(4, 8)
-HEADING, SCALE, TILT, HORIZON = 4, 5, slice(6, 8), slice(8, 10)
+HEADING, SCALE, TILT, HORIZON, COMMON = 4, 5, slice(6, 8), slice(8, 10), slice(10, 16)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 """Least standard deviations of heading and log scale of a registered view."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))

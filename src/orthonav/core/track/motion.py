@@ -64,9 +64,9 @@ class CameraDisplacement:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """A predicted state (10,), with the one before it by the odometry in between too.
+    """A predicted state (16,), with the one before it by the odometry in between too.
 
-    `cross` (10, 10): covariance of the state before (rows) and the prediction (columns)."""
+    `cross` (16, 16): covariance of the state before (rows) and the prediction (columns)."""
 
     mean: Array
     covariance: Array
@@ -94,13 +94,14 @@ def predicted(
     camera: CameraDisplacement | None = None,
     *,
     coasting: bool = False,
+    overlap: float = 0.0,
 ) -> Expected:
     """The state after so many seconds, by the reported velocity or else its own.
 
     `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view, added to
     their biases unless the `camera` measured the change, and of the horizon (Gauss-Markov,
     `Model.horizon_s`). The displacement itself is added by `by_camera`. While `coasting`, the error
-    of a reported velocity drifts (`Model.coasting_walk`)."""
+    of a reported velocity drifts (`Model.coasting_walk`). `overlap`: of ground in view."""
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)
@@ -110,10 +111,11 @@ def predicted(
         after[[HEADING, SCALE]] += [camera.turned_rad, camera.scaled]
         noise[HEADING, HEADING] += camera.turned_std_rad**2
         noise[SCALE, SCALE] += camera.scaled_std**2
-    left = math.exp(-seconds / model.horizon_s)
-    after[HORIZON] *= left
-    step[HORIZON, HORIZON] = left * np.eye(2)
-    noise[range(8, 10), range(8, 10)] = telemetry_noise[2] * (1 - left**2)
+    left = np.repeat([math.exp(-seconds / model.horizon_s), overlap], [2, 6])
+    after[8:] *= left
+    step[8:, 8:] = np.diag(left)
+    noise[8:, 8:] = np.diag(1 - left**2)
+    noise[HORIZON, HORIZON] *= telemetry_noise[2]
     if velocity is None:
         after[POSITION] += seconds * mean[VELOCITY]
         step[0, 2] = step[1, 3] = seconds
@@ -172,7 +174,7 @@ def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected,
     ):
         state = mean[first : first + STATE]
         innovation -= sign * lever @ (state[TILT] + state[HORIZON] - known)
-        observes[:, first + TILT.start : first + STATE] += sign * np.hstack([lever, lever])
+        observes[:, first + TILT.start : first + HORIZON.stop] += sign * np.hstack([lever, lever])
     spread = observes @ joint @ observes.T + turn @ camera.covariance @ turn.T
     gain = np.linalg.solve(spread, observes @ joint).T
     mean = mean + gain @ innovation

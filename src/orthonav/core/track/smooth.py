@@ -19,7 +19,7 @@ ROWS_OF_BLOCK = 256
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A state (10,), (10, 10), and the `belief` in its track."""
+    """A state (16,), (16, 16), and the `belief` in its track."""
 
     mean: Array
     covariance: Array

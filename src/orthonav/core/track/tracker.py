@@ -35,7 +35,7 @@ from orthonav.core.track import (
     Sighting,
     State,
 )
-from orthonav.core.track.likelihood import places_of
+from orthonav.core.track.likelihood import LEAST_NEW, places_of
 from orthonav.core.track.model import (
     BIASES,
     HEADING,
@@ -62,8 +62,6 @@ from orthonav.core.track.smooth import History, Smoothed
 LOCAL_SHARE = 0.75  # Belief to search around it only. Values without a source: docs/tracking.md.
 LOCAL_SIGMAS = 4.0  # half width of that search,
 MIN_LOCAL_M = 30.0  # and its least
-LEAST_NEW = 0.15
-"""Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
 LIKELY_NATS = 5.0  # places so much less likely than the best one are not examined for their tilt
 UNSEEN_TILT_RAD = math.radians(20.0)  # standard deviation of a tilt that a view does not show
 LEAST_TILT_STD_DEG = 0.1  # least that a track expects of a view
@@ -315,13 +313,13 @@ class Tracker:
         camera = None if moved is None else moved.displacement
         if camera is not None:
             self._learn_velocity(velocity, camera, seconds)
-        self.mixture.predict(seconds, velocity, camera, noise)
+        # Clouds do not fit each other, but show no new ground either.
+        ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
+        ground = ground if moved is None else 1 - moved.overlap
+        self.mixture.predict(seconds, velocity, camera, noise, 1 - ground)
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
-        if moved is not None:
-            return moved.overlap, 1 - moved.overlap
-        # Clouds do not fit each other, but show no new ground either.
-        return 0.0, 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
+        return 0.0 if moved is None else moved.overlap, ground
 
     def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
         """By the expected displacement or the largest usual speed."""
@@ -589,7 +587,7 @@ class Tracker:
         telemetry: Telemetry,
         more: dict[str, float],
     ) -> Fix:
-        """Of a state (10,), (10, 10); `more` goes into its evidence."""
+        """Of a state (16,), (16, 16); `more` goes into its evidence."""
         lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
         spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
         spread.flags.writeable = False
