@@ -3,6 +3,7 @@
 import copy
 import functools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -161,6 +162,24 @@ def test_overlapping_views_repeat_their_error_and_a_track_is_no_less_certain_tha
         own_m2 = first.covariance[0, 0] + MODEL.sighting_noise_m**2
         assert 0.7 * own_m2 < found.covariance[0, 0] < 1.05 * own_m2
     assert 1.2 < np.mean(values) < 3
+
+
+def test_a_view_that_shows_hardly_anything_of_its_camera_is_used_all_the_same():
+    """Position and tilt err as one, by 10 km: rounding leaves that covariance indefinite."""
+    flight, mixture = Flight(3), Mixture(MODEL, EXTENT)
+    sighting = flight.sighting()
+    lever = np.array([[7e3, 0.0], [0.0, 7e3]])
+    spread = np.diag([0.0, 0.0, 1e-8, 1e-8, 0.0, 0.0])
+    spread[:2, :2], spread[:2, 4:], spread[4:, :2] = (
+        2.04 * lever @ lever,
+        2.04 * lever,
+        2.04 * lever,
+    )
+    spread[4:, 4:] = 2.04 * np.eye(2) * (1 - 4.05e-8)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(spread + np.diag(np.square([2.0, 2.0, 5e-3, 4e-3, 0.0, 0.0])))
+    mixture.update(flight.reported(), [replace(sighting, covariance=spread)])
+    assert np.isfinite(mixture.estimate(RADIUS_M).covariance).all()
 
 
 @pytest.mark.parametrize("away_m", [300.0, 0.0])

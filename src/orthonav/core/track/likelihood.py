@@ -24,6 +24,7 @@ TRUSTED = (0.1, 0.5)
 """Views with less probability of their own do not count, above the second fully."""
 LEAST_NEW = 0.15
 """Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
+ROUNDING = 1e-9  # of variances: where a view shows less than its camera, rounding has no root
 MOST_OF_ONE = 0.75  # of a single view: less than `CONFIRMED`
 POSE = slice(2, 4)
 SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end
@@ -166,7 +167,8 @@ def tempered(
     odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
     odds += (1 - newness) * float(log_det) / 2 - len(mean) / 2 * math.log(newness)
     seen = SEEN.copy()
-    seen[:, COMMON] = np.linalg.cholesky((1 - LEAST_NEW) * noise)
+    spread = (noise + noise.T) / 2 + ROUNDING * np.diag(np.diag(noise))
+    seen[:, COMMON] = np.linalg.cholesky((1 - LEAST_NEW) * spread)
     return Measurement(
         mean,
         noise / newness + independent,
