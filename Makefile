@@ -59,7 +59,7 @@ figures: $(VENV)/.docs-installed
 	$(BIN)/python tools/docs/pictures.py
 
 golden: $(VENV)/.dev-installed
-	$(BIN)/python tests/golden/renew.py
+	PYTHONPATH=. $(BIN)/python tests/golden/renew.py
 
 $(BIN)/python:
 	@sh tools/make_venv.sh "$(PYTHON)" "$(VENV)"
