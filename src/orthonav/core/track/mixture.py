@@ -195,6 +195,7 @@ FORGOTTEN = 0.5
 """Factor on the count with every view at which the position is less certain than `Model.wide_m`."""
 GATE = 36.0  # largest squared innovation of the position over the trace of its covariance
 REACHED = 13.8  # squared error over its covariance, exceeded with a probability of 0.001
+RESTORED = 8.0  # new ground, in views, recognized at a place before dead reckoning must be wrong
 
 
 class State(Enum):
@@ -243,6 +244,7 @@ class Mixture:
         self._blind = 0.0
         self._numbers = 0
         self._last: Hypothesis | None = None  # of the track, dead-reckoned since
+        self._ground = self._restored = 0.0  # new in this view; recognized against dead reckoning
 
     def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
         self._extent = np.array(extent_en_m)
@@ -307,6 +309,7 @@ class Mixture:
         (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
+        self._ground = 1 - overlap
         made = []
         for each in self.hypotheses:
             for share, expected in self._predictions(each, *moves):
@@ -442,12 +445,16 @@ class Mixture:
         )
 
     def _reached(self, mean: Array, covariance: Array) -> Hypothesis:
-        """The track here; if it cannot have come here from where it was, that, not `followed`."""
+        """The track here; if it cannot have come here from where it was, that, not `followed`,
+        until the dead reckoning from there must be wrong (`RESTORED`)."""
         here = Hypothesis(1.0, mean, covariance, 0.0, 0, followed=True)
         last = self._last or here
         off, spread = (mean - last.mean)[POSITION], (last.covariance + covariance)[:2, :2]
-        reached = off @ np.linalg.solve(spread, off) < REACHED
-        return here if reached else replace(last, followed=False)
+        self._restored += 0.0 if last.followed else self._ground
+        if off @ np.linalg.solve(spread, off) < REACHED or self._restored >= RESTORED:
+            self._restored = 0.0
+            return here
+        return replace(last, followed=False)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map, of hypotheses no farther away than it
