@@ -10,9 +10,17 @@ import numpy as np
 import pytest
 from made_check import CONDITIONS, flown
 
+from orthonav.core.errors import CheckError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.findings import AVAILABILITY, FIXES, OUTAGE_S, Findings, verdict_of
-from orthonav.ground.check.records import LEAST_RISK, Along, Range, Word
+from orthonav.ground.check.records import (
+    LEAST_RISK,
+    Along,
+    CheckRequest,
+    Conditions,
+    Range,
+    Word,
+)
 from orthonav.ground.check.write.plain import to_json
 from orthonav.ground.check.write.wording import text
 
@@ -194,3 +202,12 @@ def test_a_rare_risk_has_no_availability():
     assert "-  availability: at a risk of 1e-05 too few" in text(result)
     plain = json.loads(to_json(result))
     assert plain["flights"]["availability"] == {"median": None, "low": None, "high": None}
+
+
+def test_limits_are_those_of_the_command():
+    """And the default is a figure that people would state."""
+    for asked in ({"alert_limit_m": 0.5}, {"alert_limit_m": 2e5}, {"risk": 1e-7}):
+        with pytest.raises(CheckError, match=next(iter(asked))):
+            CheckRequest("area.onav", **asked)
+    for agl_m, limit_m in ((270.0, 35.0), (2506.668, 63.0)):
+        assert Conditions.of(CheckRequest("area.onav"), agl_m, 35.0).alert_limit_m == limit_m
