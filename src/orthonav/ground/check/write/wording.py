@@ -91,8 +91,8 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
     limit, between = conditions.limit_text, interval_text(mean, probability_text)
     chance = (probability_text(mean.median), f"mean probability of a fix per view {between}")
     if not conditions.states_level:
-        few = f"availability: at a risk of {conditions.risk:g} too few have a protection level"
-        available = [("-", few)]
+        few = f"at a risk of {conditions.risk:g} too few positions have a protection level"
+        available = [("-", f"availability: {few}")]
     elif flights is None:
         level = after_fix_m(result.cells.error_m, conditions.risk)
         between = interval_text(level, metres_text)
