@@ -9,7 +9,6 @@ from made_trials import lost, right
 
 from helpers import write_dem
 from orthonav.cli import main
-from orthonav.cli.check import _Lines
 from orthonav.core.errors import AreaError, CameraError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
@@ -131,6 +130,21 @@ def test_a_route_over_both_halves(checked, frame):
 def test_trials_end_when_the_answer_holds(checked):
     few, many = (checked(effort=each).cells.trials.sum() for each in (0.25, 1.0))
     assert 20 <= few < many < 500
+
+
+def test_progress_counts_all_that_will_be_tried(untried, half_blank, monkeypatch):
+    """Two batches at least: a quick check of 64 trials is half done after 32."""
+    shares = []
+
+    def tried(request, conditions, batches, workers, progress):
+        for number, found in enumerate(made_up(request, conditions, batches, workers, progress), 1):
+            progress(32 * number)
+            yield found
+
+    monkeypatch.setattr(check_run, "run_trials", tried)
+    request = CheckRequest(half_blank.map, camera=CAMERA, agl_m=130.0, effort=0.05)
+    check_map(request, lambda _, share: shares.append(share))
+    assert shares[0] == 0.5 and shares[-1] == 1.0 and shares.count(0.99) <= 1
 
 
 @pytest.mark.parametrize(
@@ -301,17 +315,6 @@ def test_bad_input_is_one_line(run, half_blank, tmp_path, names_in, options, sai
     assert done.code == 1 and done.out == "" and done.err.count("\n") == 1
     assert done.err.startswith("orthonav: error: ") and said in done.err
     assert names_in(tmp_path) == []
-
-
-def test_the_time_left_is_said_without_a_terminal(monkeypatch, capsys):
-    now = iter(range(0, 400, 3))
-    monkeypatch.setattr("orthonav.cli.check.time.monotonic", lambda: float(next(now)))
-    lines = _Lines()
-    for done in range(1, 101):
-        lines("trials", done / 100)
-    said = capsys.readouterr().err.splitlines()
-    assert said[0] == "trials: 11 %, about 267 s left" and said[1].startswith("trials: 15 %")
-    assert len(said) == 23
 
 
 def test_an_interrupt_writes_nothing(run, half_blank, tmp_path, names_in, monkeypatch):

@@ -10,9 +10,17 @@ import numpy as np
 import pytest
 from made_check import CONDITIONS, flown
 
+from orthonav.core.errors import CheckError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.findings import AVAILABILITY, FIXES, OUTAGE_S, Findings, verdict_of
-from orthonav.ground.check.records import Along, Range, Word
+from orthonav.ground.check.records import (
+    LEAST_RISK,
+    Along,
+    CheckRequest,
+    Conditions,
+    Range,
+    Word,
+)
 from orthonav.ground.check.write.plain import to_json
 from orthonav.ground.check.write.wording import text
 
@@ -38,7 +46,7 @@ FINE = dict(
     trials=1000,
     outside=0.0,
     changed=0.0,
-    after_fix_m=30.0,
+    after_fix_m=Range(30.0, 25.0, 35.0),
     view_px=200.0,
     prior_px=50.0,
     second_date=False,
@@ -58,6 +66,7 @@ def flights(**changed):
     return dict(flights=replace(FLOWN, **changed))
 
 
+RARE = replace(CONDITIONS, risk=1e-5)
 GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
 
 
@@ -92,7 +101,15 @@ GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
         (flights(false_fix=Range(0.005, 0, 0.01)), "wrong", GO),
         (flights(false_fix=Range(0.05, 0, 0.2)), "wrong", MARGINAL),
         (flights(false_fix=Range(0.2, 0.11, 0.3)), "wrong", NO_GO),
-        (dict(after_fix_m=51.0), "availability", NO_GO),
+        (dict(after_fix_m=Range(50, 41, 60)), "availability", NO_GO),
+        (dict(after_fix_m=Range(30, 25, 41)), "availability", MARGINAL),
+        (dict(after_fix_m=Range(50, 39, 60)), "availability", MARGINAL),
+        (dict(after_fix_m=Range(30, 25, 40)), "availability", GO),
+        (dict(after_fix_m=Range(*[math.inf] * 3)), "availability", NO_GO),
+        (flights() | dict(conditions=replace(CONDITIONS, risk=LEAST_RISK)), "risk", None),
+        (flights() | dict(conditions=RARE), "risk", MARGINAL),
+        (flights() | dict(conditions=RARE), "availability", None),
+        (dict(conditions=RARE), "risk", MARGINAL),
         (dict(changed=0.05), "changed_ground", GO),
         (dict(changed=0.2), "changed_ground", MARGINAL),
     ],
@@ -147,4 +164,50 @@ def test_nothing_contradicts_the_verdict(probability, limit_m, scenes_std, word)
     assert ("can be flown" in said) == (verdict.word is GO)
     shown, low, high = re.search(r"(\d+ %)  availability \((\d+) % to (\d+) %", said).groups()
     reason = next(each.text for each in verdict.reasons if each.code == "availability")
-    assert f"{shown} ({low} to {high} %)" in reason
+    assert f"{shown} ({low} % to {high} %)" in reason
+
+
+def test_a_figure_has_one_form():
+    """Reasons and key figures, with an outage below 100 m and one above two minutes."""
+    outage = dict(outage_m=Range(5360, 74.84, 9000), outage_s=Range(268, 3.7, 450))
+    rare = dict(availability=Range(0.97, 0.83, 0.996), false_fix=Range(0.002, 0, 0.009))
+    found = replace(FLOWN, **outage, **rare)
+    verdict = verdict_of(Findings(**FINE | dict(flights=found)))
+    cells = made_check.made_cells(4, 4, 50.0)
+    result = made_check.made_check(LocalFrame(48.0, 2.0), cells, ALONG.points_en_m[[0, -1]])
+    said = text(replace(result, flights=found, verdict=verdict)).replace("\n    ", " ")
+    for shown in (
+        "4:28 min (4 s to 7:30 min), 5360 m (74.8 m to 9000 m)",
+        "97 % (83 % to 99 %)",
+        "0.2 % (0.0 % to 0.9 %)",
+    ):
+        value, rest = shown.split(" (", 1)
+        assert shown in said and re.search(rf"{value}  .* \({re.escape(rest)}", said)
+    assert said.count("confident fix beyond 35 m") == 2
+    assert said.count("40 m (the default)") == 2
+
+
+def test_without_a_route_level_and_limit_are_shown():
+    result = made_check.tiny(LocalFrame(48.0, 2.0))
+    assert re.search(r"m  protection level right after .* alert limit: 40 m", text(result))
+
+
+def test_a_rare_risk_has_no_availability():
+    found = flown(ALONG, RARE)
+    assert all(map(math.isnan, (*found.availability, *found.outage_s, *found.available)))
+    assert found.false_fix == FLOWN.false_fix and found.error_95_m == FLOWN.error_95_m
+    cells = made_check.made_cells(4, 4, 50.0)
+    result = made_check.made_check(LocalFrame(48.0, 2.0), cells, ALONG.points_en_m[[0, -1]])
+    result = replace(result, conditions=RARE, along=ALONG, flights=found, outages=())
+    assert "-  availability: at a risk of 1e-05 too few" in text(result)
+    plain = json.loads(to_json(result))
+    assert plain["flights"]["availability"] == {"median": None, "low": None, "high": None}
+
+
+def test_limits_are_those_of_the_command():
+    """And the default is a figure that people would state."""
+    for asked in ({"alert_limit_m": 0.5}, {"alert_limit_m": 2e5}, {"risk": 1e-7}):
+        with pytest.raises(CheckError, match=next(iter(asked))):
+            CheckRequest("area.onav", **asked)
+    for agl_m, limit_m in ((270.0, 35.0), (2506.668, 63.0)):
+        assert Conditions.of(CheckRequest("area.onav"), agl_m, 35.0).alert_limit_m == limit_m

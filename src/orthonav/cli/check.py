@@ -55,7 +55,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "factor on the number of trials (default 1), which end when more would not change the "
     text += "answer"
     group.add_argument("--effort", type=float, default=1.0, metavar="FACTOR", help=text)
-    text = "about a quarter of the trials, as --effort 0.25"
+    text = "fewer trials, as --effort 0.25"
     group.add_argument("--quick", dest="effort", action="store_const", const=0.25, help=text)
     add_options(group, "--workers")
 

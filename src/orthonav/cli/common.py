@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from orthonav.core.errors import AreaError, VariantError
+from orthonav.core.limits import ALERT_LIMITS_M, RISKS
 
 if TYPE_CHECKING:
     from orthonav.core.localize.confidence import Acceptance
@@ -57,7 +58,7 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "peak_ratio:1.3",
     },
     "--alert-limit-m": {
-        "type": _within(1.0, 100_000.0),
+        "type": _within(*ALERT_LIMITS_M),
         "metavar": "M",
         "help": "largest horizontal error that the mission allows: a fix is confident if its "
         "protection level is at most that (replaces --accept)",
@@ -153,7 +154,7 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "help": "refuse a map that was not signed with this key (see `orthonav sign`)",
     },
     "--risk": {
-        "type": _within(1e-6, 0.5),
+        "type": _within(*RISKS),
         "default": 1e-3,
         "metavar": "P",
         "help": "probability with which the error exceeds the protection level (default 0.001)",

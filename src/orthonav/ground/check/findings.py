@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.records import (
+    LEAST_RISK,
     Along,
     Conditions,
     Flights,
@@ -23,6 +24,7 @@ from orthonav.ground.check.records import (
 )
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import along_polyline_en_m
+from orthonav.ground.report import metres_text, percent_text, probability_text, seconds_text
 
 Array = NDArray[np.float64]
 LIKELY_OUTAGE = 0.5
@@ -140,7 +142,7 @@ class Findings(NamedTuple):
     `calibrated`: the map carries a confidence model.
     `wrong`: number of false fixes among `trials`.
     `outside`: fraction of the route outside the map; `changed`: of the area since the map was made.
-    `after_fix_m`: protection level right after a fix, median.
+    `after_fix_m`: protection level right after a fix, over the cells or points of the route.
     `view_px`: root of the area of a view in pixels of the map; `prior_px`: standard deviation of
     the prior position, infinite without one; `second_date`: tried on one.
     """
@@ -153,7 +155,7 @@ class Findings(NamedTuple):
     trials: int
     outside: float
     changed: float
-    after_fix_m: float
+    after_fix_m: Range
     view_px: float
     prior_px: float
     second_date: bool
@@ -162,22 +164,17 @@ class Findings(NamedTuple):
 def verdict_of(found: Findings) -> Verdict:
     """The worst of all reasons, worst first."""
     where = "on the map" if found.flights is None else "along the route"
-    reasons = [*_trust(found), _mean(found.mean, where)]
-    limit_m = found.conditions.alert_limit_m
-    level = f"Even right after a fix the protection level is {found.after_fix_m:.0f} m"
+    reasons = [*_trust(found), _mean(found.mean, where), *_available(found)]
     if found.flights is not None:
-        even = f". {level}" if limit_m < found.after_fix_m < math.inf else ""
-        reasons += [*_outside(found.outside), *_flown(found.flights, limit_m, even)]
-    elif found.after_fix_m > limit_m:
-        reasons += [Reason("availability", f"{level}; alert limit: {limit_m:g} m.", Word.NO_GO)]
+        reasons += [*_outside(found.outside), _false_fix(found.flights, found.conditions)]
     why = uncertainty(found.mean, found.view_px, found.prior_px)
     if why and not found.second_date:
         text = f"The map alone cannot tell how often views of {found.view_px:.0f} map pixels are "
         text += f"localized: {why}. A second date (--other-date) would help."
         reasons += [Reason("uncertain", text, Word.MARGINAL)]
     if found.changed > 0:  # a warning: it lowers the probability already
-        text = f"At least {100 * found.changed:.1f} % of the ground {where} changed since the map "
-        text += "was made: fixes are less likely there; build the map from newer imagery."
+        text = f"At least {percent_text(found.changed)} of the ground {where} changed since the "
+        text += "map was made: fixes are less likely there; build the map from newer imagery."
         reasons += [Reason("changed_ground", text, CHANGED.word(_exact(found.changed)))]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
@@ -196,18 +193,13 @@ def _exact(value: float) -> Range:
     return Range(value, value, value)
 
 
-def percent(figure: Range) -> str:
-    """Median and interval of a fraction, as `62 % (41 to 78 %)`."""
-    median, low, high = map(probability_text, figure)
-    return f"{median} ({low.removesuffix(' %')} to {high})"
+def interval_text(figure: Range, as_text: Callable[[float], str]) -> str:
+    return f"({as_text(figure.low)} to {as_text(figure.high)})"
 
 
-def probability_text(value: float) -> str:
-    """A probability in whole percent, `-` if unknown; 100 % only if it really is."""
-    if not math.isfinite(value):
-        return "-"
-    percent = round(100 * value)
-    return f"{99 if percent == 100 and value < 0.9995 else percent} %"
+def range_text(figure: Range, as_text: Callable[[float], str]) -> str:
+    """Median and interval, as `62 % (41 % to 78 %)`."""
+    return f"{as_text(figure.median)} {interval_text(figure, as_text)}"
 
 
 def _trust(found: Findings) -> list[Reason]:
@@ -218,37 +210,55 @@ def _trust(found: Findings) -> list[Reason]:
         return []
     fraction = found.wrong / max(found.trials, 1)
     word = WRONG.word(_exact(fraction))
-    text = f"False fixes: {found.wrong} of {found.trials} trial views. Limit: {100 * WRONG.go:g} %."
+    text = f"Confident fixes beyond {metres_text(found.conditions.radius_m)}: {found.wrong} of "
+    text += f"{found.trials} trial views. Limit: {100 * WRONG.go:g} %."
     return [Reason("wrong", text, word)] if found.wrong >= MIN_WRONG and word is not Word.GO else []
 
 
 def _mean(mean: Range, where: str) -> Reason:
     word = FIXES.word(mean)
-    text = f"Mean probability of a confident, correct fix per image {where}: {percent(mean)}"
+    text = f"Mean probability of a confident, correct fix per view {where}: "
+    text += range_text(mean, probability_text)
     text += "" if word is Word.GO else f"; GO requires {100 * FIXES.go:.0f} % at the lower end"
     return Reason("fixes" if word is Word.GO else "few_fixes", f"{text}.", word)
 
 
 def _outside(fraction: float) -> list[Reason]:
     word = OUTSIDE.word(_exact(fraction))
-    text = f"{100 * fraction:.0f} % of the route is outside the map. Limit: {100 * OUTSIDE.go:g} %."
+    text = f"{percent_text(fraction)} of the route is outside the map. Limit: "
+    text += f"{100 * OUTSIDE.go:g} %."
     return [] if word is Word.GO else [Reason("outside_map", text, word)]
 
 
-def _flown(flights: Flights, limit_m: float, even: str) -> list[Reason]:
-    """What the simulated flights say; `even`: about positions that are never available."""
-    text = f"Availability, the fraction of the route with a protection level within {limit_m:g} m: "
-    text += percent(flights.availability)
+def _available(found: Findings) -> list[Reason]:
+    """Positions with a protection level within the alert limit."""
+    conditions, after_m, flights = found.conditions, found.after_fix_m, found.flights
+    if not conditions.states_level:
+        text = f"At a risk of {conditions.risk:g} too few positions have a protection level: the "
+        text += "probability that their place is wrong is often higher. Availability is predicted "
+        return [Reason("risk", f"{text}for risks from {LEAST_RISK:g} on.", Word.MARGINAL)]
+    limit_m, limit = conditions.alert_limit_m, conditions.limit_text
+    level = "unknown: no trial view was localized"
+    if math.isfinite(after_m.median):
+        level = range_text(after_m, metres_text)
+    if flights is None:
+        text = f"Protection level right after a fix: {level}; alert limit: {limit}."
+        return [Reason("availability", text, Threshold(limit_m, limit_m).word(after_m))]
+    text = f"Availability, the fraction of the route with a protection level within {limit}: "
+    text += range_text(flights.availability, probability_text)
     word = AVAILABILITY.word(flights.availability)
     if word is not Word.GO:
-        text += f"; GO requires {100 * AVAILABILITY.go:.0f} % at the lower end{even}"
+        text += f"; GO requires {100 * AVAILABILITY.go:.0f} % at the lower end"
+        if after_m.median > limit_m:
+            text += f". Protection level right after a fix: {level}"
     reasons = [Reason("availability", f"{text}.", word)]
-    _, low_s, high_s = flights.outage_s
-    text = f"Longest outage: {flights.outage_m.median:.0f} m, {flights.outage_s.median:.0f} s "
-    text += f"({low_s:.0f} to {high_s:.0f} s). Limit: {OUTAGE_S.go:g} s at the upper end."
-    reasons += [Reason("outage", text, OUTAGE_S.word(flights.outage_s))]
-    word = FALSE_FIX.word(flights.false_fix)
-    text = f"Probability of a false fix on this route: {100 * flights.false_fix.median:.1f} % (up "
-    text += f"to {100 * flights.false_fix.high:.1f} %). Limit: {100 * FALSE_FIX.go:g} % at the "
-    text += "upper end."
-    return [*reasons, Reason("wrong", text, word)]
+    text = f"Longest outage: {range_text(flights.outage_s, seconds_text)}, "
+    text += f"{range_text(flights.outage_m, metres_text)}. Limit: {seconds_text(OUTAGE_S.go)} at "
+    return [*reasons, Reason("outage", f"{text}the upper end.", OUTAGE_S.word(flights.outage_s))]
+
+
+def _false_fix(flights: Flights, conditions: Conditions) -> Reason:
+    text = f"Probability of a confident fix beyond {metres_text(conditions.radius_m)} on this "
+    text += f"route: {range_text(flights.false_fix, percent_text)}. Limit: "
+    text += f"{100 * FALSE_FIX.go:g} % at the upper end."
+    return Reason("wrong", text, FALSE_FIX.word(flights.false_fix))

@@ -8,6 +8,8 @@ available. The protection level is that of a right place (core/integrity.py), as
 track confirm each other; wrong places count as false fixes.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +32,12 @@ def level_m(error_m: Array | float, risk: float) -> Array:
     """Protection level of a right place for errors (..), root mean square, alike in all directions:
     with the default `risk` 4.7 times the error."""
     return np.asarray(error_m * protection_level_m(1.0, np.eye(2) / 2, risk))
+
+
+def after_fix_m(error_m: Array, risk: float) -> Range:
+    """Protection level right after a fix, over places; infinite where no fix is expected."""
+    known = error_m[np.isfinite(error_m)]
+    return Range.of(level_m(known if len(known) else np.array([np.inf]), risk))
 
 
 def shifted(probability: Array, shifts: Array) -> Array:
@@ -85,7 +93,7 @@ def simulated(
     shape = false_fixes + 0.5
     wrong = np.interp(stops_m, distance_m, found.wrong).clip(0, 1)
     rates = wrong * rng.gamma(shape, 1 / shape, (len(shifts), 1))
-    return Flights(
+    flights = Flights(
         count=len(shifts),
         probability=Range.of(chances.mean(axis=1)),
         availability=Range.of(available @ lengths_m / lengths_m.sum()),
@@ -96,6 +104,18 @@ def simulated(
         available=available.mean(axis=0),
         protection_m=np.quantile(levels_m, 0.5, axis=0, method="nearest"),
         protection_high_m=np.quantile(levels_m, INTERVAL[1], axis=0, method="nearest"),
+    )
+    if conditions.states_level:
+        return flights
+    unknown, nowhere = Range(np.nan, np.nan, np.nan), np.full(len(distance_m), np.nan)
+    return replace(
+        flights,
+        availability=unknown,
+        outage_m=unknown,
+        outage_s=unknown,
+        available=nowhere,
+        protection_m=nowhere,
+        protection_high_m=nowhere,
     )
 
 

@@ -18,15 +18,21 @@ from orthonav.core.files import with_paths
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.integrity import DEFAULT_RISK
+from orthonav.core.limits import ALERT_LIMITS_M, RISKS
 from orthonav.core.records import CONFIDENT
+from orthonav.core.track.model import Model
 from orthonav.ground.changes.record import CellGrid, ChangedGround
 from orthonav.ground.check.estimate import INTERVAL, LEARNT, Prediction, Recalibration
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
+from orthonav.ground.report import metres_text
 
 Array = NDArray[np.float64]
 LEAST_LIMIT_M, LIMIT_SHARE = 35.0, 0.025
 """The alert limit that is not given: at least so many metres, and this fraction of the height."""
+LEAST_RISK = Model.lost / 10
+"""At a lower one too few fixes have a protection level: of the belief in other places that returns
+with every view, eight of ten views leave at most a tenth (docs/check.md)."""
 
 
 class Word(Enum):
@@ -120,8 +126,8 @@ class CheckRequest:
             "agl_std": (self.agl_std, 0.0, 0.5, " (a fraction of the height: 0.05 is 5 %)"),
             "prior_std_m": (self.prior_std_m, 0.0, 1e6, " m"),
             "accept": (self.accept, 0.01, 0.999, ""),
-            "alert_limit_m": (self.alert_limit_m, 0.1, 1e6, " m"),
-            "risk": (self.risk, 1e-9, 0.5, ""),
+            "alert_limit_m": (self.alert_limit_m, *ALERT_LIMITS_M, " m"),
+            "risk": (self.risk, *RISKS, ""),
             "speed_mps": (self.speed_mps, 0.1, 10_000.0, " m/s"),
             "drift": (self.drift, 0.0, 1.0, " (metres per metre flown: 0.03 is 3 %)"),
             "tilt_std_deg": (self.tilt_std_deg, 0.0, 20.0, " deg"),
@@ -169,7 +175,7 @@ class Conditions:
             height_m=agl_m * camera.height_px / camera.fy_px,
             agl_m=agl_m,
             radius_m=radius_m,
-            alert_limit_m=given_m or max(LEAST_LIMIT_M, LIMIT_SHARE * agl_m),
+            alert_limit_m=given_m or max(LEAST_LIMIT_M, round(LIMIT_SHARE * agl_m)),
             limit_given=given_m is not None,
             **{name: getattr(request, name) for name in (*names, "tilt_std_deg", "other_sensor")},
         )
@@ -178,6 +184,15 @@ class Conditions:
     def side_m(self) -> float:
         """Side of the square with the area of the footprint."""
         return math.sqrt(self.width_m * self.height_m)
+
+    @property
+    def states_level(self) -> bool:
+        """Whether enough fixes have a protection level at this risk."""
+        return self.risk >= LEAST_RISK
+
+    @property
+    def limit_text(self) -> str:
+        return metres_text(self.alert_limit_m) + " (the default)" * (not self.limit_given)
 
     @property
     def footprint_text(self) -> str:
@@ -244,13 +259,14 @@ class Range(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """What happens along the route in `count` simulated flights.
+    """What happens along the route in `count` simulated flights. Below `LEAST_RISK` protection
+    levels, and what follows from them, are NaN.
 
     `probability`: mean chance of a fix per view.
     `availability`: fraction of the route with a protection level of at most the alert limit.
     `outage_m`, `outage_s`: longest stretch without.
     `error_95_m`: largest position error along the route (95 %).
-    `false_fix`: probability of at least one false fix.
+    `false_fix`: probability of at least one confident fix that is not correct.
     `available` (N,): fraction of the flights with an available position at a point of the route.
     `protection_m`, `protection_high_m` (N,): protection level there, median and 90 %.
     """

@@ -29,7 +29,7 @@ from orthonav.ground.check.findings import (
     predicted_along,
     verdict_of,
 )
-from orthonav.ground.check.flights import level_m, scene_shifts, shifted, simulated
+from orthonav.ground.check.flights import after_fix_m, scene_shifts, shifted, simulated
 from orthonav.ground.check.records import (
     Along,
     Cells,
@@ -113,7 +113,7 @@ class _Check:
             require_overlap(request.other_date, self.sheet)
         self.extent = self.coverage.extent_en_m if self.area is None else self.area.extent_en_m
         self.checked_m2 = checked_m2(self.coverage, self.area)
-        self.wanted = self._limited(0.0)
+        self.wanted = max(self._limited(0.0), 2 * BATCH)  # the verdict has to hold
 
     def _require_views(self) -> None:
         footprint = self.conditions.footprint_text
@@ -167,6 +167,7 @@ class _Check:
                 same = before is not None and before.verdict.word is result.verdict.word
                 if same and tried >= self.wanted:
                     break
+                self.wanted = max(self.wanted, tried + self._batch(tried))
         self.progress("trials", 1.0)
         if result is None:
             raise AreaError(
@@ -190,12 +191,15 @@ class _Check:
         least, most = (max(each * self.request.effort, FEWEST_TRIALS) for each in ends)
         return round(min(max(trials, least), most))
 
+    def _batch(self, done: int) -> int:
+        """Number of trials of the next batch."""
+        return min(max(BATCH, round(BATCH_SHARE * done)), self._limited(math.inf) - done)
+
     def _batches(self) -> Iterator[Array]:
         """Places of trials, every batch spread over all of the checked area."""
         rng = np.random.default_rng([self.request.seed, 4])
-        done, most = 0, self._limited(math.inf)
-        while done < most:
-            count = min(max(BATCH, round(BATCH_SHARE * done)), most - done)
+        done = 0
+        while (count := self._batch(done)) > 0:
             yield trial_places(self.coverage, self.area, self.extent, self.checked_m2, count, rng)
             done += count
 
@@ -214,8 +218,6 @@ class _Check:
             outside = float(np.mean(~self.coverage.covers(along.points_en_m)))
         chances = cells.probability[known] if known.any() else np.zeros(1)
         mean = Range.of(shifted(chances, shifts).mean(axis=1))
-        errors_m = (cells if along is None else along).error_m
-        error_m = float(np.nanmedian(errors_m)) if np.isfinite(errors_m).any() else math.inf
         findings = Findings(
             mean=flights.probability if flights else mean,
             flights=flights,
@@ -225,7 +227,7 @@ class _Check:
             trials=len(own) + len(other),
             outside=outside,
             changed=float(cells.changed[known].mean()) if known.any() else 0.0,
-            after_fix_m=float(level_m(error_m, conditions.risk)),
+            after_fix_m=after_fix_m((cells if along is None else along).error_m, conditions.risk),
             view_px=conditions.side_m / self.sheet.grid.gsd_m,
             prior_px=math.inf if prior_m is None else prior_m / self.sheet.grid.gsd_m,
             second_date=bool(other),

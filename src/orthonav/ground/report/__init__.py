@@ -50,6 +50,14 @@ def percent_text(value: float) -> str:
     return f"{100 * value:.1f} %" if math.isfinite(value) else "-"
 
 
+def probability_text(value: float) -> str:
+    """A probability in whole percent; 100 % only if it really is. As `percent` in `format.js`."""
+    if not math.isfinite(value):
+        return "-"
+    percent = round(100 * value)
+    return f"{99 if percent == 100 and value < 0.9995 else percent} %"
+
+
 def metres_text(value: float) -> str:
     """A length, in kilometres from 10 km on; below 100 m with one decimal unless that is 0.
 
@@ -61,6 +69,16 @@ def metres_text(value: float) -> str:
         return f"{value / 1000:.1f} km"
     text = f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}".removesuffix(".0")
     return f"{text} m"
+
+
+def seconds_text(value: float) -> str:
+    """A time in seconds, from two minutes on as `M:SS min`, from an hour on as `H:MM h`."""
+    whole = round(value)
+    if abs(whole) < 120:
+        return f"{whole} s"
+    if abs(whole) < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    return f"{whole // 3600}:{whole // 60 % 60:02d} h"
 
 
 def plain_text(value: float) -> str:

@@ -1,11 +1,17 @@
 """Words and sentences of page and terminal, and a check as text for a terminal."""
 
 import textwrap
-from collections.abc import Callable
 
-from orthonav.ground.check.findings import probability_text
-from orthonav.ground.check.records import CheckResult, Conditions, Outage, Range, Word, summarize
-from orthonav.ground.report import aligned, metres_text, percent_text
+from orthonav.ground.check.findings import interval_text, range_text
+from orthonav.ground.check.flights import after_fix_m
+from orthonav.ground.check.records import CheckResult, Conditions, Outage, Word, summarize
+from orthonav.ground.report import (
+    aligned,
+    metres_text,
+    percent_text,
+    probability_text,
+    seconds_text,
+)
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -32,16 +38,6 @@ def verdict_sentence(result: CheckResult) -> str:
     return f"{sentence} {height}"
 
 
-def seconds_text(value: float) -> str:
-    """A time in seconds, from two minutes on as `M:SS min`, from an hour on as `H:MM h`."""
-    whole = round(value)
-    if abs(whole) < 120:
-        return f"{whole} s"
-    if abs(whole) < 3600:
-        return f"{whole // 60}:{whole % 60:02d} min"
-    return f"{whole // 3600}:{whole // 60 % 60:02d} h"
-
-
 def outage_row(number: int, outage: Outage) -> tuple[str, ...]:
     return (
         str(number),
@@ -58,7 +54,7 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
     yaw, prior = conditions.yaw_std_deg, conditions.prior_std_m
     given = "as given" if conditions.limit_given else "default: give yours with --alert-limit-m"
     rows = {
-        "alert limit": f"{conditions.alert_limit_m:g} m ({given})",
+        "alert limit": f"{metres_text(conditions.alert_limit_m)} ({given})",
         "risk": f"{conditions.risk:g} (probability of an error beyond the protection level)",
         "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
         "height above ground": f"{conditions.agl_m:.0f} m",
@@ -91,47 +87,53 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
 
 def key_figures(result: CheckResult) -> list[tuple[str, str]]:
     """Values and what they are, of page and terminal."""
-    flights, limit = result.flights, metres_text(result.conditions.alert_limit_m)
-    median, between = probability_text(result.mean.median), _ends(result.mean, probability_text)
-    mean = (median, f"mean probability of a fix per view ({between})")
-    if flights is None:
-        shown = [
-            mean,
-            (f"{result.area_km2:.3g} km²", "checked"),
-            (metres_text(summarize(result)["error_m"]), "expected error of a correct fix"),
-            (str(int(result.cells.trials.sum())), "trial views"),
-        ]
+    conditions, flights, mean = result.conditions, result.flights, result.mean
+    limit, between = conditions.limit_text, interval_text(mean, probability_text)
+    chance = (probability_text(mean.median), f"mean probability of a fix per view {between}")
+    if not conditions.states_level:
+        few = f"at a risk of {conditions.risk:g} too few positions have a protection level"
+        available = [("-", f"availability: {few}")]
+    elif flights is None:
+        level = after_fix_m(result.cells.error_m, conditions.risk)
+        between = interval_text(level, metres_text)
+        name = f"protection level right after a fix {between}; alert limit: {limit}"
+        available = [(metres_text(level.median), name)]
     else:
-        given = "" if result.conditions.limit_given else ", the default"
-        available, outage_m, outage_s = flights.availability, flights.outage_m, flights.outage_s
-        error, wrong = flights.error_95_m, flights.false_fix
-        shown = [
+        outage_s, outage_m = flights.outage_s, flights.outage_m
+        between = interval_text(flights.availability, probability_text)
+        far = range_text(outage_m, metres_text)
+        available = [
             (
-                probability_text(available.median),
-                f"availability ({_ends(available, probability_text)}) at the alert limit of {limit}"
-                f"{given}",
+                probability_text(flights.availability.median),
+                f"availability {between} at the alert limit of {limit}",
             ),
             (
                 seconds_text(outage_s.median),
-                f"longest outage ({_ends(outage_s, seconds_text)}), "
-                f"{metres_text(outage_m.median)} ({_ends(outage_m, metres_text)})",
+                f"longest outage {interval_text(outage_s, seconds_text)}, {far}",
             ),
-            (
-                metres_text(error.median),
-                f"largest position error, 95 % ({_ends(error, metres_text)})",
-            ),
-            (
-                percent_text(wrong.median),
-                f"probability of a false fix on this route ({_ends(wrong, percent_text)})",
-            ),
-            mean,
         ]
-    return shown
-
-
-def _ends(figure: Range, as_text: Callable[[float], str]) -> str:
-    """Its 80 % interval."""
-    return f"{as_text(figure.low)} to {as_text(figure.high)}"
+    if flights is None:
+        return [
+            chance,
+            *available,
+            (metres_text(summarize(result)["error_m"]), "expected error of a correct fix"),
+            (f"{result.area_km2:.3g} km²", "checked"),
+            (str(int(result.cells.trials.sum())), "trial views"),
+        ]
+    error, wrong = flights.error_95_m, flights.false_fix
+    beyond = f"a confident fix beyond {metres_text(conditions.radius_m)} on this route"
+    return [
+        *available,
+        (
+            metres_text(error.median),
+            f"largest position error, 95 % {interval_text(error, metres_text)}",
+        ),
+        (
+            percent_text(wrong.median),
+            f"probability of {beyond} {interval_text(wrong, percent_text)}",
+        ),
+        chance,
+    ]
 
 
 def text(result: CheckResult) -> str:

@@ -2,7 +2,7 @@
 
 /** A probability with its interval, if known. */
 function between(value, low, high) {
-  const interval = known(low) && known(high) ? ` (${percent(low).replace(" %", "")}–${percent(high)})` : "";
+  const interval = known(low) && known(high) ? ` (${percent(low)} to ${percent(high)})` : "";
   return percent(value) + interval;
 }
 

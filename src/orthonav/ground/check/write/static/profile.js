@@ -37,7 +37,8 @@ class Profile extends Chart {
     this.line(context, xs, route.probability, this.probabilityY, this.colour("mark"));
     const limit = data.conditions.alert_limit_m;
     const highest = Math.max(...route.protection_high_m.filter(known), 0);
-    const most = Math.min(Math.max(highest * 1.08, 1.6 * limit), 4 * limit); // the limit stays visible
+    // The limit stays visible, and every median that is finite.
+    const most = Math.max(1.6 * limit, Math.min(1.08 * highest, 4 * limit), 1.1 * Math.max(...route.protection_m.filter(known), 0));
     this.levelY = (v) => bottom - (Math.min(v, most) / most) * (bottom - top);
     const step = roundStep(most / 3);
     const levels = Array.from({ length: Math.floor(most / step) + 1 }, (_, k) => k * step);

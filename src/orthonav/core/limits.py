@@ -1,0 +1,4 @@
+"""Ranges of what a mission may ask for; importing this needs nothing else."""
+
+ALERT_LIMITS_M = (1.0, 100_000.0)
+RISKS = (1e-6, 0.5)
