@@ -194,7 +194,7 @@ MOST_SIGHTED = 3.0  # highest count, in views
 FORGOTTEN = 0.5
 """Factor on the count with every view at which the position is less certain than `Model.wide_m`."""
 GATE = 36.0  # largest squared innovation of the position over the trace of its covariance
-REACHED = 13.8  # squared error over its covariance, exceeded with a probability of 0.001
+REACHED = 6.0  # squared error over its covariance, exceeded with a probability of 0.05
 RESTORED = 8.0  # new ground, in views, recognized at a place before dead reckoning must be wrong
 
 
