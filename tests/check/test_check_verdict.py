@@ -14,7 +14,6 @@ from orthonav.core.errors import CheckError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.findings import AVAILABILITY, FIXES, OUTAGE_S, Findings, verdict_of
 from orthonav.ground.check.records import (
-    LEAST_RISK,
     Along,
     CheckRequest,
     Conditions,
@@ -106,7 +105,7 @@ GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
         (dict(after_fix_m=Range(50, 39, 60)), "availability", MARGINAL),
         (dict(after_fix_m=Range(30, 25, 40)), "availability", GO),
         (dict(after_fix_m=Range(*[math.inf] * 3)), "availability", NO_GO),
-        (flights() | dict(conditions=replace(CONDITIONS, risk=LEAST_RISK)), "risk", None),
+        (flights() | dict(conditions=replace(CONDITIONS, risk=0.0003)), "risk", None),
         (flights() | dict(conditions=RARE), "risk", MARGINAL),
         (flights() | dict(conditions=RARE), "availability", None),
         (dict(conditions=RARE), "risk", MARGINAL),

@@ -284,8 +284,8 @@ FIRST_REACH_PX, REACH_PX = 7, 4
 FITS = 3  # at most,
 SMALL_SHARE = 0.2  # until a correction is below this fraction of its standard deviations
 VARIANCE, VARIANCE_POWER, LEAST_RATIO = 1.6, -0.8, 0.5
-"""Of the errors of blocks over what their curvature says, by the local ratio of the place, at least
-the third (docs/decisions/camera.md)."""
+"""Variance of the errors of blocks over what their curvature says: the first, times the local ratio
+of the place (at least the third) to the power of the second (docs/decisions/camera.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,11 +308,11 @@ class CameraFound:
 
 
 def camera_found(
-    seen: ViewOverGround, reference: Reference, pose: Pose, local_ratio: float | None
+    seen: ViewOverGround, reference: Reference, pose: Pose, local_ratio: float
 ) -> CameraFound | None:
     """Of a view at `pose`; None where the tilt is exact or too few blocks are seen.
 
-    `local_ratio`: of the scores of the place; None: unknown."""
+    `local_ratio`: of the scores of the place."""
     if tilt_std_deg(seen.view.telemetry) == 0:
         return None
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
@@ -335,9 +335,7 @@ def camera_found(
     agl_m = above_sea_m - float(seen.relief.terrain.at_en_m([east, north]))
     if not agl_m > 0:
         return None
-    variance = 1.0
-    if local_ratio is not None:
-        variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
+    variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
     covariance = _scaled(found.covariance, _prior(seen, pose, start)[1], variance)
     return CameraFound(
         orientation,

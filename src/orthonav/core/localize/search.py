@@ -167,7 +167,7 @@ class Search:
 
     def camera(self, place: Place) -> CameraFound | None:
         """None where the reported tilt is exact or the view does not show it."""
-        ratio = place.scores.get("local_ratio")
+        ratio = place.scores.get("local_ratio", 1.0)  # of the best place only
         return camera_found(self.ground, self.sheet.reference, place.fit.pose, ratio)
 
     # What is tried

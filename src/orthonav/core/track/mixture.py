@@ -445,8 +445,8 @@ class Mixture:
         )
 
     def _reached(self, mean: Array, covariance: Array) -> Hypothesis:
-        """The track here; if it cannot have come here from where it was, that, not `followed`,
-        until the dead reckoning from there must be wrong (`RESTORED`)."""
+        """The state of the track, or, where its dead reckoning contradicts it, the dead-reckoned
+        one with `followed=False`: until enough new ground is recognized (`RESTORED`)."""
         here = Hypothesis(1.0, mean, covariance, 0.0, 0, followed=True)
         last = self._last or here
         off, spread = (mean - last.mean)[POSITION], (last.covariance + covariance)[:2, :2]

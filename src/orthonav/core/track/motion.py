@@ -101,7 +101,8 @@ def predicted(
     `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view, added to
     their biases unless the `camera` measured the change, and of the horizon (Gauss-Markov,
     `Model.horizon_s`). The displacement itself is added by `by_camera`. While `coasting`, the error
-    of a reported velocity drifts (`Model.coasting_walk`). `overlap`: of ground in view."""
+    of a reported velocity drifts (`Model.coasting_walk`). `overlap`:
+    fraction of the view that the last one showed too."""
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)

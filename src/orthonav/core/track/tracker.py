@@ -316,7 +316,8 @@ class Tracker:
         # Clouds do not fit each other, but show no new ground either.
         ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
         ground = ground if moved is None else 1 - moved.overlap
-        self.mixture.predict(seconds, velocity, camera, noise, 1 - ground)
+        # An image that is not used makes no error independent.
+        self.mixture.predict(seconds, velocity, camera, noise, 1.0 if view is None else 1 - ground)
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
         return 0.0 if moved is None else moved.overlap, ground

@@ -104,8 +104,8 @@ RIDGE = 1e-2
 MOST_STATED = 2.0
 """An error counts as at most so many times what its covariance states."""
 UNSEEN_WRONG, UNSEEN_TRIALS = 0.06, 500.0
-"""False fixes that are presumed in so many trials more: of 3,878 views of other dates none was
-available and beyond the alert limit (docs/benchmarks.md, integrity)."""
+"""False fixes that are presumed in so many trials more: of 30,013 views, half of them of other
+ground, none was available and beyond the alert limit (docs/benchmarks.md, integrity)."""
 _PAIRS_AT_ONCE = 2**20
 
 

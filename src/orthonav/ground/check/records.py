@@ -30,7 +30,7 @@ from orthonav.ground.report import metres_text
 Array = NDArray[np.float64]
 LEAST_LIMIT_M, LIMIT_SHARE = 35.0, 0.025
 """The alert limit that is not given: at least so many metres, and this fraction of the height."""
-LEAST_RISK = Model.lost / 10
+LEAST_RISK = round(Model.lost / 10, 6)
 """At a lower one too few fixes have a protection level: of the belief in other places that returns
 with every view, eight of ten views leave at most a tenth (docs/check.md)."""
 
