@@ -43,7 +43,7 @@ from benchmarks.scenes import (
     place_of,
 )
 from orthonav.cli.demo import IMAGERY
-from orthonav.core.integrity import DEFAULT_RISK
+from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.records import RADIUS_SHARE
 from orthonav.ground.evaluate.statistics import runs, upper_bound
 

@@ -28,7 +28,8 @@ from scipy.special import expit
 from benchmarks.judged_views import prepare, views_of
 from benchmarks.record import Section, Table, percent, resumed, rows_path, run, say
 from benchmarks.scenes import all_pairs, chosen, place_of
-from orthonav.core.integrity import DEFAULT_RISK, protection_levels_m
+from orthonav.core.integrity import protection_levels_m
+from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.localize.confidence import (
     ALONE,
     FEATURES,

@@ -5,7 +5,7 @@ import math
 import shutil
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -138,7 +138,7 @@ def _rows(
             continue
         # Mirrored views, and those with another prior, are the views of the map once more.
         kind = "found" if case.kind in ("mirrored", "other prior") else case.kind
-        key = (kind, *astuple(replace(case, share=0.0))[1:])
+        key = kind, case.width_px, case.heading_known, case.prior_px, case.tracked
         try:
             if key not in flights:
                 flights[key] = _flight(over, case, count, seed + number, work)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from orthonav.core.errors import AreaError, VariantError
-from orthonav.core.limits import ALERT_LIMITS_M, RISKS
+from orthonav.core.limits import ALERT_LIMITS_M, DEFAULT_RISK, RISKS
 
 if TYPE_CHECKING:
     from orthonav.core.localize.confidence import Acceptance
@@ -155,9 +155,10 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
     },
     "--risk": {
         "type": _within(*RISKS),
-        "default": 1e-3,
+        "default": DEFAULT_RISK,
         "metavar": "P",
-        "help": "probability with which the error exceeds the protection level (default 0.001)",
+        "help": "probability with which the error exceeds the protection level "
+        f"(default {DEFAULT_RISK:g})",
     },
     "--route": {
         "type": Path,

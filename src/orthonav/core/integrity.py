@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 DEGREES = 5.0
 """Degrees of freedom of the distribution of errors."""
-DEFAULT_RISK = 1e-3
-"""Probability of an error beyond the protection level."""
 STEPS = 40  # of bisection: 1e-12 of the interval
 _QUADRANT = np.cos((np.arange(16) + 0.5) * np.pi / 32) ** 2
 

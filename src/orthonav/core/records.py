@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
-from orthonav.core.integrity import DEFAULT_RISK, probability_beyond, protection_level_m
+from orthonav.core.integrity import probability_beyond, protection_level_m
+from orthonav.core.limits import DEFAULT_RISK
 
 CONFIDENT = 0.9  # from this confidence on: the default of publishing and reports
 PRIOR_SIGMAS = 3.0  # the search ends there: 1.1 % of a round Gaussian lies outside

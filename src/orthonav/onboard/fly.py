@@ -21,7 +21,7 @@ from orthonav.core.flight.mount import Mount
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles
 from orthonav.core.geo.camera import Camera
-from orthonav.core.integrity import DEFAULT_RISK
+from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.localize.view import check_picture
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
-from orthonav.core.integrity import DEFAULT_RISK
+from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.records import Fix, NoFix, ViewResult
 
 KEYS = (

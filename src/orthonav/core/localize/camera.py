@@ -45,12 +45,14 @@ Array = NDArray[np.float64]
 class Resection:
     """Corrections (6,), m east, north, up, deg heading, pitch, roll, and covariances (6, 6).
 
-    `alone`: by the blocks without telemetry, as far as they show it (`WEAK`)."""
+    `alone`: by the blocks without telemetry, as far as they show it (`WEAK`). `information` (6, 6):
+    that of the telemetry."""
 
     correction: Array
     covariance: Array
     alone: Array
     alone_covariance: Array
+    information: Array
 
 
 def resected(
@@ -89,7 +91,11 @@ def resected(
     if not all(np.isfinite(each).all() for each in (correction, covariance, alone_covariance)):
         return None
     return Resection(
-        correction, np.asarray(covariance), np.asarray(alone), np.asarray(alone_covariance)
+        correction,
+        np.asarray(covariance),
+        np.asarray(alone),
+        np.asarray(alone_covariance),
+        information,
     )
 
 
@@ -336,7 +342,7 @@ def camera_found(
     if not agl_m > 0:
         return None
     variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
-    covariance = _scaled(found.covariance, _prior(seen, pose, start)[1], variance)
+    covariance = _scaled(found.covariance, found.information, variance)
     return CameraFound(
         orientation,
         agl_m,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
-from orthonav.core.integrity import DEFAULT_RISK
+from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.records import Fix, NoFix, ViewResult
 
 FEATURES = (

@@ -314,8 +314,10 @@ class Tracker:
         if camera is not None:
             self._learn_velocity(velocity, camera, seconds)
         # Clouds do not fit each other, but show no new ground either.
-        ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
-        ground = ground if moved is None else 1 - moved.overlap
+        if moved is not None:
+            ground = 1 - moved.overlap
+        else:
+            ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
         # An image that is not used makes no error independent.
         self.mixture.predict(seconds, velocity, camera, noise, 1.0 if view is None else 1 - ground)
         if self._every_prior and prior is not None:

@@ -17,8 +17,7 @@ from orthonav.core.errors import CheckError
 from orthonav.core.files import with_paths
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.integrity import DEFAULT_RISK
-from orthonav.core.limits import ALERT_LIMITS_M, RISKS
+from orthonav.core.limits import ALERT_LIMITS_M, DEFAULT_RISK, RISKS
 from orthonav.core.records import CONFIDENT
 from orthonav.core.track.model import Model
 from orthonav.ground.changes.record import CellGrid, ChangedGround

@@ -22,7 +22,7 @@ from orthonav.core.flight import FlightFolder, read_truth
 from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import HINT
-from orthonav.core.integrity import DEFAULT_RISK
+from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.statistics import (
