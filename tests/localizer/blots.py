@@ -18,6 +18,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.confidence import Chances, RegisteredConfidence
 from orthonav.core.localize.policy import DEFAULT_PLAN
+from orthonav.core.mapfile.manifest import TerrainInfo
 from orthonav.core.records import Fix, Prior
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import RegistrationCalibration
@@ -25,6 +26,12 @@ from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 
 SIDE_M = 620
+SURFACE = TerrainInfo(
+    *(0.0, 0.0, 1.0, 16, 16, 16, 0.0, 0.0, 0.1, 256, "surface", "none"),
+    source_posting_m=1.0,
+    roughness_m=2.0,
+)
+"""A terrain that shows houses and trees, as that of the ground without any does."""
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 AGL_M = 150.0
 FINEST_M = 0.5

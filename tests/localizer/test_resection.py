@@ -5,11 +5,13 @@ import math
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, as_grey, known_map, rendered
+from blots import AGL_M, CAMERA, GROUND, SURFACE, as_grey, known_map, rendered
 
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize import Localizer
-from orthonav.core.localize.camera import _scaled, camera_found
+from orthonav.core.localize import Localizer, systematic
+from orthonav.core.localize.camera import camera_found
+from orthonav.core.localize.ground import Relief
+from orthonav.core.localize.resection import _Marginal
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Prior, Telemetry, View
 
@@ -17,11 +19,27 @@ VIEWS, TILT_DEG = 24, 4.0
 YAW_STD_DEG, AGL_STD = 5.0, 0.05
 
 
+class Flat:
+    """A surface model of level ground without houses."""
+
+    def at_en_m(self, points_en_m):
+        return np.zeros(np.shape(points_en_m)[:-1])
+
+
 @pytest.fixture(scope="module")
-def localizer(made_once, make_ortho):
+def without_terrain(made_once, make_ortho):
     """Without the displacement between dates: map and views show the same ground."""
     made = Localizer(open_map(known_map(made_once, make_ortho).path))
     made.registration.floor_px = 0.0
+    return made
+
+
+@pytest.fixture(scope="module")
+def localizer(made_once, make_ortho):
+    """The same on a map with a surface model."""
+    made = Localizer(open_map(known_map(made_once, make_ortho).path))
+    made.registration.floor_px = 0.0
+    made.registration.relief = Relief(Flat(), made.grid, SURFACE)
     return made
 
 
@@ -111,14 +129,13 @@ def test_a_view_that_does_not_show_its_tilt_keeps_the_doubt_of_the_report(locali
     assert narrow_fix(localizer, 6000.0)[0].confidence > 0.9
 
 
-def test_exact_pitch_and_roll_are_not_estimated(localizer):
+def test_exact_pitch_and_roll_stay(localizer):
     place, attitude = np.array([-30.0, 50.0]), (70.0, 6.0, -4.0)
     grey = rendered(GROUND, place, attitude)
     reported = Telemetry(0, 73.0, *attitude[1:], 1.03 * AGL_M, tilt_std_deg=0.0)
     fix = localizer.locate(View(grey, CAMERA, reported))
     assert np.hypot(*error_en_m(localizer, fix, place)) < 0.1
-    assert (fix.pitch_deg, fix.roll_deg) == attitude[1:] and fix.pose_cov is None
-    assert not {"pitch_bias_deg", "roll_bias_std_deg"} & set(fix.evidence)
+    assert (fix.pitch_deg, fix.roll_deg) == pytest.approx(attitude[1:], abs=0.05)
     assert np.sqrt(np.diag(fix.cov_en_m2)).max() < 0.5
     # Where they are wrong, the camera is as far off.
     wrong = Telemetry(0, 73.0, 9.0, -4.0, AGL_M, tilt_std_deg=0.0)
@@ -139,14 +156,31 @@ def test_tilt_of_an_oblique_view_is_found(localizer):
 def test_errors_of_blocks_scale_all_but_what_telemetry_says(variance):
     # Shown by the picture; by telemetry only; by both alike.
     shown, reported = np.array([1e4, 0.0, 3.0]), np.array([0.0, 0.2, 3.0])
-    covariance = np.diag(1 / (shown + reported))
-    scaled = np.diag(_scaled(covariance, np.diag(reported), variance))
+    marginal = _Marginal(np.diag(shown), np.zeros((3, 3)))
+    scaled = np.diag(marginal.covariance(np.diag(reported), variance))
     assert scaled[:2] == pytest.approx([variance * 1e-4, 5.0])
     # A mean of two errors with standard deviations of sqrt(variance / 3) and sqrt(1 / 3).
     assert scaled[2] == pytest.approx((variance / 3 + 1 / 3) / 4)
 
 
-def test_a_place_that_stands_out_is_known_better(localizer):
+def test_systematic_errors_are_marginalized():
+    """As in the covariance of all unknowns."""
+    rng = np.random.default_rng(1)
+    slopes = rng.normal(size=(40, 9))
+    curvature, information = slopes.T @ slopes, np.eye(9)
+    telemetry = np.diag([0.0, 0.0, 1.0, 1.0, 4.0, 4.0])
+    information[:6, :6] = telemetry
+    marginal = _Marginal.of(curvature, information)
+    every = np.linalg.inv(curvature + information)
+    noise, known = every @ curvature @ every, every @ information @ every
+    np.testing.assert_allclose(
+        marginal.covariance(telemetry, 1.7), (1.7 * noise + known)[:6, :6], rtol=1e-9
+    )
+
+
+def test_a_place_that_stands_out_is_known_better(localizer, monkeypatch):
+    for field in ("SURFACE_M", "STRETCH_PX"):  # noise of blocks alone
+        monkeypatch.setattr(systematic, field, (1e-3, 10.0))
     attitude = (20.0, 0.0, 0.0)
     view = View(
         as_grey(rendered(GROUND, np.zeros(2), attitude, AGL_M)),
@@ -162,3 +196,26 @@ def test_a_place_that_stands_out_is_known_better(localizer):
     assert (alone.orientation.position_m == alike.orientation.position_m).all()
     stds = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in (alone, alike)]
     assert 0.3 < stds[0] / stds[1] < 0.7
+
+
+def test_a_slope_that_no_terrain_states_is_no_tilt(without_terrain, localizer):
+    """The same picture: over unknown ground half of what it shows may be the ground's slope; with
+    a terrain it is tilt."""
+    attitude = 40.0, 3.0, -2.0
+    grey = rendered(GROUND, np.zeros(2), attitude)
+
+    def fix(localizer, std_deg=None):
+        telemetry = Telemetry(0, 40.0, 0.0, 0.0, AGL_M, tilt_std_deg=std_deg)
+        return localizer.locate(View(grey, CAMERA, telemetry))
+
+    known, unknown = fix(localizer), fix(without_terrain)
+    assert (known.pitch_deg, known.roll_deg) == pytest.approx(attitude[1:], abs=0.3)
+    assert 1.2 < unknown.pitch_deg < 2.6 and -1.8 < unknown.roll_deg < -0.8
+    std_m = math.sqrt(unknown.pose_cov[0, 0])
+    assert 0.015 * AGL_M < std_m < 0.045 * AGL_M
+    off_m = np.hypot(*error_en_m(without_terrain, unknown, np.zeros(2)))
+    assert off_m < 2 * std_m
+    # A tilt that is stated keeps its weight over unknown ground only.
+    stated, over_known = fix(without_terrain, 0.5), fix(localizer, 0.5)
+    assert abs(stated.pitch_deg) < 0.4 and math.sqrt(stated.cov_en_m2[0, 0]) < 0.012 * AGL_M
+    assert over_known.pitch_deg > 1.5

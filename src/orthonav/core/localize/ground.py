@@ -16,9 +16,10 @@ from orthonav.core.geo.ground import sight_on_ground
 from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
 from orthonav.core.localize.rectify import Orientation, node_px, orthorectified
+from orthonav.core.localize.systematic import GroundErrors, terrain_errors, unknown_ground
 from orthonav.core.localize.tiles import TileProposer
 from orthonav.core.localize.view import MIN_AGL_STD, PreparedView
-from orthonav.core.mapfile.manifest import SheetInfo
+from orthonav.core.mapfile.manifest import SheetInfo, TerrainInfo
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import DEFAULT_AGL_STD
 from orthonav.core.register.pose import SIGMAS, Pose, PosePrior, ScaleMap
@@ -45,8 +46,11 @@ class LevelTerrain:
 class Relief:
     """The ground of a sheet; threads may share it."""
 
-    def __init__(self, terrain: Terrain, grid: TileGrid) -> None:
-        self.terrain, self.grid = terrain, grid
+    def __init__(
+        self, terrain: Terrain, grid: TileGrid, source: TerrainInfo | str | None = None
+    ) -> None:
+        """`source`: of the terrain, or what the land without one is like; None: not known."""
+        self.terrain, self.grid, self.source = terrain, grid, source
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
     @property
@@ -74,6 +78,12 @@ class Relief:
             )
             out[:, axis] = (ahead - behind) / (2 * SLOPE_M)
         return out
+
+    def errors(self, slopes: Array) -> GroundErrors:
+        """Of the heights under a view, by slopes (N, 2) there."""
+        if self.is_level:
+            return unknown_ground(self.source if isinstance(self.source, str) else None)
+        return terrain_errors(self.source if isinstance(self.source, TerrainInfo) else None, slopes)
 
     def expected(self, view: PreparedView) -> PosePrior:
         """The view's prior, with scales by the height above sea at each place."""
@@ -149,7 +159,8 @@ class SearchedSheet:
         self.windows = SearchWindows(self.reference)
         self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
         self.propose, self.plan = propose, plan
-        self.relief = Relief(terrain or LevelTerrain(), self.grid)
+        source = sheet.relief if terrain is None else terrain.info
+        self.relief = Relief(terrain or LevelTerrain(), self.grid, source)
 
     @property
     def pyramid(self) -> GreyPyramid:

@@ -82,6 +82,8 @@ class TerrainInfo:
     known: int
     name: str
     datum: str
+    source_posting_m: float = 10.0
+    roughness_m: float = 0.0
 
     def to_plain(self) -> dict[str, Any]:
         return {"codec": TERRAIN_CODEC, **vars(self)}
@@ -107,9 +109,15 @@ class TerrainInfo:
         return info
 
 
+RELIEF_SLOPES = {"level": 0.01, "rolling": 0.05, "hills": 0.12}
+"""Root mean square gradient of land without a terrain, by what it is like."""
+DEFAULT_RELIEF = "rolling"
+
+
 @dataclass(frozen=True)
 class SheetInfo:
-    """`area_km2`: number of tiles times stride squared."""
+    """`area_km2`: number of tiles times stride squared. `relief`: what land without a terrain is
+    like (`RELIEF_SLOPES`), None: not stated."""
 
     frame: LocalFrame
     grid: TileGrid
@@ -117,6 +125,7 @@ class SheetInfo:
     area_km2: float
     grey: GreyInfo | None = None
     terrain: TerrainInfo | None = None
+    relief: str | None = None
 
     def to_plain(self) -> dict[str, Any]:
         terrain = {} if self.terrain is None else {"terrain": self.terrain.to_plain()}

@@ -1,0 +1,358 @@
+"""The camera under which the blocks of a view fit the map best, by resection.
+
+Blocks say how well they fit the map a little aside (`orthonav.core.register.blocks`). The camera
+and the systematic errors of the blocks (`systematic`) are the maximum of their posterior with the
+telemetry, by Newton's method; changed ground is an outlier of a mixture. The size of the systematic
+errors and of the noise is estimated too (variance components, Koch 1999)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.core.localize.systematic import Systematic
+from orthonav.core.register.blocks import BlockScores
+
+BLURS_PX = (2.0, 1.0, 0.0, 0.0)
+"""Gaussian blur of correlations at each step: wide peaks first, for views off by some pixels."""
+SHARP_PX = (0.7, 0.0)  # the same from a correction by `SAMPLE` blocks, or from one close by
+SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
+"""Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC)."""
+JOINT_STEPS = 5  # of camera and systematic errors together
+LONGEST_STEP_PX = 3.0  # of any block, per step, pixels of its level
+PIXELS_PER_NUMBER = 5.0  # pixels per independent number; only the odds of outliers depend on it
+LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9  # limits of the mean correlation of a right block
+CORRELATED, CORRELATED_PX = 2.0, 60.0
+"""Errors of levels and dates correlate: least excess of the variance over the scatter of blocks,
+and what errors reach over, pixels of the map (docs/decisions/camera.md)."""
+MIN_BLOCKS = 8
+MIN_LEFT = 0.25  # least share of the blocks' numbers that the solution leaves to their scatter
+COMPONENT_PRIOR = 8.0  # numbers that the prior variance of a systematic error counts as,
+COMPONENT_LIMITS = 0.25, 16.0  # and the least and largest factor on it
+WEAK = np.array([1e4, 1e4, 1e3, 60.0, 20.0, 20.0])
+"""Standard deviations of a camera of which nothing is reported."""
+CAMERA = slice(0, 6)
+Array = NDArray[np.float64]
+
+
+class Expected(NamedTuple):
+    """What telemetry expects: correction (6,), and its information (6, 6)."""
+
+    correction: Array
+    information: Array
+
+
+NOTHING = Expected(np.zeros(6), np.diag(WEAK**-2))
+
+
+@dataclass(frozen=True, eq=False)
+class Resection:
+    """Corrections (6,), m east, north, up, deg heading, pitch, roll, and covariances (6, 6);
+    `alone`: by the picture without telemetry, as far as it shows them (`WEAK`)."""
+
+    correction: Array
+    covariance: Array
+    alone: Array
+    alone_covariance: Array
+
+
+def resected(
+    seen: Sequence[tuple[BlockScores, float]],
+    moved_px: Array,
+    expected: Expected,
+    systematic: Systematic,
+    *,
+    variance: float,
+    block_px: float,
+    close: bool = False,
+) -> Resection | None:
+    """None where too few blocks are seen.
+
+    `seen`: of each level the blocks and its pixel in pixels of level 0. `moved_px` (N, 2, 6): how
+    far each moves by the camera, pixels right and down at level 0. `variance`: of the blocks'
+    noise over what their curvature says. `close`: the camera is known to a pixel or two."""
+    correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
+    blocks = _Blocks.of(seen, moved_px, correlated)
+    if blocks is None:
+        return None
+    correction = _climbed(blocks, _with_slope(expected, systematic.slope_rad), close=close)
+    return _joint(blocks, correction, expected, systematic, variance)
+
+
+def _with_slope(expected: Expected, slope_rad: float) -> Expected:
+    """With pitch and roll that may be a slope of the ground."""
+    correction, information = expected
+    loose = information.copy()
+    for axis in (4, 5):
+        loose[axis, axis] = 1 / (1 / information[axis, axis] + np.degrees(slope_rad) ** 2)
+    return Expected(correction, loose)
+
+
+def _climbed(blocks: "_Blocks", expected: Expected, *, close: bool) -> Array:
+    """The camera (6,) by itself."""
+    correction = blocks.climbed(np.zeros(6), SHARP_PX if close else BLURS_PX, expected)
+    if close:
+        return correction
+    sampled = blocks.best(blocks.sampled(expected), expected)
+    ascents = [correction, blocks.climbed(sampled, SHARP_PX, expected)]
+    return blocks.best(np.stack(ascents), expected)
+
+
+def _joint(
+    blocks: "_Blocks",
+    correction: Array,
+    expected: Expected,
+    systematic: Systematic,
+    variance: float,
+) -> Resection | None:
+    """With systematic errors, from a camera (6,) near by."""
+    blocks = blocks.with_moves(systematic.moves_px)
+    size = blocks.moved_px.shape[2]
+    state, prior, information = np.zeros(size), np.zeros(size), np.eye(size)
+    state[CAMERA], prior[CAMERA] = correction, expected.correction
+    information[CAMERA, CAMERA] = expected.information
+    groups = [slice(6 + each.start, 6 + each.stop) for each in systematic.groups]
+    excess = blocks.correlated
+    for number in range(JOINT_STEPS):
+        state = blocks.stepped(state, 0.0, excess, Expected(prior, information))
+        if number == 0:
+            continue
+        excess = blocks.excess(state, information, excess)
+        curvature, _ = blocks.system(state)
+        covariance = np.linalg.inv(curvature / excess + information)
+        for each in groups:
+            information[each, each] = np.eye(each.stop - each.start) / _component(
+                state[each], np.diag(covariance)[each]
+            )
+    curvature = blocks.system(state)[0] / excess
+    shown = _Marginal.of(curvature, information)
+    covariance = shown.covariance(expected.information, variance)
+    alone, weak = shown.without(state[CAMERA], expected), NOTHING.information
+    alone_covariance = shown.covariance(weak, variance)
+    if not all(np.isfinite(each).all() for each in (state, covariance, alone, alone_covariance)):
+        return None
+    return Resection(state[CAMERA], covariance, alone, alone_covariance)
+
+
+def _component(values: Array, variances: Array) -> float:
+    """Common variance of systematic errors, 1 as assumed, by expectation maximization."""
+    shown = float(values @ values + variances.sum())
+    low, high = COMPONENT_LIMITS
+    return min(max((COMPONENT_PRIOR + shown) / (COMPONENT_PRIOR + len(values)), low), high)
+
+
+class _Marginal(NamedTuple):
+    """What blocks say of the camera with systematic errors marginalized: information (6, 6), and
+    the part `prior` (6, 6) of it that these errors' variances decide, not noise."""
+
+    information: Array
+    prior: Array
+
+    @classmethod
+    def of(cls, curvature: Array, information: Array) -> "_Marginal":
+        """From those of all (D, D): of the blocks, and of what was known before."""
+        rest = slice(6, None)
+        own = information[rest, rest]
+        gain = np.linalg.solve(curvature[rest, rest] + own, curvature[rest, CAMERA])
+        left = curvature[CAMERA, CAMERA] - curvature[CAMERA, rest] @ gain
+        return cls((left + left.T) / 2, gain.T @ own @ gain)
+
+    def covariance(self, telemetry: Array, variance: float) -> Array:
+        """With so many times the variance of all that is noise of blocks."""
+        covariance = np.linalg.inv(self.information + telemetry)
+        known = covariance @ (telemetry + self.prior) @ covariance
+        return np.asarray(variance * covariance + (1 - variance) * known)
+
+    def without(self, found: Array, expected: Expected) -> Array:
+        """The camera (6,) without telemetry: where the quadratic of the blocks has its peak."""
+        weak = np.linalg.inv(self.information + NOTHING.information)
+        pull = expected.information @ (found - expected.correction)
+        return np.asarray(found + weak @ pull)
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Of all levels: correlations (L * N, S, S), pixels (L * N,), and the size of these in pixels
+    of level 0 (L * N,). `moved_px` (N, 2, D): by each unknown."""
+
+    levels: int
+    correlated: float
+    correlations: Array
+    pixels: Array
+    unit_px: Array
+    moved_px: Array
+
+    @classmethod
+    def of(
+        cls, seen: Sequence[tuple[BlockScores, float]], moved_px: Array, correlated: float
+    ) -> "_Blocks | None":
+        known = np.tile(np.isfinite(moved_px).all(axis=(1, 2)), len(seen))
+        pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in seen]), 0.0)
+        by_level = pixels.reshape(len(seen), -1) > 0
+        if by_level.sum(axis=1).max() < MIN_BLOCKS:
+            return None
+        correlations = np.concatenate([scores.correlations for scores, _ in seen])
+        moved_px = np.where(by_level.any(axis=0)[:, None, None], moved_px, 0.0)
+        unit_px = np.repeat([unit for _, unit in seen], len(moved_px))
+        return cls(len(seen), correlated, correlations, pixels, unit_px, moved_px)
+
+    def with_moves(self, moves_px: Array) -> "_Blocks":
+        used = self.moved_px.any(axis=(1, 2))
+        more_px = np.where(used[:, None, None], moves_px, 0.0)
+        return replace(self, moved_px=np.concatenate([self.moved_px, more_px], axis=2))
+
+    def sampled(self, expected: Expected) -> Array:
+        """Corrections (S, 6) by the peaks of a few blocks each, chosen by how high these are."""
+        mean, information = expected
+        count, side = len(self.pixels), self.correlations.shape[1]
+        flat = self.correlations.reshape(count, -1)
+        highest = flat.argmax(axis=1)
+        peaks_px = np.stack([highest % side, highest // side], axis=-1) - side // 2
+        height = np.maximum(flat.max(axis=1), 0.0)
+        with np.errstate(divide="ignore"):
+            chance = np.log(self._weights(self._usual(height)) * height)
+        drawn = np.random.default_rng(0).gumbel(size=(SAMPLES, count)) + chance
+        chosen = np.argpartition(-drawn, SAMPLE, axis=1)[:, :SAMPLE]
+        moved = self._by_level[chosen].reshape(SAMPLES, 2 * SAMPLE, 6)
+        peaks = peaks_px[chosen].reshape(SAMPLES, 2 * SAMPLE)
+        known = moved.swapaxes(1, 2) / SAMPLE_STD_PX**2
+        right = np.einsum("spk,sk->sp", known, peaks) + information @ mean
+        return np.asarray(np.linalg.solve(known @ moved + information, right[..., None])[..., 0])
+
+    @property
+    def _by_level(self) -> Array:
+        """Moves (L * N, 2, D) in pixels of the level."""
+        moved = np.tile(self.moved_px, (self.levels, 1, 1)) / self.unit_px[:, None, None]
+        return np.asarray(moved)
+
+    @property
+    def seen(self) -> int:
+        return int((self.pixels.reshape(self.levels, -1) > 0).any(axis=0).sum())
+
+    def climbed(self, start: Array, blurs_px: Sequence[float], expected: Expected) -> Array:
+        """A maximum of the posterior near a correction."""
+        correction = start
+        for blur_px in blurs_px:
+            correction = self.stepped(correction, blur_px, 1.0, expected)
+        return correction
+
+    def best(self, corrections: Array, expected: Expected) -> Array:
+        """The most likely one of corrections (S, 6)."""
+        mean, information = expected
+        size = corrections.shape[1]
+        moved = (self._by_level.reshape(-1, size) @ corrections.T).T
+        here = _values(self.correlations, moved.reshape(len(corrections), -1, 2))
+        usual = self._usual(here).max(axis=0)
+        fit = (
+            np.logaddexp(0.0, self._weights(usual) * (here - usual / 2)).sum(axis=1)
+            / self.correlated
+        )
+        off = corrections - mean
+        prior_nats = np.einsum("sp,pq,sq->s", off, information, off) / 2
+        return np.asarray(corrections[int(np.argmax(fit - prior_nats))])
+
+    def _usual(self, correlations: Array) -> Array:
+        """Mean correlation (.., L * N) of the level."""
+        by_level = (*correlations.shape[:-1], self.levels, -1)
+        weighted = (correlations * self.pixels).reshape(by_level).sum(axis=-1)
+        pixels = self.pixels.reshape(self.levels, -1).sum(axis=1)
+        usual = weighted / np.maximum(pixels, 1.0)
+        usual = np.minimum(np.maximum(usual, LEAST_CORRELATION), MOST_CORRELATION)
+        return np.repeat(usual, len(self.pixels) // self.levels, axis=-1)
+
+    def _weights(self, usual: Array) -> Array:
+        """Log likelihood ratio (L * N,) per unit of correlation, of a right block against none."""
+        return usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
+
+    def stepped(self, state: Array, blur_px: float, excess: float, expected: Expected) -> Array:
+        """One step of Newton's method on a state (D,); the blocks say less by `excess`."""
+        mean, information = expected
+        curvature, slopes = self.system(state, blur_px)
+        pull = slopes.sum(axis=0) / excess + information @ (mean - state)
+        step = np.linalg.solve(curvature / excess + information, pull)
+        longest = float(np.hypot(*(self.moved_px @ step).T).max() / self.unit_px.min())
+        return np.asarray(state + step * min(1.0, LONGEST_STEP_PX / max(longest, 1e-9)))
+
+    def excess(self, state: Array, information: Array, excess: float) -> float:
+        """Variance of the slopes by the camera over the curvature, times `correlated`, at least 1;
+        the numbers that a solution with `information` and `excess` uses are not counted."""
+        curvature, slopes = self.system(state)
+        covariance = np.linalg.inv(curvature / excess + information)
+        numbers = 2 * self.seen
+        left = max(1 - float((covariance * curvature).sum()) / excess / numbers, MIN_LEFT)
+        spread = slopes[:, CAMERA].T @ slopes[:, CAMERA]
+        inverse = np.linalg.pinv(curvature[CAMERA, CAMERA], hermitian=True)
+        return max(1.0, self.correlated * float((inverse * spread).sum()) / 6 / left)
+
+    def system(self, state: Array, blur_px: float = 0.0) -> tuple[Array, Array]:
+        """Curvature (D, D) of the log likelihood, and its slope (N, D) by each block."""
+        moved_px = np.tile(self.moved_px @ state, (self.levels, 1)) / self.unit_px[:, None]
+        here, slope, curvature = _quadratic(_blurred(self.correlations, blur_px), moved_px)
+        usual = self._usual(here)
+        weight = self._weights(usual)
+        odds = np.clip(weight * (here - usual / 2), -30.0, 30.0)
+        weight = weight / (1 + np.exp(-odds)) / self.unit_px
+        slope = (slope * weight[:, None]).reshape(self.levels, -1, 2).sum(axis=0)
+        curvature = curvature * (weight / self.unit_px)[:, None, None]
+        held = curvature.reshape(self.levels, -1, 2, 2).sum(axis=0) @ self.moved_px
+        size = self.moved_px.shape[2]
+        total = self.moved_px.reshape(-1, size).T @ held.reshape(-1, size)
+        return total, (slope[:, None] @ self.moved_px)[:, 0]
+
+
+def _blurred(correlations: Array, blur_px: float) -> Array:
+    if blur_px == 0:
+        return correlations
+    at = np.arange(correlations.shape[1])
+    kernel = np.exp(-((at[:, None] - at) ** 2) / (2 * blur_px**2))
+    kernel /= kernel.sum(axis=1, keepdims=True)
+    return np.asarray(kernel @ correlations @ kernel.T)
+
+
+def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
+    """Values (N,), slopes (N, 2), curvatures (N, 2, 2) >= 0 of surfaces (N, S, S) at (N, 2) x, y.
+
+    By the quadratic through the pixels around; 0 beyond the surface."""
+    reach = surfaces.shape[1] // 2
+    inside = (np.abs(moved_px) <= reach).all(axis=1)
+    held = np.clip(moved_px, 1 - reach, reach - 1)
+    nearest = np.rint(held)
+    x, y = (nearest.astype(int) + reach).T
+    rows = np.arange(len(surfaces))
+
+    def at(right: int, down: int) -> Array:
+        return np.asarray(surfaces[rows, y + down, x + right])
+
+    here = at(0, 0)
+    slope = np.stack([at(1, 0) - at(-1, 0), at(0, 1) - at(0, -1)], axis=-1) / 2
+    along = 2 * here - at(1, 0) - at(-1, 0)
+    down = 2 * here - at(0, 1) - at(0, -1)
+    across = (at(1, -1) + at(-1, 1) - at(1, 1) - at(-1, -1)) / 4
+    curvature = np.stack([along, across, across, down], axis=-1).reshape(-1, 2, 2)
+    off = np.clip(moved_px - nearest, -1.0, 1.0)
+    bent = (curvature @ off[..., None])[..., 0]
+    value = here + ((slope - bent / 2) * off).sum(axis=1)
+    slope = slope - bent
+    return value * inside, slope * inside[:, None], _positive(curvature) * inside[:, None, None]
+
+
+def _values(surfaces: Array, moved_px: Array) -> Array:
+    """Of surfaces (N, S, S) at the pixel nearest to displacements (.., N, 2), else 0."""
+    reach = surfaces.shape[-1] // 2
+    nearest = np.rint(np.minimum(np.maximum(moved_px, -reach), reach)).astype(int) + reach
+    values = surfaces[np.arange(len(surfaces)), nearest[..., 1], nearest[..., 0]]
+    return np.asarray(values * (np.abs(moved_px) <= reach).all(axis=-1))
+
+
+def _positive(matrices: Array) -> Array:
+    """Symmetric matrices (N, 2, 2) with negative eigenvalues set to 0."""
+    half = (matrices[:, 0, 0] + matrices[:, 1, 1]) / 2
+    apart = np.hypot((matrices[:, 0, 0] - matrices[:, 1, 1]) / 2, matrices[:, 0, 1])
+    # Between an ellipse and a saddle only the larger one is left: its projection.
+    whole, none = half >= apart, half <= -apart
+    scale = np.where(whole, 1.0, (half + apart) / np.maximum(2 * apart, 1e-30))
+    shift = np.where(whole, 0.0, apart - half)
+    out = scale[:, None, None] * (matrices + shift[:, None, None] * np.eye(2))
+    return np.asarray(np.where(none[:, None, None], 0.0, out))
