@@ -293,8 +293,8 @@ class Tracker:
         if self._usual_model and math.isfinite(telemetry.agl_m):
             self._usual_model = False
             self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
-        if telemetry.tilt_std_deg is not None:
-            horizon = math.radians(telemetry.tilt_std_deg)
+        if telemetry.horizon_std_deg is not None:
+            horizon = math.radians(telemetry.horizon_std_deg)
             self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
         if self._time_ns is None:
             self._time_ns, self._before = telemetry.time_ns, now
