@@ -33,7 +33,7 @@ Grey = NDArray[np.uint8]
 DECIMALS = 8
 _ROUNDED = (
     *("yaw_deg", "pitch_deg", "roll_deg", "agl_m", "yaw_std_deg", "agl_std_m", "prior"),
-    *("vel_en_mps", "home_m", "amsl_m", "hae_m"),
+    *("vel_en_mps", "tilt_std_deg", "mount_std_deg", "home_m", "amsl_m", "hae_m"),
 )
 
 
