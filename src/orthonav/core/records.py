@@ -135,6 +135,8 @@ class View:
 
         `agl_m`: height above ground. `heading_deg`: of the top of the image, clockwise from true
         north; None: unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down.
+        `tilt_std_deg`: their standard deviation, by the source (docs/flights.md); None: 3 deg,
+        which on a map without terrain places the camera to 3 % of the height, 1 deg to 1.6 %.
         `time_s`: of the exposure. The standard deviations are those of `Telemetry`."""
         heading = math.nan if heading_deg is None else float(heading_deg)
         return cls(

@@ -24,7 +24,6 @@ class TiltSource:
     """Where pitch and roll come from. `aided_deg`, `unaided_deg`: standard deviation of the
     horizon, deg, with and without GNSS. `mount_deg`: of a mount that was never calibrated."""
 
-    name: str
     aided_deg: float
     unaided_deg: float
     mount_deg: float = 0.0
@@ -41,14 +40,12 @@ class TiltSource:
         return {"tilt_std_deg": total_deg, "mount_std_deg": self.mount_deg or None}
 
 
-GIMBAL = TiltSource("a gimbal", 1.0, 1.0)
-AUTOPILOT = TiltSource(
-    "an autopilot", HORIZON_STD_DEG, UNAIDED_HORIZON_STD_DEG, mount_deg=MOUNT_STD_DEG
-)
-ARDUPILOT = TiltSource("ArduPilot", HORIZON_STD_DEG, HORIZON_STD_DEG, mount_deg=MOUNT_STD_DEG)
-UNSTATED = TiltSource("unknown", 3.0, 3.0)
-ASSUMED = TiltSource("assumed", 6.0, 6.0)
-"""Straight down: consistent on 30 photographs of a DJI Mini, most of which look 9 deg ahead."""
+GIMBAL = TiltSource(1.0, 1.0)
+AUTOPILOT = TiltSource(HORIZON_STD_DEG, UNAIDED_HORIZON_STD_DEG, MOUNT_STD_DEG)
+ARDUPILOT = TiltSource(HORIZON_STD_DEG, HORIZON_STD_DEG, MOUNT_STD_DEG)
+UNSTATED = TiltSource(3.0, 3.0)
+ASSUMED = TiltSource(6.0, 6.0)
+"""Straight down: consistent on 30 photographs of a DJI Mini, some of which look 9 deg ahead."""
 
 UNRECORDED = (
     "all gimbal angles are 0, so they were not recorded: a camera that looks straight down is "

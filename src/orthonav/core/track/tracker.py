@@ -184,7 +184,8 @@ class Tracker:
         """The position of the aircraft by this image and all before it; arguments as of `View.of`.
 
         `heading_deg` may be None in a tracker made with `heading_known=False`. `vel_en_mps`:
-        reported velocity over ground. Raises as `View.of`."""
+        reported velocity over ground. `tilt_std_deg`: of `pitch_deg` and `roll_deg`, without the
+        constant error of the mount, which is estimated. Raises as `View.of`."""
         view = View.of(
             image,
             camera,
