@@ -137,6 +137,7 @@ def test_build_options_are_in_the_recipe(run, ortho, out, options):
 
 def test_info(run, map_path):
     done = run("info", map_path)
+    assert "terrain    none: a degree of pitch or roll is 1.7 %" in done.out
     assert (done.code, done.err) == (0, "")
     assert str(map_path) in done.out and "2.5 m per pixel" in done.out and "2016-07" in done.out
     plain = json.loads(run("info", map_path, "--json").out)

@@ -1,6 +1,7 @@
 """A mount is written, read again, and removed from telemetry."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -27,6 +28,10 @@ def test_reported_values_are_corrected():
     assert found.agl_m == pytest.approx(100 * math.exp(-0.1))
     assert (found.time_ns, found.vel_en_mps) == (5, (1.0, 2.0))
     assert found.tilt_std_deg == pytest.approx(math.hypot(0.5, 0.4))
+    fixed = replace(telemetry, tilt_std_deg=2.5, mount_std_deg=2.4)  # 0.7 of the horizon
+    again = MOUNT.corrected(fixed)
+    assert again.tilt_std_deg == pytest.approx(math.hypot(0.7, 0.4))
+    assert again.mount_std_deg == 0.4 and again.horizon_std_deg == pytest.approx(0.7)
     views = [SimpleNamespace(frame="1.png", telemetry=telemetry)]
     flight = SimpleNamespace(views=views, camera="camera", note="note", expected=1)
     mounted = MountedFlight(flight, MOUNT)

@@ -283,11 +283,13 @@ def test_the_origin_of_the_autopilot_is_stored_until_it_restarts(flying):
 
 def stds(flying):
     telemetry = flying.link.state_at(flying.time.now_ns).telemetry(0)
-    return telemetry.vel_std_mps, telemetry.tilt_std_deg
+    total_deg, mount_deg = telemetry.tilt_std_deg, telemetry.mount_std_deg
+    assert total_deg == math.hypot(telemetry.horizon_std_deg, mount_deg) and mount_deg == 2.5
+    return telemetry.vel_std_mps, pytest.approx(telemetry.horizon_std_deg)
 
 
 ABSOLUTE, DEAD_RECKONING = 831, 303
-GNSS_AIDED, UNAIDED = (None, 1.5), (5.0, 3.0)
+GNSS_AIDED, UNAIDED = (None, 1.0), (5.0, 3.0)
 
 
 class Reporting(Flying):
@@ -317,7 +319,7 @@ class Reporting(Flying):
 
 @pytest.mark.parametrize("ardupilot", [False, True])
 def test_velocity_and_horizon_are_accurate_only_while_gnss_holds_the_filter(ardupilot):
-    flying, unaided = Reporting(), (5.0, 1.5) if ardupilot else UNAIDED  # its horizon holds
+    flying, unaided = Reporting(), (5.0, 1.0) if ardupilot else UNAIDED  # its horizon holds
     assert stds(flying) == UNAIDED  # nothing is known
     assert flying.report(ardupilot=ardupilot) == GNSS_AIDED
     assert flying.report(DEAD_RECKONING, ardupilot=ardupilot) == unaided

@@ -295,7 +295,7 @@ def test_an_imu_without_orientation_is_no_attitude(peer, reading):
 
 @pytest.mark.parametrize(
     ("std_deg", "expected"),
-    [(0.0, 3.0), (0.1, 1.5), (5.0, 5.0), (57.3, 3.0), (math.nan, 3.0)],  # MAVROS: 1 rad
+    [(0.0, 3.0), (0.1, 0.3), (5.0, 5.0), (57.3, 3.0), (math.nan, 3.0)],  # MAVROS: 1 rad
 )
 def test_the_covariance_of_an_imu_is_that_of_the_tilt(peer, reading, std_deg, expected):
     flying = joined(peer, reading, *SEEN)
@@ -305,7 +305,21 @@ def test_the_covariance_of_an_imu_is_that_of_the_tilt(peer, reading, std_deg, ex
     message.orientation_covariance = [variance, 0.0, 0.0, 0.0, variance / 4, 0.0, 0.0, 0.0, 9.0]
     peer.write("/imu/data", message)
     peer.write("/cam/image_raw", image(now_ns))
-    assert flying.read().telemetry.tilt_std_deg == pytest.approx(expected)
+    reported = flying.read().telemetry
+    assert reported.horizon_std_deg == pytest.approx(expected)
+    assert reported.tilt_std_deg == pytest.approx(math.hypot(expected, 2.5))
+
+
+def test_a_fix_of_a_receiver_aids_the_horizon(peer, reading):
+    flying = joined(peer, reading, *SEEN, "/gps/fix")
+    now_ns = time.time_ns()
+    message = ros.zeros(ros.NavSatFix)
+    message.header.stamp = stamp(now_ns)
+    peer.write("/gps/fix", message)
+    wait_for(lambda: flying.node.spin(0.02) >= 0 and flying.reader.gnss)
+    peer.write("/imu/data", imu(now_ns))
+    peer.write("/cam/image_raw", image(now_ns))
+    assert flying.read().telemetry.horizon_std_deg == pytest.approx(1.0)
 
 
 def test_a_publisher_that_leaves_is_no_message(peer, reading):

@@ -1,5 +1,7 @@
 """Recordings of ROS messages by the writers of `rosbags`."""
 
+import math
+
 import cv2
 import numpy as np
 from recorders import HEIGHT, START_S, WIDTH, picture
@@ -81,9 +83,9 @@ class Messages:
         }
         return self.new("sensor_msgs/msg/CameraInfo", **(fields | changes))
 
-    def imu(self, time_ns, turn, known=True):
+    def imu(self, time_ns, turn, known=True, std_deg=0.0):
         nine = np.zeros(9)
-        nine[0] = 0.0 if known else -1.0
+        nine[0] = math.radians(std_deg) ** 2 if known else -1.0
         header = self.header(time_ns)
         name = "sensor_msgs/msg/Imu"
         return self.new(name, header=header, orientation=turn, orientation_covariance=nine)

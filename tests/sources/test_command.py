@@ -139,7 +139,8 @@ def test_import_of_a_flight_changes_nothing(run, tmp_path):
     for path in source.rglob("*.*"):
         assert (tmp_path / "flight" / path.relative_to(source)).read_bytes() == path.read_bytes()
     again = run("import", source, "--out", tmp_path / "prior", "--prior-std-m", "25")
-    assert again[0] == 0 and "2 views, 2 with heading, tilt and height, 2 with a" in again[1]
+    assert again[0] == 0 and "2 views, 2 with heading, pitch, roll and height, 2 with a" in again[1]
+    assert "standard deviation of pitch and roll: not stated, 3 deg are assumed" in again[1]
     assert open_flight(tmp_path / "prior").views[0].telemetry.prior.std_m == 25
 
 

@@ -9,6 +9,7 @@ from recorders import dji, photo, picture, place
 
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.ground.recordings import SourceOptions, open_source
+from orthonav.ground.recordings.image_table import read_image_table
 
 FOV = SourceOptions(fov_deg=60.0)
 
@@ -153,6 +154,19 @@ def test_the_table_comes_before_metadata(tmp_path):
     found = views_of(tmp_path / "p", "file,yaw,agl,lat,lon\na.jpg,77,99,47,3\n", SourceOptions())
     assert angles(found.by["a.jpg"]) == pytest.approx((77, 10, 0, 99), abs=1e-6)
     assert found.by["a.jpg"].truth_latlon_deg == (47, 3)
+
+
+def test_a_gimbal_that_is_0_in_all_rows_was_not_recorded(images):
+    rows = "file,yaw,gimbal_pitch,gimbal_roll\na.png,30,0,0\n{},40,{},0\n"
+    (images / "a.csv").write_text(rows.format("c.png", 0))
+    found = read_image_table(images / "a.csv")
+    assert any("all gimbal angles are 0" in each for each in found.warnings)
+    assert [row.pose["pitch_deg"] for row in found.rows.values()] == [0, 0]
+    assert {row.pose["tilt_std_deg"] for row in found.rows.values()} == {6.0}
+    (images / "a.csv").write_text(rows.format("c.png", -90))
+    found = read_image_table(images / "a.csv")
+    assert not any("angles are 0" in each for each in found.warnings)
+    assert {row.pose["tilt_std_deg"] for row in found.rows.values()} == {1.0}
 
 
 def test_single_photographs(images):

@@ -20,6 +20,7 @@ from recorders import (
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.telemetry_track import angles_at
+from orthonav.core.tilt import MOUNT_STD_DEG
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.logs import read_log
 
@@ -57,6 +58,8 @@ def test_attitude_position_and_velocity(kind, log):
     assert track.latlon_deg(at) == pytest.approx((46.5, 2.5), abs=1e-7)
     velocity = {"ulog": (-1, 3), "dataflash": (5, 0), "tlog": (3, -1)}[kind]
     assert track.telemetry(at).vel_en_mps == pytest.approx(velocity, abs=1e-6)
+    assert track.telemetry(at).horizon_std_deg == pytest.approx(1.0)  # GNSS aids it
+    assert track.telemetry(at).mount_std_deg == MOUNT_STD_DEG
 
 
 @pytest.mark.parametrize(
@@ -90,7 +93,10 @@ def test_logs_without_gps_count_from_boot(tmp_path):
     track = read_log(ulog(tmp_path / "a.ulg", topics), DOWN)
     assert track.origin_ns == 5 * 10**9 and track.latlon_deg(6 * 10**9) is None
     assert track.telemetry(6 * 10**9).agl_m == pytest.approx(101)  # above its origin
-    assert read_log(dataflash(tmp_path / "a.bin", gps=False), DOWN).origin_ns == 3 * 10**9
+    assert track.telemetry(6 * 10**9).horizon_std_deg == pytest.approx(3.0)
+    ardupilot = read_log(dataflash(tmp_path / "a.bin", gps=False), DOWN)
+    assert ardupilot.origin_ns == 3 * 10**9
+    assert ardupilot.telemetry(4 * 10**9).horizon_std_deg == pytest.approx(1.0)
 
 
 def test_attitude_as_a_quaternion_in_a_tlog(tmp_path):

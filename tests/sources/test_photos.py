@@ -19,10 +19,7 @@ from recorders import (
 
 from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.flight import open_flight, read_image, read_truth
-from orthonav.core.geo.attitude import (
-    ASSUMED_TILT_STD_DEG,
-    AUTOPILOT_TILT_STD_DEG,
-)
+from orthonav.core.tilt import MOUNT_STD_DEG
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.exif import FocalLength, Optics, Xmp, focal_length, read_photo
 from orthonav.ground.recordings.photos import UNKNOWN_YAW_STD_DEG, posed
@@ -229,7 +226,7 @@ def test_a_gimbal_that_reports_zero_was_not_recorded(tmp_path):
     reported = [view.telemetry for view in recording.views]
     assert [each.yaw_deg for each in reported] == pytest.approx([152.0, 205.8, 0.0])
     assert all(each.pitch_deg == each.roll_deg == 0 for each in reported)
-    assert all(each.tilt_std_deg == ASSUMED_TILT_STD_DEG for each in reported)
+    assert {(each.tilt_std_deg, each.mount_std_deg) for each in reported} == {(6.0, None)}
 
 
 # Focal lengths.
@@ -307,7 +304,8 @@ def test_sensefly(tmp_path):
         (70.0620575, 2.5, -3.5)
     )
     assert reported.agl_m == reported.home_m == pytest.approx(66.11117554)
-    assert reported.tilt_std_deg == AUTOPILOT_TILT_STD_DEG
+    assert reported.tilt_std_deg == pytest.approx(math.hypot(1.0, MOUNT_STD_DEG))
+    assert reported.mount_std_deg == MOUNT_STD_DEG
     assert (reported.amsl_m, reported.hae_m) == (313.99, 281.69)
     assert view.truth_latlon_deg == (41.0346708, -83.3057253)
 

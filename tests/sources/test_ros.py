@@ -175,6 +175,23 @@ def test_a_raw_imu_is_passed_over(tmp_path, messages, topics):
     assert view.telemetry.yaw_deg == pytest.approx(355)  # of the odometry
 
 
+def test_the_horizon_is_as_good_as_an_imu_states(tmp_path, messages, topics):
+    """Or as good as an autopilot's that GNSS aids, or not."""
+    turn = messages.turn(100)
+    times = [time_ns for time_ns, _ in topics["/imu/data"]]
+
+    def horizon_deg(name, std_deg):
+        topics["/imu/data"] = [(t, messages.imu(t, turn, std_deg=std_deg)) for t in times]
+        views = list(open_source(record(tmp_path / name, topics, messages)).views)
+        assert {view.telemetry.mount_std_deg for view in views} == {2.5}
+        return [round(view.telemetry.horizon_std_deg, 6) for view in views]
+
+    assert set(horizon_deg("stated", 0.5)) == {0.5}
+    assert set(horizon_deg("placeholder", 57.3)) == {1.0}
+    del topics["/fix"]
+    assert set(horizon_deg("without", 0.0)) == {3.0}
+
+
 def test_heights_of_mavros(tmp_path, messages, topics):
     del topics["/range"]
     times = [time_ns for time_ns, _ in topics["/imu/data"]]

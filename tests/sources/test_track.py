@@ -1,6 +1,7 @@
 """Series over time: between samples, across north and the 180th meridian, and where nothing is."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -12,12 +13,8 @@ from orthonav.core.flight.telemetry_track import (
     angles_at,
     attitude_of_angles,
 )
-from orthonav.core.geo.attitude import (
-    AUTOPILOT_TILT_STD_DEG,
-    GIMBAL_TILT_STD_DEG,
-    enu_from_body_camera,
-    ned_from_angles,
-)
+from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
+from orthonav.core.tilt import ARDUPILOT, GIMBAL, MOUNT_STD_DEG, UNSTATED, stated_deg
 from orthonav.ground.recordings.recording import (
     SourceOptions,
     SourceView,
@@ -131,16 +128,45 @@ def test_what_is_assumed_about_heights_is_said_once(names, options, expected):
     assert expected is None or expected in doubts[0]
 
 
+def tilt(track, time_ns=S):
+    telemetry = track.telemetry(time_ns)
+    return telemetry.tilt_std_deg, telemetry.mount_std_deg
+
+
 def test_tilt_has_a_standard_deviation_by_the_kind_of_the_source():
-    """Or as reported; never 0, and unknown where pitch and roll are."""
+    """Or as reported; unknown where pitch and roll are."""
     attitude = attitudes((0, 10.0, 1.0, -2.0), (2, 10.0, 1.0, -2.0))
-    assert RecordedTrack(attitude).telemetry(S).tilt_std_deg == AUTOPILOT_TILT_STD_DEG
-    gimbal = RecordedTrack(attitude, tilt_std_deg=GIMBAL_TILT_STD_DEG)
-    assert gimbal.telemetry(S).tilt_std_deg == GIMBAL_TILT_STD_DEG
-    reported = RecordedTrack(attitude, tilt_std=series((0, 0.5), (0.5, 0.7)))
-    assert reported.telemetry(0).tilt_std_deg == 0.5
-    assert reported.telemetry(S).tilt_std_deg == AUTOPILOT_TILT_STD_DEG
-    assert RecordedTrack(None).telemetry(0).tilt_std_deg is None
+    placed = series((0, 46.0, 2.0, 300.0), (1.5, 46.0, 2.0, 300.0))
+    mount = MOUNT_STD_DEG
+    assert tilt(RecordedTrack(attitude)) == (math.hypot(3, mount), mount)
+    with_gnss = RecordedTrack(attitude, position=placed)
+    assert tilt(with_gnss) == (math.hypot(1, mount), mount)
+    assert tilt(with_gnss, 2 * S) == (math.hypot(3, mount), mount), "GNSS was lost before"
+    assert tilt(RecordedTrack(attitude, tilt=ARDUPILOT)) == (math.hypot(1, mount), mount)
+    assert tilt(RecordedTrack(attitude, tilt=GIMBAL)) == (1.0, None)
+    stated = RecordedTrack(attitude, horizon_std=series((0, 0.3), (2, 0.3)))
+    assert tilt(stated) == (math.hypot(0.3, mount), mount)
+    reported = RecordedTrack(attitude, tilt=UNSTATED, tilt_std=series((0, 0.5), (0.5, 0.7)))
+    assert tilt(reported, 0) == (0.5, None) and tilt(reported) == (3.0, None)
+    apart = replace(reported, mount_std=series((0, 0.3), (0.5, 0.3)))
+    assert tilt(apart, 0) == (0.5, 0.3)
+    assert apart.telemetry(0).horizon_std_deg == pytest.approx(0.4)
+    assert tilt(RecordedTrack(None)) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("variances", "expected"),
+    [
+        ((0.0, 0.0), None),
+        ((-1.0, 0.0), None),
+        ((math.radians(0.1) ** 2,) * 2, 0.3),
+        ((math.radians(5) ** 2, math.radians(2) ** 2), 5.0),
+        ((1.0, 1.0), None),  # of MAVROS
+        ((math.nan, 0.0), None),
+    ],
+)
+def test_a_message_states_its_horizon_or_a_placeholder(variances, expected):
+    assert stated_deg(variances) == (None if expected is None else pytest.approx(expected))
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,6 @@ from recorders import camera_file, dji_subtitle, picture, subtitles, video
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.geo.attitude import (
-    ASSUMED_TILT_STD_DEG,
-    AUTOPILOT_TILT_STD_DEG,
-)
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.logs import blocks
 
@@ -82,7 +78,7 @@ def test_a_table_beside_the_video(tmp_path):
     assert telemetry.yaw_std_deg == 3 and telemetry.vel_en_mps == (5.0, 1.0)
     assert views[1].truth_latlon_deg == pytest.approx((46.501, 2.5))
     assert views[2].telemetry.agl_m == 104
-    assert telemetry.tilt_std_deg == AUTOPILOT_TILT_STD_DEG
+    assert telemetry.tilt_std_deg == 3
     (tmp_path / "a.csv").write_text("time_s,pitch_deg,roll_deg\n0,0,0\n1,0,0\nx,0,0\n")
     with pytest.raises(FlightError, match=r"line 4: time_s"):
         open_source(path, options(path))
@@ -160,7 +156,22 @@ def test_without_gimbal_angles_nothing_is_made_up(tmp_path):
     telemetry = next(open_source(path, options(path)).views).telemetry
     assert telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and telemetry.agl_m == 91.9
     level = next(open_source(path, options(path, looks_down=True)).views).telemetry
-    assert level.missing() == ["yaw_deg"] and level.tilt_std_deg == ASSUMED_TILT_STD_DEG
+    assert level.missing() == ["yaw_deg"] and level.tilt_std_deg == 6
+
+
+def test_a_gimbal_that_is_0_throughout_was_not_recorded(recorded):
+    srt = recorded.with_suffix(".SRT")
+    subtitles(srt, [dji_subtitle(n, yaw=0, pitch=0) for n in range(30)])
+    recording = open_source(recorded, options(recorded))
+    assert ["all gimbal angles are 0" in each for each in recording.warnings].count(True) == 1
+    for telemetry in (view.telemetry for view in recording.views):
+        assert telemetry.missing() == ["yaw_deg"] and telemetry.tilt_std_deg == 6
+        assert (telemetry.pitch_deg, telemetry.roll_deg) == pytest.approx((0, 0), abs=1e-6)
+    texts = [dji_subtitle(n, yaw=0, pitch=-90 if n else 0) for n in range(30)]
+    subtitles(srt, texts)  # a gimbal that was at the horizon once
+    recording = open_source(recorded, options(recorded))
+    assert not any("angles are 0" in each for each in recording.warnings)
+    assert {view.telemetry.tilt_std_deg for view in recording.views} == {1.0}
 
 
 BROKEN = {

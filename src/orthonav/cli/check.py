@@ -76,7 +76,10 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     text = "standard deviation of the height of houses and trees, which causes relief displacement "
     number("--relief-m", default=3.0, help=f"{text}(default 3)")
     text = "standard deviation of the error of the reported pitch and roll, which displaces fixes "
-    number("--tilt-std-deg", default=1.5, help=f"{text}(default 1.5)")
+    text += (
+        "by 1.7 %% of the height a degree (docs/flights.md has that of each source; default 1.5)"
+    )
+    number("--tilt-std-deg", default=1.5, help=text)
     text = "camera and map imagery are of different kinds (drone against satellite, infrared): "
     group.add_argument("--other-sensor", action="store_true", help=f"{text}predicts fewer fixes")
 

@@ -108,7 +108,8 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "--mount": {
         "type": Path,
         "metavar": "mount.json",
-        "help": "calibration by `orthonav calibrate`, which corrects heading, height and tilt",
+        "help": "calibration by `orthonav calibrate`, which corrects heading, height, pitch and "
+        "roll; without it the mount counts as known to 2.5 deg",
     },
     "--mount-deg": {
         "type": float,

@@ -46,7 +46,11 @@ def run(options: argparse.Namespace) -> None:
         plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
         print_json(plain | asdict(done))
     else:
+        tilt = "not stated, 3 deg are assumed"
+        if done.tilt_std_deg is not None:
+            tilt = " to ".join(dict.fromkeys(f"{each:.1f}" for each in done.tilt_std_deg)) + " deg"
         print(
-            f"{counted(done.views, 'view')}, {done.complete} with heading, tilt and height, "
-            f"{done.with_truth} with a position\nwritten to {options.out}"
+            f"{counted(done.views, 'view')}, {done.complete} with heading, pitch, roll and "
+            f"height, {done.with_truth} with a position\n"
+            f"standard deviation of pitch and roll: {tilt}\nwritten to {options.out}"
         )

@@ -43,7 +43,8 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     number("--yaw-std-deg", default=0.0, help="reported heading (default 0)")
     text = "reported height, as a fraction of it (default 0)"
     number("--agl-std", default=0.0, metavar="FRACTION", help=text)
-    text = "reported pitch and roll from view to view, which the telemetry states (default 0)"
+    text = "reported pitch and roll from view to view, which the telemetry states as tilt_std_deg "
+    text += "(default 0: it states nothing where the two below are not 0)"
     number("--tilt-std-deg", default=0.0, help=text)
     number("--prior-std-m", help="prior position, per axis (default: no prior is reported)")
     text = "scale (a fraction) and direction (rad) of the reported velocity (default: not reported)"

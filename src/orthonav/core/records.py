@@ -15,6 +15,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.integrity import probability_beyond, protection_level_m
 from orthonav.core.limits import DEFAULT_RISK
+from orthonav.core.tilt import UNSTATED
 
 CONFIDENT = 0.9  # from this confidence on: the default of publishing and reports
 PRIOR_SIGMAS = 3.0  # the search ends there: 1.1 % of a round Gaussian lies outside
@@ -23,8 +24,7 @@ DEFAULT_YAW_STD_DEG = 7.0
 MIN_YAW_STD_DEG = 2.0  # the least that searches allow for
 TILE_YAW_STD_DEG = 5.0  # of tiles alone: three headings 6 deg apart (docs/decisions/embedding.md)
 DEFAULT_AGL_STD = 0.08  # over the height
-DEFAULT_TILT_STD_DEG = 3.0
-"""Mounts lean by 1 to 5 deg, horizons of autopilots err by 0.5 to 6 deg (docs/flights.md)."""
+DEFAULT_TILT_STD_DEG = UNSTATED.aided_deg
 RADIUS_SHARE = 0.025  # least radius of the confidence over the height: an error of 1.4 deg of tilt
 MAP_STD_M = 3.0  # per axis, of a displacement of the map as a whole: it never averages out
 
@@ -63,6 +63,8 @@ class Telemetry:
     tilt_std_deg: float | None = None
     """Standard deviation of the error of pitch and of roll, mount included; 0: they are exact.
     `DEFAULT_TILT_STD_DEG` where None."""
+    mount_std_deg: float | None = None
+    """Its part that is constant: of a mount that was never calibrated; None: not known."""
     vel_std_mps: float | None = None
     """Standard deviation of the velocity per axis; see `orthonav.core.track.tracker`."""
     home_m: float | None = None
@@ -72,6 +74,13 @@ class Telemetry:
     below: Ground | None = None
     """The ground from which `agl_m` was computed by a height above sea; None where it was measured.
     Its deviation is part of `agl_std_m`."""
+
+    @property
+    def horizon_std_deg(self) -> float | None:
+        """`tilt_std_deg` without the mount's part."""
+        if self.tilt_std_deg is None or self.mount_std_deg is None:
+            return self.tilt_std_deg
+        return math.sqrt(max(self.tilt_std_deg**2 - self.mount_std_deg**2, 0.0))
 
     def missing(self) -> list[str]:
         """Names of the fields without which a view cannot be rectified, empty if all are there."""
@@ -126,6 +135,8 @@ class View:
 
         `agl_m`: height above ground. `heading_deg`: of the top of the image, clockwise from true
         north; None: unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down.
+        `tilt_std_deg`: their standard deviation, by the source (docs/flights.md); None: 3 deg,
+        which on a map without terrain places the camera to 3 % of the height, 1 deg to 1.6 %.
         `time_s`: of the exposure. The standard deviations are those of `Telemetry`."""
         heading = math.nan if heading_deg is None else float(heading_deg)
         return cls(

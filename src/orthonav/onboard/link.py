@@ -142,9 +142,9 @@ class AutopilotLink:
             boot_ns = self.sync.boot_ns(exposed_ns)
             if boot_ns is None:
                 return VehicleState(None)
-            vel_std_mps, tilt_std_deg = self.aiding.stds(self._clocks.mono_ns())
+            vel_std_mps, horizon_std_deg = self.aiding.stds(self._clocks.mono_ns())
             state = self.buffer.at(boot_ns)
-            return replace(state, vel_std_mps=vel_std_mps, tilt_std_deg=tilt_std_deg)
+            return replace(state, vel_std_mps=vel_std_mps, horizon_std_deg=horizon_std_deg)
 
     def mean_velocity(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
         """See `TelemetryBuffer.mean_velocity`; times of our clock."""

@@ -25,6 +25,7 @@ from orthonav.core.geo.attitude import (
 )
 from orthonav.core.geo.camera import angles_of_ned, attitude_of
 from orthonav.core.records import Telemetry
+from orthonav.core.tilt import ARDUPILOT, AUTOPILOT
 
 HEIGHT_SOURCES = ("distance", "terrain", "amsl", "home", "relative")
 """Sources of the height above ground, best first: a rangefinder, the autopilot's terrain model, the
@@ -49,9 +50,6 @@ Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
 UNAIDED_VEL_STD_MPS = 5.0
 """Of the velocity without GNSS: PX4's was 2 to 5 m/s off in simulated flights."""
-UNAIDED_TILT_STD_DEG, AIDED_TILT_STD_DEG = 3.0, 1.5
-"""Of the horizon: PX4's was 2 to 4 deg off without GNSS. With GNSS, errors of the accelerometers
-and of the mount remain; ArduPilot's was 0.4 deg off without it (docs/closed-loop.md)."""
 LARGEST_AIDED_MPS = 1.0
 """A filter that claims more for its velocity does not fuse GNSS, whatever the receiver has."""
 STATUS_NS, FIX_NS = 5 * 10**9, 3 * 10**9
@@ -75,7 +73,7 @@ class VehicleState:
     `ned_from_body`: attitude as a rotation matrix (3, 3); None where not known. The rest is NaN
     where not known. `height_m`: above ground; it equals `home_m`, the height above the take-off,
     where only that is known: level ground is assumed. `down_m`: below the origin of the autopilot's
-    local frame. `vel_std_mps`, `tilt_std_deg`: NaN: as usual.
+    local frame. `vel_std_mps`, `horizon_std_deg`: NaN: as usual.
     """
 
     ned_from_body: Array | None
@@ -85,7 +83,7 @@ class VehicleState:
     home_m: float = math.nan
     amsl_m: float = math.nan
     vel_std_mps: float = math.nan
-    tilt_std_deg: float = math.nan
+    horizon_std_deg: float = math.nan
 
     def attitude_rad(self) -> Triple:
         """Roll, pitch and yaw of the body in radians; NaN where not known."""
@@ -107,7 +105,7 @@ class VehicleState:
             roll,
             self.height_m,
             vel_en_mps=(east, north) if known else None,
-            tilt_std_deg=_known(self.tilt_std_deg),
+            **AUTOPILOT.with_horizon(self.horizon_std_deg),
             vel_std_mps=_known(self.vel_std_mps),
             home_m=_known(self.home_m),
             amsl_m=_known(self.amsl_m),
@@ -385,7 +383,7 @@ class Aiding:
     def __init__(self, own_receiver: int | None = None) -> None:
         """`own_receiver`: number of the receiver in whose place orthonav sends GPS_INPUT."""
         self._own = own_receiver
-        self._unaided_tilt_deg = UNAIDED_TILT_STD_DEG
+        self._source = AUTOPILOT
         self._absolute_ns: int | None = None
         self._fixed_ns: int | None = None
         self._vel: tuple[int, float] | None = None
@@ -394,7 +392,7 @@ class Aiding:
         """Take the flags of ESTIMATOR_STATUS or, by `ardupilot`, of EKF_STATUS_REPORT, which mean
         the same: an absolute position (16), but neither constant (128), nor a glitch or an
         uninitialized filter (1024), nor a glitch of GNSS (ArduPilot: 32768)."""
-        self._unaided_tilt_deg = AIDED_TILT_STD_DEG if ardupilot else UNAIDED_TILT_STD_DEG
+        self._source = ARDUPILOT if ardupilot else AUTOPILOT
         aided = flags & ABSOLUTE and not flags & _IN_DOUBT
         self._absolute_ns = now_ns if aided else None
 
@@ -414,10 +412,10 @@ class Aiding:
         )
 
     def stds(self, now_ns: int) -> tuple[float, float]:
-        """Standard deviations of velocity (m/s; NaN: as usual) and tilt (deg)."""
+        """Standard deviations of velocity (m/s; NaN: as usual) and horizon (deg)."""
         if self.is_aided(now_ns):
-            return math.nan, AIDED_TILT_STD_DEG
-        return max(UNAIDED_VEL_STD_MPS, self._claimed_mps(now_ns)), self._unaided_tilt_deg
+            return math.nan, self._source.aided_deg
+        return max(UNAIDED_VEL_STD_MPS, self._claimed_mps(now_ns)), self._source.unaided_deg
 
     def _claimed_mps(self, now_ns: int) -> float:
         """Standard deviation of the velocity by the filter; 0 where it is not known."""

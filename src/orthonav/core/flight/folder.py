@@ -24,7 +24,8 @@ from orthonav.core.tables import TableError, TableRows
 TELEMETRY_COLUMNS = ("frame", "time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m")
 OPTIONAL_COLUMNS = (
     *("yaw_std_deg", "agl_std_m", "prior_lat_deg", "prior_lon_deg", "prior_std_m"),
-    *("vel_east_mps", "vel_north_mps", "tilt_std_deg", "vel_std_mps", "home_m", "amsl_m", "hae_m"),
+    *("vel_east_mps", "vel_north_mps", "tilt_std_deg", "mount_std_deg"),
+    *("vel_std_mps", "home_m", "amsl_m", "hae_m"),
 )
 _PRIOR_FIELDS = ("lat_deg", "lon_deg", "std_m")
 _OPTIONAL_FIELDS = [each.name for each in fields(Telemetry) if each.name in OPTIONAL_COLUMNS]

@@ -48,9 +48,10 @@ class Mount:
     def corrected(self, telemetry: Telemetry) -> Telemetry:
         """Telemetry without these errors; unknown values stay unknown.
 
-        What is not known of the mount adds to the stated deviation of pitch and roll.
+        What the calibration does not know of the mount adds to the stated deviation of pitch and
+        roll, in place of the part of a mount that was never calibrated.
         """
-        tilt = telemetry.tilt_std_deg
+        tilt = telemetry.horizon_std_deg
         mount = max(self.pitch_deg.std, self.roll_deg.std)
         return replace(
             telemetry,
@@ -59,6 +60,7 @@ class Mount:
             pitch_deg=telemetry.pitch_deg + self.pitch_deg.value,
             roll_deg=telemetry.roll_deg + self.roll_deg.value,
             tilt_std_deg=None if tilt is None else math.hypot(tilt, mount),
+            mount_std_deg=None if tilt is None else mount,
         )
 
 

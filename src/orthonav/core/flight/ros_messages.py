@@ -9,14 +9,9 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import decode_image
-from orthonav.core.geo.attitude import (
-    AUTOPILOT_TILT_STD_DEG,
-)
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import camera_from_numbers
-
-LEAST_TILT_STD_DEG, MOST_TILT_STD_DEG = 1.5, 10.0
-"""An orientation of an IMU counts as stated between them; MAVROS states 57 deg by default."""
+from orthonav.core.tilt import stated_deg
 
 
 def stamp_ns(message: Any, recorded_ns: int) -> int:
@@ -43,18 +38,11 @@ def attitude_of_message(message: Any) -> tuple[float, float, float, float] | Non
     return float(turn.w), float(turn.x), float(turn.y), float(turn.z)
 
 
-def tilt_std_of_message(message: Any) -> float:
-    """Standard deviation of pitch and roll (deg) by the covariance of a `sensor_msgs/Imu`.
-
-    That of an autopilot where it is not stated, or is a placeholder. A smaller one than
-    `LEAST_TILT_STD_DEG` leaves out the errors of the mount and of accelerations.
-    """
+def horizon_std_of_message(message: Any) -> float | None:
+    """Standard deviation of pitch and roll (deg) by the covariance of a `sensor_msgs/Imu`; None
+    where it is not stated, or is a placeholder."""
     covariance = getattr(message, "orientation_covariance", (0.0,) * 9)
-    variance = max(float(covariance[0]), float(covariance[4]))
-    std_deg = math.degrees(math.sqrt(variance)) if variance > 0 else math.inf
-    if not std_deg <= MOST_TILT_STD_DEG:
-        return AUTOPILOT_TILT_STD_DEG
-    return max(std_deg, LEAST_TILT_STD_DEG)
+    return stated_deg((float(covariance[0]), float(covariance[4])))
 
 
 def height_of_message(message: Any) -> float | None:

@@ -5,18 +5,15 @@ from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.geo.attitude import (
-    AUTOPILOT_TILT_STD_DEG,
-    matrices_of_wxyz,
-    slerp,
-    wxyz_of_matrices,
-)
+from orthonav.core.geo.attitude import matrices_of_wxyz, slerp, wxyz_of_matrices
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.records import Prior, Telemetry
+from orthonav.core.tilt import AUTOPILOT, TiltSource
 
 Array = NDArray[np.float64]
 DAY_NS = 86_400 * 10**9
@@ -170,8 +167,10 @@ class RecordedTrack:
     yaw_std: TimeSeries | None = None  # reported standard deviation of the heading, degrees
     agl_std: TimeSeries | None = None  # reported standard deviation of the height, metres
     tilt_std: TimeSeries | None = None  # reported standard deviation of pitch and roll, degrees
-    tilt_std_deg: float = AUTOPILOT_TILT_STD_DEG
-    """The same by the kind of the source, where none was reported."""
+    mount_std: TimeSeries | None = None  # reported part of it of a mount never calibrated, degrees
+    horizon_std: TimeSeries | None = None  # reported standard deviation of the horizon, degrees
+    tilt: TiltSource = AUTOPILOT
+    """Source of the attitude, which says what was not reported."""
     prior: TimeSeries | None = None
     """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
     origin_ns: int = 0  # time at which a recording without a clock begins
@@ -200,9 +199,6 @@ class RecordedTrack:
         Where no height above ground was measured, it is the one above take-off.
         """
         yaw, pitch, roll = angles_at(self.attitude, time_ns)
-        tilt_std = _number(_at(self.tilt_std, time_ns, 1)[0])
-        if tilt_std is None and math.isfinite(pitch + roll):
-            tilt_std = self.tilt_std_deg
         prior = _at(self.prior, time_ns, 3)
         velocity = _at(self.velocity, time_ns, 2)
         return Telemetry(
@@ -213,7 +209,7 @@ class RecordedTrack:
             agl_m=self._agl_m(time_ns, ground_alt_m),
             yaw_std_deg=_number(_at(self.yaw_std, time_ns, 1)[0]),
             agl_std_m=_number(_at(self.agl_std, time_ns, 1)[0]),
-            tilt_std_deg=tilt_std,
+            **(self._tilt_stds(time_ns) if math.isfinite(pitch + roll) else {}),
             prior=Prior(*map(float, prior)) if np.isfinite(prior).all() else None,
             vel_en_mps=(float(velocity[0]), float(velocity[1]))
             if np.isfinite(velocity).all()
@@ -242,6 +238,17 @@ class RecordedTrack:
         if not math.isfinite(lat + lon):
             return None
         return float(lat), float((lon + 180) % 360 - 180)
+
+    def _tilt_stds(self, time_ns: int) -> dict[str, Any]:
+        """Fields of the telemetry. A position says that GNSS aids the horizon."""
+        reported = _number(_at(self.tilt_std, time_ns, 1)[0])
+        if reported is not None:
+            mount = _number(_at(self.mount_std, time_ns, 1)[0])
+            return {"tilt_std_deg": reported, "mount_std_deg": mount}
+        horizon = _number(_at(self.horizon_std, time_ns, 1)[0])
+        if horizon is not None:
+            return self.tilt.with_horizon(horizon)
+        return self.tilt.stated(aided=self.latlon_deg(time_ns) is not None)
 
     def _agl_m(self, time_ns: int, ground_alt_m: float | None) -> float:
         for series in (*self.heights, self.home):

@@ -19,12 +19,6 @@ _ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _GIMBAL_FROM_CAMERA = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
 LOOKS_DOWN = (0.0, 0.0, 0.0)
-GIMBAL_TILT_STD_DEG = 2.0
-"""Of a gimbal: horizon errors of 1 deg after turns, mounting errors of 1 to 2 deg."""
-AUTOPILOT_TILT_STD_DEG = 3.0
-"""Of an autopilot with a mount never calibrated: mounts lean by 1 to 5 deg (docs/flights.md)."""
-ASSUMED_TILT_STD_DEG = 6.0
-"""Of an assumed nadir camera: consistent on 30 photographs of a DJI Mini (docs/flights.md)."""
 
 
 def ned_from_angles(yaw_pitch_roll_deg: ArrayLike) -> Array:

@@ -107,9 +107,10 @@ class Localizer:
     ) -> Fix | NoFix:
         """The position from which an image was taken; for the arguments see `View.of`.
 
-        `heading_deg` None: all headings are tried. `prior`: searched within three of its standard
-        deviations; None: on the whole map. Raises `FlightError` for what is no image and
-        `CameraError` where image and camera have different aspect ratios."""
+        `heading_deg` None: all headings are tried. `pitch_deg`, `roll_deg`: state how good they are
+        by `tilt_std_deg`, above all without terrain in the map. `prior`: searched within three of
+        its standard deviations; None: on the whole map. Raises `FlightError` for what is no image
+        and `CameraError` where image and camera have different aspect ratios."""
         view = View.of(
             image,
             camera,

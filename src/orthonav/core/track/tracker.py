@@ -184,7 +184,8 @@ class Tracker:
         """The position of the aircraft by this image and all before it; arguments as of `View.of`.
 
         `heading_deg` may be None in a tracker made with `heading_known=False`. `vel_en_mps`:
-        reported velocity over ground. Raises as `View.of`."""
+        reported velocity over ground. `tilt_std_deg`: of `pitch_deg` and `roll_deg`, without the
+        constant error of the mount, which is estimated. Raises as `View.of`."""
         view = View.of(
             image,
             camera,
@@ -293,8 +294,8 @@ class Tracker:
         if self._usual_model and math.isfinite(telemetry.agl_m):
             self._usual_model = False
             self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
-        if telemetry.tilt_std_deg is not None:
-            horizon = math.radians(telemetry.tilt_std_deg)
+        if telemetry.horizon_std_deg is not None:
+            horizon = math.radians(telemetry.horizon_std_deg)
             self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
         if self._time_ns is None:
             self._time_ns, self._before = telemetry.time_ns, now

@@ -20,13 +20,10 @@ import numpy as np
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.folder import check_latlon, number_of
 from orthonav.core.flight.telemetry_track import measured
-from orthonav.core.geo.attitude import (
-    AUTOPILOT_TILT_STD_DEG,
-    GIMBAL_TILT_STD_DEG,
-    enu_from_gimbal_camera,
-)
+from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
+from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED, UNSTATED
 
 MAX_BYTES = 100_000_000
 _SYNONYMS = {
@@ -134,6 +131,7 @@ def read_image_table(path: Path) -> ImageTable:
     comma = delimiter != ","
     numbers = [(line, texts, _numbers(texts, columns, line, comma, path)) for line, texts in lines]
     gimbal = _is_gimbal(columns, [values for _, _, values in numbers])
+    unrecorded = _is_unrecorded(gimbal, [values for _, _, values in numbers])
     rows: dict[str, ImageRow] = {}
     for order, (line, texts, values) in enumerate(numbers):
         name = str(PurePosixPath(texts["file"].replace("\\", "/").lower()))
@@ -141,11 +139,13 @@ def read_image_table(path: Path) -> ImageTable:
             raise FlightError(f"table names {texts['file']!r:.80} twice: {path}")
         if texts["file"]:
             time_ns = _time_ns(texts.get("time", ""), line, path)
-            rows[name] = _row(order, values, time_ns, gimbal)
+            rows[name] = _row(order, values, time_ns, gimbal, unrecorded)
     if not rows:
         raise FlightError(f"table names no image: {path}")
     warnings = _missing(columns, path)
-    if gimbal and "gimbal" not in columns["pitch"][0].lower():
+    if unrecorded:
+        warnings.append(f"{UNRECORDED}: {path}")
+    elif gimbal and "gimbal" not in columns["pitch"][0].lower():
         warnings.append(
             f"pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight "
             f"down: {path}"
@@ -211,7 +211,19 @@ def _is_gimbal(
     )
 
 
-def _row(order: int, values: Mapping[str, float], time_ns: int | None, gimbal: bool) -> ImageRow:
+def _is_unrecorded(gimbal: bool, rows: Sequence[Mapping[str, float]]) -> bool:
+    """Whether a gimbal reports 0 in all rows, where it would look at the horizon."""
+    angles = [values.get(name, 0.0) for values in rows for name in ("pitch", "roll")]
+    return gimbal and not any(angles)
+
+
+def _row(
+    order: int,
+    values: Mapping[str, float],
+    time_ns: int | None,
+    gimbal: bool,
+    unrecorded: bool,
+) -> ImageRow:
     found: dict[str, Any] = {}
     if time_ns is not None:
         found |= {"time_ns": time_ns, "zone_known": True}
@@ -221,14 +233,14 @@ def _row(order: int, values: Mapping[str, float], time_ns: int | None, gimbal: b
         found |= {f"{name}_m": values.get(name, math.nan) for name in _HEIGHTS}
     yaw, pitch = values.get("yaw", math.nan), values.get("pitch", math.nan)
     roll = values.get("roll", 0.0)
-    if gimbal and math.isfinite(pitch):
+    if gimbal and math.isfinite(pitch) and not unrecorded:
         known = math.isfinite(yaw)
         turned = attitude_of(enu_from_gimbal_camera((yaw if known else 0.0, pitch, roll)))
         yaw, pitch, roll = (turned[0] if known else math.nan), turned[1], turned[2]
     pose: dict[str, Any] = {}
     if math.isfinite(pitch):
-        std_deg = GIMBAL_TILT_STD_DEG if gimbal else AUTOPILOT_TILT_STD_DEG
-        pose |= {"pitch_deg": pitch, "roll_deg": roll, "tilt_std_deg": std_deg}
+        source = ASSUMED if unrecorded else GIMBAL if gimbal else UNSTATED
+        pose |= {"pitch_deg": pitch, "roll_deg": roll, **source.stated(aided=False)}
     if math.isfinite(yaw):
         pose |= {"yaw_deg": yaw % 360, "yaw_std_deg": None}
     return ImageRow(order, found, pose)

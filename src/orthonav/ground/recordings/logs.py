@@ -25,7 +25,6 @@ from orthonav.core.flight.telemetry_track import (
     series_of,
 )
 from orthonav.core.geo.attitude import (
-    GIMBAL_TILT_STD_DEG,
     Angles,
     enu_from_body_camera,
     enu_from_gimbal_camera,
@@ -36,6 +35,15 @@ from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.guard import needed, reading
 from orthonav.core.tables import TableError, TableRows
+from orthonav.core.tilt import (
+    ARDUPILOT,
+    ASSUMED,
+    AUTOPILOT,
+    GIMBAL,
+    UNRECORDED,
+    UNSTATED,
+    TiltSource,
+)
 
 DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats
 MAVLINK_MAGICS = (0xFE, 0xFD)
@@ -68,7 +76,7 @@ class _Collected:
         self.attitude, self.velocity, self.position = Samples(3), Samples(2), Samples(3)
         self.distance, self.above_home, self.hae = Samples(1), Samples(1), Samples(1)
 
-    def track(self, what: str, path: Path) -> RecordedTrack:
+    def track(self, what: str, path: Path, tilt: TiltSource = AUTOPILOT) -> RecordedTrack:
         """The track of all samples; raises `FlightError` without attitude."""
         attitude = attitude_of_angles(
             self.attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles), self.mount)
@@ -84,6 +92,7 @@ class _Collected:
             hae=self.hae.series(),
             position=position,
             velocity=self.velocity.series(),
+            tilt=tilt,
             origin_ns=int(attitude.time_ns[0]),
         )
 
@@ -104,7 +113,7 @@ def read_dataflash(path: Path, mount_deg: Angles) -> RecordedTrack:
             with contextlib.suppress(AttributeError, BufferError):
                 log.filehandle.close()
                 log.data_map.close()
-    return collected.track("ArduPilot log", path)
+    return collected.track("ArduPilot log", path, ARDUPILOT)
 
 
 def _from_dataflash(collected: _Collected, message: Any, time_ns: int) -> None:
@@ -313,6 +322,7 @@ _COLUMNS = {
     "yaw_std": ("yaw_std_deg",),
     "agl_std": ("agl_std_m",),
     "tilt_std": ("tilt_std_deg",),
+    "mount_std": ("mount_std_deg",),
     "prior": ("prior_lat_deg", "prior_lon_deg", "prior_std_m"),
 }
 """Columns of a table by the series of `RecordedTrack`."""
@@ -387,16 +397,20 @@ def read_srt(path: Path) -> RecordedTrack:
     if not found:
         raise FlightError(f"subtitles hold no telemetry: {path}")
     attitude, position, height = Samples(3), Samples(3), Samples(1)
+    unrecorded = not any(
+        (each.yaw_deg, each.pitch_deg, each.roll_deg) != (0, 0, 0) for each in found
+    )
     for block in [*found, found[-1]._replace(start_ns=found[-1].end_ns)]:
-        attitude.add(block.start_ns, block.yaw_deg, block.pitch_deg, block.roll_deg)
+        gimbal = block.yaw_deg, block.pitch_deg, block.roll_deg
+        attitude.add(block.start_ns, *((math.nan, -90.0, 0.0) if unrecorded else gimbal))
         position.add(block.start_ns, block.lat_deg, block.lon_deg, block.alt_m)
         height.add(block.start_ns, block.height_m)
     track = RecordedTrack(
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
         home=height.series(),
         position=position.positions(),
-        tilt_std_deg=GIMBAL_TILT_STD_DEG,
-        warnings=(UNCLEAR_ORDER,) * doubtful,
+        tilt=ASSUMED if unrecorded else GIMBAL,
+        warnings=(UNCLEAR_ORDER,) * doubtful + (f"{UNRECORDED}: {path}",) * unrecorded,
     )
     if track.attitude is None and track.position is None:
         raise FlightError(f"subtitles have neither position nor gimbal angles: {path}")
@@ -514,6 +528,7 @@ def read_table(path: Path) -> RecordedTrack:
         attitude_of_angles(attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles))),
         heights=() if height is None else (height,),
         position=position.positions(),
+        tilt=UNSTATED,
         **found,
     )
     if track.attitude is None:

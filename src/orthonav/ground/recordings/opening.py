@@ -152,6 +152,8 @@ class Imported:
     broken: int  # views left out because their image cannot be decoded, or has another size
     first_broken: str  # the error of the first one of them
     radians: bool  # whether the headings look like radians
+    tilt_std_deg: tuple[float, float] | None
+    """Least and largest stated standard deviation of pitch and roll; None: never stated."""
 
 
 def import_flight(
@@ -168,7 +170,7 @@ def import_flight(
     written.
     """
     views = truths = complete = broken = 0
-    first_broken, yaw_deg = "", []
+    first_broken, yaw_deg, tilt_std_deg = "", [], []
     with replacing_folder(Path(out)) as folder:
         writer = FlightWriter(folder, recording.camera, recording.note)
         for view in recording.views:
@@ -180,6 +182,8 @@ def import_flight(
             writer.add_encoded(frame, data, view.telemetry, view.truth_latlon_deg)
             views += 1
             yaw_deg.append(view.telemetry.yaw_deg)
+            if view.telemetry.tilt_std_deg is not None:
+                tilt_std_deg.append(view.telemetry.tilt_std_deg)
             truths += view.truth_latlon_deg is not None
             complete += not view.telemetry.missing()
             if recording.expected:
@@ -187,7 +191,8 @@ def import_flight(
         if views == 0:
             raise FlightError(first_broken or f"recording has no view: {recording.path}")
         writer.close()
-    return Imported(views, truths, complete, broken, first_broken, seem_radians(yaw_deg))
+    tilt = (min(tilt_std_deg), max(tilt_std_deg)) if tilt_std_deg else None
+    return Imported(views, truths, complete, broken, first_broken, seem_radians(yaw_deg), tilt)
 
 
 def _encoded_image(

@@ -18,13 +18,11 @@ from orthonav.core.files import require_file
 from orthonav.core.flight import read_image
 from orthonav.core.flight.telemetry_track import RecordedTrack
 from orthonav.core.geo.attitude import (
-    ASSUMED_TILT_STD_DEG,
-    AUTOPILOT_TILT_STD_DEG,
-    GIMBAL_TILT_STD_DEG,
     enu_from_gimbal_camera,
 )
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
+from orthonav.core.tilt import ASSUMED, AUTOPILOT, GIMBAL, TiltSource
 from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, read_photo
 from orthonav.ground.recordings.image_table import (
     ImageTable,
@@ -168,18 +166,17 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
 
 
 def _pose(photo: Photo, gimbal_unrecorded: bool) -> dict[str, Any]:
-    std_deg = None
+    source: TiltSource | None = None
     if gimbal_unrecorded:
-        angles, std_deg = (photo.body_yaw_deg % 360, 0.0, 0.0), ASSUMED_TILT_STD_DEG
+        angles, source = (photo.body_yaw_deg % 360, 0.0, 0.0), ASSUMED
     elif photo.gimbal_deg is not None:
-        angles, std_deg = attitude_of(enu_from_gimbal_camera(photo.gimbal_deg)), GIMBAL_TILT_STD_DEG
+        angles, source = attitude_of(enu_from_gimbal_camera(photo.gimbal_deg)), GIMBAL
     elif photo.rotation is not None:
-        angles, std_deg = attitude_of(photo.rotation), AUTOPILOT_TILT_STD_DEG
+        angles, source = attitude_of(photo.rotation), AUTOPILOT
     else:
         angles = photo.body_yaw_deg % 360, math.nan, math.nan
-    return dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), angles, strict=True)) | {
-        "tilt_std_deg": std_deg
-    }
+    pose: dict[str, Any] = dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), angles, strict=True))
+    return pose if source is None else pose | source.stated(aided=photo.latlon_deg is not None)
 
 
 def _is_unrecorded(photos: Sequence[Photo]) -> bool:

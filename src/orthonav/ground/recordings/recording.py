@@ -14,10 +14,10 @@ from orthonav.core.errors import FlightError
 from orthonav.core.files import with_paths
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
 from orthonav.core.flight.telemetry_track import RecordedTrack, measured
-from orthonav.core.geo.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
 from orthonav.core.records import Prior, Telemetry
+from orthonav.core.tilt import ASSUMED
 
 KINDS = ("flight", "photos", "video", "ros", "log")
 ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
@@ -33,7 +33,7 @@ Grey = NDArray[np.uint8]
 DECIMALS = 8
 _ROUNDED = (
     *("yaw_deg", "pitch_deg", "roll_deg", "agl_m", "yaw_std_deg", "agl_std_m", "prior"),
-    *("vel_en_mps", "home_m", "amsl_m", "hae_m"),
+    *("vel_en_mps", "tilt_std_deg", "mount_std_deg", "home_m", "amsl_m", "hae_m"),
 )
 
 
@@ -139,9 +139,7 @@ def with_options(
         prior = Prior(*truth_latlon_deg, options.prior_std_m)
         telemetry = replace(telemetry, prior=prior)
     if options.looks_down and math.isnan(telemetry.pitch_deg + telemetry.roll_deg):
-        telemetry = replace(
-            telemetry, pitch_deg=0.0, roll_deg=0.0, tilt_std_deg=ASSUMED_TILT_STD_DEG
-        )
+        telemetry = replace(telemetry, pitch_deg=0.0, roll_deg=0.0, **ASSUMED.stated(aided=False))
     return telemetry
 
 

@@ -27,6 +27,7 @@ from orthonav.core.flight.ros_messages import (
     camera_of_info,
     grey_of_message,
     height_of_message,
+    horizon_std_of_message,
     stamp_ns,
 )
 from orthonav.core.flight.telemetry_track import (
@@ -513,11 +514,13 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
     The attitude is that of the first topic that has one (raw IMUs do not).
     """
     attitude: TimeSeries | None = None
+    horizon: TimeSeries | None = None
     for connection in topics.attitudes:
         times, wxyz = _samples(reader, connection, 4, attitude_of_message).arrays()
         enu_from_flu, sound = rotations_of_wxyz(wxyz)
         attitude = attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
         if attitude is not None:
+            horizon = _samples(reader, connection, 1, _horizon_std).series()
             break
     agl, home, amsl = _heights(reader, topics)
     places = _samples(reader, topics.roles.get("position"), 3, _position).positions()
@@ -530,6 +533,7 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
         hae=altitude_series(places),  # sensor_msgs/NavSatFix
         position=places,
         velocity=velocity.series(),
+        horizon_std=horizon,
         origin_ns=0 if attitude is None else int(attitude.time_ns[0]),
     )
 
@@ -578,6 +582,11 @@ def _velocity(message: Any) -> tuple[float, ...] | None:
         east, north, _ = enu_from_flu @ [twist.x, twist.y, twist.z]
         return float(east), float(north)
     return None
+
+
+def _horizon_std(message: Any) -> tuple[float, ...] | None:
+    std_deg = horizon_std_of_message(message)
+    return None if std_deg is None else (std_deg,)
 
 
 def _position(message: Any) -> tuple[float, ...] | None:

@@ -21,20 +21,16 @@ from orthonav.core.flight.ros_messages import (
     camera_of_info,
     grey_of_message,
     height_of_message,
+    horizon_std_of_message,
     stamp_ns,
-    tilt_std_of_message,
 )
-from orthonav.core.geo.attitude import (
-    AUTOPILOT_TILT_STD_DEG,
-    LOOKS_DOWN,
-    Angles,
-    ned_wxyz_from_ros,
-)
+from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, ned_wxyz_from_ros
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import NoFix
+from orthonav.core.tilt import AUTOPILOT
 from orthonav.onboard.cameras import CameraImage
 from orthonav.onboard.ros2.node import TIME_NS, Graph
-from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
+from orthonav.onboard.telemetry import FIX_NS, Clocks, TelemetryBuffer
 
 log = logging.getLogger(__name__)
 JUMP_NS = TIME_NS
@@ -108,7 +104,7 @@ class Ros2Reader:
         self._clock: tuple[int, int] | None = None
         self._number, self._image_ns, self._attitude_ns = 0, 0, 0
         self._checked_ns = self._reminded_ns = clocks.mono_ns()
-        self._tilt_std_deg = AUTOPILOT_TILT_STD_DEG
+        self._stated_horizon_deg: float | None = None
         self._said: set[str] = set()
         self._subscribe()
 
@@ -235,7 +231,7 @@ class Ros2Reader:
         if time_ns < self._attitude_ns - JUMP_NS:
             self._restart("imu", self._attitude_ns - time_ns)
         self._attitude_ns = max(self._attitude_ns, time_ns)
-        self._tilt_std_deg = tilt_std_of_message(message)
+        self._stated_horizon_deg = horizon_std_of_message(message)
         turned = ned_wxyz_from_ros(wxyz)
         if turned is not None:
             self._buffer.add_attitude(time_ns, turned.tolist())
@@ -288,7 +284,8 @@ class Ros2Reader:
         except FlightError as error:
             problem = NoFix("bad_image", str(error))
             self._say_once(str(error))
-        vehicle = replace(self._buffer.at(image.stamp_ns), tilt_std_deg=self._tilt_std_deg)
+        vehicle = self._buffer.at(image.stamp_ns)
+        vehicle = replace(vehicle, horizon_std_deg=self._horizon_std_deg())
         return CameraImage(
             self._number,
             f"{image.stamp_ns}",
@@ -299,6 +296,17 @@ class Ros2Reader:
             vehicle.telemetry(image.stamp_ns, self._mount_deg),
             vehicle,
         )
+
+    def _horizon_std_deg(self) -> float:
+        """As stated, else by whether a receiver has a fix."""
+        if self._stated_horizon_deg is not None:
+            return self._stated_horizon_deg
+        now_ns = self._clocks.mono_ns()
+        aided = any(
+            each.fix_type >= FIX_3D and now_ns - each.arrived_ns <= FIX_NS
+            for each in list(self.gnss)[-1:]
+        )
+        return AUTOPILOT.aided_deg if aided else AUTOPILOT.unaided_deg
 
     def _restart(self, what: str, back_ns: int) -> None:
         """Discard telemetry and images: time went back, they belong to an earlier run."""
