@@ -166,7 +166,7 @@ def test_a_gimbal_that_is_0_in_all_rows_was_not_recorded(images):
     (images / "a.csv").write_text(rows.format("c.png", -90))
     found = read_image_table(images / "a.csv")
     assert not any("angles are 0" in each for each in found.warnings)
-    assert {row.pose["tilt_std_deg"] for row in found.rows.values()} == {1.0}
+    assert {row.pose["tilt_std_deg"] for row in found.rows.values()} == {0.5}
 
 
 def test_single_photographs(images):

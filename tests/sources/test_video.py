@@ -171,7 +171,7 @@ def test_a_gimbal_that_is_0_throughout_was_not_recorded(recorded):
     subtitles(srt, texts)  # a gimbal that was at the horizon once
     recording = open_source(recorded, options(recorded))
     assert not any("angles are 0" in each for each in recording.warnings)
-    assert {view.telemetry.tilt_std_deg for view in recording.views} == {1.0}
+    assert {view.telemetry.tilt_std_deg for view in recording.views} == {0.5}
 
 
 BROKEN = {

@@ -5,7 +5,8 @@ by 0.7 to 1.4, without it by 1.1 to 2.3; ArduPilot's by 0.2, without GNSS by 0.5
 were better than real ones. PX4's own variance (0.3 to 0.4 in a log) leaves accelerations out.
 Gimbals: 0.01 to 0.1 is how much they shake; the horizon that they hold drifts (1 deg in 5 minutes,
 https://github.com/maiermic/robot-cameraman/issues/17) and is trimmed by hand within 2 deg
-(`DJIGimbal` of DJI's Mobile SDK). Mounts lean by 1 to 5 (docs/flights.md).
+(`DJIGimbal` of DJI's Mobile SDK), so that one held and trimmed is off by about 0.5. Mounts lean by 1
+to 5 (docs/flights.md).
 """
 
 import math
@@ -40,7 +41,7 @@ class TiltSource:
         return {"tilt_std_deg": total_deg, "mount_std_deg": self.mount_deg or None}
 
 
-GIMBAL = TiltSource(1.0, 1.0)
+GIMBAL = TiltSource(0.5, 0.5)
 AUTOPILOT = TiltSource(HORIZON_STD_DEG, UNAIDED_HORIZON_STD_DEG, MOUNT_STD_DEG)
 ARDUPILOT = TiltSource(HORIZON_STD_DEG, HORIZON_STD_DEG, MOUNT_STD_DEG)
 UNSTATED = TiltSource(3.0, 3.0)
