@@ -275,7 +275,6 @@ class Mixture:
         if not self.hypotheses:
             self.start(mean_en_m, std_m)
             return
-        self._last = None  # what dead reckoning contradicts, other means confirm
         made, noise = [], np.eye(2) * std_m**2
         for each in self.hypotheses:
             spread = each.covariance[POSITION, POSITION] + noise
@@ -292,10 +291,14 @@ class Mixture:
                 )
             )
         # Belief elsewhere is spread over the map: its density at this position remains.
-        self.elsewhere /= self.area_m2
-        made += self._born_at(mean_en_m, std_m, START_SHARE * self.elsewhere)
-        self.elsewhere *= 1 - START_SHARE
-        self._merge(made)
+        elsewhere = self.elsewhere / self.area_m2
+        made += self._born_at(mean_en_m, std_m, START_SHARE * elsewhere)
+        self._merge(made, elsewhere * (1 - START_SHARE))
+        self._last = None  # what dead reckoning contradicts, other means confirm
+
+    def unrecognize(self) -> None:
+        """As if the last view had not shown the map anywhere."""
+        self.hypotheses = [replace(each, recognized=0.0) for each in self.hypotheses]
 
     def predict(
         self,
@@ -309,16 +312,15 @@ class Mixture:
         (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
-        self._ground = 1 - overlap
-        made = []
+        made, last = [], self._last
         for each in self.hypotheses:
             for share, expected in self._predictions(each, *moves):
                 on_map = held_to_map(self.model, expected, self.area_m2)
                 made.append(self._from(each, on_map, each.share * share * stays))
-        if self._last is not None:
-            _, expected = max(self._predictions(self._last, *moves), key=lambda split: split[0])
-            self._last = self._from(self._last, held_to_map(self.model, expected, self.area_m2), 1)
-        self.hypotheses = made
+        if last is not None:
+            _, expected = max(self._predictions(last, *moves), key=lambda split: split[0])
+            last = self._from(last, held_to_map(self.model, expected, self.area_m2), 1)
+        self.hypotheses, self._last, self._ground = made, last, 1 - overlap
         self.elsewhere += (1 - stays) * (1 - self.elsewhere)
 
     def _predictions(
@@ -396,7 +398,7 @@ class Mixture:
             seen = tempered(self.model, mounts, areas_m2, reported, each, newness)
             made += self._updated(split, seen, found, ground, confirms)
             made += self._born(seen, confirms)
-        self._merge(made)
+        self._merge(made, self.elsewhere)
         shown = bool(self.hypotheses) and self.hypotheses[0].recognized >= RECOGNIZED
         confirmed = self._state is not State.SEARCHING
         self._blind = self._blind + newness if confirmed and not shown else 0.0
@@ -627,16 +629,15 @@ class Mixture:
             recognized=0.0,
         )
 
-    def _merge(self, made: list[Hypothesis]) -> None:
-        self.hypotheses = made
-        self._normalize()
-        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
-        self._normalize()
+    def _merge(self, made: list[Hypothesis], elsewhere: float) -> None:
+        left, elsewhere = _normalized(made, elsewhere)
+        left = merged(sorted(left, key=lambda each: -each.share))
+        self.hypotheses, self.elsewhere = _normalized(left, elsewhere)
 
-    def _normalize(self) -> None:
-        total = sum(each.share for each in self.hypotheses) + self.elsewhere
-        self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
-        self.elsewhere /= total
+
+def _normalized(made: list[Hypothesis], elsewhere: float) -> tuple[list[Hypothesis], float]:
+    total = sum(each.share for each in made) + elsewhere
+    return [replace(each, share=each.share / total) for each in made], elsewhere / total
 
 
 def _forgotten(sighted: float, ground: float) -> float:
