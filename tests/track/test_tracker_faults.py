@@ -1,6 +1,9 @@
-"""A tracker whose parts raise errors: dead reckoning, never a position of before stated again."""
+"""A tracker whose parts raise errors or whose telemetry is unknown: it never states the position of
+the view before again."""
 
 import copy
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +12,11 @@ import pytest
 from orthonav.core.errors import MapFileError
 from orthonav.core.flight import open_flight
 from orthonav.core.flight.mount import Bias, Mount
+from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import Fix, NoFix, View, ViewResult
+from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
+from orthonav.core.track import Model
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.run import MountCorrected, locate_view
 
@@ -190,3 +195,58 @@ def test_a_passed_view_moves_the_track_although_the_clock_stands_still(
     plane, before = localizer.sheet.frame, confirmed[1].outcome
     moved_m = plane.en_from_latlon(passed.lat_deg, passed.lon_deg) - en_m(localizer, confirmed[1])
     assert np.hypot(*moved_m) > 10.0 and passed.std_m > before.std_m
+
+
+UNKNOWN = {
+    **{
+        name: (math.nan, math.inf)
+        for name in (
+            *("yaw_std_deg", "agl_std_m", "tilt_std_deg", "vel_std_mps"),
+            *("home_m", "amsl_m", "hae_m"),
+        )
+    },
+    "vel_en_mps": ((math.nan, 2.0), (2.0, math.nan)),
+    "prior": tuple(Prior(*(math.nan if n == at else 48.0 for n in range(3))) for at in range(3)),
+    "below": (Ground(math.nan, 1.0, 1.0), Ground(30.0, math.nan, 1.0)),
+}
+VALUES = [(name, value) for name, values in UNKNOWN.items() for value in values]
+
+
+@pytest.mark.parametrize(("name", "value"), VALUES)
+def test_what_is_not_finite_is_unknown(name, value):
+    assert getattr(Telemetry(0, 1.0, 2.0, 3.0, 100.0, **{name: value}), name) is None
+    assert Telemetry(0, math.nan, 2.0, 3.0, 100.0).missing() == ["yaw_deg"]
+
+
+def test_every_optional_field_is_covered():
+    optional = [name for name in Telemetry.__slots__ if name in UNKNOWN]
+    assert len(optional) == len(UNKNOWN) == len(Telemetry.__slots__) - 5
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_views_with_nan_are_tracked_like_views_without_the_value(tracker, localizer, seen, name):
+    other = copy.deepcopy(
+        tracker, {id(each): each for each in (localizer, tracker._registration, tracker._before)}
+    )
+    found = []
+    for each, value in ((tracker, UNKNOWN[name][0]), (other, None)):
+        views = [
+            replace(view, telemetry=replace(view.telemetry, **{name: value}))
+            if not number
+            else view
+            for number, view in enumerate(seen[FIRST:])
+        ]
+        found.append(results(each, views))
+    for (nan, failures), (none, _) in zip(*found, strict=True):
+        assert failures == 0 and nan.state == none.state
+        assert nan.outcome.confidence == none.outcome.confidence
+        assert (en_m(localizer, nan) == en_m(localizer, none)).all()
+
+
+def test_a_tilt_without_deviation_has_the_usual_one_again(tracker, seen):
+    used = []
+    for tilt_std_deg, view in zip((0.2, math.nan, 0.5, None), seen[FIRST:], strict=False):
+        tracker.locate(replace(view, telemetry=replace(view.telemetry, tilt_std_deg=tilt_std_deg)))
+        used.append(math.degrees(tracker.mixture.model.horizon_rad))
+    usual = math.degrees(Model.horizon_rad)
+    assert used == pytest.approx([0.2, usual, 0.5, usual])

@@ -118,6 +118,7 @@ class Tracker:
         self._heading_known = heading_known
         self.model, self._usual_model = model or Model(), model is None
         self._usual_scale = self._usual_model
+        self._usual_horizon_rad = self.model.horizon_rad
         self.mixture = Mixture(self.model, self._use(localizer))
         self._time_ns: int | None = None
         self._predicted_ns: int | None = None  # a view predicted, but without an outcome so far
@@ -299,9 +300,9 @@ class Tracker:
         if self._usual_model and math.isfinite(telemetry.agl_m):
             self._usual_model = False
             self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
-        if telemetry.tilt_std_deg is not None:
-            horizon = math.radians(telemetry.tilt_std_deg)
-            self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
+        tilt = telemetry.tilt_std_deg
+        horizon = self._usual_horizon_rad if tilt is None else math.radians(tilt)
+        self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
         if self._time_ns is None:
             if prior is not None:
                 self.mixture.start(*self._position_of(prior))
