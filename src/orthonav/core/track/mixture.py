@@ -244,7 +244,8 @@ class Mixture:
         self._blind = 0.0
         self._numbers = 0
         self._last: Hypothesis | None = None  # of the track, dead-reckoned since
-        self._ground = self._restored = 0.0  # new in this view; recognized against dead reckoning
+        self._against: Hypothesis | None = None  # the place that contradicts it, dead-reckoned too
+        self._ground = self._restored = 0.0  # new in this view; recognized there
 
     def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
         self._extent = np.array(extent_en_m)
@@ -256,6 +257,7 @@ class Mixture:
         """Continue between two views in another plane, on a map of this extent there."""
         self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
         self._last = None if self._last is None else moved(self._last, plane, other)
+        self._against = None if self._against is None else moved(self._against, plane, other)
         self._set_extent(extent_en_m)
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
@@ -294,7 +296,7 @@ class Mixture:
         elsewhere = self.elsewhere / self.area_m2
         made += self._born_at(mean_en_m, std_m, START_SHARE * elsewhere)
         self._merge(made, elsewhere * (1 - START_SHARE))
-        self._last = None  # what dead reckoning contradicts, other means confirm
+        self._last = self._against = None  # what dead reckoning contradicts, other means confirm
 
     def unrecognize(self) -> None:
         """As if the last view had not shown the map anywhere."""
@@ -312,15 +314,18 @@ class Mixture:
         (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
-        made, last = [], self._last
+        made = []
         for each in self.hypotheses:
             for share, expected in self._predictions(each, *moves):
                 on_map = held_to_map(self.model, expected, self.area_m2)
                 made.append(self._from(each, on_map, each.share * share * stays))
-        if last is not None:
-            _, expected = max(self._predictions(last, *moves), key=lambda split: split[0])
-            last = self._from(last, held_to_map(self.model, expected, self.area_m2), 1)
-        self.hypotheses, self._last, self._ground = made, last, 1 - overlap
+        singles = []
+        for one in (self._last, self._against):
+            if one is not None:
+                _, expected = max(self._predictions(one, *moves), key=lambda split: split[0])
+                one = self._from(one, held_to_map(self.model, expected, self.area_m2), 1)
+            singles.append(one)
+        self.hypotheses, (self._last, self._against), self._ground = made, singles, 1 - overlap
         self.elsewhere += (1 - stays) * (1 - self.elsewhere)
 
     def _predictions(
@@ -432,6 +437,8 @@ class Mixture:
                 self._follow(near)
                 follows = True
                 self._last = self._reached(mean, covariance)
+            elif self._state is not State.COASTING:
+                self._against = None
         belief = sum(each.share for each in near)
         most = 1.0 if self._state is State.TRACKING else UNCONFIRMED
         return Estimate(
@@ -448,14 +455,16 @@ class Mixture:
 
     def _reached(self, mean: Array, covariance: Array) -> Hypothesis:
         """The state of the track, or, where its dead reckoning contradicts it, the dead-reckoned
-        one with `followed=False`: until enough new ground is recognized (`RESTORED`)."""
+        one with `followed=False`: until enough new ground is recognized in one place (`RESTORED`),
+        without a loss of the track."""
         here = Hypothesis(1.0, mean, covariance, 0.0, 0, followed=True)
-        last = self._last or here
-        off, spread = (mean - last.mean)[POSITION], (last.covariance + covariance)[:2, :2]
-        self._restored += 0.0 if last.followed else self._ground
-        if off @ np.linalg.solve(spread, off) < REACHED or self._restored >= RESTORED:
-            self._restored = 0.0
+        last, against = self._last or here, self._against
+        known = against is not None and _is_reached(here, against)
+        self._restored = self._restored + self._ground if known else 0.0
+        if _is_reached(here, last) or self._restored >= RESTORED:
+            self._against = None
             return here
+        self._against = here
         return replace(last, followed=False)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
@@ -633,6 +642,12 @@ class Mixture:
         left, elsewhere = _normalized(made, elsewhere)
         left = merged(sorted(left, key=lambda each: -each.share))
         self.hypotheses, self.elsewhere = _normalized(left, elsewhere)
+
+
+def _is_reached(here: Hypothesis, last: Hypothesis) -> bool:
+    """Whether the aircraft can have come here by dead reckoning."""
+    off, spread = (here.mean - last.mean)[POSITION], (last.covariance + here.covariance)[:2, :2]
+    return bool(off @ np.linalg.solve(spread, off) < REACHED)
 
 
 def _normalized(made: list[Hypothesis], elsewhere: float) -> tuple[list[Hypothesis], float]:
