@@ -474,6 +474,29 @@ def views_until_believed(rows, away_m):
 EAST, WEST = (300.0, 0.0), (-420.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    "displacements_m",
+    [
+        [(0.0, 0.0)] * 12,
+        [EAST] * 9 + [WEST] * 12,
+        [EAST] * 9 + [None] * 14 + [WEST] * 12,
+        ([EAST] * 5 + [WEST] * 5) * 3,
+        [(25.0 * (-1) ** view, 10.0) for view in range(24)],
+        [EAST, (320.0, 20.0)] * 12,
+    ],
+    ids=["none", "another", "unseen", "turns", "scattered", "scattered contradiction"],
+)
+def test_an_error_is_small_no_more_probably_than_its_place_is_right(displacements_m):
+    for found, _ in contradicted(displacements_m):
+        assert found.confidence <= found.place_probability <= 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_confidence_of_a_flight_is_below_its_place_probability(seed):
+    for *_, found, _ in known(seed)[1]:
+        assert found.confidence <= found.place_probability
+
+
 def test_two_contradicting_places_by_turns_are_not_believed():
     """Neither was recognized on enough new ground, although both together were."""
     rows = contradicted(([EAST] * 5 + [WEST] * 5) * 5)

@@ -176,6 +176,15 @@ def test_without_dead_reckoning_there_is_no_position_until_the_next_view(
     assert moved_m == pytest.approx(expected, abs=10.0)
 
 
+def test_the_confidence_of_a_track_is_no_more_than_its_place_probability(localizer, seen):
+    tracker = Tracker(localizer)
+    for view in seen:
+        fix = tracker.locate(view)
+        assert fix.confidence <= fix.place_probability <= 1.0
+        estimate = tracker.mixture.estimate(fix.radius_m, between_views=True)
+        assert estimate.confidence <= estimate.place_probability
+
+
 def test_behind_a_mount_an_error_view_is_predicted_once(localizer, tracker, seen, faults):
     """Each correction makes new telemetry."""
     level = Bias(0.0, 0.0, 0.0)

@@ -216,9 +216,9 @@ class Estimate:
     """The best cluster of hypotheses. Its arrays are not to be changed.
 
     `confidence`: probability of being within the radius asked for; `place_probability`: however
-    wide the cluster. Both are limited until the track is confirmed; `belief` is not. `recognized`:
-    probability that the last view showed the map there. `confirmed`: enough ground was recognized
-    lately. `followed`: from a confirmed track or a reported position."""
+    wide the cluster, and so no less. Both are limited until the track is confirmed; `belief` is
+    not. `recognized`: probability that the last view showed the map there. `confirmed`: enough
+    ground was recognized lately. `followed`: from a confirmed track or a reported position."""
 
     mean: Array
     covariance: Array
@@ -441,11 +441,13 @@ class Mixture:
                 self._against = None
         belief = sum(each.share for each in near)
         most = 1.0 if self._state is State.TRACKING else UNCONFIRMED
+        contradicted = self._last is not None and not self._last.followed
+        place = min(belief, UNCONFIRMED if contradicted else most, 1.0)
         return Estimate(
             mean,
             covariance,
-            min(confidence, most),
-            min(belief, most if self._last is None or self._last.followed else UNCONFIRMED),
+            min(confidence, place),
+            place,
             self._state,
             belief,
             seen,
