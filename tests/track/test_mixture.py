@@ -524,3 +524,26 @@ def test_a_contradicting_place_is_counted_on_after_views_that_show_nothing():
     rows = contradicted([EAST] * 9 + [None] * 3 + [EAST] * 3)
     assert {found.state for found, _ in rows[9:12]} == {State.COASTING}
     assert views_until_believed(rows, EAST) == 8
+
+
+def test_hypotheses_are_merged_and_ordered_at_views_that_cannot_be_used():
+    """Odometry splits each in several: nothing else merges them there."""
+    flight, mixture, _ = flown(3)
+    for _ in range(9):
+        mixture.predict(1.0, camera=flight.moved())
+        mixture.estimate(RADIUS_M)
+        shares = [each.share for each in mixture.hypotheses]
+        assert shares == sorted(shares, reverse=True) and len(shares) <= 40
+        assert mixture.likeliest.share == max(shares) and sum(shares) + mixture.elsewhere == (
+            pytest.approx(1.0)
+        )
+    assert len(shares) < 20 and off_m(mixture, flight) < 30
+
+
+def test_the_place_expected_before_an_update_is_the_likeliest_one():
+    flight, mixture, _ = flown(3)
+    wrong = CameraDisplacement(3 * SPEED, np.eye(2) * 0.25, 80.0)
+    for moved in (flight.moved(), wrong, flight.moved()):
+        mixture.predict(1.0, ReportedVelocity(SPEED, SPEED, 1.0), moved)
+        mixture.estimate(RADIUS_M, between_views=True)
+        assert mixture.likeliest.share == max(each.share for each in mixture.hypotheses)

@@ -238,7 +238,8 @@ class Mixture:
         """`extent_en_m`: west, south, east, north of the map, on which the aircraft is."""
         self.model = model
         self._set_extent(extent_en_m)
-        self.hypotheses: list[Hypothesis] = []
+        self.hypotheses: list[Hypothesis] = []  # the likeliest first
+        self._is_split = False  # by a prediction, and not merged since
         self.elsewhere = 1.0
         self._state = State.SEARCHING
         self._blind = 0.0
@@ -325,7 +326,9 @@ class Mixture:
                 _, expected = max(self._predictions(one, *moves), key=lambda split: split[0])
                 one = self._from(one, held_to_map(self.model, expected, self.area_m2), 1)
             singles.append(one)
+        made.sort(key=lambda each: -each.share)
         self.hypotheses, (self._last, self._against), self._ground = made, singles, 1 - overlap
+        self._is_split = True
         self.elsewhere += (1 - stays) * (1 - self.elsewhere)
 
     def _predictions(
@@ -424,6 +427,8 @@ class Mixture:
         """The best cluster, None without hypotheses. Updates the state, except `between_views`."""
         if not self.hypotheses:
             return None
+        if self._is_split and not between_views:  # no update has followed the prediction
+            self._merge(self.hypotheses, self.elsewhere)
         best = self._best(radius_m)
         near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
         mean, covariance = moments(near)
@@ -644,6 +649,7 @@ class Mixture:
         left, elsewhere = _normalized(made, elsewhere)
         left = merged(sorted(left, key=lambda each: -each.share))
         self.hypotheses, self.elsewhere = _normalized(left, elsewhere)
+        self._is_split = False
 
 
 def _is_reached(here: Hypothesis, last: Hypothesis) -> bool:
