@@ -259,3 +259,18 @@ def test_a_tilt_without_deviation_has_the_usual_one_again(tracker, seen):
         used.append(math.degrees(tracker.mixture.model.horizon_rad))
     usual = math.degrees(Model.horizon_rad)
     assert used == pytest.approx([0.2, usual, 0.5, usual])
+
+
+def test_the_prior_of_the_mount_is_that_of_the_first_height_from_which_views_are_located(
+    localizer, seen
+):
+    """On the ground, metres there say nothing about the mount."""
+    tracker, view = Tracker(localizer), seen[0]
+    for agl_m in (0.5, 3.0):
+        tracker.locate(replace(view, telemetry=replace(view.telemetry, agl_m=agl_m)))
+        assert tracker.model.tilt_rad == pytest.approx(math.radians(1.5))
+    tracker.locate(replace(view, telemetry=replace(view.telemetry, agl_m=800.0)))
+    fixed = tracker.model.tilt_rad
+    assert fixed == pytest.approx(10.0 / 800.0)
+    tracker.locate(seen[1])
+    assert tracker.model.tilt_rad == fixed == tracker.mixture.model.tilt_rad

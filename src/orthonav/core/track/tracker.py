@@ -298,7 +298,7 @@ class Tracker:
             now = self._odometry_view(view, before, bias)
         prior = telemetry.prior if self._use_prior or self._every_prior else None
         if self._usual_model and math.isfinite(telemetry.agl_m):
-            self._usual_model = False
+            self._usual_model = view is None  # as on the ground
             self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
         tilt = telemetry.tilt_std_deg
         horizon = self._usual_horizon_rad if tilt is None else math.radians(tilt)
