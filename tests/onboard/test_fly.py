@@ -329,6 +329,17 @@ def test_an_internal_error_is_one_no_fix(flight, caplog):
     assert (health.level, health.reasons) == (Level.DEGRADED, ("internal_error",))
 
 
+@pytest.mark.parametrize("error", [MapFileError("damaged"), ValueError("odd")])
+def test_internal_errors_bridged_by_dead_reckoning_are_counted(flight, monkeypatch, error):
+    """Health shows them although every view has a position."""
+    monkeypatch.setattr(flight.locator, "passed", lambda telemetry, reason: fix())
+    flight.locator.outcome, flight.locator.state_name = raising(error), "coasting"
+    assert [reason_of(each) for each in flight.views(3)] == ["fix"] * 3
+    assert flight.runner.counter.total["internal_error"] == 3
+    flight.views(107)
+    assert flight.health().level is Level.FAILED
+
+
 def raising(error):
     def outcome(view):
         raise error

@@ -444,3 +444,106 @@ def test_the_bias_of_a_reported_velocity_is_estimated():
     error = estimate.mean[:2] - flight.place
     assert np.hypot(*error) < 20 < 30 * 1.8
     assert error @ np.linalg.solve(estimate.covariance[:2, :2], error) < 14
+
+
+def contradicted(displacements_m):
+    """Estimates of a flight whose camera shows it `displacements_m` (2,) away; None: nothing."""
+    flight, mixture, rows = Flight(5), Mixture(MODEL, EXTENT), []
+    for away_m in [(0.0, 0.0)] * 11 + list(displacements_m):
+        seen = []
+        if away_m is not None:
+            seen = [flight.sighting(4.0, flight.place + np.array(away_m))]
+        mixture.update(flight.reported(), seen)
+        found = mixture.estimate(RADIUS_M)
+        rows.append((found, found.mean[:2] - flight.place))
+        mixture.predict(1.0, ReportedVelocity(SPEED, None, 1.0), flight.moved())
+    return rows[11:]
+
+
+def views_until_believed(rows, away_m):
+    """Tracked views there, before the first with a place probability above 0.8; None: all."""
+    here = [
+        found
+        for found, off_m in rows
+        if found.state is State.TRACKING and math.dist(off_m, away_m) < 30
+    ]
+    believed = [found.place_probability > 0.8 for found in here]
+    return believed.index(True) if True in believed else None
+
+
+EAST, WEST = (300.0, 0.0), (-420.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "displacements_m",
+    [
+        [(0.0, 0.0)] * 12,
+        [EAST] * 9 + [WEST] * 12,
+        [EAST] * 9 + [None] * 14 + [WEST] * 12,
+        ([EAST] * 5 + [WEST] * 5) * 3,
+        [(25.0 * (-1) ** view, 10.0) for view in range(24)],
+        [EAST, (320.0, 20.0)] * 12,
+    ],
+    ids=["none", "another", "unseen", "turns", "scattered", "scattered contradiction"],
+)
+def test_an_error_is_small_no_more_probably_than_its_place_is_right(displacements_m):
+    for found, _ in contradicted(displacements_m):
+        assert found.confidence <= found.place_probability <= 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_confidence_of_a_flight_is_below_its_place_probability(seed):
+    for *_, found, _ in known(seed)[1]:
+        assert found.confidence <= found.place_probability
+
+
+def test_two_contradicting_places_by_turns_are_not_believed():
+    """Neither was recognized on enough new ground, although both together were."""
+    rows = contradicted(([EAST] * 5 + [WEST] * 5) * 5)
+    tracked = [found for found, _ in rows if found.state is State.TRACKING]
+    assert len(tracked) > 20
+    assert max(found.place_probability for found in tracked) <= 0.8
+
+
+@pytest.mark.parametrize("unseen", [0, 3, 14])
+def test_another_contradicting_place_is_counted_anew(unseen):
+    rows = contradicted([EAST] * 9 + [None] * unseen + [WEST] * 24)
+    assert views_until_believed(rows[:9], EAST) is None
+    assert sum(found.state is State.TRACKING for found, _ in rows[:9]) > 5
+    assert views_until_believed(rows[9 + unseen :], WEST) >= 8
+
+
+def test_a_contradicting_place_is_counted_anew_after_a_loss():
+    rows = contradicted([EAST] * 9 + [WEST] + [EAST] * 24)
+    assert rows[9][0].state is State.LOST
+    assert views_until_believed(rows[:9], EAST) is None
+    assert views_until_believed(rows[10:], EAST) >= 8
+
+
+def test_a_contradicting_place_is_counted_on_after_views_that_show_nothing():
+    rows = contradicted([EAST] * 9 + [None] * 3 + [EAST] * 3)
+    assert {found.state for found, _ in rows[9:12]} == {State.COASTING}
+    assert views_until_believed(rows, EAST) == 8
+
+
+def test_hypotheses_are_merged_and_ordered_at_views_that_cannot_be_used():
+    """Odometry splits each in several: nothing else merges them there."""
+    flight, mixture, _ = flown(3)
+    for _ in range(9):
+        mixture.predict(1.0, camera=flight.moved())
+        mixture.estimate(RADIUS_M)
+        shares = [each.share for each in mixture.hypotheses]
+        assert shares == sorted(shares, reverse=True) and len(shares) <= 40
+        assert mixture.likeliest.share == max(shares) and sum(shares) + mixture.elsewhere == (
+            pytest.approx(1.0)
+        )
+    assert len(shares) < 20 and off_m(mixture, flight) < 30
+
+
+def test_the_place_expected_before_an_update_is_the_likeliest_one():
+    flight, mixture, _ = flown(3)
+    wrong = CameraDisplacement(3 * SPEED, np.eye(2) * 0.25, 80.0)
+    for moved in (flight.moved(), wrong, flight.moved()):
+        mixture.predict(1.0, ReportedVelocity(SPEED, SPEED, 1.0), moved)
+        mixture.estimate(RADIUS_M, between_views=True)
+        assert mixture.likeliest.share == max(each.share for each in mixture.hypotheses)

@@ -46,7 +46,8 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """What the autopilot reported for the exposure of one view. NaN and None stand for unknown."""
+    """What the autopilot reported for the exposure of one view. NaN and None stand for unknown: an
+    optional field that is not finite becomes None."""
 
     time_ns: int  # time of exposure, ns
     yaw_deg: float  # heading of the top of the picture, clockwise from true north
@@ -74,6 +75,25 @@ class Telemetry:
     below: Ground | None = None
     """The ground from which `agl_m` was computed by a height above sea; None where it was measured.
     Its deviation is part of `agl_std_m`."""
+
+    def __post_init__(self) -> None:
+        prior, below = self.prior, self.below
+        optional: dict[str, tuple[float | None, ...]] = {
+            "yaw_std_deg": (self.yaw_std_deg,),
+            "agl_std_m": (self.agl_std_m,),
+            "prior": () if prior is None else (prior.lat_deg, prior.lon_deg, prior.std_m),
+            "vel_en_mps": () if self.vel_en_mps is None else self.vel_en_mps,
+            "tilt_std_deg": (self.tilt_std_deg,),
+            "mount_std_deg": (self.mount_std_deg,),
+            "vel_std_mps": (self.vel_std_mps,),
+            "home_m": (self.home_m,),
+            "amsl_m": (self.amsl_m,),
+            "hae_m": (self.hae_m,),
+            "below": () if below is None else (below.height_m, below.std_m, below.known),
+        }
+        for name, values in optional.items():
+            if not all(value is None or math.isfinite(value) for value in values):
+                object.__setattr__(self, name, None)
 
     @property
     def horizon_std_deg(self) -> float | None:

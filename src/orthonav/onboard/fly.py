@@ -271,8 +271,6 @@ class Runner:
         outcome, latency_ms = self._placed(view, reported)
         self._tracked_ns = image.exposed_ns
         self._count("processed")
-        if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
-            self._count("internal_error")
         vehicle = self._with_altitude(vehicle, outcome, known)
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, reported, latency.std_s)
@@ -325,7 +323,9 @@ class Runner:
 
     def _placed(self, view: View, reported: Telemetry) -> tuple[Fix | NoFix, float]:
         try:
-            outcome, latency_ms = locate_view(self._locator, view)
+            outcome, latency_ms = locate_view(
+                self._locator, view, lambda: self._count("internal_error")
+            )
         except CameraError as error:  # ends `orthonav localize`, but must not end a flight
             return self._refusal("wrong_camera", "wrong_camera", str(error)), math.nan
         if isinstance(outcome, Fix):

@@ -3,6 +3,7 @@
 import logging
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -17,6 +18,7 @@ from orthonav.core.track import Model
 log = logging.getLogger(__name__)
 MAP_CHANGED = "map_file_changed"
 MAP_DAMAGED = "map_damaged"
+INTERNAL_ERROR = "internal_error"
 LEAST_TILT_DEG = 0.1
 
 
@@ -79,8 +81,11 @@ def model_of(mount: Mount) -> Model:
     )
 
 
-def locate_view(locator: Locator, view: View) -> tuple[Fix | NoFix, float]:
-    """Result of one view and the time taken in ms; an internal error becomes a `NoFix`.
+def locate_view(
+    locator: Locator, view: View, failed: Callable[[], None] = lambda: None
+) -> tuple[Fix | NoFix, float]:
+    """Result of one view and the time taken in ms; after an internal error dead reckoning or a
+    `NoFix`. `failed` is called at such an error.
 
     A map file that changed in place gives no position. Raises `CameraError`: it ends the flight.
     """
@@ -94,10 +99,16 @@ def locate_view(locator: Locator, view: View) -> tuple[Fix | NoFix, float]:
         outcome = NoFix(MAP_CHANGED, str(error))
     except MapFileError as error:  # a crafted part of the map, decoded for this view
         log.error("%s", error)
+        failed()
         outcome = passed_view(locator, view.telemetry, NoFix(MAP_DAMAGED, str(error)))
     except Exception as error:  # one view must not end a flight
         log.exception("view could not be processed")
+        failed()
         outcome = passed_view(locator, view.telemetry, _internal(error))
+    else:
+        outcome = finite(outcome)
+        if isinstance(outcome, NoFix) and outcome.reason == INTERNAL_ERROR:
+            failed()
     return finite(outcome), (time.perf_counter() - start) * 1e3
 
 
@@ -110,12 +121,12 @@ def passed_view(locator: Locator, telemetry: Telemetry, reason: NoFix) -> Fix | 
 
 
 def _internal(error: Exception) -> NoFix:
-    return NoFix("internal_error", f"{type(error).__name__}: {error}")
+    return NoFix(INTERNAL_ERROR, f"{type(error).__name__}: {error}")
 
 
 def finite(outcome: Fix | NoFix) -> Fix | NoFix:
     if isinstance(outcome, Fix) and not _is_finite(outcome):
-        return NoFix("internal_error", "the computed position is not finite")
+        return NoFix(INTERNAL_ERROR, "the computed position is not finite")
     return outcome
 
 

@@ -216,9 +216,9 @@ class Estimate:
     """The best cluster of hypotheses. Its arrays are not to be changed.
 
     `confidence`: probability of being within the radius asked for; `place_probability`: however
-    wide the cluster. Both are limited until the track is confirmed; `belief` is not. `recognized`:
-    probability that the last view showed the map there. `confirmed`: enough ground was recognized
-    lately. `followed`: from a confirmed track or a reported position."""
+    wide the cluster, and so no less. Both are limited until the track is confirmed; `belief` is
+    not. `recognized`: probability that the last view showed the map there. `confirmed`: enough
+    ground was recognized lately. `followed`: from a confirmed track or a reported position."""
 
     mean: Array
     covariance: Array
@@ -238,13 +238,15 @@ class Mixture:
         """`extent_en_m`: west, south, east, north of the map, on which the aircraft is."""
         self.model = model
         self._set_extent(extent_en_m)
-        self.hypotheses: list[Hypothesis] = []
+        self.hypotheses: list[Hypothesis] = []  # the likeliest first
+        self._is_split = False  # by a prediction, and not merged since
         self.elsewhere = 1.0
         self._state = State.SEARCHING
         self._blind = 0.0
         self._numbers = 0
         self._last: Hypothesis | None = None  # of the track, dead-reckoned since
-        self._ground = self._restored = 0.0  # new in this view; recognized against dead reckoning
+        self._against: Hypothesis | None = None  # the place that contradicts it, dead-reckoned too
+        self._ground = self._restored = 0.0  # new in this view; recognized there
 
     def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
         self._extent = np.array(extent_en_m)
@@ -256,6 +258,7 @@ class Mixture:
         """Continue between two views in another plane, on a map of this extent there."""
         self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
         self._last = None if self._last is None else moved(self._last, plane, other)
+        self._against = None if self._against is None else moved(self._against, plane, other)
         self._set_extent(extent_en_m)
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
@@ -275,7 +278,6 @@ class Mixture:
         if not self.hypotheses:
             self.start(mean_en_m, std_m)
             return
-        self._last = None  # what dead reckoning contradicts, other means confirm
         made, noise = [], np.eye(2) * std_m**2
         for each in self.hypotheses:
             spread = each.covariance[POSITION, POSITION] + noise
@@ -292,10 +294,14 @@ class Mixture:
                 )
             )
         # Belief elsewhere is spread over the map: its density at this position remains.
-        self.elsewhere /= self.area_m2
-        made += self._born_at(mean_en_m, std_m, START_SHARE * self.elsewhere)
-        self.elsewhere *= 1 - START_SHARE
-        self._merge(made)
+        elsewhere = self.elsewhere / self.area_m2
+        made += self._born_at(mean_en_m, std_m, START_SHARE * elsewhere)
+        self._merge(made, elsewhere * (1 - START_SHARE))
+        self._last = self._against = None  # what dead reckoning contradicts, other means confirm
+
+    def unrecognize(self) -> None:
+        """As if the last view had not shown the map anywhere."""
+        self.hypotheses = [replace(each, recognized=0.0) for each in self.hypotheses]
 
     def predict(
         self,
@@ -309,16 +315,20 @@ class Mixture:
         (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
-        self._ground = 1 - overlap
         made = []
         for each in self.hypotheses:
             for share, expected in self._predictions(each, *moves):
                 on_map = held_to_map(self.model, expected, self.area_m2)
                 made.append(self._from(each, on_map, each.share * share * stays))
-        if self._last is not None:
-            _, expected = max(self._predictions(self._last, *moves), key=lambda split: split[0])
-            self._last = self._from(self._last, held_to_map(self.model, expected, self.area_m2), 1)
-        self.hypotheses = made
+        singles = []
+        for one in (self._last, self._against):
+            if one is not None:
+                _, expected = max(self._predictions(one, *moves), key=lambda split: split[0])
+                one = self._from(one, held_to_map(self.model, expected, self.area_m2), 1)
+            singles.append(one)
+        made.sort(key=lambda each: -each.share)
+        self.hypotheses, (self._last, self._against), self._ground = made, singles, 1 - overlap
+        self._is_split = True
         self.elsewhere += (1 - stays) * (1 - self.elsewhere)
 
     def _predictions(
@@ -396,7 +406,7 @@ class Mixture:
             seen = tempered(self.model, mounts, areas_m2, reported, each, newness)
             made += self._updated(split, seen, found, ground, confirms)
             made += self._born(seen, confirms)
-        self._merge(made)
+        self._merge(made, self.elsewhere)
         shown = bool(self.hypotheses) and self.hypotheses[0].recognized >= RECOGNIZED
         confirmed = self._state is not State.SEARCHING
         self._blind = self._blind + newness if confirmed and not shown else 0.0
@@ -417,6 +427,8 @@ class Mixture:
         """The best cluster, None without hypotheses. Updates the state, except `between_views`."""
         if not self.hypotheses:
             return None
+        if self._is_split and not between_views:  # no update has followed the prediction
+            self._merge(self.hypotheses, self.elsewhere)
         best = self._best(radius_m)
         near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
         mean, covariance = moments(near)
@@ -430,13 +442,17 @@ class Mixture:
                 self._follow(near)
                 follows = True
                 self._last = self._reached(mean, covariance)
+            elif self._state is not State.COASTING:
+                self._against = None
         belief = sum(each.share for each in near)
         most = 1.0 if self._state is State.TRACKING else UNCONFIRMED
+        contradicted = self._last is not None and not self._last.followed
+        place = min(belief, UNCONFIRMED if contradicted else most, 1.0)
         return Estimate(
             mean,
             covariance,
-            min(confidence, most),
-            min(belief, most if self._last is None or self._last.followed else UNCONFIRMED),
+            min(confidence, place),
+            place,
             self._state,
             belief,
             seen,
@@ -446,14 +462,16 @@ class Mixture:
 
     def _reached(self, mean: Array, covariance: Array) -> Hypothesis:
         """The state of the track, or, where its dead reckoning contradicts it, the dead-reckoned
-        one with `followed=False`: until enough new ground is recognized (`RESTORED`)."""
+        one with `followed=False`: until enough new ground is recognized in one place (`RESTORED`),
+        without a loss of the track."""
         here = Hypothesis(1.0, mean, covariance, 0.0, 0, followed=True)
-        last = self._last or here
-        off, spread = (mean - last.mean)[POSITION], (last.covariance + covariance)[:2, :2]
-        self._restored += 0.0 if last.followed else self._ground
-        if off @ np.linalg.solve(spread, off) < REACHED or self._restored >= RESTORED:
-            self._restored = 0.0
+        last, against = self._last or here, self._against
+        known = against is not None and _is_reached(here, against)
+        self._restored = self._restored + self._ground if known else 0.0
+        if _is_reached(here, last) or self._restored >= RESTORED:
+            self._against = None
             return here
+        self._against = here
         return replace(last, followed=False)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
@@ -627,16 +645,22 @@ class Mixture:
             recognized=0.0,
         )
 
-    def _merge(self, made: list[Hypothesis]) -> None:
-        self.hypotheses = made
-        self._normalize()
-        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
-        self._normalize()
+    def _merge(self, made: list[Hypothesis], elsewhere: float) -> None:
+        left, elsewhere = _normalized(made, elsewhere)
+        left = merged(sorted(left, key=lambda each: -each.share))
+        self.hypotheses, self.elsewhere = _normalized(left, elsewhere)
+        self._is_split = False
 
-    def _normalize(self) -> None:
-        total = sum(each.share for each in self.hypotheses) + self.elsewhere
-        self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
-        self.elsewhere /= total
+
+def _is_reached(here: Hypothesis, last: Hypothesis) -> bool:
+    """Whether the aircraft can have come here by dead reckoning."""
+    off, spread = (here.mean - last.mean)[POSITION], (last.covariance + here.covariance)[:2, :2]
+    return bool(off @ np.linalg.solve(spread, off) < REACHED)
+
+
+def _normalized(made: list[Hypothesis], elsewhere: float) -> tuple[list[Hypothesis], float]:
+    total = sum(each.share for each in made) + elsewhere
+    return [replace(each, share=each.share / total) for each in made], elsewhere / total
 
 
 def _forgotten(sighted: float, ground: float) -> float:

@@ -118,9 +118,10 @@ class Tracker:
         self._heading_known = heading_known
         self.model, self._usual_model = model or Model(), model is None
         self._usual_scale = self._usual_model
+        self._usual_horizon_rad = self.model.horizon_rad
         self.mixture = Mixture(self.model, self._use(localizer))
         self._time_ns: int | None = None
-        self._predicted: Telemetry | None = None
+        self._predicted_ns: int | None = None  # a view predicted, but without an outcome so far
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
         self._velocity_variance, self._learnt_s = 0.0, 0.0
@@ -163,7 +164,9 @@ class Tracker:
         self._seen = []
         if refused is None:
             refused = self._update(view, overlap, ground)
-        return self._outcome(view.telemetry, refused)
+        outcome = self._outcome(view.telemetry, refused)
+        self._predicted_ns = None
+        return outcome
 
     def update(
         self,
@@ -214,10 +217,13 @@ class Tracker:
         return self.state.value
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
-        """The position by dead reckoning, at a view whose picture cannot be used for `reason`."""
+        """The position by dead reckoning, at a view whose picture cannot be used for `reason`, as
+        where `locate` raised an error."""
         self._seen = []
-        if telemetry is not self._predicted:  # else an error ended the view after its prediction
+        self.mixture.unrecognize()  # an error may have come after the places were found
+        if telemetry.time_ns != self._predicted_ns:  # else the error came after the prediction
             self._predict(None, telemetry)
+        self._predicted_ns = None
         return self._outcome(telemetry, reason)
 
     def smoothed_track(self) -> list[Fix | NoFix]:
@@ -283,34 +289,33 @@ class Tracker:
         return math.degrees(turn_rad) % 360 if off_m <= fix.radius_m else math.nan
 
     def _predict(self, view: View | None, telemetry: Telemetry) -> tuple[float, float]:
-        """Overlap with the view before, and the share that this cannot have shown, 0..1."""
+        """Overlap with the view before, and the share that this cannot have shown, 0..1.
+
+        Time, velocity and view change with the mixture: an error before leaves all as they were."""
         before, now = self._before, None
-        self._predicted = telemetry
         if view is not None and self._heading_known:
             bias, _ = self.mixture.bias()
             before = None if before is None else before.corrected(bias)
             now = self._odometry_view(view, before, bias)
         prior = telemetry.prior if self._use_prior or self._every_prior else None
         if self._usual_model and math.isfinite(telemetry.agl_m):
-            self._usual_model = False
+            self._usual_model = view is None  # as on the ground
             self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
-        if telemetry.horizon_std_deg is not None:
-            horizon = math.radians(telemetry.horizon_std_deg)
-            self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
+        tilt = telemetry.horizon_std_deg
+        horizon = self._usual_horizon_rad if tilt is None else math.radians(tilt)
+        self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
         if self._time_ns is None:
-            self._time_ns, self._before = telemetry.time_ns, now
             if prior is not None:
                 self.mixture.start(*self._position_of(prior))
+            self._stand(telemetry, None, now)
             return 0.0, 1.0
         seconds = (telemetry.time_ns - self._time_ns) / 1e9
         if not 0 < seconds < LONGEST_GAP_S:
             seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
-        self._time_ns = telemetry.time_ns
         noise = self._telemetry_noise(telemetry)
         velocity = self._reported_velocity(telemetry)
         expected = self._expected_displacement(seconds, velocity)
         moved = self._displacement(before, now, noise, expected)
-        self._before = now
         camera = None if moved is None else moved.displacement
         if camera is not None:
             self._learn_velocity(velocity, camera, seconds)
@@ -321,9 +326,18 @@ class Tracker:
             ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
         # An image that is not used makes no error independent.
         self.mixture.predict(seconds, velocity, camera, noise, 1.0 if view is None else 1 - ground)
+        self._stand(telemetry, velocity, now)
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
         return 0.0 if moved is None else moved.overlap, ground
+
+    def _stand(
+        self, telemetry: Telemetry, velocity: ReportedVelocity | None, view: OdometryView | None
+    ) -> None:
+        """What the next view is predicted from."""
+        self._time_ns = self._predicted_ns = telemetry.time_ns
+        self._velocity = None if velocity is None else velocity.now_en_mps
+        self._before = view
 
     def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
         """By the expected displacement or the largest usual speed."""
@@ -359,10 +373,9 @@ class Tracker:
     def _reported_velocity(self, telemetry: Telemetry) -> ReportedVelocity | None:
         """None where none is given."""
         before, reported = self._velocity, telemetry.vel_en_mps
-        self._velocity = None
         if reported is None or not np.isfinite(reported).all():
             return None
-        self._velocity = now = np.array(reported)
+        now = np.array(reported)
         std = telemetry.vel_std_mps
         if std is None or not std > 0:
             std = usual_velocity_std_mps(float(np.hypot(*now)))
