@@ -203,8 +203,11 @@ class Recorded:
         """Exposures and their views. `rule`: sets the deviations of the telemetry, given whether
         GNSS is on."""
         for exposure, telemetry in self.stated():
-            grey = _shown(area, exposure, cache / self.folder.name)
-            yield exposure, View(grey, CAMERA, rule(telemetry, exposure.phase == ON))
+            yield exposure, self.view(area, cache, exposure, rule(telemetry, exposure.phase == ON))
+
+    def view(self, area: Area, cache: Path, exposure: Exposure, telemetry: Telemetry) -> View:
+        """The view of an exposure; its picture is kept in a folder."""
+        return View(_shown(area, exposure, cache / self.folder.name), CAMERA, telemetry)
 
 
 def _give(buffer: TelemetryBuffer, time_ns: int, value: dict[str, float]) -> None:

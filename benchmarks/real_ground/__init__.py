@@ -1,0 +1,1 @@
+"""Views of real ground: relief, houses, trees, real lenses, recorded flights; and its gate."""

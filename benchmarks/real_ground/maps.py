@@ -1,0 +1,181 @@
+"""Maps of the rows, built by the path of `orthonav build --dem`, and the heights they are given."""
+
+import hashlib
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from lab.landscape import DEFAULT_DATES, generate_heights
+from lab.terrain import random_relief
+from numpy.typing import NDArray
+
+from benchmarks.scenes import DATA, SIDE_M, ortho
+from orthonav.core.localize import Localizer
+from orthonav.core.mapfile import open_map
+from orthonav.ground.build import BuildRequest, build_map
+
+ROOT = Path(__file__).resolve().parents[2]
+TRUE_POSTING_M, COARSE_POSTING_M = 2.0, 30.0
+"""Of the relief that views show, and of a terrain model such as Copernicus GLO-30."""
+COARSE_STD_M, COARSE_LENGTH_M = 4.0, 150.0
+"""Error of that terrain model: standard deviation, and distance at which its correlation is 1/e."""
+SHORTEST_M, WIDEST_M = 100.0, 6000.0
+"""Wavelengths of the relief."""
+BASE_M = 200.0
+BARE, FLAT, COARSE, SURFACE = "bare", "flat", "coarse", "surface"
+RELIEF_IS_STATED = "relief" in {each.name for each in fields(BuildRequest)}
+"""Whether a build without terrain can say what the land is like."""
+Heights = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Map:
+    """A map to be built.
+
+    - `ortho`: orthophoto as `scenes.ortho` takes it, or `scaled:GSD:NAME`.
+    - `ground`: one of `BARE` to `SURFACE` of `relief`, or a file of heights below `DATA`; None: the
+      map has no terrain.
+    - `relief`: root mean square slope of the ground in per cent; None: the ground is not rendered.
+    - `land`: what the build says of land without terrain; None: nothing.
+    - `datum`: of the heights; None: the file states it.
+    """
+
+    ortho: str
+    ground: str | None = None
+    relief: float | None = None
+    land: str | None = None
+    datum: str | None = "msl"
+
+    def path(self, work: Path) -> Path:
+        name = hashlib.sha256(repr(self).encode()).hexdigest()[:10]
+        return work / f"maps-{code()}" / f"{Path(self.ortho.replace(':', '-')).stem}-{name}.onav"
+
+    def build(self, work: Path) -> None:
+        """Build the map unless the same code has built it."""
+        out = self.path(work)
+        if not out.is_file():
+            out.parent.mkdir(parents=True, exist_ok=True)
+            more: dict[str, Any] = {} if self.land is None else {"relief": self.land}
+            if self.ground is not None:
+                more |= {"dem": self.heights(work), "dem_datum": self.datum}
+            build_map(BuildRequest([found(self.ortho, work)], out, **more))
+
+    def heights(self, work: Path) -> Path:
+        """File of the heights that the map is given."""
+        assert self.ground is not None
+        if self.relief is None:
+            return found(self.ground, work)
+        if self.ortho.startswith("generated:"):
+            return landscape_heights(self.ortho, work, self.relief, self.ground)
+        return relief_file(self.ortho, work, self.relief, self.ground)
+
+    def localizer(self, work: Path) -> Localizer:
+        return Localizer(open_map(self.path(work)))
+
+
+def found(name: str, work: Path) -> Path:
+    """The file of a name as `scenes.ortho` takes it, or `scaled:GSD:NAME`."""
+    return scaled_copy(name, work) if name.startswith("scaled:") else ortho(name, work)
+
+
+@cache
+def code() -> str:
+    """Digest of the code of orthonav: maps and rows of other code are not taken for those of it."""
+    digest = hashlib.sha256()
+    for path in sorted((ROOT / "src" / "orthonav").rglob("*")):
+        if path.suffix in (".py", ".so", ".toml"):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:10]
+
+
+def fractal_relief(shape: tuple[int, int], posting_m: float, slope: float, seed: int) -> Heights:
+    """Heights (H, W) whose gradient is `slope` (root mean square). The hills are as steep at every
+    wavelength from `SHORTEST_M` to `WIDEST_M`."""
+    side = max(*shape, round(WIDEST_M / posting_m))
+    made = random_relief((side, side), posting_m, 1.0, SHORTEST_M, seed)[: shape[0], : shape[1]]
+    steep = np.sqrt(sum(np.mean(part**2) for part in np.gradient(made, posting_m)))
+    return np.asarray(made * np.float32(slope / steep) + np.float32(BASE_M), np.float32)
+
+
+def coarse_of(heights: Heights, posting_m: float, seed: int) -> Heights:
+    """The heights at `COARSE_POSTING_M`, with the error of such a terrain model."""
+    factor = posting_m / COARSE_POSTING_M
+    size = tuple(max(2, round(side * factor)) for side in heights.shape[::-1])
+    small = cv2.resize(heights, size, interpolation=cv2.INTER_AREA)
+    pad = 16
+    noise = np.random.default_rng(seed).standard_normal((size[1] + 2 * pad, size[0] + 2 * pad))
+    # Noise blurred by s has the correlation exp(-d^2 / (4 s^2)).
+    error = cv2.GaussianBlur(noise, (0, 0), COARSE_LENGTH_M / COARSE_POSTING_M / 2)
+    error *= COARSE_STD_M / error.std()
+    return np.asarray(small + error[pad:-pad, pad:-pad], np.float32)
+
+
+def relief_file(name: str, work: Path, slope: float, kind: str) -> Path:
+    """Heights over an orthophoto, in its coordinate system: the relief itself (`BARE`), or a
+    terrain model of it."""
+    out = work / f"{Path(name).stem}-relief{slope:g}-{kind}.tif"
+    if out.is_file():
+        return out
+    with rasterio.open(found(name, work)) as source:
+        bounds, crs = source.bounds, source.crs
+    width_m, height_m = bounds.right - bounds.left, bounds.top - bounds.bottom
+    # Whole cells of the coarse terrain, and some beyond the imagery.
+    cols, rows = (int(side // COARSE_POSTING_M) + 5 for side in (width_m, height_m))
+    factor = round(COARSE_POSTING_M / TRUE_POSTING_M)
+    shape = rows * factor, cols * factor
+    if kind == FLAT:
+        made, posting_m = np.full((rows, cols), BASE_M, np.float32), COARSE_POSTING_M
+    else:
+        made, posting_m = fractal_relief(shape, TRUE_POSTING_M, slope / 100, 1), TRUE_POSTING_M
+    if kind == COARSE:
+        made, posting_m = coarse_of(made, posting_m, 2), COARSE_POSTING_M
+    corner = bounds.left - 2 * COARSE_POSTING_M, bounds.top + 2 * COARSE_POSTING_M
+    return written(out, made, rasterio.Affine(posting_m, 0, corner[0], 0, -posting_m, corner[1]), crs)
+
+
+def written(out: Path, heights: Heights, transform: Any, crs: Any) -> Path:
+    """Heights above the sea as a GeoTIFF."""
+    rows, cols = heights.shape
+    about = {"driver": "GTiff", "count": 1, "dtype": "float32", "compress": "deflate"}
+    part = out.with_suffix(".part.tif")
+    with rasterio.open(
+        part, "w", width=cols, height=rows, crs=crs, transform=transform, **about
+    ) as target:
+        target.write(heights, 1)
+        target.update_tags(ORTHONAV_VERTICAL_DATUM="msl")
+    return part.replace(out)
+
+
+def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
+    """Heights under generated imagery: `BARE`, or the `SURFACE` of the date of the name."""
+    _, seed, date = name.split(":")
+    folder = work / f"area-{seed}-{SIDE_M}m-1m-hills{slope:g}"
+    path = folder / ("dem.tif" if kind == BARE else f"{date}_dsm.tif")
+    if not path.is_file():
+        dates = [each for each in DEFAULT_DATES if each.name == date]
+        size_m = (float(SIDE_M), float(SIDE_M))
+        generate_heights(folder, slope=slope / 100, size_m=size_m, dates=dates, seed=int(seed))
+    return path
+
+
+def scaled_copy(name: str, work: Path) -> Path:
+    """A copy of imagery whose scale is a stand-in, at another one: `scaled:GSD:NAME`."""
+    _, gsd, source_name = name.split(":")
+    out = work / f"{Path(source_name).parent.name}-{Path(source_name).stem}-{gsd}m.tif"
+    if out.is_file():
+        return out
+    with rasterio.open(DATA / source_name) as source:
+        profile, bands = source.profile, source.read()
+        mask, step = source.dataset_mask(), source.transform
+    scale = float(gsd) / step.a
+    profile["transform"] = rasterio.Affine(float(gsd), 0, step.c, 0, step.e * scale, step.f)
+    part = out.with_suffix(".part.tif")
+    with rasterio.open(part, "w", **profile) as target:
+        target.write(bands)
+        if profile.get("nodata") is None:
+            target.write_mask(mask)
+    return part.replace(out)

@@ -1,0 +1,180 @@
+"""The rows: which views on which map, single or tracked."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from benchmarks.closed_loop.replays import flights
+from benchmarks.real_ground.maps import (
+    BARE,
+    COARSE,
+    FLAT,
+    RELIEF_IS_STATED,
+    SURFACE,
+    Map,
+)
+from benchmarks.real_ground.score import Row, placed
+from benchmarks.real_ground.views import OverLevel, OverRelief, Recording, Replay
+from benchmarks.scenes import DATA, PAST, PRESENT, SCENES, Pair
+from orthonav.cli.demo import IMAGERY
+from orthonav.core.track.tracker import Tracker
+from orthonav.onboard.run import Locator, SingleViews
+
+PARTS = ("flights", "replays", "oblique", "relief", "lens", "mapping", "steady")
+ARROIO_STD_M = 5.0
+"""The truth is good to 7 to 10 m (README of the data): 5 to 7 m per axis. The smaller, so that the
+error of the truth hides less of the localizer's."""
+TAICHUNG_STD_M = 4.0
+"""GNSS of a small drone (2 to 3 m per axis) and map corners good to 5 m."""
+TILTED_STD_M, TILTED_GROUND_STD_M = 2.5, 0.5
+"""By registration and PnP: 2 to 3 m, the ground in the middle 0.5 m (README of the data)."""
+SUBURB_GSD_M = 0.52
+"""At this scale 256 px are seen from 133 m; the nominal scale of the imagery is a stand-in."""
+SUBURB = "2020_03", "2009_04"
+SLOPES = (2.0, 5.0, 10.0)
+LAND = {2.0: "level", 5.0: "rolling", 10.0: "hills"}
+
+
+AnySource = OverRelief | OverLevel | Recording | Replay
+
+
+@dataclass(frozen=True)
+class Question:
+    """One row of the table.
+
+    `legs`: maps with their views; several where each picture has a map of its own. `prior`: whether
+    single views use that of the telemetry.
+    """
+
+    name: str
+    part: str
+    legs: tuple[tuple[Map, AnySource], ...]
+    tracked: bool = False
+    prior: bool = False
+
+    def measured(self, work: Path, views: int) -> Row:
+        """Place the views of all legs."""
+        found = Row([], [])
+        for built, source in self.legs:
+            localizer = built.localizer(work)
+            locator: Locator = SingleViews(localizer, use_prior=self.prior)
+            if self.tracked:
+                locator = Tracker(localizer)
+            seen = source.seen(work, localizer, views, self.tracked)
+            found += placed(locator, seen, localizer.sheet.frame, source.std_m)
+        return found
+
+
+def questions() -> list[Question]:
+    """All rows whose imagery is there, those of real flights first."""
+    made = [*_flights(), *_replays(), *_oblique(), *_relief(), *_lens(), *_steady()]
+    return [each for each in made if all(_is_there(*leg) for leg in each.legs)]
+
+
+def _is_there(built: Map, source: AnySource) -> bool:
+    """Whether the files of a leg are there, or are generated."""
+    views = source.pair.views if isinstance(source, OverRelief | OverLevel) else source.name
+    if isinstance(source, Replay):
+        views = f"closed_loop/{views}"
+    names = [each.rpartition(":")[2] for each in (built.ortho, views) if "generated:" not in each]
+    return all((DATA / name).exists() for name in names)
+
+
+def both(name: str, part: str, *legs: tuple[Map, AnySource]) -> Iterator[Question]:
+    """Single views and a track."""
+    yield Question(f"{name}, single", part, legs)
+    yield Question(f"{name}, tracked", part, legs, tracked=True)
+
+
+def _flights() -> Iterator[Question]:
+    for month in ("2014-01", "2014-03"):
+        flown = Recording("arroio_drone_1", ARROIO_STD_M)
+        yield from both(f"arroio on {month}", "flights", (Map(f"arroio_maps/{month}.tif"), flown))
+    taichung = Recording("taichung_drone", TAICHUNG_STD_M)
+    yield from both("taichung", "flights", (Map("taichung_drone/map.tif"), taichung))
+    tilted = Recording("tilted_mount", TILTED_STD_M)
+    ground = Recording("tilted_mount", TILTED_GROUND_STD_M, "truth_ground.csv", of_ground=True)
+    on = Map("tilted_mount/map.tif")
+    yield from both("tilted_mount", "flights", (on, tilted))
+    yield Question("tilted_mount, middle of the picture", "flights", ((on, ground),))
+
+
+def _replays() -> Iterator[Question]:
+    on = Map(str(IMAGERY / f"{PAST}.tif"))
+    for flight in (each.name for each in flights()):
+        for with_stds in (False, True):
+            name = f"{flight}, {'deviations stated' if with_stds else 'nothing stated'}"
+            leg = on, Replay(flight, with_stds)
+            single, tracked = both(name, "replays", leg)
+            yield from (replace(single, prior=True), tracked)
+
+
+def _oblique() -> Iterator[Question]:
+    files = {"no terrain": None, "bare earth": "bare_earth.tif", "surface": "surface.tif"}
+    for kind, file in files.items():
+        ground = None if file is None else f"oblique_surface/{file}"
+        legs = tuple(
+            (
+                Map(f"oblique_surface/map_for_{number}.tif", ground),
+                Recording("oblique_surface", 0.0, only=number),
+            )
+            for number in ("0136", "0142")
+        )
+        yield Question(f"oblique_surface, {kind}", "oblique", legs)
+
+
+def _grounds(name: str, slope: float) -> Iterator[tuple[str, Map]]:
+    """Maps over relief, by what they know of it."""
+    yield "no terrain", Map(name, relief=slope)
+    if RELIEF_IS_STATED and slope in LAND:
+        yield f"no terrain, {LAND[slope]}", Map(name, relief=slope, land=LAND[slope])
+    if name.startswith("generated:"):
+        kinds = {"bare earth": BARE, "surface": SURFACE}
+    else:
+        kinds = {"30 m terrain": COARSE, "bare earth": BARE}
+    for kind, ground in kinds.items():
+        yield kind, Map(name, ground, slope)
+
+
+def _relief() -> Iterator[Question]:
+    szada = SCENES["szada_mosaic"].pair("szada_mosaic_a", "szada_mosaic_b")
+    naip = SCENES["naip"].pair("20090818", "20180716")
+    lab = SCENES["generated_31"].pair(PAST, PRESENT)
+    cases = [(szada, slope) for slope in SLOPES] + [(naip, 5.0), (lab, 5.0)]
+    for pair, slope in cases:
+        for tilt, stated in ((0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)):
+            told = "" if stated is None else f" stated {stated:g}"
+            for ground, on in _grounds(pair.map, slope):
+                source = OverRelief(pair, slope, tilt, stated)
+                name = f"{pair.scene} {slope:g} %, tilt {tilt:g}{told}, {ground}"
+                yield Question(name, "relief", ((on, source),))
+    flat = Map(szada.map, FLAT, 0.0)
+    for tilt in (0.0, 3.0):
+        leg = flat, OverLevel(szada, tilt)
+        yield Question(f"{szada.scene} flat, tilt {tilt:g}, flat terrain", "relief", (leg,))
+
+
+def _lens() -> Iterator[Question]:
+    szada = SCENES["szada_mosaic"].pair("szada_mosaic_a", "szada_mosaic_b")
+    for slope in (0.0, 5.0):
+        for tilt, stated in ((0.0, None), (0.0, 0.5), (3.0, None)):
+            told = "" if stated is None else f" stated {stated:g}"
+            for ground, kind in (("no terrain", None), ("bare earth", BARE)):
+                source = OverRelief(szada, slope, tilt, stated, nominal=True)
+                name = f"nominal lens, {slope:g} %, tilt {tilt:g}{told}, {ground}"
+                leg = Map(szada.map, kind, None if kind is None else slope), source
+                yield Question(name, "lens", (leg,))
+
+
+def _steady() -> Iterator[Question]:
+    naip = SCENES["naip"]
+    for date in ("20120731", "20180716"):
+        pair = naip.pair("20090818", date)
+        for stated in (None, 0.5):
+            told = "default" if stated is None else f"tilt stated {stated:g}"
+            leg = Map(pair.map), OverLevel(pair, 0.0, stated)
+            yield Question(f"naip {date}, steady, {told}", "steady", (leg,))
+    past, present = (f"scaled:{SUBURB_GSD_M}:scenes/garching/{d}.tif" for d in SUBURB)
+    suburb = Pair("garching", past, present, SUBURB_GSD_M)
+    leg = Map(past), OverLevel(suburb, 3.0)
+    yield Question("garching from 133 m, tilt 3", "steady", (leg,))

@@ -1,0 +1,145 @@
+"""What a row says: errors of confident fixes, and whether what they state is true."""
+
+import math
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.record import number
+from benchmarks.scenes import FAR_M
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.integrity import protection_level_m
+from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, View
+from orthonav.onboard.run import Locator, locate_view
+
+RISK = 0.001
+HEADER = (
+    *("row", "views", "confident %", "of right %", "median m", "95 % m", "stated sd m"),
+    *("NEES", "NEES median", "PL exceeded", "false", "ms"),
+)
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A view and the truth.
+
+    - `latlon_deg`: of the camera; of the ground in the middle of the picture if `of_ground`.
+    - `height_m`: of the camera above ground.
+    - `judged`: whether it counts; others only lead a track to those that do.
+    """
+
+    view: View
+    latlon_deg: tuple[float, float]
+    height_m: float
+    judged: bool = True
+    of_ground: bool = False
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A fix against the truth; `level_m`: its protection level at `RISK`."""
+
+    confident: bool
+    error_m: float
+    wrong: bool
+    variance_m2: float
+    nees: float
+    level_m: float
+
+
+def placed(locator: Locator, seen: Iterable[Seen], frame: LocalFrame, std_m: float) -> "Row":
+    """Places views in order. `std_m`: error of the truth per axis."""
+    found: list[Placed] = []
+    times_ms: list[float] = []
+    for each in seen:
+        if not times_ms and locator.state_name is None:
+            locate_view(locator, each.view)  # the first view prepares the map
+        start = time.process_time()
+        outcome, _ = locate_view(locator, each.view)
+        took_ms = 1e3 * (time.process_time() - start)
+        if each.judged:
+            times_ms.append(took_ms)
+            found += compared(outcome, each, frame, std_m)
+    return Row(found, times_ms)
+
+
+def compared(outcome: Fix | NoFix, each: Seen, frame: LocalFrame, std_m: float) -> list[Placed]:
+    """The fix against the truth; nothing where there is none."""
+    if not isinstance(outcome, Fix):
+        return []
+    place, cov = (outcome.lat_deg, outcome.lon_deg), outcome.cov_en_m2
+    if each.of_ground:
+        if outcome.ground_latlon_deg is None or outcome.ground_cov_en_m2 is None:
+            return []
+        place, cov = outcome.ground_latlon_deg, outcome.ground_cov_en_m2
+    off = frame.en_from_latlon(*place) - frame.en_from_latlon(*each.latlon_deg)
+    total, error_m = cov + std_m**2 * np.eye(2), float(np.hypot(*off))
+    return [
+        Placed(
+            confident=outcome.is_confident,
+            error_m=error_m,
+            wrong=error_m > max(FAR_M, RADIUS_SHARE * each.height_m),
+            variance_m2=float(np.trace(cov)) / 2,
+            nees=float(off @ np.linalg.solve(total, off)),
+            level_m=protection_level_m(outcome.right_probability, total, RISK),
+        )
+    ]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Fixes of one row, and the processor's time of all its views."""
+
+    found: list[Placed]
+    times_ms: list[float]
+
+    def __add__(self, other: "Row") -> "Row":
+        return Row(self.found + other.found, self.times_ms + other.times_ms)
+
+    def values(self) -> dict[str, float | None]:
+        """The numbers of the row, as JSON; None where nothing is confident."""
+        sure = [each for each in self.found if each.confident]
+        right = [each for each in self.found if not each.wrong]
+        views = len(self.times_ms)
+
+        def of(name: str) -> Array:
+            return np.array([getattr(each, name) for each in sure], np.float64)
+
+        found: dict[str, float | None] = {
+            "views": views,
+            "confident": len(sure) / max(views, 1),
+            "of_right": sum(each.confident for each in right) / max(len(right), 1),
+            "exceeded": sum(each.error_m > each.level_m for each in sure),
+            "bounded": sum(math.isfinite(each.level_m) for each in sure),
+            "false": sum(each.wrong for each in sure),
+            "ms": float(np.median(self.times_ms)) if views else None,
+        }
+        made = {
+            "median_m": lambda: np.median(of("error_m")),
+            "p95_m": lambda: np.percentile(of("error_m"), 95),
+            "std_m": lambda: np.sqrt(of("variance_m2").mean()),
+            "nees": lambda: of("nees").mean(),
+            "nees_median": lambda: np.median(of("nees")),
+        }
+        return found | {name: float(value()) if sure else None for name, value in made.items()}
+
+
+def cells(name: str, values: dict[str, Any]) -> list[str]:
+    """Values of a row as cells under `HEADER`."""
+
+    def text(key: str) -> str:
+        return "-" if values[key] is None else number(values[key])
+
+    return [
+        *(name, str(values["views"])),
+        *(f"{100 * values['confident']:.0f}", f"{100 * values['of_right']:.0f}"),
+        *(text(key) for key in ("median_m", "p95_m", "std_m", "nees", "nees_median")),
+        f"{values['exceeded']} of {values['bounded']}",
+        str(values["false"]),
+        text("ms"),
+    ]

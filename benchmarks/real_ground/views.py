@@ -1,0 +1,258 @@
+"""Where the views of a row come from: rendered over relief, of flat ground, or recorded."""
+
+import argparse
+import csv
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count as numbers
+from pathlib import Path
+
+import cv2
+import numpy as np
+from lab.terrain import seen_view
+from numpy.typing import NDArray
+
+from benchmarks.closed_loop.replays import OFF, ON, Area, Recorded, plain, stated
+from benchmarks.judged_views import is_covered
+from benchmarks.placing import views_in
+from benchmarks.real_ground.maps import BARE, SURFACE, Map, found, landscape_heights, relief_file
+from benchmarks.real_ground.score import Seen
+from benchmarks.scenes import DATA, Pair, root_agl_of
+from benchmarks.unreported_tilt import Flown, level_telemetry, tilted_views
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.geo.camera import FOV_STD, Camera
+from orthonav.core.localize import Localizer
+from orthonav.core.records import Telemetry, View
+from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.imagery.terrain import open_dem
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA
+from orthonav.ground.simulate.render import Raster, ViewEffects, degraded
+
+SEED, WIDTH_PX = 1, 256
+MIDDLE_STD, BARREL_STD = 0.01, 0.03
+"""Errors of a nominal lens beside that of its focal length (`FOV_STD`): the principal point as a
+share of the width, and k1."""
+CAMERA, EFFECTS = DEFAULT_CAMERA.fitted(640, 480), ViewEffects()
+LEAD = 50  # views with GNSS before a track is judged
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OverRelief:
+    """Views rendered over relief, or over the surface of generated ground.
+
+    - `pair`: imagery of the map and of the views. `slope`: of the relief, per cent.
+    - `tilt_std_deg`: of the true pitch and roll, reported as 0; `stated_deg`: the deviation that is
+      reported with them.
+    - `nominal`: whether the lens is known by its field of view only.
+    """
+
+    pair: Pair
+    slope: float
+    tilt_std_deg: float = 0.0
+    stated_deg: float | None = None
+    nominal: bool = False
+    std_m: float = 0.0
+
+    def pictures(self) -> str:
+        """Name of the folder of pictures, which rows share."""
+        lens = "-nominal" if self.nominal else ""
+        name = self.pair.name.replace(" ", "").replace(">", "-")
+        return f"{name}-{self.slope:g}-{self.tilt_std_deg:g}{lens}"
+
+    def prepare(self, work: Path, base: Localizer, views: int) -> None:
+        """Render the pictures."""
+        for _ in self.seen(work, base, views, False):
+            pass
+
+    def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
+        folder = work / f"pictures-{self.pictures()}"
+        folder.mkdir(parents=True, exist_ok=True)
+        rasters: tuple[Raster, Raster] | None = None
+        heights = open_dem(self._heights(work))
+        for number in range(views):
+            rng = np.random.default_rng([SEED, number])
+            true, place = self._pose(base, rng)
+            lens, camera = self._lens(rng)
+            lat, lon = base.sheet.frame.latlon_from_en(place)
+            path = folder / f"{number:04d}.png"
+            if not path.is_file():
+                rasters = rasters or self._rasters(work, base)
+                above = float(heights(lat[None], lon[None])[0]) + true.agl_m
+                attitude = true.yaw_deg, true.pitch_deg, true.roll_deg
+                position = np.array([*place, above])
+                grey, _ = seen_view(*rasters, lens, attitude, position, 1)
+                part = folder / f"{number:04d}.part.png"
+                seen = degraded(cv2.merge([grey, grey, grey]), EFFECTS, rng)
+                cv2.imwrite(str(part), seen[..., 0])
+                part.replace(path)
+            grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+            level = level_telemetry(true, np.random.default_rng([SEED, number, 1]))
+            reported = replace(level, tilt_std_deg=self.stated_deg)
+            yield Seen(View(grey, camera, reported), (float(lat), float(lon)), true.agl_m)
+
+    def _heights(self, work: Path) -> Path:
+        if self.pair.views.startswith("generated:"):
+            return landscape_heights(self.pair.views, work, self.slope, SURFACE)
+        return relief_file(self.pair.map, work, self.slope, BARE)
+
+    def _rasters(self, work: Path, base: Localizer) -> tuple[Raster, Raster]:
+        """Imagery of the later date and heights, in the plane of the map."""
+        grid, frame = base.grid, base.sheet.frame
+        size = grid.width_px, grid.height_px
+        sheet = Mosaic.open([found(self.pair.views, work)]).sheet(
+            frame, west_m=grid.west_m, north_m=grid.north_m, width_px=size[0], height_px=size[1],
+            gsd_m=grid.gsd_m,
+        )  # fmt: skip
+        with sheet as raster:
+            grey = raster.read_grey(0, 0, *size).grey.astype(np.float32)
+        posting_m = min(2.0, grid.gsd_m)
+        cols, rows = (math.ceil(side * grid.gsd_m / posting_m) for side in size)
+        dem = open_dem(self._heights(work))
+        heights = dem.in_plane(frame, grid.west_m, grid.north_m, posting_m, rows, cols)
+        heights = np.where(np.isfinite(heights), heights, np.nanmean(heights))
+        corner = grid.west_m, grid.north_m
+        return Raster(grey, *corner, grid.gsd_m), Raster(
+            heights.astype(np.float32), *corner, posting_m
+        )
+
+    def _pose(self, base: Localizer, rng: np.random.Generator) -> tuple[Telemetry, Array]:
+        """A true pose whose view lies on the imagery of the map."""
+        assert base.registration is not None
+        grid = base.grid
+        agl_m = root_agl_of(WIDTH_PX, grid.gsd_m)
+        while True:
+            share = rng.uniform(0, 1, 2)
+            place = np.array(
+                [
+                    grid.west_m + share[0] * grid.width_px * grid.gsd_m,
+                    grid.north_m - share[1] * grid.height_px * grid.gsd_m,
+                ]
+            )
+            yaw, (pitch, roll) = float(rng.uniform(0, 360)), rng.normal(0, 1, 2).tolist()
+            latlon = tuple(float(v) for v in base.sheet.frame.latlon_from_en(place))
+            if is_covered(base.registration, latlon, WIDTH_PX):
+                tilt = pitch * self.tilt_std_deg, roll * self.tilt_std_deg
+                return Telemetry(0, yaw, *tilt, agl_m), place
+
+    def _lens(self, rng: np.random.Generator) -> tuple[Camera, Camera]:
+        """The lens of a view, and as the localizer knows it."""
+        nominal = CAMERA
+        focal, east, south, barrel = rng.normal(0, [FOV_STD, MIDDLE_STD, MIDDLE_STD, BARREL_STD])
+        if not self.nominal:
+            return nominal, nominal
+        lens = replace(
+            nominal,
+            fx_px=nominal.fx_px * (1 + focal),
+            fy_px=nominal.fy_px * (1 + focal),
+            cx_px=nominal.cx_px + east * nominal.width_px,
+            cy_px=nominal.cy_px + south * nominal.width_px,
+            distortion=(barrel, 0.0, 0.0, 0.0),
+        )
+        return lens, replace(nominal, focal_std=FOV_STD)
+
+
+@dataclass(frozen=True)
+class OverLevel:
+    """Views of flat ground whose true tilt is not reported, as of `unreported_tilt`."""
+
+    pair: Pair
+    tilt_std_deg: float
+    stated_deg: float | None = None
+    std_m: float = 0.0
+
+    def pictures(self) -> str:
+        return f"level-{self.pair.name}-{self.tilt_std_deg:g}"
+
+    def prepare(self, work: Path, base: Localizer, views: int) -> None:
+        next(self._flown(work, base, views))
+
+    def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
+        for each in self._flown(work, base, views):
+            latlon = tuple(float(v) for v in base.sheet.frame.latlon_from_en(each.camera_en_m))
+            reported = replace(each.view.telemetry, tilt_std_deg=self.stated_deg)
+            yield Seen(replace(each.view, telemetry=reported), latlon, each.true.agl_m)
+
+    def _flown(self, work: Path, base: Localizer, views: int) -> Iterator[Flown]:
+        pair = self.pair
+        if pair.views.startswith("scaled:"):
+            pair = replace(pair, views=str(found(pair.views, work)))
+        options = argparse.Namespace(work=work, seed=SEED)
+        return tilted_views(pair, WIDTH_PX, self.tilt_std_deg, base, views, options)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A flight folder of real pictures. Single views are spread over it, a track takes `track`
+    times as many from `first` on.
+
+    `truth`: file of the true positions, of the ground in the middle with `of_ground`. `only`: of
+    these frames only.
+    """
+
+    name: str
+    std_m: float
+    truth: str = "truth.csv"
+    of_ground: bool = False
+    only: str = ""
+    track: int = 5
+    first: int = 0
+
+    def pictures(self) -> str:
+        return ""  # they are there
+
+    def prepare(self, work: Path, base: Localizer, views: int) -> None:
+        """Nothing."""
+
+    def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
+        flight, truth = open_flight(DATA / self.name), read_truth(DATA / self.name / self.truth)
+        flown = [each for each in flight.views if each.frame in truth and self.only in each.frame]
+        if tracked:
+            flown = flown[self.first : self.first + self.track * views]
+        else:
+            flown = flown[:: max(1, math.ceil(len(flown) / views))]
+        for each in flown:
+            view = View(each.grey(), flight.camera, each.telemetry)
+            height_m = each.telemetry.agl_m
+            yield Seen(view, truth[each.frame], height_m, of_ground=self.of_ground)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A recorded flight of an autopilot, judged after GNSS is off and before any disturbance; the
+    track begins with GNSS. `with_stds`: whether the telemetry states deviations."""
+
+    name: str
+    with_stds: bool
+    std_m: float = 0.0
+    step: int = 5
+
+    def pictures(self) -> str:
+        return self.name
+
+    def prepare(self, work: Path, base: Localizer, views: int) -> None:
+        for _ in self.seen(work, base, views, True):
+            pass
+
+    def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
+        recorded, area = Recorded(DATA / "closed_loop" / self.name), Area.demo(work)
+        area.__dict__["localizer"] = base  # the same area; its own map would be built once more
+        autopilot = self.name.partition("_")[0]
+        rule = partial(stated if self.with_stds else plain, autopilot)
+        alone = numbers()
+        aided = [each.number for each in recorded.exposures if each.phase == ON]
+        kept = set(aided[-LEAD:] if tracked else [])
+        for exposure in recorded.exposures:
+            if exposure.phase == OFF:
+                at = next(alone)
+                if at < self.step * views and (tracked or at % self.step == 0):
+                    kept.add(exposure.number)
+        for exposure, telemetry in recorded.stated():
+            if exposure.number not in kept or telemetry.missing():
+                continue
+            reported = rule(telemetry, exposure.phase == ON)
+            view = recorded.view(area, work / "views", exposure, reported)
+            place = exposure.lat_deg, exposure.lon_deg
+            yield Seen(view, place, exposure.agl_m, judged=exposure.phase == OFF)
