@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from maps import arrays, manifest
 
 from orthonav.core.errors import MapFileError
+from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.mapfile import open_map, write_map
-from orthonav.core.mapfile.manifest import TerrainInfo
+from orthonav.core.mapfile.manifest import SheetInfo, TerrainInfo
 from orthonav.core.mapfile.terrain import (
     TerrainLayer,
     decode_terrain,
@@ -138,12 +139,38 @@ def test_a_damaged_chunk_is_an_error(tmp_path, name):
         {"unit_m": 0.01, "high_m": 800.0, "low_m": 100.0},
         {"known": ROWS * COLS + 1},
         {"west_m": 1e9},
+        {"source_posting_m": 0.0},
+        {"source_posting_m": 1e6},
+        {"roughness_m": -0.1},
+        {"roughness_m": 1001.0},
     ],
 )
 def test_impossible_layers_are_refused(tmp_path, change):
     path = write(tmp_path / "a.onav", info=replace(INFO, **change))
     with pytest.raises(MapFileError, match="impossible terrain layer"):
         open_map(path)
+
+
+def test_what_the_source_was_like_is_optional(tmp_path):
+    finer = replace(INFO, source_posting_m=0.5, roughness_m=2.75)
+    assert TerrainInfo.from_plain(finer.to_plain()) == finer
+    older = INFO.to_plain()
+    assert "roughness_m" not in older and "source_posting_m" not in older
+    assert TerrainInfo.from_plain(older) == INFO
+    for value in (float("nan"), "2", True):
+        with pytest.raises(MapFileError, match="roughness_m must be a finite number"):
+            TerrainInfo.from_plain(older | {"roughness_m": value})
+
+
+def test_relief_is_stated_or_not(tmp_path):
+    plain = manifest().sheets[0]
+    assert "relief" not in plain.to_plain()
+    for relief in (None, *RELIEF_SLOPES):
+        stated = replace(plain, relief=relief)
+        assert SheetInfo.from_plain(stated.to_plain()) == stated
+    for value in ("steep", 3, ["level"]):
+        with pytest.raises(MapFileError, match="relief"):
+            SheetInfo.from_plain(plain.to_plain() | {"relief": value})
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,9 @@ TerrainHeights = Callable[[Array, Array], Array]
 """Of latitudes and longitudes (deg): heights above mean sea level (m), NaN where unknown."""
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Heights above mean sea level: the Dead Sea is at -430 m, Mount Everest at 8,849."""
+RELIEF_SLOPES = {"level": 0.01, "rolling": 0.05, "hills": 0.12}
+"""RMS gradient of ground whose heights are unknown, by what a map says of it."""
+DEFAULT_RELIEF = "rolling"
 SIGHT_STEPS = 512
 DEEPEST_M = 1000.0
 _RINGS = 5
@@ -46,6 +49,16 @@ def ground_around(
         return ground_over(terrain, np.array([place_deg[0]]), np.array([place_deg[1]]))
     lat, lon = LocalFrame(*place_deg).latlon_from_en(2 * std_m * _DISC)
     return ground_over(terrain, lat, lon)
+
+
+def unknown_slope_share(tilt_std_deg: float, relief: str | None = None) -> float:
+    """Standard deviation per axis of the camera over ground without terrain, per metre of height.
+
+    A slope of the ground looks like a tilt of the camera by the same angle, so that pictures
+    determine only their sum. `tilt_std_deg`: of the reported pitch and roll, 0 or more."""
+    slope = RELIEF_SLOPES[relief or DEFAULT_RELIEF] / math.sqrt(2)
+    tilt = math.radians(tilt_std_deg)
+    return tilt * slope / math.hypot(tilt, slope)
 
 
 def bilinear(

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera
-from orthonav.core.mapfile.manifest import DEFAULT_RELIEF, RELIEF_SLOPES, TerrainInfo
+from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES
+from orthonav.core.mapfile.manifest import TerrainInfo
 
 OBJECTS_M = 4.0, 15.0
 """Houses and trees: 8 to 10 m on a quarter of the ground."""
@@ -57,9 +58,11 @@ def unknown_ground(relief: str | None) -> GroundErrors:
 
 def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
     """Of a map's terrain with slopes (N, 2) under a view; `source`: None: one like Copernicus'."""
-    posting_m = COARSE_POSTING_M if source is None else source.source_posting_m
-    if source is not None and source.roughness_m > ROUGH_M:
-        return GroundErrors(0.0, (SURFACE_M,))
+    posting_m = COARSE_POSTING_M
+    if source is not None:
+        posting_m = source.source_posting_m or source.posting_m
+        if (source.roughness_m or 0.0) > ROUGH_M:
+            return GroundErrors(0.0, (SURFACE_M,))
     least_m, length_m = BARE_EARTH_M
     steep = math.sqrt(float(np.nan_to_num(slopes**2).sum(axis=1).mean()))
     most_m = max(COARSE_STD_M * min(posting_m / COARSE_POSTING_M, 1.0), least_m)

@@ -9,7 +9,7 @@ from typing import Any
 from orthonav.core.errors import AreaError, MapFileError, MapVersionError
 from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.core.geo.grid import MAX_TILE_PX, TileGrid
-from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M
+from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M, RELIEF_SLOPES
 
 FORMAT = "orthonav-map"
 SCHEMA = 1
@@ -23,6 +23,8 @@ CODEC = "jpeg"
 TERRAIN_CODEC = "delta-zlib"
 MAX_CODE = 65_535  # of heights above the lowest one of a layer
 MAX_POSTING_M = 1000.0
+MIN_SOURCE_POSTING_M, MAX_SOURCE_POSTING_M = 0.01, 100_000.0
+MAX_ROUGHNESS_M = 1000.0
 MAX_NAME = 200
 MAX_DIGITS = 20  # more than any number needs, few enough for a float
 MIN_HEADING_STEP_DEG = 0.5
@@ -68,7 +70,11 @@ class TerrainInfo:
     `west_m`, `north_m`: outer north-west corner, half a posting from sample (0, 0). `posting_m`: 1
     to 1000. `chunk_px`: samples, 16 to 1024. `low_m`, `high_m`: heights above mean sea level, -500
     to 9000. `unit_m`: per step, 0.01 to 10. `known`: samples with a height. `name`, `datum`: of the
-    source."""
+    source.
+
+    `source_posting_m`: of the source, 0.01 to 100,000; None in older maps: `posting_m`.
+    `roughness_m`: root mean square difference of the heights of the source from those of the layer,
+    0 to 1000; None where the source is not finer."""
 
     west_m: float
     north_m: float
@@ -82,16 +88,18 @@ class TerrainInfo:
     known: int
     name: str
     datum: str
-    source_posting_m: float = 10.0
-    roughness_m: float = 0.0
+    source_posting_m: float | None = None
+    roughness_m: float | None = None
 
     def to_plain(self) -> dict[str, Any]:
-        return {"codec": TERRAIN_CODEC, **vars(self)}
+        known = {name: value for name, value in vars(self).items() if value is not None}
+        return {"codec": TERRAIN_CODEC, **known}
 
     @classmethod
     def from_plain(cls, plain: Any) -> "TerrainInfo":
         info = cls(**_fields(cls, plain))
         most = 4 * MAX_SHEET_M
+        source_m, roughness_m = info.source_posting_m, info.roughness_m
         sane = (
             _get(plain, "codec", str) == TERRAIN_CODEC
             and 1 <= info.posting_m <= MAX_POSTING_M
@@ -103,21 +111,18 @@ class TerrainInfo:
             and 0.01 <= info.unit_m <= 10
             and (info.high_m - info.low_m) / info.unit_m <= MAX_CODE + 0.5
             and 0 <= info.known <= info.rows * info.cols
+            and (source_m is None or MIN_SOURCE_POSTING_M <= source_m <= MAX_SOURCE_POSTING_M)
+            and (roughness_m is None or 0 <= roughness_m <= MAX_ROUGHNESS_M)
         )
         if not sane:
             raise MapFileError(f"map has an impossible terrain layer: {plain!r:.300}")
         return info
 
 
-RELIEF_SLOPES = {"level": 0.01, "rolling": 0.05, "hills": 0.12}
-"""Root mean square gradient of land without a terrain, by what it is like."""
-DEFAULT_RELIEF = "rolling"
-
-
 @dataclass(frozen=True)
 class SheetInfo:
-    """`area_km2`: number of tiles times stride squared. `relief`: what land without a terrain is
-    like (`RELIEF_SLOPES`), None: not stated."""
+    """`area_km2`: number of tiles times stride squared. `relief`: of ground without terrain, a key
+    of `RELIEF_SLOPES`, None if nobody said."""
 
     frame: LocalFrame
     grid: TileGrid
@@ -129,8 +134,10 @@ class SheetInfo:
 
     def to_plain(self) -> dict[str, Any]:
         terrain = {} if self.terrain is None else {"terrain": self.terrain.to_plain()}
+        relief = {} if self.relief is None else {"relief": self.relief}
         return {
             **terrain,
+            **relief,
             "origin_lat_deg": self.frame.lat_deg,
             "origin_lon_deg": self.frame.lon_deg,
             "grid": vars(self.grid),
@@ -163,7 +170,10 @@ class SheetInfo:
         grey = None if layer is None else GreyInfo.from_plain(layer, grid)
         layer = plain.get("terrain")
         terrain = None if layer is None else TerrainInfo.from_plain(layer)
-        return cls(frame, grid, tiles, _number(plain, "area_km2"), grey, terrain)
+        relief = None if plain.get("relief") is None else _get(plain, "relief", str)
+        if relief is not None and relief not in RELIEF_SLOPES:
+            raise MapFileError(f"map has an unknown relief: {relief!r:.80}")
+        return cls(frame, grid, tiles, _number(plain, "area_km2"), grey, terrain, relief)
 
 
 @dataclass(frozen=True)
@@ -287,10 +297,14 @@ def _get(plain: Any, name: str, kind: type) -> Any:
 
 
 def _fields(record: type, plain: Any) -> dict[str, Any]:
-    """Each of its type; raises `MapFileError`."""
+    """Each of its type; raises `MapFileError`. Optional numbers may be absent."""
     found = {}
     for each in fields(record):
         kind: Any = each.type
+        if kind == float | None:
+            if plain.get(each.name) is None:
+                continue
+            kind = float
         value: Any = _number(plain, each.name) if kind is float else _get(plain, each.name, kind)
         found[each.name] = value[:MAX_NAME] if kind is str else value
     return found

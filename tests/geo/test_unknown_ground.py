@@ -1,0 +1,21 @@
+"""What ground of unknown slope costs."""
+
+import math
+
+import pytest
+
+from orthonav.core.geo.ground import RELIEF_SLOPES, unknown_slope_share
+
+
+def test_slope_and_tilt_are_told_apart_by_what_is_known_of_each():
+    assert unknown_slope_share(0) == 0
+    assert unknown_slope_share(90, "rolling") == pytest.approx(0.05 / math.sqrt(2), rel=1e-3)
+    for relief, slope in RELIEF_SLOPES.items():
+        tilt = math.radians(1)
+        exact = 1 / math.sqrt(1 / tilt**2 + 2 / slope**2)
+        assert unknown_slope_share(1, relief) == pytest.approx(exact)
+
+
+def test_the_default_costs_three_percent_without_tilt_and_half_of_it_with():
+    assert unknown_slope_share(3) == pytest.approx(0.03, abs=0.001)
+    assert unknown_slope_share(1) == pytest.approx(0.0157, abs=0.0005)
