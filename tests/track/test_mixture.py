@@ -497,6 +497,13 @@ def test_the_confidence_of_a_flight_is_below_its_place_probability(seed):
         assert found.confidence <= found.place_probability
 
 
+def test_a_place_shown_at_every_second_view_only_is_not_believed():
+    """The other place makes the track coast, and often does not end it."""
+    rows = contradicted([EAST, WEST] * 30)
+    assert all(found.place_probability <= 0.8 for found, _ in rows)
+    assert {State.TRACKING, State.COASTING} <= {found.state for found, _ in rows[20:]}
+
+
 def test_two_contradicting_places_by_turns_are_not_believed():
     """Neither was recognized on enough new ground, although both together were."""
     rows = contradicted(([EAST] * 5 + [WEST] * 5) * 5)

@@ -3,10 +3,9 @@
 Horizons: measured on the autopilots of docs/closed-loop.md, RMS per axis. With GNSS PX4's was off
 by 0.7 to 1.4, without it by 1.1 to 2.3; ArduPilot's by 0.2, without GNSS by 0.5. Its accelerometers
 were better than real ones. PX4's own variance (0.3 to 0.4 in a log) leaves accelerations out.
-Gimbals: 0.01 to 0.1 is how much they shake; the horizon that they hold drifts (1 deg in 5 minutes,
-https://github.com/maiermic/robot-cameraman/issues/17) and is trimmed by hand within 2 deg
-(`DJIGimbal` of DJI's Mobile SDK), so that one held and trimmed is off by about 0.5. Mounts lean by 1
-to 5 (docs/flights.md).
+Gimbals shake by 0.01 to 0.1. Their horizon may drift (by 1 deg in 5 minutes,
+https://github.com/maiermic/robot-cameraman/issues/17) and is trimmed by hand (`DJIGimbal` of DJI's
+Mobile SDK). Mounts lean by 1 to 5 (docs/flights.md).
 """
 
 import math

@@ -44,7 +44,7 @@ def ground_by_picture(
     on_ground[bad] = np.eye(2)
     inverse = np.linalg.inv(on_ground)
     inverse[bad] = np.nan
-    return inverse
+    return np.asarray(inverse)
 
 
 def picture_by_camera(camera: Camera, orientation: Orientation, ground_m: Array) -> Array:

@@ -190,7 +190,7 @@ class _Blocks:
     ) -> "_Blocks | None":
         known = np.tile(np.isfinite(moved_px).all(axis=(1, 2)), len(seen))
         pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in seen]), 0.0)
-        by_level = pixels.reshape(len(seen), -1) > 0
+        by_level = np.asarray(pixels.reshape(len(seen), -1) > 0, np.bool_)
         if by_level.sum(axis=1).max() < MIN_BLOCKS:
             return None
         correlations = np.concatenate([scores.correlations for scores, _ in seen])
@@ -199,7 +199,7 @@ class _Blocks:
         return cls(len(seen), correlated, correlations, pixels, unit_px, moved_px)
 
     def with_moves(self, moves_px: Array) -> "_Blocks":
-        used = self.moved_px.any(axis=(1, 2))
+        used = np.asarray(self.moved_px.any(axis=(1, 2)), np.bool_)
         more_px = np.where(used[:, None, None], moves_px, 0.0)
         return replace(self, moved_px=np.concatenate([self.moved_px, more_px], axis=2))
 

@@ -444,6 +444,8 @@ class Mixture:
                 self._last = self._reached(mean, covariance)
             elif self._state is not State.COASTING:
                 self._against = None
+            elif self._shows_another(best, radius_m):
+                self._restored = max(self._restored - self._ground, 0.0)
         belief = sum(each.share for each in near)
         most = 1.0 if self._state is State.TRACKING else UNCONFIRMED
         contradicted = self._last is not None and not self._last.followed
@@ -473,6 +475,11 @@ class Mixture:
             return here
         self._against = here
         return replace(last, followed=False)
+
+    def _shows_another(self, best: Hypothesis, radius_m: float) -> bool:
+        """Whether this view shows the map farther away than `radius_m`."""
+        shown = [each for each in major(self.hypotheses) if each.recognized >= RECOGNIZED]
+        return any(distance(each, best) > radius_m for each in shown)
 
     def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map, of hypotheses no farther away than it
