@@ -29,8 +29,8 @@ CORRELATED, CORRELATED_PX = 2.0, 60.0
 and what errors reach over, pixels of the map (docs/decisions/camera.md)."""
 MIN_BLOCKS = 8
 MIN_LEFT = 0.25  # least share of the blocks' numbers that the solution leaves to their scatter
-COMPONENT_PRIOR = 8.0  # numbers that the prior variance of a systematic error counts as,
-COMPONENT_LIMITS = 0.25, 16.0  # and the least and largest factor on it
+COMPONENT_PRIOR = 4.0  # numbers that the prior variance of a systematic error counts as,
+COMPONENT_LIMITS = 0.1, 16.0  # and the least and largest factor on it
 WEAK = np.array([1e4, 1e4, 1e3, 60.0, 20.0, 20.0])
 """Standard deviations of a camera of which nothing is reported."""
 CAMERA = slice(0, 6)

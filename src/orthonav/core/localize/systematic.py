@@ -16,12 +16,12 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES
 from orthonav.core.mapfile.manifest import TerrainInfo
 
-OBJECTS_M = 4.0, 15.0
+OBJECTS_M = 3.0, 15.0
 """Houses and trees: 8 to 10 m on a quarter of the ground."""
 SURFACE_M = 0.5, 10.0  # a surface model, whose houses and trees are those of another date
 BARE_EARTH_M = 0.5, 50.0
 """Bare earth of laser scanning or photogrammetry, 0.1 to 0.5 m (docs/decisions/camera.md)."""
-COARSE_STD_M, COARSE_POSTING_M = 4.0, 30.0
+COARSE_STD_M, COARSE_POSTING_M = 6.0, 30.0
 """Copernicus GLO-30 and its like on slopes, and their posting; finer models err by less."""
 STD_PER_SLOPE_M = 100.0
 """Standard deviation over the root mean square slope of the terrain, which its errors add to."""
