@@ -194,7 +194,7 @@ class _Blocks:
         if by_level.sum(axis=1).max() < MIN_BLOCKS:
             return None
         correlations = np.concatenate([scores.correlations for scores, _ in seen])
-        moved_px = np.where(by_level.any(axis=0)[:, None, None], moved_px, 0.0)
+        moved_px = np.where(by_level.any(axis=0).reshape(-1, 1, 1), moved_px, 0.0)
         unit_px = np.repeat([unit for _, unit in seen], len(moved_px))
         return cls(len(seen), correlated, correlations, pixels, unit_px, moved_px)
 

@@ -271,7 +271,7 @@ def part_of(
         plan=sheet.plan,
     )
     if sheet.relief is not None:
-        part.relief = Relief(sheet.relief.terrain, part_grid)
+        part.relief = Relief(sheet.relief.terrain, part_grid, sheet.relief.source)
     return part
 
 

@@ -1,0 +1,126 @@
+"""Errors that displace blocks of a view together."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blots import SURFACE
+
+from orthonav.core.geo.camera import Camera
+from orthonav.core.localize.camera import ground_by_picture, picture_by_camera
+from orthonav.core.localize.rectify import Orientation
+from orthonav.core.localize.systematic import (
+    BARE_EARTH_M,
+    COARSE_STD_M,
+    OBJECTS_M,
+    SURFACE_M,
+    GroundErrors,
+    field_modes,
+    systematic,
+    terrain_errors,
+    unknown_ground,
+)
+
+CAMERA = Camera(400, 300, 400.0, 400.0, 200.0, 150.0)
+AGL_M, BLOCK_M = 200.0, 30.0
+SLOPES = np.full((36, 2), 0.03)
+
+
+def places():
+    at = (np.arange(6) - 2.5) * BLOCK_M
+    return np.stack(np.meshgrid(at, at[::-1]), axis=-1).reshape(-1, 2)
+
+
+def displaced(errors, camera=CAMERA):
+    """Displacements by camera (36, 2, 6) and by systematic errors (36, 2, K), metres on level
+    ground."""
+    ground = np.concatenate([places(), np.zeros((36, 1))], axis=1)
+    orientation = Orientation(np.array([0.0, 0.0, AGL_M]), np.zeros(3))
+    by_picture = ground_by_picture(camera, orientation, ground, np.zeros((36, 2)))
+    by_camera = -by_picture @ picture_by_camera(camera, orientation, ground)
+    found = systematic(
+        camera,
+        errors,
+        places_m=ground[:, :2],
+        by_height_px=-by_camera[:, :, 2],
+        by_picture_px=by_picture,
+        seen_px=orientation.seen_px(camera, ground),
+        block_px=BLOCK_M,
+        gsd_m=1.0,
+    )
+    return by_camera, found
+
+
+def explained(moves, by_camera):
+    """Share of displacements (36, 2) that some camera explains."""
+    design, values = by_camera.reshape(72, 6), moves.reshape(72)
+    found, *_ = np.linalg.lstsq(design, values, rcond=None)
+    return 1 - float(np.sum((values - design @ found) ** 2) / np.sum(values**2))
+
+
+def test_a_slope_of_the_ground_displaces_as_a_tilt_of_the_camera():
+    by_camera, found = displaced(GroundErrors(math.tan(math.radians(1.0)), ()))
+    for axis in range(2):
+        assert explained(found.moves_px[:, :, axis], by_camera) > 0.999
+    # By the same angle: both displace the corners alike, but for a shift and a scale.
+    east = found.moves_px[:, :, 0].reshape(72)
+    known = by_camera[:, :, [0, 1, 2, 3]].reshape(72, 4)
+    roll = np.degrees(math.radians(1.0)) * by_camera[:, :, 5].reshape(72)
+    (left, tilted) = (
+        each - known @ np.linalg.lstsq(known, each, rcond=None)[0] for each in (east, roll)
+    )
+    assert np.linalg.norm(left) == pytest.approx(np.linalg.norm(tilted), rel=0.02)
+
+
+def test_undulating_ground_displaces_as_no_camera_does():
+    by_camera, found = displaced(GroundErrors(0.0, ((3.0, 20.0),)))
+    ground = found.moves_px[:, :, found.groups[0]]
+    shares = [explained(ground[:, :, k], by_camera) for k in range(ground.shape[2])]
+    assert np.mean(shares) < 0.6
+
+
+def test_a_nominal_lens_adds_errors_of_its_own():
+    _, calibrated = displaced(GroundErrors(0.0, ((1.0, 50.0),)))
+    _, nominal = displaced(
+        GroundErrors(0.0, ((1.0, 50.0),)), replace(CAMERA, focal_std=0.05)
+    )
+    more = nominal.moves_px[:, :, calibrated.moves_px.shape[2] :]
+    assert more.shape == (36, 2, 4)
+    # One percent of the width, and 5 % of the distance from the middle.
+    np.testing.assert_allclose(np.abs(more[:, :, 0]), np.tile([2.0, 0.0], (36, 1)), atol=1e-6)
+    np.testing.assert_allclose(np.hypot(*more[:, :, 2].T), 0.05 * np.hypot(*places().T), rtol=1e-3)
+
+
+def test_fields_have_their_covariance_averaged_over_blocks():
+    """Against the mean of a finely sampled field over each block."""
+    std, length = 2.0, 25.0
+    modes = field_modes(places(), ((std, length),), BLOCK_M)
+    at = (np.arange(7) - 3) * BLOCK_M / 7
+    fine = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+    points = places()[[0, 1, 7, 35]][:, None] + fine
+    squares = ((points[:, None, :, None] - points[None, :, None]) ** 2).sum(axis=-1)
+    expected = std**2 * np.exp(-squares / (2 * length**2)).mean(axis=(2, 3))
+    found = (modes @ modes.T)[np.ix_([0, 1, 7, 35], [0, 1, 7, 35])]
+    np.testing.assert_allclose(found, expected, atol=0.05 * std**2)
+
+
+@pytest.mark.parametrize("relief, slope", [("level", 0.01), (None, 0.05), ("hills", 0.12)])
+def test_unknown_ground_is_as_steep_as_the_map_says(relief, slope):
+    errors = unknown_ground(relief)
+    assert errors.slope == pytest.approx(slope / math.sqrt(2)) and OBJECTS_M in errors.fields
+
+
+def test_errors_of_terrain_follow_its_source():
+    bare = replace(SURFACE, roughness_m=0.3, source_posting_m=1.0)
+    coarse = replace(bare, source_posting_m=30.0)
+    assert terrain_errors(SURFACE, SLOPES).fields == (SURFACE_M,)
+    assert terrain_errors(bare, SLOPES).fields == (BARE_EARTH_M, OBJECTS_M)
+    (std_m, length_m), objects = terrain_errors(coarse, SLOPES).fields
+    assert 2.0 < std_m < COARSE_STD_M and length_m == 150.0 and objects == OBJECTS_M
+    assert terrain_errors(coarse, 0 * SLOPES).fields[0][0] == BARE_EARTH_M[0]
+    assert terrain_errors(coarse, 10 * SLOPES).fields[0][0] == COARSE_STD_M
+    assert terrain_errors(None, SLOPES) == terrain_errors(coarse, SLOPES)
+    older = replace(bare, source_posting_m=None, roughness_m=None, posting_m=10.0)
+    assert terrain_errors(older, 10 * SLOPES).fields[0][0] == pytest.approx(COARSE_STD_M / 3)
+    assert terrain_errors(coarse, np.full((36, 2), np.nan)).fields[0][0] == BARE_EARTH_M[0]
