@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import rasterio
 from lab.landscape import DEFAULT_DATES, generate_heights
 from lab.terrain import random_relief
 from numpy.typing import NDArray
+from rasterio.enums import ColorInterp
 
 from benchmarks.scenes import DATA, SIDE_M, ortho
 from orthonav.core.localize import Localizer
@@ -124,16 +126,17 @@ def relief_file(name: str, work: Path, slope: float, kind: str) -> Path:
         bounds, crs = source.bounds, source.crs
     width_m, height_m = bounds.right - bounds.left, bounds.top - bounds.bottom
     # Whole cells of the coarse terrain, and some beyond the imagery.
-    cols, rows = (int(side // COARSE_POSTING_M) + 5 for side in (width_m, height_m))
+    cols, rows = (int(side // COARSE_POSTING_M) + 11 for side in (width_m, height_m))
     factor = round(COARSE_POSTING_M / TRUE_POSTING_M)
     shape = rows * factor, cols * factor
+    seed = crc32(name.encode())  # other hills at every place
     if kind == FLAT:
         made, posting_m = np.full((rows, cols), BASE_M, np.float32), COARSE_POSTING_M
     else:
-        made, posting_m = fractal_relief(shape, TRUE_POSTING_M, slope / 100, 1), TRUE_POSTING_M
+        made, posting_m = fractal_relief(shape, TRUE_POSTING_M, slope / 100, seed), TRUE_POSTING_M
     if kind == COARSE:
-        made, posting_m = coarse_of(made, posting_m, 2), COARSE_POSTING_M
-    corner = bounds.left - 2 * COARSE_POSTING_M, bounds.top + 2 * COARSE_POSTING_M
+        made, posting_m = coarse_of(made, posting_m, seed + 1), COARSE_POSTING_M
+    corner = bounds.left - 5 * COARSE_POSTING_M, bounds.top + 5 * COARSE_POSTING_M
     return written(out, made, rasterio.Affine(posting_m, 0, corner[0], 0, -posting_m, corner[1]), crs)
 
 
@@ -163,19 +166,27 @@ def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
 
 
 def scaled_copy(name: str, work: Path) -> Path:
-    """A copy of imagery whose scale is a stand-in, at another one: `scaled:GSD:NAME`."""
+    """A copy of imagery of a stand-in scale at another one: `scaled:GSD:NAME`. A palette becomes
+    its colours, which `build` needs."""
     _, gsd, source_name = name.split(":")
     out = work / f"{Path(source_name).parent.name}-{Path(source_name).stem}-{gsd}m.tif"
     if out.is_file():
         return out
     with rasterio.open(DATA / source_name) as source:
-        profile, bands = source.profile, source.read()
-        mask, step = source.dataset_mask(), source.transform
+        bands, mask, step = source.read(), source.dataset_mask(), source.transform
+        if source.colorinterp[0] == ColorInterp.palette:
+            table = source.colormap(1)
+            colours = np.array([table[level][:3] for level in range(256)], np.uint8)
+            bands = np.moveaxis(colours[bands[0]], -1, 0)
+        crs = source.crs
     scale = float(gsd) / step.a
-    profile["transform"] = rasterio.Affine(float(gsd), 0, step.c, 0, step.e * scale, step.f)
+    transform = rasterio.Affine(float(gsd), 0, step.c, 0, step.e * scale, step.f)
     part = out.with_suffix(".part.tif")
-    with rasterio.open(part, "w", **profile) as target:
+    count, rows, cols = bands.shape
+    about = {"driver": "GTiff", "count": count, "dtype": "uint8", "crs": crs}
+    with rasterio.open(
+        part, "w", width=cols, height=rows, transform=transform, **about
+    ) as target:
         target.write(bands)
-        if profile.get("nodata") is None:
-            target.write_mask(mask)
+        target.write_mask(mask)
     return part.replace(out)

@@ -1,5 +1,6 @@
 """The rows: which views on which map, single or tracked."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,15 +53,19 @@ class Question:
     tracked: bool = False
     prior: bool = False
 
+    def of_each(self, views: int) -> int:
+        """Views of each leg."""
+        return math.ceil(views / len(self.legs))
+
     def measured(self, work: Path, views: int) -> Row:
-        """Place the views of all legs."""
-        found = Row([], [])
+        """Place the views, as many of each leg."""
+        found, share = Row([], []), self.of_each(views)
         for built, source in self.legs:
             localizer = built.localizer(work)
             locator: Locator = SingleViews(localizer, use_prior=self.prior)
             if self.tracked:
                 locator = Tracker(localizer)
-            seen = source.seen(work, localizer, views, self.tracked)
+            seen = source.seen(work, localizer, share, self.tracked)
             found += placed(locator, seen, localizer.sheet.frame, source.std_m)
         return found
 
@@ -94,7 +99,7 @@ def _flights() -> Iterator[Question]:
     yield from both("taichung", "flights", (Map("taichung_drone/map.tif"), taichung))
     tilted = Recording("tilted_mount", TILTED_STD_M)
     ground = Recording("tilted_mount", TILTED_GROUND_STD_M, "truth_ground.csv", of_ground=True)
-    on = Map("tilted_mount/map.tif")
+    on = Map("scaled:0.5:tilted_mount/map.tif")
     yield from both("tilted_mount", "flights", (on, tilted))
     yield Question("tilted_mount, middle of the picture", "flights", ((on, ground),))
 
@@ -136,34 +141,40 @@ def _grounds(name: str, slope: float) -> Iterator[tuple[str, Map]]:
         yield kind, Map(name, ground, slope)
 
 
+def _farmland() -> list[Pair]:
+    return [SCENES[f"szada_{n}"].pair(f"szada_{n}_a", f"szada_{n}_b") for n in ("1", "5", "7")]
+
+
+def _rendered(
+    name: str, part: str, pairs: list[Pair], slope: float, nominal: bool = False
+) -> Iterator[Question]:
+    """Rows over one relief: true and stated tilt, and what the map knows of the ground."""
+    for tilt, stated in ((0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)):
+        told = "" if stated is None else f" stated {stated:g}"
+        maps = [dict(_grounds(pair.map, slope)) for pair in pairs]
+        for ground in maps[0]:
+            legs = tuple(
+                (on[ground], OverRelief(pair, slope, tilt, stated, nominal))
+                for on, pair in zip(maps, pairs, strict=True)
+            )
+            yield Question(f"{name} {slope:g} %, tilt {tilt:g}{told}, {ground}", part, legs)
+
+
 def _relief() -> Iterator[Question]:
-    szada = SCENES["szada_mosaic"].pair("szada_mosaic_a", "szada_mosaic_b")
-    naip = SCENES["naip"].pair("20090818", "20180716")
+    farmland = _farmland()
+    for slope in SLOPES:
+        yield from _rendered("farmland", "relief", farmland, slope)
+    yield from _rendered("naip", "relief", [SCENES["naip"].pair("20090818", "20180716")], 5.0)
     lab = SCENES["generated_31"].pair(PAST, PRESENT)
-    cases = [(szada, slope) for slope in SLOPES] + [(naip, 5.0), (lab, 5.0)]
-    for pair, slope in cases:
-        for tilt, stated in ((0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)):
-            told = "" if stated is None else f" stated {stated:g}"
-            for ground, on in _grounds(pair.map, slope):
-                source = OverRelief(pair, slope, tilt, stated)
-                name = f"{pair.scene} {slope:g} %, tilt {tilt:g}{told}, {ground}"
-                yield Question(name, "relief", ((on, source),))
-    flat = Map(szada.map, FLAT, 0.0)
+    yield from _rendered("houses and trees", "relief", [lab], 5.0)
     for tilt in (0.0, 3.0):
-        leg = flat, OverLevel(szada, tilt)
-        yield Question(f"{szada.scene} flat, tilt {tilt:g}, flat terrain", "relief", (leg,))
+        legs = tuple((Map(pair.map, FLAT, 0.0), OverLevel(pair, tilt)) for pair in farmland)
+        yield Question(f"farmland flat, tilt {tilt:g}, flat terrain", "relief", legs)
 
 
 def _lens() -> Iterator[Question]:
-    szada = SCENES["szada_mosaic"].pair("szada_mosaic_a", "szada_mosaic_b")
     for slope in (0.0, 5.0):
-        for tilt, stated in ((0.0, None), (0.0, 0.5), (3.0, None)):
-            told = "" if stated is None else f" stated {stated:g}"
-            for ground, kind in (("no terrain", None), ("bare earth", BARE)):
-                source = OverRelief(szada, slope, tilt, stated, nominal=True)
-                name = f"nominal lens, {slope:g} %, tilt {tilt:g}{told}, {ground}"
-                leg = Map(szada.map, kind, None if kind is None else slope), source
-                yield Question(name, "lens", (leg,))
+        yield from _rendered("nominal lens", "lens", _farmland(), slope, nominal=True)
 
 
 def _steady() -> Iterator[Question]:

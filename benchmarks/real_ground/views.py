@@ -70,20 +70,21 @@ class OverRelief:
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
         folder = work / f"pictures-{self.pictures()}"
         folder.mkdir(parents=True, exist_ok=True)
-        rasters: tuple[Raster, Raster] | None = None
+        imagery, inside_m = self._imagery(work, base)
+        relief: Raster | None = None
         heights = open_dem(self._heights(work))
         for number in range(views):
             rng = np.random.default_rng([SEED, number])
-            true, place = self._pose(base, rng)
+            true, place = self._pose(base, inside_m, rng)
             lens, camera = self._lens(rng)
             lat, lon = base.sheet.frame.latlon_from_en(place)
             path = folder / f"{number:04d}.png"
             if not path.is_file():
-                rasters = rasters or self._rasters(work, base)
+                relief = relief or self._relief(work, base)
                 above = float(heights(lat[None], lon[None])[0]) + true.agl_m
                 attitude = true.yaw_deg, true.pitch_deg, true.roll_deg
                 position = np.array([*place, above])
-                grey, _ = seen_view(*rasters, lens, attitude, position, 1)
+                grey, _ = seen_view(imagery, relief, lens, attitude, position, 1)
                 part = folder / f"{number:04d}.part.png"
                 seen = degraded(cv2.merge([grey, grey, grey]), EFFECTS, rng)
                 cv2.imwrite(str(part), seen[..., 0])
@@ -98,8 +99,8 @@ class OverRelief:
             return landscape_heights(self.pair.views, work, self.slope, SURFACE)
         return relief_file(self.pair.map, work, self.slope, BARE)
 
-    def _rasters(self, work: Path, base: Localizer) -> tuple[Raster, Raster]:
-        """Imagery of the later date and heights, in the plane of the map."""
+    def _imagery(self, work: Path, base: Localizer) -> tuple[Raster, Array]:
+        """The later date in the plane of the map, and metres (H, W) to where it shows nothing."""
         grid, frame = base.grid, base.sheet.frame
         size = grid.width_px, grid.height_px
         sheet = Mosaic.open([found(self.pair.views, work)]).sheet(
@@ -107,33 +108,41 @@ class OverRelief:
             gsd_m=grid.gsd_m,
         )  # fmt: skip
         with sheet as raster:
-            grey = raster.read_grey(0, 0, *size).grey.astype(np.float32)
-        posting_m = min(2.0, grid.gsd_m)
-        cols, rows = (math.ceil(side * grid.gsd_m / posting_m) for side in size)
-        dem = open_dem(self._heights(work))
-        heights = dem.in_plane(frame, grid.west_m, grid.north_m, posting_m, rows, cols)
-        heights = np.where(np.isfinite(heights), heights, np.nanmean(heights))
-        corner = grid.west_m, grid.north_m
-        return Raster(grey, *corner, grid.gsd_m), Raster(
-            heights.astype(np.float32), *corner, posting_m
-        )
+            read = raster.read_grey(0, 0, *size)
+        inside = np.pad(read.valid, 1).astype(np.uint8)
+        distance_m = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1] * grid.gsd_m
+        grey = read.grey.astype(np.float32)
+        return Raster(grey, grid.west_m, grid.north_m, grid.gsd_m), np.asarray(distance_m)
 
-    def _pose(self, base: Localizer, rng: np.random.Generator) -> tuple[Telemetry, Array]:
-        """A true pose whose view lies on the imagery of the map."""
+    def _relief(self, work: Path, base: Localizer) -> Raster:
+        """The heights in the plane of the map."""
+        grid = base.grid
+        posting_m = min(2.0, grid.gsd_m)
+        cols, rows = (
+            math.ceil(side * grid.gsd_m / posting_m) for side in (grid.width_px, grid.height_px)
+        )
+        dem = open_dem(self._heights(work))
+        made = dem.in_plane(base.sheet.frame, grid.west_m, grid.north_m, posting_m, rows, cols)
+        made = np.where(np.isfinite(made), made, np.nanmean(made))  # a rim that no view shows
+        return Raster(made.astype(np.float32), grid.west_m, grid.north_m, posting_m)
+
+    def _pose(
+        self, base: Localizer, inside_m: Array, rng: np.random.Generator
+    ) -> tuple[Telemetry, Array]:
+        """A true pose whose view shows imagery only, and its place (2,)."""
         assert base.registration is not None
         grid = base.grid
         agl_m = root_agl_of(WIDTH_PX, grid.gsd_m)
+        reach_m = math.hypot(*CAMERA.extent) / 2 * agl_m
+        rows, cols = inside_m.shape
         while True:
             share = rng.uniform(0, 1, 2)
-            place = np.array(
-                [
-                    grid.west_m + share[0] * grid.width_px * grid.gsd_m,
-                    grid.north_m - share[1] * grid.height_px * grid.gsd_m,
-                ]
-            )
+            at = np.array([share[0] * cols, -share[1] * rows]) * grid.gsd_m
+            place = np.array([grid.west_m, grid.north_m]) + at
             yaw, (pitch, roll) = float(rng.uniform(0, 360)), rng.normal(0, 1, 2).tolist()
-            latlon = tuple(float(v) for v in base.sheet.frame.latlon_from_en(place))
-            if is_covered(base.registration, latlon, WIDTH_PX):
+            lat, lon = (float(v) for v in base.sheet.frame.latlon_from_en(place))
+            seen = inside_m[int(share[1] * rows), int(share[0] * cols)] >= reach_m
+            if seen and is_covered(base.registration, (lat, lon), WIDTH_PX):
                 tilt = pitch * self.tilt_std_deg, roll * self.tilt_std_deg
                 return Telemetry(0, yaw, *tilt, agl_m), place
 
