@@ -63,6 +63,7 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         **tile_level,
         "registration": _registration(manifest),
         "terrain": None if terrain is None else asdict(terrain),
+        "relief": manifest.sheets[0].relief,
         "sheets": [
             {
                 "centre_lat_deg": sheet.frame.lat_deg,
@@ -137,6 +138,9 @@ def summary_text(plain: dict[str, Any]) -> str:
         heights = f"{terrain['low_m']:.0f} to {terrain['high_m']:.0f} m above the sea"
         named = "".join(c for c in f"{terrain['name']}, {terrain['datum']}" if c.isprintable())
         lines.append(f"terrain    {heights} every {terrain['posting_m']:g} m ({named})")
+        lines += [f"           {text}" for text in _source_text(terrain)]
+    else:
+        lines.append(f"terrain    {unknown_ground_text(plain['relief'])}")
     for source in plain["imagery"]:
         files = f"{source['files']} files  " if source.get("files") else ""
         dates = " to ".join(texts(source, "date_from", "date")) or "date unknown"
@@ -153,6 +157,27 @@ def summary_text(plain: dict[str, Any]) -> str:
         speed = plain["area_km2"] / plain["build_s"]
         lines.append(f"built in   {plain['build_s']:.1f} s, {speed:.2f} km2/s")
     return "\n".join(lines)
+
+
+def _source_text(terrain: Mapping[str, Any]) -> Iterable[str]:
+    source_m, roughness_m = terrain["source_posting_m"], terrain["roughness_m"]
+    if source_m is not None:
+        rough = "" if roughness_m is None else f", rough by {roughness_m:.2g} m RMS between samples"
+        yield f"made of heights every {source_m:g} m{rough}"
+
+
+def unknown_ground_text(relief: str | None) -> str:
+    """What ground without terrain costs."""
+    from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES, unknown_slope_share
+    from orthonav.core.records import DEFAULT_TILT_STD_DEG
+
+    slope = RELIEF_SLOPES[relief or DEFAULT_RELIEF]
+    known, unknown = (unknown_slope_share(deg, relief) for deg in (1.0, DEFAULT_TILT_STD_DEG))
+    return (
+        f"none: {relief or DEFAULT_RELIEF} land is assumed (slopes of {slope:.0%}), and the error "
+        f"of the camera is {known:.1%} of the height where its tilt is known to 1 deg, {unknown:.1%} "
+        "where it is not"
+    )
 
 
 def recipe_text(recipe: dict[str, Any]) -> str:
