@@ -175,8 +175,8 @@ def unknown_ground_text(relief: str | None) -> str:
     known, unknown = (unknown_slope_share(deg, relief) for deg in (1.0, DEFAULT_TILT_STD_DEG))
     return (
         f"none: {relief or DEFAULT_RELIEF} land is assumed (slopes of {slope:.0%}), and the error "
-        f"of the camera is {known:.1%} of the height where its tilt is known to 1 deg, {unknown:.1%} "
-        "where it is not"
+        f"of the camera is {known:.1%} of the height where its tilt is known to 1 deg, "
+        f"{unknown:.1%} where it is not"
     )
 
 
