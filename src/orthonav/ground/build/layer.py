@@ -11,6 +11,7 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import cv2
@@ -246,7 +247,7 @@ POSTING_M = 10.0
 """Distance of samples; that of the terrain model where it is coarser."""
 TERRAIN_CHUNK_PX = 128
 UNIT_M = 0.1
-ROUGH_BLOCKS, ROUGH_POSTINGS, MAX_FINER = 6, 16, 16
+ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
 """Squares per side of the area in which roughness is measured, their width in postings, and the
 most samples of the source across a posting."""
 HeightSampler = Callable[[float, float, int, int], NDArray[np.float64]]
@@ -304,28 +305,33 @@ def _roughness_m(info: TerrainInfo, dem: Dem, area: Area) -> float | None:
     col, row = np.meshgrid(at, at)
     inner = np.s_[finer:-finer, finer:-finer]  # bilinear between samples on all sides
     squares = []
-    for first_row in np.unique(np.linspace(0, info.rows - side, ROUGH_BLOCKS).astype(int)):
-        for first_col in np.unique(np.linspace(0, info.cols - side, ROUGH_BLOCKS).astype(int)):
-            west = info.west_m + first_col * info.posting_m
-            north = info.north_m - first_row * info.posting_m
-            half_m = side * info.posting_m / 2
-            if not area.contains(np.array([[west + half_m, north - half_m]]), half_m)[0]:
-                continue
-            shape = side * finer, side * finer
-            fine = dem.in_plane(area.frame, west, north, info.posting_m / finer, *shape)
-            mean = fine.reshape(side, finer, side, finer).mean(axis=(1, 3))
-            layer = bilinear(
-                lambda rows, cols, mean=mean: mean[rows, cols],  # type: ignore[misc]
-                mean.shape,
-                col,
-                row,
-            )
-            off_m = (fine - layer)[inner]
-            squares.append(off_m[np.isfinite(off_m)] ** 2)
+    for first_row, first_col in product(_firsts(info.rows, side), _firsts(info.cols, side)):
+        west = info.west_m + first_col * info.posting_m
+        north = info.north_m - first_row * info.posting_m
+        half_m = side * info.posting_m / 2
+        if not area.contains(np.array([[west + half_m, north - half_m]]), half_m)[0]:
+            continue
+        shape = side * finer, side * finer
+        fine = dem.in_plane(area.frame, west, north, info.posting_m / finer, *shape)
+        mean = fine.reshape(side, finer, side, finer).mean(axis=(1, 3))
+        layer = bilinear(
+            lambda rows, cols, mean=mean: mean[rows, cols],  # type: ignore[misc]
+            mean.shape,
+            col,
+            row,
+        )
+        off_m = (fine - layer)[inner]
+        squares.append(off_m[np.isfinite(off_m)] ** 2)
     found = np.concatenate(squares) if squares else np.empty(0)
     if not found.size:
         return None
     return round(min(float(np.sqrt(found.mean())), MAX_ROUGHNESS_M), 3)
+
+
+def _firsts(count: int, side: int) -> list[int]:
+    """Where squares of `side` samples begin, one in the middle of each equal part."""
+    number = min(ROUGH_SQUARES, count // side)
+    return [round((k + 0.5) * count / number - side / 2) for k in range(number)]
 
 
 def terrain_parts(
