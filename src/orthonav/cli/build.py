@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
 
 WITHOUT_TERRAIN = (
-    "--dem FILE removes this error, with a terrain from 'orthonav fetch --source copernicus-dem'; "
-    "--relief level reduces it where the land is level"
+    "less with --dem FILE ('orthonav fetch --source copernicus-dem --out FILE'), and with --relief "
+    "level where the land is level"
 )
 LEAST_SHIFT_M = 0.3
 """A pixel of the finest orthophotos of countries."""

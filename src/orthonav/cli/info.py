@@ -140,7 +140,8 @@ def summary_text(plain: dict[str, Any]) -> str:
         lines.append(f"terrain    {heights} every {terrain['posting_m']:g} m ({named})")
         lines += [f"           {text}" for text in _source_text(terrain)]
     else:
-        lines.append(f"terrain    {unknown_ground_text(plain['relief'])}")
+        first, second = unknown_ground_text(plain["relief"])
+        lines += [f"terrain    {first}", f"           {second}"]
     for source in plain["imagery"]:
         files = f"{source['files']} files  " if source.get("files") else ""
         dates = " to ".join(texts(source, "date_from", "date")) or "date unknown"
@@ -159,25 +160,30 @@ def summary_text(plain: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _source_text(terrain: Mapping[str, Any]) -> Iterable[str]:
+def _source_text(terrain: Mapping[str, Any]) -> list[str]:
     source_m, roughness_m = terrain["source_posting_m"], terrain["roughness_m"]
-    if source_m is not None:
-        rough = "" if roughness_m is None else f", rough by {roughness_m:.2g} m RMS between samples"
-        yield f"made of heights every {source_m:g} m{rough}"
+    said = (
+        [] if source_m in (None, terrain["posting_m"]) else [f"from heights every {source_m:g} m"]
+    )
+    said += [] if roughness_m is None else [f"which differ from these by {roughness_m:.2g} m RMS"]
+    return [", ".join(said)] if said else []
 
 
-def unknown_ground_text(relief: str | None) -> str:
-    """What ground without terrain costs."""
+def unknown_ground_text(relief: str | None) -> list[str]:
+    """What ground without terrain costs, in lines."""
     from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES, unknown_slope_share
     from orthonav.core.records import DEFAULT_TILT_STD_DEG
 
     slope = RELIEF_SLOPES[relief or DEFAULT_RELIEF]
-    known, unknown = (unknown_slope_share(deg, relief) for deg in (1.0, DEFAULT_TILT_STD_DEG))
-    return (
-        f"none: {relief or DEFAULT_RELIEF} land is assumed (slopes of {slope:.0%}), and the error "
-        f"of the camera is {known:.1%} of the height where its tilt is known to 1 deg, "
-        f"{unknown:.1%} where it is not"
+    known, unknown = (
+        f"{100 * unknown_slope_share(tilt_deg, relief):.1f} %"
+        for tilt_deg in (1.0, DEFAULT_TILT_STD_DEG)
     )
+    return [
+        f"none: {relief or DEFAULT_RELIEF} land is assumed (slopes of {100 * slope:.0f} %); the "
+        "camera is",
+        f"off by {known} of the height where its tilt is known to 1 deg, {unknown} where it is not",
+    ]
 
 
 def recipe_text(recipe: dict[str, Any]) -> str:
