@@ -192,14 +192,16 @@ def map_of(
     work: Path,
     bounds_deg: tuple[float, float, float, float] | None = None,
     overlap: float = 0.875,
+    dem: Path | None = None,
 ) -> Path:
     """The map of an orthophoto as `orthonav build` makes it, built once; of a part within bounds
-    (west, south, east, north)."""
+    (west, south, east, north), with the terrain `dem`."""
     part = "" if bounds_deg is None else "-part"
     part += "" if overlap == 0.875 else f"-{overlap:g}"
+    part += "" if dem is None else f"-{dem.stem}"
     out = work / f"{path.parent.name}-{path.stem}{part}.onav"
     if not out.is_file():
-        build_map(BuildRequest([path], out, bounds_deg=bounds_deg, overlap=overlap))
+        build_map(BuildRequest([path], out, bounds_deg=bounds_deg, overlap=overlap, dem=dem))
     return out
 
 

@@ -18,6 +18,7 @@ from helpers import Done
 from orthonav import __version__
 from orthonav.cli import COMMANDS, common, main
 from orthonav.core.flight.fixes import read_results
+from orthonav.core.geo.ground import unknown_slope_share
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix
 from orthonav.ground.report.drawing import Drawing
@@ -111,6 +112,8 @@ def truth_path(flight_path):
 def test_build(run, ortho, out, names_in):
     done = run("build", "--ortho", ortho, *WHOLE_MAP, "--out", out / "a.onav")
     assert (done.code, done.err) == (0, "") and "km2" in done.out and "built in" in done.out
+    assert "terrain    none: rolling land" in done.out and "copernicus-dem" in done.out
+    assert "1.6 % of the height where its tilt is known to 1 deg, 2.9 %" in done.out
     again = run("build", "--ortho", ortho, *SMALL_MAP, "--out", out / "b.onav", "--json", "-q")
     assert (again.code, again.err) == (0, "")
     plain = json.loads(again.out)
@@ -133,6 +136,16 @@ def test_build_options_are_in_the_recipe(run, ortho, out, options):
     assert recipe == open_map(out / "m.onav").manifest.recipe
     if "canny" in options[1]:
         assert recipe["represent"]["low"] == 50 and recipe["embed"]["dims"] == 16
+
+
+def test_relief_is_in_the_map(run, ortho, out):
+    built = ("build", "--ortho", ortho, *SMALL_MAP, "--out", out / "m.onav", "--relief", "level")
+    done = run(*built)
+    assert done.code == 0 and "terrain    none: level land" in done.out
+    assert open_map(out / "m.onav").manifest.sheets[0].relief == "level"
+    assert json.loads(run("info", out / "m.onav", "--json").out)["relief"] == "level"
+    share = unknown_slope_share(1.0, "level")
+    assert f"{100 * share:.1f} % of the height" in run("info", out / "m.onav").out
 
 
 def test_info(run, map_path):

@@ -3,18 +3,24 @@
 import functools
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
+from lab.demo_imagery import write_terrain
 
 from orthonav.cli import demo, main
 from orthonav.ground.build import BuildRequest
 
 
 @pytest.fixture
-def small_demo(area, monkeypatch):
+def small_demo(area, monkeypatch, tmp_path_factory):
     """The demo on the small area instead of its own imagery."""
-    monkeypatch.setattr(demo, "IMAGERY", area.past.parent)
+    imagery = tmp_path_factory.mktemp("imagery")
+    for path in (area.past, area.present):
+        shutil.copy(path, imagery)
+    write_terrain(area.past, imagery / "dem.tif")
+    monkeypatch.setattr(demo, "IMAGERY", imagery)
     turns = tuple((east * 0.45, north * 0.35) for east, north in demo.WAYPOINTS_EN_M)
     monkeypatch.setattr(demo, "WAYPOINTS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 200.0)

@@ -62,22 +62,24 @@ Angles = tuple[float, float, float]
 class Area:
     """A map of one date and pictures of another; the map lies in a folder of work.
 
-    `mount_deg`: unreported pitch and roll of the camera in the body.
+    `mount_deg`: unreported pitch and roll of the camera in the body. `dem`: terrain of the map.
     """
 
     past: Path
     present: Path
     work: Path
     mount_deg: tuple[float, float] = (0.0, 0.0)
+    dem: Path | None = None
 
     @classmethod
     def demo(cls, work: Path) -> "Area":
-        """The area of `orthonav demo`."""
-        return cls(IMAGERY / f"{PAST}.tif", IMAGERY / f"{PRESENT}.tif", work)
+        """The area of `orthonav demo`, over whose level ground the flights were flown."""
+        dem = IMAGERY / "dem.tif"
+        return cls(IMAGERY / f"{PAST}.tif", IMAGERY / f"{PRESENT}.tif", work, dem=dem)
 
     @cached_property
     def localizer(self) -> Localizer:
-        return Localizer(open_map(map_of(self.past, self.work)))
+        return Localizer(open_map(map_of(self.past, self.work, dem=self.dem)))
 
     @property
     def frame(self) -> LocalFrame:

@@ -1,5 +1,6 @@
 """Servers on the loopback: one that does what a test says, and a WMS of the ground."""
 
+import json
 import socket
 import struct
 import threading
@@ -139,6 +140,35 @@ def files(contents, ranges=True):
         part = body[int(first) : int(last) + 1]
         place = f"bytes {first}-{int(first) + len(part) - 1}/{len(body)}"
         return Answer(part, 206, kind, {"Content-Range": place, "ETag": '"1"'})
+
+    return answer
+
+
+def searching(catalogue, server_url, asked_for):
+    """A STAC API with a search in pages of one."""
+    items = {k: v for k, v in catalogue.items() if not k.startswith("/")}
+    pictures = files({k: v for k, v in catalogue.items() if k.startswith("/")})
+
+    def answer(asked):
+        if asked.path == "/api/":
+            links = [{"rel": "search", "href": "/api/search"}, {"rel": "child", "href": "/none"}]
+            return Answer(terrain.plain({"type": "Catalog", "links": links}))
+        if asked.path == "/api/search":
+            body = json.loads(asked.body)
+            asked_for.append(body)
+            names = sorted(name for name in items if body.get("datetime", "")[:4] in name)
+            if not names:
+                return Answer(terrain.plain({"features": []}))
+            at = names.index(body["token"]) if "token" in body else 0
+            page = {"type": "FeatureCollection", "features": [items[names[at]]]}
+            page["features"][0]["assets"]["data"]["href"] = f"{server_url[0]}/{names[at]}.tif"
+            if at + 1 < len(names):
+                more = {"rel": "next", "href": "/api/search", "method": "POST", "merge": True}
+                page["links"] = [more | {"body": {"token": names[at + 1]}}]
+            return Answer(terrain.plain(page))
+        if asked.path == "/api/token":
+            return Answer(terrain.plain({"token": "se=1&sig=abcdefg"}))
+        return pictures(asked)
 
     return answer
 

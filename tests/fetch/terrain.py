@@ -136,6 +136,37 @@ def item(name, href, box, time="2021-06-15T10:00:00Z", **asset):
     }
 
 
+def heights(lat_deg, lon_deg):
+    """Metres: they rise to the north and to the east, and pass through 0."""
+    north, east = np.asarray(lat_deg) - LAT_DEG, np.asarray(lon_deg) - LON_DEG
+    return 40 + 0.1 * north * NORTH_M - 0.2 * east * EAST_M
+
+
+def height_files(folder):
+    """Two files of heights in degrees, as those of Copernicus, with a hole, and their items by
+    name; the step, and the corner of the eastern one."""
+    step = 1 / 3600
+    west = round(LON_DEG / step) * step
+    north = round(LAT_DEG / step) * step + 20 * step
+    found = {}
+    for name, first in (("west", west - 40 * step), ("east", west)):
+        col, row = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
+        values = heights(north - row * step, first + col * step).astype(np.float32)
+        if name == "east":
+            values[18:20, 5:8] = -9999
+        raw, path = folder / f"{name}.raw.tif", folder / f"{name}.tif"
+        with rasterio.open(
+            raw, "w", driver="GTiff", width=40, height=40, count=1, dtype="float32",
+            crs="EPSG:4326", nodata=-9999, transform=Affine(step, 0, first, 0, -step, north),
+        ) as data:  # fmt: skip
+            data.write(values[None])
+            box = tuple(data.bounds)
+        rasterio.shutil.copy(raw, path, driver="COG", COMPRESS="DEFLATE")
+        found[f"/{name}.tif"] = path.read_bytes()
+        found[name] = item(name, f"./{name}.tif", box)
+    return found, step, west, north
+
+
 def plain(value):
     """JSON as bytes."""
     return json.dumps(value).encode()

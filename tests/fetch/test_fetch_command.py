@@ -1,14 +1,19 @@
 """`orthonav fetch` from end to end: its output, its file, and the map built from it."""
 
 import json
+import shlex
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import rasterio
 import servers
 import terrain
 
 from orthonav.cli import main
+from orthonav.ground.fetch.presets import presets, terrain_preset, terrain_spec
 from orthonav.ground.imagery.source import open_sources
+from orthonav.ground.imagery.terrain import open_dem
 
 SECRET = "t0ken-of-mine"
 
@@ -17,8 +22,9 @@ SECRET = "t0ken-of-mine"
 def command(capsys):
     """Function that runs the command and gives exit code, stdout and stderr."""
 
-    def run(*arguments):
-        code = main(["fetch", *map(str, arguments)])
+    def run(*arguments, terrain=False):
+        more = [] if terrain else ["--no-terrain"]
+        code = main(["fetch", *map(str, arguments), *more])
         return code, *capsys.readouterr()
 
     return run
@@ -73,6 +79,83 @@ def test_a_dry_run_fetches_no_tile(command, area, tmp_path, names_below):
         code, stdout, _ = command(area, "--source", source, "--dry-run", "--json")
         assert json.loads(stdout)["tiles"] > 0 and not server.log
     assert names_below(tmp_path) == []
+
+
+@pytest.fixture
+def offered(monkeypatch):
+    """Function that puts the terrain known by name at an address."""
+
+    def put(url):
+        known = replace(presets()["copernicus-dem"], url=f"{url}/api/", token_url=None)
+        found = presets() | {"copernicus-dem": known}
+        monkeypatch.setattr("orthonav.ground.fetch.presets.presets", lambda: found)
+        monkeypatch.setattr("orthonav.ground.fetch.web.RequestLimits", lambda **_: servers.QUICK)
+
+    return put
+
+
+def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
+    found, step, west, _ = terrain.height_files(tmp_path)
+    url, asked_for = [], []
+    out = tmp_path / "ortho.tif"
+    with (
+        servers.serving(servers.searching(found, url, asked_for)) as heights,
+        servers.serving(servers.tiles) as server,
+    ):
+        url.append(heights.url)
+        offered(heights.url)
+        fetch = (area, "--source", f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png", "--out", out)
+        code, stdout, _ = command(*fetch, "--gsd-m", 1, terrain=True)
+        assert code == 0 and "Copernicus" not in stdout and "COPERNICUS" in stdout
+        (line,) = [each.strip() for each in stdout.splitlines() if "orthonav build" in each]
+        code, stdout, _ = command(*fetch, "--gsd-m", 1, "--json", terrain=True)  # replaces its own
+        plain = json.loads(stdout)["terrain"]
+        code, stdout, _ = command(*fetch, "--dry-run", terrain=True)
+        assert code == 0 and "the terrain of copernicus-dem" in stdout
+    dem_path = tmp_path / "ortho_dem.tif"
+    assert plain["out"] == str(dem_path) and plain["datum"] == "egm2008"
+    words = shlex.split(line)
+    assert words[:6] == ["orthonav", "build", "--ortho", str(out), "--dem", str(dem_path)]
+    assert area in words and words[-1] == str(tmp_path / "ortho.onav")
+    box = asked_for[0]["bbox"]  # beyond the imagery by what oblique views see
+    assert (box[3] - terrain.LAT_DEG) * terrain.NORTH_M > 1200
+    dem = open_dem(dem_path)
+    lat, lon = np.array([terrain.LAT_DEG]), np.array([west - 3 * step])
+    np.testing.assert_allclose(dem(lat, lon), terrain.heights(lat, lon), atol=0.05)
+
+
+@pytest.mark.parametrize("fault", ["down", "another file"])
+def test_imagery_is_kept_where_terrain_fails(command, area, tmp_path, offered, caplog, fault):
+    out, other = tmp_path / "ortho.tif", tmp_path / "ortho_dem.tif"
+    if fault == "another file":
+        other.write_text("mine")
+    with (
+        servers.serving(lambda _: servers.Answer(b"no", 503)) as heights,
+        servers.serving(servers.tiles) as server,
+    ):
+        offered(heights.url)
+        source = f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png"
+        code, stdout, _ = command(area, "--source", source, "--out", out, terrain=True)
+    assert code == 0 and out.is_file() and "no terrain was fetched" in caplog.text
+    assert "--source copernicus-dem" in caplog.text and "--dem" not in stdout
+    assert f"orthonav build --ortho {out}" in stdout
+    assert (other.read_text() == "mine") if fault == "another file" else not other.exists()
+
+
+@pytest.mark.parametrize(
+    "source, name",
+    [
+        ("ign:2021", "ign-terrain"), ("naip:2020", "usgs-3dep"), ("swissimage", "swissalti3d"),
+        ("pdok", "copernicus-dem"), ("wms:https://a.example/wms", "copernicus-dem"),
+        ("nasadem", None),
+    ],
+)  # fmt: skip
+def test_the_terrain_is_that_of_the_country_or_of_copernicus(source, name):
+    assert terrain_preset(source) == name
+    if name is not None:
+        spec = terrain_spec(name)
+        assert spec.provenance.datum
+        assert spec.options.gsd_m == (5.0 if name in ("ign-terrain", "swissalti3d") else None)
 
 
 @pytest.mark.long

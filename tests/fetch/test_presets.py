@@ -24,6 +24,7 @@ def test_a_service_and_its_layers_are_complete(name, monkeypatch):
     assert ("{key}" in preset.url) == (preset.key_env is not None)
     if preset.key_env:
         monkeypatch.setenv(preset.key_env, "x" * 8)
+    assert preset.terrain is None or presets()[preset.terrain].datum
     coarsest_m = 1 if preset.datum is None else 30
     for id_, layer in preset.layers.items():
         assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= coarsest_m, id_

@@ -1,6 +1,5 @@
 """Files on servers: only the window's bytes, in their place, alone or as a catalogue has them."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,6 @@ import rasterio
 import servers
 import terrain
 from pyproj import Transformer
-from rasterio.transform import Affine
 
 from orthonav.core.errors import FetchError
 from orthonav.core.geo.frames import LocalFrame
@@ -159,38 +157,9 @@ def catalogue(tmp_path):
     return contents
 
 
-def searching(catalogue, server_url, asked_for):
-    """A STAC API with a search in pages of one."""
-    items = {k: v for k, v in catalogue.items() if not k.startswith("/")}
-    pictures = servers.files({k: v for k, v in catalogue.items() if k.startswith("/")})
-
-    def answer(asked):
-        if asked.path == "/api/":
-            links = [{"rel": "search", "href": "/api/search"}, {"rel": "child", "href": "/none"}]
-            return servers.Answer(terrain.plain({"type": "Catalog", "links": links}))
-        if asked.path == "/api/search":
-            body = json.loads(asked.body)
-            asked_for.append(body)
-            names = sorted(name for name in items if body.get("datetime", "")[:4] in name)
-            if not names:
-                return servers.Answer(terrain.plain({"features": []}))
-            at = names.index(body["token"]) if "token" in body else 0
-            page = {"type": "FeatureCollection", "features": [items[names[at]]]}
-            page["features"][0]["assets"]["data"]["href"] = f"{server_url[0]}/{names[at]}.tif"
-            if at + 1 < len(names):
-                more = {"rel": "next", "href": "/api/search", "method": "POST", "merge": True}
-                page["links"] = [more | {"body": {"token": names[at + 1]}}]
-            return servers.Answer(terrain.plain(page))
-        if asked.path == "/api/token":
-            return servers.Answer(terrain.plain({"token": "se=1&sig=abcdefg"}))
-        return pictures(asked)
-
-    return answer
-
-
 def test_an_interface_with_a_search_in_pages(take, placed, catalogue):
     url, asked_for = [], []
-    with servers.serving(searching(catalogue, url, asked_for)) as server:
+    with servers.serving(servers.searching(catalogue, url, asked_for)) as server:
         url.append(server.url)
         time = "2021-01-01T00:00:00Z/2021-12-31T23:59:59Z"
         result, path = take(f"stac:{server.url}/api/", gsd_m=None, time=time, collection="dop")
@@ -205,7 +174,7 @@ def test_an_interface_with_a_search_in_pages(take, placed, catalogue):
 
 def test_a_file_off_the_grid_is_resampled(take, placed, catalogue):
     url = []
-    with servers.serving(searching(catalogue, url, [])) as server:
+    with servers.serving(servers.searching(catalogue, url, [])) as server:
         url.append(server.url)
         _, path = take(f"stac:{server.url}/api/", gsd_m=None)
     placed(path, worst=8)
@@ -222,7 +191,7 @@ def test_the_picture_of_several_files_is_that_of_the_usual_name():
 def test_signed_files(catalogue, tmp_path):
     """A query string that a signing service gives goes to the files' server, and nowhere else."""
     url = []
-    with servers.serving(searching(catalogue, url, [])) as server:
+    with servers.serving(servers.searching(catalogue, url, [])) as server:
         url.append(server.url)
         spec = parse_source(f"stac:{server.url}/api/", ImageryOptions(time="2021"))
         spec = replace(spec, token_url=f"{server.url}/api/token")
@@ -246,41 +215,19 @@ def test_signed_files(catalogue, tmp_path):
 )
 def test_missing_items_and_invalid_catalogues_are_errors(take, catalogue, body, options, words):
     url = []
-    answer = searching(catalogue, url, []) if body is None else lambda _: servers.Answer(body)
+    answer = (
+        servers.searching(catalogue, url, []) if body is None else lambda _: servers.Answer(body)
+    )
     with servers.serving(answer) as server, pytest.raises(FetchError, match=words):
         url.append(server.url)
         take(f"stac:{server.url}/api/", gsd_m=None, **options)
 
 
-def heights(lat_deg, lon_deg):
-    """Metres: they rise to the north and to the east, and pass through 0."""
-    north, east = np.asarray(lat_deg) - terrain.LAT_DEG, np.asarray(lon_deg) - terrain.LON_DEG
-    return 40 + 0.1 * north * terrain.NORTH_M - 0.2 * east * terrain.EAST_M
-
-
 def test_a_terrain_preset_is_fetched_with_its_datum(catalogue, tmp_path, monkeypatch):
     """Two files of heights in degrees, as those of Copernicus, with a hole."""
-    step = 1 / 3600
-    west = round(terrain.LON_DEG / step) * step
-    north = round(terrain.LAT_DEG / step) * step + 20 * step
-    found = {}
-    for name, first in (("west", west - 40 * step), ("east", west)):
-        col, row = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
-        values = heights(north - row * step, first + col * step).astype(np.float32)
-        if name == "east":
-            values[18:20, 5:8] = -9999
-        raw, path = tmp_path / f"{name}.raw.tif", tmp_path / f"{name}.tif"
-        with rasterio.open(
-            raw, "w", driver="GTiff", width=40, height=40, count=1, dtype="float32",
-            crs="EPSG:4326", nodata=-9999, transform=Affine(step, 0, first, 0, -step, north),
-        ) as data:  # fmt: skip
-            data.write(values[None])
-            box = tuple(data.bounds)
-        rasterio.shutil.copy(raw, path, driver="COG", COMPRESS="DEFLATE")
-        found[f"/{name}.tif"] = path.read_bytes()
-        found[name] = terrain.item(name, f"./{name}.tif", box)
+    found, step, west, north = terrain.height_files(tmp_path)
     url, asked_for = [], []
-    with servers.serving(searching(found, url, asked_for)) as server:
+    with servers.serving(servers.searching(found, url, asked_for)) as server:
         url.append(server.url)
         known = replace(
             presets()["copernicus-dem"],
@@ -298,7 +245,7 @@ def test_a_terrain_preset_is_fetched_with_its_datum(catalogue, tmp_path, monkeyp
     assert dem.datum.name == "EGM2008 height" and not dem.datum.above_ellipsoid
     lat = terrain.LAT_DEG + np.linspace(-5, 5, 11) * step
     lon = west - np.linspace(0.5, 8, 11) * step
-    np.testing.assert_allclose(dem(lat, lon), heights(lat, lon), atol=0.05)
+    np.testing.assert_allclose(dem(lat, lon), terrain.heights(lat, lon), atol=0.05)
     hole = np.array([north - 19 * step]), np.array([west + 6.5 * step])
     assert np.isnan(dem(*hole))
     plane = dem.in_plane(LocalFrame(float(hole[0][0]), float(hole[1][0])), -5, 5, 10, 1, 1)

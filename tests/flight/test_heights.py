@@ -14,6 +14,7 @@ from orthonav.core.flight.heights import (
     TerrainFit,
     assumed_heights,
     is_measured,
+    needs_datum,
 )
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import Ground
@@ -70,6 +71,18 @@ def test_each_height_becomes_one_above_ground(heights, expected_m):
     assert found.agl_m == pytest.approx(expected_m) and found.agl_std_m is None
     if len(heights) == 1 and "amsl_m" not in heights:  # no height is taken for another
         assert GroundHeights(terrain).above(telemetry, below, place(0, 0)) == telemetry
+
+
+def test_over_an_unknown_datum_only_heights_above_take_off_are_converted():
+    over = flown(take_off=(*place(0, 200), 0.0), datum_known=False)  # took off at 320 m
+    both = over.corrected(reported(amsl_m=1.0, home_m=250.0, hae_m=1.0))
+    assert both.agl_m == pytest.approx(270.0, abs=0.1)
+    for heights in ({"amsl_m": 700.0}, {"hae_m": 700.0}):
+        assert needs_datum(reported(**heights))
+        assert math.isnan(over.corrected(reported(**heights)).agl_m)
+    assert over.corrected(reported(agl_m=123.0, amsl_m=700.0)).agl_m == 123.0
+    assert not needs_datum(reported(agl_m=123.0, amsl_m=700.0))
+    assert math.isnan(over.ground_m(fix(0, 0)))
 
 
 def test_a_flight_without_a_position_uses_the_area_searched():

@@ -1,5 +1,6 @@
 """Terrain models in files: place, vertical reference, units, voids, size."""
 
+import re
 import struct
 
 import numpy as np
@@ -88,8 +89,11 @@ def test_any_coordinate_system_and_a_raster_that_begins_in_the_south(make_dem, t
 
 
 def test_the_vertical_datum_is_that_of_the_file_or_asked_for(make_dem):
-    with pytest.raises(ImageryError, match=r"does not state its vertical datum.* --dem-datum"):
-        open_dem(make_dem())
+    unknown = open_dem(make_dem())
+    assert unknown.datum.name == "unknown" and not unknown.datum.is_known
+    assert error_m(unknown) < 0.01
+    with pytest.raises(ImageryError, match=r"a reason, .* not state its vertical .* --dem-datum"):
+        unknown.require_datum("a reason")
     compound = "EPSG:32631+5773"
     corner = Affine(10, 0, 458_000, 0, -10, 5_152_000)
     dem = open_dem(make_dem("a.tif", crs=compound, transform=corner))
@@ -102,11 +106,12 @@ def test_the_vertical_datum_is_that_of_the_file_or_asked_for(make_dem):
         open_dem(make_dem(), "EPSG:5715")
 
 
-def test_heights_above_the_ellipsoid_need_a_geoid(make_dem, tmp_path, monkeypatch):
+def test_heights_above_the_ellipsoid_need_a_geoid(make_dem, tmp_path, monkeypatch, caplog):
     datums.geoid.cache_clear()
     monkeypatch.setattr(datums, "GEOIDS", ("none_such.tif",))
-    with pytest.raises(ImageryError, match=r"need a geoid.* none_such\.tif in .*projsync"):
-        open_dem(make_dem(), "ellipsoid")
+    without = open_dem(make_dem(), "ellipsoid")
+    assert re.search(r"need a geoid.* none_such\.tif in .*projsync", caplog.text)
+    assert not without.datum.is_known and error_m(without) < 0.01
     before = pyproj.datadir.get_data_dir()
     try:
         head = struct.pack(">4d2i", 40.0, 0.0, 1.0, 1.0, 11, 11)

@@ -10,12 +10,16 @@ from orthonav.cli.common import add_area, add_options, print_json, progress
 if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
 
+WITHOUT_TERRAIN = (
+    "less with --dem FILE ('orthonav fetch --source copernicus-dem --out FILE'), and with --relief "
+    "level where the land is level"
+)
 LEAST_SHIFT_M = 0.3
 """A pixel of the finest orthophotos of countries."""
 
 EXAMPLE = "--ortho ortho.tif --route route.kml --band-m 600 --out area.onav"
 EVERYDAY = (
-    *("--other-date", "--dem"),
+    *("--other-date", "--dem", "--relief"),
     *("--route", "--bounds", "--band-m"),
     *("--gsd-m", "--work", "--json"),
 )
@@ -32,7 +36,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     add_options(parser, "--json")
     imagery = parser.add_argument_group("imagery")
-    add_options(imagery, "--ortho", "--dem", "--dem-datum")
+    add_options(imagery, "--ortho", "--dem", "--dem-datum", "--relief")
     text = "orthophoto of the same area at another date, from which confidence and covariance are "
     text += "calibrated; it does not become part of the map; may be repeated"
     imagery.add_argument(
@@ -78,6 +82,7 @@ def asked(options: argparse.Namespace) -> dict[str, Any]:
         "band_m": options.band_m,
         "dem": options.dem,
         "dem_datum": options.dem_datum,
+        "relief": options.relief,
     }
 
 
@@ -110,6 +115,14 @@ def run(options: argparse.Namespace) -> None:
         print_json(plain | {"plates": plates})
         return
     print(summary_text(plain))
+    terrain = result.manifest.sheets[0].terrain
+    if terrain is None:
+        print(WITHOUT_TERRAIN)
+    elif not terrain.is_above_sea:
+        print(
+            "the terrain file does not state its vertical datum: heights above ground and take-off "
+            "can be used; --dem-datum adds heights above the sea and the ellipsoid"
+        )
     for each in plates:
         print(
             f"{each['crs']:.60} is taken as WGS 84, from which its tectonic plate has moved it by "

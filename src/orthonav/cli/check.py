@@ -198,6 +198,11 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
             "heights of the route are not above ground: give the terrain (--dem FILE, or a map "
             "built with --dem) or the height (--agl-m)"
         )
+    if isinstance(terrain, TerrainLayer) and "amsl" in frames and not terrain.info.is_above_sea:
+        raise CheckError(
+            "heights of the route are above the sea, and the vertical datum of the map's terrain "
+            "is unknown: build it with --dem-datum, or give --agl-m"
+        )
     try:
         flown = flown_agl_m(route, terrain)
     except RouteError as error:

@@ -95,6 +95,11 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "help": "vertical datum of the terrain model, where the file does not state it: egm96, "
         "egm2008, msl, ellipsoid or EPSG:NUMBER of a vertical system",
     },
+    "--relief": {
+        "choices": ("level", "rolling", "hills"),
+        "help": "what the land is like where no terrain is given: slopes of 1, 5 (default) or "
+        "12 %% RMS, which look like tilt of the camera",
+    },
     "--gsd-m": {
         "type": float,
         "help": "ground resolution, metres per pixel (default: suited to imagery or view)",

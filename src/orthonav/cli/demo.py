@@ -15,7 +15,7 @@ from orthonav.cli.common import add_options, print_json
 
 EXAMPLE = ""
 IMAGERY = Path(__file__).parents[1] / "ground" / "demo_data"
-"""Two dates of a generated area of 2 x 2 km; `lab/demo_imagery.py` makes them."""
+"""Two dates of a generated area of 2 x 2 km and its level terrain, from `lab/demo_imagery.py`."""
 MARKER = "demo.json"
 """File that marks a folder as an earlier demo, which may be replaced."""
 HEIGHT_M = 270.0
@@ -81,11 +81,11 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
     """Run the commands in the folder; the metrics, and what the commands printed about them."""
     from orthonav.core.mapfile import open_map
 
-    past, present = (shutil.copy(path, folder) for path in sorted(IMAGERY.glob("*.tif")))
+    past, present, dem = (shutil.copy(path, folder) for path in sorted(IMAGERY.glob("*.tif")))
     with contextlib.chdir(folder):
-        past, present = Path(past).name, Path(present).name
+        past, present, dem = (Path(each).name for each in (past, present, dem))
         _say(options, f"1/4 building the map from {past}")
-        built = _run(options, "build", "--ortho", past, "--out", "area.onav")
+        built = _run(options, "build", "--ortho", past, "--dem", dem, "--out", "area.onav")
         frame = open_map(Path("area.onav")).manifest.sheets[0].frame
         _write_route(Path("route.geojson"), frame.latlon_from_en(WAYPOINTS_EN_M))
         flown = ("--route", "route.geojson", "--agl-m", HEIGHT_M)

@@ -1,6 +1,8 @@
 """`orthonav fetch`: download orthophotos of an area from open services."""
 
 import argparse
+import logging
+import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -12,12 +14,13 @@ from orthonav.core.errors import FetchError
 
 if TYPE_CHECKING:
     from orthonav.ground.fetch.presets import ImageryOptions
-    from orthonav.ground.fetch.run import FetchRequest, FetchResult
+    from orthonav.ground.fetch.run import CostEstimate, FetchRequest, FetchResult
 
+log = logging.getLogger(__name__)
 EXAMPLE = "--route route.kml --source ign --out ortho.tif"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
-    *("--layer", "--time", "--date", "--key-env", "--cache", "--json"),
+    *("--layer", "--time", "--date", "--key-env", "--cache", "--no-terrain", "--json"),
 )
 
 
@@ -26,6 +29,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--source", metavar="NAME[:YEAR]|PROTOCOL:ADDRESS", help=text)
     parser.add_argument("--list", action="store_true", help="list the services known by name")
     parser.add_argument("--out", type=Path, metavar="ORTHO.tif", help="GeoTIFF to write")
+    text = "omit the terrain model that is written beside the imagery, as ORTHO_dem.tif"
+    parser.add_argument("--no-terrain", dest="terrain", action="store_false", help=text)
     text = "print the estimated cost and fetch nothing"
     parser.add_argument("--dry-run", action="store_true", help=text)
     add_options(parser, "--json")
@@ -92,24 +97,71 @@ def run(options: argparse.Namespace) -> None:
     if options.source is None or (options.out is None and not options.dry_run):
         raise FetchError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
-    from orthonav.ground.fetch.run import estimate_fetch, fetch
+    from orthonav.ground.fetch.presets import terrain_preset
+    from orthonav.ground.fetch.run import estimate_fetch, fetch, terrain_request
 
     request = _request(options)
+    name = terrain_preset(options.source) if options.terrain else None
     if options.dry_run:
-        estimate = estimate_fetch(request)
-        if options.json:
-            print_json(vars(estimate) | {"provenance": vars(estimate.provenance)})
-        else:
-            print(f"would fetch {estimate.text()}")
+        _print_estimate(options, estimate_fetch(request), name)
         return
     with progress(options) as shown:
         result = fetch(
             request, shown, lambda estimate: _say(options, f"fetching {estimate.text()}")
         )
+    found = [(request, result)]
+    if name is not None:
+        found += _terrain(options, terrain_request(request, name), name)
     if options.json:
-        print_json({"out": str(options.out), **result.describe()})
+        terrain = [{"out": str(each.out), **got.describe()} for each, got in found[1:]]
+        more = {"terrain": terrain[0] if terrain else None}
+        print_json({"out": str(options.out), **result.describe(), **more})
+        return
+    print("\n\n".join(_summary(each.out, got) for each, got in found))
+    if options.terrain and request.spec.provenance.datum is None:
+        print(f"\nbuild the map:\n  {_build_line(options, [each.out for each, _ in found[1:]])}")
+
+
+def _print_estimate(
+    options: argparse.Namespace, estimate: "CostEstimate", terrain: str | None
+) -> None:
+    if options.json:
+        print_json(vars(estimate) | {"provenance": vars(estimate.provenance), "terrain": terrain})
     else:
-        print(_summary(options.out, result))
+        more = "" if terrain is None else f"; the terrain of {terrain} besides"
+        print(f"would fetch {estimate.text()}{more}")
+
+
+def _terrain(
+    options: argparse.Namespace, request: "FetchRequest", name: str
+) -> "list[tuple[FetchRequest, FetchResult]]":
+    """Nothing, with a warning, where it cannot be had: the imagery is kept."""
+    from orthonav.core.errors import AreaError, OutputError
+    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
+    from orthonav.ground.fetch.run import fetch_terrain
+
+    _say(options, f"fetching the terrain of {name}")
+    try:
+        with progress(options) as shown:
+            return [(request, fetch_terrain(request, shown))]
+    except (FetchError, AreaError, OutputError) as error:
+        log.warning(
+            "no terrain was fetched (%s); the imagery is complete; fetch a terrain with --source "
+            "%s, or build with one of your own, or without: %s",
+            *(error, DEFAULT_TERRAIN, options.out),
+        )
+        return []
+
+
+def _build_line(options: argparse.Namespace, terrain: list[Path]) -> str:
+    words = ["orthonav", "build", "--ortho", options.out]
+    words += [word for path in terrain for word in ("--dem", path)]
+    if options.bounds is not None:
+        words.append(f"--bounds={','.join(map(str, options.bounds))}")
+    else:
+        words += ["--route", options.route]
+        words += [] if options.band_m is None else ["--band-m", f"{options.band_m:g}"]
+    return shlex.join(map(str, [*words, "--out", options.out.with_suffix(".onav")]))
 
 
 def _request(options: argparse.Namespace) -> "FetchRequest":

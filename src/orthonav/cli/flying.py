@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import acceptance, checked_signature, search_plan
 from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
-from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
+from orthonav.core.errors import CameraError, FlightError, OutputError, UsageError, VariantError
 from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
 from orthonav.core.flight.fixes import Identity
 from orthonav.core.flight.gnss import FILE, GnssSample, read_gnss
+from orthonav.core.flight.heights import DATUM_ADVICE
 from orthonav.core.flight.mount import MOST_MS, CameraLatency, Mount, read_latency, read_mount
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
@@ -80,6 +81,11 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         return MountCorrected(tracker, mount) if mount else tracker
 
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
+    if heights is not None and not heights.datum_known and set(options.height or ()) == {"amsl"}:
+        raise FlightError(
+            "--height amsl needs the height of the ground above the sea, and the vertical datum of "
+            f"the map's terrain is unknown: {DATUM_ADVICE}"
+        )
     link = _link(options, clocks)
     if options.ros2:
         source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, sent_least)

@@ -63,6 +63,7 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         **tile_level,
         "registration": _registration(manifest),
         "terrain": None if terrain is None else asdict(terrain),
+        "relief": manifest.sheets[0].relief,
         "sheets": [
             {
                 "centre_lat_deg": sheet.frame.lat_deg,
@@ -139,6 +140,10 @@ def summary_text(plain: dict[str, Any]) -> str:
         heights = f"{terrain['low_m']:.0f} to {terrain['high_m']:.0f} m above the sea"
         named = "".join(c for c in f"{terrain['name']}, {terrain['datum']}" if c.isprintable())
         lines.append(f"terrain    {heights} every {terrain['posting_m']:g} m ({named})")
+        lines += [f"           {text}" for text in _source_text(terrain)]
+    else:
+        first, second = unknown_ground_text(plain["relief"])
+        lines += [f"terrain    {first}", f"           {second}"]
     for source in plain["imagery"]:
         files = f"{source['files']} files  " if source.get("files") else ""
         dates = " to ".join(texts(source, "date_from", "date")) or "date unknown"
@@ -155,6 +160,32 @@ def summary_text(plain: dict[str, Any]) -> str:
         speed = plain["area_km2"] / plain["build_s"]
         lines.append(f"built in   {plain['build_s']:.1f} s, {speed:.2f} km2/s")
     return "\n".join(lines)
+
+
+def _source_text(terrain: Mapping[str, Any]) -> list[str]:
+    source_m, roughness_m = terrain["source_posting_m"], terrain["roughness_m"]
+    said = (
+        [] if source_m in (None, terrain["posting_m"]) else [f"from heights every {source_m:g} m"]
+    )
+    said += [] if roughness_m is None else [f"which differ from these by {roughness_m:.2g} m RMS"]
+    return [", ".join(said)] if said else []
+
+
+def unknown_ground_text(relief: str | None) -> list[str]:
+    """What ground without terrain costs, in lines."""
+    from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES, unknown_slope_share
+    from orthonav.core.records import DEFAULT_TILT_STD_DEG
+
+    slope = RELIEF_SLOPES[relief or DEFAULT_RELIEF]
+    known, unknown = (
+        f"{100 * unknown_slope_share(tilt_deg, relief):.1f} %"
+        for tilt_deg in (1.0, DEFAULT_TILT_STD_DEG)
+    )
+    return [
+        f"none: {relief or DEFAULT_RELIEF} land is assumed (slopes of {100 * slope:.0f} %); the "
+        "camera is",
+        f"off by {known} of the height where its tilt is known to 1 deg, {unknown} where it is not",
+    ]
 
 
 def recipe_text(recipe: dict[str, Any]) -> str:

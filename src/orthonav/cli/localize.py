@@ -41,10 +41,13 @@ if TYPE_CHECKING:
     from orthonav.core.flight.fixes import Identity
     from orthonav.core.flight.mount import Mount
     from orthonav.core.flight.recording import Flight
+    from orthonav.core.geo.ground import TerrainHeights
     from orthonav.core.localize import Localizer
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile import MapFile
+    from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.records import Fix, Telemetry, ViewResult
+    from orthonav.ground.imagery.terrain import Dem
     from orthonav.ground.recordings import Recording, SourceView
     from orthonav.ground.recordings.setups import Tried
 
@@ -118,6 +121,13 @@ def run(options: argparse.Namespace) -> None:
         _on_map(options)
 
 
+def _above_sea(dem: "Dem | None", layer: "TerrainLayer | None") -> "TerrainHeights | None":
+    """The terrain, if its heights count from the sea."""
+    if dem is not None:
+        return dem if dem.datum.is_known else None
+    return layer if layer is not None and layer.info.is_above_sea else None
+
+
 def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.errors import VariantError
     from orthonav.core.flight.fixes import FlightDigest, Identity
@@ -172,7 +182,7 @@ def _on_map(options: argparse.Namespace) -> None:
         else:
             compare_with_flight(flight, results)
         _write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
-        export_all(exports, results, dem or TerrainLayer.of(opened))
+        export_all(exports, results, _above_sea(dem, TerrainLayer.of(opened)))
         advice, tried = advisor.advice(results, accept)
         seen_by = MountedFlight(flight, mount) if mount else flight
         changed = report_changes(options, opened, seen_by, results, shown)

@@ -65,11 +65,12 @@ def run(options: argparse.Namespace) -> None:
     if other:
         log.warning("fixes are of %s: %s", other, options.fixes)
     found = locate_pixel(_camera(flight, view), telemetry, fix, (options.x, options.y), terrain)
+    height_m = found.height_m if _is_above_sea(terrain) else math.nan
     ellipse = ellipse_95(found.cov_en_m2)
     plain = {
         "lat_deg": round(found.lat_deg, 9),
         "lon_deg": round(found.lon_deg, 9),
-        "height_m": None if math.isnan(found.height_m) else round(found.height_m, 2),
+        "height_m": None if math.isnan(height_m) else round(height_m, 2),
         "range_m": round(found.range_m, 2),
         "cov_en_m2": found.cov_en_m2.tolist(),
         "ellipse_95": ellipse,
@@ -78,7 +79,7 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         print_json(plain)
         return
-    above = "" if math.isnan(found.height_m) else f", {found.height_m:.1f} m above sea"
+    above = "" if math.isnan(height_m) else f", {height_m:.1f} m above sea"
     print(f"{found.lat_deg:.8f}, {found.lon_deg:.8f}{above}")
     axes = "unknown"
     if ellipse is not None:
@@ -98,6 +99,10 @@ def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
     except (FlightError, MissingFileError):
         return flight.camera
     return flight.camera.fitted(width_px, height_px)
+
+
+def _is_above_sea(terrain: "TerrainLayer | None") -> bool:
+    return terrain is not None and terrain.info.is_above_sea
 
 
 def _terrain(path: Path) -> "tuple[TerrainLayer, str]":

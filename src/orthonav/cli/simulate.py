@@ -67,6 +67,8 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.ground.simulate.receiver import receiver_of
 
     dem, given = dem_of(options), vars(options)
+    if dem is not None:
+        dem.require_datum("heights of simulated flights are above the sea")
     request = SimulateRequest(
         orthos=options.ortho,
         out=options.out,

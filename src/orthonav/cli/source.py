@@ -140,6 +140,8 @@ def dem_of(options: argparse.Namespace, route: "Route | None" = None) -> "Dem | 
     from orthonav.ground.imagery.terrain import open_dem
 
     dem = open_dem(options.dem, options.dem_datum)
+    if route is not None and any(each and each.frame == "amsl" for each in route.heights):
+        dem.require_datum("heights of the route are above the sea")
     if route is not None and not any(dem.covers(*waypoint) for waypoint in route.waypoints):
         hint = swapped_hint(*route.waypoints[0], dem.covers)
         raise ImageryError(f"the route lies outside the terrain{hint}: {options.dem}")
@@ -153,16 +155,26 @@ def map_heights(
     take_off: tuple[float, float, float] | None = None,
     geoid: "Undulation | None" = None,
     use_prior: bool = True,
+    datum_known: bool = True,
 ) -> "FlownHeights | None":
-    """Heights above ground on a map by `terrain`, else by its own; None where it has none."""
+    """Heights above ground on a map by `terrain` (`datum_known`: whether it counts from the sea),
+    else by its own; None where it has none."""
     from orthonav.core.flight.heights import FlownHeights
     from orthonav.core.mapfile.terrain import TerrainLayer
 
-    terrain = terrain or TerrainLayer.of(opened)
-    if terrain is None:
+    layer = None if terrain is not None else TerrainLayer.of(opened)
+    found = terrain or layer
+    if found is None:
         return None
-    area_deg = _area_deg(opened)
-    return FlownHeights(terrain, area_deg, take_off=take_off, geoid=geoid, use_prior=use_prior)
+    known = datum_known if layer is None else layer.info.is_above_sea
+    return FlownHeights(
+        found,
+        _area_deg(opened),
+        take_off=take_off,
+        geoid=geoid,
+        use_prior=use_prior,
+        datum_known=known,
+    )
 
 
 def _area_deg(opened: "MapFile") -> "tuple[Array, Array]":
@@ -183,6 +195,7 @@ def flight_heights(
 ) -> "FlownHeights | None":
     """Heights above ground of the views of a recorded flight; None without a terrain. What is
     assumed about heights is logged once."""
+    from orthonav.core.flight.heights import DATUM_ADVICE, needs_datum
 
     if dem is not None and not any(map(dem.covers, *_area_deg(opened))):
         raise ImageryError(f"the terrain lies outside the map: {dem.path}")
@@ -197,7 +210,13 @@ def flight_heights(
         take_off=None if place is None else (*place, 0.0),
         geoid=geoid_for(flight) if has_terrain else None,
         use_prior=getattr(options, "prior", None) != "none",
+        datum_known=dem is None or dem.datum.is_known,
     )
+    if heights is not None and not heights.datum_known and needs_datum(first.telemetry):
+        raise FlightError(
+            "the flight has heights above the sea or the ellipsoid only, and the vertical datum "
+            f"of the terrain is unknown: {DATUM_ADVICE}"
+        )
     name = None
     if heights is not None:
         name = "the terrain of the map" if dem is None else f"the terrain of {options.dem.name}"

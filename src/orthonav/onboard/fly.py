@@ -16,7 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, MapChangedError, MapFileError
-from orthonav.core.flight.heights import FlownHeights, assumed_heights
+from orthonav.core.flight.heights import (
+    DATUM_ADVICE,
+    FlownHeights,
+    assumed_heights,
+    needs_datum,
+)
 from orthonav.core.flight.mount import Mount
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles
@@ -420,6 +425,14 @@ class Runner:
             return
         self._heights_said = True
         name = None if self.options.heights is None else "the terrain of the map"
+        heights = self.options.heights
+        if heights is not None and not heights.datum_known and needs_datum(telemetry):
+            log.warning(
+                "only heights above the sea or the ellipsoid are known, and the vertical datum of "
+                "the map's terrain is not: %s",
+                DATUM_ADVICE,
+            )
+            return
         said = assumed_heights(telemetry, name, "build the map with --dem")
         if said is not None:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)

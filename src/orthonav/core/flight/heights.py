@@ -41,6 +41,7 @@ height above ground: by a right terrain it was 1.3 %, by one displaced by 200 m 
 (`benchmarks.terrain_flight` at d63ac91)."""
 MAX_VIEWS = 2000  # only so many of the latest confident views are kept
 HOLES_SHARE = 0.1  # so are holes below more than this fraction of the confident views
+DATUM_ADVICE = "state it with --dem-datum, or use heights above ground or take-off"
 _LOST = ("searching", "lost")  # states of a track that has no position
 log = logging.getLogger(__name__)
 
@@ -76,17 +77,25 @@ def assumed_heights(
     return f"only heights above {' and '.join(known)} are known, none above ground: {advice}"
 
 
+def needs_datum(telemetry: Telemetry) -> bool:
+    """Whether its height above ground follows only from the height of the ground above the sea."""
+    known = is_measured(telemetry) or telemetry.home_m is not None
+    return not known and (telemetry.amsl_m is not None or telemetry.hae_m is not None)
+
+
 @dataclass(frozen=True, eq=False)
 class GroundHeights:
     """Heights above ground over a terrain.
 
     `terrain`: its heights above mean sea level. `take_off`: the ground where the aircraft took off,
     None where that is unknown. `geoid`: needed for heights above the ellipsoid; None without one.
+    `datum_known`: where not, heights above the sea and the ellipsoid are ignored.
     """
 
     terrain: TerrainHeights
     take_off: Ground | None = None
     geoid: Undulation | None = None
+    datum_known: bool = True
 
     def above(self, telemetry: Telemetry, below: Ground, place: Place) -> Telemetry:
         """The telemetry with the height above the ground `below`, and its standard deviation.
@@ -108,17 +117,19 @@ class GroundHeights:
 
     def mismatch_m(self, telemetry: Telemetry) -> float:
         """Height above sea by take-off and terrain, minus the reported one; NaN where unknown."""
-        if self.take_off is None or telemetry.home_m is None or telemetry.amsl_m is None:
+        known = self.datum_known and self.take_off is not None
+        if not known or telemetry.home_m is None or telemetry.amsl_m is None:
             return math.nan
+        assert self.take_off is not None
         return telemetry.home_m + self.take_off.height_m - telemetry.amsl_m
 
     def above_sea(self, telemetry: Telemetry, place: Place) -> tuple[float, float] | None:
-        """Height above sea level and its standard deviation by the terrain; None where unknown."""
-        if telemetry.amsl_m is not None:
+        """Height above the datum of the terrain and its standard deviation; None where unknown."""
+        if self.datum_known and telemetry.amsl_m is not None:
             return telemetry.amsl_m, 0.0
         if telemetry.home_m is not None and self.take_off is not None:
             return telemetry.home_m + self.take_off.height_m, self.take_off.std_m
-        if telemetry.hae_m is not None and self.geoid is not None:
+        if self.datum_known and telemetry.hae_m is not None and self.geoid is not None:
             lat, lon = np.array([place[0]]), np.array([place[1]])
             return telemetry.hae_m - float(self.geoid(lat, lon)[0]), 0.0
         return None
@@ -140,13 +151,15 @@ class FlownHeights:
         take_off: tuple[float, float, float] | None = None,
         geoid: Undulation | None = None,
         use_prior: bool = True,
+        datum_known: bool = True,
     ) -> None:
         """`area_deg`: latitudes and longitudes spread over the area searched. `take_off`: latitude,
-        longitude and standard deviation (m) of the take-off position."""
+        longitude and standard deviation (m) of the take-off position. `datum_known`: whether the
+        terrain counts from the sea."""
         self._terrain, self._area_deg = terrain, area_deg
-        self._use_prior = use_prior
+        self._use_prior, self.datum_known = use_prior, datum_known
         known = take_off and ground_around(terrain, take_off[:2], take_off[2])
-        self._heights = GroundHeights(terrain, known or self._whole, geoid)
+        self._heights = GroundHeights(terrain, known or self._whole, geoid, datum_known)
         self._checked = known is None
         self._last: tuple[int, Place, float] | None = None
         self._fit, self._newest = TerrainFit(terrain), Telemetry(-1, 0.0, 0.0, 0.0, math.nan)
@@ -186,7 +199,9 @@ class FlownHeights:
                 self._fit.take(outcome, reported[0])
 
     def ground_m(self, fix: Fix) -> float:
-        """Height of the terrain above sea level at a fix; NaN where the terrain has none."""
+        """Height of the terrain above sea level at a fix; NaN where that is unknown."""
+        if not self.datum_known:
+            return math.nan
         std_m = math.sqrt(float(np.trace(fix.cov_en_m2)) / 2)
         below = ground_around(self._terrain, (fix.lat_deg, fix.lon_deg), std_m)
         return math.nan if below is None else below.height_m

@@ -23,6 +23,7 @@ CODEC = "jpeg"
 TERRAIN_CODEC = "delta-zlib"
 MAX_CODE = 65_535  # of heights above the lowest one of a layer
 MAX_POSTING_M = 1000.0
+UNKNOWN_DATUM = "unknown"
 MIN_SOURCE_POSTING_M, MAX_SOURCE_POSTING_M = 0.01, 100_000.0
 MAX_ROUGHNESS_M = 1000.0
 MAX_NAME = 200
@@ -70,7 +71,7 @@ class TerrainInfo:
     `west_m`, `north_m`: outer north-west corner, half a posting from sample (0, 0). `posting_m`: 1
     to 1000. `chunk_px`: samples, 16 to 1024. `low_m`, `high_m`: heights above mean sea level, -500
     to 9000. `unit_m`: per step, 0.01 to 10. `known`: samples with a height. `name`, `datum`: of the
-    source.
+    source; heights over `UNKNOWN_DATUM` can only be compared with each other.
 
     `source_posting_m`: of the source, 0.01 to 100,000; None in older maps: `posting_m`.
     `roughness_m`: root mean square difference of the heights of the source from those of the layer,
@@ -90,6 +91,10 @@ class TerrainInfo:
     datum: str
     source_posting_m: float | None = None
     roughness_m: float | None = None
+
+    @property
+    def is_above_sea(self) -> bool:
+        return UNKNOWN_DATUM not in self.datum.split(", ")
 
     def to_plain(self) -> dict[str, Any]:
         known = {name: value for name, value in vars(self).items() if value is not None}

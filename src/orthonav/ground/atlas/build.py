@@ -30,7 +30,7 @@ from orthonav.ground.atlas.cluster import Failure, TaskRunner
 from orthonav.ground.atlas.coarse import coarse_grid, write_coarse
 from orthonav.ground.atlas.cut import box_around, box_deg, turned
 from orthonav.ground.atlas.store import Store
-from orthonav.ground.build.build import BuildRequest, build_map
+from orthonav.ground.build.build import BuildRequest, build_map, require_relief
 from orthonav.ground.build.layer import rounded_gsd_m
 from orthonav.ground.build.sheet import digest, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -64,6 +64,7 @@ class AtlasRequest:
     index: bool = True  # also make the index of the coarse tiles
     dem: Path | None = None  # terrain model of which sheets get a terrain layer
     dem_datum: str | None = None  # what its heights count from
+    relief: str | None = None  # what the land is like, as in `BuildRequest`; not with `dem`
 
     def __post_init__(self) -> None:
         with_paths(self, "orthos", "dem")
@@ -137,6 +138,8 @@ def request_digest(
     if request.dem is not None:
         found, name = request.dem.stat(), request.dem.name
         depends.append([name, found.st_size, found.st_mtime_ns // 10**9, request.dem_datum])
+    if request.relief is not None:
+        depends.append(request.relief)
     return digest(depends)
 
 
@@ -315,6 +318,7 @@ def build_atlas(
     `MissingFileError`; `AtlasError` where present sheets are of other imagery or versions;
     `WorkerError` where a worker has other versions; `StorageError`."""
     started_s = time.monotonic()
+    require_relief(request.relief, request.dem)
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
     recipe = recipe_for(request, mosaic)
@@ -394,6 +398,7 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
         dem=task.request.dem,
         dem_datum=task.request.dem_datum,
         dem_needed=False,
+        relief=task.request.relief,
         cells=True,
         **recipe,
     )

@@ -14,7 +14,7 @@ import logging
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -34,6 +34,7 @@ from orthonav.core.errors import (
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
+from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES
 from orthonav.core.localize.confidence import (
     CHANCES,
     Chances,
@@ -454,7 +455,23 @@ def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> T
         points = np.stack([west_m + col * posting_m, north_m - row * posting_m], axis=-1)
         return _heights(layers, *area.frame.latlon_from_en(points))
 
-    return terrain_parts(area, grid, posting_m, ", ".join(names), ", ".join(datums), sampled)
+    made = terrain_parts(area, grid, posting_m, ", ".join(names), ", ".join(datums), sampled)
+    if made is None:
+        return None
+    source_m = [each.source_posting_m for each in infos if each.source_posting_m is not None]
+    roughness_m = [each.roughness_m for each in infos if each.roughness_m is not None]
+    info = replace(
+        made.info,
+        source_posting_m=max(source_m, default=None),
+        roughness_m=max(roughness_m, default=None),
+    )
+    return made._replace(info=info)
+
+
+def _relief(members: Sequence[SheetSource]) -> str | None:
+    """The steepest of the sheets."""
+    stated = [each.manifest.sheets[0].relief for each in members]
+    return max(stated, key=lambda each: RELIEF_SLOPES[each or DEFAULT_RELIEF])
 
 
 def _heights(
@@ -572,7 +589,7 @@ def _learnt(
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     made = cut_terrain(members, area, grid)
     terrain, terrain_parts = (None, {}) if made is None else made
-    sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey, terrain)
+    sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, _relief(members))
     manifest = pooled_manifest(members, _shares(area, centres, members), sheet)
     return manifest, {
         "sheet0/centres_en_m": centres.astype(np.float32),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.core.errors import AreaError, OutputError, VariantError
 from orthonav.core.files import Progress, no_progress, with_paths
+from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import USUAL_TILES
 from orthonav.core.localize.localizer import RegistrationLocalizer
@@ -86,6 +87,8 @@ class BuildRequest:
     - `dem_datum`: what its heights count from, where the file does not state it
       (`orthonav.ground.imagery.terrain.OPTION`).
     - `dem_needed`: whether an area in which the model has no height is refused.
+    - `relief`: what the land is like where there is no terrain, a key of
+      `orthonav.core.geo.ground.RELIEF_SLOPES`; None: not stated. Not together with `dem`.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
     """
@@ -109,6 +112,7 @@ class BuildRequest:
     dem: Path | None = None
     dem_datum: str | None = None
     dem_needed: bool = True
+    relief: str | None = None
     epoch: float | None = None
     device: str = "auto"
     cells: bool = False
@@ -177,6 +181,15 @@ def _check_numbers(request: BuildRequest) -> None:
         )
     if request.workers is not None and not 1 <= request.workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {request.workers}")
+    require_relief(request.relief, request.dem)
+
+
+def require_relief(relief: str | None, dem: Path | None) -> None:
+    """Raise `VariantError` for an unknown relief, and for one beside a terrain model."""
+    if relief is not None and relief not in RELIEF_SLOPES:
+        raise VariantError(f"relief must be {', '.join(RELIEF_SLOPES)}, got '{relief:.40}'")
+    if relief is not None and dem is not None:
+        raise VariantError("the terrain model says what the land is like: give --dem or --relief")
 
 
 def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
@@ -263,7 +276,7 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     if request.cells and isinstance(inputs.recipe, WhitenedRecipe):
         arrays |= cell_parts(sheet.cells)
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
-    info = SheetInfo(sheet.area.frame, grid, len(tiles_rc), area_km2, grey, terrain)
+    info = SheetInfo(sheet.area.frame, grid, len(tiles_rc), area_km2, grey, terrain, request.relief)
     manifest = _manifest(inputs, info, embedder, calibration)
     if request.registration:
         found = _registration(inputs, tiles, embedder, manifest, arrays, progress)

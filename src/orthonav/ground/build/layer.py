@@ -10,6 +10,8 @@ import logging
 import math
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import cv2
@@ -18,12 +20,16 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError, MapFileError
 from orthonav.core.geo.grid import TileGrid
+from orthonav.core.geo.ground import bilinear
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.mapfile.layer import ChunkTable, part_names
 from orthonav.core.mapfile.manifest import (
     MAX_CODE,
     MAX_LEVELS,
     MAX_POSTING_M,
+    MAX_ROUGHNESS_M,
+    MAX_SOURCE_POSTING_M,
+    MIN_SOURCE_POSTING_M,
     GreyInfo,
     TerrainInfo,
 )
@@ -241,6 +247,9 @@ POSTING_M = 10.0
 """Distance of samples; that of the terrain model where it is coarser."""
 TERRAIN_CHUNK_PX = 128
 UNIT_M = 0.1
+ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
+"""Squares per side of the area in which roughness is measured, their width in postings, and the
+most samples of the source across a posting."""
 HeightSampler = Callable[[float, float, int, int], NDArray[np.float64]]
 """Heights above mean sea level of rows and columns of samples from a north-west corner, metres."""
 log = logging.getLogger(__name__)
@@ -277,7 +286,52 @@ def terrain_of_dem(
             f"the terrain has no height in the area, at {centre[0]:.4f}, {centre[1]:.4f}{hint}: "
             f"{dem.path}"
         )
-    return made
+    return None if made is None else made._replace(info=_with_source(made.info, dem, area))
+
+
+def _with_source(info: TerrainInfo, dem: Dem, area: Area) -> TerrainInfo:
+    source_m = min(max(rounded_gsd_m(dem.gsd_m), MIN_SOURCE_POSTING_M), MAX_SOURCE_POSTING_M)
+    return replace(info, source_posting_m=source_m, roughness_m=_roughness_m(info, dem, area))
+
+
+def _roughness_m(info: TerrainInfo, dem: Dem, area: Area) -> float | None:
+    """RMS difference of the heights of the source from those of the layer; None where the source is
+    not finer."""
+    finer = min(round(info.posting_m / dem.gsd_m), MAX_FINER)
+    side = min(ROUGH_POSTINGS, info.rows, info.cols)
+    if finer < 2 or side < 3:
+        return None
+    at = (np.arange(side * finer) + 0.5) / finer - 0.5
+    col, row = np.meshgrid(at, at)
+    inner = np.s_[finer:-finer, finer:-finer]  # bilinear between samples on all sides
+    squares = []
+    for first_row, first_col in product(_firsts(info.rows, side), _firsts(info.cols, side)):
+        west = info.west_m + first_col * info.posting_m
+        north = info.north_m - first_row * info.posting_m
+        half_m = side * info.posting_m / 2
+        if not area.contains(np.array([[west + half_m, north - half_m]]), half_m)[0]:
+            continue
+        shape = side * finer, side * finer
+        fine = dem.in_plane(area.frame, west, north, info.posting_m / finer, *shape)
+        mean = fine.reshape(side, finer, side, finer).mean(axis=(1, 3))
+        layer = bilinear(
+            lambda rows, cols, mean=mean: mean[rows, cols],  # type: ignore[misc]
+            mean.shape,
+            col,
+            row,
+        )
+        off_m = (fine - layer)[inner]
+        squares.append(off_m[np.isfinite(off_m)] ** 2)
+    found = np.concatenate(squares) if squares else np.empty(0)
+    if not found.size:
+        return None
+    return round(min(float(np.sqrt(found.mean())), MAX_ROUGHNESS_M), 3)
+
+
+def _firsts(count: int, side: int) -> list[int]:
+    """Where squares of `side` samples begin, one in the middle of each equal part."""
+    number = min(ROUGH_SQUARES, count // side)
+    return [round((k + 0.5) * count / number - side / 2) for k in range(number)]
 
 
 def terrain_parts(

@@ -180,15 +180,16 @@ def _read(
             return pixels, (placed.read_masks(list(bands)) > 0).any(axis=0)
 
 
-def stac_source(web: Web, spec: SourceSpec, area: Area) -> CellSource:
-    """The files that a STAC API finds in the area and time requested, newest on top.
+def stac_source(web: Web, spec: SourceSpec, area: Area, margin_m: float) -> CellSource:
+    """The files that a STAC API finds in the area, a margin around it and the time requested,
+    newest on top.
 
     Of items whose names differ by a year only the newest is taken. Raises `FetchError` where there
     are none.
     """
     options = spec.options
     items: list[tuple[str, str, str]] = []  # time, name, address
-    for feature, where in _found(web, spec, area):
+    for feature, where in _found(web, spec, area, margin_m):
         items.append(_item(feature, where, options))
         if len(items) > MAX_ITEMS:
             problem = f"more than {MAX_ITEMS} files; choose a smaller area or time"
@@ -222,8 +223,10 @@ def _signed(web: Web, token_url: str | None, urls: list[str]) -> list[str]:
     return [f"{url}{'&' if '?' in url else '?'}{TOKEN}" for url in urls]
 
 
-def _found(web: Web, spec: SourceSpec, area: Area) -> Iterator[tuple[dict[str, Any], str]]:
-    west, south, east, north = area.extent_en_m
+def _found(
+    web: Web, spec: SourceSpec, area: Area, margin_m: float
+) -> Iterator[tuple[dict[str, Any], str]]:
+    west, south, east, north = np.array(area.extent_en_m) + np.array([-1, -1, 1, 1]) * margin_m
     corners = [(west, south), (west, north), (east, south), (east, north)]
     lat, lon = area.frame.latlon_from_en(corners)
     box = [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]

@@ -28,6 +28,7 @@ HEIGHTS_FORMAT = "image/geotiff"
 """Media type of heights, numbers of 32 bits. Taken where a preset or user names it."""
 TERRAIN_GSD_M = 5.0
 """Ground resolution of heights where none is given: half the posting of a map's terrain."""
+DEFAULT_TERRAIN = "copernicus-dem"
 MAX_COARSER = 1.5
 """Where no level is fine enough, the finest one is taken if it is at most this much coarser."""
 _DATE = re.compile(r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?")
@@ -170,12 +171,27 @@ class Preset:
     key_env: str | None = None  # environment variable that holds the key
     note: str | None = None
     datum: str | None = None  # as in `Provenance`
+    terrain: str | None = None  # preset of the terrain of the same country
 
 
 @cache
 def presets() -> dict[str, Preset]:
     text = resources.files(__package__).joinpath("presets.toml").read_text(encoding="utf-8")
     return {name: _preset(name, values) for name, values in tomllib.loads(text).items()}
+
+
+def terrain_preset(text: str) -> str | None:
+    """The terrain that belongs to the imagery of a source; None where that is a terrain itself."""
+    preset = presets().get(text.partition(":")[0])
+    if preset is None:
+        return DEFAULT_TERRAIN
+    return None if preset.datum is not None else preset.terrain or DEFAULT_TERRAIN
+
+
+def terrain_spec(name: str) -> SourceSpec:
+    """Of a preset of terrain, at a ground resolution that suits maps."""
+    finer = presets()[name].layers[CURRENT].gsd_m < TERRAIN_GSD_M
+    return parse_source(name, ImageryOptions(gsd_m=TERRAIN_GSD_M if finer else None))
 
 
 def parse_source(

@@ -9,7 +9,8 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
@@ -27,7 +28,7 @@ from orthonav.core.errors import FetchError, OutputError
 from orthonav.core.files import Progress, no_progress, not_written, replacing
 from orthonav.ground.fetch.files import cog_source, stac_source
 from orthonav.ground.fetch.grid import Selection, select
-from orthonav.ground.fetch.presets import Provenance, SourceSpec
+from orthonav.ground.fetch.presets import Provenance, SourceSpec, terrain_spec
 from orthonav.ground.fetch.service import CellPixels, CellReader, CellSource
 from orthonav.ground.fetch.tiles import wms_cells, wmts_tiles, xyz_tiles
 from orthonav.ground.fetch.web import RequestLimits, Web
@@ -36,6 +37,8 @@ from orthonav.ground.planning.area import Area
 _SECONDS_PER_TILE = 0.3  # usual latency of a tile service; an assumption for the estimate
 _BYTES_PER_SECOND = 3e6  # usual throughput of a connection; an assumption for the estimate
 _OURS = re.compile(r"[0-9a-f]|mosaic-\w+")  # names in a cache that GDAL and this program make
+TERRAIN_MARGIN_M = 1000.0
+"""Width of terrain beyond the imagery: a view from 450 m sees so far 65 deg off nadir."""
 GIVE_UP_AFTER = 20  # failed cells in a row after which the service counts as down
 _BATCH_PER_THREAD = 8  # cells that may wait in memory until they are written
 log = logging.getLogger(__name__)
@@ -166,10 +169,30 @@ def fetch(
     return result
 
 
+def terrain_request(request: FetchRequest, name: str) -> FetchRequest:
+    """The request for the terrain of a preset under the imagery of another, beside its file."""
+    return replace(
+        request,
+        spec=terrain_spec(name),
+        out=request.out.with_name(f"{request.out.stem}_dem{request.out.suffix}"),
+        margin_m=request.margin_m + TERRAIN_MARGIN_M,
+    )
+
+
+def fetch_terrain(request: FetchRequest, progress: Progress = no_progress) -> FetchResult:
+    """As `fetch`, but another's file of that name is not replaced."""
+    if request.out.exists():
+        with suppress(RasterioError), rasterio.open(request.out) as data:
+            if "ORTHONAV_FETCHED" in data.tags():
+                return fetch(request, progress)
+        raise OutputError(f"the file exists and is not a fetched one: {request.out}")
+    return fetch(request, progress)
+
+
 def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, CostEstimate]:
     if not (math.isfinite(request.margin_m) and request.margin_m >= 0):
         raise FetchError(f"margin must be 0 m or more, got {request.margin_m}")
-    source = open_cells(web, request.spec, request.area)
+    source = open_cells(web, request.spec, request.area, request.margin_m)
     selection = select(source.grid, request.area, request.margin_m)
     height, width = selection.shape_px
     tiles = len(selection.cells)
@@ -181,7 +204,7 @@ def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, Co
     return source, selection, estimate
 
 
-def open_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
+def open_cells(web: Web, spec: SourceSpec, area: Area, margin_m: float) -> CellSource:
     """The cells of the imagery requested, after reading the service's capabilities.
 
     Raises `FetchError` with the available choices where it has no such layer, style, zoom or time.
@@ -194,7 +217,7 @@ def open_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
         return xyz_tiles(spec, area)
     if spec.protocol == "cog":
         return cog_source(web, spec, area, [spec.url])
-    return stac_source(web, spec, area)
+    return stac_source(web, spec, area, margin_m)
 
 
 def _check_out(out: Path) -> None:

@@ -1,10 +1,11 @@
 """A terrain model in a file that GDAL reads: heights above mean sea level by position."""
 
 import functools
+import logging
 import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from orthonav.core.extras import missing_extra
 from orthonav.core.files import require_file
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M, bilinear
+from orthonav.core.mapfile.manifest import UNKNOWN_DATUM
 
 try:
     import pyproj
@@ -50,6 +52,7 @@ ELLIPSOID = "ellipsoid"
 OPTION = f"--dem-datum {'|'.join((*NAMED, ELLIPSOID))}|EPSG:NUMBER"
 GEOIDS = ("us_nga_egm08_25.tif", "egm08_25.gtx", "us_nga_egm96_15.tif", "egm96_15.gtx")
 """In the order of preference; the second names are those of older PROJ."""
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -60,23 +63,22 @@ class VerticalDatum:
     above_ellipsoid: bool
     unit_m: float = 1.0
 
+    @property
+    def is_known(self) -> bool:
+        return self.name != UNKNOWN_DATUM
+
 
 def horizontal_and_vertical(
     crs: Any, given: str | None, path: Path
 ) -> tuple[pyproj.CRS, VerticalDatum]:
-    """Of a file with the system `crs`; the datum `given` is needed where it states none."""
+    """Of a file with the system `crs`; `given` counts where it states no vertical datum."""
     try:
         system = pyproj.CRS.from_wkt(crs.to_wkt())
         stated, horizontal = _stated(system)
         named = None if given is None else datum_of(given)
     except ProjError as error:
         raise ImageryError(f"coordinate system cannot be used ({error}): {path}") from error
-    found = stated or named
-    if found is None:
-        raise ImageryError(
-            "terrain file does not state its vertical datum; see its documentation and "
-            f"give {OPTION}: {path}"
-        )
+    found = stated or named or VerticalDatum(UNKNOWN_DATUM, False)
     if named is not None and found.above_ellipsoid != named.above_ellipsoid:
         raise ImageryError(
             f"terrain file states heights as {found.name}, --dem-datum {given} contradicts it; "
@@ -152,7 +154,8 @@ def _undulation(transformer: pyproj.Transformer, lat_deg: Array, lon_deg: Array)
 
 @dataclass(frozen=True, eq=False)
 class Dem:
-    """Calling it gives heights above mean sea level (`TerrainHeights`); for one thread."""
+    """Calling it gives heights above mean sea level, or above an unknown datum (`TerrainHeights`);
+    for one thread."""
 
     path: Path
     datum: VerticalDatum
@@ -178,6 +181,14 @@ class Dem:
                 row[some] - top - 0.5,
             )
         return self._above_sea(found.reshape(lat.shape), lat, lon)
+
+    def require_datum(self, why: str) -> None:
+        """Raise `ImageryError` where heights do not count from the sea. `why`: what needs them."""
+        if not self.datum.is_known:
+            raise ImageryError(
+                f"{why}, and the terrain file does not state its vertical datum; see its "
+                f"documentation and give {OPTION}: {self.path}"
+            )
 
     def covers(self, lat_deg: float, lon_deg: float) -> bool:
         col, row = self._pixels(np.array([lat_deg]), np.array([lon_deg]))
@@ -296,10 +307,14 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
             f"heights of the terrain file are in '{unit:.30}': metres or feet are expected: {path}"
         )
     unit_m = _UNITS.get(unit, vertical.unit_m)
-    vertical = VerticalDatum(vertical.name, vertical.above_ellipsoid, unit_m)
+    vertical = replace(vertical, unit_m=unit_m)
     _require_heights(path, data, vertical)
     if vertical.above_ellipsoid:
-        geoid()  # refuses before the work
+        try:
+            geoid()
+        except ImageryError as error:
+            log.warning("%s; without it the vertical datum counts as unknown: %s", error, path)
+            vertical = VerticalDatum(UNKNOWN_DATUM, False, unit_m)
     return Dem(path, vertical, ground_m(data, CRS.from_wkt(horizontal.to_wkt())), data, horizontal)
 
 
