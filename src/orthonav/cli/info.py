@@ -134,9 +134,7 @@ def summary_text(plain: dict[str, Any]) -> str:
     if grey is not None:
         said = f"registration layer of {grey['bytes'] / 1e6:.3f} MB, {grey['levels']} levels"
     lines.append(f"grey       {said}")
-    if terrain is None:
-        lines.append("terrain    none: a degree of pitch or roll is 1.7 % of the height")
-    else:
+    if terrain is not None:
         heights = f"{terrain['low_m']:.0f} to {terrain['high_m']:.0f} m above the sea"
         named = "".join(c for c in f"{terrain['name']}, {terrain['datum']}" if c.isprintable())
         lines.append(f"terrain    {heights} every {terrain['posting_m']:g} m ({named})")
