@@ -6,7 +6,6 @@ each block fits the map best, ten times as long.
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 import cv2
@@ -40,7 +39,7 @@ def residuals(localizer: Localizer, view: View) -> NDArray[np.uint8] | None:
         return None
     template = made.at(level)
     scores = block_scores(template, registration.reference, pose, REACH_PX)
-    grey, _ = made._picture(level)
+    grey = made.picture(level)[0]
     wide = cv2.resize(grey, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_CUBIC)
     picture = np.asarray(cv2.cvtColor(wide, cv2.COLOR_GRAY2BGR), np.uint8)
     rows, cols = grey.shape
@@ -51,9 +50,9 @@ def residuals(localizer: Localizer, view: View) -> NDArray[np.uint8] | None:
         begin = (middle + [cols / 2, rows / 2]) * ENLARGED
         moved = np.array([right, down]) - REACH_PX
         end = begin + moved * LONGER
-        ends = [tuple(int(round(v)) for v in each) for each in (begin, end)]
-        cv2.arrowedLine(picture, *ends, (0, 200, 255), 2, tipLength=0.3)
-        cv2.circle(picture, ends[0], 3, (0, 200, 255), -1)
+        first, last = np.rint(begin).astype(int).tolist(), np.rint(end).astype(int).tolist()
+        cv2.arrowedLine(picture, first, last, (0, 200, 255), 2, tipLength=0.3)
+        cv2.circle(picture, first, 3, (0, 200, 255), -1)
     return picture
 
 
@@ -84,4 +83,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize.ground import LevelTerrain, Relief, ViewOverGround
 from orthonav.core.localize.rectify import Orientation, is_oblique
-from orthonav.core.localize.resection import Expected, Resection, resected
+from orthonav.core.localize.resection import Expected, Resection, climbed, resected
 from orthonav.core.localize.systematic import systematic
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
-from orthonav.core.register.blocks import block_scores
+from orthonav.core.register.blocks import BlockScores, block_scores
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.template import BLOCKS, ViewTemplates
 from orthonav.core.register.window import Reference
@@ -63,8 +63,9 @@ def picture_by_camera(camera: Camera, orientation: Orientation, ground_m: Array)
 
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
-FITS = 3  # at most,
-SMALL_SHARE = 0.2  # until a correction is below this fraction of its standard deviations
+MOST_FITS, AGAIN_PX = 2, 1.0
+"""A view is orthorectified again where the correction moves a block by more pixels of the final
+level, at most so often."""
 VARIANCE, VARIANCE_POWER, LEAST_RATIO = 1.6, -0.8, 0.5
 """Variance of the errors of blocks over what their curvature says: the first, times the local ratio
 of the place (at least the third) to the power of the second (docs/decisions/camera.md)."""
@@ -97,21 +98,24 @@ def camera_found(
     `local_ratio`: of the scores of the place."""
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
         seen = ViewOverGround(Relief(LevelTerrain(), seen.relief.grid), seen.view)
-    orientation, start = seen.orientation(pose), None
+    orientation = seen.orientation(pose)
     if orientation is None:
         return None
     variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
-    found: Resection | None = None
-    for number in range(FITS):
+    far = _compared(seen, reference, pose, orientation, first=True)
+    correction = None if far is None else far.climbed(seen)
+    if far is None or correction is None:
+        return None
+    orientation = orientation.moved(correction)
+    for _ in range(MOST_FITS):
         start = orientation
-        found = _fitted(seen, reference, pose, start, variance, first=number == 0)
-        if found is None:
+        near = _compared(seen, reference, pose, start, first=False)
+        found = None if near is None else near.resected(seen, variance)
+        if near is None or found is None:
             return None
         orientation = start.moved(found.correction)
-        small = np.abs(found.correction) < SMALL_SHARE * np.sqrt(np.diag(found.covariance))
-        if number > 0 and small.all():
+        if near.moves_px(found.correction) < AGAIN_PX * 2.0**seen.view.levels.final:
             break
-    assert found is not None and start is not None
     east, north, above_sea_m = orientation.position_m.tolist()
     agl_m = above_sea_m - float(seen.relief.terrain.at_en_m([east, north]))
     if not agl_m > 0:
@@ -133,16 +137,56 @@ def tilt_std_deg(telemetry: Telemetry) -> float:
     return DEFAULT_TILT_STD_DEG if stated is None else stated
 
 
-def _fitted(
-    seen: ViewOverGround,
-    reference: Reference,
-    pose: Pose,
-    orientation: Orientation,
-    variance: float,
-    *,
-    first: bool,
-) -> Resection | None:
-    """A correction: the first at the final level and a coarser one, then one finer too."""
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Blocks of a view under an orientation, beside the map.
+
+    - `blocks`: of each level, and its pixel in pixels of level 0.
+    - `ground_m` (N, 3), `slopes` (N, 2): in their middles.
+    - `by_picture_px` (N, 2, 2): they move by so many pixels of level 0 per pixel of the picture.
+    - `moved_px` (N, 2, 6): and per unit of the camera."""
+
+    camera: Camera
+    orientation: Orientation
+    blocks: list[tuple[BlockScores, float]]
+    ground_m: Array
+    slopes: Array
+    by_picture_px: Array
+    moved_px: Array
+    expected: Expected
+
+    def moves_px(self, correction: Array) -> float:
+        """How far a correction (6,) moves a block, pixels of level 0."""
+        return float(np.nanmax(np.hypot(*(self.moved_px @ correction).T)))
+
+    def climbed(self, seen: ViewOverGround) -> Array | None:
+        slope = seen.relief.errors(self.slopes).slope
+        return climbed(
+            self.blocks, self.moved_px, self.expected, slope, block_px=seen.view.side_px / BLOCKS
+        )
+
+    def resected(self, seen: ViewOverGround, variance: float) -> Resection | None:
+        block_px = seen.view.side_px / BLOCKS
+        errors = systematic(
+            self.camera,
+            seen.relief.errors(self.slopes),
+            places_m=self.ground_m[:, :2],
+            # Raised ground moves as under a camera that is lower by as much.
+            by_height_px=-self.moved_px[:, :, 2],
+            by_picture_px=self.by_picture_px,
+            seen_px=self.orientation.seen_px(self.camera, self.ground_m),
+            block_px=block_px,
+            gsd_m=seen.relief.grid.gsd_m,
+        )
+        return resected(
+            self.blocks, self.moved_px, self.expected, errors, variance=variance, block_px=block_px
+        )
+
+
+def _compared(
+    seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
+) -> _Compared | None:
+    """At first at the final level and a coarser one, then at one finer too."""
     final = seen.view.levels.final
     finest = final if first else max(final - 1, 0)
     made = _templates(seen, pose, finest, orientation, first=first)
@@ -153,32 +197,21 @@ def _fitted(
     levels = [at for at in range(finest, coarsest + 1) if min(made.shape(at)) >= BLOCKS]
     if not levels:
         return None
-    blocks = [block_scores(made.at(each), reference, pose, reach_px) for each in levels]
-    camera, grid = seen.view.picture_at(finest).camera, seen.relief.grid
-    ground = seen.relief.ground_m(pose.map_px(blocks[0].middles_px * 2.0**finest))
+    blocks = [(block_scores(made.at(at), reference, pose, reach_px), 2.0**at) for at in levels]
+    camera = seen.view.picture_at(finest).camera
+    ground = seen.relief.ground_m(pose.map_px(blocks[0][0].middles_px * blocks[0][1]))
     slopes = seen.relief.slopes(ground)
-    window_from_en = np.linalg.inv(pose.linear) @ np.diag([1.0, -1.0]) / grid.gsd_m
+    window_from_en = np.linalg.inv(pose.linear) @ np.diag([1.0, -1.0]) / seen.relief.grid.gsd_m
     by_picture = window_from_en @ ground_by_picture(camera, orientation, ground, slopes)
-    moved = -by_picture @ picture_by_camera(camera, orientation, ground)
-    # Raised ground moves as under a camera that is lower by as much.
-    errors = systematic(
+    return _Compared(
         camera,
-        seen.relief.errors(slopes),
-        places_m=ground[:, :2],
-        by_height_px=-moved[:, :, 2],
-        by_picture_px=by_picture,
-        seen_px=orientation.seen_px(camera, ground),
-        block_px=seen.view.side_px / BLOCKS,
-        gsd_m=grid.gsd_m,
-    )
-    return resected(
-        [(each, 2.0**level) for each, level in zip(blocks, levels, strict=True)],
-        moved,
+        orientation,
+        blocks,
+        ground,
+        slopes,
+        by_picture,
+        -by_picture @ picture_by_camera(camera, orientation, ground),
         _expected(seen, pose, orientation),
-        errors,
-        variance=variance,
-        block_px=seen.view.side_px / BLOCKS,
-        close=not first,
     )
 
 

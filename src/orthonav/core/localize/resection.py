@@ -20,7 +20,7 @@ BLURS_PX = (2.0, 1.0, 0.0, 0.0)
 SHARP_PX = (0.7, 0.0)  # the same from a correction by `SAMPLE` blocks, or from one close by
 SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
 """Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC)."""
-JOINT_STEPS = 5  # of camera and systematic errors together
+JOINT_STEPS = 6  # of camera and systematic errors together
 LONGEST_STEP_PX = 3.0  # of any block, per step, pixels of its level
 PIXELS_PER_NUMBER = 5.0  # pixels per independent number; only the odds of outliers depend on it
 LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9  # limits of the mean correlation of a right block
@@ -58,6 +58,26 @@ class Resection:
     alone_covariance: Array
 
 
+def climbed(
+    seen: Sequence[tuple[BlockScores, float]],
+    moved_px: Array,
+    expected: Expected,
+    slope_rad: float,
+    *,
+    block_px: float,
+) -> Array | None:
+    """The correction (6,) alone, from far away; None where too few blocks are seen. For the
+    arguments see `resected`."""
+    blocks = _Blocks.of(seen, moved_px, block_px)
+    if blocks is None:
+        return None
+    loose = _with_slope(expected, slope_rad)
+    correction = blocks.climbed(np.zeros(6), BLURS_PX, loose)
+    sampled = blocks.best(blocks.sampled(loose), loose)
+    ascents = [correction, blocks.climbed(sampled, SHARP_PX, loose)]
+    return blocks.best(np.stack(ascents), loose)
+
+
 def resected(
     seen: Sequence[tuple[BlockScores, float]],
     moved_px: Array,
@@ -66,18 +86,18 @@ def resected(
     *,
     variance: float,
     block_px: float,
-    close: bool = False,
 ) -> Resection | None:
-    """None where too few blocks are seen.
+    """The camera with its covariance, from one known to a pixel or two; None where too few blocks
+    are seen.
 
     `seen`: of each level the blocks and its pixel in pixels of level 0. `moved_px` (N, 2, 6): how
     far each moves by the camera, pixels right and down at level 0. `variance`: of the blocks'
-    noise over what their curvature says. `close`: the camera is known to a pixel or two."""
-    correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
-    blocks = _Blocks.of(seen, moved_px, correlated)
+    noise over what their curvature says. `block_px`: their width, pixels of level 0."""
+    blocks = _Blocks.of(seen, moved_px, block_px)
     if blocks is None:
         return None
-    correction = _climbed(blocks, _with_slope(expected, systematic.slope_rad), close=close)
+    loose = _with_slope(expected, systematic.slope_rad)
+    correction = blocks.climbed(np.zeros(6), SHARP_PX, loose)
     return _joint(blocks, correction, expected, systematic, variance)
 
 
@@ -90,16 +110,6 @@ def _with_slope(expected: Expected, slope_rad: float) -> Expected:
     return Expected(correction, loose)
 
 
-def _climbed(blocks: "_Blocks", expected: Expected, *, close: bool) -> Array:
-    """The camera (6,) by itself."""
-    correction = blocks.climbed(np.zeros(6), SHARP_PX if close else BLURS_PX, expected)
-    if close:
-        return correction
-    sampled = blocks.best(blocks.sampled(expected), expected)
-    ascents = [correction, blocks.climbed(sampled, SHARP_PX, expected)]
-    return blocks.best(np.stack(ascents), expected)
-
-
 def _joint(
     blocks: "_Blocks",
     correction: Array,
@@ -110,27 +120,24 @@ def _joint(
     """With systematic errors, from a camera (6,) near by."""
     blocks = blocks.with_moves(systematic.moves_px)
     size = blocks.moved_px.shape[2]
-    state, prior, information = np.zeros(size), np.zeros(size), np.eye(size)
+    state, prior, precision = np.zeros(size), np.zeros(size), np.ones(size)
     state[CAMERA], prior[CAMERA] = correction, expected.correction
-    information[CAMERA, CAMERA] = expected.information
     groups = [slice(6 + each.start, 6 + each.stop) for each in systematic.groups]
     excess = blocks.correlated
-    for number in range(JOINT_STEPS):
-        state = blocks.stepped(state, 0.0, excess, Expected(prior, information))
-        if number == 0:
-            continue
-        excess = blocks.excess(state, information, excess)
-        curvature, _ = blocks.system(state)
-        covariance = np.linalg.inv(curvature / excess + information)
+    for _ in range(JOINT_STEPS):
+        information = np.diag(precision)
+        information[CAMERA, CAMERA] = expected.information
+        curvature, slopes = blocks.system(state)
+        covariance = np.asarray(np.linalg.inv(curvature / excess + information))
+        pull = slopes.sum(axis=0) / excess + information @ (prior - state)
+        state = state + blocks.limited(covariance @ pull)
+        excess = blocks.excess(curvature, slopes, covariance, excess)
         for each in groups:
-            information[each, each] = np.eye(each.stop - each.start) / _component(
-                state[each], np.diag(covariance)[each]
-            )
-    curvature = blocks.system(state)[0] / excess
-    shown = _Marginal.of(curvature, information)
+            precision[each] = 1 / _component(state[each], np.diag(covariance)[each])
+    shown = _Marginal.of(curvature / excess, information)
     covariance = shown.covariance(expected.information, variance)
-    alone, weak = shown.without(state[CAMERA], expected), NOTHING.information
-    alone_covariance = shown.covariance(weak, variance)
+    alone = shown.without(state[CAMERA], expected)
+    alone_covariance = shown.covariance(NOTHING.information, variance)
     if not all(np.isfinite(each).all() for each in (state, covariance, alone, alone_covariance)):
         return None
     return Resection(state[CAMERA], covariance, alone, alone_covariance)
@@ -186,8 +193,9 @@ class _Blocks:
 
     @classmethod
     def of(
-        cls, seen: Sequence[tuple[BlockScores, float]], moved_px: Array, correlated: float
+        cls, seen: Sequence[tuple[BlockScores, float]], moved_px: Array, block_px: float
     ) -> "_Blocks | None":
+        correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
         known = np.tile(np.isfinite(moved_px).all(axis=(1, 2)), len(seen))
         pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in seen]), 0.0)
         by_level = np.asarray(pixels.reshape(len(seen), -1) > 0, np.bool_)
@@ -235,7 +243,7 @@ class _Blocks:
         """A maximum of the posterior near a correction."""
         correction = start
         for blur_px in blurs_px:
-            correction = self.stepped(correction, blur_px, 1.0, expected)
+            correction = self.stepped(correction, blur_px, expected)
         return correction
 
     def best(self, corrections: Array, expected: Expected) -> Array:
@@ -266,20 +274,21 @@ class _Blocks:
         """Log likelihood ratio (L * N,) per unit of correlation, of a right block against none."""
         return usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
 
-    def stepped(self, state: Array, blur_px: float, excess: float, expected: Expected) -> Array:
-        """One step of Newton's method on a state (D,); the blocks say less by `excess`."""
+    def stepped(self, state: Array, blur_px: float, expected: Expected) -> Array:
+        """One step of Newton's method on a state (D,)."""
         mean, information = expected
         curvature, slopes = self.system(state, blur_px)
-        pull = slopes.sum(axis=0) / excess + information @ (mean - state)
-        step = np.linalg.solve(curvature / excess + information, pull)
-        longest = float(np.hypot(*(self.moved_px @ step).T).max() / self.unit_px.min())
-        return np.asarray(state + step * min(1.0, LONGEST_STEP_PX / max(longest, 1e-9)))
+        pull = slopes.sum(axis=0) + information @ (mean - state)
+        return np.asarray(state + self.limited(np.linalg.solve(curvature + information, pull)))
 
-    def excess(self, state: Array, information: Array, excess: float) -> float:
+    def limited(self, step: Array) -> Array:
+        """No block by more than `LONGEST_STEP_PX`."""
+        longest = float(np.hypot(*(self.moved_px @ step).T).max() / self.unit_px.min())
+        return step * min(1.0, LONGEST_STEP_PX / max(longest, 1e-9))
+
+    def excess(self, curvature: Array, slopes: Array, covariance: Array, excess: float) -> float:
         """Variance of the slopes by the camera over the curvature, times `correlated`, at least 1;
-        the numbers that a solution with `information` and `excess` uses are not counted."""
-        curvature, slopes = self.system(state)
-        covariance = np.linalg.inv(curvature / excess + information)
+        the numbers that a solution with `covariance` and `excess` uses are not counted."""
         numbers = 2 * self.seen
         left = max(1 - float((covariance * curvature).sum()) / excess / numbers, MIN_LEFT)
         spread = slopes[:, CAMERA].T @ slopes[:, CAMERA]
@@ -320,16 +329,13 @@ def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
     held = np.clip(moved_px, 1 - reach, reach - 1)
     nearest = np.rint(held)
     x, y = (nearest.astype(int) + reach).T
-    rows = np.arange(len(surfaces))
-
-    def at(right: int, down: int) -> Array:
-        return np.asarray(surfaces[rows, y + down, x + right])
-
-    here = at(0, 0)
-    slope = np.stack([at(1, 0) - at(-1, 0), at(0, 1) - at(0, -1)], axis=-1) / 2
-    along = 2 * here - at(1, 0) - at(-1, 0)
-    down = 2 * here - at(0, 1) - at(0, -1)
-    across = (at(1, -1) + at(-1, 1) - at(1, 1) - at(-1, -1)) / 4
+    around = np.arange(-1, 2)
+    rows = np.arange(len(surfaces))[:, None, None]
+    patches = surfaces[rows, (y[:, None] + around)[:, :, None], (x[:, None] + around)[:, None]]
+    (a, above, b), (left, here, right), (c, below, d) = np.moveaxis(patches, 0, -1)
+    slope = np.stack([right - left, below - above], axis=-1) / 2
+    along, down = 2 * here - right - left, 2 * here - below - above
+    across = (b + c - a - d) / 4
     curvature = np.stack([along, across, across, down], axis=-1).reshape(-1, 2, 2)
     off = np.clip(moved_px - nearest, -1.0, 1.0)
     bent = (curvature @ off[..., None])[..., 0]

@@ -236,14 +236,14 @@ class ViewTemplates:
     def at(self, level: int, recipe: ChannelRecipe = FINE) -> Template:
         key = (level, recipe)
         if key not in self._made:
-            self._made[key] = Template.of(*self._picture(level), level, recipe)
+            self._made[key] = Template.of(*self.picture(level), level, recipe)
         return self._made[key]
 
     def shape(self, level: int) -> tuple[int, int]:
-        rows, cols = self._picture(level)[0].shape
+        rows, cols = self.picture(level)[0].shape
         return rows, cols
 
-    def _picture(self, level: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    def picture(self, level: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         while len(self._pictures) <= level - self.finest:
             self._pictures.append(halved(*self._pictures[-1]))
         return self._pictures[level - self.finest]
