@@ -1,9 +1,10 @@
 """Make the imagery that `orthonav demo` ships: `python -m lab.demo_imagery [FOLDER]`.
 
 Two dates of one generated area of 2 x 2 km at 1 m per pixel, seed 1, as GeoTIFF compressed with
-JPEG, and the terrain under it and around it, which is level. On one machine with the same NumPy, OpenCV and GDAL the files are the same to the bit. Other
-processors round single pixels of the generated landscape differently. The golden views are views
-of this imagery: renew them too (`make golden`).
+JPEG, and the terrain under it and around it, which is level. On one machine with the same NumPy,
+OpenCV and GDAL the files are the same to the bit. Other processors round single pixels of the
+generated landscape differently. The golden views are views of this imagery: renew them too
+(`make golden`).
 """
 
 import sys

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthonav.core.errors import AreaError, AtlasError, StorageError, WorkerError
+from orthonav.core.errors import AreaError, AtlasError, StorageError, VariantError, WorkerError
 from orthonav.core.mapfile import open_map
 from orthonav.ground.atlas import build as building
 from orthonav.ground.atlas.build import (
@@ -154,6 +154,13 @@ def test_sheets_made_otherwise_are_refused_or_replaced(built, make_ortho, ortho,
         n for n in before if n.startswith("sheets")
     ]
     assert made(place, changed, replace=True).names("unchanged") == result.names("built")
+
+
+def test_another_relief_is_another_request(built, ortho):
+    with pytest.raises(AtlasError, match="--replace"):
+        made(built[0], ortho, relief="level")
+    with pytest.raises(VariantError, match="give --dem or --relief"):
+        made(built[0], ortho, relief="level", dem=ortho)
 
 
 def test_other_recipes_are_refused_with_the_differences(built, ortho):

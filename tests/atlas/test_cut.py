@@ -4,6 +4,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
-from orthonav.ground.atlas.cut import Warp, check_shown, cut_in_memory, cut_map
+from orthonav.ground.atlas.cut import Warp, _relief, check_shown, cut_in_memory, cut_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -143,9 +144,20 @@ def test_terrain_is_that_of_the_sheets(cut, middle):
         "MSL height",
         25,
     )
+    assert (layer.info.source_posting_m, layer.info.roughness_m) == (25, None)
     points = np.random.default_rng(0).uniform(-150, 150, (300, 2))
     found = layer(*middle.latlon_from_en(points))
     np.testing.assert_allclose(found, ground(*points.T), atol=0.2)  # two times rounded
+
+
+def test_relief_is_the_steepest_of_the_sheets():
+    def member(relief):
+        return SimpleNamespace(manifest=SimpleNamespace(sheets=[SimpleNamespace(relief=relief)]))
+
+    for stated, steepest in (
+        (["level", "level"], "level"), (["level", None], None), (["hills", None, "level"], "hills")
+    ):  # fmt: skip
+        assert _relief([member(each) for each in stated]) == steepest
 
 
 def sheet_file(atlas, name):

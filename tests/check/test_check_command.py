@@ -293,6 +293,12 @@ def test_heights_above_sea_need_a_terrain(run, unwritten, half_blank, frame, rou
     assert (
         "Checked at 120 m above ground, the lowest over the terrain of dem.tif (220 m" in over.out
     )
+    without = run(*check, "--dem", dem)  # only differences of its heights count
+    assert without.out == over.out
+    route.write_text(route.read_text().replace("home_m", "amsl_m").replace(",120", ",420"))
+    refused = run(*check, "--dem", dem)
+    assert refused.code == 1 and "above the sea" in refused.err and "--dem-datum" in refused.err
+    assert "lowest over the terrain" in run(*check, "--dem", dem, "--dem-datum", "msl").out
     far = write_dem(
         tmp_path / "far.tif", LocalFrame(1, 1), lambda east, north: 0.1 * east + north * 0
     )

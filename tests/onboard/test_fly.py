@@ -652,6 +652,21 @@ def test_a_map_with_terrain_gives_heights_above_ground(begin):
         assert view[3] == seen  # a replay of the log has the height that was flown with
 
 
+def test_over_an_unknown_datum_heights_above_sea_give_no_fix(begin):
+    def terrain(lat_deg, lon_deg):
+        return np.full(np.shape(lat_deg), 300.0)
+
+    heights = FlownHeights(terrain, (np.zeros(2), np.zeros(2)), datum_known=False)
+    flight = begin(recorded=True, heights=heights, start=[None].pop)
+    above_sea = Telemetry(5, 1.0, 2.0, 3.0, math.nan, amsl_m=400.0)
+    refused = flight.recorded(above_sea).outcome
+    assert refused.reason == "no_telemetry" and "--dem-datum" in refused.detail
+    assert flight.locator.seen == []
+    above_home = Telemetry(10**9, 1.0, 2.0, 3.0, math.nan, amsl_m=0.0, home_m=100.0)
+    assert reason_of(flight.recorded(above_home)) == "fix"
+    assert flight.locator.seen[0].agl_m == pytest.approx(100.0)
+
+
 def test_gps_input_has_the_altitude_by_the_terrain_where_the_autopilot_knows_none(begin):
     def terrain(lat_deg, lon_deg):
         return np.full(np.shape(lat_deg), 300.0)

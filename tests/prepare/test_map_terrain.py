@@ -148,9 +148,14 @@ def test_heights_over_an_unknown_datum(run, map_path, flown, dem, tmp_path):
     write(agl_m="", home_m="")
     refused = run(*localize)
     assert refused.code == 1 and "vertical datum" in refused.err and "--dem-datum" in refused.err
-    with_dem = run(*localize, "--dem", dem)
-    assert with_dem.code == 1 and "--dem-datum" in with_dem.err
-    assert run(*localize, "--dem", dem, "--dem-datum", "msl").code == 0
+    for more in ((), ("--dem-datum", "msl")):  # the map's stays unknown
+        with_dem = run(*localize, "--dem", dem, *more)
+        assert with_dem.code == 1 and "different levels" in with_dem.err
+    flat = ("localize", map_path, few, "--out", tmp_path / "fixes.jsonl", "--dem", dem)
+    assert "vertical datum" in run(*flat).err
+    assert run(*flat, "--dem-datum", "msl").code == 0
+    flying = run("fly", tmp_path / "a.onav", few, "--recorded-telemetry", "--height", "amsl")
+    assert flying.code == 1 and "--height amsl" in flying.err and "--dem-datum" in flying.err
 
 
 def test_terrain_elsewhere_is_refused(tmp_path):

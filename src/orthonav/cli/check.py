@@ -180,7 +180,7 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
 
     Raises `CheckError` where the heights of the route are not above ground and no terrain is known.
     """
-    from orthonav.cli.source import dem_of
+    from orthonav.cli.source import dem_of, is_above_sea
     from orthonav.core.errors import CheckError, RouteError
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
@@ -198,7 +198,8 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
             "heights of the route are not above ground: give the terrain (--dem FILE, or a map "
             "built with --dem) or the height (--agl-m)"
         )
-    if isinstance(terrain, TerrainLayer) and "amsl" in frames and not terrain.info.is_above_sea:
+    known = not isinstance(terrain, TerrainLayer) or terrain.info.is_above_sea
+    if not known and is_above_sea(route):
         raise CheckError(
             "heights of the route are above the sea, and the vertical datum of the map's terrain "
             "is unknown: build it with --dem-datum, or give --agl-m"

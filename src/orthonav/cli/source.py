@@ -140,12 +140,18 @@ def dem_of(options: argparse.Namespace, route: "Route | None" = None) -> "Dem | 
     from orthonav.ground.imagery.terrain import open_dem
 
     dem = open_dem(options.dem, options.dem_datum)
-    if route is not None and any(each and each.frame == "amsl" for each in route.heights):
+    if route is not None and is_above_sea(route):
         dem.require_datum("heights of the route are above the sea")
     if route is not None and not any(dem.covers(*waypoint) for waypoint in route.waypoints):
         hint = swapped_hint(*route.waypoints[0], dem.covers)
         raise ImageryError(f"the route lies outside the terrain{hint}: {options.dem}")
     return dem
+
+
+def is_above_sea(route: "Route") -> bool:
+    """Whether heights of a route, or of its take-off, count from the sea."""
+    frames = {each.frame for each in route.heights if each is not None}
+    return "amsl" in frames or ("home" in frames and route.home_amsl_m is not None)
 
 
 def map_heights(
@@ -199,10 +205,16 @@ def flight_heights(
 
     if dem is not None and not any(map(dem.covers, *_area_deg(opened))):
         raise ImageryError(f"the terrain lies outside the map: {dem.path}")
+    layer = opened.manifest.sheets[0].terrain
+    if dem is not None and layer is not None and not (dem.datum.is_known and layer.is_above_sea):
+        raise FlightError(
+            "the terrain of --dem and that of the map may count from different levels, as the "
+            "vertical datum of one is unknown: omit --dem, or state both with --dem-datum"
+        )
     first = next(iter(flight.views), None)
     if first is None:
         return None
-    has_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
+    has_terrain = dem is not None or layer is not None
     place = flight.take_off_latlon_deg or getattr(first, "truth_latlon_deg", None)
     heights = map_heights(
         opened,

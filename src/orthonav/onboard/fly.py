@@ -268,7 +268,9 @@ class Runner:
         known = self._above_ground(view.telemetry)
         if isinstance(known, NoFix):
             return self._refused(image, known, vehicle)
-        if known.below is not None and math.isnan(vehicle.amsl_m):
+        heights = self.options.heights
+        above_sea = heights is None or heights.datum_known
+        if known.below is not None and above_sea and math.isnan(vehicle.amsl_m):
             vehicle = replace(vehicle, amsl_m=known.below.height_m + known.agl_m)
         reported, telemetry = known, self._over_gap(known, image.exposed_ns)
         view = replace(view, telemetry=telemetry)
@@ -425,14 +427,6 @@ class Runner:
             return
         self._heights_said = True
         name = None if self.options.heights is None else "the terrain of the map"
-        heights = self.options.heights
-        if heights is not None and not heights.datum_known and needs_datum(telemetry):
-            log.warning(
-                "only heights above the sea or the ellipsoid are known, and the vertical datum of "
-                "the map's terrain is not: %s",
-                DATUM_ADVICE,
-            )
-            return
         said = assumed_heights(telemetry, name, "build the map with --dem")
         if said is not None:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
@@ -446,6 +440,9 @@ class Runner:
         ]
         if missing:
             detail = f"not reported at the exposure: {', '.join(missing)}"
+            heights = self.options.heights
+            if heights is not None and not heights.datum_known and needs_datum(telemetry):
+                detail = f"vertical datum of the map's terrain is unknown: {DATUM_ADVICE}"
             return self._refusal("no_telemetry", "no_telemetry", detail)
         least_m = self.options.min_agl_m
         if known.agl_m < least_m:  # on the ground, and in the take-off
