@@ -53,13 +53,13 @@ def measure(options: argparse.Namespace) -> Section:
 
 
 NOTES = (
-    f"median to NEES median are of confident fixes (confidence of {CONFIDENT:g} or more); of right: "
-    f"confident share of the fixes within {FAR_M:g} m or {RADIUS_SHARE:.1%} of the height, beyond "
-    "which confident ones are false; NEES: 2 in the mean and 1.4 in the median where the covariance "
+    f"median to NEES median are of confident fixes (confidence of {CONFIDENT:g} or more); of "
+    f"right: confident share of the fixes within {FAR_M:g} m or {RADIUS_SHARE:.1%} of the height, beyond "
+    "which confident ones are false; NEES: 2 in the mean and 1.4 in the median if the covariance "
     f"is right, the truth's own error included; PL exceeded: protection levels at {RISK:g}, of "
     "those that are finite; ms: processor time",
-    "rendered views: heading off by 10 deg and height by 10 % (standard deviations, reported), tilt "
-    "reported 0, without a deviation unless stated; whole map, no prior",
+    "rendered views: heading off by 10 deg and height by 10 % (standard deviations, reported); "
+    "tilt reported 0, without a deviation unless stated; whole map, no prior",
 )
 
 

@@ -31,7 +31,7 @@ TILTED_STD_M, TILTED_GROUND_STD_M = 2.5, 0.5
 """By registration and PnP: 2 to 3 m, the ground in the middle 0.5 m (README of the data)."""
 SUBURB_GSD_M = 0.52
 """At this scale 256 px are seen from 133 m; the nominal scale of the imagery is a stand-in."""
-SUBURB = "2020_03", "2009_04"
+SUBURB = ("2020_03", "2009_04"), ("2001_09", "2015_04")
 SLOPES = (2.0, 5.0, 10.0)
 LAND = {2.0: "level", 5.0: "rolling", 10.0: "hills"}
 
@@ -185,7 +185,10 @@ def _steady() -> Iterator[Question]:
             told = "default" if stated is None else f"tilt stated {stated:g}"
             leg = Map(pair.map), OverLevel(pair, 0.0, stated)
             yield Question(f"naip {date}, steady, {told}", "steady", (leg,))
-    past, present = (f"scaled:{SUBURB_GSD_M}:scenes/garching/{d}.tif" for d in SUBURB)
-    suburb = Pair("garching", past, present, SUBURB_GSD_M)
-    leg = Map(past), OverLevel(suburb, 3.0)
-    yield Question("garching from 133 m, tilt 3", "steady", (leg,))
+    folder = f"scaled:{SUBURB_GSD_M}:scenes/garching"
+    suburb = [
+        Pair("garching", f"{folder}/{past}.tif", f"{folder}/{present}.tif", SUBURB_GSD_M)
+        for past, present in SUBURB
+    ]
+    legs = tuple((Map(pair.map), OverLevel(pair, 3.0)) for pair in suburb)
+    yield Question("garching from 133 m, tilt 3", "steady", legs)

@@ -1,7 +1,6 @@
 """Where the views of a row come from: rendered over relief, of flat ground, or recorded."""
 
 import argparse
-import csv
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.closed_loop.replays import OFF, ON, Area, Recorded, plain, stated
 from benchmarks.judged_views import is_covered
-from benchmarks.placing import views_in
-from benchmarks.real_ground.maps import BARE, SURFACE, Map, found, landscape_heights, relief_file
+from benchmarks.real_ground.maps import BARE, SURFACE, found, landscape_heights, relief_file
 from benchmarks.real_ground.score import Seen
 from benchmarks.scenes import DATA, Pair, root_agl_of
 from benchmarks.unreported_tilt import Flown, level_telemetry, tilted_views
