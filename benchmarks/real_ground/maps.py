@@ -15,6 +15,7 @@ from lab.terrain import random_relief
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
+from benchmarks.real_ground.mapping import strip_ortho
 from benchmarks.scenes import DATA, SIDE_M, ortho
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
@@ -42,7 +43,8 @@ Heights = NDArray[np.float32]
 class Map:
     """A map to be built.
 
-    - `ortho`: orthophoto as `scenes.ortho` takes it, or `scaled:GSD:NAME`.
+    - `ortho`: orthophoto as `scenes.ortho` takes it, `scaled:GSD:NAME` or
+      `strip:NUMBER:NAME`.
     - `ground`: one of `BARE` to `SURFACE` of `relief`, or a file of heights below `DATA`; None: the
       map has no terrain.
     - `relief`: root mean square slope of the ground in per cent; None: the ground is not rendered.
@@ -84,7 +86,10 @@ class Map:
 
 
 def found(name: str, work: Path) -> Path:
-    """The file of a name as `scenes.ortho` takes it, or `scaled:GSD:NAME`."""
+    """The file of a name as `scenes.ortho` takes it, `scaled:GSD:NAME`, or `strip:NUMBER:NAME` of
+    mapping photographs."""
+    if name.startswith("strip:"):
+        return strip_ortho(int(name.split(":")[1]), work)
     return scaled_copy(name, work) if name.startswith("scaled:") else ortho(name, work)
 
 

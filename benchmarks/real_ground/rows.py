@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.closed_loop.replays import flights
+from benchmarks.real_ground.mapping import STRIPS, Windows
 from benchmarks.real_ground.maps import (
     BARE,
     COARSE,
@@ -36,7 +37,7 @@ SLOPES = (2.0, 5.0, 10.0)
 LAND = {2.0: "level", 5.0: "rolling", 10.0: "hills"}
 
 
-AnySource = OverRelief | OverLevel | Recording | Replay
+AnySource = OverRelief | OverLevel | Recording | Replay | Windows
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Question:
 
 def questions() -> list[Question]:
     """All rows whose imagery is there, those of real flights first."""
-    made = [*_flights(), *_replays(), *_oblique(), *_relief(), *_lens(), *_steady()]
+    made = [*_flights(), *_replays(), *_oblique(), *_relief(), *_lens(), *_mapping(), *_steady()]
     return [each for each in made if all(_is_there(*leg) for leg in each.legs)]
 
 
@@ -175,6 +176,17 @@ def _relief() -> Iterator[Question]:
 def _lens() -> Iterator[Question]:
     for slope in (0.0, 5.0):
         yield from _rendered("nominal lens", "lens", _farmland(), slope, nominal=True)
+
+
+def _mapping() -> Iterator[Question]:
+    """Orientation exact, or pitch and roll off by 1 deg."""
+    for tilt in (0.0, 1.0):
+        for name, dem in (("no terrain", None), ("24 m terrain", "relief_ngi/dem.tif")):
+            legs = tuple(
+                (Map(f"strip:{strip}:relief_ngi", dem, datum=None), Windows(strip, tilt))
+                for strip in range(len(STRIPS))
+            )
+            yield Question(f"relief_ngi, tilt off by {tilt:g}, {name}", "mapping", legs)
 
 
 def _steady() -> Iterator[Question]:

@@ -84,7 +84,7 @@ class OverRelief:
                 position = np.array([*place, above])
                 grey, _ = seen_view(imagery, relief, lens, attitude, position, 1)
                 part = folder / f"{number:04d}.part.png"
-                seen = degraded(cv2.merge([grey, grey, grey]), EFFECTS, rng)
+                seen = degraded(np.repeat(grey[..., None], 3, -1), EFFECTS, rng)
                 cv2.imwrite(str(part), seen[..., 0])
                 part.replace(path)
             grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
@@ -178,9 +178,11 @@ class OverLevel:
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
         for each in self._flown(work, base, views):
-            latlon = tuple(float(v) for v in base.sheet.frame.latlon_from_en(each.camera_en_m))
+            lat, lon = base.sheet.frame.latlon_from_en(each.camera_en_m)
             reported = replace(each.view.telemetry, tilt_std_deg=self.stated_deg)
-            yield Seen(replace(each.view, telemetry=reported), latlon, each.true.agl_m)
+            yield Seen(
+                replace(each.view, telemetry=reported), (float(lat), float(lon)), each.true.agl_m
+            )
 
     def _flown(self, work: Path, base: Localizer, views: int) -> Iterator[Flown]:
         pair = self.pair
