@@ -23,15 +23,21 @@ def seen_view(
 
 
 def random_relief(
-    shape: tuple[int, int], posting_m: float, slope: float, shortest_m: float, seed: int
+    shape: tuple[int, int],
+    posting_m: float,
+    slope: float,
+    shortest_m: float,
+    seed: int,
+    roughness: float = 2.0,
 ) -> NDArray[np.float32]:
     """Heights (H, W) of random hills from 0 up with a slope (root mean square of the gradient).
-    Wavelengths from `shortest_m` up; amplitudes grow with them."""
+    Wavelengths from `shortest_m` up; amplitudes grow with this power of them: by 2 the hills of
+    every octave are as steep, by less the short ones are steeper."""
     rng = np.random.default_rng(seed)
     rows, cols = np.fft.fftfreq(shape[0], posting_m), np.fft.rfftfreq(shape[1], posting_m)
     frequency = np.hypot(rows[:, None], cols)
     frequency[0, 0] = 1.0
-    power = frequency**-2.0 * np.exp(-((frequency * shortest_m) ** 2))
+    power = frequency**-roughness * np.exp(-((frequency * shortest_m) ** 2))
     power[0, 0] = 0.0
     noise = np.fft.rfft2(rng.standard_normal(shape))
     heights = np.fft.irfft2(noise * power, s=shape)

@@ -15,6 +15,7 @@ from lab.terrain import random_relief
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
+from benchmarks.real_ground.mapping import strip_ortho
 from benchmarks.scenes import DATA, SIDE_M, ortho
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
@@ -25,8 +26,12 @@ TRUE_POSTING_M, COARSE_POSTING_M = 2.0, 30.0
 """Of the relief that views show, and of a terrain model such as Copernicus GLO-30."""
 COARSE_STD_M, COARSE_LENGTH_M = 4.0, 150.0
 """Error of that terrain model: standard deviation, and distance at which its correlation is 1/e."""
-SHORTEST_M, WIDEST_M = 100.0, 6000.0
-"""Wavelengths of the relief."""
+SHORTEST_M, WIDEST_M = 60.0, 6000.0
+"""Of the relief: it is smooth below the first, so that slopes come from wavelengths of about 100 m
+up, and has none above the second."""
+ROUGHNESS = 1.5
+"""Power of the wavelength with which amplitudes grow: a fractal dimension of 2.5, the rough end of
+measured terrain (2.1 to 2.5)."""
 BASE_M = 200.0
 BARE, FLAT, COARSE, SURFACE = "bare", "flat", "coarse", "surface"
 RELIEF_IS_STATED = "relief" in {each.name for each in fields(BuildRequest)}
@@ -38,7 +43,8 @@ Heights = NDArray[np.float32]
 class Map:
     """A map to be built.
 
-    - `ortho`: orthophoto as `scenes.ortho` takes it, or `scaled:GSD:NAME`.
+    - `ortho`: orthophoto as `scenes.ortho` takes it, `scaled:GSD:NAME` or
+      `strip:NUMBER:NAME`.
     - `ground`: one of `BARE` to `SURFACE` of `relief`, or a file of heights below `DATA`; None: the
       map has no terrain.
     - `relief`: root mean square slope of the ground in per cent; None: the ground is not rendered.
@@ -80,7 +86,10 @@ class Map:
 
 
 def found(name: str, work: Path) -> Path:
-    """The file of a name as `scenes.ortho` takes it, or `scaled:GSD:NAME`."""
+    """The file of a name as `scenes.ortho` takes it, `scaled:GSD:NAME`, or `strip:NUMBER:NAME` of
+    mapping photographs."""
+    if name.startswith("strip:"):
+        return strip_ortho(int(name.split(":")[1]), work)
     return scaled_copy(name, work) if name.startswith("scaled:") else ortho(name, work)
 
 
@@ -95,10 +104,11 @@ def code() -> str:
 
 
 def fractal_relief(shape: tuple[int, int], posting_m: float, slope: float, seed: int) -> Heights:
-    """Heights (H, W) whose gradient is `slope` (root mean square). The hills are as steep at every
-    wavelength from `SHORTEST_M` to `WIDEST_M`."""
+    """Heights (H, W) whose gradient is `slope` (root mean square) of wavelengths up to
+    `WIDEST_M`."""
     side = max(*shape, round(WIDEST_M / posting_m))
-    made = random_relief((side, side), posting_m, 1.0, SHORTEST_M, seed)[: shape[0], : shape[1]]
+    made = random_relief((side, side), posting_m, 1.0, SHORTEST_M, seed, ROUGHNESS)
+    made = made[: shape[0], : shape[1]]
     steep = np.sqrt(sum(np.mean(part**2) for part in np.gradient(made, posting_m)))
     return np.asarray(made * np.float32(slope / steep) + np.float32(BASE_M), np.float32)
 
@@ -137,7 +147,9 @@ def relief_file(name: str, work: Path, slope: float, kind: str) -> Path:
     if kind == COARSE:
         made, posting_m = coarse_of(made, posting_m, seed + 1), COARSE_POSTING_M
     corner = bounds.left - 5 * COARSE_POSTING_M, bounds.top + 5 * COARSE_POSTING_M
-    return written(out, made, rasterio.Affine(posting_m, 0, corner[0], 0, -posting_m, corner[1]), crs)
+    return written(
+        out, made, rasterio.Affine(posting_m, 0, corner[0], 0, -posting_m, corner[1]), crs
+    )
 
 
 def written(out: Path, heights: Heights, transform: Any, crs: Any) -> Path:
@@ -184,9 +196,7 @@ def scaled_copy(name: str, work: Path) -> Path:
     part = out.with_suffix(".part.tif")
     count, rows, cols = bands.shape
     about = {"driver": "GTiff", "count": count, "dtype": "uint8", "crs": crs}
-    with rasterio.open(
-        part, "w", width=cols, height=rows, transform=transform, **about
-    ) as target:
+    with rasterio.open(part, "w", width=cols, height=rows, transform=transform, **about) as target:
         target.write(bands)
         target.write_mask(mask)
     return part.replace(out)

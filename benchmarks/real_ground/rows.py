@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.closed_loop.replays import flights
+from benchmarks.real_ground.mapping import STRIPS, Windows
 from benchmarks.real_ground.maps import (
     BARE,
     COARSE,
@@ -31,12 +32,12 @@ TILTED_STD_M, TILTED_GROUND_STD_M = 2.5, 0.5
 """By registration and PnP: 2 to 3 m, the ground in the middle 0.5 m (README of the data)."""
 SUBURB_GSD_M = 0.52
 """At this scale 256 px are seen from 133 m; the nominal scale of the imagery is a stand-in."""
-SUBURB = "2020_03", "2009_04"
+SUBURB = ("2020_03", "2009_04"), ("2001_09", "2015_04")
 SLOPES = (2.0, 5.0, 10.0)
 LAND = {2.0: "level", 5.0: "rolling", 10.0: "hills"}
 
 
-AnySource = OverRelief | OverLevel | Recording | Replay
+AnySource = OverRelief | OverLevel | Recording | Replay | Windows
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Question:
 
 def questions() -> list[Question]:
     """All rows whose imagery is there, those of real flights first."""
-    made = [*_flights(), *_replays(), *_oblique(), *_relief(), *_lens(), *_steady()]
+    made = [*_flights(), *_replays(), *_oblique(), *_relief(), *_lens(), *_mapping(), *_steady()]
     return [each for each in made if all(_is_there(*leg) for leg in each.legs)]
 
 
@@ -177,6 +178,17 @@ def _lens() -> Iterator[Question]:
         yield from _rendered("nominal lens", "lens", _farmland(), slope, nominal=True)
 
 
+def _mapping() -> Iterator[Question]:
+    """Orientation exact, or pitch and roll off by 1 deg."""
+    for tilt in (0.0, 1.0):
+        for name, dem in (("no terrain", None), ("24 m terrain", "relief_ngi/dem.tif")):
+            legs = tuple(
+                (Map(f"strip:{strip}:relief_ngi", dem, datum=None), Windows(strip, tilt))
+                for strip in range(len(STRIPS))
+            )
+            yield Question(f"relief_ngi, tilt off by {tilt:g}, {name}", "mapping", legs)
+
+
 def _steady() -> Iterator[Question]:
     naip = SCENES["naip"]
     for date in ("20120731", "20180716"):
@@ -185,7 +197,10 @@ def _steady() -> Iterator[Question]:
             told = "default" if stated is None else f"tilt stated {stated:g}"
             leg = Map(pair.map), OverLevel(pair, 0.0, stated)
             yield Question(f"naip {date}, steady, {told}", "steady", (leg,))
-    past, present = (f"scaled:{SUBURB_GSD_M}:scenes/garching/{d}.tif" for d in SUBURB)
-    suburb = Pair("garching", past, present, SUBURB_GSD_M)
-    leg = Map(past), OverLevel(suburb, 3.0)
-    yield Question("garching from 133 m, tilt 3", "steady", (leg,))
+    folder = f"scaled:{SUBURB_GSD_M}:scenes/garching"
+    suburb = [
+        Pair("garching", f"{folder}/{past}.tif", f"{folder}/{present}.tif", SUBURB_GSD_M)
+        for past, present in SUBURB
+    ]
+    legs = tuple((Map(pair.map), OverLevel(pair, 3.0)) for pair in suburb)
+    yield Question("garching from 133 m, tilt 3", "steady", legs)

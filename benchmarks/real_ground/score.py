@@ -119,14 +119,15 @@ class Row:
             "false": sum(each.wrong for each in sure),
             "ms": float(np.median(self.times_ms)) if views else None,
         }
-        made = {
-            "median_m": lambda: np.median(of("error_m")),
-            "p95_m": lambda: np.percentile(of("error_m"), 95),
-            "std_m": lambda: np.sqrt(of("variance_m2").mean()),
-            "nees": lambda: of("nees").mean(),
-            "nees_median": lambda: np.median(of("nees")),
+        if not sure:
+            return found | dict.fromkeys(("median_m", "p95_m", "std_m", "nees", "nees_median"))
+        return found | {
+            "median_m": float(np.median(of("error_m"))),
+            "p95_m": float(np.percentile(of("error_m"), 95)),
+            "std_m": math.sqrt(float(of("variance_m2").mean())),
+            "nees": float(of("nees").mean()),
+            "nees_median": float(np.median(of("nees"))),
         }
-        return found | {name: float(value()) if sure else None for name, value in made.items()}
 
 
 def cells(name: str, values: dict[str, Any]) -> list[str]:

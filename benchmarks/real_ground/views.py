@@ -1,7 +1,6 @@
 """Where the views of a row come from: rendered over relief, of flat ground, or recorded."""
 
 import argparse
-import csv
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.closed_loop.replays import OFF, ON, Area, Recorded, plain, stated
 from benchmarks.judged_views import is_covered
-from benchmarks.placing import views_in
-from benchmarks.real_ground.maps import BARE, SURFACE, Map, found, landscape_heights, relief_file
+from benchmarks.real_ground.maps import BARE, SURFACE, found, landscape_heights, relief_file
 from benchmarks.real_ground.score import Seen
 from benchmarks.scenes import DATA, Pair, root_agl_of
 from benchmarks.unreported_tilt import Flown, level_telemetry, tilted_views
@@ -86,7 +84,7 @@ class OverRelief:
                 position = np.array([*place, above])
                 grey, _ = seen_view(imagery, relief, lens, attitude, position, 1)
                 part = folder / f"{number:04d}.part.png"
-                seen = degraded(cv2.merge([grey, grey, grey]), EFFECTS, rng)
+                seen = degraded(np.repeat(grey[..., None], 3, -1), EFFECTS, rng)
                 cv2.imwrite(str(part), seen[..., 0])
                 part.replace(path)
             grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
@@ -180,9 +178,11 @@ class OverLevel:
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
         for each in self._flown(work, base, views):
-            latlon = tuple(float(v) for v in base.sheet.frame.latlon_from_en(each.camera_en_m))
+            lat, lon = base.sheet.frame.latlon_from_en(each.camera_en_m)
             reported = replace(each.view.telemetry, tilt_std_deg=self.stated_deg)
-            yield Seen(replace(each.view, telemetry=reported), latlon, each.true.agl_m)
+            yield Seen(
+                replace(each.view, telemetry=reported), (float(lat), float(lon)), each.true.agl_m
+            )
 
     def _flown(self, work: Path, base: Localizer, views: int) -> Iterator[Flown]:
         pair = self.pair
