@@ -55,8 +55,9 @@ def _worse(name: str, figure: dict[str, Any], values: Figures) -> list[list[str]
     found = values.get(name)
     if found is None:
         return [[name, "row", "missing", "there"]]
-    if found["median_m"] is None:
-        return [[name, "confident fixes", "none", "some"]]
+    if found["median_m"] is None:  # as where nothing says how the camera is tilted
+        none = figure.get("median_m", 0.0) is None
+        return [] if none else [[name, "confident fixes", "none", "some"]]
     made = []
     median_m = figure.get("median_m")
     limit_m = LEAST_M + (1 + SHARE) * (median_m or 0.0)

@@ -1,8 +1,8 @@
 """Residual displacements of the blocks of a view under the camera that was found.
 
-`python -m benchmarks.real_ground.pictures --work DIR --only TEXT .. [--views 4]` writes a picture of
-each view into DIR/residuals: the view orthorectified under its camera, and the displacement at which
-each block fits the map best, ten times as long.
+`python -m benchmarks.real_ground.pictures --work DIR --only TEXT .. [--views 4]` writes a picture
+of each view into DIR/residuals: the view orthorectified under its camera, and the displacement at
+which each block fits the map best, ten times as long.
 """
 
 import argparse
@@ -41,19 +41,19 @@ def residuals(localizer: Localizer, view: View) -> NDArray[np.uint8] | None:
     scores = block_scores(template, registration.reference, pose, REACH_PX)
     grey = made.picture(level)[0]
     wide = cv2.resize(grey, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_CUBIC)
-    picture = np.asarray(cv2.cvtColor(wide, cv2.COLOR_GRAY2BGR), np.uint8)
+    picture = cv2.cvtColor(np.asarray(wide, np.uint8), cv2.COLOR_GRAY2BGR)
     rows, cols = grey.shape
     for surface, pixels, middle in zip(*scores, strict=True):
         down, right = np.unravel_index(int(surface.argmax()), surface.shape)
         if pixels == 0 or surface.max() < LEAST_CORRELATION:
             continue
-        begin = (middle + [cols / 2, rows / 2]) * ENLARGED
+        begin = (middle + np.array([cols, rows]) / 2) * ENLARGED
         moved = np.array([right, down]) - REACH_PX
         end = begin + moved * LONGER
         first, last = np.rint(begin).astype(int).tolist(), np.rint(end).astype(int).tolist()
         cv2.arrowedLine(picture, first, last, (0, 200, 255), 2, tipLength=0.3)
         cv2.circle(picture, first, 3, (0, 200, 255), -1)
-    return picture
+    return np.asarray(picture, np.uint8)
 
 
 def main() -> None:

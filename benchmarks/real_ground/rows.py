@@ -106,7 +106,7 @@ def _flights() -> Iterator[Question]:
 
 
 def _replays() -> Iterator[Question]:
-    on = Map(str(IMAGERY / f"{PAST}.tif"))
+    on = Map(str(IMAGERY / f"{PAST}.tif"), str(IMAGERY / "dem.tif"), datum=None)
     for flight in (each.name for each in flights()):
         for with_stds in (False, True):
             name = f"{flight}, {'deviations stated' if with_stds else 'nothing stated'}"

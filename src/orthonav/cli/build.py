@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
 
 WITHOUT_TERRAIN = (
-    "less with --dem FILE ('orthonav fetch --source copernicus-dem --out FILE'), and with --relief "
-    "level where the land is level"
+    "a terrain reduces this error: --dem FILE, such as 'orthonav fetch' brings with the imagery; "
+    "--relief level reduces it where the land is level"
 )
 LEAST_SHIFT_M = 0.3
 """A pixel of the finest orthophotos of countries."""

@@ -135,7 +135,8 @@ def summary_text(plain: dict[str, Any]) -> str:
         said = f"registration layer of {grey['bytes'] / 1e6:.3f} MB, {grey['levels']} levels"
     lines.append(f"grey       {said}")
     if terrain is not None:
-        heights = f"{terrain['low_m']:.0f} to {terrain['high_m']:.0f} m above the sea"
+        level = "" if "unknown" in terrain["datum"] else " above the sea"
+        heights = f"{terrain['low_m']:.0f} to {terrain['high_m']:.0f} m{level}"
         named = "".join(c for c in f"{terrain['name']}, {terrain['datum']}" if c.isprintable())
         lines.append(f"terrain    {heights} every {terrain['posting_m']:g} m ({named})")
         lines += [f"           {text}" for text in _source_text(terrain)]

@@ -5,6 +5,7 @@ explains them. Then the view is orthorectified one level finer, and fitted again
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,9 +64,9 @@ def picture_by_camera(camera: Camera, orientation: Orientation, ground_m: Array)
 
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
-MOST_FITS, AGAIN_PX = 2, 1.0
-"""A view is orthorectified again where the correction moves a block by more pixels of the final
-level, at most so often."""
+AGAIN_PX = 1.0
+"""A view is orthorectified once more where its correction moves a block by more pixels of the final
+level."""
 VARIANCE, VARIANCE_POWER, LEAST_RATIO = 1.6, -0.8, 0.5
 """Variance of the errors of blocks over what their curvature says: the first, times the local ratio
 of the place (at least the third) to the power of the second (docs/decisions/camera.md)."""
@@ -106,16 +107,12 @@ def camera_found(
     correction = None if far is None else far.climbed(seen)
     if far is None or correction is None:
         return None
-    orientation = orientation.moved(correction)
-    for _ in range(MOST_FITS):
-        start = orientation
-        near = _compared(seen, reference, pose, start, first=False)
-        found = None if near is None else near.resected(seen, variance)
-        if near is None or found is None:
-            return None
-        orientation = start.moved(found.correction)
-        if near.moves_px(found.correction) < AGAIN_PX * 2.0**seen.view.levels.final:
-            break
+    near = _fitted(seen, reference, pose, orientation.moved(correction), variance)
+    if near is not None and near.moved_px > AGAIN_PX * 2.0**seen.view.levels.final:
+        near = _fitted(seen, reference, pose, near.orientation, variance)
+    if near is None:
+        return None
+    found, orientation = near.found, near.orientation
     east, north, above_sea_m = orientation.position_m.tolist()
     agl_m = above_sea_m - float(seen.relief.terrain.at_en_m([east, north]))
     if not agl_m > 0:
@@ -124,7 +121,7 @@ def camera_found(
         orientation,
         agl_m,
         found.covariance,
-        start.moved(found.alone),
+        near.start.moved(found.alone),
         found.alone_covariance,
         variance,
         seen.middle_en_m(orientation, pose),
@@ -135,6 +132,28 @@ def camera_found(
 def tilt_std_deg(telemetry: Telemetry) -> float:
     stated = telemetry.tilt_std_deg
     return DEFAULT_TILT_STD_DEG if stated is None else stated
+
+
+class _Fitted(NamedTuple):
+    """A resection from `start`; it moved a block by up to `moved_px`, pixels of level 0."""
+
+    start: Orientation
+    found: Resection
+    moved_px: float
+
+    @property
+    def orientation(self) -> Orientation:
+        return self.start.moved(self.found.correction)
+
+
+def _fitted(
+    seen: ViewOverGround, reference: Reference, pose: Pose, start: Orientation, variance: float
+) -> _Fitted | None:
+    near = _compared(seen, reference, pose, start, first=False)
+    found = None if near is None else near.resected(seen, variance)
+    if near is None or found is None:
+        return None
+    return _Fitted(start, found, near.moves_px(found.correction))
 
 
 @dataclass(frozen=True, eq=False)
