@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from blots import SURFACE
 
-from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.camera import ground_by_picture, picture_by_camera
+from orthonav.core.geo.camera import Camera, enu_from_camera
+from orthonav.core.localize.camera import ground_by_picture, picture_by_camera, picture_by_ground
 from orthonav.core.localize.rectify import Orientation
 from orthonav.core.localize.systematic import (
     BARE_EARTH_M,
@@ -37,8 +37,9 @@ def displaced(errors, camera=CAMERA):
     ground."""
     ground = np.concatenate([places(), np.zeros((36, 1))], axis=1)
     orientation = Orientation(np.array([0.0, 0.0, AGL_M]), np.zeros(3))
-    by_picture = ground_by_picture(camera, orientation, ground, np.zeros((36, 2)))
-    by_camera = -by_picture @ picture_by_camera(camera, orientation, ground)
+    by_ground = picture_by_ground(camera, orientation, ground)
+    by_picture = ground_by_picture(by_ground, np.zeros((36, 2)))
+    by_camera = -by_picture @ picture_by_camera(camera, orientation, ground, by_ground)
     found = systematic(
         camera,
         errors,
@@ -75,16 +76,14 @@ def test_a_slope_of_the_ground_displaces_as_a_tilt_of_the_camera():
 
 def test_undulating_ground_displaces_as_no_camera_does():
     by_camera, found = displaced(GroundErrors(0.0, ((3.0, 20.0),)))
-    ground = found.moves_px[:, :, found.groups[0]]
+    ground = found.moves_px[:, :, found.components[0].at]
     shares = [explained(ground[:, :, k], by_camera) for k in range(ground.shape[2])]
     assert np.mean(shares) < 0.6
 
 
 def test_a_nominal_lens_adds_errors_of_its_own():
     _, calibrated = displaced(GroundErrors(0.0, ((1.0, 50.0),)))
-    _, nominal = displaced(
-        GroundErrors(0.0, ((1.0, 50.0),)), replace(CAMERA, focal_std=0.05)
-    )
+    _, nominal = displaced(GroundErrors(0.0, ((1.0, 50.0),)), replace(CAMERA, focal_std=0.05))
     more = nominal.moves_px[:, :, calibrated.moves_px.shape[2] :]
     assert more.shape == (36, 2, 4)
     # One percent of the width, and 5 % of the distance from the middle.
@@ -124,3 +123,25 @@ def test_errors_of_terrain_follow_its_source():
     older = replace(bare, source_posting_m=None, roughness_m=None, posting_m=10.0)
     assert terrain_errors(older, 10 * SLOPES).fields[0][0] == pytest.approx(COARSE_STD_M / 3)
     assert terrain_errors(coarse, np.full((36, 2), np.nan)).fields[0][0] == BARE_EARTH_M[0]
+
+
+def test_derivatives_of_points_on_a_slope_are_those_of_lines_of_sight():
+    """Against the meeting of moved lines of sight with the slope."""
+    orientation = Orientation(np.array([3.0, -5.0, 150.0]), np.array([40.0, 20.0, -8.0]))
+    slope = np.array([0.1, -0.2])
+    pixel = np.array([120.0, 220.0])
+
+    def met(moved):
+        ray = np.array([(pixel[0] - 200) / 400, (pixel[1] - 150) / 400, 1.0])
+        ray = enu_from_camera(*moved.attitude_deg.tolist()) @ ray
+        east, north, up = moved.position_m
+        run = (up - slope @ [east, north]) / (slope @ ray[:2] - ray[2])
+        return np.array([east, north]) + run * ray[:2]
+
+    ground = np.array([[*met(orientation), float(slope @ met(orientation))]])
+    by_ground = picture_by_ground(CAMERA, orientation, ground)
+    by_camera = picture_by_camera(CAMERA, orientation, ground, by_ground)
+    found = -(ground_by_picture(by_ground, slope[None]) @ by_camera)[0]
+    for axis, step in enumerate(np.diag([0.01] * 6)):
+        expected = (met(orientation.moved(step)) - met(orientation.moved(-step))) / 0.02
+        np.testing.assert_allclose(found[:, axis], expected, rtol=1e-3, atol=1e-4)

@@ -23,43 +23,39 @@ from orthonav.core.register.window import Reference
 
 STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 """Of numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
-GROUND_STEP_M = 2.0  # of a point along the ground: the noise of a terrain model over its slope
+GROUND_STEP_M = 1.0  # of a point of the ground
 MIN_TILT_STD_DEG = 0.05  # of a tilt that is reported as exact
 Array = NDArray[np.float64]
 
 
-def ground_by_picture(
-    camera: Camera, orientation: Orientation, ground_m: Array, slopes: Array
+def picture_by_ground(camera: Camera, orientation: Orientation, ground_m: Array) -> Array:
+    """Pixels (N, 2, 3) by which points of the ground (N, 3) move in the picture per metre east,
+    north and up; NaN where not seen."""
+    steps = GROUND_STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
+    ahead, behind = orientation.seen_px(camera, ground_m + steps[:, None]).reshape(2, 3, -1, 2)
+    return np.asarray(np.moveaxis(ahead - behind, 0, -1) / (2 * GROUND_STEP_M))
+
+
+def ground_by_picture(by_ground: Array, slopes: Array) -> Array:
+    """Metres (N, 2, 2) along the ground per pixel of the picture; NaN where not seen. `by_ground`
+    (N, 2, 3): `picture_by_ground`; `slopes` (N, 2): rise of the ground."""
+    along = by_ground[:, :, :2] + by_ground[:, :, 2:] * slopes[:, None]
+    known = np.isfinite(along).all(axis=(1, 2), keepdims=True)
+    return np.where(known, np.linalg.inv(np.where(known, along, np.eye(2))), np.nan)
+
+
+def picture_by_camera(
+    camera: Camera, orientation: Orientation, ground_m: Array, by_ground: Array
 ) -> Array:
-    """Metres (N, 2, 2) over the ground per pixel of the picture; NaN where not seen. `ground_m`
-    (N, 3): east, north, above sea; `slopes` (N, 2): its rise."""
-    by_ground = []
-    for axis in range(2):
-        step = np.zeros((len(ground_m), 3))
-        step[:, axis] = GROUND_STEP_M
-        step[:, 2] = slopes[:, axis] * GROUND_STEP_M
-        ahead, behind = (orientation.seen_px(camera, ground_m + sign * step) for sign in (1, -1))
-        by_ground.append((ahead - behind) / (2 * GROUND_STEP_M))
-    on_ground = np.stack(by_ground, axis=-1)
-    bad = ~np.isfinite(on_ground).all(axis=(1, 2))
-    on_ground[bad] = np.eye(2)
-    inverse = np.linalg.inv(on_ground)
-    inverse[bad] = np.nan
-    return np.asarray(inverse)
-
-
-def picture_by_camera(camera: Camera, orientation: Orientation, ground_m: Array) -> Array:
     """Pixels (N, 2, 6) by which points of the ground (N, 3) move in the picture per unit of the
-    camera."""
-    columns = []
-    for axis in range(6):
-        change = np.zeros(6)
-        change[axis] = STEPS[axis]
+    camera. `by_ground` (N, 2, 3): `picture_by_ground`, as of a camera that moves the other way."""
+    turned = []
+    for step in np.diag(STEPS)[3:]:
         ahead, behind = (
-            orientation.moved(sign * change).seen_px(camera, ground_m) for sign in (1, -1)
+            orientation.moved(sign * step).seen_px(camera, ground_m) for sign in (1, -1)
         )
-        columns.append((ahead - behind) / (2 * STEPS[axis]))
-    return np.stack(columns, axis=-1)
+        turned.append((ahead - behind) / (2 * step.sum()))
+    return np.concatenate([-by_ground, np.stack(turned, axis=-1)], axis=2)
 
 
 FIRST_REACH_PX, REACH_PX = 7, 4
@@ -221,7 +217,8 @@ def _compared(
     ground = seen.relief.ground_m(pose.map_px(blocks[0][0].middles_px * blocks[0][1]))
     slopes = seen.relief.slopes(ground)
     window_from_en = np.linalg.inv(pose.linear) @ np.diag([1.0, -1.0]) / seen.relief.grid.gsd_m
-    by_picture = window_from_en @ ground_by_picture(camera, orientation, ground, slopes)
+    by_ground = picture_by_ground(camera, orientation, ground)
+    by_picture = window_from_en @ ground_by_picture(by_ground, slopes)
     return _Compared(
         camera,
         orientation,
@@ -229,7 +226,7 @@ def _compared(
         ground,
         slopes,
         by_picture,
-        -by_picture @ picture_by_camera(camera, orientation, ground),
+        -by_picture @ picture_by_camera(camera, orientation, ground, by_ground),
         _expected(seen, pose, orientation),
     )
 
@@ -247,12 +244,16 @@ def _middle_covariance(
     seen: ViewOverGround, orientation: Orientation, covariance: Array
 ) -> Array | None:
     """Of the ground (2, 2), m2, that the middle of a view shows; None beside unknown ground."""
-    columns = []
-    for step in np.diag(STEPS):
-        ahead, behind = (seen.sight_en_m(orientation.moved(sign * step)) for sign in (1, -1))
-        columns.append((ahead - behind) / (2 * step.sum()))
-    slopes = np.stack(columns, axis=1)
-    return slopes @ covariance @ slopes.T if np.isfinite(slopes).all() else None
+    met = seen.sight_en_m(orientation)
+    point = np.array([[*met, float(seen.relief.terrain.at_en_m(met))]])
+    slopes = seen.relief.slopes(point)
+    if not (np.isfinite(point).all() and np.isfinite(slopes).all()):
+        return None
+    camera = seen.view.picture_at(seen.view.levels.final).camera
+    by_ground = picture_by_ground(camera, orientation, point)
+    by_camera = picture_by_camera(camera, orientation, point, by_ground)
+    moved = (ground_by_picture(by_ground, slopes) @ by_camera)[0]
+    return np.asarray(moved @ covariance @ moved.T)
 
 
 def _expected(seen: ViewOverGround, pose: Pose, orientation: Orientation) -> Expected:

@@ -30,7 +30,7 @@ and what errors reach over, pixels of the map (docs/decisions/camera.md)."""
 MIN_BLOCKS = 8
 MIN_LEFT = 0.25  # least share of the blocks' numbers that the solution leaves to their scatter
 COMPONENT_PRIOR = 4.0  # numbers that the prior variance of a systematic error counts as,
-COMPONENT_LIMITS = 0.1, 16.0  # and the least and largest factor on it
+MAX_COMPONENT = 16.0  # and the largest factor on it
 WEAK = np.array([1e4, 1e4, 1e3, 60.0, 20.0, 20.0])
 """Standard deviations of a camera of which nothing is reported."""
 CAMERA = slice(0, 6)
@@ -122,7 +122,7 @@ def _joint(
     size = blocks.moved_px.shape[2]
     state, prior, precision = np.zeros(size), np.zeros(size), np.ones(size)
     state[CAMERA], prior[CAMERA] = correction, expected.correction
-    groups = [slice(6 + each.start, 6 + each.stop) for each in systematic.groups]
+    components = [(slice(6 + at.start, 6 + at.stop), least) for at, least in systematic.components]
     excess = blocks.correlated
     for _ in range(JOINT_STEPS):
         information = np.diag(precision)
@@ -132,8 +132,8 @@ def _joint(
         pull = slopes.sum(axis=0) / excess + information @ (prior - state)
         state = state + blocks.limited(covariance @ pull)
         excess = blocks.excess(curvature, slopes, covariance, excess)
-        for each in groups:
-            precision[each] = 1 / _component(state[each], np.diag(covariance)[each])
+        for at, least in components:
+            precision[at] = 1 / _component(state[at], np.diag(covariance)[at], least)
     shown = _Marginal.of(curvature / excess, information)
     covariance = shown.covariance(expected.information, variance)
     alone = shown.without(state[CAMERA], expected)
@@ -143,11 +143,11 @@ def _joint(
     return Resection(state[CAMERA], covariance, alone, alone_covariance)
 
 
-def _component(values: Array, variances: Array) -> float:
+def _component(values: Array, variances: Array, least: float) -> float:
     """Common variance of systematic errors, 1 as assumed, by expectation maximization."""
     shown = float(values @ values + variances.sum())
-    low, high = COMPONENT_LIMITS
-    return min(max((COMPONENT_PRIOR + shown) / (COMPONENT_PRIOR + len(values)), low), high)
+    found = (COMPONENT_PRIOR + shown) / (COMPONENT_PRIOR + len(values))
+    return min(max(found, least), MAX_COMPONENT)
 
 
 class _Marginal(NamedTuple):

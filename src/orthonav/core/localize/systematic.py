@@ -32,6 +32,9 @@ UNDULATION_M = 50.0, 100.0
 STRETCH_PX = 0.3, 80.0
 """Of imagery of two dates, pixels of the map: as residuals of blocks show (docs/decisions)."""
 LEAST_SHARE = 0.02  # weaker modes of a field, of the variance of its strongest, are left out
+LEAST_KNOWN, LEAST_UNKNOWN = 0.1, 0.7
+"""Least factors on the variance of errors by what a view shows: ground that does not undulate may
+still slope."""
 CENTRE_SHARE, DISTORTION = 0.01, 0.05
 """Of a nominal lens: principal point over the width, and first radial coefficient."""
 Array = NDArray[np.float64]
@@ -70,13 +73,19 @@ def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
     return GroundErrors(0.0, ((std_m, max(length_m, LENGTH_POSTINGS * posting_m)), OBJECTS_M))
 
 
+class Component(NamedTuple):
+    """Errors whose common variance the view itself shows, and the least factor on it."""
+
+    at: slice
+    least: float
+
+
 class Systematic(NamedTuple):
     """Displacements of blocks (N, 2, K), pixels right and down at level 0, by one standard
-    deviation of each error; `groups`: those whose common variance the view itself shows;
-    `slope_rad`: standard deviation of the slope among them."""
+    deviation of each error; `slope_rad`: standard deviation of the slope among them."""
 
     moves_px: Array
-    groups: tuple[slice, ...]
+    components: tuple[Component, ...]
     slope_rad: float
 
 
@@ -108,8 +117,11 @@ def systematic(
     ]
     if camera.focal_std > 0:
         moves_px.append(by_picture_px @ _lens_px(camera, seen_px))
-    groups = slice(0, ground), slice(ground, ground + stretched)
-    return Systematic(np.concatenate(moves_px, axis=2), groups, errors.slope)
+    components = (
+        Component(slice(0, ground), LEAST_UNKNOWN if errors.slope > 0 else LEAST_KNOWN),
+        Component(slice(ground, ground + stretched), LEAST_KNOWN),
+    )
+    return Systematic(np.concatenate(moves_px, axis=2), components, errors.slope)
 
 
 def _lens_px(camera: Camera, seen_px: Array) -> Array:
