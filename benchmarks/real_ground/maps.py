@@ -77,7 +77,7 @@ class Map:
         assert self.ground is not None
         if self.relief is None:
             return found(self.ground, work)
-        if self.ortho.startswith("generated:"):
+        if self.ortho.startswith("generated:") and self.ground != FLAT:
             return landscape_heights(self.ortho, work, self.relief, self.ground)
         return relief_file(self.ortho, work, self.relief, self.ground)
 
@@ -129,7 +129,8 @@ def coarse_of(heights: Heights, posting_m: float, seed: int) -> Heights:
 def relief_file(name: str, work: Path, slope: float, kind: str) -> Path:
     """Heights over an orthophoto, in its coordinate system: the relief itself (`BARE`), or a
     terrain model of it."""
-    out = work / f"{Path(name).stem}-relief{slope:g}-{kind}.tif"
+    path = Path(name.replace(":", "-"))  # dates of several places have the same name
+    out = work / f"{path.parent.name}-{path.stem}-relief{slope:g}-{kind}.tif"
     if out.is_file():
         return out
     with rasterio.open(found(name, work)) as source:

@@ -29,9 +29,9 @@ from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 from orthonav.ground.simulate.render import Raster, ViewEffects, degraded
 
 SEED, WIDTH_PX = 1, 256
-MIDDLE_STD, BARREL_STD = 0.01, 0.03
-"""Errors of a nominal lens beside that of its focal length (`FOV_STD`): the principal point as a
-share of the width, and k1."""
+MIDDLE_STD, BARREL = 0.01, 0.05
+"""Errors of a nominal lens beside that of its focal length (`FOV_STD`): standard deviation of the
+principal point as a share of the width, and the largest k1."""
 CAMERA, EFFECTS = DEFAULT_CAMERA.fitted(640, 480), ViewEffects()
 LEAD = 50  # views with GNSS before a track is judged
 Array = NDArray[np.float64]
@@ -147,7 +147,8 @@ class OverRelief:
     def _lens(self, rng: np.random.Generator) -> tuple[Camera, Camera]:
         """The lens of a view, and as the localizer knows it."""
         nominal = CAMERA
-        focal, east, south, barrel = rng.normal(0, [FOV_STD, MIDDLE_STD, MIDDLE_STD, BARREL_STD])
+        focal, east, south = rng.normal(0, [FOV_STD, MIDDLE_STD, MIDDLE_STD])
+        barrel = float(rng.uniform(-BARREL, BARREL))
         if not self.nominal:
             return nominal, nominal
         lens = replace(

@@ -31,7 +31,7 @@ def test_equal_figures_pass():
     [
         ({"median_m": 4.7}, "median m"),
         ({"nees": 3.6}, "NEES"),
-        ({"nees": 0.2}, "NEES"),
+        ({"nees": 0.09}, "NEES"),
         ({"exceeded": 2}, "protection levels exceeded"),
         ({"of_right": 0.7}, "confident of right"),
         ({"median_m": None, "nees": None}, "confident fixes"),
