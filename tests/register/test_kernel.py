@@ -10,6 +10,7 @@ import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.register import blocks, refine, search, sharpness, template
+from orthonav.core.register.channels import FINE
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Refiner
@@ -292,46 +293,95 @@ def test_windows_that_do_not_match_are_refused(damage):
 @needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("reach_px", [2, 7])
-def test_scores_of_blocks_are_the_same(reference, monkeypatch, level, whole, reach_px):
+@pytest.mark.parametrize("cached", [True, False])
+@pytest.mark.parametrize("reach_px", [0, 2, 4, 7])
+def test_scores_of_blocks_are_the_same(reference, monkeypatch, level, whole, cached, reach_px):
     """The map has a hole, and views reach beyond its border."""
+    monkeypatch.setattr(reference, "caches", lambda _: cached)
     seen = list(views(6, 9, level, valid_but_a_corner(whole)))
 
     def work():
         return [blocks.block_scores(made, reference, pose, reach_px) for made, pose in seen]
 
     for one, other in zip(*both(monkeypatch, work), strict=True):
-        np.testing.assert_array_equal(one.pixels, other.pixels)
-        np.testing.assert_allclose(one.correlations, other.correlations, atol=1e-5)
+        # OpenCV rounds positions, by which single pixels beside the hole count or not.
+        both_used = (one.pixels > 0) & (other.pixels > 0)
+        assert ((one.pixels > 0) != (other.pixels > 0)).sum() <= 1
+        np.testing.assert_allclose(one.pixels[both_used], other.pixels[both_used], atol=2.5)
+        off = one.correlations[both_used] - other.correlations[both_used]
+        assert np.abs(off).max(initial=0.0) < 0.05 and np.abs(off).mean() < 3e-3
         np.testing.assert_array_equal(one.middles_px, other.middles_px)
 
 
 @needs_kernel
+@pytest.mark.parametrize("shape", [(6, 6), (7, 13), (11, 6), (50, 47), (65, 96)])
+@pytest.mark.parametrize("reach_px", [0, 1, 4, 7])
+def test_scores_of_blocks_where_nothing_is_interpolated_are_exactly_those(
+    monkeypatch, shape, reach_px
+):
+    """Views of any size, down to one pixel to a block, at whole pixels of the map."""
+    rng = np.random.default_rng(4)
+    made = rng.normal(size=(4, *shape)).astype(np.float32)
+    made[3] = rng.uniform(size=shape) > 0.2
+    view = template.Template(0, made * made[3], (1.0, 0.6), FINE)
+    ground = rng.normal(size=(90, 120, 4)).astype(np.float32)
+    ground[..., 3] = rng.uniform(size=(90, 120)) > 0.1
+    ground[..., :3] *= ground[..., 3:]
+    reference = reference_of(GROUND, (128, 128))
+    monkeypatch.setattr(reference, "caches", lambda _: True)
+    monkeypatch.setattr(reference, "whole", lambda *_: ground)
+    # The last reaches beyond the border; in the first OpenCV's arithmetic is exact too.
+    for x, y, quarter in [(50, 40, 0), (70, 45, 1), (10, 80, 2)]:
+        rows, cols = shape if quarter % 2 == 0 else shape[::-1]
+        pose = Pose(x + cols % 2 / 2, y + rows % 2 / 2, quarter * math.pi / 2, 0.0)
+        window = MapWindow.of(view, reference, pose, 1, (reach_px, reach_px))
+        plain, plain_sums = blocks._compared(view, window, pose, reach_px)
+        products, sums = np.full_like(plain, math.nan), np.full_like(plain_sums, math.nan)
+        at = window.matrix(pose), pose.turn_rad, reach_px, blocks.GREY_SHARE
+        KERNEL.blocks(window.made, view.planes, *at, products, sums)
+        np.testing.assert_allclose(products, plain, atol=1e-4 * np.abs(plain).max())
+        np.testing.assert_allclose(sums, plain_sums, rtol=1e-3, atol=1e-3)
+
+
+@needs_kernel
 @pytest.mark.parametrize(
-    "damage", ["channels", "type", "seen", "reach", "negative", "blocks", "side", "strided"]
+    "matrix", [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
+)
+def test_blocks_beyond_all_bounds_touch_no_memory(matrix):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    products, sums = np.full((36, 9, 9), math.nan, np.float32), np.full((3, 36), math.nan)
+    window = np.ones((20, 30, 4), np.float32)
+    KERNEL.blocks(window, made.planes, matrix, 0.0, 4, 0.25, products, sums)
+    assert not products.any() and not sums[1:].any() and np.isfinite(sums).all()
+
+
+@needs_kernel
+@pytest.mark.parametrize(
+    "damage",
+    ["channels", "type", "planes", "small", "reach", "negative", "blocks", "side", "strided", "sums"],
 )
 def test_blocks_that_do_not_match_are_refused(damage):
-    view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).values
-    rows, cols = view.shape[:2]
+    view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).planes
+    view = {"planes": view[:3], "small": view[:, :5].copy()}.get(damage, view)
     reach = {"reach": 3, "negative": -1}.get(damage, 2)
-    seen = np.ones((rows + 4 + (damage == "seen"), cols + 4, 4), np.float32)
-    if damage == "channels":
-        seen = np.ones((rows + 4, cols + 4, 3), np.float32)
-    elif damage == "type":
-        seen = seen.astype(np.float64)
-    count = 35 if damage == "blocks" else 36
-    products = np.zeros((count, 5, 6 if damage == "side" else 5, 4), np.float32)
-    if damage == "strided":
-        products = np.zeros((count, 5, 5, 8), np.float32)[..., ::2]
+    window = np.ones((20, 30, 3 if damage == "channels" else 4), np.float32)
+    if damage == "type":
+        window = window.astype(np.float64)
+    products = np.zeros((36, 5, 6 if damage == "side" else 5), np.float32)
+    if damage == "blocks":
+        products = products[:35]
+    elif damage == "strided":
+        products = np.zeros((36, 5, 10), np.float32)[..., ::2]
+    sums = np.zeros((2 if damage == "sums" else 3, 36))
     with pytest.raises(ValueError, match=r"match|expected|contiguous"):
-        KERNEL.blocks(view, seen, reach, products)
+        KERNEL.blocks(window, view, (1.0, 0, 0, 0, 1, 0), 0.0, reach, 0.25, products, sums)
 
 
 @needs_kernel
 @pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks"])
 def test_an_array_that_is_missing_is_refused(name):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    values, weights, (rows, cols) = made.values, made.weights, made.mask.shape
+    values, weights = made.values, made.weights
 
     def zeros(*shape, of=np.float32):
         return np.zeros(shape, of)
@@ -339,12 +389,13 @@ def test_an_array_that_is_missing_is_refused(name):
     window, best, numbers = zeros(20, 30, 4), zeros(3, 40, 16), zeros(3, 40, 16, of=np.int32)
     spectra, poses, sums = zeros(3, 3, 45, 16), np.zeros((1, 4)), np.zeros(2 * 16 + 36 * 7)
     moved = (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, zeros(3, 7, 9)
+    block = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 2, 0.25
     given = {
         "search": (spectra, values, weights, poses, 0, best, numbers, None),
         "near": (zeros(20, 30, 3), values, weights, poses, 2, np.zeros((1, 3))),
         "moved": (window, values, weights, *moved),
         "spread": (window, values, made.slopes, made.numbers, (0,) * 4, (0,) * 9, sums),
-        "blocks": (values, zeros(rows + 4, cols + 4, 4), 2, zeros(36, 5, 5, 4)),
+        "blocks": (window, made.planes, *block, zeros(36, 5, 5), np.zeros((3, 36))),
     }[name]
     for at, each in enumerate(given):
         if isinstance(each, np.ndarray):

@@ -21,6 +21,7 @@ MIN_SEEN = 0.4  # blocks of which less is seen on valid map do not count
 MIN_ENERGY = 0.1
 """Nor those below this fraction of the median energy: edges brought in would count too much."""
 Array = NDArray[np.float32]
+Sums = NDArray[np.float64]
 
 
 class BlockScores(NamedTuple):
@@ -39,33 +40,47 @@ def block_scores(
     template: Template, reference: Reference, pose: Pose, reach_px: int
 ) -> BlockScores:
     """Of a view whose window lies at `pose`, moved by up to `reach_px` pixels of the level."""
-    seen = _sampled(template, reference, pose, reach_px)
     rows, cols = template.mask.shape
-    count = BLOCKS * BLOCKS
-    products = _products(template, template.values, seen, reach_px)
-    here = np.ascontiguousarray(seen[reach_px : reach_px + rows, reach_px : reach_px + cols])
-    weights, energies = zip(
-        *(_energies(template, each) for each in (template.values, here)), strict=True
-    )
-    pixels = products[:, reach_px, reach_px, 3].astype(np.float64)
-    used = pixels >= MIN_SEEN * rows * cols / count
-    for each in energies:
+    window = MapWindow.of(template, reference, pose, 1, (reach_px, reach_px))
+    if KERNEL is not None:
+        count, side = BLOCKS * BLOCKS, 2 * reach_px + 1
+        products, sums = np.empty((count, side, side), np.float32), np.empty((3, count))
+        at = window.matrix(pose), pose.turn_rad, reach_px, GREY_SHARE
+        KERNEL.blocks(window.made, template.planes, *at, products, sums)
+    else:
+        products, sums = _compared(template, window, pose, reach_px)
+    used = sums[2] >= MIN_SEEN * rows * cols / len(products)
+    for each in sums[:2]:
         used &= each > MIN_ENERGY * np.median(each)
-    scale = np.sqrt(np.where(used, energies[0] * energies[1], 1.0))
-    correlations = products @ np.sqrt(weights[0] * weights[1]) / scale[:, None, None]
+    scale = np.where(used, 1 / np.sqrt(np.where(used, sums[0] * sums[1], 1.0)), 0.0)
+    correlations = products.astype(np.float64) * scale[:, None, None]
     starts = zip(template.block_starts, template.mask.shape, strict=True)
     y, x = ((np.append(each[1:], size) + each) / 2 - size / 2 for each, size in starts)
     middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return BlockScores(
-        np.where(used[:, None, None], np.clip(correlations, -1.0, 1.0), 0.0),
-        np.where(used, pixels, 0.0),
-        middles,
-    )
+    correlations.clip(-1.0, 1.0, out=correlations)
+    return BlockScores(correlations, np.where(used, sums[2], 0.0), middles)
 
 
-def _sampled(template: Template, reference: Reference, pose: Pose, margin_px: int) -> Array:
-    """(H + 2 R, W + 2 R, 4): the window and `margin_px` around it, turned; 0 where not valid."""
-    window = MapWindow.of(template, reference, pose, 1, (margin_px, margin_px))
+def _compared(template: Template, window: MapWindow, pose: Pose, reach_px: int) -> tuple[Array, Sums]:
+    """Products (B * B, 2 R + 1, 2 R + 1) of blocks with the map, moved; of each block the energy in
+    the view and on the map, and the pixels that count (3, B * B)."""
+    rows, cols = template.mask.shape
+    seen = _sampled(window, pose)
+    here = seen[reach_px : reach_px + rows, reach_px : reach_px + cols]
+    own_weights, own = _energies(template, template.values)
+    weights, energies = _energies(template, here)
+    used = template.planes * np.sqrt(own_weights * weights)[:, None, None].astype(np.float32)
+    side = 2 * reach_px + 1
+    products = np.empty((BLOCKS * BLOCKS, side, side), np.float32)
+    for down, right in np.ndindex(side, side):
+        moved = np.moveaxis(seen[down : down + rows, right : right + cols, :3], 2, 0)
+        products[:, down, right] = template.block_sums((used[:3] * moved).sum(axis=0))
+    pixels = template.block_sums(template.mask * here[..., 3])
+    return products, np.stack([own, energies, pixels])
+
+
+def _sampled(window: MapWindow, pose: Pose) -> Array:
+    """The window (H, W, 4), edge directions turned; 0 where not valid."""
     sampled = np.empty((*window.shape, CHANNELS), np.float32)
     window.sample(pose, sampled)
     cos, sin = math.cos(2 * pose.turn_rad), math.sin(2 * pose.turn_rad)
@@ -76,24 +91,10 @@ def _sampled(template: Template, reference: Reference, pose: Pose, margin_px: in
     return turned
 
 
-def _energies(template: Template, values: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _energies(template: Template, values: Array) -> tuple[Sums, Sums]:
     """Weights (4,) of the squares of channels (H, W, 4), and the weighted energy of each block."""
-    blocks = _products(template, values, values, 0)[:, 0, 0].astype(np.float64)
-    gradients, grey = float(blocks[:, :2].sum()), float(blocks[:, 2].sum())
+    squares = np.moveaxis(np.square(values, dtype=np.float64), 2, 0)
+    blocks = template.block_sums(squares)
+    gradients, grey = float(blocks[:2].sum()), float(blocks[2].sum())
     weights = np.array([1.0, 1.0, GREY_SHARE * gradients / grey if grey > 0 else 0.0, 0.0])
-    return weights, blocks @ weights
-
-
-def _products(template: Template, values: Array, seen: Array, reach_px: int) -> Array:
-    """Sums (B * B, 2 R + 1, 2 R + 1, 4) over blocks of channels (H, W, 4) times the map, moved."""
-    side = 2 * reach_px + 1
-    products = np.empty((BLOCKS * BLOCKS, side, side, CHANNELS), np.float32)
-    if KERNEL is not None:
-        KERNEL.blocks(values, seen, reach_px, products)
-        return products
-    rows, cols = values.shape[:2]
-    planes = np.moveaxis(values, 2, 0)
-    for down, right in np.ndindex(side, side):
-        moved = np.moveaxis(seen[down : down + rows, right : right + cols], 2, 0)
-        products[:, down, right] = template.block_sums(planes * moved).T
-    return products
+    return weights, weights @ blocks
