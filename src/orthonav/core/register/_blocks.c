@@ -12,7 +12,7 @@
 
 #define FULLY_VALID 0.99f
 #define CHANNELS 3      /* that are compared; validity is the fourth plane */
-#define ASIDE 9         /* moves along a row that are added up together, at most */
+#define ASIDE 9         /* moves along a row that are added up together, at most: registers hold no more */
 #define SUMS 3          /* energies of view and map, pixels that count */
 
 typedef float wide __attribute__((vector_size(32)));
@@ -127,8 +127,9 @@ INLINE void weigh_inline(const aside_t *with, double *pixels) {
 
 FOR_EVERY_PROCESSOR(weigh, (const aside_t *with, double *pixels), (with, pixels))
 
-/* A block of one plane times the map at `other`, under `count` moves along the row, added to `out`. */
-INLINE void add_moves(const aside_t *with, const block_t *at, const float *other, int count,
+/* A block of one plane times the map at `other`, under `count` moves along the row; all from `first`
+ * on are added to `out`. */
+INLINE void add_moves(const aside_t *with, const block_t *at, const float *other, int first, int count,
                       float weight, float *out) {
     wide sums[ASIDE] = {{0}};
     const float *mine = with->block;
@@ -138,28 +139,32 @@ INLINE void add_moves(const aside_t *with, const block_t *at, const float *other
             for (int move = 0; move < count; move++)
                 sums[move] += view * load_wide(other + WIDE * i + move);
         }
-    for (int move = 0; move < count; move++) out[move] += weight * sum_of(sums[move]);
+    for (int move = 0; move < count; move++)
+        if (move >= first) out[move] += weight * sum_of(sums[move]);
 }
 
 /* Products (B^2, 2 R + 1, 2 R + 1) of each block with the map under all moves. */
 INLINE void multiply_inline(const aside_t *with, const float *weights, float *out) {
     const int moves = 2 * with->reach + 1;
+    const int together = moves % 9 == 0 ? 9 : moves >= 8 ? 8 : 1;
     memset(out, 0, sizeof(float) * BLOCKS * BLOCKS * moves * moves);
     for (int number = 0; number < BLOCKS * BLOCKS; number++) {
         const block_t at = block_at(with, number);
         for (int channel = 0; channel < CHANNELS; channel++) {
+            const float weight = weights[channel];
             take_block(with, &at, channel);
             for (int down = 0; down < moves; down++) {
                 const float *other =
                     with->map + with->plane * channel + with->stride * (at.top + down) + at.left;
                 float *into = out + ((size_t)number * moves + down) * moves;
-                int first = 0;
-                for (; first + ASIDE <= moves; first += ASIDE)
-                    add_moves(with, &at, other + first, ASIDE, weights[channel], into + first);
-                for (; first + 3 <= moves; first += 3)
-                    add_moves(with, &at, other + first, 3, weights[channel], into + first);
-                for (; first < moves; first++)
-                    add_moves(with, &at, other + first, 1, weights[channel], into + first);
+                for (int done = 0, next; done < moves; done = next + together) {
+                    next = done < moves - together ? done : moves - together;
+                    if (together == 9)
+                        add_moves(with, &at, other + next, done - next, 9, weight, into + next);
+                    else if (together == 8)
+                        add_moves(with, &at, other + next, done - next, 8, weight, into + next);
+                    else add_moves(with, &at, other + next, done - next, 1, weight, into + next);
+                }
             }
         }
     }

@@ -3,6 +3,7 @@
 Under wrong tilt, relief or lens they fit at different displacements, which show the camera."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from orthonav.core.register.channels import CHANNELS
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.template import BLOCKS, Template
+from orthonav.core.register.template import BLOCKS, Template, block_starts
 from orthonav.core.register.window import MapWindow, Reference
 
 GREY_SHARE = 0.25
@@ -53,12 +54,20 @@ def block_scores(
     for each in sums[:2]:
         used &= each > MIN_ENERGY * np.median(each)
     scale = np.where(used, 1 / np.sqrt(np.where(used, sums[0] * sums[1], 1.0)), 0.0)
-    correlations = products.astype(np.float64) * scale[:, None, None]
-    starts = zip(template.block_starts, template.mask.shape, strict=True)
-    y, x = ((np.append(each[1:], size) + each) / 2 - size / 2 for each, size in starts)
+    correlations = np.maximum(np.minimum(products * scale[:, None, None], 1.0), -1.0)
+    return BlockScores(correlations, np.where(used, sums[2], 0.0), _middles_px(rows, cols))
+
+
+@lru_cache(maxsize=64)
+def _middles_px(rows: int, cols: int) -> Sums:
+    """Of the blocks (B * B, 2), shared: not to be written to."""
+    y, x = (
+        (np.append(each[1:], size) + each) / 2 - size / 2
+        for each, size in zip(block_starts((rows, cols)), (rows, cols), strict=True)
+    )
     middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    correlations.clip(-1.0, 1.0, out=correlations)
-    return BlockScores(correlations, np.where(used, sums[2], 0.0), middles)
+    middles.flags.writeable = False
+    return middles
 
 
 def _compared(template: Template, window: MapWindow, pose: Pose, reach_px: int) -> tuple[Array, Sums]:

@@ -139,8 +139,13 @@ class Template:
 
     @cached_property
     def block_starts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in self.mask.shape)
-        return rows.astype(np.intp), cols.astype(np.intp)
+        return block_starts(self.mask.shape)
+
+
+def block_starts(shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First rows and columns of the blocks of a view (H, W)."""
+    rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in shape)
+    return rows.astype(np.intp), cols.astype(np.intp)
 
 
 def by_kind(template: Template, channels: Array) -> NDArray[np.float64]:
