@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-from orthonav.core.register import blocks, refine, search, sharpness, template
-from orthonav.core.register.channels import FINE
+from orthonav.core.register import blocks, channels, refine, search, sharpness, template
+from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Refiner
@@ -33,7 +33,7 @@ def reference():
 def both(monkeypatch, work):
     """What `work` makes with the kernel, and without it."""
     compiled = work()
-    for module in (blocks, refine, search, sharpness, template):
+    for module in (blocks, channels, refine, search, sharpness, template):
         monkeypatch.setattr(module, "KERNEL", None)
     return compiled, work()
 
@@ -378,7 +378,58 @@ def test_blocks_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks"])
+@pytest.mark.parametrize("recipe", [FINE, COARSE], ids=["fine", "coarse"])
+@pytest.mark.parametrize("valid", ["all", "none", "part", "scattered"])
+@pytest.mark.parametrize(
+    "shape", [(64, 96), (97, 41), (1, 1), (1, 9), (5, 3), (9, 31), (8, 8)], ids=str
+)
+def test_channels_are_the_same(shape, valid, recipe):
+    """At borders too, and of pictures smaller than the windows."""
+    rng = np.random.default_rng(5)
+    grey = (rng.integers(0, 256, shape) // 2 + np.arange(shape[1])).astype(np.uint8)
+    which = np.full(shape, valid != "none")
+    if valid == "part":
+        which[: shape[0] // 3, shape[1] // 2 :] = False
+    elif valid == "scattered":
+        which = rng.uniform(size=shape) > 0.1
+    compiled = channels.channel_planes(grey, which, recipe)
+    plain = np.stack(channels._planes(grey, which, recipe, bool(which.all())))
+    np.testing.assert_array_equal(compiled[3], plain[3])
+    np.testing.assert_allclose(compiled, plain, atol=1e-4)
+
+
+@needs_kernel
+def test_channels_of_a_uniform_picture_are_zero():
+    grey = np.full((40, 50), 90, np.uint8)
+    compiled = channels.channel_planes(grey, np.ones(grey.shape, bool), FINE)
+    assert not compiled[:3].any()
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["type", "valid", "planes", "strided", "empty", "even", "sigma"])
+def test_pictures_that_do_not_match_are_refused(damage):
+    grey, valid = np.zeros((20, 30), np.uint8), np.ones((20, 30), bool)
+    planes, recipe = np.zeros((4, 20, 30), np.float32), [1.0, 27, 11, 21]
+    if damage == "type":
+        grey = grey.astype(np.int32)
+    elif damage == "valid":
+        valid = valid[:-1]
+    elif damage == "planes":
+        planes = planes[:3]
+    elif damage == "strided":
+        grey = np.zeros((20, 60), np.uint8)[:, ::2]
+    elif damage == "empty":
+        grey, valid, planes = grey[:0], valid[:0], planes[:, :0]
+    elif damage == "even":
+        recipe[2] = 10
+    else:
+        recipe[0] = math.nan
+    with pytest.raises(ValueError, match=r"match|expected"):
+        KERNEL.channels(grey, valid, tuple(recipe), planes)
+
+
+@needs_kernel
+@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks", "channels"])
 def test_an_array_that_is_missing_is_refused(name):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
     values, weights = made.values, made.weights
@@ -395,6 +446,7 @@ def test_an_array_that_is_missing_is_refused(name):
         "near": (zeros(20, 30, 3), values, weights, poses, 2, np.zeros((1, 3))),
         "moved": (window, values, weights, *moved),
         "spread": (window, values, made.slopes, made.numbers, (0,) * 4, (0,) * 9, sums),
+        "channels": (zeros(20, 30, of=np.uint8), None, (1.0, 27, 11, 21), zeros(4, 20, 30)),
         "blocks": (window, made.planes, *block, zeros(36, 5, 5), np.zeros((3, 36))),
     }[name]
     for at, each in enumerate(given):

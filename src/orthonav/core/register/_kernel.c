@@ -1,5 +1,5 @@
 /* Refinement of a view on the map: the loop of orthonav.core.register.refine, compiled. `_search.c` has
- * the search, `_blocks.c` blocks of a view.
+ * the search, `_channels.c` what is compared, `_blocks.c` blocks of a view.
  *
  * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
  * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
@@ -429,7 +429,7 @@ static int spread(const window_t *window, const template_t *view, const numbers_
 
 int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind, int flags) {
     if (PyObject_GetBuffer(from, into, PyBUF_STRIDES | PyBUF_FORMAT | flags) < 0) return -1;
-    const Py_ssize_t size = kind == 'd' ? 8 : 4;
+    const Py_ssize_t size = kind == 'd' ? 8 : kind == 'f' || kind == 'i' ? 4 : 1;
     int good = into->ndim == dimensions && into->itemsize == size && into->format &&
                into->format[0] == kind && (last == ANY || into->shape[dimensions - 1] == last) &&
                into->strides[dimensions - 1] == size;
@@ -595,6 +595,8 @@ static PyMethodDef functions[] = {
      "spread(window, view, slopes, numbers, pose, limits, out): see orthonav.core.register.refine."},
     {"derive", py_derive, METH_VARARGS,
      "derive(view, slopes, out): see orthonav.core.register.template."},
+    {"channels", py_channels, METH_VARARGS,
+     "channels(grey, valid, recipe, planes): see orthonav.core.register.channels."},
     {"blocks", py_blocks, METH_VARARGS,
      "blocks(window, view, matrix, turn, reach, share, products, sums): see "
      "orthonav.core.register.blocks."},

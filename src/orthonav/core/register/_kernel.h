@@ -102,7 +102,7 @@ INLINE int find_taps(const window_t *window, float x, float y, float dx, float d
     return 1;
 }
 
-/* Borrow a buffer of numbers of 'f', 'd' or 'i' with so many dimensions, the last of `last` numbers
+/* Borrow a buffer of numbers of 'f', 'd', 'i', 'B' or '?' with so many dimensions, the last of `last` numbers
  * (or `ANY`) that lie together; 0, or -1 with an error. */
 int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind, int flags);
 
@@ -110,6 +110,7 @@ int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, cha
 int is_whole(const Py_buffer *buffer);
 
 PyObject *py_blocks(PyObject *self, PyObject *arguments);
+PyObject *py_channels(PyObject *self, PyObject *arguments);
 PyObject *py_search(PyObject *self, PyObject *arguments);
 PyObject *py_near(PyObject *self, PyObject *arguments);
 PyObject *py_moved(PyObject *self, PyObject *arguments);

@@ -36,7 +36,7 @@ class Template:
     def of(
         cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: ChannelRecipe
     ) -> "Template":
-        planes, weights = np.stack(channel_planes(grey, valid, recipe)), (1.0, recipe.grey_share)
+        planes, weights = channel_planes(grey, valid, recipe), (1.0, recipe.grey_share)
         for group, weight in zip(GROUPS, weights, strict=True):
             energy = energy_of(planes[group])
             planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
