@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
+from orthonav.core.localize import resection
 from orthonav.core.register import blocks, channels, refine, search, sharpness, template
 from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.kernel import KERNEL
@@ -19,6 +20,7 @@ from orthonav.core.register.window import MapWindow
 
 SHAPE = (256, 320)
 GROUND = Ground()
+SHARES = blocks.GREY_SHARE, blocks.MIN_SEEN, blocks.MIN_ENERGY
 needs_kernel = pytest.mark.skipif(KERNEL is None, reason="the kernel was not compiled")
 
 
@@ -335,12 +337,14 @@ def test_scores_of_blocks_where_nothing_is_interpolated_are_exactly_those(
         rows, cols = shape if quarter % 2 == 0 else shape[::-1]
         pose = Pose(x + cols % 2 / 2, y + rows % 2 / 2, quarter * math.pi / 2, 0.0)
         window = MapWindow.of(view, reference, pose, 1, (reach_px, reach_px))
-        plain, plain_sums = blocks._compared(view, window, pose, reach_px)
-        products, sums = np.full_like(plain, math.nan), np.full_like(plain_sums, math.nan)
-        at = window.matrix(pose), pose.turn_rad, reach_px, blocks.GREY_SHARE
-        KERNEL.blocks(window.made, view.planes, *at, products, sums)
-        np.testing.assert_allclose(products, plain, atol=1e-4 * np.abs(plain).max())
-        np.testing.assert_allclose(sums, plain_sums, rtol=1e-3, atol=1e-3)
+        sums = blocks._compared(view, window, pose, reach_px)
+        plain, plain_pixels = blocks._correlated(*sums, math.prod(shape))
+        found, pixels = np.full_like(plain, math.nan), np.full_like(plain_pixels, math.nan)
+        at = window.matrix(pose), pose.turn_rad, reach_px, SHARES
+        KERNEL.blocks(window.made, view.planes, *at, found, pixels)
+        assert pixels.any()
+        np.testing.assert_allclose(pixels, plain_pixels, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(found, plain, atol=2e-4)
 
 
 @needs_kernel
@@ -349,16 +353,16 @@ def test_scores_of_blocks_where_nothing_is_interpolated_are_exactly_those(
 )
 def test_blocks_beyond_all_bounds_touch_no_memory(matrix):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    products, sums = np.full((36, 9, 9), math.nan, np.float32), np.full((3, 36), math.nan)
+    found, pixels = np.full((36, 9, 9), math.nan), np.full(36, math.nan)
     window = np.ones((20, 30, 4), np.float32)
-    KERNEL.blocks(window, made.planes, matrix, 0.0, 4, 0.25, products, sums)
-    assert not products.any() and not sums[1:].any() and np.isfinite(sums).all()
+    KERNEL.blocks(window, made.planes, matrix, 0.0, 4, SHARES, found, pixels)
+    assert not found.any() and not pixels.any()
 
 
 @needs_kernel
 @pytest.mark.parametrize(
     "damage",
-    ["channels", "type", "planes", "small", "reach", "negative", "blocks", "side", "strided", "sums"],
+    ["channels", "type", "planes", "small", "reach", "negative", "blocks", "side", "strided", "pixels"],
 )
 def test_blocks_that_do_not_match_are_refused(damage):
     view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).planes
@@ -367,14 +371,49 @@ def test_blocks_that_do_not_match_are_refused(damage):
     window = np.ones((20, 30, 3 if damage == "channels" else 4), np.float32)
     if damage == "type":
         window = window.astype(np.float64)
-    products = np.zeros((36, 5, 6 if damage == "side" else 5), np.float32)
+    found = np.zeros((36, 5, 6 if damage == "side" else 5))
     if damage == "blocks":
-        products = products[:35]
+        found = found[:35]
     elif damage == "strided":
-        products = np.zeros((36, 5, 10), np.float32)[..., ::2]
-    sums = np.zeros((2 if damage == "sums" else 3, 36))
+        found = np.zeros((36, 5, 10))[..., ::2]
+    pixels = np.zeros(35 if damage == "pixels" else 36)
     with pytest.raises(ValueError, match=r"match|expected|contiguous"):
-        KERNEL.blocks(window, view, (1.0, 0, 0, 0, 1, 0), 0.0, reach, 0.25, products, sums)
+        KERNEL.blocks(window, view, (1.0, 0, 0, 0, 1, 0), 0.0, reach, SHARES, found, pixels)
+
+
+@needs_kernel
+@pytest.mark.parametrize("side", [3, 9, 15])
+def test_quadratics_through_correlations_are_the_same(monkeypatch, side):
+    """At the border of a surface and beyond it too, and at saddles and pits."""
+    rng = np.random.default_rng(6)
+    surfaces, reach = rng.normal(size=(300, side, side)), side // 2
+    moved = rng.uniform(-1.3 * reach, 1.3 * reach, (300, 2))
+    moved[:40] = rng.integers(-reach, reach + 1, (40, 2))
+    moved[40:80] = rng.integers(-reach, reach, (40, 2)) + 0.5
+    surfaces[80:90] = 0.0
+    monkeypatch.setattr(resection, "KERNEL", KERNEL)
+    compiled = resection._quadratic(surfaces, moved)
+    monkeypatch.setattr(resection, "KERNEL", None)
+    for one, other in zip(compiled, resection._quadratic(surfaces, moved), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+@needs_kernel
+def test_places_that_are_not_numbers_have_no_quadratic():
+    out = np.full((3, 7), math.nan)
+    moved = np.array([[math.nan, 0.0], [0.0, math.inf], [-1e300, 1e300]])
+    KERNEL.bend(np.ones((3, 5, 5)), moved, out)
+    assert not out.any()
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["type", "even", "count", "out", "small"])
+def test_surfaces_that_do_not_match_are_refused(damage):
+    side = {"even": 4, "small": 1}.get(damage, 5)
+    surfaces = np.zeros((3, side, side), np.float32 if damage == "type" else np.float64)
+    moved, out = np.zeros((4 if damage == "count" else 3, 2)), np.zeros((3, 6 + (damage != "out")))
+    with pytest.raises(ValueError, match=r"match|expected"):
+        KERNEL.bend(surfaces, moved, out)
 
 
 @needs_kernel
@@ -429,7 +468,7 @@ def test_pictures_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks", "channels"])
+@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks", "channels", "bend"])
 def test_an_array_that_is_missing_is_refused(name):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
     values, weights = made.values, made.weights
@@ -440,14 +479,15 @@ def test_an_array_that_is_missing_is_refused(name):
     window, best, numbers = zeros(20, 30, 4), zeros(3, 40, 16), zeros(3, 40, 16, of=np.int32)
     spectra, poses, sums = zeros(3, 3, 45, 16), np.zeros((1, 4)), np.zeros(2 * 16 + 36 * 7)
     moved = (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, zeros(3, 7, 9)
-    block = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 2, 0.25
+    block = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 2, SHARES
     given = {
         "search": (spectra, values, weights, poses, 0, best, numbers, None),
         "near": (zeros(20, 30, 3), values, weights, poses, 2, np.zeros((1, 3))),
         "moved": (window, values, weights, *moved),
         "spread": (window, values, made.slopes, made.numbers, (0,) * 4, (0,) * 9, sums),
         "channels": (zeros(20, 30, of=np.uint8), None, (1.0, 27, 11, 21), zeros(4, 20, 30)),
-        "blocks": (window, made.planes, *block, zeros(36, 5, 5), np.zeros((3, 36))),
+        "bend": (np.zeros((3, 5, 5)), np.zeros((3, 2)), np.zeros((3, 7))),
+        "blocks": (window, made.planes, *block, np.zeros((36, 5, 5)), np.zeros(36)),
     }[name]
     for at, each in enumerate(given):
         if isinstance(each, np.ndarray):

@@ -1,7 +1,8 @@
 /* Blocks of a view beside the map, moved a little aside: orthonav.core.register.blocks, compiled.
  *
  * The map is sampled once, in planes, with a margin; then each block is multiplied with it under all
- * moves, eight pixels at a time. Rows of a block are filled up to whole vectors with zeros. */
+ * moves, eight pixels at a time. Rows of a block are filled up to whole vectors with zeros. `bend` is
+ * the quadratic of orthonav.core.localize.resection through these correlations. */
 
 #include "_kernel.h"
 
@@ -13,7 +14,6 @@
 #define FULLY_VALID 0.99f
 #define CHANNELS 3      /* that are compared; validity is the fourth plane */
 #define ASIDE 9         /* moves along a row that are added up together, at most: registers hold no more */
-#define SUMS 3          /* energies of view and map, pixels that count */
 
 typedef float wide __attribute__((vector_size(32)));
 typedef float wide_in_memory __attribute__((vector_size(32), aligned(4)));
@@ -173,79 +173,174 @@ INLINE void multiply_inline(const aside_t *with, const float *weights, float *ou
 FOR_EVERY_PROCESSOR(multiply, (const aside_t *with, const float *weights, float *out),
                     (with, weights, out))
 
-/* Products of blocks under all moves, and `sums` (3, B^2): energies of the view's blocks and of the
- * map's, and pixels that count. Grey has `share` of the energy of gradients. 0, or -1 without memory. */
+/* What orthonav.core.register.blocks says of them: grey's energy over that of gradients, and of a block
+ * that counts the least share of pixels, and of energy over the median. */
+typedef struct {
+    double grey, seen, energy;
+} shares_t;
+
+static int ascending(const void *one, const void *other) {
+    const double a = *(const double *)one, b = *(const double *)other;
+    return (a > b) - (a < b);
+}
+
+static double median_of(const double *values) {
+    double sorted[BLOCKS * BLOCKS];
+    memcpy(sorted, values, sizeof sorted);
+    qsort(sorted, BLOCKS * BLOCKS, sizeof *sorted, ascending);
+    return (sorted[BLOCKS * BLOCKS / 2 - 1] + sorted[BLOCKS * BLOCKS / 2]) / 2;
+}
+
+/* Correlations of blocks under all moves by their `products`, and the pixels that count; both 0 where
+ * too few do. */
+static void normalize(const aside_t *with, const shares_t *shares, const float *products,
+                      const double sums[2][BLOCKS * BLOCKS], double *out, double *pixels) {
+    const size_t moves = 2 * (size_t)with->reach + 1, each = moves * moves;
+    const double least[2] = {shares->energy * median_of(sums[0]), shares->energy * median_of(sums[1])};
+    const double seen = shares->seen * with->rows * with->cols / (BLOCKS * BLOCKS);
+    for (int block = 0; block < BLOCKS * BLOCKS; block++, products += each, out += each) {
+        const int used =
+            pixels[block] >= seen && sums[0][block] > least[0] && sums[1][block] > least[1];
+        const double scale = used ? 1 / sqrt(sums[0][block] * sums[1][block]) : 0.0;
+        if (!used) pixels[block] = 0.0;
+        for (size_t i = 0; i < each; i++) {
+            const double found = scale * products[i], high = found > 1.0 ? 1.0 : found;
+            out[i] = high < -1.0 ? -1.0 : high;
+        }
+    }
+}
+
+/* Correlations and pixels of all blocks; 0, or -1 without memory. */
 static int compare_aside(const window_t *window, aside_t *with, const double *matrix, double turn,
-                         double share, float *out, double *sums) {
+                         const shares_t *shares, double *out, double *pixels) {
     const int count = BLOCKS * BLOCKS;
     const size_t height = (size_t)with->rows + 2 * (size_t)with->reach;
     const size_t tall = (size_t)with->rows / BLOCKS + 1, broad = (size_t)with->cols / BLOCKS + 1;
-    double energies[2 * BLOCKS * BLOCKS][CHANNELS];
+    const size_t moves = 2 * (size_t)with->reach + 1;
+    double energies[2 * BLOCKS * BLOCKS][CHANNELS], sums[2][BLOCKS * BLOCKS];
     float weights[CHANNELS] = {1.0f, 1.0f, 1.0f};
     with->stride = (size_t)with->cols + 2 * (size_t)with->reach + WIDE;
     with->plane = with->stride * height;
     with->energies = energies;
     with->map = malloc(sizeof(float) * (CHANNELS + 1) * with->plane);
     with->block = malloc(sizeof(float) * tall * (broad + WIDE));
-    const int failed = !with->map || !with->block;
+    float *const products = malloc(sizeof(float) * BLOCKS * BLOCKS * moves * moves);
+    const int failed = !with->map || !with->block || !products;
     if (!failed) {
         sample_map(window, with, matrix, (float)cos(2 * turn), (float)sin(2 * turn));
-        weigh(with, sums + 2 * count);
+        weigh(with, pixels);
         for (int each = 0; each < 2; each++) {
             double gradients = 0.0, grey = 0.0;
             const double(*const from)[CHANNELS] = energies + each * count;
             for (int i = 0; i < count; i++) gradients += from[i][0] + from[i][1], grey += from[i][2];
-            const double weight = grey > 0 ? share * gradients / grey : 0.0;
+            const double weight = grey > 0 ? shares->grey * gradients / grey : 0.0;
             for (int i = 0; i < count; i++)
-                sums[each * count + i] = from[i][0] + from[i][1] + weight * from[i][2];
+                sums[each][i] = from[i][0] + from[i][1] + weight * from[i][2];
             weights[2] *= (float)sqrt(weight);
         }
-        multiply(with, weights, out);
+        multiply(with, weights, products);
+        normalize(with, shares, products, sums, out, pixels);
     }
-    free(with->map), free(with->block);
+    free(with->map), free(with->block), free(products);
     return failed ? -1 : 0;
 }
 
 PyObject *py_blocks(PyObject *self, PyObject *arguments) {
     PyObject *from[4];
-    Py_buffer made, view, out, sums;
-    double matrix[6], turn, share;
+    Py_buffer made, view, out, pixels;
+    double matrix[6], turn;
+    shares_t shares;
     int reach;
     (void)self;
-    if (!PyArg_ParseTuple(arguments, "OO(dddddd)didOO", &from[0], &from[1], &matrix[0], &matrix[1],
-                          &matrix[2], &matrix[3], &matrix[4], &matrix[5], &turn, &reach, &share,
-                          &from[2], &from[3]))
+    if (!PyArg_ParseTuple(arguments, "OO(dddddd)di(ddd)OO", &from[0], &from[1], &matrix[0], &matrix[1],
+                          &matrix[2], &matrix[3], &matrix[4], &matrix[5], &turn, &reach, &shares.grey,
+                          &shares.seen, &shares.energy, &from[2], &from[3]))
         return NULL;
     if (reach < 0 || reach > LARGEST) {
-        PyErr_SetString(PyExc_ValueError, "reach must match the products");
+        PyErr_SetString(PyExc_ValueError, "reach must match the correlations");
         return NULL;
     }
     if (borrow(from[0], &made, 3, LANES, 'f', 0) < 0) return NULL;
     if (borrow(from[1], &view, 3, ANY, 'f', 0) < 0) goto free_made;
-    if (borrow(from[2], &out, 3, 2 * (Py_ssize_t)reach + 1, 'f', PyBUF_WRITABLE) < 0) goto free_view;
-    if (borrow(from[3], &sums, 2, BLOCKS * BLOCKS, 'd', PyBUF_WRITABLE) < 0) goto free_out;
+    if (borrow(from[2], &out, 3, 2 * (Py_ssize_t)reach + 1, 'd', PyBUF_WRITABLE) < 0) goto free_view;
+    if (borrow(from[3], &pixels, 1, BLOCKS * BLOCKS, 'd', PyBUF_WRITABLE) < 0) goto free_out;
     const Py_ssize_t rows = view.shape[1], cols = view.shape[2], stride = made.strides[0] / 4;
     if (made.shape[1] > LARGEST || made.strides[0] % 4 || made.shape[0] * stride > INT_MAX)
         PyErr_SetString(PyExc_ValueError, "window must have at most 32768 columns and 2^31 numbers");
-    else if (!is_whole(&view) || !is_whole(&out) || !is_whole(&sums) || view.shape[0] != LANES ||
+    else if (!is_whole(&view) || !is_whole(&out) || !is_whole(&pixels) || view.shape[0] != LANES ||
              rows < BLOCKS || cols < BLOCKS || rows > LARGEST || cols > LARGEST ||
-             out.shape[0] != BLOCKS * BLOCKS || out.shape[1] != out.shape[2] || sums.shape[0] != SUMS)
-        PyErr_SetString(PyExc_ValueError, "view, reach, products and sums do not match");
+             out.shape[0] != BLOCKS * BLOCKS || out.shape[1] != out.shape[2])
+        PyErr_SetString(PyExc_ValueError, "view, reach and correlations do not match");
     else {
         const window_t window = {made.buf, stride, (int)made.shape[0], (int)made.shape[1]};
         aside_t with = {.view = view.buf, .rows = (int)rows, .cols = (int)cols, .reach = reach};
         int failed;
         Py_BEGIN_ALLOW_THREADS
-        failed = compare_aside(&window, &with, matrix, turn, share, out.buf, sums.buf);
+        failed = compare_aside(&window, &with, matrix, turn, &shares, out.buf, pixels.buf);
         Py_END_ALLOW_THREADS
         if (failed) PyErr_NoMemory();
     }
-    PyBuffer_Release(&sums);
+    PyBuffer_Release(&pixels);
 free_out:
     PyBuffer_Release(&out);
 free_view:
     PyBuffer_Release(&view);
 free_made:
     PyBuffer_Release(&made);
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+}
+
+#define BENT 7          /* value, slopes by x and y, curvatures (2, 2) */
+
+/* As `_positive` of orthonav.core.localize.resection. */
+static void make_positive(double along, double across, double down, double out[4]) {
+    const double half = (along + down) / 2, apart = hypot((along - down) / 2, across);
+    const double scale = half >= apart ? 1.0 : half <= -apart ? 0.0 : (half + apart) / (2 * apart);
+    const double shift = half >= apart || half <= -apart ? 0.0 : apart - half;
+    out[0] = scale * (along + shift), out[3] = scale * (down + shift);
+    out[1] = out[2] = scale * across;
+}
+
+/* As `_quadratic` of orthonav.core.localize.resection, of one surface. */
+static void bend(const double *surface, int side, double x, double y, double out[BENT]) {
+    const int reach = side / 2;
+    memset(out, 0, sizeof(double) * BENT);
+    if (!(fabs(x) <= reach && fabs(y) <= reach)) return;
+    const double right = rint(fmin(fmax(x, 1 - reach), reach - 1));
+    const double below = rint(fmin(fmax(y, 1 - reach), reach - 1));
+    const double *const at = surface + side * ((int)below + reach) + (int)right + reach;
+    const double by_x = (at[1] - at[-1]) / 2, by_y = (at[side] - at[-side]) / 2;
+    const double along = 2 * at[0] - at[1] - at[-1], down = 2 * at[0] - at[side] - at[-side];
+    const double across = (at[1 - side] + at[side - 1] - at[side + 1] - at[-side - 1]) / 4;
+    const double off_x = x - right, off_y = y - below; /* at most 1 */
+    const double bent_x = along * off_x + across * off_y, bent_y = across * off_x + down * off_y;
+    out[0] = at[0] + (by_x - bent_x / 2) * off_x + (by_y - bent_y / 2) * off_y;
+    out[1] = by_x - bent_x, out[2] = by_y - bent_y;
+    make_positive(along, across, down, out + 3);
+}
+
+PyObject *py_bend(PyObject *self, PyObject *arguments) {
+    PyObject *from[3];
+    Py_buffer surfaces, moved, out;
+    (void)self;
+    if (!PyArg_ParseTuple(arguments, "OOO", &from[0], &from[1], &from[2])) return NULL;
+    if (borrow(from[0], &surfaces, 3, ANY, 'd', 0) < 0) return NULL;
+    if (borrow(from[1], &moved, 2, 2, 'd', 0) < 0) goto free_surfaces;
+    if (borrow(from[2], &out, 2, BENT, 'd', PyBUF_WRITABLE) < 0) goto free_moved;
+    const Py_ssize_t count = surfaces.shape[0], side = surfaces.shape[1];
+    if (!is_whole(&surfaces) || !is_whole(&moved) || !is_whole(&out) || side != surfaces.shape[2] ||
+        side < 3 || side > LARGEST || side % 2 == 0 || moved.shape[0] != count || out.shape[0] != count)
+        PyErr_SetString(PyExc_ValueError, "surfaces, places and results do not match");
+    else
+        for (Py_ssize_t i = 0; i < count; i++) {
+            const double *const at = (const double *)moved.buf + 2 * i;
+            bend((const double *)surfaces.buf + side * side * i, (int)side, at[0], at[1],
+                 (double *)out.buf + BENT * i);
+        }
+    PyBuffer_Release(&out);
+free_moved:
+    PyBuffer_Release(&moved);
+free_surfaces:
+    PyBuffer_Release(&surfaces);
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
 }

@@ -598,8 +598,10 @@ static PyMethodDef functions[] = {
     {"channels", py_channels, METH_VARARGS,
      "channels(grey, valid, recipe, planes): see orthonav.core.register.channels."},
     {"blocks", py_blocks, METH_VARARGS,
-     "blocks(window, view, matrix, turn, reach, share, products, sums): see "
+     "blocks(window, view, matrix, turn, reach, shares, correlations, pixels): see "
      "orthonav.core.register.blocks."},
+    {"bend", py_bend, METH_VARARGS,
+     "bend(surfaces, places, out): see orthonav.core.localize.resection."},
     {"search", py_search, METH_VARARGS,
      "search(spectra, view, weights, poses, first, best, which, expected): see "
      "orthonav.core.register.search."},

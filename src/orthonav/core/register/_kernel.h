@@ -110,6 +110,7 @@ int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, cha
 int is_whole(const Py_buffer *buffer);
 
 PyObject *py_blocks(PyObject *self, PyObject *arguments);
+PyObject *py_bend(PyObject *self, PyObject *arguments);
 PyObject *py_channels(PyObject *self, PyObject *arguments);
 PyObject *py_search(PyObject *self, PyObject *arguments);
 PyObject *py_near(PyObject *self, PyObject *arguments);

@@ -43,19 +43,23 @@ def block_scores(
     """Of a view whose window lies at `pose`, moved by up to `reach_px` pixels of the level."""
     rows, cols = template.mask.shape
     window = MapWindow.of(template, reference, pose, 1, (reach_px, reach_px))
-    if KERNEL is not None:
-        count, side = BLOCKS * BLOCKS, 2 * reach_px + 1
-        products, sums = np.empty((count, side, side), np.float32), np.empty((3, count))
-        at = window.matrix(pose), pose.turn_rad, reach_px, GREY_SHARE
-        KERNEL.blocks(window.made, template.planes, *at, products, sums)
+    if KERNEL is None:
+        found, pixels = _correlated(*_compared(template, window, pose, reach_px), rows * cols)
     else:
-        products, sums = _compared(template, window, pose, reach_px)
-    used = sums[2] >= MIN_SEEN * rows * cols / len(products)
+        count, side = BLOCKS * BLOCKS, 2 * reach_px + 1
+        found, pixels = np.empty((count, side, side)), np.empty(count)
+        at, shares = (window.matrix(pose), pose.turn_rad), (GREY_SHARE, MIN_SEEN, MIN_ENERGY)
+        KERNEL.blocks(window.made, template.planes, *at, reach_px, shares, found, pixels)
+    return BlockScores(found, pixels, _middles_px(rows, cols))
+
+
+def _correlated(products: Array, sums: Sums, view_px: int) -> tuple[Sums, Sums]:
+    """Correlations (B * B, 2 R + 1, 2 R + 1) and pixels (B * B,) that count, by `_compared`."""
+    used = sums[2] >= MIN_SEEN * view_px / len(products)
     for each in sums[:2]:
         used &= each > MIN_ENERGY * np.median(each)
     scale = np.where(used, 1 / np.sqrt(np.where(used, sums[0] * sums[1], 1.0)), 0.0)
-    correlations = np.maximum(np.minimum(products * scale[:, None, None], 1.0), -1.0)
-    return BlockScores(correlations, np.where(used, sums[2], 0.0), _middles_px(rows, cols))
+    return (products * scale[:, None, None]).clip(-1.0, 1.0), np.where(used, sums[2], 0.0)
 
 
 @lru_cache(maxsize=64)
