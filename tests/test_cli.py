@@ -112,7 +112,7 @@ def truth_path(flight_path):
 def test_build(run, ortho, out, names_in):
     done = run("build", "--ortho", ortho, *WHOLE_MAP, "--out", out / "a.onav")
     assert (done.code, done.err) == (0, "") and "km2" in done.out and "built in" in done.out
-    assert "terrain    none: rolling land" in done.out and "copernicus-dem" in done.out
+    assert "terrain    none: rolling land" in done.out and "--dem FILE" in done.out
     assert "1.6 % of the height where its tilt is known to 1 deg, 2.9 %" in done.out
     again = run("build", "--ortho", ortho, *SMALL_MAP, "--out", out / "b.onav", "--json", "-q")
     assert (again.code, again.err) == (0, "")
@@ -150,7 +150,7 @@ def test_relief_is_in_the_map(run, ortho, out):
 
 def test_info(run, map_path):
     done = run("info", map_path)
-    assert "terrain    none: a degree of pitch or roll is 1.7 %" in done.out
+    assert "terrain    none: rolling land is assumed" in done.out
     assert (done.code, done.err) == (0, "")
     assert str(map_path) in done.out and "2.5 m per pixel" in done.out and "2016-07" in done.out
     plain = json.loads(run("info", map_path, "--json").out)

@@ -95,7 +95,7 @@ def test_a_view_is_placed_to_a_fraction_of_a_pixel(localizer, place, yaw_deg):
     fix = localizer.locate(View(grey, CAMERA, reported))
     assert error_m(localizer, fix, place) < 0.1
     assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1 and 0 <= fix.heading_deg < 360
-    assert fix.agl_m == pytest.approx(agl_m, rel=0.002)
+    assert fix.agl_m == pytest.approx(agl_m, rel=0.003)
     assert fix.confidence > 0.9 and fix.evidence["score"] > 0.85
 
 
@@ -139,7 +139,7 @@ def test_the_position_is_that_of_the_camera(localizer, attitude):
 def test_unknown_heading(localizer, yaw_deg):
     place = np.array([-60.0, 50.0])
     grey = rendered(GROUND, place, (yaw_deg, 5.0, -4.0))
-    reported = telemetry(math.nan, 5.0, -4.0)
+    reported = telemetry(math.nan, 5.0, -4.0, tilt_std_deg=0.0)
     fix = localizer.locate(View(grey, CAMERA, reported), heading_known=False)
     assert error_m(localizer, fix, place) < 0.15 and fix.confidence > 0.9
     assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1

@@ -143,7 +143,7 @@ def test_tilt_has_a_standard_deviation_by_the_kind_of_the_source():
     assert tilt(with_gnss) == (math.hypot(1, mount), mount)
     assert tilt(with_gnss, 2 * S) == (math.hypot(3, mount), mount), "GNSS was lost before"
     assert tilt(RecordedTrack(attitude, tilt=ARDUPILOT)) == (math.hypot(1, mount), mount)
-    assert tilt(RecordedTrack(attitude, tilt=GIMBAL)) == (1.0, None)
+    assert tilt(RecordedTrack(attitude, tilt=GIMBAL)) == (0.5, None)
     stated = RecordedTrack(attitude, horizon_std=series((0, 0.3), (2, 0.3)))
     assert tilt(stated) == (math.hypot(0.3, mount), mount)
     reported = RecordedTrack(attitude, tilt=UNSTATED, tilt_std=series((0, 0.5), (0.5, 0.7)))

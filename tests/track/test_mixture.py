@@ -545,12 +545,3 @@ def test_hypotheses_are_merged_and_ordered_at_views_that_cannot_be_used():
             pytest.approx(1.0)
         )
     assert len(shares) < 20 and off_m(mixture, flight) < 30
-
-
-def test_the_place_expected_before_an_update_is_the_likeliest_one():
-    flight, mixture, _ = flown(3)
-    wrong = CameraDisplacement(3 * SPEED, np.eye(2) * 0.25, 80.0)
-    for moved in (flight.moved(), wrong, flight.moved()):
-        mixture.predict(1.0, ReportedVelocity(SPEED, SPEED, 1.0), moved)
-        mixture.estimate(RADIUS_M, between_views=True)
-        assert mixture.likeliest.share == max(each.share for each in mixture.hypotheses)

@@ -210,7 +210,7 @@ UNKNOWN = {
     **{
         name: (math.nan, math.inf)
         for name in (
-            *("yaw_std_deg", "agl_std_m", "tilt_std_deg", "vel_std_mps"),
+            *("yaw_std_deg", "agl_std_m", "tilt_std_deg", "mount_std_deg", "vel_std_mps"),
             *("home_m", "amsl_m", "hae_m"),
         )
     },

@@ -201,17 +201,17 @@ class _Compared:
 def _compared(
     seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
 ) -> _Compared | None:
-    """At first at the final level and a coarser one, then at one finer too."""
+    """At first at the final level and a coarser one, then at the final level and a finer one."""
     final = seen.view.levels.final
     finest = final if first else max(final - 1, 0)
     made = _templates(seen, pose, finest, orientation, first=first)
     if made is None:
         return None
-    reach_px = FIRST_REACH_PX if first else REACH_PX
-    coarsest = min(final + 1, reference.levels - 1)
+    coarsest = min(final + first, reference.levels - 1)
     levels = [at for at in range(finest, coarsest + 1) if min(made.shape(at)) >= BLOCKS]
     if not levels:
         return None
+    reach_px = FIRST_REACH_PX if first else REACH_PX
     blocks = [(block_scores(made.at(at), reference, pose, reach_px), 2.0**at) for at in levels]
     camera = seen.view.picture_at(finest).camera
     ground = seen.relief.ground_m(pose.map_px(blocks[0][0].middles_px * blocks[0][1]))

@@ -238,7 +238,7 @@ class Mixture:
         """`extent_en_m`: west, south, east, north of the map, on which the aircraft is."""
         self.model = model
         self._set_extent(extent_en_m)
-        self.hypotheses: list[Hypothesis] = []  # the likeliest first
+        self.hypotheses: list[Hypothesis] = []  # the likeliest first, unless split
         self._is_split = False  # by a prediction, and not merged since
         self.elsewhere = 1.0
         self._state = State.SEARCHING
@@ -326,7 +326,6 @@ class Mixture:
                 _, expected = max(self._predictions(one, *moves), key=lambda split: split[0])
                 one = self._from(one, held_to_map(self.model, expected, self.area_m2), 1)
             singles.append(one)
-        made.sort(key=lambda each: -each.share)
         self.hypotheses, (self._last, self._against), self._ground = made, singles, 1 - overlap
         self._is_split = True
         self.elsewhere += (1 - stays) * (1 - self.elsewhere)
