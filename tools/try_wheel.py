@@ -29,7 +29,7 @@ CONSTRAINTS = ROOT / "constraints.txt"
 LARGE = ("train", "cluster")
 """Extras that bring gigabytes (PyTorch) or hundreds of MB (Ray): only with --all."""
 KERNEL = "orthonav/core/register/_kernel.abi3.so"
-"""Compiled from `_kernel.c` and `_search.c`; needs a C compiler and Python's headers."""
+"""Compiled from `_kernel.c` and the files beside it; needs a C compiler and Python's headers."""
 MADE_BY_BUILD = ("PKG-INFO", "setup.cfg", "src/orthonav.egg-info/")
 
 ORTHO, MAP, FLIGHT, FIXES = "land/2016-07.tif", "area.onav", "flight", "fixes.jsonl"

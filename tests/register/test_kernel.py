@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-from orthonav.core.register import blocks, refine, search, sharpness, template
+from orthonav.core.localize import resection
+from orthonav.core.register import blocks, channels, refine, search, sharpness, template
+from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Refiner
@@ -18,6 +20,7 @@ from orthonav.core.register.window import MapWindow
 
 SHAPE = (256, 320)
 GROUND = Ground()
+SHARES = blocks.GREY_SHARE, blocks.MIN_SEEN, blocks.MIN_ENERGY
 needs_kernel = pytest.mark.skipif(KERNEL is None, reason="the kernel was not compiled")
 
 
@@ -32,7 +35,7 @@ def reference():
 def both(monkeypatch, work):
     """What `work` makes with the kernel, and without it."""
     compiled = work()
-    for module in (blocks, refine, search, sharpness, template):
+    for module in (blocks, channels, refine, search, sharpness, template):
         monkeypatch.setattr(module, "KERNEL", None)
     return compiled, work()
 
@@ -292,46 +295,183 @@ def test_windows_that_do_not_match_are_refused(damage):
 @needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("reach_px", [2, 7])
-def test_scores_of_blocks_are_the_same(reference, monkeypatch, level, whole, reach_px):
+@pytest.mark.parametrize("cached", [True, False])
+@pytest.mark.parametrize("reach_px", [0, 2, 4, 7])
+def test_scores_of_blocks_are_the_same(reference, monkeypatch, level, whole, cached, reach_px):
     """The map has a hole, and views reach beyond its border."""
+    monkeypatch.setattr(reference, "caches", lambda _: cached)
     seen = list(views(6, 9, level, valid_but_a_corner(whole)))
 
     def work():
         return [blocks.block_scores(made, reference, pose, reach_px) for made, pose in seen]
 
     for one, other in zip(*both(monkeypatch, work), strict=True):
-        np.testing.assert_array_equal(one.pixels, other.pixels)
-        np.testing.assert_allclose(one.correlations, other.correlations, atol=1e-5)
+        # OpenCV rounds positions, by which single pixels beside the hole count or not.
+        both_used = (one.pixels > 0) & (other.pixels > 0)
+        assert ((one.pixels > 0) != (other.pixels > 0)).sum() <= 1
+        np.testing.assert_allclose(one.pixels[both_used], other.pixels[both_used], atol=2.5)
+        off = one.correlations[both_used] - other.correlations[both_used]
+        assert np.abs(off).max(initial=0.0) < 0.05 and np.abs(off).mean() < 3e-3
         np.testing.assert_array_equal(one.middles_px, other.middles_px)
 
 
 @needs_kernel
-@pytest.mark.parametrize(
-    "damage", ["channels", "type", "seen", "reach", "negative", "blocks", "side", "strided"]
-)
-def test_blocks_that_do_not_match_are_refused(damage):
-    view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).values
-    rows, cols = view.shape[:2]
-    reach = {"reach": 3, "negative": -1}.get(damage, 2)
-    seen = np.ones((rows + 4 + (damage == "seen"), cols + 4, 4), np.float32)
-    if damage == "channels":
-        seen = np.ones((rows + 4, cols + 4, 3), np.float32)
-    elif damage == "type":
-        seen = seen.astype(np.float64)
-    count = 35 if damage == "blocks" else 36
-    products = np.zeros((count, 5, 6 if damage == "side" else 5, 4), np.float32)
-    if damage == "strided":
-        products = np.zeros((count, 5, 5, 8), np.float32)[..., ::2]
-    with pytest.raises(ValueError, match=r"match|expected|contiguous"):
-        KERNEL.blocks(view, seen, reach, products)
+@pytest.mark.parametrize("shape", [(6, 6), (7, 13), (11, 6), (50, 47), (65, 96)])
+@pytest.mark.parametrize("reach_px", [0, 1, 4, 7])
+def test_scores_of_blocks_where_nothing_is_interpolated_are_exactly_those(
+    monkeypatch, shape, reach_px
+):
+    """Views of any size, down to one pixel to a block, at whole pixels of the map."""
+    rng = np.random.default_rng(4)
+    made = rng.normal(size=(4, *shape)).astype(np.float32)
+    made[3] = rng.uniform(size=shape) > 0.2
+    view = template.Template(0, made * made[3], (1.0, 0.6), FINE)
+    ground = rng.normal(size=(90, 120, 4)).astype(np.float32)
+    ground[..., 3] = rng.uniform(size=(90, 120)) > 0.1
+    ground[..., :3] *= ground[..., 3:]
+    reference = reference_of(GROUND, (128, 128))
+    monkeypatch.setattr(reference, "caches", lambda _: True)
+    monkeypatch.setattr(reference, "whole", lambda *_: ground)
+    # The last reaches beyond the border; in the first OpenCV's arithmetic is exact too.
+    for x, y, quarter in [(50, 40, 0), (70, 45, 1), (10, 80, 2)]:
+        rows, cols = shape if quarter % 2 == 0 else shape[::-1]
+        pose = Pose(x + cols % 2 / 2, y + rows % 2 / 2, quarter * math.pi / 2, 0.0)
+        window = MapWindow.of(view, reference, pose, 1, (reach_px, reach_px))
+        sums = blocks._compared(view, window, pose, reach_px)
+        plain, plain_pixels = blocks._correlated(*sums, math.prod(shape))
+        found, pixels = np.full_like(plain, math.nan), np.full_like(plain_pixels, math.nan)
+        at = window.matrix(pose), pose.turn_rad, reach_px, SHARES
+        KERNEL.blocks(window.made, view.planes, *at, found, pixels)
+        assert pixels.any()
+        np.testing.assert_allclose(pixels, plain_pixels, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(found, plain, atol=2e-4)
 
 
 @needs_kernel
-@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks"])
+@pytest.mark.parametrize(
+    "matrix", [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
+)
+def test_blocks_beyond_all_bounds_touch_no_memory(matrix):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
+    found, pixels = np.full((36, 9, 9), math.nan), np.full(36, math.nan)
+    window = np.ones((20, 30, 4), np.float32)
+    KERNEL.blocks(window, made.planes, matrix, 0.0, 4, SHARES, found, pixels)
+    assert not found.any() and not pixels.any()
+
+
+@needs_kernel
+@pytest.mark.parametrize(
+    "damage",
+    ["channels", "type", "planes", "small", "reach", "negative", "blocks", "side", "strided", "pixels"],
+)
+def test_blocks_that_do_not_match_are_refused(damage):
+    view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).planes
+    view = {"planes": view[:3], "small": view[:, :5].copy()}.get(damage, view)
+    reach = {"reach": 3, "negative": -1}.get(damage, 2)
+    window = np.ones((20, 30, 3 if damage == "channels" else 4), np.float32)
+    if damage == "type":
+        window = window.astype(np.float64)
+    found = np.zeros((36, 5, 6 if damage == "side" else 5))
+    if damage == "blocks":
+        found = found[:35]
+    elif damage == "strided":
+        found = np.zeros((36, 5, 10))[..., ::2]
+    pixels = np.zeros(35 if damage == "pixels" else 36)
+    with pytest.raises(ValueError, match=r"match|expected|contiguous"):
+        KERNEL.blocks(window, view, (1.0, 0, 0, 0, 1, 0), 0.0, reach, SHARES, found, pixels)
+
+
+@needs_kernel
+@pytest.mark.parametrize("side", [3, 9, 15])
+def test_quadratics_through_correlations_are_the_same(monkeypatch, side):
+    """At the border of a surface and beyond it too, and at saddles and pits."""
+    rng = np.random.default_rng(6)
+    surfaces, reach = rng.normal(size=(300, side, side)), side // 2
+    moved = rng.uniform(-1.3 * reach, 1.3 * reach, (300, 2))
+    moved[:40] = rng.integers(-reach, reach + 1, (40, 2))
+    moved[40:80] = rng.integers(-reach, reach, (40, 2)) + 0.5
+    surfaces[80:90] = 0.0
+    monkeypatch.setattr(resection, "KERNEL", KERNEL)
+    compiled = resection._quadratic(surfaces, moved)
+    monkeypatch.setattr(resection, "KERNEL", None)
+    for one, other in zip(compiled, resection._quadratic(surfaces, moved), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+@needs_kernel
+def test_places_that_are_not_numbers_have_no_quadratic():
+    out = np.full((3, 7), math.nan)
+    moved = np.array([[math.nan, 0.0], [0.0, math.inf], [-1e300, 1e300]])
+    KERNEL.bend(np.ones((3, 5, 5)), moved, out)
+    assert not out.any()
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["type", "even", "count", "out", "small"])
+def test_surfaces_that_do_not_match_are_refused(damage):
+    side = {"even": 4, "small": 1}.get(damage, 5)
+    surfaces = np.zeros((3, side, side), np.float32 if damage == "type" else np.float64)
+    moved, out = np.zeros((4 if damage == "count" else 3, 2)), np.zeros((3, 6 + (damage != "out")))
+    with pytest.raises(ValueError, match=r"match|expected"):
+        KERNEL.bend(surfaces, moved, out)
+
+
+@needs_kernel
+@pytest.mark.parametrize("recipe", [FINE, COARSE], ids=["fine", "coarse"])
+@pytest.mark.parametrize("valid", ["all", "none", "part", "scattered"])
+@pytest.mark.parametrize(
+    "shape", [(64, 96), (97, 41), (1, 1), (1, 9), (5, 3), (9, 31), (8, 8)], ids=str
+)
+def test_channels_are_the_same(shape, valid, recipe):
+    """At borders too, and of pictures smaller than the windows."""
+    rng = np.random.default_rng(5)
+    grey = (rng.integers(0, 256, shape) // 2 + np.arange(shape[1])).astype(np.uint8)
+    which = np.full(shape, valid != "none")
+    if valid == "part":
+        which[: shape[0] // 3, shape[1] // 2 :] = False
+    elif valid == "scattered":
+        which = rng.uniform(size=shape) > 0.1
+    compiled = channels.channel_planes(grey, which, recipe)
+    plain = np.stack(channels._planes(grey, which, recipe, bool(which.all())))
+    np.testing.assert_array_equal(compiled[3], plain[3])
+    np.testing.assert_allclose(compiled, plain, atol=1e-4)
+
+
+@needs_kernel
+def test_channels_of_a_uniform_picture_are_zero():
+    grey = np.full((40, 50), 90, np.uint8)
+    compiled = channels.channel_planes(grey, np.ones(grey.shape, bool), FINE)
+    assert not compiled[:3].any()
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["type", "valid", "planes", "strided", "empty", "even", "sigma"])
+def test_pictures_that_do_not_match_are_refused(damage):
+    grey, valid = np.zeros((20, 30), np.uint8), np.ones((20, 30), bool)
+    planes, recipe = np.zeros((4, 20, 30), np.float32), [1.0, 27, 11, 21]
+    if damage == "type":
+        grey = grey.astype(np.int32)
+    elif damage == "valid":
+        valid = valid[:-1]
+    elif damage == "planes":
+        planes = planes[:3]
+    elif damage == "strided":
+        grey = np.zeros((20, 60), np.uint8)[:, ::2]
+    elif damage == "empty":
+        grey, valid, planes = grey[:0], valid[:0], planes[:, :0]
+    elif damage == "even":
+        recipe[2] = 10
+    else:
+        recipe[0] = math.nan
+    with pytest.raises(ValueError, match=r"match|expected"):
+        KERNEL.channels(grey, valid, tuple(recipe), planes)
+
+
+@needs_kernel
+@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks", "channels", "bend"])
 def test_an_array_that_is_missing_is_refused(name):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    values, weights, (rows, cols) = made.values, made.weights, made.mask.shape
+    values, weights = made.values, made.weights
 
     def zeros(*shape, of=np.float32):
         return np.zeros(shape, of)
@@ -339,12 +479,15 @@ def test_an_array_that_is_missing_is_refused(name):
     window, best, numbers = zeros(20, 30, 4), zeros(3, 40, 16), zeros(3, 40, 16, of=np.int32)
     spectra, poses, sums = zeros(3, 3, 45, 16), np.zeros((1, 4)), np.zeros(2 * 16 + 36 * 7)
     moved = (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, zeros(3, 7, 9)
+    block = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 2, SHARES
     given = {
         "search": (spectra, values, weights, poses, 0, best, numbers, None),
         "near": (zeros(20, 30, 3), values, weights, poses, 2, np.zeros((1, 3))),
         "moved": (window, values, weights, *moved),
         "spread": (window, values, made.slopes, made.numbers, (0,) * 4, (0,) * 9, sums),
-        "blocks": (values, zeros(rows + 4, cols + 4, 4), 2, zeros(36, 5, 5, 4)),
+        "channels": (zeros(20, 30, of=np.uint8), None, (1.0, 27, 11, 21), zeros(4, 20, 30)),
+        "bend": (np.zeros((3, 5, 5)), np.zeros((3, 2)), np.zeros((3, 7))),
+        "blocks": (window, made.planes, *block, np.zeros((36, 5, 5)), np.zeros(36)),
     }[name]
     for at, each in enumerate(given):
         if isinstance(each, np.ndarray):

@@ -54,9 +54,9 @@ kernel=orthonav/core/register/_kernel
 rm -rf "$work/src" && mkdir "$work/src" && cp -rs "$checkout/src/orthonav" "$work/src/"
 rm -f "$work/src/$kernel".*so
 if command -v aarch64-linux-gnu-gcc >/dev/null; then
-    aarch64-linux-gnu-gcc -O3 -fno-math-errno -shared -fPIC "-I$work/root/usr/include/$python" \
+    aarch64-linux-gnu-gcc -O3 -fno-math-errno -fno-trapping-math -shared -fPIC "-I$work/root/usr/include/$python" \
         -idirafter "$work/root/usr/include" -o "$work/src/$kernel.abi3.so" \
-        -Wno-psabi "$checkout/src/$kernel.c" "$checkout/src/orthonav/core/register/_search.c" -lm
+        -Wno-psabi "$checkout/src/orthonav/core/register"/_*.c -lm
 else
     echo "aarch64-linux-gnu-gcc is missing: NumPy takes the place of the kernel" >&2
 fi

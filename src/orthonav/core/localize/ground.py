@@ -15,7 +15,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import sight_on_ground
 from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.rectify import Orientation, node_px, orthorectified
+from orthonav.core.localize.rectify import Orientation, node_px, orthorectified, rectified_level
 from orthonav.core.localize.systematic import GroundErrors, terrain_errors, unknown_ground
 from orthonav.core.localize.tiles import TileProposer
 from orthonav.core.localize.view import MIN_AGL_STD, PreparedView
@@ -227,10 +227,23 @@ class ViewOverGround:
         rows, cols = self.view.templates.valid.shape
         scale = 2.0 ** (final - level)
         shape = round(rows * scale), round(cols * scale)
-        nodes = (node_px(shape) - [shape[1] / 2, shape[0] / 2]) * 2.0**level
-        ground = self.relief.ground_m(pose.map_px(nodes))
-        picture = self.view.picture_at(level)
-        return ViewTemplates(*orthorectified(picture, orientation, ground, shape), level)
+        picture, middle = self.view.picture_at(level), np.array([shape[1], shape[0]]) / 2
+        made = None
+        if self.relief.is_level:
+            en_from_window = self._en_from_window(pose, level, middle)
+            made = rectified_level(picture, orientation, en_from_window, shape)
+        if made is None:
+            ground = self.relief.ground_m(pose.map_px((node_px(shape) - middle) * 2.0**level))
+            made = orthorectified(picture, orientation, ground, shape)
+        return ViewTemplates(*made, level)
+
+    def _en_from_window(self, pose: Pose, level: int, middle: Array) -> Array:
+        """Metres by pixels of a window of a level (3, 3)."""
+        metres = np.array([1.0, -1.0]) * self.relief.grid.gsd_m
+        made = np.eye(3)
+        made[:2, :2] = metres[:, None] * pose.linear * 2.0**level
+        made[:2, 2] = self.relief.en_m(np.array([pose.x_px, pose.y_px])) - made[:2, :2] @ middle
+        return made
 
     def orientation(self, pose: Pose) -> Orientation | None:
         """Of the camera under a pose; None where less than half of its ground is known."""

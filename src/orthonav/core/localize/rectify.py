@@ -76,6 +76,31 @@ def orthorectified(
     return np.where(valid, grey, 0).astype(np.uint8), np.asarray(valid, np.bool_)
 
 
+def rectified_level(
+    view: View, orientation: Orientation, en_from_window: Array, shape: tuple[int, int]
+) -> tuple[NDArray[np.uint8], Mask] | None:
+    """As `orthorectified` over level ground at 0 m, by one homography; None where the lens or the
+    tilt needs more. `en_from_window` (3, 3): metres by pixels of the window, pixel-is-area."""
+    if not view.camera.is_pinhole:
+        return None
+    east, north, above_m = orientation.position_m.tolist()
+    offset = np.array([[1.0, 0, -east], [0, 1, -north], [0, 0, -above_m]])
+    camera_from_en = enu_from_camera(*orientation.attitude_deg.tolist()).T @ offset
+    camera_from_window = camera_from_en @ en_from_window
+    corners = _corners(shape)
+    depth = corners @ camera_from_window[2]
+    # Areas of pixels on the ground grow with the cube of the depth: all are fine enough.
+    if not 0 < depth.max() < MAX_COARSER ** (2 / 3) * depth.min():
+        return None
+    return _warped(view, camera_from_window, shape, corners)
+
+
+def _corners(shape: tuple[int, int]) -> Array:
+    """Of a window (4, 3), homogeneous."""
+    height, width = shape
+    return np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1.0]])
+
+
 def _fine(view: View, index: Array) -> Mask:
     """Which nodes (h, w), with image points (h, w, 2), are seen finely enough."""
     with np.errstate(invalid="ignore"):
@@ -276,7 +301,7 @@ def _window(
     west, north = middle_en_m + np.array([-width, height]) * gsd_m / 2
     en_from_window = np.array([[gsd_m, 0, west], [0, -gsd_m, north], [0, 0, 1]])
     camera_from_window = camera_from_en(*attitude) @ en_from_window
-    corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1.0]])
+    corners = _corners(shape)
     depth = corners @ camera_from_window[2]
     if not view.camera.is_pinhole or depth.min() <= 0:
         return _remapped(view, camera_from_window, shape)

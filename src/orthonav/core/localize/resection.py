@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.localize.systematic import Systematic
 from orthonav.core.register.blocks import BlockScores
+from orthonav.core.register.kernel import KERNEL
 
 BLURS_PX = (2.0, 1.0, 0.0, 0.0)
 """Gaussian blur of correlations at each step: wide peaks first, for views off by some pixels."""
@@ -324,6 +325,10 @@ def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
     """Values (N,), slopes (N, 2), curvatures (N, 2, 2) >= 0 of surfaces (N, S, S) at (N, 2) x, y.
 
     By the quadratic through the pixels around; 0 beyond the surface."""
+    if KERNEL is not None:
+        out = np.empty((len(surfaces), 7))
+        KERNEL.bend(surfaces, moved_px, out)
+        return out[:, 0], out[:, 1:3], out[:, 3:].reshape(-1, 2, 2)
     reach = surfaces.shape[1] // 2
     inside = (np.abs(moved_px) <= reach).all(axis=1)
     held = np.clip(moved_px, 1 - reach, reach - 1)

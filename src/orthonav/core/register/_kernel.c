@@ -1,12 +1,11 @@
 /* Refinement of a view on the map: the loop of orthonav.core.register.refine, compiled. `_search.c` has
- * the search.
+ * the search, `_channels.c` what is compared, `_blocks.c` blocks of a view.
  *
  * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
  * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
  * `spread` adds up what the covariance is made of. `derive` makes the view's derivatives and adds up
- * their products. `blocks` compares each block of a view with the map a little aside. The Python
- * modules do the same with NumPy; they are the oracle of this file and take its place where it was
- * not compiled.
+ * their products. The Python modules do the same with NumPy; they are the oracle of this file and take
+ * its place where it was not compiled.
  *
  * Only the stable ABI of Python 3.11 is used: buffers in, buffers out, no NumPy at build time. */
 
@@ -17,8 +16,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define LAYOUT 5        /* of all arguments and results; kernel.py has the same number */
-#define BLOCKS 6        /* blocks along a side of a view: orthonav.core.register.template.BLOCKS */
+#define LAYOUT 6        /* of all arguments and results; kernel.py has the same number */
 #define FULLY_VALID 0.99f
 #define OUTPUTS (22 + BLOCKS * BLOCKS)
 #define PER_BLOCK (2 * 4 * 4)
@@ -26,8 +24,6 @@
 #define DERIVED (CURVATURES + 8)
 #define BLOCK_SUMS 7    /* four steps' terms, both products, pixels that count */
 #define SPREAD (16 + 16 + BLOCKS * BLOCKS * BLOCK_SUMS)
-#define CHUNK 128       /* pixels of a row whose taps are found together */
-#define ASIDE 9         /* moves along a row that are added up together: as many vectors as registers hold */
 
 typedef struct {
     const float *view;      /* (H, W, 4): evidence of the view and its mask */
@@ -40,42 +36,10 @@ typedef struct {
     lanes slope[2], slope_by_x[2];  /* along x and along y */
 } sums_t;
 
-typedef struct {
-    int offset[CHUNK];          /* of the upper left tap, floats from the first */
-    float right[CHUNK], below[CHUNK];
-} taps_t;
-
 INLINE float from_middle(int at, int side) { return (float)at + 0.5f - (float)side / 2.0f; }
 
 /* Block that a row or column belongs to: the first ones are floor(side * block / BLOCKS). */
 INLINE int block_of(int at, int side) { return ((at + 1) * BLOCKS - 1) / side; }
-
-/* As `sampled` of _kernel.h, where all four taps are inside. */
-INLINE lanes inside(const float *at, Py_ssize_t stride, float right, float down) {
-    const lanes upper = load(at), lower = load(at + stride);
-    const lanes next = load(at + LANES), last = load(at + stride + LANES);
-    const lanes left_side = upper + down * (lower - upper), right_side = next + down * (last - next);
-    return left_side + right * (right_side - left_side);
-}
-
-/* Taps of `count` pixels of a row from (x, y); whether all of them are inside the window. */
-INLINE int find_taps(const window_t *window, float x, float y, float dx, float dy, int count,
-                     taps_t *taps) {
-    const float end_x = x + dx * (float)(count - 1), end_y = y + dy * (float)(count - 1);
-    const float last_x = (float)window->cols - 1.001f, last_y = (float)window->rows - 1.001f;
-    if (!(x >= 0.001f && y >= 0.001f && end_x >= 0.001f && end_y >= 0.001f && x <= last_x &&
-          y <= last_y && end_x <= last_x && end_y <= last_y))
-        return 0;
-    const int stride = (int)window->stride;
-    for (int i = 0; i < count; i++) {
-        const float at_x = x + dx * (float)i, at_y = y + dy * (float)i;
-        const int col = (int)at_x, row = (int)at_y;
-        taps->offset[i] = row * stride + LANES * col;
-        taps->right[i] = at_x - (float)col;
-        taps->below[i] = at_y - (float)row;
-    }
-    return 1;
-}
 
 INLINE void add(sums_t *sum, const float *slopes, lanes mine, lanes other, lanes x) {
     sum->product += mine * other;
@@ -465,11 +429,12 @@ static int spread(const window_t *window, const template_t *view, const numbers_
 
 int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind, int flags) {
     if (PyObject_GetBuffer(from, into, PyBUF_STRIDES | PyBUF_FORMAT | flags) < 0) return -1;
-    const Py_ssize_t size = kind == 'd' ? 8 : 4;
+    const Py_ssize_t size = kind == 'd' ? 8 : kind == 'f' || kind == 'i' ? 4 : 1;
     int good = into->ndim == dimensions && into->itemsize == size && into->format &&
-               into->format[0] == kind && into->shape[dimensions - 1] == last &&
+               into->format[0] == kind && (last == ANY || into->shape[dimensions - 1] == last) &&
                into->strides[dimensions - 1] == size;
-    if (good && dimensions == 3) good = into->strides[1] == last * size && into->strides[0] >= 0;
+    if (good && dimensions == 3)
+        good = into->strides[1] == into->shape[2] * size && into->strides[0] >= 0;
     if (good) return 0;
     PyErr_Format(PyExc_ValueError, "expected %d dimensions of '%c', the last of %zd", dimensions,
                  kind, last);
@@ -483,44 +448,6 @@ int is_whole(const Py_buffer *buffer) {
         if (buffer->strides[at] != size) return 0;
     return 1;
 }
-
-/* Products of one row of a block with the map under `count` moves along it, added to `sums`. */
-INLINE void add_moves(const float *mine, const float *other, int pixels, int count, lanes *sums) {
-    for (int x = 0; x < pixels; x++) {
-        const lanes view = load(mine + LANES * x);
-        for (int move = 0; move < count; move++)
-            sums[move] += view * load(other + LANES * (x + move));
-    }
-}
-
-/* Products (B * B, 2 R + 1, 2 R + 1, 4) of each block of a view (H, W, 4) with the map
- * (H + 2 R, W + 2 R, 4) moved by up to R = `reach` pixels. */
-INLINE void blocks_inline(const float *view, int rows, int cols, const float *map, int reach,
-                          float *out) {
-    const int moves = 2 * reach + 1, together = moves < ASIDE ? moves : ASIDE;
-    const size_t stride = (size_t)LANES * (cols + 2 * reach);
-    for (int block = 0; block < BLOCKS * BLOCKS; block++) {
-        const int i = block / BLOCKS, j = block % BLOCKS;
-        const int top = i * rows / BLOCKS, bottom = (i + 1) * rows / BLOCKS;
-        const int left = j * cols / BLOCKS, pixels = (j + 1) * cols / BLOCKS - left;
-        for (int down = 0; down < moves; down++, out += LANES * moves)
-            for (int first = 0; first < moves; first += together) {
-                const int at = first < moves - together ? first : moves - together;
-                lanes sums[ASIDE] = {{0}};
-                for (int row = top; row < bottom; row++) {
-                    const float *mine = view + LANES * ((size_t)cols * row + left);
-                    const float *other = map + stride * (row + down) + LANES * (left + at);
-                    if (together == ASIDE) add_moves(mine, other, pixels, ASIDE, sums);
-                    else add_moves(mine, other, pixels, together, sums);
-                }
-                memcpy(out + LANES * at, sums, sizeof(lanes) * together);
-            }
-    }
-}
-
-FOR_EVERY_PROCESSOR(blocks,
-                    (const float *view, int rows, int cols, const float *map, int reach, float *out),
-                    (view, rows, cols, map, reach, out))
 
 /* Whether view and slopes are contiguous and of one shape; else an error is set. */
 static int are_alike(const Py_buffer *view, const Py_buffer *slopes) {
@@ -661,35 +588,6 @@ static PyObject *py_spread(PyObject *self, PyObject *arguments) {
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
 }
 
-static PyObject *py_blocks(PyObject *self, PyObject *arguments) {
-    PyObject *from[2], *to;
-    Py_buffer view, map, out;
-    int reach;
-    (void)self;
-    if (!PyArg_ParseTuple(arguments, "OOiO", &from[0], &from[1], &reach, &to)) return NULL;
-    if (borrow(from[0], &view, 3, LANES, 'f', 0) < 0) return NULL;
-    if (borrow(from[1], &map, 3, LANES, 'f', 0) < 0) goto free_view;
-    if (borrow(to, &out, 4, LANES, 'f', PyBUF_WRITABLE) < 0) goto free_map;
-    const Py_ssize_t moves = 2 * (Py_ssize_t)reach + 1;
-    if (reach < 0 || reach > LARGEST || view.shape[0] < 1 || view.shape[1] < 1 ||
-        view.shape[0] > LARGEST || view.shape[1] > LARGEST || !is_whole(&view) || !is_whole(&map) ||
-        !is_whole(&out) || map.shape[0] != view.shape[0] + moves - 1 ||
-        map.shape[1] != view.shape[1] + moves - 1 || out.shape[0] != BLOCKS * BLOCKS ||
-        out.shape[1] != moves || out.shape[2] != moves)
-        PyErr_SetString(PyExc_ValueError, "view, map, reach and products do not match");
-    else {
-        Py_BEGIN_ALLOW_THREADS
-        blocks(view.buf, (int)view.shape[0], (int)view.shape[1], map.buf, reach, out.buf);
-        Py_END_ALLOW_THREADS
-    }
-    PyBuffer_Release(&out);
-free_map:
-    PyBuffer_Release(&map);
-free_view:
-    PyBuffer_Release(&view);
-    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
-}
-
 static PyMethodDef functions[] = {
     {"refine", py_refine, METH_VARARGS,
      "refine(window, view, slopes, numbers, pose, limits): see orthonav.core.register.refine."},
@@ -697,8 +595,13 @@ static PyMethodDef functions[] = {
      "spread(window, view, slopes, numbers, pose, limits, out): see orthonav.core.register.refine."},
     {"derive", py_derive, METH_VARARGS,
      "derive(view, slopes, out): see orthonav.core.register.template."},
+    {"channels", py_channels, METH_VARARGS,
+     "channels(grey, valid, recipe, planes): see orthonav.core.register.channels."},
     {"blocks", py_blocks, METH_VARARGS,
-     "blocks(view, map, reach, out): see orthonav.core.register.blocks."},
+     "blocks(window, view, matrix, turn, reach, shares, correlations, pixels): see "
+     "orthonav.core.register.blocks."},
+    {"bend", py_bend, METH_VARARGS,
+     "bend(surfaces, places, out): see orthonav.core.localize.resection."},
     {"search", py_search, METH_VARARGS,
      "search(spectra, view, weights, poses, first, best, which, expected): see "
      "orthonav.core.register.search."},

@@ -1,4 +1,4 @@
-/* What both files of the kernel share: vectors, one function for several processors, buffers. */
+/* What the files of the kernel share: vectors, one function for several processors, buffers. */
 
 #ifndef ORTHONAV_KERNEL_H
 #define ORTHONAV_KERNEL_H
@@ -7,9 +7,12 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
+#define BLOCKS 6        /* blocks along a side of a view: orthonav.core.register.template.BLOCKS */
 #define LANES 4         /* cosine and sine of the doubled direction, grey, valid or mask */
 #define LARGEST 32768   /* longest side, px */
 #define SHIFT 64        /* makes coordinates positive, so that truncation rounds down */
+#define CHUNK 128       /* pixels of a row whose taps are found together */
+#define ANY (-1)        /* length of a dimension */
 #define INLINE static inline __attribute__((always_inline))
 
 typedef float lanes __attribute__((vector_size(16)));
@@ -67,13 +70,48 @@ INLINE lanes sampled(const window_t *window, float x, float y) {
     return top + down * (bottom - top);
 }
 
-/* Borrow a buffer of numbers of 'f', 'd' or 'i' with so many dimensions, the last of `last` numbers
- * that lie together; 0, or -1 with an error. */
+typedef struct {
+    int offset[CHUNK];          /* of the upper left tap, floats from the first */
+    float right[CHUNK], below[CHUNK];
+} taps_t;
+
+/* As `sampled`, where all four taps are inside. */
+INLINE lanes inside(const float *at, Py_ssize_t stride, float right, float down) {
+    const lanes upper = load(at), lower = load(at + stride);
+    const lanes next = load(at + LANES), last = load(at + stride + LANES);
+    const lanes left_side = upper + down * (lower - upper), right_side = next + down * (last - next);
+    return left_side + right * (right_side - left_side);
+}
+
+/* Taps of `count` pixels of a row from (x, y); whether all of them are inside the window. */
+INLINE int find_taps(const window_t *window, float x, float y, float dx, float dy, int count,
+                     taps_t *taps) {
+    const float end_x = x + dx * (float)(count - 1), end_y = y + dy * (float)(count - 1);
+    const float last_x = (float)window->cols - 1.001f, last_y = (float)window->rows - 1.001f;
+    if (!(x >= 0.001f && y >= 0.001f && end_x >= 0.001f && end_y >= 0.001f && x <= last_x &&
+          y <= last_y && end_x <= last_x && end_y <= last_y))
+        return 0;
+    const int stride = (int)window->stride;
+    for (int i = 0; i < count; i++) {
+        const float at_x = x + dx * (float)i, at_y = y + dy * (float)i;
+        const int col = (int)at_x, row = (int)at_y;
+        taps->offset[i] = row * stride + LANES * col;
+        taps->right[i] = at_x - (float)col;
+        taps->below[i] = at_y - (float)row;
+    }
+    return 1;
+}
+
+/* Borrow a buffer of numbers of 'f', 'd', 'i', 'B' or '?' with so many dimensions, the last of `last` numbers
+ * (or `ANY`) that lie together; 0, or -1 with an error. */
 int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind, int flags);
 
 /* Whether all numbers of a buffer lie together. */
 int is_whole(const Py_buffer *buffer);
 
+PyObject *py_blocks(PyObject *self, PyObject *arguments);
+PyObject *py_bend(PyObject *self, PyObject *arguments);
+PyObject *py_channels(PyObject *self, PyObject *arguments);
 PyObject *py_search(PyObject *self, PyObject *arguments);
 PyObject *py_near(PyObject *self, PyObject *arguments);
 PyObject *py_moved(PyObject *self, PyObject *arguments);

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.register.kernel import KERNEL
+
 Array = NDArray[np.float32]
 CHANNELS = 4  # cosine and sine of the doubled edge direction, grey, valid
 GROUPS = (slice(0, 2), slice(2, 3))
@@ -44,13 +46,28 @@ def channels_of(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe = FINE
 ) -> Array:
     """(H, W, 4), zero where not valid; the last is 1 where valid and not on its border."""
-    return np.asarray(cv2.merge(channel_planes(grey, valid, recipe)), np.float32)
+    return np.asarray(cv2.merge(list(channel_planes(grey, valid, recipe))), np.float32)
 
 
 def channel_planes(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe
-) -> list[Array]:
+) -> Array:
+    """The same as planes (4, H, W)."""
     whole = bool(valid.all())
+    if KERNEL is None or grey.size == 0:
+        return np.stack(_planes(grey, valid, recipe, whole))
+    planes = np.empty((CHANNELS, *grey.shape), np.float32)
+    sides = recipe.contrast_px, recipe.mean_px, recipe.deviation_px
+    counted = None if whole else np.ascontiguousarray(valid)
+    KERNEL.channels(
+        np.ascontiguousarray(grey), counted, (recipe.gradient_sigma_px, *sides), planes
+    )
+    return planes
+
+
+def _planes(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_], recipe: ChannelRecipe, whole: bool
+) -> list[Array]:
     picture = np.asarray(grey, dtype=np.float32)
     share = np.ones(grey.shape, np.float32) if whole else valid.astype(np.float32)
     local = _LocalMean(share, whole)

@@ -36,7 +36,7 @@ class Template:
     def of(
         cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: ChannelRecipe
     ) -> "Template":
-        planes, weights = np.stack(channel_planes(grey, valid, recipe)), (1.0, recipe.grey_share)
+        planes, weights = channel_planes(grey, valid, recipe), (1.0, recipe.grey_share)
         for group, weight in zip(GROUPS, weights, strict=True):
             energy = energy_of(planes[group])
             planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
@@ -139,8 +139,13 @@ class Template:
 
     @cached_property
     def block_starts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in self.mask.shape)
-        return rows.astype(np.intp), cols.astype(np.intp)
+        return block_starts(self.mask.shape)
+
+
+def block_starts(shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First rows and columns of the blocks of a view (H, W)."""
+    rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in shape)
+    return rows.astype(np.intp), cols.astype(np.intp)
 
 
 def by_kind(template: Template, channels: Array) -> NDArray[np.float64]:
