@@ -7,7 +7,13 @@ import pytest
 from blots import CAMERA, GROUND, as_grey
 from lab.terrain import random_relief, seen_view
 
-from orthonav.core.localize.rectify import Orientation, hidden, node_px, orthorectified
+from orthonav.core.localize.rectify import (
+    Orientation,
+    hidden,
+    node_px,
+    orthorectified,
+    rectified_level,
+)
 from orthonav.core.records import Telemetry, View
 from orthonav.ground.simulate.render import Raster
 
@@ -113,3 +119,42 @@ def test_unknown_heights_and_ground_not_seen_are_not_valid(grey):
     assert not valid[140:176, 120:156].any() and not valid[:20].any()
     assert (found[~valid] == 0).all()
     assert valid[160, 175] and valid[160, 100] and 0.2 < valid.mean() < 0.3
+
+
+@pytest.mark.parametrize("attitude", [(30.0, 0.0, 0.0), (200.0, 12.0, -9.0), (-75.0, -6.0, 15.0)])
+@pytest.mark.parametrize("shape", [(160, 180), (31, 18)], ids=str)
+def test_level_ground_is_rectified_by_one_homography_as_by_nodes(grey, attitude, shape):
+    orientation, en_from_window = over_level_ground(attitude, shape)
+    view = view_of(seen_view(grey, level(), CAMERA, attitude, ABOVE_M, finer=1)[0], CAMERA)
+    made, valid = rectified_level(view, orientation, en_from_window, shape)
+    nodes = window(level(), MIDDLE_EN_M, shape)
+    plain, seen = orthorectified(view, orientation, nodes, shape)
+    assert (valid != seen).mean() < 0.01 and seen.mean() > 0.3
+    both = valid & seen
+    off = made[both].astype(float) - plain[both]
+    assert abs(off.mean()) < 0.1 and np.abs(off).mean() < 0.6
+    assert not made[~valid].any()
+
+
+@pytest.mark.parametrize("camera, tilt_deg", [(LENS, 0.0), (CAMERA, 45.0), (CAMERA, 80.0)])
+def test_a_lens_and_far_ground_need_more_than_a_homography(camera, tilt_deg):
+    shape = (320, 320)
+    orientation, en_from_window = over_level_ground((0.0, tilt_deg, 0.0), shape)
+    view = view_of(np.zeros((camera.height_px, camera.width_px), np.uint8), camera)
+    assert rectified_level(view, orientation, en_from_window, shape) is None
+
+
+ABOVE_M = np.array([MIDDLE_M - 30, MIDDLE_M + 10, 150.0])
+MIDDLE_EN_M = (MIDDLE_M, MIDDLE_M)
+
+
+def level():
+    side = int(SIDE_M / POSTING_M)
+    return Raster(np.zeros((side, side), np.float32), 0.0, SIDE_M, POSTING_M)
+
+
+def over_level_ground(attitude, shape):
+    """A camera, and metres by pixels of a window of `shape`."""
+    west, north = MIDDLE_M - shape[1] / 2 * PIXEL_M, MIDDLE_M + shape[0] / 2 * PIXEL_M
+    en_from_window = np.array([[PIXEL_M, 0, west], [0, -PIXEL_M, north], [0, 0, 1]])
+    return Orientation(ABOVE_M, np.array(attitude)), en_from_window

@@ -11,10 +11,12 @@ from lab.terrain import random_relief, seen_view
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.camera import VARIANCE, VARIANCE_POWER
-from orthonav.core.localize.ground import Relief
+from orthonav.core.localize.ground import Relief, ViewOverGround
 from orthonav.core.localize.place import MAX_RATIO
+from orthonav.core.localize.rectify import Orientation
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
+from orthonav.core.register.pose import Pose
 from orthonav.ground.simulate.render import Raster
 
 SIDE_M, POSTING_M = 700.0, 10.0
@@ -171,6 +173,24 @@ def test_level_ground_is_as_without_a_terrain(opened):
         for each in (on_terrain(opened, hills(0.0)), Localizer(opened))
     )
     assert level.pose_cov[4, 4] > 10 * fix.pose_cov[4, 4]
+
+
+@pytest.mark.parametrize("attitude", [ATTITUDE, (10.0, -25.0, 15.0), (0.0, 85.0, 0.0)])
+def test_formulas_for_level_ground_agree_with_those_for_any(opened, attitude):
+    registration = Localizer(opened).registration
+    picture = rendered(GROUND, PLACE, ATTITUDE)
+    prepared = registration.prepared(View(picture, CAMERA, telemetry(ATTITUDE)), True)
+    flat = Relief(Terrain(Raster(np.zeros((70, 70), np.float32), -7e4, 7e4, 2e3)), registration.grid)
+    seen, any_seen = (ViewOverGround(each, prepared) for each in (registration.relief, flat))
+    assert seen.relief.is_level and not flat.is_level
+    pose = Pose(300.0, 290.0, 0.3, 0.01)
+    assert seen.reference_m(pose) == any_seen.reference_m(pose) == 0.0
+    for above_m in (AGL_M, 0.0, -5.0):
+        orientation = Orientation(np.array([*PLACE, above_m]), np.array(attitude))
+        met, any_met = seen.sight_en_m(orientation), any_seen.sight_en_m(orientation)
+        np.testing.assert_allclose(met, any_met, atol=1e-6)
+    ground = np.zeros((3, 3))
+    np.testing.assert_array_equal(seen.relief.slopes(ground), flat.slopes(ground))
 
 
 def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):

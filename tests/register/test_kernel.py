@@ -417,6 +417,18 @@ def test_surfaces_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
+@pytest.mark.parametrize("damage", ["type", "factor", "zero", "size", "strided"])
+def test_pictures_made_smaller_that_do_not_match_are_refused(damage):
+    grey = np.zeros((12, 16), np.float32 if damage == "type" else np.uint8)
+    factor = {"factor": 257, "zero": 0}.get(damage, 4)
+    out = np.zeros((3, 5 if damage == "size" else 4), np.uint8)
+    if damage == "strided":
+        grey = np.zeros((12, 32), np.uint8)[:, ::2]
+    with pytest.raises(ValueError, match=r"match|expected"):
+        KERNEL.thin(grey, factor, out)
+
+
+@needs_kernel
 @pytest.mark.parametrize("recipe", [FINE, COARSE], ids=["fine", "coarse"])
 @pytest.mark.parametrize("valid", ["all", "none", "part", "scattered"])
 @pytest.mark.parametrize(
@@ -468,7 +480,7 @@ def test_pictures_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks", "channels", "bend"])
+@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks", "channels", "bend", "thin"])
 def test_an_array_that_is_missing_is_refused(name):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
     values, weights = made.values, made.weights
@@ -487,6 +499,7 @@ def test_an_array_that_is_missing_is_refused(name):
         "spread": (window, values, made.slopes, made.numbers, (0,) * 4, (0,) * 9, sums),
         "channels": (zeros(20, 30, of=np.uint8), None, (1.0, 27, 11, 21), zeros(4, 20, 30)),
         "bend": (np.zeros((3, 5, 5)), np.zeros((3, 2)), np.zeros((3, 7))),
+        "thin": (zeros(12, 16, of=np.uint8), 4, zeros(3, 4, of=np.uint8)),
         "blocks": (window, made.planes, *block, np.zeros((36, 5, 5)), np.zeros(36)),
     }[name]
     for at, each in enumerate(given):

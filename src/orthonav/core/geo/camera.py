@@ -167,9 +167,19 @@ class Camera:
 @lru_cache(maxsize=64)
 def enu_from_camera(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
     """Rotation (3, 3), shared: not to be written to."""
-    yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
-    ned_from_body = _rotation(2, yaw) @ _rotation(1, pitch) @ _rotation(0, roll)
-    rotation = np.asarray(_ENU_FROM_NED @ ned_from_body @ _BODY_FROM_CAMERA)
+    yaw, pitch, roll = (math.radians(each) for each in (yaw_deg, pitch_deg, roll_deg))
+    sin_y, cos_y, sin_p, cos_p = math.sin(yaw), math.cos(yaw), math.sin(pitch), math.cos(pitch)
+    sin_r, cos_r = math.sin(roll), math.cos(roll)
+    # Forward, right and down of the body (Tait-Bryan Z-Y-X) are up, right and ahead of the camera.
+    right_e, right_n = sin_y * sin_p * sin_r + cos_y * cos_r, cos_y * sin_p * sin_r - sin_y * cos_r
+    down_e, down_n = sin_y * sin_p * cos_r - cos_y * sin_r, cos_y * sin_p * cos_r + sin_y * sin_r
+    rotation = np.array(
+        [
+            [right_e, -sin_y * cos_p, down_e],
+            [right_n, -cos_y * cos_p, down_n],
+            [-cos_p * sin_r, -sin_p, -cos_p * cos_r],
+        ]
+    )
     rotation.flags.writeable = False
     return rotation
 
@@ -191,16 +201,6 @@ def angles_of_ned(ned_from_body: Array) -> tuple[float, float, float]:
         yaw = math.atan2(ned_from_body[1, 0], ned_from_body[0, 0])
         roll = math.atan2(ned_from_body[2, 1], ned_from_body[2, 2])
     return yaw, pitch, roll
-
-
-def _rotation(axis: int, angle_rad: float) -> Array:
-    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-    first, second = [i for i in range(3) if i != axis]
-    rotation = np.eye(3)
-    rotation[first, first] = rotation[second, second] = cos
-    sign = -1.0 if axis == 1 else 1.0
-    rotation[first, second], rotation[second, first] = -sign * sin, sign * sin
-    return rotation
 
 
 def camera_from_en(yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float) -> Array:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.camera import Camera, enu_from_camera, seen_px
 from orthonav.core.localize.ground import LevelTerrain, Relief, ViewOverGround
 from orthonav.core.localize.rectify import Orientation, is_oblique
 from orthonav.core.localize.resection import Expected, Resection, climbed, resected
@@ -49,13 +49,14 @@ def picture_by_camera(
 ) -> Array:
     """Pixels (N, 2, 6) by which points of the ground (N, 3) move in the picture per unit of the
     camera. `by_ground` (N, 2, 3): `picture_by_ground`, as of a camera that moves the other way."""
-    turned = []
-    for step in np.diag(STEPS)[3:]:
-        ahead, behind = (
-            orientation.moved(sign * step).seen_px(camera, ground_m) for sign in (1, -1)
-        )
-        turned.append((ahead - behind) / (2 * step.sum()))
-    return np.concatenate([-by_ground, np.stack(turned, axis=-1)], axis=2)
+    steps = np.concatenate([np.diag(STEPS[3:]), -np.diag(STEPS[3:])])
+    attitudes_deg = (orientation.attitude_deg + steps).tolist()
+    rotations = np.stack([enu_from_camera(*each) for each in attitudes_deg])
+    ahead, behind = seen_px(camera, (ground_m - orientation.position_m) @ rotations).reshape(
+        2, 3, -1, 2
+    )
+    turned = np.moveaxis((ahead - behind) / (2 * STEPS[3:, None, None]), 0, -1)
+    return np.concatenate([-by_ground, turned], axis=2)
 
 
 FIRST_REACH_PX, REACH_PX = 7, 4

@@ -69,6 +69,8 @@ class Relief:
 
     def slopes(self, ground_m: Array) -> Array:
         """Rise (N, 2) per metre east and north at (N, 3)."""
+        if self.is_level:
+            return np.zeros((len(ground_m), 2))
         out = np.empty((len(ground_m), 2))
         for axis in range(2):
             step = np.zeros(2)
@@ -259,6 +261,8 @@ class ViewOverGround:
 
     def reference_m(self, pose: Pose) -> float:
         """Mean height under the window; NaN where less than half is known."""
+        if self.relief.is_level:
+            return 0.0
         heights = self.relief.ground_m(pose.map_px(self._reference_px))[:, 2]
         known = np.isfinite(heights)
         return float(heights[known].mean()) if known.mean() >= MIN_KNOWN else math.nan
@@ -311,11 +315,14 @@ class ViewOverGround:
         px = np.array([camera.width_px / 2 - camera.cx_px, camera.height_px / 2 - camera.cy_px])
         plane = undistort(camera, px / [camera.fx_px, camera.fy_px])
         ray = enu_from_camera(*orientation.attitude_deg.tolist()) @ [*plane.tolist(), 1.0]
-        if not ray[2] < -1e-6:
+        above_m = float(orientation.position_m[2])
+        if not ray[2] < -1e-6 or (self.relief.is_level and not above_m > 0):
             return np.full(2, np.nan)
+        if self.relief.is_level:
+            return np.asarray(orientation.position_m[:2] - ray[:2] / ray[2] * above_m)
 
         def above_sea_m(offset_en_m: Array) -> Array:
             return self.relief.terrain.at_en_m(orientation.position_m[:2] + offset_en_m)
 
-        met = sight_on_ground(ray[:2] / -ray[2], float(orientation.position_m[2]), above_sea_m)
+        met = sight_on_ground(ray[:2] / -ray[2], above_m, above_sea_m)
         return np.asarray(orientation.position_m[:2] + met)

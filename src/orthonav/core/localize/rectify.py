@@ -21,6 +21,7 @@ from orthonav.core.geo.camera import (
     seen_px,
 )
 from orthonav.core.records import Telemetry, View
+from orthonav.core.register.kernel import KERNEL
 
 NODE_PX = 4
 """Spacing of heights and projections: at most one and a half postings of a usual terrain."""
@@ -28,6 +29,7 @@ MAX_COARSER = 3.0
 """Coarser ground, over the window's pixel and the view's finest ground, does not count."""
 SIGHT_STEPS = 48  # of a line of sight, at most
 CLEAR_M = 0.5  # error of interpolation
+FASTER_FROM, FASTER_TO = 3, 256  # factors by which the kernel makes pictures smaller, as OpenCV
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -232,9 +234,18 @@ def downsampled(view: View, gsd_m: float) -> View:
     # Whole multiples only: what is left over at the right and below is not worth a slower path.
     whole = replace(camera, width_px=width * factor, height_px=height * factor)
     used = view.grey[: whole.height_px, : whole.width_px]
-    thinned = cv2.resize(used, (width, height), interpolation=cv2.INTER_AREA)
-    grey = np.asarray(thinned, dtype=np.uint8)
-    return replace(view, grey=grey, camera=whole.resized(width, height))
+    return replace(view, grey=_thinned(used, factor), camera=whole.resized(width, height))
+
+
+def _thinned(grey: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Means over squares of `factor` pixels, whole multiples of which the sides are."""
+    height, width = (side // factor for side in grey.shape)
+    if KERNEL is None or not FASTER_FROM <= factor <= FASTER_TO:
+        thinned = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(thinned, dtype=np.uint8)
+    out = np.empty((height, width), np.uint8)
+    KERNEL.thin(grey, factor, out)
+    return out
 
 
 def rectify(view: View, *, gsd_m: float, size_px: int) -> RectifiedView:

@@ -600,6 +600,8 @@ static PyMethodDef functions[] = {
     {"blocks", py_blocks, METH_VARARGS,
      "blocks(window, view, matrix, turn, reach, shares, correlations, pixels): see "
      "orthonav.core.register.blocks."},
+    {"thin", py_thin, METH_VARARGS,
+     "thin(grey, factor, out): see orthonav.core.localize.rectify."},
     {"bend", py_bend, METH_VARARGS,
      "bend(surfaces, places, out): see orthonav.core.localize.resection."},
     {"search", py_search, METH_VARARGS,

@@ -112,6 +112,7 @@ int is_whole(const Py_buffer *buffer);
 PyObject *py_blocks(PyObject *self, PyObject *arguments);
 PyObject *py_bend(PyObject *self, PyObject *arguments);
 PyObject *py_channels(PyObject *self, PyObject *arguments);
+PyObject *py_thin(PyObject *self, PyObject *arguments);
 PyObject *py_search(PyObject *self, PyObject *arguments);
 PyObject *py_near(PyObject *self, PyObject *arguments);
 PyObject *py_moved(PyObject *self, PyObject *arguments);
