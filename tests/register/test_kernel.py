@@ -362,7 +362,18 @@ def test_blocks_beyond_all_bounds_touch_no_memory(matrix):
 @needs_kernel
 @pytest.mark.parametrize(
     "damage",
-    ["channels", "type", "planes", "small", "reach", "negative", "blocks", "side", "strided", "pixels"],
+    [
+        "channels",
+        "type",
+        "planes",
+        "small",
+        "reach",
+        "negative",
+        "blocks",
+        "side",
+        "strided",
+        "pixels",
+    ],
 )
 def test_blocks_that_do_not_match_are_refused(damage):
     view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).planes
@@ -480,7 +491,9 @@ def test_pictures_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks", "channels", "bend", "thin"])
+@pytest.mark.parametrize(
+    "name", ["search", "near", "moved", "spread", "blocks", "channels", "bend", "thin"]
+)
 def test_an_array_that_is_missing_is_refused(name):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
     values, weights = made.values, made.weights
