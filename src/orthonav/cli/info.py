@@ -172,10 +172,10 @@ def _source_text(terrain: Mapping[str, Any]) -> list[str]:
 
 def unknown_ground_text(relief: str | None) -> list[str]:
     """What ground without terrain costs, in lines."""
-    from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES, unknown_slope_share
+    from orthonav.core.geo.ground import DEFAULT_RELIEF, relief_slope, unknown_slope_share
     from orthonav.core.records import DEFAULT_TILT_STD_DEG
 
-    slope = RELIEF_SLOPES[relief or DEFAULT_RELIEF]
+    slope = relief_slope(relief)
     known, unknown = (
         f"{100 * unknown_slope_share(tilt_deg, relief):.1f} %"
         for tilt_deg in (1.0, DEFAULT_TILT_STD_DEG)

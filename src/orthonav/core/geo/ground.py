@@ -51,12 +51,17 @@ def ground_around(
     return ground_over(terrain, lat, lon)
 
 
+def relief_slope(relief: str | None) -> float:
+    """RMS gradient of ground whose heights are unknown; `relief`: None: nobody said."""
+    return RELIEF_SLOPES[relief or DEFAULT_RELIEF]
+
+
 def unknown_slope_share(tilt_std_deg: float, relief: str | None = None) -> float:
     """Standard deviation per axis of the camera over ground without terrain, per metre of height.
 
     A slope of the ground looks like a tilt of the camera by the same angle, so that pictures
     determine only their sum. `tilt_std_deg`: of the reported pitch and roll, 0 or more."""
-    slope = RELIEF_SLOPES[relief or DEFAULT_RELIEF] / math.sqrt(2)
+    slope = relief_slope(relief) / math.sqrt(2)
     tilt = math.radians(tilt_std_deg)
     return tilt * slope / math.hypot(tilt, slope)
 

@@ -47,10 +47,14 @@ class Relief:
     """The ground of a sheet; threads may share it."""
 
     def __init__(
-        self, terrain: Terrain, grid: TileGrid, source: TerrainInfo | str | None = None
+        self,
+        terrain: Terrain,
+        grid: TileGrid,
+        info: TerrainInfo | None = None,
+        land: str | None = None,
     ) -> None:
-        """`source`: of the terrain, or what the land without one is like; None: not known."""
-        self.terrain, self.grid, self.source = terrain, grid, source
+        """`info`: of the terrain; `land`: what it is like without one. None: not known."""
+        self.terrain, self.grid, self.info, self.land = terrain, grid, info, land
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
     @property
@@ -84,8 +88,8 @@ class Relief:
     def errors(self, slopes: Array) -> GroundErrors:
         """Of the heights under a view, by slopes (N, 2) there."""
         if self.is_level:
-            return unknown_ground(self.source if isinstance(self.source, str) else None)
-        return terrain_errors(self.source if isinstance(self.source, TerrainInfo) else None, slopes)
+            return unknown_ground(self.land)
+        return terrain_errors(self.info, slopes)
 
     def expected(self, view: PreparedView) -> PosePrior:
         """The view's prior, with scales by the height above sea at each place."""
@@ -161,8 +165,8 @@ class SearchedSheet:
         self.windows = SearchWindows(self.reference)
         self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
         self.propose, self.plan = propose, plan
-        source = sheet.relief if terrain is None else terrain.info
-        self.relief = Relief(terrain or LevelTerrain(), self.grid, source)
+        info = None if terrain is None else terrain.info
+        self.relief = Relief(terrain or LevelTerrain(), self.grid, info, sheet.relief)
 
     @property
     def pyramid(self) -> GreyPyramid:

@@ -166,7 +166,7 @@ class Search:
         return self._concluded() if self.places else None
 
     def camera(self, place: Place) -> CameraFound | None:
-        """None where the reported tilt is exact or the view does not show it."""
+        """None where too few blocks of the view are seen."""
         ratio = place.scores.get("local_ratio", 1.0)  # of the best place only
         return camera_found(self.ground, self.sheet.reference, place.fit.pose, ratio)
 

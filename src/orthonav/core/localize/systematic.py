@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera
-from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES
+from orthonav.core.geo.ground import relief_slope
 from orthonav.core.mapfile.manifest import TerrainInfo
 
 OBJECTS_M = 3.0, 15.0
-"""Houses and trees: 8 to 10 m on a quarter of the ground."""
+"""Houses and trees: 6 to 8 m high on a fifth of the ground."""
 SURFACE_M = 0.5, 10.0  # a surface model, whose houses and trees are those of another date
 BARE_EARTH_M = 0.5, 50.0
 """Bare earth of laser scanning or photogrammetry, 0.1 to 0.5 m (docs/decisions/camera.md)."""
@@ -53,8 +53,8 @@ class GroundErrors:
 
 
 def unknown_ground(relief: str | None) -> GroundErrors:
-    """Of level ground that is assumed; `relief`: what the land is like (`RELIEF_SLOPES`)."""
-    slope = RELIEF_SLOPES[relief or DEFAULT_RELIEF]
+    """Of level ground that is assumed; `relief`: what the land is like, None: nobody said."""
+    slope = relief_slope(relief)
     per_slope_m, length_m = UNDULATION_M
     return GroundErrors(slope / math.sqrt(2), ((per_slope_m * slope, length_m), OBJECTS_M))
 

@@ -34,7 +34,7 @@ from orthonav.core.errors import (
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.geo.ground import DEFAULT_RELIEF, RELIEF_SLOPES
+from orthonav.core.geo.ground import relief_slope
 from orthonav.core.localize.confidence import (
     CHANCES,
     Chances,
@@ -471,7 +471,7 @@ def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> T
 def _relief(members: Sequence[SheetSource]) -> str | None:
     """The steepest of the sheets."""
     stated = [each.manifest.sheets[0].relief for each in members]
-    return max(stated, key=lambda each: RELIEF_SLOPES[each or DEFAULT_RELIEF])
+    return max(stated, key=relief_slope)
 
 
 def _heights(

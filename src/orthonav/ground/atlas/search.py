@@ -271,7 +271,8 @@ def part_of(
         plan=sheet.plan,
     )
     if sheet.relief is not None:
-        part.relief = Relief(sheet.relief.terrain, part_grid, sheet.relief.source)
+        whole = sheet.relief
+        part.relief = Relief(whole.terrain, part_grid, whole.info, whole.land)
     return part
 
 
