@@ -17,6 +17,7 @@ from orthonav.core.localize.systematic import (
     SURFACE_M,
     GroundErrors,
     field_modes,
+    lens_px,
     systematic,
     terrain_errors,
     unknown_ground,
@@ -40,13 +41,12 @@ def displaced(errors, camera=CAMERA):
     by_ground = picture_by_ground(camera, orientation, ground)
     by_picture = ground_by_picture(by_ground, np.zeros((36, 2)))
     by_camera = -by_picture @ picture_by_camera(camera, orientation, ground, by_ground)
+    by_lens = by_picture @ lens_px(camera, orientation.seen_px(camera, ground))
     found = systematic(
-        camera,
         errors,
         places_m=ground[:, :2],
         by_height_px=-by_camera[:, :, 2],
-        by_picture_px=by_picture,
-        seen_px=orientation.seen_px(camera, ground),
+        by_lens_px=by_lens if camera.focal_std > 0 else None,
         block_px=BLOCK_M,
         gsd_m=1.0,
     )

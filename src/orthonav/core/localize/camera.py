@@ -14,7 +14,7 @@ from orthonav.core.geo.camera import Camera, enu_from_camera, seen_px
 from orthonav.core.localize.ground import LevelTerrain, Relief, ViewOverGround
 from orthonav.core.localize.rectify import Orientation, is_oblique
 from orthonav.core.localize.resection import Expected, Resection, climbed, resected
-from orthonav.core.localize.systematic import systematic
+from orthonav.core.localize.systematic import GroundErrors, lens_px, systematic
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
 from orthonav.core.register.blocks import BlockScores, block_scores
 from orthonav.core.register.pose import Pose
@@ -101,7 +101,7 @@ def camera_found(
         return None
     variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
     far = _compared(seen, reference, pose, orientation, first=True)
-    correction = None if far is None else far.climbed(seen)
+    correction = None if far is None else far.climbed()
     if far is None or correction is None:
         return None
     near = _fitted(seen, reference, pose, orientation.moved(correction), variance)
@@ -147,7 +147,7 @@ def _fitted(
     seen: ViewOverGround, reference: Reference, pose: Pose, start: Orientation, variance: float
 ) -> _Fitted | None:
     near = _compared(seen, reference, pose, start, first=False)
-    found = None if near is None else near.resected(seen, variance)
+    found = None if near is None else near.resected(variance)
     if near is None or found is None:
         return None
     return _Fitted(start, found, near.moves_px(found.correction))
@@ -157,45 +157,49 @@ def _fitted(
 class _Compared:
     """Blocks of a view under an orientation, beside the map.
 
+    - `seen`: the view. `expected`: its camera by telemetry.
     - `blocks`: of each level, and its pixel in pixels of level 0.
-    - `ground_m` (N, 3), `slopes` (N, 2): in their middles.
-    - `by_picture_px` (N, 2, 2): they move by so many pixels of level 0 per pixel of the picture.
-    - `moved_px` (N, 2, 6): and per unit of the camera."""
+    - `ground_m` (N, 3): in their middles, and its `errors`.
+    - `moved_px` (N, 2, 6): they move by so many pixels of level 0 per unit of the camera.
+    - `by_lens_px`: see `systematic`."""
 
-    camera: Camera
-    orientation: Orientation
+    seen: ViewOverGround
+    expected: Expected
     blocks: list[tuple[BlockScores, float]]
     ground_m: Array
-    slopes: Array
-    by_picture_px: Array
+    errors: GroundErrors
     moved_px: Array
-    expected: Expected
+    by_lens_px: Array | None
+
+    @property
+    def block_px(self) -> float:
+        return self.seen.view.side_px / BLOCKS
 
     def moves_px(self, correction: Array) -> float:
         """How far a correction (6,) moves a block, pixels of level 0."""
         return float(np.nanmax(np.hypot(*(self.moved_px @ correction).T)))
 
-    def climbed(self, seen: ViewOverGround) -> Array | None:
-        slope = seen.relief.errors(self.slopes).slope
-        return climbed(
-            self.blocks, self.moved_px, self.expected, slope, block_px=seen.view.side_px / BLOCKS
-        )
+    def climbed(self) -> Array | None:
+        blocks, moved_px, slope = self.blocks, self.moved_px, self.errors.slope
+        return climbed(blocks, moved_px, self.expected, slope, block_px=self.block_px)
 
-    def resected(self, seen: ViewOverGround, variance: float) -> Resection | None:
-        block_px = seen.view.side_px / BLOCKS
+    def resected(self, variance: float) -> Resection | None:
         errors = systematic(
-            self.camera,
-            seen.relief.errors(self.slopes),
+            self.errors,
             places_m=self.ground_m[:, :2],
             # Raised ground moves as under a camera that is lower by as much.
             by_height_px=-self.moved_px[:, :, 2],
-            by_picture_px=self.by_picture_px,
-            seen_px=self.orientation.seen_px(self.camera, self.ground_m),
-            block_px=block_px,
-            gsd_m=seen.relief.grid.gsd_m,
+            by_lens_px=self.by_lens_px,
+            block_px=self.block_px,
+            gsd_m=self.seen.relief.grid.gsd_m,
         )
         return resected(
-            self.blocks, self.moved_px, self.expected, errors, variance=variance, block_px=block_px
+            self.blocks,
+            self.moved_px,
+            self.expected,
+            errors,
+            variance=variance,
+            block_px=self.block_px,
         )
 
 
@@ -220,15 +224,17 @@ def _compared(
     window_from_en = np.linalg.inv(pose.linear) @ np.diag([1.0, -1.0]) / seen.relief.grid.gsd_m
     by_ground = picture_by_ground(camera, orientation, ground)
     by_picture = window_from_en @ ground_by_picture(by_ground, slopes)
+    by_lens = None
+    if camera.focal_std > 0:
+        by_lens = by_picture @ lens_px(camera, orientation.seen_px(camera, ground))
     return _Compared(
-        camera,
-        orientation,
+        seen,
+        _expected(seen, pose, orientation),
         blocks,
         ground,
-        slopes,
-        by_picture,
+        seen.relief.errors(slopes),
         -by_picture @ picture_by_camera(camera, orientation, ground, by_ground),
-        _expected(seen, pose, orientation),
+        by_lens,
     )
 
 

@@ -90,19 +90,17 @@ class Systematic(NamedTuple):
 
 
 def systematic(
-    camera: Camera,
     errors: GroundErrors,
     *,
     places_m: Array,
     by_height_px: Array,
-    by_picture_px: Array,
-    seen_px: Array,
+    by_lens_px: Array | None,
     block_px: float,
     gsd_m: float,
 ) -> Systematic:
     """Of blocks `block_px` wide at places (N, 2) on the ground, m. They move by `by_height_px`
-    (N, 2) per metre of height, and by `by_picture_px` (N, 2, 2) per pixel of the picture, where
-    they lie at `seen_px` (N, 2)."""
+    (N, 2) per metre of height, and by `by_lens_px` (N, 2, L) per standard deviation of each error
+    of the lens; None: it is calibrated."""
     heights_m = field_modes(places_m, errors.fields, block_px * gsd_m)
     if errors.slope > 0:
         middle = places_m - places_m.mean(axis=0)
@@ -115,8 +113,8 @@ def systematic(
         np.stack([stretch_px, none_px], axis=1),
         np.stack([none_px, stretch_px], axis=1),
     ]
-    if camera.focal_std > 0:
-        moves_px.append(by_picture_px @ _lens_px(camera, seen_px))
+    if by_lens_px is not None:
+        moves_px.append(by_lens_px)
     components = (
         Component(slice(0, ground), LEAST_UNKNOWN if errors.slope > 0 else LEAST_KNOWN),
         Component(slice(ground, ground + stretched), LEAST_KNOWN),
@@ -124,9 +122,9 @@ def systematic(
     return Systematic(np.concatenate(moves_px, axis=2), components, errors.slope)
 
 
-def _lens_px(camera: Camera, seen_px: Array) -> Array:
+def lens_px(camera: Camera, seen_px: Array) -> Array:
     """By which a nominal lens displaces points of the picture (N, 2), (N, 2, 4): its principal
-    point, focal length and radial distortion."""
+    point, focal length and radial distortion, by one standard deviation of each."""
     off_px = seen_px - [camera.cx_px, camera.cy_px]
     square = (off_px**2).sum(axis=1, keepdims=True) / camera.fx_px**2
     centre_px = np.full(len(seen_px), CENTRE_SHARE * camera.width_px)
