@@ -301,9 +301,6 @@ def _roughness_m(info: TerrainInfo, dem: Dem, area: Area) -> float | None:
     side = min(ROUGH_POSTINGS, info.rows, info.cols)
     if finer < 2 or side < 3:
         return None
-    at = (np.arange(side * finer) + 0.5) / finer - 0.5
-    col, row = np.meshgrid(at, at)
-    inner = np.s_[finer:-finer, finer:-finer]  # bilinear between samples on all sides
     squares = []
     for first_row, first_col in product(_firsts(info.rows, side), _firsts(info.cols, side)):
         west = info.west_m + first_col * info.posting_m
@@ -313,19 +310,23 @@ def _roughness_m(info: TerrainInfo, dem: Dem, area: Area) -> float | None:
             continue
         shape = side * finer, side * finer
         fine = dem.in_plane(area.frame, west, north, info.posting_m / finer, *shape)
-        mean = fine.reshape(side, finer, side, finer).mean(axis=(1, 3))
-        layer = bilinear(
-            lambda rows, cols, mean=mean: mean[rows, cols],  # type: ignore[misc]
-            mean.shape,
-            col,
-            row,
-        )
-        off_m = (fine - layer)[inner]
+        off_m = _off_means_m(fine, finer)
         squares.append(off_m[np.isfinite(off_m)] ** 2)
     found = np.concatenate(squares) if squares else np.empty(0)
     if not found.size:
         return None
     return round(min(float(np.sqrt(found.mean())), MAX_ROUGHNESS_M), 3)
+
+
+def _off_means_m(fine: NDArray[np.float64], finer: int) -> NDArray[np.float64]:
+    """Differences of the heights (N, N) of a square from those between means over `finer` samples a
+    side, without the rim, where these lie on one side only."""
+    side = len(fine) // finer
+    means = fine.reshape(side, finer, side, finer).mean(axis=(1, 3))
+    at = (np.arange(len(fine)) + 0.5) / finer - 0.5
+    col, row = np.meshgrid(at, at)
+    between = bilinear(lambda rows, cols: np.asarray(means[rows, cols]), means.shape, col, row)
+    return np.asarray((fine - between)[finer:-finer, finer:-finer])
 
 
 def _firsts(count: int, side: int) -> list[int]:
