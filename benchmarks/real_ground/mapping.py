@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.real_ground.score import Seen
 from benchmarks.scenes import DATA
+from orthonav.core.files import replacing
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.localize import Localizer
 from orthonav.core.records import Telemetry, View
@@ -92,12 +93,12 @@ def strip_ortho(strip: int, work: Path) -> Path:
         grey = cv2.remap(each.grey, index[..., 0], index[..., 1], cv2.INTER_CUBIC)
         use = inside & (off < nearest)
         made[use], nearest[use] = np.maximum(grey[use], 1), off[use]
-    part = out.with_suffix(".part.tif")
     about = {"driver": "GTiff", "count": 1, "dtype": "uint8", "crs": PLANE, "nodata": 0}
     step = rasterio.Affine(ORTHO_M, 0, heights.west_m, 0, -ORTHO_M, heights.north_m)
-    with rasterio.open(part, "w", width=width, height=height, transform=step, **about) as target:
+    about |= {"width": width, "height": height, "transform": step}
+    with replacing(out) as part, rasterio.open(part, "w", **about) as target:
         target.write(made, 1)
-    return part.replace(out)
+    return out
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Maps of the rows, built by the path of `orthonav build --dem`, and the heights they are given."""
 
 import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from rasterio.enums import ColorInterp
 
 from benchmarks.real_ground.mapping import strip_ortho
 from benchmarks.scenes import DATA, SIDE_M, ortho
+from orthonav.core.files import replacing
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
@@ -34,8 +35,6 @@ ROUGHNESS = 1.5
 measured terrain (2.1 to 2.5)."""
 BASE_M = 200.0
 BARE, FLAT, COARSE, SURFACE = "bare", "flat", "coarse", "surface"
-RELIEF_IS_STATED = "relief" in {each.name for each in fields(BuildRequest)}
-"""Whether a build without terrain can say what the land is like."""
 Heights = NDArray[np.float32]
 
 
@@ -157,13 +156,11 @@ def written(out: Path, heights: Heights, transform: Any, crs: Any) -> Path:
     """Heights above the sea as a GeoTIFF."""
     rows, cols = heights.shape
     about = {"driver": "GTiff", "count": 1, "dtype": "float32", "compress": "deflate"}
-    part = out.with_suffix(".part.tif")
-    with rasterio.open(
-        part, "w", width=cols, height=rows, crs=crs, transform=transform, **about
-    ) as target:
+    about |= {"width": cols, "height": rows, "crs": crs, "transform": transform}
+    with replacing(out) as part, rasterio.open(part, "w", **about) as target:
         target.write(heights, 1)
         target.update_tags(ORTHONAV_VERTICAL_DATUM="msl")
-    return part.replace(out)
+    return out
 
 
 def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
@@ -194,10 +191,10 @@ def scaled_copy(name: str, work: Path) -> Path:
         crs = source.crs
     scale = float(gsd) / step.a
     transform = rasterio.Affine(float(gsd), 0, step.c, 0, step.e * scale, step.f)
-    part = out.with_suffix(".part.tif")
     count, rows, cols = bands.shape
     about = {"driver": "GTiff", "count": count, "dtype": "uint8", "crs": crs}
-    with rasterio.open(part, "w", width=cols, height=rows, transform=transform, **about) as target:
+    about |= {"width": cols, "height": rows, "transform": transform}
+    with replacing(out) as part, rasterio.open(part, "w", **about) as target:
         target.write(bands)
         target.write_mask(mask)
-    return part.replace(out)
+    return out

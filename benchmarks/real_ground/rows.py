@@ -11,7 +11,6 @@ from benchmarks.real_ground.maps import (
     BARE,
     COARSE,
     FLAT,
-    RELIEF_IS_STATED,
     SURFACE,
     Map,
 )
@@ -138,7 +137,7 @@ def _oblique() -> Iterator[Question]:
 def _grounds(name: str, slope: float) -> Iterator[tuple[str, Map]]:
     """Maps over relief, by what they know of it."""
     yield "no terrain", Map(name, relief=slope)
-    if RELIEF_IS_STATED and slope in LAND:
+    if slope in LAND:
         yield f"no terrain, {LAND[slope]}", Map(name, relief=slope, land=LAND[slope])
     if name.startswith("generated:"):
         kinds = {"bare earth": BARE, "surface": SURFACE}

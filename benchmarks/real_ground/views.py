@@ -19,6 +19,7 @@ from benchmarks.real_ground.maps import BARE, SURFACE, found, landscape_heights,
 from benchmarks.real_ground.score import Seen
 from benchmarks.scenes import DATA, Pair, root_agl_of
 from benchmarks.unreported_tilt import Flown, level_telemetry, tilted_views
+from orthonav.core.files import replacing
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import FOV_STD, Camera
 from orthonav.core.localize import Localizer
@@ -83,10 +84,9 @@ class OverRelief:
                 attitude = true.yaw_deg, true.pitch_deg, true.roll_deg
                 position = np.array([*place, above])
                 grey, _ = seen_view(imagery, relief, lens, attitude, position, 1)
-                part = folder / f"{number:04d}.part.png"
                 seen = degraded(np.repeat(grey[..., None], 3, -1), EFFECTS, rng)
-                cv2.imwrite(str(part), seen[..., 0])
-                part.replace(path)
+                with replacing(path) as part:
+                    cv2.imwrite(str(part), seen[..., 0])
             grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
             level = level_telemetry(true, np.random.default_rng([SEED, number, 1]))
             reported = replace(level, tilt_std_deg=self.stated_deg)
@@ -196,7 +196,7 @@ class OverLevel:
 @dataclass(frozen=True)
 class Recording:
     """A flight folder of real pictures. Single views are spread over it, a track takes `track`
-    times as many from `first` on.
+    times as many.
 
     `truth`: file of the true positions, of the ground in the middle with `of_ground`. `only`: of
     these frames only.
@@ -208,7 +208,6 @@ class Recording:
     of_ground: bool = False
     only: str = ""
     track: int = 5
-    first: int = 0
 
     def pictures(self) -> str:
         return ""  # they are there
@@ -220,7 +219,7 @@ class Recording:
         flight, truth = open_flight(DATA / self.name), read_truth(DATA / self.name / self.truth)
         flown = [each for each in flight.views if each.frame in truth and self.only in each.frame]
         if tracked:
-            flown = flown[self.first : self.first + self.track * views]
+            flown = flown[: self.track * views]
         else:
             flown = flown[:: max(1, math.ceil(len(flown) / views))]
         for each in flown:
