@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from orthonav.cli.common import OPTIONS
 from orthonav.core.geo.ground import RELIEF_SLOPES, unknown_slope_share
 from orthonav.core.records import DEFAULT_TILT_STD_DEG
 
@@ -31,3 +32,7 @@ def test_the_documentation_states_what_is_computed():
     for relief in RELIEF_SLOPES:
         row = [f"{100 * unknown_slope_share(tilt_deg, relief):.1f} %" for tilt_deg in tilts_deg]
         assert found[relief] == " | ".join(row)
+
+
+def test_the_command_line_offers_all_reliefs():
+    assert OPTIONS["--relief"]["choices"] == tuple(RELIEF_SLOPES)
