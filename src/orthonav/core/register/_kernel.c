@@ -603,7 +603,7 @@ static PyMethodDef functions[] = {
     {"thin", py_thin, METH_VARARGS,
      "thin(grey, factor, out): see orthonav.core.localize.rectify."},
     {"bend", py_bend, METH_VARARGS,
-     "bend(surfaces, places, out): see orthonav.core.localize.resection."},
+     "bend(surfaces, blur, places, pixels, units, limits, out): see orthonav.core.localize.resection."},
     {"search", py_search, METH_VARARGS,
      "search(spectra, view, weights, poses, first, best, which, expected): see "
      "orthonav.core.register.search."},
