@@ -116,23 +116,6 @@ def tilted_and_prepared(grey, camera, attitude, gsd_m=GSD_M, size_px=SIZE_PX, ag
     return rectify(downsampled(view, gsd_m), gsd_m=gsd_m, size_px=size_px)
 
 
-@pytest.mark.parametrize("factor", [2, 3, 4, 7, 16, 37])
-def test_pictures_are_made_smaller_as_by_opencv(monkeypatch, factor):
-    grey = np.random.default_rng(factor).integers(0, 256, (149, 203)).astype(np.uint8)
-    camera = Camera(203, 149, 200.0, 200.0, 101.5, 74.5)
-    view = View(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 100.0))
-    height, width = 149 // factor, 203 // factor
-    rectify_module = importlib.import_module("orthonav.core.localize.rectify")
-    used = grey[: height * factor, : width * factor]
-    mean = used.reshape(height, factor, width, factor).mean(axis=(1, 3))
-    compiled = rectify_module._thinned(used, factor)
-    assert np.abs(compiled - mean).max() <= 0.5 + 1e-4
-    monkeypatch.setattr(rectify_module, "KERNEL", None)
-    np.testing.assert_array_equal(compiled, rectify_module._thinned(used, factor))
-    if min(height, width) >= 8:
-        np.testing.assert_array_equal(downsampled(view, 0.5 * (factor + 0.5)).grey, compiled)
-
-
 def shift_px(found, expected, where):
     """Least-squares shift (column, row) between two pictures, in pixels, over `where`."""
     row_slope, col_slope = np.gradient(expected)

@@ -180,7 +180,9 @@ def test_formulas_for_level_ground_agree_with_those_for_any(opened, attitude):
     registration = Localizer(opened).registration
     picture = rendered(GROUND, PLACE, ATTITUDE)
     prepared = registration.prepared(View(picture, CAMERA, telemetry(ATTITUDE)), True)
-    flat = Relief(Terrain(Raster(np.zeros((70, 70), np.float32), -7e4, 7e4, 2e3)), registration.grid)
+    flat = Relief(
+        Terrain(Raster(np.zeros((70, 70), np.float32), -7e4, 7e4, 2e3)), registration.grid
+    )
     seen, any_seen = (ViewOverGround(each, prepared) for each in (registration.relief, flat))
     assert seen.relief.is_level and not flat.is_level
     pose = Pose(300.0, 290.0, 0.3, 0.01)

@@ -1,5 +1,6 @@
 """The compiled kernel does what NumPy does."""
 
+import importlib
 import math
 import os
 import subprocess
@@ -7,9 +8,10 @@ import sys
 
 import numpy as np
 import pytest
-from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
+from scenes import Ground, apart_px, as_grey, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.localize import resection
+from orthonav.core.localize.rectify import node_px
 from orthonav.core.register import blocks, channels, refine, search, sharpness, template
 from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.kernel import KERNEL
@@ -18,6 +20,7 @@ from orthonav.core.register.refine import Refiner
 from orthonav.core.register.search import SearchWindow, bank, best_near
 from orthonav.core.register.window import MapWindow
 
+rectify_module = importlib.import_module("orthonav.core.localize.rectify")
 SHAPE = (256, 320)
 GROUND = Ground()
 SHARES = blocks.GREY_SHARE, blocks.MIN_SEEN, blocks.MIN_ENERGY
@@ -362,7 +365,18 @@ def test_blocks_beyond_all_bounds_touch_no_memory(matrix):
 @needs_kernel
 @pytest.mark.parametrize(
     "damage",
-    ["channels", "type", "planes", "small", "reach", "negative", "blocks", "side", "strided", "pixels"],
+    [
+        "channels",
+        "type",
+        "planes",
+        "small",
+        "reach",
+        "negative",
+        "blocks",
+        "side",
+        "strided",
+        "pixels",
+    ],
 )
 def test_blocks_that_do_not_match_are_refused(damage):
     view = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1).planes
@@ -452,6 +466,77 @@ def test_surfaces_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
+@pytest.mark.parametrize("factor", [2, 3, 4, 7, 16, 37])
+def test_pictures_are_made_smaller_as_by_opencv(monkeypatch, factor):
+    grey = np.random.default_rng(factor).integers(0, 256, (149, 203)).astype(np.uint8)
+    height, width = 149 // factor, 203 // factor
+    used = grey[: height * factor, : width * factor]
+    mean = used.reshape(height, factor, width, factor).mean(axis=(1, 3))
+    compiled = rectify_module._thinned(used, factor)
+    assert np.abs(compiled - mean).max() <= 0.5 + 1e-4
+    monkeypatch.setattr(rectify_module, "KERNEL", None)
+    np.testing.assert_array_equal(compiled, rectify_module._thinned(used, factor))
+
+
+@needs_kernel
+@pytest.mark.parametrize("shape", [(160, 180), (37, 18), (1, 1), (4, 5)], ids=str)
+def test_pictures_are_rectified_as_without_the_kernel(monkeypatch, shape):
+    """Windows reach beyond the picture, and some nodes are not usable."""
+    rng = np.random.default_rng(7)
+    picture = as_grey(GROUND(np.arange(150.0)[None], np.arange(90.0)[:, None]))
+    px = node_px(shape)
+    nodes = np.stack([1.1 * px[..., 0] - 0.2 * px[..., 1] - 9, 0.7 * px[..., 1] - 3], axis=-1)
+    nodes += 1e-3 * px**2
+    nodes[rng.uniform(size=nodes.shape[:2]) < 0.05] = np.nan
+    compiled, seen = rectify_module._at_nodes(picture, nodes, shape)
+    monkeypatch.setattr(rectify_module, "KERNEL", None)
+    plain, plain_seen = rectify_module._at_nodes(picture, nodes, shape)
+    assert (seen != plain_seen).mean() < 0.005
+    both = seen & plain_seen
+    assert both.any() == (min(shape) > 5)
+    # OpenCV rounds positions to 1/32 of a pixel.
+    assert np.abs(compiled[both].astype(int) - plain[both]).max(initial=0) <= 2
+    assert not compiled[~seen].any()
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["nodes", "type", "valid", "strided", "picture"])
+def test_windows_that_do_not_match_their_nodes_are_refused(damage):
+    picture = np.zeros((9, 11), np.float32 if damage == "picture" else np.uint8)
+    nodes = np.zeros((5 if damage == "nodes" else 6, 6, 2), np.float32)
+    grey, valid = np.zeros((20, 20), np.uint8), np.zeros((20, 20), bool)
+    if damage == "type":
+        nodes = nodes.astype(float)
+    elif damage == "valid":
+        valid = valid[:-1]
+    elif damage == "strided":
+        grey = np.zeros((20, 40), np.uint8)[:, ::2]
+    with pytest.raises(ValueError, match=r"match|expected"):
+        KERNEL.rectify(picture, nodes, grey, valid)
+
+
+@needs_kernel
+def test_nodes_beyond_all_bounds_touch_no_memory():
+    nodes = np.full((6, 6, 2), 1e30, np.float32)
+    nodes[:3], nodes[4] = np.nan, -np.inf
+    grey, valid = np.ones((20, 20), np.uint8), np.ones((20, 20), bool)
+    KERNEL.rectify(np.ones((9, 11), np.uint8), nodes, grey, valid)
+    assert not grey.any() and not valid.any()
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["type", "factor", "zero", "size", "strided"])
+def test_pictures_made_smaller_that_do_not_match_are_refused(damage):
+    grey = np.zeros((12, 16), np.float32 if damage == "type" else np.uint8)
+    factor = {"factor": 257, "zero": 0}.get(damage, 4)
+    out = np.zeros((3, 5 if damage == "size" else 4), np.uint8)
+    if damage == "strided":
+        grey = np.zeros((12, 32), np.uint8)[:, ::2]
+    with pytest.raises(ValueError, match=r"match|expected"):
+        KERNEL.thin(grey, factor, out)
+
+
+@needs_kernel
 @pytest.mark.parametrize("recipe", [FINE, COARSE], ids=["fine", "coarse"])
 @pytest.mark.parametrize("valid", ["all", "none", "part", "scattered"])
 @pytest.mark.parametrize(
@@ -503,7 +588,9 @@ def test_pictures_that_do_not_match_are_refused(damage):
 
 
 @needs_kernel
-@pytest.mark.parametrize("name", ["search", "near", "moved", "spread", "blocks", "channels", "bend", "thin"])
+@pytest.mark.parametrize(
+    "name", ["search", "near", "moved", "spread", "blocks", "channels", "bend", "thin", "rectify"]
+)
 def test_an_array_that_is_missing_is_refused(name):
     made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
     values, weights = made.values, made.weights
@@ -524,6 +611,12 @@ def test_an_array_that_is_missing_is_refused(name):
         "channels": (zeros(20, 30, of=np.uint8), None, (1.0, 27, 11, 21), zeros(4, 20, 30)),
         "bend": (np.zeros((3, 5, 5)), None, np.zeros((3, 2)), *pixels, LIMITS, np.zeros((3, 6))),
         "thin": (zeros(12, 16, of=np.uint8), 4, zeros(3, 4, of=np.uint8)),
+        "rectify": (
+            zeros(9, 11, of=np.uint8),
+            zeros(6, 6, 2),
+            zeros(20, 20, of=np.uint8),
+            zeros(20, 20, of=bool),
+        ),
         "blocks": (window, made.planes, *block, np.zeros((36, 5, 5)), np.zeros(36)),
     }[name]
     for at, each in enumerate(given):

@@ -64,17 +64,29 @@ def orthorectified(
 
     `nodes_m` (h, w, 3): east, north, above sea at `node_px`; NaN where unknown."""
     index = orientation.seen_px(view.camera, nodes_m) - 0.5
-    usable = np.isfinite(index).all(axis=-1) & _fine(view, index)
-    usable &= ~hidden(nodes_m, orientation.position_m)
-    seen = np.where(usable[..., None], index, -10.0)
+    usable = _fine(view, index) & ~hidden(nodes_m, orientation.position_m)
+    index[~usable] = np.nan
+    return _at_nodes(view.grey, index, shape)
+
+
+def _at_nodes(
+    picture: NDArray[np.uint8], nodes_px: Array, shape: tuple[int, int]
+) -> tuple[NDArray[np.uint8], Mask]:
+    """Grey and valid (H, W) by where nodes (h, w, 2) lie, from pixel centres; NaN: not usable."""
+    if KERNEL is not None:
+        made = np.empty(shape, np.uint8), np.empty(shape, np.bool_)
+        KERNEL.rectify(picture, nodes_px.astype(np.float32), *made)
+        return made
+    usable = np.asarray(np.isfinite(nodes_px).all(axis=-1), np.bool_)
+    seen = np.where(usable[..., None], nodes_px, -10.0)
     planes = np.dstack([seen, usable]).astype(np.float32)
     part = np.array([[1 / NODE_PX, 0, 0], [0, 1 / NODE_PX, 0]])
     size = shape[1], shape[0]
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     x, y, counted = cv2.split(cv2.warpAffine(planes, part, size, flags=flags))
-    high, wide = view.grey.shape
+    high, wide = picture.shape
     valid = (counted > 0.999) & (x >= -0.5) & (y >= -0.5) & (x <= wide - 0.5) & (y <= high - 0.5)
-    grey = cv2.remap(view.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.where(valid, grey, 0).astype(np.uint8), np.asarray(valid, np.bool_)
 
 

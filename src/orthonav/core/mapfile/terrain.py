@@ -56,7 +56,15 @@ class TerrainLayer:
 
     def _samples(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Array:
         side = self.info.chunk_px
+        if not rows.size:
+            return np.empty(rows.shape)
         chunk_rows, chunk_cols = rows // side, cols // side
+        first = int(chunk_rows.min()), int(chunk_cols.min())
+        if first == (int(chunk_rows.max()), int(chunk_cols.max())):
+            heights = self._chunk(*first)
+            if heights is None:
+                return np.full(rows.shape, np.nan)
+            return heights[rows % side, cols % side].astype(np.float64)
         found = np.full(rows.shape, np.nan)
         across = int(chunk_cols.max(initial=0)) + 1
         for key in np.unique(chunk_rows * across + chunk_cols).tolist():

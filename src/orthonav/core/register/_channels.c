@@ -1,11 +1,10 @@
-/* Channels of a picture: orthonav.core.register.channels, compiled, and pictures made smaller.
+/* Channels of a picture: orthonav.core.register.channels, compiled.
  *
  * Loops are such that compilers make vectors of them. At borders pictures are reflected without their
  * first pixel, as OpenCV does. */
 
 #include "_kernel.h"
 
-#include <limits.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -274,57 +273,6 @@ PyObject *py_channels(PyObject *self, PyObject *arguments) {
     PyBuffer_Release(&out);
 free_valid:
     if (partly) PyBuffer_Release(&valid);
-free_grey:
-    PyBuffer_Release(&grey);
-    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
-}
-
-#define LARGEST_FACTOR 256  /* whose sums of columns fit into 16 bits */
-
-/* Mean over squares of `factor` pixels, as OpenCV rounds it; `sums`: room for a row. */
-INLINE void thin_inline(const unsigned char *from, size_t stride, int factor, int rows, int cols,
-                        unsigned short *restrict sums, unsigned char *restrict to) {
-    const float share = 1.0f / (float)(factor * factor);
-    for (int row = 0; row < rows; row++, to += cols) {
-        memset(sums, 0, sizeof *sums * (size_t)cols * factor);
-        for (int i = 0; i < factor; i++, from += stride)
-            for (int col = 0; col < cols * factor; col++) sums[col] += from[col];
-        for (int col = 0; col < cols; col++) {
-            int total = 0;
-            for (int i = 0; i < factor; i++) total += sums[col * factor + i];
-            to[col] = (unsigned char)rintf((float)total * share);
-        }
-    }
-}
-
-FOR_EVERY_PROCESSOR(thin,
-                    (const unsigned char *from, size_t stride, int factor, int rows, int cols,
-                     unsigned short *sums, unsigned char *to),
-                    (from, stride, factor, rows, cols, sums, to))
-
-PyObject *py_thin(PyObject *self, PyObject *arguments) {
-    PyObject *from, *to;
-    Py_buffer grey, out;
-    int factor;
-    (void)self;
-    if (!PyArg_ParseTuple(arguments, "OiO", &from, &factor, &to)) return NULL;
-    if (borrow(from, &grey, 2, ANY, 'B', 0) < 0) return NULL;
-    if (borrow(to, &out, 2, ANY, 'B', PyBUF_WRITABLE) < 0) goto free_grey;
-    if (factor < 1 || factor > LARGEST_FACTOR || !is_whole(&out) || out.shape[0] < 1 ||
-        out.shape[1] < 1 || out.shape[0] != grey.shape[0] / factor ||
-        out.shape[1] != grey.shape[1] / factor || grey.strides[0] < 0 || grey.shape[1] > INT_MAX)
-        PyErr_SetString(PyExc_ValueError, "picture, factor and result do not match");
-    else {
-        unsigned short *const sums = malloc(sizeof *sums * (size_t)grey.shape[1]);
-        Py_BEGIN_ALLOW_THREADS
-        if (sums)
-            thin(grey.buf, (size_t)grey.strides[0], factor, (int)out.shape[0], (int)out.shape[1],
-                 sums, out.buf);
-        Py_END_ALLOW_THREADS
-        if (!sums) PyErr_NoMemory();
-        free(sums);
-    }
-    PyBuffer_Release(&out);
 free_grey:
     PyBuffer_Release(&grey);
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);

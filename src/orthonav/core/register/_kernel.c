@@ -1,5 +1,6 @@
 /* Refinement of a view on the map: the loop of orthonav.core.register.refine, compiled. `_search.c` has
- * the search, `_channels.c` what is compared, `_blocks.c` blocks of a view.
+ * the search, `_pictures.c` and `_channels.c` what is compared, `_blocks.c`
+ * blocks of a view.
  *
  * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
  * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
@@ -602,6 +603,8 @@ static PyMethodDef functions[] = {
      "orthonav.core.register.blocks."},
     {"thin", py_thin, METH_VARARGS,
      "thin(grey, factor, out): see orthonav.core.localize.rectify."},
+    {"rectify", py_rectify, METH_VARARGS,
+     "rectify(picture, nodes, grey, valid): see orthonav.core.localize.rectify."},
     {"bend", py_bend, METH_VARARGS,
      "bend(surfaces, blur, places, pixels, units, limits, out): see orthonav.core.localize.resection."},
     {"search", py_search, METH_VARARGS,

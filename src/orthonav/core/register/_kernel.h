@@ -113,6 +113,7 @@ PyObject *py_blocks(PyObject *self, PyObject *arguments);
 PyObject *py_bend(PyObject *self, PyObject *arguments);
 PyObject *py_channels(PyObject *self, PyObject *arguments);
 PyObject *py_thin(PyObject *self, PyObject *arguments);
+PyObject *py_rectify(PyObject *self, PyObject *arguments);
 PyObject *py_search(PyObject *self, PyObject *arguments);
 PyObject *py_near(PyObject *self, PyObject *arguments);
 PyObject *py_moved(PyObject *self, PyObject *arguments);

@@ -74,7 +74,9 @@ def _middles_px(rows: int, cols: int) -> Sums:
     return middles
 
 
-def _compared(template: Template, window: MapWindow, pose: Pose, reach_px: int) -> tuple[Array, Sums]:
+def _compared(
+    template: Template, window: MapWindow, pose: Pose, reach_px: int
+) -> tuple[Array, Sums]:
     """Products (B * B, 2 R + 1, 2 R + 1) of blocks with the map, moved; of each block the energy in
     the view and on the map, and the pixels that count (3, B * B)."""
     rows, cols = template.mask.shape

@@ -59,9 +59,7 @@ def channel_planes(
     planes = np.empty((CHANNELS, *grey.shape), np.float32)
     sides = recipe.contrast_px, recipe.mean_px, recipe.deviation_px
     counted = None if whole else np.ascontiguousarray(valid)
-    KERNEL.channels(
-        np.ascontiguousarray(grey), counted, (recipe.gradient_sigma_px, *sides), planes
-    )
+    KERNEL.channels(np.ascontiguousarray(grey), counted, (recipe.gradient_sigma_px, *sides), planes)
     return planes
 
 
