@@ -62,7 +62,7 @@ class TerrainLayer:
             lambda rows, cols: heights[rows - top, cols - left], (info.rows, info.cols), col, row
         )
 
-    def _part(self, col: Array, row: Array) -> tuple[Heights, int, int] | None:
+    def _part(self, col: Array, row: Array) -> tuple[Array, int, int] | None:
         """Samples around places, the first row and column of these; None where they are many."""
         info, side = self.info, self.info.chunk_px
         firsts, ends = [], []
@@ -80,7 +80,7 @@ class TerrainLayer:
         samples, chunks = (bottom - top) * (right - left), len(chunk_rows) * len(chunk_cols)
         if samples > FEW_SAMPLES or chunks > FEW_CHUNKS:
             return None
-        part = np.full((bottom - top, right - left), np.nan, np.float32)
+        part = np.full((bottom - top, right - left), np.nan)
         for chunk_row, chunk_col in product(chunk_rows, chunk_cols):
             heights = self._chunk(chunk_row, chunk_col)
             if heights is not None:
