@@ -32,6 +32,15 @@ SURFACE = TerrainInfo(
     roughness_m=2.0,
 )
 """A terrain that shows houses and trees, as that of the ground without any does."""
+
+
+class Flat:
+    """A surface model of level ground without houses."""
+
+    def at_en_m(self, points_en_m):
+        return np.zeros(np.shape(points_en_m)[:-1])
+
+
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 AGL_M = 150.0
 FINEST_M = 0.5

@@ -5,7 +5,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, SURFACE, as_grey, known_map, rendered
+from blots import AGL_M, CAMERA, GROUND, SURFACE, Flat, as_grey, known_map, rendered
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer, systematic
@@ -17,13 +17,6 @@ from orthonav.core.records import Fix, Prior, Telemetry, View
 
 VIEWS, TILT_DEG = 24, 4.0
 YAW_STD_DEG, AGL_STD = 5.0, 0.05
-
-
-class Flat:
-    """A surface model of level ground without houses."""
-
-    def at_en_m(self, points_en_m):
-        return np.zeros(np.shape(points_en_m)[:-1])
 
 
 @pytest.fixture(scope="module")

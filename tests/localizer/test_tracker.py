@@ -7,11 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, GROUND, Ground, known_map, place_of, rendered
+from blots import AGL_M, GROUND, SURFACE, Flat, Ground, known_map, place_of, rendered
 
 from orthonav.core.errors import CameraError, MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
+from orthonav.core.localize.ground import Relief
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.track.odometry import OdometryView, displacement
@@ -114,8 +115,11 @@ def test_a_flight_is_followed(usual):
 
 
 @pytest.mark.long
-def test_biases_of_heading_height_and_mount_are_estimated(localizer):
-    """Uncorrected, 5 deg of pitch are 13 m from 150 m. Single views show their tilt themselves."""
+def test_biases_of_heading_height_and_mount_are_estimated(localizer, monkeypatch):
+    """Uncorrected, 5 deg of pitch are 13 m from 150 m. Over known ground single views show their
+    tilt themselves."""
+    relief = Relief(Flat(), localizer.grid, SURFACE)
+    monkeypatch.setattr(localizer.registration, "relief", relief)
     tracker = Tracker(localizer)
     seen = list(
         views(

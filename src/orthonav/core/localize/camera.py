@@ -203,13 +203,13 @@ class _Compared:
 def _compared(
     seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
 ) -> _Compared | None:
-    """At first at the final level and a coarser one, then at the final level and a finer one."""
+    """At first at the final level and a coarser one, then at a finer one too."""
     final = seen.view.levels.final
     finest = final if first else max(final - 1, 0)
     made = _templates(seen, pose, finest, orientation, first=first)
     if made is None:
         return None
-    coarsest = min(final + first, reference.levels - 1)
+    coarsest = min(final + 1, reference.levels - 1)
     levels = [at for at in range(finest, coarsest + 1) if min(made.shape(at)) >= BLOCKS]
     if not levels:
         return None
