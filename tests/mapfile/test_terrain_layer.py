@@ -11,7 +11,7 @@ from maps import arrays, manifest
 
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.ground import RELIEF_SLOPES
-from orthonav.core.mapfile import open_map, write_map
+from orthonav.core.mapfile import open_map, terrain, write_map
 from orthonav.core.mapfile.manifest import SheetInfo, TerrainInfo
 from orthonav.core.mapfile.terrain import (
     TerrainLayer,
@@ -82,6 +82,22 @@ def test_holes_and_what_lies_outside_are_unknown(layer):
     assert np.isnan(layer.at_en_m(np.array(outside))).all()
     assert np.isnan(layer.at_en_m([-46.0, 100.0]))  # beside a hole
     assert np.isfinite(layer.at_en_m([-44.0, 100.0]))
+
+
+@pytest.mark.parametrize("few", [(1, 10**6), (4, 10**6), (100, 10**6), (4, 30), (4, 0)], ids=str)
+def test_heights_do_not_depend_on_how_many_are_read_at_once(layer, monkeypatch, few):
+    """Of points in one chunk and across several, beside the hole and outside."""
+    rng = np.random.default_rng(2)
+    middles = rng.uniform([-260, -210], [260, 210], (60, 2))
+    asked = [each + rng.uniform(-reach, reach, (12, 2)) for each in middles for reach in (4, 90)]
+    asked += [np.empty((0, 2)), np.array([[np.nan, 0.0], [0.0, 0.0]]), np.array([[1e12, -np.inf]])]
+    monkeypatch.setattr(terrain, "FEW_CHUNKS", 0)
+    alone = [layer.at_en_m(points) for points in asked]
+    assert any(np.isnan(each).any() and np.isfinite(each).any() for each in alone)
+    monkeypatch.setattr(terrain, "FEW_CHUNKS", few[0])
+    monkeypatch.setattr(terrain, "FEW_SAMPLES", few[1])
+    for points, expected in zip(asked, alone, strict=True):
+        np.testing.assert_array_equal(layer.at_en_m(points), expected)
 
 
 @given(

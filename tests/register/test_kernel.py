@@ -395,39 +395,74 @@ def test_blocks_that_do_not_match_are_refused(damage):
         KERNEL.blocks(window, view, (1.0, 0, 0, 0, 1, 0), 0.0, reach, SHARES, found, pixels)
 
 
+def blocks_of(surfaces, levels, rng):
+    """Blocks of so many levels with these correlations; some do not count."""
+    pixels = rng.uniform(200, 900, len(surfaces)) * (rng.uniform(size=len(surfaces)) > 0.1)
+    count = len(surfaces) // levels
+    units = np.repeat(2.0 ** np.arange(levels), count)
+    moved_px = rng.normal(size=(count, 2, 6))
+    return resection._Blocks(levels, 2.0, surfaces, pixels, units, moved_px)
+
+
 @needs_kernel
 @pytest.mark.parametrize("side", [3, 9, 15])
-def test_quadratics_through_correlations_are_the_same(monkeypatch, side):
+@pytest.mark.parametrize("blur_px", [0.0, 0.7, 2.0])
+@pytest.mark.parametrize("levels", [1, 2, 3])
+def test_pulls_of_blocks_are_the_same(monkeypatch, side, blur_px, levels):
     """At the border of a surface and beyond it too, and at saddles and pits."""
     rng = np.random.default_rng(6)
-    surfaces, reach = rng.normal(size=(300, side, side)), side // 2
+    surfaces, reach = rng.normal(size=(300, side, side)) / 2, side // 2
     moved = rng.uniform(-1.3 * reach, 1.3 * reach, (300, 2))
     moved[:40] = rng.integers(-reach, reach + 1, (40, 2))
     moved[40:80] = rng.integers(-reach, reach, (40, 2)) + 0.5
     surfaces[80:90] = 0.0
+    blocks = blocks_of(surfaces, levels, rng)
     monkeypatch.setattr(resection, "KERNEL", KERNEL)
-    compiled = resection._quadratic(surfaces, moved)
+    compiled = blocks._pulls(moved, blur_px)
     monkeypatch.setattr(resection, "KERNEL", None)
-    for one, other in zip(compiled, resection._quadratic(surfaces, moved), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-12)
+    for one, other in zip(compiled, blocks._pulls(moved, blur_px), strict=True):
+        assert other.any()
+        np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(other).max())
 
 
 @needs_kernel
-def test_places_that_are_not_numbers_have_no_quadratic():
-    out = np.full((3, 7), math.nan)
+def test_blocks_of_which_nothing_counts_do_not_pull(monkeypatch):
+    rng = np.random.default_rng(6)
+    blocks = blocks_of(rng.normal(size=(72, 9, 9)), 2, rng)
+    blocks.pixels[:] = 0.0
+    for kernel in (KERNEL, None):
+        monkeypatch.setattr(resection, "KERNEL", kernel)
+        assert not any(each.any() for each in blocks._pulls(np.zeros((72, 2)), 0.0))
+
+
+LIMITS = resection.LEAST_CORRELATION, resection.MOST_CORRELATION, resection.PIXELS_PER_NUMBER
+
+
+@needs_kernel
+@pytest.mark.parametrize("blur_px", [0.0, 1.0])
+def test_places_that_are_not_numbers_do_not_pull(blur_px):
+    out = np.full((3, 6), math.nan)
     moved = np.array([[math.nan, 0.0], [0.0, math.inf], [-1e300, 1e300]])
-    KERNEL.bend(np.ones((3, 5, 5)), moved, out)
+    weighted = resection._gaussian(5, blur_px), moved, np.ones(3), np.ones(3)
+    KERNEL.bend(np.ones((3, 5, 5)), *weighted, LIMITS, out)
     assert not out.any()
 
 
 @needs_kernel
-@pytest.mark.parametrize("damage", ["type", "even", "count", "out", "small"])
+@pytest.mark.parametrize(
+    "damage",
+    ["type", "even", "count", "out", "levels", "none", "small", "wide", "blur", "pixels", "units"],
+)
 def test_surfaces_that_do_not_match_are_refused(damage):
-    side = {"even": 4, "small": 1}.get(damage, 5)
-    surfaces = np.zeros((3, side, side), np.float32 if damage == "type" else np.float64)
-    moved, out = np.zeros((4 if damage == "count" else 3, 2)), np.zeros((3, 6 + (damage != "out")))
+    side = {"even": 4, "small": 1, "wide": 65}.get(damage, 5)
+    surfaces = np.zeros((4, side, side), np.float32 if damage == "type" else np.float64)
+    moved = np.zeros((5 if damage == "count" else 4, 2))
+    blur = np.zeros((side - (damage == "blur"), side))
+    pixels, units = np.ones(3 if damage == "pixels" else 4), np.ones(3 if damage == "units" else 4)
+    rows = {"levels": 3, "none": 0}.get(damage, 2)
+    out = np.zeros((rows, 5 if damage == "out" else 6))
     with pytest.raises(ValueError, match=r"match|expected"):
-        KERNEL.bend(surfaces, moved, out)
+        KERNEL.bend(surfaces, blur, moved, pixels, units, LIMITS, out)
 
 
 @needs_kernel
@@ -567,13 +602,14 @@ def test_an_array_that_is_missing_is_refused(name):
     spectra, poses, sums = zeros(3, 3, 45, 16), np.zeros((1, 4)), np.zeros(2 * 16 + 36 * 7)
     moved = (0,) * 6, 0.0, (3, 4), (80, 100), 1e-3, zeros(3, 7, 9)
     block = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 2, SHARES
+    pixels = np.ones(3), np.ones(3)
     given = {
         "search": (spectra, values, weights, poses, 0, best, numbers, None),
         "near": (zeros(20, 30, 3), values, weights, poses, 2, np.zeros((1, 3))),
         "moved": (window, values, weights, *moved),
         "spread": (window, values, made.slopes, made.numbers, (0,) * 4, (0,) * 9, sums),
         "channels": (zeros(20, 30, of=np.uint8), None, (1.0, 27, 11, 21), zeros(4, 20, 30)),
-        "bend": (np.zeros((3, 5, 5)), np.zeros((3, 2)), np.zeros((3, 7))),
+        "bend": (np.zeros((3, 5, 5)), None, np.zeros((3, 2)), *pixels, LIMITS, np.zeros((3, 6))),
         "thin": (zeros(12, 16, of=np.uint8), 4, zeros(3, 4, of=np.uint8)),
         "rectify": (
             zeros(9, 11, of=np.uint8),

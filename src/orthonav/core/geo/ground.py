@@ -74,18 +74,22 @@ def bilinear(
 ) -> Array:
     """Heights at fractional samples (0, 0 is the first); NaN beyond half a sample outside.
 
-    `samples` gives heights by rows and columns; beside an unknown one all is unknown."""
+    `samples` gives heights by rows and columns, those at the border for places outside, the first
+    for NaN; beside an unknown one all is unknown."""
     rows, cols = shape
     with np.errstate(invalid="ignore"):
         inside = (col >= -0.5) & (col <= cols - 0.5) & (row >= -0.5) & (row <= rows - 0.5)
-    col = np.clip(np.where(inside, col, 0), 0, cols - 1)
-    row = np.clip(np.where(inside, row, 0), 0, rows - 1)
-    left, top = np.floor(col).astype(np.intp), np.floor(row).astype(np.intp)
+    all_inside = bool(inside.all())
+    if not all_inside:
+        col, row = np.nan_to_num(col), np.nan_to_num(row)
+    col, row = np.minimum(np.maximum(col, 0), cols - 1), np.minimum(np.maximum(row, 0), rows - 1)
+    left, top = col.astype(np.intp), row.astype(np.intp)
     right, bottom = np.minimum(left + 1, cols - 1), np.minimum(top + 1, rows - 1)
     x, y = col - left, row - top
     upper = (1 - x) * samples(top, left) + x * samples(top, right)
     lower = (1 - x) * samples(bottom, left) + x * samples(bottom, right)
-    return np.where(inside, (1 - y) * upper + y * lower, np.nan)
+    heights = (1 - y) * upper + y * lower
+    return np.asarray(heights if all_inside else np.where(inside, heights, np.nan))
 
 
 def sight_on_ground(slope_en: Array, height_m: float, ground_m: Callable[[Array], Array]) -> Array:

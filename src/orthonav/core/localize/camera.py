@@ -114,6 +114,7 @@ def camera_found(
     agl_m = above_sea_m - float(seen.relief.terrain.at_en_m([east, north]))
     if not agl_m > 0:
         return None
+    sight_en_m = seen.sight_en_m(orientation)
     return CameraFound(
         orientation,
         agl_m,
@@ -121,8 +122,8 @@ def camera_found(
         near.start.moved(found.alone),
         found.alone_covariance,
         variance,
-        seen.middle_en_m(orientation, pose),
-        _middle_covariance(seen, orientation, found.covariance),
+        seen.middle_en_m(sight_en_m, pose),
+        _middle_covariance(seen, orientation, sight_en_m, found.covariance),
     )
 
 
@@ -248,11 +249,10 @@ def _templates(
 
 
 def _middle_covariance(
-    seen: ViewOverGround, orientation: Orientation, covariance: Array
+    seen: ViewOverGround, orientation: Orientation, sight_en_m: Array, covariance: Array
 ) -> Array | None:
     """Of the ground (2, 2), m2, that the middle of a view shows; None beside unknown ground."""
-    met = seen.sight_en_m(orientation)
-    point = np.array([[*met, float(seen.relief.terrain.at_en_m(met))]])
+    point = np.array([[*sight_en_m, float(seen.relief.terrain.at_en_m(sight_en_m))]])
     slopes = seen.relief.slopes(point)
     if not (np.isfinite(point).all() and np.isfinite(slopes).all()):
         return None

@@ -28,7 +28,7 @@ def fix_of(search: Search, best: Place) -> Fix:
     else:
         found = _by_similarity(sheet, search.view, best)
         if orientation is not None:
-            middle_en_m = ground.middle_en_m(orientation, pose)
+            middle_en_m = ground.middle_en_m(ground.sight_en_m(orientation), pose)
     place = math.nan if sheet.confidence is None else sheet.confidence(best.scores)
     radius_m = max(sheet.radius_m, RADIUS_SHARE * found.agl_m)
     evidence = best.scores | found.stds

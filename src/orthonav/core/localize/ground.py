@@ -75,15 +75,9 @@ class Relief:
         """Rise (N, 2) per metre east and north at (N, 3)."""
         if self.is_level:
             return np.zeros((len(ground_m), 2))
-        out = np.empty((len(ground_m), 2))
-        for axis in range(2):
-            step = np.zeros(2)
-            step[axis] = SLOPE_M
-            ahead, behind = (
-                self.terrain.at_en_m(ground_m[:, :2] + sign * step) for sign in (1, -1)
-            )
-            out[:, axis] = (ahead - behind) / (2 * SLOPE_M)
-        return out
+        steps = SLOPE_M * np.concatenate([np.eye(2), -np.eye(2)])
+        ahead, behind = np.split(self.terrain.at_en_m(ground_m[:, None, :2] + steps), 2, axis=1)
+        return np.asarray((ahead - behind) / (2 * SLOPE_M))
 
     def errors(self, slopes: Array) -> GroundErrors:
         """Of the heights under a view, by slopes (N, 2) there."""
@@ -221,6 +215,7 @@ class ViewOverGround:
         x, y = np.meshgrid(cols - valid.shape[1] / 2, rows - valid.shape[0] / 2)
         nodes = np.stack([x, y], axis=-1) * 2.0**view.levels.final
         self._reference_px = nodes[used] if used.any() else nodes.reshape(-1, 2)
+        self._last_ground: tuple[Pose, Array] | None = None
 
     def templates_at(
         self, pose: Pose, level: int, orientation: Orientation | None = None
@@ -267,15 +262,23 @@ class ViewOverGround:
         """Mean height under the window; NaN where less than half is known."""
         if self.relief.is_level:
             return 0.0
-        heights = self.relief.ground_m(pose.map_px(self._reference_px))[:, 2]
+        heights = self._ground_m(pose)[:, 2]
         known = np.isfinite(heights)
         return float(heights[known].mean()) if known.mean() >= MIN_KNOWN else math.nan
+
+    def _ground_m(self, pose: Pose) -> Array:
+        """East, north, above sea (N, 3) at nodes of the window, kept for the last pose."""
+        last = self._last_ground
+        if last is None or last[0] != pose:
+            last = pose, self.relief.ground_m(pose.map_px(self._reference_px))
+            self._last_ground = last
+        return last[1]
 
     def is_level(self, pose: Pose) -> bool:
         """Whether relief displaces the window by less than is visible."""
         if self.relief.is_level:
             return True
-        ground = self.relief.ground_m(pose.map_px(self._reference_px))
+        ground = self._ground_m(pose)
         orientation = self.orientation(pose)
         if orientation is None or not np.isfinite(ground).all():
             return False
@@ -306,9 +309,9 @@ class ViewOverGround:
         x, y = pose.map_px(camera_px) - turned.linear @ camera_px
         return replace(turned, x_px=float(x), y_px=float(y))
 
-    def middle_en_m(self, orientation: Orientation, pose: Pose) -> tuple[float, float]:
+    def middle_en_m(self, sight_en_m: Array, pose: Pose) -> tuple[float, float]:
         """Ground in the middle of the picture; that of the window where unknown."""
-        found = self.sight_en_m(orientation)
+        found = sight_en_m
         if not np.isfinite(found).all():
             found = self.relief.en_m(np.array([pose.x_px, pose.y_px]))
         return float(found[0]), float(found[1])

@@ -7,6 +7,7 @@ errors and of the noise is estimated too (variance components, Koch 1999)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ CORRELATED, CORRELATED_PX = 2.0, 60.0
 """Errors of levels and dates correlate: least excess of the variance over the scatter of blocks,
 and what errors reach over, pixels of the map (docs/decisions/camera.md)."""
 MIN_BLOCKS = 8
+SINGULAR = 1e-15  # least eigenvalue over the largest of what blocks show of the camera
 MIN_LEFT = 0.25  # least share of the blocks' numbers that the solution leaves to their scatter
 COMPONENT_PRIOR = 4.0  # numbers that the prior variance of a systematic error counts as,
 MAX_COMPONENT = 16.0  # and the largest factor on it
@@ -222,19 +224,19 @@ class _Blocks:
         height = np.maximum(flat.max(axis=1), 0.0)
         with np.errstate(divide="ignore"):
             chance = np.log(self._weights(self._usual(height)) * height)
-        drawn = np.random.default_rng(0).gumbel(size=(SAMPLES, count)) + chance
-        chosen = np.argpartition(-drawn, SAMPLE, axis=1)[:, :SAMPLE]
-        moved = self._by_level[chosen].reshape(SAMPLES, 2 * SAMPLE, 6)
+        drawn = _drawn(count) - chance
+        chosen = np.argpartition(drawn, SAMPLE, axis=1)[:, :SAMPLE]
+        moved = self._by_level.reshape(count, 2, -1)[chosen].reshape(SAMPLES, 2 * SAMPLE, 6)
         peaks = peaks_px[chosen].reshape(SAMPLES, 2 * SAMPLE)
         known = moved.swapaxes(1, 2) / SAMPLE_STD_PX**2
         right = np.einsum("spk,sk->sp", known, peaks) + information @ mean
         return np.asarray(np.linalg.solve(known @ moved + information, right[..., None])[..., 0])
 
-    @property
+    @cached_property
     def _by_level(self) -> Array:
-        """Moves (L * N, 2, D) in pixels of the level."""
+        """Moves (L * N * 2, D) in pixels of the level."""
         moved = np.tile(self.moved_px, (self.levels, 1, 1)) / self.unit_px[:, None, None]
-        return np.asarray(moved)
+        return np.asarray(moved.reshape(-1, moved.shape[2]))
 
     @property
     def seen(self) -> int:
@@ -250,14 +252,13 @@ class _Blocks:
     def best(self, corrections: Array, expected: Expected) -> Array:
         """The most likely one of corrections (S, 6)."""
         mean, information = expected
-        size = corrections.shape[1]
-        moved = (self._by_level.reshape(-1, size) @ corrections.T).T
+        moved = corrections @ self._by_level.T
         here = _values(self.correlations, moved.reshape(len(corrections), -1, 2))
         usual = self._usual(here).max(axis=0)
-        fit = (
-            np.logaddexp(0.0, self._weights(usual) * (here - usual / 2)).sum(axis=1)
-            / self.correlated
-        )
+        odds = self._weights(usual) * (here - usual / 2)
+        # Of 1 + exp(odds): the product of the rest is at most 2 to the power of the blocks.
+        fit = np.maximum(odds, 0.0).sum(axis=1) + np.log((1 + np.exp(-np.abs(odds))).prod(axis=1))
+        fit /= self.correlated
         off = corrections - mean
         prior_nats = np.einsum("sp,pq,sq->s", off, information, off) / 2
         return np.asarray(corrections[int(np.argmax(fit - prior_nats))])
@@ -292,43 +293,65 @@ class _Blocks:
         the numbers that a solution with `covariance` and `excess` uses are not counted."""
         numbers = 2 * self.seen
         left = max(1 - float((covariance * curvature).sum()) / excess / numbers, MIN_LEFT)
-        spread = slopes[:, CAMERA].T @ slopes[:, CAMERA]
-        inverse = np.linalg.pinv(curvature[CAMERA, CAMERA], hermitian=True)
-        return max(1.0, self.correlated * float((inverse * spread).sum()) / 6 / left)
+        values, vectors = np.linalg.eigh(curvature[CAMERA, CAMERA])
+        spread = np.square(slopes[:, CAMERA] @ vectors).sum(axis=0)
+        shown = values > SINGULAR * values[-1]
+        return max(1.0, self.correlated * float((spread[shown] / values[shown]).sum()) / 6 / left)
 
     def system(self, state: Array, blur_px: float = 0.0) -> tuple[Array, Array]:
         """Curvature (D, D) of the log likelihood, and its slope (N, D) by each block."""
-        moved_px = np.tile(self.moved_px @ state, (self.levels, 1)) / self.unit_px[:, None]
-        here, slope, curvature = _quadratic(_blurred(self.correlations, blur_px), moved_px)
+        slope, curvature = self._pulls((self._by_level @ state).reshape(-1, 2), blur_px)
+        size = self.moved_px.shape[2]
+        held = (curvature @ self.moved_px).reshape(-1, size)
+        x, y = self.moved_px[:, 0], self.moved_px[:, 1]
+        return self.moved_px.reshape(-1, size).T @ held, slope[:, :1] * x + slope[:, 1:] * y
+
+    def _pulls(self, moved_px: Array, blur_px: float) -> tuple[Array, Array]:
+        """Slopes (N, 2) and curvatures (N, 2, 2) of the log likelihood by places at level 0, of
+        blocks moved by so many pixels of the levels (L * N, 2)."""
+        count, blur = len(self.moved_px), _gaussian(self.correlations.shape[1], blur_px)
+        if KERNEL is not None:
+            out = np.empty((count, 6))
+            limits = LEAST_CORRELATION, MOST_CORRELATION, PIXELS_PER_NUMBER
+            weighted = self.pixels, self.unit_px, limits
+            KERNEL.bend(self.correlations, blur, np.ascontiguousarray(moved_px), *weighted, out)
+            return out[:, :2], out[:, 2:].reshape(-1, 2, 2)
+        blurred = self.correlations if blur is None else blur @ self.correlations @ blur.T
+        here, slope, curvature = _quadratic(blurred, moved_px)
         usual = self._usual(here)
         weight = self._weights(usual)
         odds = np.clip(weight * (here - usual / 2), -30.0, 30.0)
         weight = weight / (1 + np.exp(-odds)) / self.unit_px
-        slope = (slope * weight[:, None]).reshape(self.levels, -1, 2).sum(axis=0)
+        slope = (slope * weight[:, None]).reshape(self.levels, count, 2).sum(axis=0)
         curvature = curvature * (weight / self.unit_px)[:, None, None]
-        held = curvature.reshape(self.levels, -1, 2, 2).sum(axis=0) @ self.moved_px
-        size = self.moved_px.shape[2]
-        total = self.moved_px.reshape(-1, size).T @ held.reshape(-1, size)
-        return total, (slope[:, None] @ self.moved_px)[:, 0]
+        return slope, curvature.reshape(self.levels, count, 2, 2).sum(axis=0)
 
 
-def _blurred(correlations: Array, blur_px: float) -> Array:
+@lru_cache(maxsize=8)
+def _drawn(count: int) -> Array:
+    """Random numbers (SAMPLES, count) whose least ones choose with the chances that are subtracted
+    as logarithms. Shared: not to be written to."""
+    made = -np.random.default_rng(0).gumbel(size=(SAMPLES, count))
+    made.flags.writeable = False
+    return made
+
+
+@lru_cache(maxsize=32)
+def _gaussian(side: int, blur_px: float) -> Array | None:
+    """Blur (side, side) along one axis, None: none. Shared: not to be written to."""
     if blur_px == 0:
-        return correlations
-    at = np.arange(correlations.shape[1])
+        return None
+    at = np.arange(side)
     kernel = np.exp(-((at[:, None] - at) ** 2) / (2 * blur_px**2))
     kernel /= kernel.sum(axis=1, keepdims=True)
-    return np.asarray(kernel @ correlations @ kernel.T)
+    kernel.flags.writeable = False
+    return kernel
 
 
 def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
     """Values (N,), slopes (N, 2), curvatures (N, 2, 2) >= 0 of surfaces (N, S, S) at (N, 2) x, y.
 
     By the quadratic through the pixels around; 0 beyond the surface."""
-    if KERNEL is not None:
-        out = np.empty((len(surfaces), 7))
-        KERNEL.bend(surfaces, moved_px, out)
-        return out[:, 0], out[:, 1:3], out[:, 3:].reshape(-1, 2, 2)
     reach = surfaces.shape[1] // 2
     inside = (np.abs(moved_px) <= reach).all(axis=1)
     held = np.clip(moved_px, 1 - reach, reach - 1)
@@ -353,8 +376,11 @@ def _values(surfaces: Array, moved_px: Array) -> Array:
     """Of surfaces (N, S, S) at the pixel nearest to displacements (.., N, 2), else 0."""
     reach = surfaces.shape[-1] // 2
     nearest = np.rint(np.minimum(np.maximum(moved_px, -reach), reach)).astype(int) + reach
-    values = surfaces[np.arange(len(surfaces)), nearest[..., 1], nearest[..., 0]]
-    return np.asarray(values * (np.abs(moved_px) <= reach).all(axis=-1))
+    count, side = surfaces.shape[:2]
+    values = surfaces.take((np.arange(count) * side + nearest[..., 1]) * side + nearest[..., 0])
+    beyond = np.abs(moved_px) > reach
+    values[beyond[..., 0] | beyond[..., 1]] = 0.0
+    return np.asarray(values)
 
 
 def _positive(matrices: Array) -> Array:

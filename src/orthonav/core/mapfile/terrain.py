@@ -1,6 +1,7 @@
 """The terrain layer of a map (`docs/map-format.md`); untrusted, so every length is checked."""
 
 import zlib
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,7 @@ from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
 from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
 
 CACHE_BYTES = 16 * 2**20  # 400 km2 at 10 m
+FEW_CHUNKS, FEW_SAMPLES = 4, 2**18  # that are read as one part, as those under a view
 _MAX_BYTES_PER_SAMPLE = 4
 _CHUNK_HEADER_BYTES = 1024
 Array = NDArray[np.float64]
@@ -52,19 +54,46 @@ class TerrainLayer:
         info, points = self.info, np.asarray(points_en_m, np.float64)
         col = (points[..., 0] - info.west_m) / info.posting_m - 0.5
         row = (info.north_m - points[..., 1]) / info.posting_m - 0.5
-        return bilinear(self._samples, (info.rows, info.cols), col, row)
+        part = self._part(col, row) if col.size else None
+        if part is None:
+            return bilinear(self._samples, (info.rows, info.cols), col, row)
+        heights, top, left = part
+        return bilinear(
+            lambda rows, cols: heights[rows - top, cols - left], (info.rows, info.cols), col, row
+        )
+
+    def _part(self, col: Array, row: Array) -> tuple[Array, int, int] | None:
+        """Samples around places, the first row and column of these; None where they are many."""
+        info, side = self.info, self.info.chunk_px
+        firsts, ends = [], []
+        for at, count in ((row, info.rows), (col, info.cols)):
+            low, high = (min(max(float(end), 0.0), count - 1.0) for end in (at.min(), at.max()))
+            if not low <= high:  # not numbers
+                return None
+            firsts.append(int(low))
+            ends.append(min(int(high) + 2, count))
+        (top, left), (bottom, right) = firsts, ends
+        chunk_rows, chunk_cols = (
+            range(first // side, (end - 1) // side + 1)
+            for first, end in zip(firsts, ends, strict=True)
+        )
+        samples, chunks = (bottom - top) * (right - left), len(chunk_rows) * len(chunk_cols)
+        if samples > FEW_SAMPLES or chunks > FEW_CHUNKS:
+            return None
+        part = np.full((bottom - top, right - left), np.nan)
+        for chunk_row, chunk_col in product(chunk_rows, chunk_cols):
+            heights = self._chunk(chunk_row, chunk_col)
+            if heights is not None:
+                row_0, col_0 = chunk_row * side, chunk_col * side
+                here = heights[max(top - row_0, 0) :, max(left - col_0, 0) :]
+                into = part[max(row_0 - top, 0) :, max(col_0 - left, 0) :]
+                rows, cols = (min(sides) for sides in zip(here.shape, into.shape, strict=True))
+                into[:rows, :cols] = here[:rows, :cols]
+        return part, top, left
 
     def _samples(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Array:
         side = self.info.chunk_px
-        if not rows.size:
-            return np.empty(rows.shape)
         chunk_rows, chunk_cols = rows // side, cols // side
-        first = int(chunk_rows.min()), int(chunk_cols.min())
-        if first == (int(chunk_rows.max()), int(chunk_cols.max())):
-            heights = self._chunk(*first)
-            if heights is None:
-                return np.full(rows.shape, np.nan)
-            return heights[rows % side, cols % side].astype(np.float64)
         found = np.full(rows.shape, np.nan)
         across = int(chunk_cols.max(initial=0)) + 1
         for key in np.unique(chunk_rows * across + chunk_cols).tolist():

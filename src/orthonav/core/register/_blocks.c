@@ -2,7 +2,7 @@
  *
  * The map is sampled once, in planes, with a margin; then each block is multiplied with it under all
  * moves, eight pixels at a time. Rows of a block are filled up to whole vectors with zeros. `bend` is
- * the quadratic of orthonav.core.localize.resection through these correlations. */
+ * `_pulls` of orthonav.core.localize.resection, by quadratics through these correlations. */
 
 #include "_kernel.h"
 
@@ -291,6 +291,9 @@ free_made:
 }
 
 #define BENT 7          /* value, slopes by x and y, curvatures (2, 2) */
+#define PULLS 6         /* slopes and curvatures */
+#define WIDEST 64       /* surface that is blurred */
+#define MOST_ODDS 30.0
 
 /* As `_positive` of orthonav.core.localize.resection. */
 static void make_positive(double along, double across, double down, double out[4]) {
@@ -301,17 +304,43 @@ static void make_positive(double along, double across, double down, double out[4
     out[1] = out[2] = scale * across;
 }
 
-/* As `_quadratic` of orthonav.core.localize.resection, of one surface. */
-static void bend(const double *surface, int side, double x, double y, double out[BENT]) {
+/* The nine numbers around (row, col) of a surface, blurred along both axes. */
+INLINE void blur_around_inline(const double *surface, const double *blur, int side, int row, int col,
+                               double *out) {
+    double line[WIDEST];
+    for (int i = -1; i <= 1; i++, out += 3) {
+        const double *const down = blur + side * (row + i);
+        for (int x = 0; x < side; x++) line[x] = 0.0;
+        for (int y = 0; y < side; y++)
+            for (int x = 0; x < side; x++) line[x] += down[y] * surface[side * y + x];
+        for (int j = -1; j <= 1; j++) {
+            const double *const across = blur + side * (col + j);
+            double total = 0.0;
+            for (int x = 0; x < side; x++) total += across[x] * line[x];
+            out[j + 1] = total;
+        }
+    }
+}
+
+FOR_EVERY_PROCESSOR(blur_around,
+                    (const double *surface, const double *blur, int side, int row, int col, double *out),
+                    (surface, blur, side, row, col, out))
+
+/* As `_quadratic` of orthonav.core.localize.resection, of one surface, blurred unless `blur` is NULL. */
+static void bend(const double *surface, const double *blur, int side, double x, double y,
+                 double out[BENT]) {
     const int reach = side / 2;
+    double around[9];
     memset(out, 0, sizeof(double) * BENT);
     if (!(fabs(x) <= reach && fabs(y) <= reach)) return;
     const double right = rint(fmin(fmax(x, 1 - reach), reach - 1));
     const double below = rint(fmin(fmax(y, 1 - reach), reach - 1));
-    const double *const at = surface + side * ((int)below + reach) + (int)right + reach;
-    const double by_x = (at[1] - at[-1]) / 2, by_y = (at[side] - at[-side]) / 2;
-    const double along = 2 * at[0] - at[1] - at[-1], down = 2 * at[0] - at[side] - at[-side];
-    const double across = (at[1 - side] + at[side - 1] - at[side + 1] - at[-side - 1]) / 4;
+    const int row = (int)below + reach, col = (int)right + reach, step = blur ? 3 : side;
+    if (blur) blur_around(surface, blur, side, row, col, around);
+    const double *const at = blur ? around + 4 : surface + side * row + col;
+    const double by_x = (at[1] - at[-1]) / 2, by_y = (at[step] - at[-step]) / 2;
+    const double along = 2 * at[0] - at[1] - at[-1], down = 2 * at[0] - at[step] - at[-step];
+    const double across = (at[1 - step] + at[step - 1] - at[step + 1] - at[-step - 1]) / 4;
     const double off_x = x - right, off_y = y - below; /* at most 1 */
     const double bent_x = along * off_x + across * off_y, bent_y = across * off_x + down * off_y;
     out[0] = at[0] + (by_x - bent_x / 2) * off_x + (by_y - bent_y / 2) * off_y;
@@ -319,27 +348,74 @@ static void bend(const double *surface, int side, double x, double y, double out
     make_positive(along, across, down, out + 3);
 }
 
+/* Limits of the mean correlation of a right block, and pixels per independent number. */
+typedef struct {
+    double least, most, numbers;
+} odds_t;
+
+/* Add to `out` (count, PULLS) what `_pulls` of orthonav.core.localize.resection says of one level, by
+ * its blocks' quadratics (count, BENT). */
+static void add_level(const double *bent, const double *pixels, const double *units, Py_ssize_t count,
+                      const odds_t *limits, double *out) {
+    double weighted = 0.0, counted = 0.0;
+    for (Py_ssize_t i = 0; i < count; i++)
+        weighted += bent[BENT * i] * pixels[i], counted += pixels[i];
+    const double usual = fmin(fmax(weighted / fmax(counted, 1.0), limits->least), limits->most);
+    const double share = usual / (1 - usual * usual) / limits->numbers;
+    for (Py_ssize_t i = 0; i < count; i++, bent += BENT, out += PULLS) {
+        const double odds = share * pixels[i] * (bent[0] - usual / 2);
+        const double held = fmin(fmax(odds, -MOST_ODDS), MOST_ODDS);
+        const double weight = share * pixels[i] / (1 + exp(-held)) / units[i];
+        for (int j = 0; j < 2; j++) out[j] += weight * bent[1 + j];
+        for (int j = 2; j < PULLS; j++) out[j] += weight / units[i] * bent[1 + j];
+    }
+}
+
 PyObject *py_bend(PyObject *self, PyObject *arguments) {
-    PyObject *from[3];
-    Py_buffer surfaces, moved, out;
+    PyObject *from[6];
+    Py_buffer surfaces, blur, moved, pixels, units, out;
+    odds_t limits;
     (void)self;
-    if (!PyArg_ParseTuple(arguments, "OOO", &from[0], &from[1], &from[2])) return NULL;
+    if (!PyArg_ParseTuple(arguments, "OOOOO(ddd)O", &from[0], &from[1], &from[2], &from[3], &from[4],
+                          &limits.least, &limits.most, &limits.numbers, &from[5]))
+        return NULL;
     if (borrow(from[0], &surfaces, 3, ANY, 'd', 0) < 0) return NULL;
-    if (borrow(from[1], &moved, 2, 2, 'd', 0) < 0) goto free_surfaces;
-    if (borrow(from[2], &out, 2, BENT, 'd', PyBUF_WRITABLE) < 0) goto free_moved;
     const Py_ssize_t count = surfaces.shape[0], side = surfaces.shape[1];
+    const int is_blurred = from[1] != Py_None;
+    if (is_blurred && borrow(from[1], &blur, 2, side, 'd', 0) < 0) goto free_surfaces;
+    if (borrow(from[2], &moved, 2, 2, 'd', 0) < 0) goto free_blur;
+    if (borrow(from[3], &pixels, 1, count, 'd', 0) < 0) goto free_moved;
+    if (borrow(from[4], &units, 1, count, 'd', 0) < 0) goto free_pixels;
+    if (borrow(from[5], &out, 2, PULLS, 'd', PyBUF_WRITABLE) < 0) goto free_units;
+    const Py_ssize_t blocks = out.shape[0];
     if (!is_whole(&surfaces) || !is_whole(&moved) || !is_whole(&out) || side != surfaces.shape[2] ||
-        side < 3 || side > LARGEST || side % 2 == 0 || moved.shape[0] != count || out.shape[0] != count)
+        side < 3 || side > WIDEST || side % 2 == 0 || moved.shape[0] != count ||
+        (is_blurred && (!is_whole(&blur) || blur.shape[0] != side)) || blocks < 1 || count % blocks)
         PyErr_SetString(PyExc_ValueError, "surfaces, places and results do not match");
-    else
-        for (Py_ssize_t i = 0; i < count; i++) {
-            const double *const at = (const double *)moved.buf + 2 * i;
-            bend((const double *)surfaces.buf + side * side * i, (int)side, at[0], at[1],
-                 (double *)out.buf + BENT * i);
+    else {
+        double *const bent = malloc(sizeof(double) * BENT * (size_t)blocks);
+        if (bent) memset(out.buf, 0, sizeof(double) * PULLS * (size_t)blocks);
+        else PyErr_NoMemory();
+        for (Py_ssize_t first = 0; bent && first < count; first += blocks) {
+            for (Py_ssize_t i = 0; i < blocks; i++) {
+                const double *const at = (const double *)moved.buf + 2 * (first + i);
+                bend((const double *)surfaces.buf + side * side * (first + i),
+                     is_blurred ? blur.buf : NULL, (int)side, at[0], at[1], bent + BENT * i);
+            }
+            add_level(bent, (const double *)pixels.buf + first, (const double *)units.buf + first,
+                      blocks, &limits, out.buf);
         }
+        free(bent);
+    }
     PyBuffer_Release(&out);
+free_units:
+    PyBuffer_Release(&units);
+free_pixels:
+    PyBuffer_Release(&pixels);
 free_moved:
     PyBuffer_Release(&moved);
+free_blur:
+    if (is_blurred) PyBuffer_Release(&blur);
 free_surfaces:
     PyBuffer_Release(&surfaces);
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);

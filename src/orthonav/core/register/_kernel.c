@@ -17,7 +17,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define LAYOUT 6        /* of all arguments and results; kernel.py has the same number */
+#define LAYOUT 7        /* of all arguments and results; kernel.py has the same number */
 #define FULLY_VALID 0.99f
 #define OUTPUTS (22 + BLOCKS * BLOCKS)
 #define PER_BLOCK (2 * 4 * 4)
@@ -606,7 +606,7 @@ static PyMethodDef functions[] = {
     {"rectify", py_rectify, METH_VARARGS,
      "rectify(picture, nodes, grey, valid): see orthonav.core.localize.rectify."},
     {"bend", py_bend, METH_VARARGS,
-     "bend(surfaces, places, out): see orthonav.core.localize.resection."},
+     "bend(surfaces, blur, places, pixels, units, limits, out): see orthonav.core.localize.resection."},
     {"search", py_search, METH_VARARGS,
      "search(spectra, view, weights, poses, first, best, which, expected): see "
      "orthonav.core.register.search."},

@@ -5,7 +5,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-LAYOUT = 6  # of arguments and results; a kernel with another one is not used
+LAYOUT = 7  # of arguments and results; a kernel with another one is not used
 _NAME = "orthonav.core.register._kernel"
 log = logging.getLogger(__name__)
 
