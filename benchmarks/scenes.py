@@ -2,8 +2,8 @@
 
 Real imagery is optional: it is looked for beside the checkout (`../shared/data`), or in the folder
 that ORTHONAV_DATA names. Orthophotos are named by their file below it, generated ones by
-`generated:SEED:DATE`. Maps, generated areas and flights stay in a folder of work: use another one
-after the code that makes them has changed.
+`generated:SEED:DATE`, or `generated:SEED:GSD:DATE` at another scale than 1 m. Maps, generated areas
+and flights stay in a folder of work: use another one after the code that makes them has changed.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ DATA = Path(os.environ.get("ORTHONAV_DATA", BESIDE))
 """Folder of the optional real imagery."""
 FAR_M, FAR_PX = 35.0, 10.0
 """A position is wrong beyond both."""
-SIDE_M = 2000
+SIDE_PX = 2000
 PAST, PRESENT, OTHER = (date.name for date in DEFAULT_DATES)
 TILT_STD_DEG = 1.0
 """Of the mount and of the horizon, in pitch and in roll, unreported."""
@@ -45,7 +45,7 @@ WIDE = Errors(yaw_std_deg=10.0, agl_std=0.1)
 class Scene:
     """One place at several dates.
 
-    - `name`, `folder`: name, and folder below `DATA`, or `generated:SEED`.
+    - `name`, `folder`: name, and folder below `DATA`, or `generated:SEED` or `generated:SEED:GSD`.
     - `gsd_m`: metres per pixel, nominal.
     - `dates`: names of the orthophotos, in order.
     """
@@ -164,14 +164,22 @@ def is_there(*names: str) -> bool:
 
 
 def ortho(name: str, work: Path) -> Path:
-    """The orthophoto of a name; generated ones, 2 x 2 km at 1 m, lie in `work`."""
+    """The orthophoto of a name; generated ones, of 2000 x 2000 px, lie in `work`."""
     if not _generated(name):
         return DATA / name
-    _, seed, date = name.split(":")
-    return area(work, date, seed=int(seed))
+    seed, gsd_m, date = generated(name)
+    return area(work, date, side_m=round(SIDE_PX * gsd_m), gsd_m=gsd_m, seed=seed)
 
 
-def area(work: Path, date: str, *, side_m: int = SIDE_M, gsd_m: float = 1.0, seed: int = 1) -> Path:
+def generated(name: str) -> tuple[int, float, str]:
+    """Seed, metres per pixel and date of a generated orthophoto's name."""
+    _, seed, *gsd, date = name.split(":")
+    return int(seed), float(gsd[0]) if gsd else 1.0, date
+
+
+def area(
+    work: Path, date: str, *, side_m: int = SIDE_PX, gsd_m: float = 1.0, seed: int = 1
+) -> Path:
     """A generated orthophoto of a square."""
     folder = work / f"area-{seed}-{side_m}m-{gsd_m:g}m"
     path = folder / f"{date}.tif"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
 from benchmarks.real_ground.mapping import strip_ortho
-from benchmarks.scenes import DATA, SIDE_M, ortho
+from benchmarks.scenes import DATA, SIDE_PX, generated, ortho
 from orthonav.core.files import replacing
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
@@ -165,13 +165,14 @@ def written(out: Path, heights: Heights, transform: Any, crs: Any) -> Path:
 
 def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
     """Heights under generated imagery: `BARE`, or the `SURFACE` of the date of the name."""
-    _, seed, date = name.split(":")
-    folder = work / f"area-{seed}-{SIDE_M}m-1m-hills{slope:g}"
+    seed, gsd_m, date = generated(name)
+    side_m = SIDE_PX * gsd_m
+    folder = work / f"area-{seed}-{side_m:g}m-{gsd_m:g}m-hills{slope:g}"
     path = folder / ("dem.tif" if kind == BARE else f"{date}_dsm.tif")
     if not path.is_file():
         dates = [each for each in DEFAULT_DATES if each.name == date]
-        size_m = (float(SIDE_M), float(SIDE_M))
-        generate_heights(folder, slope=slope / 100, size_m=size_m, dates=dates, seed=int(seed))
+        area = {"size_m": (side_m, side_m), "gsd_m": gsd_m, "seed": seed}
+        generate_heights(folder, slope=slope / 100, dates=dates, **area)
     return path
 
 

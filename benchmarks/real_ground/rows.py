@@ -1,7 +1,7 @@
 """The rows: which views on which map, single or tracked."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from benchmarks.real_ground.maps import (
 )
 from benchmarks.real_ground.score import Row, placed
 from benchmarks.real_ground.views import OverLevel, OverRelief, Recording, Replay
-from benchmarks.scenes import DATA, PAST, PRESENT, SCENES, Pair, leave_one_out_pairs
+from benchmarks.scenes import DATA, PAST, PRESENT, SCENES, Pair, Scene, leave_one_out_pairs
 from orthonav.cli.demo import IMAGERY
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.run import Locator, SingleViews
@@ -37,6 +37,9 @@ SUBURB_GSD_M = 0.52
 SUBURB = ("2020_03", "2009_04"), ("2001_09", "2015_04")
 SLOPES = (2.0, 5.0, 10.0)
 LAND = {2.0: "level", 5.0: "rolling", 10.0: "hills"}
+TILTS = (0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)
+"""Standard deviations of the true pitch and roll, and as stated, degrees."""
+ROOFS_GSD_M, ROOFS_SEEDS = 0.2, (1, 11, 25)  # of generated towns
 
 
 AnySource = OverRelief | OverLevel | Recording | Replay | Windows
@@ -152,10 +155,15 @@ def _farmland() -> list[Pair]:
 
 
 def _rendered(
-    name: str, part: str, pairs: list[Pair], slope: float, nominal: bool = False
+    name: str,
+    part: str,
+    pairs: list[Pair],
+    slope: float,
+    nominal: bool = False,
+    tilts: Iterable[tuple[float, float | None]] = TILTS,
 ) -> Iterator[Question]:
     """Rows over one relief: true and stated tilt, and what the map knows of the ground."""
-    for tilt, stated in ((0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)):
+    for tilt, stated in tilts:
         told = "" if stated is None else f" stated {stated:g}"
         maps = [dict(_grounds(pair.map, slope)) for pair in pairs]
         for ground in maps[0]:
@@ -173,6 +181,12 @@ def _relief() -> Iterator[Question]:
     yield from _rendered("naip", "relief", [SCENES["naip"].pair("20090818", "20180716")], 5.0)
     lab = SCENES["generated_31"].pair(PAST, PRESENT)
     yield from _rendered("houses and trees", "houses", [lab], 5.0)
+    fine = [
+        Scene(f"roofs_{seed}", f"generated:{seed}:{ROOFS_GSD_M}", ROOFS_GSD_M, (PAST, PRESENT))
+        for seed in ROOFS_SEEDS
+    ]
+    roofs = [each.pair(PAST, PRESENT) for each in fine]
+    yield from _rendered("roofs at 0.2 m", "houses", roofs, 2.0, tilts=[(0.0, 0.0), (0.0, None)])
 
 
 def _known() -> Iterator[Question]:

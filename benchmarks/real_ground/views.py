@@ -1,6 +1,5 @@
 """Where the views of a row come from: rendered over relief, of flat ground, or recorded."""
 
-import argparse
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,10 +14,10 @@ from numpy.typing import NDArray
 
 from benchmarks.closed_loop.replays import OFF, ON, Area, Recorded, plain, stated
 from benchmarks.judged_views import is_covered
+from benchmarks.placing import views_in
 from benchmarks.real_ground.maps import BARE, SURFACE, found, landscape_heights, relief_file
 from benchmarks.real_ground.score import Seen
-from benchmarks.scenes import DATA, Pair, root_agl_of
-from benchmarks.unreported_tilt import Flown, level_telemetry, tilted_views
+from benchmarks.scenes import DATA, Pair, flight, root_agl_of
 from orthonav.core.files import replacing
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import FOV_STD, Camera
@@ -26,10 +25,12 @@ from orthonav.core.localize import Localizer
 from orthonav.core.records import Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
-from orthonav.ground.simulate.flight import DEFAULT_CAMERA
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors
 from orthonav.ground.simulate.render import Raster, ViewEffects, degraded
 
 SEED, WIDTH_PX = 1, 256
+YAW_STD_DEG, AGL_STD = 10.0, 0.1
+"""Errors of heading and height, which are reported."""
 MIDDLE_STD, BARREL = 0.01, 0.05
 """Errors of a nominal lens beside that of its focal length (`FOV_STD`): standard deviation of the
 principal point as a share of the width, and the largest k1."""
@@ -164,7 +165,7 @@ class OverRelief:
 
 @dataclass(frozen=True)
 class OverLevel:
-    """Views of flat ground whose true tilt is not reported, as of `unreported_tilt`."""
+    """Views of flat ground, true and reported tilt as of `OverRelief`."""
 
     pair: Pair
     tilt_std_deg: float
@@ -175,22 +176,38 @@ class OverLevel:
         return f"level-{self.pair.name}-{self.tilt_std_deg:g}"
 
     def prepare(self, work: Path, base: Localizer, views: int) -> None:
-        next(self._flown(work, base, views))
+        """Fly the flight."""
+        self._flight(work, base, views)
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
-        for each in self._flown(work, base, views):
-            lat, lon = base.sheet.frame.latlon_from_en(each.camera_en_m)
-            reported = replace(each.view.telemetry, tilt_std_deg=self.stated_deg)
-            yield Seen(
-                replace(each.view, telemetry=reported), (float(lat), float(lon)), each.true.agl_m
-            )
+        assert base.registration is not None
+        for number, each in enumerate(views_in(self._flight(work, base, views))):
+            place, true = each.truth_latlon_deg, each.view.telemetry
+            if is_covered(base.registration, place, WIDTH_PX):
+                level = level_telemetry(true, np.random.default_rng([SEED, number]))
+                reported = replace(level, tilt_std_deg=self.stated_deg)
+                yield Seen(replace(each.view, telemetry=reported), place, true.agl_m)
 
-    def _flown(self, work: Path, base: Localizer, views: int) -> Iterator[Flown]:
-        pair = self.pair
-        if pair.views.startswith("scaled:"):
-            pair = replace(pair, views=str(found(pair.views, work)))
-        options = argparse.Namespace(work=work, seed=SEED)
-        return tilted_views(pair, WIDTH_PX, self.tilt_std_deg, base, views, options)
+    def _flight(self, work: Path, base: Localizer, views: int) -> Path:
+        path = found(self.pair.views, work)
+        errors = Errors(attitude_std_deg=self.tilt_std_deg)
+        agl_m = root_agl_of(WIDTH_PX, base.grid.gsd_m)
+        return flight(path, work, views=views, errors=errors, seed=SEED, agl_m=agl_m)
+
+
+def level_telemetry(true: Telemetry, rng: np.random.Generator) -> Telemetry:
+    """Telemetry that reports a level camera, with errors of heading and height."""
+    turn, log = rng.normal(0, 1, 2)
+    return replace(
+        true,
+        yaw_deg=(true.yaw_deg + float(turn) * YAW_STD_DEG) % 360,
+        pitch_deg=0.0,
+        roll_deg=0.0,
+        agl_m=true.agl_m * max(0.5, 1 + float(log) * AGL_STD),
+        yaw_std_deg=YAW_STD_DEG,
+        agl_std_m=AGL_STD * true.agl_m,
+        tilt_std_deg=None,
+    )
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,13 @@ import pytest
 from benchmarks.real_ground import gate
 from benchmarks.real_ground.maps import COARSE_STD_M, coarse_of, fractal_relief
 from benchmarks.real_ground.score import Row, Seen, compared
+from benchmarks.real_ground.views import level_telemetry
+from benchmarks.scenes import root_agl_of
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, Telemetry, View
+from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 
 KEPT = {"valley": {"views": 20, "median_m": 4.0, "of_right": 0.9, "exceeded": 1}}
 FOUND = {"valley": {"median_m": 4.0, "of_right": 0.9, "exceeded": 1, "nees": 2.0}}
@@ -92,3 +95,16 @@ def test_the_error_of_the_truth_is_part_of_the_nees():
     assert exact[0].nees == pytest.approx(25.0, rel=1e-3)
     assert doubtful[0].nees == pytest.approx(5.0, rel=1e-3)
     assert Row(exact, [5.0]).values()["median_m"] == pytest.approx(10.0, rel=1e-3)
+
+
+def test_the_telemetry_says_nothing_of_the_tilt():
+    true = Telemetry(0, 30.0, 4.0, -3.0, 250.0)
+    reported = level_telemetry(true, np.random.default_rng(1))
+    assert (reported.pitch_deg, reported.roll_deg, reported.tilt_std_deg) == (0.0, 0.0, None)
+    assert reported.yaw_std_deg == 10.0 and reported.agl_std_m == pytest.approx(25.0)
+    assert reported.yaw_deg != true.yaw_deg and reported.agl_m != true.agl_m
+
+
+def test_the_height_gives_the_width():
+    width, height = (root_agl_of(256, 1.5) * each for each in DEFAULT_CAMERA.extent)
+    assert width * height == pytest.approx((256 * 1.5) ** 2)
