@@ -2,7 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -171,8 +171,8 @@ def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
     path = folder / ("dem.tif" if kind == BARE else f"{date}_dsm.tif")
     if not path.is_file():
         dates = [each for each in DEFAULT_DATES if each.name == date]
-        area = {"size_m": (side_m, side_m), "gsd_m": gsd_m, "seed": seed}
-        generate_heights(folder, slope=slope / 100, dates=dates, **area)
+        area = partial(generate_heights, size_m=(side_m, side_m), gsd_m=gsd_m, seed=seed)
+        area(folder, slope=slope / 100, dates=dates)
     return path
 
 
