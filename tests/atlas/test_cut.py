@@ -27,7 +27,14 @@ from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
-from orthonav.ground.atlas.cut import Warp, _relief, check_shown, cut_in_memory, cut_map
+from orthonav.ground.atlas.cut import (
+    Warp,
+    _relief,
+    _roughness_m,
+    check_shown,
+    cut_in_memory,
+    cut_map,
+)
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -148,6 +155,15 @@ def test_terrain_is_that_of_the_sheets(cut, middle):
     points = np.random.default_rng(0).uniform(-150, 150, (300, 2))
     found = layer(*middle.latlon_from_en(points))
     np.testing.assert_allclose(found, ground(*points.T), atol=0.2)  # two times rounded
+
+
+def test_terrain_is_a_surface_model_only_where_all_of_it_is_one(cut):
+    info = TerrainLayer.of(cut).info
+
+    def least(*roughness_m):
+        return _roughness_m([replace(info, roughness_m=each) for each in roughness_m])
+
+    assert (least(3.0, 2.0), least(3.0, None), least(None)) == (2.0, None, None)
 
 
 def test_relief_is_the_steepest_of_the_sheets():

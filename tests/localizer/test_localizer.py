@@ -191,6 +191,15 @@ def test_pictures_that_make_no_fix(localizer, grey, reason):
     assert isinstance(outcome, NoFix) and outcome.reason == reason
 
 
+def test_a_picture_that_is_turned_in_memory_is_one_like_any_other(views, flight, localizer, good):
+    """As of a camera mounted upside down: `image[::-1, ::-1]` is no copy."""
+    grey, telemetry = views[good]
+    grey = cv2.resize(grey, None, fx=4, fy=4)
+    turned = np.ascontiguousarray(grey[::-1, ::-1])[::-1, ::-1]
+    one, other = (localizer.locate(View(each, flight.camera, telemetry)) for each in (grey, turned))
+    assert (one.lat_deg, one.lon_deg) == (other.lat_deg, other.lon_deg)
+
+
 @pytest.mark.parametrize("shape", [(240, 300), (320, 240), (480, 320)])
 def test_a_camera_of_another_aspect_ratio_is_an_error(flight, shape):
     telemetry = Telemetry(0, 0.0, 0.0, 0.0, 300.0)

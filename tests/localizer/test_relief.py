@@ -160,6 +160,20 @@ def test_holes_are_not_compared(opened, grey, relief):
     assert (fix.lat_deg, fix.lon_deg) == (level.lat_deg, level.lon_deg)
 
 
+def test_the_camera_over_a_hole_of_the_terrain_is_found(opened, grey, relief):
+    """Its height is that above the ground in the picture."""
+    picture, _ = seen_from(grey, relief)
+    row, col = (
+        round((SIDE_M / 2 - PLACE[1]) / POSTING_M),
+        round((PLACE[0] + SIDE_M / 2) / POSTING_M),
+    )
+    holed = replace(relief, values=relief.values.copy())
+    holed.values[row - 1 : row + 2, col - 1 : col + 2] = np.nan
+    fix = (localizer := on_terrain(opened, holed)).locate(View(picture, CAMERA, telemetry()))
+    assert isinstance(fix, Fix) and fix.pose_cov is not None
+    assert error_m(localizer, fix, PLACE) < 10
+
+
 def test_level_ground_is_as_without_a_terrain(opened):
     """Views of a map whose terrain is level are placed as on a map without one; there the picture
     says less of pitch and roll."""

@@ -15,6 +15,7 @@ from orthonav.core.localize.systematic import (
     COARSE_STD_M,
     OBJECTS_M,
     SURFACE_M,
+    UNDULATION_M,
     GroundErrors,
     field_modes,
     lens_px,
@@ -61,7 +62,7 @@ def explained(moves, by_camera):
 
 
 def test_a_slope_of_the_ground_displaces_as_a_tilt_of_the_camera():
-    by_camera, found = displaced(GroundErrors(math.tan(math.radians(1.0)), ()))
+    by_camera, found = displaced(GroundErrors(math.tan(math.radians(1.0)), (OBJECTS_M,)))
     for axis in range(2):
         assert explained(found.moves_px[:, :, axis], by_camera) > 0.999
     # By the same angle: both displace the corners alike, but for a shift and a scale.
@@ -94,7 +95,7 @@ def test_a_nominal_lens_adds_errors_of_its_own():
 def test_fields_have_their_covariance_averaged_over_blocks():
     """Against the mean of a finely sampled field over each block."""
     std, length = 2.0, 25.0
-    modes = field_modes(places(), ((std, length),), BLOCK_M)
+    modes = field_modes(places(), (std, length), BLOCK_M)
     at = (np.arange(7) - 3) * BLOCK_M / 7
     fine = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
     points = places()[[0, 1, 7, 35]][:, None] + fine
@@ -102,6 +103,21 @@ def test_fields_have_their_covariance_averaged_over_blocks():
     expected = std**2 * np.exp(-squares / (2 * length**2)).mean(axis=(2, 3))
     found = (modes @ modes.T)[np.ix_([0, 1, 7, 35], [0, 1, 7, 35])]
     np.testing.assert_allclose(found, expected, atol=0.05 * std**2)
+
+
+def test_a_field_longer_than_the_view_keeps_its_slope():
+    std, length = 6.0, 150.0
+    near = places() / 4  # a view 45 m wide
+    modes = field_modes(near, (std, length), BLOCK_M / 4)
+    plane, *_ = np.linalg.lstsq(np.column_stack([near, np.ones(36)]), modes, rcond=None)
+    np.testing.assert_allclose(np.hypot.reduce(plane[:2], axis=1), std / length, rtol=0.15)
+
+
+def test_terrain_houses_and_dates_have_variances_of_their_own():
+    _, found = displaced(GroundErrors(0.0, ((6.0, 150.0), OBJECTS_M)))
+    terrain, objects, stretch = (each.at for each in found.components)
+    assert (terrain.start, terrain.stop, objects.stop) == (0, objects.start, stretch.start)
+    assert stretch.stop == found.moves_px.shape[2]
 
 
 @pytest.mark.parametrize("relief, slope", [("level", 0.01), (None, 0.05), ("hills", 0.12)])
@@ -122,7 +138,20 @@ def test_errors_of_terrain_follow_its_source():
     assert terrain_errors(None, SLOPES) == terrain_errors(coarse, SLOPES)
     older = replace(bare, source_posting_m=None, roughness_m=None, posting_m=10.0)
     assert terrain_errors(older, 10 * SLOPES).fields[0][0] == pytest.approx(COARSE_STD_M / 3)
-    assert terrain_errors(coarse, np.full((36, 2), np.nan)).fields[0][0] == BARE_EARTH_M[0]
+    half = np.where(np.arange(36)[:, None] < 18, np.nan, SLOPES)
+    assert terrain_errors(coarse, half).fields == terrain_errors(coarse, SLOPES).fields
+    assert terrain_errors(coarse, np.full((36, 2), np.nan)).fields[0][0] == COARSE_STD_M
+
+
+@pytest.mark.parametrize("posting_m", [90.0, 250.0])
+def test_a_coarser_terrain_is_not_believed_more(posting_m):
+    """The slope of its error stays, and it leaves out undulation."""
+    info = replace(SURFACE, roughness_m=None, source_posting_m=30.0)
+    (fine_m, fine_length_m), _ = terrain_errors(info, 10 * SLOPES).fields
+    coarse = replace(info, source_posting_m=posting_m)
+    (std_m, length_m), undulation, _ = terrain_errors(coarse, 10 * SLOPES).fields
+    assert std_m / length_m == pytest.approx(fine_m / fine_length_m) and std_m > fine_m
+    assert undulation[1] == UNDULATION_M[1] and 0 < undulation[0] <= std_m
 
 
 def test_derivatives_of_points_on_a_slope_are_those_of_lines_of_sight():

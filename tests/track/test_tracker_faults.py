@@ -227,6 +227,11 @@ def test_what_is_not_finite_is_unknown(name, value):
     assert Telemetry(0, math.nan, 2.0, 3.0, 100.0).missing() == ["yaw_deg"]
 
 
+@pytest.mark.parametrize("name", [each for each in UNKNOWN if "_std_" in each])
+def test_a_negative_deviation_is_unknown_not_exact(name):
+    assert getattr(Telemetry(0, 1.0, 2.0, 3.0, 100.0, **{name: -1.0}), name) is None
+
+
 def test_every_optional_field_is_covered():
     optional = [name for name in Telemetry.__slots__ if name in UNKNOWN]
     assert len(optional) == len(UNKNOWN) == len(Telemetry.__slots__) - 5

@@ -92,7 +92,8 @@ class Telemetry:
             "below": () if below is None else (below.height_m, below.std_m, below.known),
         }
         for name, values in optional.items():
-            if not all(value is None or math.isfinite(value) for value in values):
+            is_std, known = "_std_" in name, [each for each in values if each is not None]
+            if not all(math.isfinite(each) and not (is_std and each < 0) for each in known):
                 object.__setattr__(self, name, None)
 
     @property
@@ -129,7 +130,7 @@ class View:
     telemetry: Telemetry
 
     def __post_init__(self) -> None:
-        grey = grey_levels(self.grey)
+        grey = np.ascontiguousarray(grey_levels(self.grey))  # a flipped picture is a view of it
         object.__setattr__(self, "grey", grey)
         object.__setattr__(self, "camera", self.camera.fitted(grey.shape[1], grey.shape[0]))
 

@@ -117,10 +117,10 @@ class GroundHeights:
 
     def mismatch_m(self, telemetry: Telemetry) -> float:
         """Height above sea by take-off and terrain, minus the reported one; NaN where unknown."""
-        known = self.datum_known and self.take_off is not None
-        if not known or telemetry.home_m is None or telemetry.amsl_m is None:
+        if not self.datum_known or self.take_off is None:
             return math.nan
-        assert self.take_off is not None
+        if telemetry.home_m is None or telemetry.amsl_m is None:
+            return math.nan
         return telemetry.home_m + self.take_off.height_m - telemetry.amsl_m
 
     def above_sea(self, telemetry: Telemetry, place: Place) -> tuple[float, float] | None:

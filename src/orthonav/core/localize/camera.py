@@ -95,7 +95,8 @@ def camera_found(
 
     `local_ratio`: of the scores of the place."""
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
-        seen = ViewOverGround(Relief(LevelTerrain(), seen.relief.grid), seen.view)
+        level = Relief(LevelTerrain(), seen.relief.grid, land=seen.relief.land)
+        seen = ViewOverGround(level, seen.view)
     orientation = seen.orientation(pose)
     if orientation is None:
         return None
@@ -111,7 +112,8 @@ def camera_found(
         return None
     found, orientation = near.found, near.orientation
     east, north, above_sea_m = orientation.position_m.tolist()
-    agl_m = above_sea_m - float(seen.relief.terrain.at_en_m([east, north]))
+    below_m = float(seen.relief.terrain.at_en_m([east, north]))
+    agl_m = above_sea_m - (seen.reference_m(pose) if math.isnan(below_m) else below_m)
     if not agl_m > 0:
         return None
     sight_en_m = seen.sight_en_m(orientation)

@@ -5,7 +5,6 @@ two dates that is stretched. A slope of the ground displaces blocks as a tilt of
 Each is Gaussian; `resection` solves for them with the camera and marginalizes them."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,16 +21,21 @@ SURFACE_M = 0.5, 10.0  # a surface model, whose houses and trees are those of an
 BARE_EARTH_M = 0.5, 50.0
 """Bare earth of laser scanning or photogrammetry, 0.1 to 0.5 m (docs/decisions/camera.md)."""
 COARSE_STD_M, COARSE_POSTING_M = 6.0, 30.0
-"""Copernicus GLO-30 and its like on slopes, and their posting; finer models err by less."""
+"""Copernicus GLO-30 and its like on slopes, and their posting. Finer models err by less, coarser
+ones by more: the slope of the error stays."""
 STD_PER_SLOPE_M = 100.0
-"""Standard deviation over the root mean square slope of the terrain, which its errors add to."""
-LENGTH_POSTINGS = 5.0  # correlation length of its errors, in postings, at least that of bare earth
+"""Standard deviation over the root mean square slope of the terrain, which its errors add to; of
+coarser models in proportion."""
+COARSE_LENGTH_M, MOST_COARSER = 150.0, 8.0
+"""Correlation length of these errors, in proportion to the posting up to a multiple at which they
+are longer than any view; at least that of bare earth."""
 ROUGH_M = 1.0  # terrain as rough within a sample shows houses and trees
 UNDULATION_M = 50.0, 100.0
-"""Of unknown ground: standard deviation over its slope, and correlation length."""
+"""Of unknown ground, and what a terrain of a posting above 50 m leaves out: standard deviation over
+the slope, and correlation length."""
 STRETCH_PX = 0.3, 80.0
 """Of imagery of two dates, pixels of the map: as residuals of blocks show (docs/decisions)."""
-LEAST_SHARE = 0.02  # weaker modes of a field, of the variance of its strongest, are left out
+LEAST_SHARE = 1e-3  # weaker modes of a field, of the variance of its strongest, are left out
 LEAST_KNOWN, LEAST_UNKNOWN = 0.1, 0.7
 """Least factors on the variance of errors by what a view shows: ground that does not undulate may
 still slope."""
@@ -66,11 +70,17 @@ def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
         posting_m = source.source_posting_m or source.posting_m
         if (source.roughness_m or 0.0) > ROUGH_M:
             return GroundErrors(0.0, (SURFACE_M,))
-    least_m, length_m = BARE_EARTH_M
-    steep = math.sqrt(float(np.nan_to_num(slopes**2).sum(axis=1).mean()))
-    most_m = max(COARSE_STD_M * min(posting_m / COARSE_POSTING_M, 1.0), least_m)
-    std_m = min(max(STD_PER_SLOPE_M * steep, least_m), most_m)
-    return GroundErrors(0.0, ((std_m, max(length_m, LENGTH_POSTINGS * posting_m)), OBJECTS_M))
+    least_m, least_length_m = BARE_EARTH_M
+    known = slopes[np.isfinite(slopes).all(axis=1)]
+    steep = math.sqrt(float((known**2).sum(axis=1).mean())) if len(known) else math.inf
+    coarser = min(posting_m / COARSE_POSTING_M, MOST_COARSER)
+    most_m = max(COARSE_STD_M * coarser, least_m)
+    std_m = min(max(STD_PER_SLOPE_M * max(coarser, 1.0) * steep, least_m), most_m)
+    fields = [(std_m, max(COARSE_LENGTH_M * coarser, least_length_m))]
+    per_slope_m, length_m = UNDULATION_M
+    if length_m < 2 * posting_m:
+        fields.append((min(per_slope_m * steep, most_m), length_m))
+    return GroundErrors(0.0, (*fields, OBJECTS_M))
 
 
 class Component(NamedTuple):
@@ -101,24 +111,24 @@ def systematic(
     """Of blocks `block_px` wide at places (N, 2) on the ground, m. They move by `by_height_px`
     (N, 2) per metre of height, and by `by_lens_px` (N, 2, L) per standard deviation of each error
     of the lens; None: it is calibrated."""
-    heights_m = field_modes(places_m, errors.fields, block_px * gsd_m)
+    heights_m = [field_modes(places_m, field, block_px * gsd_m) for field in errors.fields]
+    least = [LEAST_KNOWN] * len(heights_m)
     if errors.slope > 0:
-        middle = places_m - places_m.mean(axis=0)
-        heights_m = np.concatenate([errors.slope * middle, heights_m], axis=1)
-    stretch_px = field_modes(places_m / gsd_m, (STRETCH_PX,), block_px)
+        sloped_m = errors.slope * (places_m - places_m.mean(axis=0))
+        heights_m[0] = np.concatenate([sloped_m, heights_m[0]], axis=1)
+        least[0] = LEAST_UNKNOWN
+    moves_px = [by_height_px[:, :, None] * each[:, None] for each in heights_m]
+    stretch_px = field_modes(places_m / gsd_m, STRETCH_PX, block_px)
     none_px = np.zeros(stretch_px.shape)
-    ground, stretched = heights_m.shape[1], 2 * stretch_px.shape[1]
-    moves_px = [
-        by_height_px[:, :, None] * heights_m[:, None],
-        np.stack([stretch_px, none_px], axis=1),
-        np.stack([none_px, stretch_px], axis=1),
-    ]
+    stretched_px = [[stretch_px, none_px], [none_px, stretch_px]]
+    moves_px.append(np.concatenate([np.stack(each, axis=1) for each in stretched_px], axis=2))
+    ends = np.cumsum([each.shape[2] for each in moves_px]).tolist()
+    components = tuple(
+        Component(slice(start, end), low)
+        for start, end, low in zip([0, *ends[:-1]], ends, [*least, LEAST_KNOWN], strict=True)
+    )
     if by_lens_px is not None:
         moves_px.append(by_lens_px)
-    components = (
-        Component(slice(0, ground), LEAST_UNKNOWN if errors.slope > 0 else LEAST_KNOWN),
-        Component(slice(ground, ground + stretched), LEAST_KNOWN),
-    )
     return Systematic(np.concatenate(moves_px, axis=2), components, errors.slope)
 
 
@@ -133,15 +143,14 @@ def lens_px(camera: Camera, seen_px: Array) -> Array:
     return np.stack([right_px, down_px, scaled_px, bent_px], axis=2)
 
 
-def field_modes(places: Array, fields: Sequence[Field], block: float) -> Array:
-    """Values (N, K) of random fields with a Gaussian covariance, mean over blocks at places (N, 2),
-    by one standard deviation of each of their modes. All in one unit."""
+def field_modes(places: Array, field: Field, block: float) -> Array:
+    """Values (N, K) of a random field with a Gaussian covariance, mean over blocks at places
+    (N, 2), by one standard deviation of each of its modes. All in one unit."""
     squares = ((places[:, None] - places) ** 2).sum(axis=-1)
-    covariance = np.zeros(squares.shape)
-    for std, length in fields:
-        # The mean over a square block is that over a Gaussian with the same second moments.
-        wide = length**2 + block**2 / 6
-        covariance += std**2 * length**2 / wide * np.exp(-squares / (2 * wide))
+    std, length = field
+    # The mean over a square block is that over a Gaussian with the same second moments.
+    wide = length**2 + block**2 / 6
+    covariance = std**2 * length**2 / wide * np.exp(-squares / (2 * wide))
     values, vectors = np.linalg.eigh(covariance)
     used = values > LEAST_SHARE * values[-1]
     return np.asarray(vectors[:, used] * np.sqrt(values[used]))

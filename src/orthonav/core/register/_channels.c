@@ -115,7 +115,7 @@ INLINE void eroded(const picture_t *with, int reach, float *restrict to) {
             if (with->valid[(size_t)cols * row + col]) continue;
             const int left = col > reach ? col - reach : 0;
             const int right = col + reach < cols ? col + reach : cols - 1;
-            /* Of pixels that are not valid beside each other only the last one clears rows as wide. */
+            /* Of pixels beside each other the first clears the whole square, each next one a column. */
             const int from = col > 0 && !with->valid[(size_t)cols * row + col - 1] ? right : left;
             for (int y = row > reach ? row - reach : 0; y <= row + reach && y < rows; y++)
                 for (int x = from; x <= right; x++) to[(size_t)cols * y + x] = 0.0f;
@@ -188,7 +188,7 @@ INLINE void channels_inline(const picture_t *with, const recipe_t *recipe, float
     const float *const share = with->valid ? room : NULL;
     for (size_t i = 0; i < pixels; i++) picture[i] = (float)with->grey[i];
     if (share) {
-        eroded(with, 2 * (int)ceil(2 * recipe->sigma) / 2, counts);
+        eroded(with, (int)ceil(2 * recipe->sigma), counts);
         for (size_t i = 0; i < pixels; i++) room[i] = with->valid[i] ? 1.0f : 0.0f;
         for (size_t i = 0; i < pixels; i++) one[i] = picture[i] * room[i];
         local_mean(with, one, share, recipe->deviation, three, two);

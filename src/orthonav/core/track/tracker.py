@@ -656,4 +656,5 @@ def _known(corrected: Telemetry, spread: Array) -> Telemetry:
         yaw_std_deg=math.degrees(heading),
         agl_std_m=scale * corrected.agl_m,
         tilt_std_deg=max(math.degrees(max(pitch, roll)), LEAST_TILT_STD_DEG),
+        mount_std_deg=None,
     )

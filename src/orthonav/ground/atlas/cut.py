@@ -41,7 +41,7 @@ from orthonav.core.localize.confidence import (
     RegisteredConfidence,
 )
 from orthonav.core.mapfile.layer import GreyLayer
-from orthonav.core.mapfile.manifest import Manifest, SheetInfo
+from orthonav.core.mapfile.manifest import Manifest, SheetInfo, TerrainInfo
 from orthonav.core.mapfile.reader import MapFile, open_map, write_map
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.tiles import embed, represent
@@ -459,13 +459,17 @@ def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> T
     if made is None:
         return None
     source_m = [each.source_posting_m for each in infos if each.source_posting_m is not None]
-    roughness_m = [each.roughness_m for each in infos if each.roughness_m is not None]
     info = replace(
         made.info,
         source_posting_m=max(source_m, default=None),
-        roughness_m=max(roughness_m, default=None),
+        roughness_m=_roughness_m(infos),
     )
     return made._replace(info=info)
+
+
+def _roughness_m(infos: Sequence[TerrainInfo]) -> float | None:
+    """The least of the sheets: a surface model only where all of it is one."""
+    return min(each.roughness_m or 0.0 for each in infos) or None
 
 
 def _relief(members: Sequence[SheetSource]) -> str | None:
