@@ -25,6 +25,14 @@ STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 """Of numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
 GROUND_STEP_M = 1.0  # of a point of the ground
 MIN_TILT_STD_DEG = 0.05  # of a tilt that is reported as exact
+FIRST_REACH_PX, REACH_PX = 7, 4
+"""Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
+AGAIN_PX = 1.0
+"""A view is orthorectified once more where its correction moves a block by more pixels of the final
+level."""
+VARIANCE, VARIANCE_POWER, LEAST_RATIO = 1.6, -0.8, 0.5
+"""Variance of the errors of blocks over what their curvature says: the first, times the local ratio
+of the place (at least the third) to the power of the second (docs/decisions/camera.md)."""
 Array = NDArray[np.float64]
 
 
@@ -59,16 +67,6 @@ def picture_by_camera(
     return np.concatenate([-by_ground, turned], axis=2)
 
 
-FIRST_REACH_PX, REACH_PX = 7, 4
-"""Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
-AGAIN_PX = 1.0
-"""A view is orthorectified once more where its correction moves a block by more pixels of the final
-level."""
-VARIANCE, VARIANCE_POWER, LEAST_RATIO = 1.6, -0.8, 0.5
-"""Variance of the errors of blocks over what their curvature says: the first, times the local ratio
-of the place (at least the third) to the power of the second (docs/decisions/camera.md)."""
-
-
 @dataclass(frozen=True, eq=False)
 class CameraFound:
     """The camera of a view; `agl_m`: above the ground below it; `alone`: without telemetry.
@@ -91,7 +89,8 @@ class CameraFound:
 def camera_found(
     seen: ViewOverGround, reference: Reference, pose: Pose, local_ratio: float
 ) -> CameraFound | None:
-    """Of a view at `pose`; None where too few blocks are seen.
+    """Position, attitude and covariance of the camera of a view that was placed at `pose`; None
+    where too few blocks are seen, or the camera would be below the ground.
 
     `local_ratio`: of the scores of the place."""
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
@@ -130,6 +129,7 @@ def camera_found(
 
 
 def tilt_std_deg(telemetry: Telemetry) -> float:
+    """Standard deviation of the reported pitch and roll, the default where none is stated."""
     stated = telemetry.tilt_std_deg
     return DEFAULT_TILT_STD_DEG if stated is None else stated
 
@@ -209,7 +209,8 @@ class _Compared:
 def _compared(
     seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
 ) -> _Compared | None:
-    """At first at the final level and a coarser one, then at a finer one too."""
+    """The blocks of a view under an orientation, compared with the map; None: too few pixels. At
+    first at the final level and a coarser one, then at a finer one too."""
     final = seen.view.levels.final
     finest = final if first else max(final - 1, 0)
     made = _templates(seen, pose, finest, orientation, first=first)

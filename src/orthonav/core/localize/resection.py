@@ -105,7 +105,7 @@ def resected(
 
 
 def _with_slope(expected: Expected, slope_rad: float) -> Expected:
-    """With pitch and roll that may be a slope of the ground."""
+    """What telemetry expects where pitch and roll may be a slope of the ground instead."""
     correction, information = expected
     loose = information.copy()
     for axis in (4, 5):
@@ -155,10 +155,10 @@ def _component(values: Array, variances: Array, least: float) -> float:
 
 class _Marginal(NamedTuple):
     """What blocks say of the camera with systematic errors marginalized: information (6, 6), and
-    the part `prior` (6, 6) of it that these errors' variances decide, not noise."""
+    the part `assumed` (6, 6) of it that these errors' variances decide, not noise."""
 
     information: Array
-    prior: Array
+    assumed: Array
 
     @classmethod
     def of(cls, curvature: Array, information: Array) -> "_Marginal":
@@ -172,7 +172,7 @@ class _Marginal(NamedTuple):
     def covariance(self, telemetry: Array, variance: float) -> Array:
         """With so many times the variance of all that is noise of blocks."""
         covariance = np.linalg.inv(self.information + telemetry)
-        known = covariance @ (telemetry + self.prior) @ covariance
+        known = covariance @ (telemetry + self.assumed) @ covariance
         return np.asarray(variance * covariance + (1 - variance) * known)
 
     def without(self, found: Array, expected: Expected) -> Array:

@@ -57,14 +57,16 @@ class GroundErrors:
 
 
 def unknown_ground(relief: str | None) -> GroundErrors:
-    """Of level ground that is assumed; `relief`: what the land is like, None: nobody said."""
+    """Errors of assumed level ground; `relief`: what the land is like, None: nobody said."""
     slope = relief_slope(relief)
     per_slope_m, length_m = UNDULATION_M
     return GroundErrors(slope / math.sqrt(2), ((per_slope_m * slope, length_m), OBJECTS_M))
 
 
 def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
-    """Of a map's terrain with slopes (N, 2) under a view; `source`: None: one like Copernicus'."""
+    """Errors of a map's terrain with slopes (N, 2) under a view, NaN where unknown.
+
+    `source`: None: a terrain like Copernicus'."""
     posting_m = COARSE_POSTING_M
     if source is not None:
         posting_m = source.source_posting_m or source.posting_m
@@ -108,9 +110,10 @@ def systematic(
     block_px: float,
     gsd_m: float,
 ) -> Systematic:
-    """Of blocks `block_px` wide at places (N, 2) on the ground, m. They move by `by_height_px`
-    (N, 2) per metre of height, and by `by_lens_px` (N, 2, L) per standard deviation of each error
-    of the lens; None: it is calibrated."""
+    """Displacements of blocks `block_px` wide at places (N, 2) on the ground, m.
+
+    They move by `by_height_px` (N, 2) per metre of height, and by `by_lens_px` (N, 2, L) per
+    standard deviation of each error of the lens; None: it is calibrated."""
     heights_m = [field_modes(places_m, field, block_px * gsd_m) for field in errors.fields]
     least = [LEAST_KNOWN] * len(heights_m)
     if errors.slope > 0:
