@@ -174,6 +174,17 @@ def test_the_camera_over_a_hole_of_the_terrain_is_found(opened, grey, relief):
     assert error_m(localizer, fix, PLACE) < 10
 
 
+def test_simulated_level_ground_is_known_as_well_as_the_terrain(opened):
+    localizer = on_terrain(opened, hills(0.05))
+    known = localizer.registration.relief
+    known.info = replace(SURFACE, roughness_m=None, source_posting_m=30.0)
+    levelled, unknown = known.levelled(), Localizer(opened).registration.relief
+    assert levelled.is_level and levelled.level_errors.slope == 0 < unknown.level_errors.slope
+    (std_m, _), _ = levelled.level_errors.fields
+    assert 3.0 < std_m <= 5.5  # 100 m times the slope
+    assert unknown.levelled() is unknown
+
+
 def test_level_ground_is_as_without_a_terrain(opened):
     """Views of a map whose terrain is level are placed as on a map without one; there the picture
     says less of pitch and roll."""

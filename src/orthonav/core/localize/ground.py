@@ -28,6 +28,7 @@ from orthonav.core.register.template import ViewTemplates
 from orthonav.core.register.window import GreyPyramid, Reference
 
 MAP_NODES = 256  # of expected scales across the map, at most
+LEVELLED_NODES = 32  # across the map, for the slopes of its terrain
 SLOPE_M = 10.0  # half the base over which slopes are measured
 LARGEST_STD = 0.3  # of scales searched: three are 0.41 to 2.46
 Array = NDArray[np.float64]
@@ -55,6 +56,7 @@ class Relief:
     ) -> None:
         """`info`: of the terrain; `land`: what it is like without one. None: not known."""
         self.terrain, self.grid, self.info, self.land = terrain, grid, info, land
+        self.level_errors = unknown_ground(land)
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
     @property
@@ -81,9 +83,18 @@ class Relief:
 
     def errors(self, slopes: Array) -> GroundErrors:
         """Of the heights under a view, by slopes (N, 2) there."""
+        return self.level_errors if self.is_level else terrain_errors(self.info, slopes)
+
+    def levelled(self) -> "Relief":
+        """Level ground that is known as well as this: of simulated views."""
         if self.is_level:
-            return unknown_ground(self.land)
-        return terrain_errors(self.info, slopes)
+            return self
+        sides_px = self.grid.width_px, self.grid.height_px
+        nodes_px = [np.linspace(0.0, side, LEVELLED_NODES) for side in sides_px]
+        found = Relief(LevelTerrain(), self.grid, self.info, self.land)
+        slopes = self.slopes(self.en_m(np.stack(np.meshgrid(*nodes_px), -1).reshape(-1, 2)))
+        found.level_errors = terrain_errors(self.info, slopes)
+        return found
 
     def expected(self, view: PreparedView) -> PosePrior:
         """The view's prior, with scales by the height above sea at each place."""

@@ -46,8 +46,8 @@ class Localizer:
 
         Without `registration`, or a layer for it, tiles place the views, by the rule `position`.
         Without `flying`, representations too slow to fly are accepted: only for maps of one's own,
-        because networks are loaded from this machine. `level_ground`: without the map's terrain,
-        for simulated views."""
+        because networks are loaded from this machine. `level_ground`: for simulated views of
+        level ground, as well known as the map's terrain."""
         if len(opened.manifest.sheets) != 1:
             raise MapFileError(f"this program flies maps of one sheet: {opened.path}")
         self.opened = opened
@@ -150,7 +150,7 @@ class RegistrationLocalizer(SearchedSheet):
             raise MapFileError(f"map cannot be flown ({error}): {opened.path}") from error
         if not (0 < radius_m < math.inf and 0 <= floor_px < math.inf):
             raise MapFileError(f"map has impossible registration parameters: {opened.path}")
-        return cls(
+        made = cls(
             opened.manifest.sheets[0],
             layer,
             confidence=confidence,
@@ -158,8 +158,11 @@ class RegistrationLocalizer(SearchedSheet):
             floor_px=floor_px,
             propose=propose,
             plan=plan,
-            terrain=None if level_ground else TerrainLayer.of(opened),
+            terrain=TerrainLayer.of(opened),
         )
+        if level_ground:
+            made.relief = made.relief.levelled()
+        return made
 
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
         search = self.search(view, prior, heading_known)
