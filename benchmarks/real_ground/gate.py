@@ -2,7 +2,7 @@
 
 For each row: `views` of it; `median_m` and `of_right` (share of the right fixes that are
 confident) as renewed; `exceeded` protection levels; `nees`, the band of its mean, where it is not
-the usual one.
+the usual one. No confident fix may be false.
 """
 
 import json
@@ -59,6 +59,8 @@ def _worse(name: str, figure: dict[str, Any], values: Figures) -> list[list[str]
         none = figure.get("median_m", 0.0) is None
         return [] if none else [[name, "confident fixes", "none", "some"]]
     made = []
+    if found["false"]:
+        made.append([name, "false", str(found["false"]), "0"])
     median_m = figure.get("median_m")
     limit_m = LEAST_M + (1 + SHARE) * (median_m or 0.0)
     if median_m is not None and found["median_m"] > limit_m:

@@ -49,7 +49,7 @@ def measure(options: argparse.Namespace) -> Section:
     tables = [Table("Real ground", HEADER, rows, NOTES)] if rows else []
     if not options.gate:
         return Section("Real ground", tables)
-    if options.only:
+    if options.only or set(options.part) < set(PARTS):
         figures = {name: each for name, each in figures.items() if name in values}
     if options.renew:
         gate.write(gate.renewed(gate.figures(), values))

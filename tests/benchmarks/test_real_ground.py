@@ -16,7 +16,7 @@ from orthonav.core.records import Fix, Telemetry, View
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 
 KEPT = {"valley": {"views": 20, "median_m": 4.0, "of_right": 0.9, "exceeded": 1}}
-FOUND = {"valley": {"median_m": 4.0, "of_right": 0.9, "exceeded": 1, "nees": 2.0}}
+FOUND = {"valley": {"median_m": 4.0, "of_right": 0.9, "exceeded": 1, "nees": 2.0, "false": 0}}
 
 
 def failed(**changed):
@@ -37,6 +37,7 @@ def test_equal_figures_pass():
         ({"nees": 0.09}, "NEES"),
         ({"exceeded": 2}, "protection levels exceeded"),
         ({"of_right": 0.7}, "confident of right"),
+        ({"false": 1}, "false"),
         ({"median_m": None, "nees": None}, "confident fixes"),
     ],
 )

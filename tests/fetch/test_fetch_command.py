@@ -12,6 +12,7 @@ import terrain
 
 from orthonav.cli import main
 from orthonav.ground.fetch.presets import presets, terrain_preset, terrain_spec
+from orthonav.ground.fetch.run import holds_heights
 from orthonav.ground.imagery.source import open_sources
 from orthonav.ground.imagery.terrain import open_dem
 
@@ -111,7 +112,7 @@ def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
         code, stdout, _ = command(*fetch, "--gsd-m", 1, "--json", terrain=True)  # replaces its own
         plain = json.loads(stdout)["terrain"]
         code, stdout, _ = command(*fetch, "--dry-run", terrain=True)
-        assert code == 0 and "the terrain of copernicus-dem" in stdout
+        assert code == 0 and "terrain from copernicus-dem" in stdout
     dem_path = tmp_path / "ortho_dem.tif"
     assert plain["out"] == str(dem_path) and plain["datum"] == "egm2008"
     words = shlex.split(line)
@@ -122,6 +123,14 @@ def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
     dem = open_dem(dem_path)
     lat, lon = np.array([terrain.LAT_DEG]), np.array([west - 3 * step])
     np.testing.assert_allclose(dem(lat, lon), terrain.heights(lat, lon), atol=0.05)
+
+
+def test_no_terrain_comes_with_heights(tmp_path):
+    path = tmp_path / "a.tif"
+    for dtype, heights in (("float32", True), ("int16", True), ("uint8", False)):
+        with rasterio.open(path, "w", driver="GTiff", width=8, height=8, count=1, dtype=dtype):
+            pass
+        assert holds_heights(path) == heights
 
 
 @pytest.mark.parametrize("fault", ["down", "another file"])

@@ -94,6 +94,10 @@ def test_logs_without_gps_count_from_boot(tmp_path):
     assert track.origin_ns == 5 * 10**9 and track.latlon_deg(6 * 10**9) is None
     assert track.telemetry(6 * 10**9).agl_m == pytest.approx(101)  # above its origin
     assert track.telemetry(6 * 10**9).horizon_std_deg == pytest.approx(3.0)
+    del (estimated := px4_topics())["vehicle_gps_position"]
+    track = read_log(ulog(tmp_path / "b.ulg", estimated), DOWN)
+    assert track.latlon_deg(6 * 10**9) == (46.5, 2.5)  # the estimator's own, which aids nothing
+    assert track.telemetry(6 * 10**9).horizon_std_deg == pytest.approx(3.0)
     ardupilot = read_log(dataflash(tmp_path / "a.bin", gps=False), DOWN)
     assert ardupilot.origin_ns == 3 * 10**9
     assert ardupilot.telemetry(4 * 10**9).horizon_std_deg == pytest.approx(1.0)

@@ -11,9 +11,10 @@ if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
 
 WITHOUT_TERRAIN = (
-    "a terrain reduces this error: --dem FILE, such as 'orthonav fetch' brings with the imagery; "
-    "--relief level reduces it where the land is level"
+    "without terrain: --dem FILE reduces the error of the camera (orthonav fetch writes one beside "
+    "the imagery)"
 )
+LEVEL_LAND = "; --relief level does where the land is level"
 LEAST_SHIFT_M = 0.3
 """A pixel of the finest orthophotos of countries."""
 
@@ -117,11 +118,12 @@ def run(options: argparse.Namespace) -> None:
     print(summary_text(plain))
     terrain = result.manifest.sheets[0].terrain
     if terrain is None:
-        print(WITHOUT_TERRAIN)
+        print(WITHOUT_TERRAIN + ("" if options.relief else LEVEL_LAND))
     elif not terrain.is_above_sea:
         print(
-            "the terrain file does not state its vertical datum: heights above ground and take-off "
-            "can be used; --dem-datum adds heights above the sea and the ellipsoid"
+            "the vertical datum of the terrain is not known: heights above ground and take-off can "
+            "be used; --dem-datum, and a geoid grid for heights above the ellipsoid, add heights "
+            "above the sea"
         )
     for each in plates:
         print(

@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> None:
         raise FetchError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
     from orthonav.ground.fetch.presets import terrain_preset
-    from orthonav.ground.fetch.run import estimate_fetch, fetch, terrain_request
+    from orthonav.ground.fetch.run import estimate_fetch, fetch, holds_heights, terrain_request
 
     request = _request(options)
     name = terrain_preset(options.source) if options.terrain else None
@@ -110,7 +110,8 @@ def run(options: argparse.Namespace) -> None:
             request, shown, lambda estimate: _say(options, f"fetching {estimate.text()}")
         )
     found = [(request, result)]
-    if name is not None:
+    imagery = request.spec.provenance.datum is None and not holds_heights(options.out)
+    if name is not None and imagery:
         found += _terrain(options, terrain_request(request, name), name)
     if options.json:
         terrain = [{"out": str(each.out), **got.describe()} for each, got in found[1:]]
@@ -118,7 +119,7 @@ def run(options: argparse.Namespace) -> None:
         print_json({"out": str(options.out), **result.describe(), **more})
         return
     print("\n\n".join(_summary(each.out, got) for each, got in found))
-    if options.terrain and request.spec.provenance.datum is None:
+    if options.terrain and imagery:
         print(f"\nbuild the map:\n  {_build_line(options, [each.out for each, _ in found[1:]])}")
 
 
@@ -128,7 +129,7 @@ def _print_estimate(
     if options.json:
         print_json(vars(estimate) | {"provenance": vars(estimate.provenance), "terrain": terrain})
     else:
-        more = "" if terrain is None else f"; the terrain of {terrain} besides"
+        more = "" if terrain is None else f", and terrain from {terrain}"
         print(f"would fetch {estimate.text()}{more}")
 
 

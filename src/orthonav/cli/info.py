@@ -182,8 +182,9 @@ def unknown_ground_text(relief: str | None) -> list[str]:
     )
     return [
         f"none: {relief or DEFAULT_RELIEF} land is assumed (slopes of {100 * slope:.0f} %); the "
-        "camera is",
-        f"off by {known} of the height where its tilt is known to 1 deg, {unknown} where it is not",
+        f"standard deviation",
+        f"of the camera per axis is {known} of the height where its tilt is known to 1 deg, "
+        f"{unknown} where it is not",
     ]
 
 

@@ -48,8 +48,8 @@ ASSUMED = TiltSource(6.0, 6.0)
 """Straight down: consistent on 30 photographs of a DJI Mini, some of which look 9 deg ahead."""
 
 UNRECORDED = (
-    "all gimbal angles are 0, so they were not recorded: a camera that looks straight down is "
-    "assumed"
+    "pitch and roll of the gimbal are 0 throughout, so they were not recorded: a camera that looks "
+    "straight down is assumed"
 )
 
 

@@ -29,7 +29,8 @@ coarser models in proportion."""
 COARSE_LENGTH_M, MOST_COARSER = 150.0, 8.0
 """Correlation length of these errors, in proportion to the posting up to a multiple at which they
 are longer than any view; at least that of bare earth."""
-ROUGH_M = 1.0  # terrain as rough within a sample shows houses and trees
+ROUGH_M, ROUGH_PER_SLOPE_M = 1.0, 4.0
+"""Terrain as rough within a sample shows houses and trees; steep bare earth is rough too."""
 UNDULATION_M = 50.0, 100.0
 """Of unknown ground, and what a terrain of a posting above 50 m leaves out: standard deviation over
 the slope, and correlation length."""
@@ -67,14 +68,14 @@ def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
     """Errors of a map's terrain with slopes (N, 2) under a view, NaN where unknown.
 
     `source`: None: a terrain like Copernicus'."""
+    known = slopes[np.isfinite(slopes).all(axis=1)]
+    steep = math.sqrt(float((known**2).sum(axis=1).mean())) if len(known) else math.inf
     posting_m = COARSE_POSTING_M
     if source is not None:
         posting_m = source.source_posting_m or source.posting_m
-        if (source.roughness_m or 0.0) > ROUGH_M:
+        if (source.roughness_m or 0.0) > max(ROUGH_M, ROUGH_PER_SLOPE_M * steep):
             return GroundErrors(0.0, (SURFACE_M,))
     least_m, least_length_m = BARE_EARTH_M
-    known = slopes[np.isfinite(slopes).all(axis=1)]
-    steep = math.sqrt(float((known**2).sum(axis=1).mean())) if len(known) else math.inf
     coarser = min(posting_m / COARSE_POSTING_M, MOST_COARSER)
     most_m = max(COARSE_STD_M * coarser, least_m)
     std_m = min(max(STD_PER_SLOPE_M * max(coarser, 1.0) * steep, least_m), most_m)

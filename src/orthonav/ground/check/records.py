@@ -18,7 +18,7 @@ from orthonav.core.files import with_paths
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.limits import ALERT_LIMITS_M, DEFAULT_RISK, RISKS
-from orthonav.core.records import CONFIDENT
+from orthonav.core.records import CONFIDENT, DEFAULT_TILT_STD_DEG
 from orthonav.core.track.model import Model
 from orthonav.ground.changes.record import CellGrid, ChangedGround
 from orthonav.ground.check.estimate import INTERVAL, LEARNT, Prediction, Recalibration
@@ -85,8 +85,7 @@ class CheckRequest:
     `workers`: processes; None: one per core.
     `alert_limit_m`: largest error that the mission allows; None: 2.5 % of the height, at least 35.
     `risk`: allowed probability of an error beyond it.
-    `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20; drones
-    that report a level gimbal were tilted by up to 9 deg.
+    `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20.
     `other_sensor`: the camera differs from the map's sensor by more than years do.
     `changes`: ground that changed since the map was made, as a flight saw it.
     """
@@ -109,7 +108,7 @@ class CheckRequest:
     effort: float = 1.0
     workers: int | None = None
     seed: int = 1
-    tilt_std_deg: float = 1.5
+    tilt_std_deg: float = DEFAULT_TILT_STD_DEG
     other_sensor: bool = False
     recalibration: Recalibration = LEARNT
     changes: ChangedGround | None = None

@@ -169,6 +169,12 @@ def fetch(
     return result
 
 
+def holds_heights(path: Path) -> bool:
+    """Whether a fetched file has one band of signed numbers, which is no imagery."""
+    with rasterio.open(path) as data:
+        return bool(data.count == 1 and data.dtypes[0].startswith(("float", "int")))
+
+
 def terrain_request(request: FetchRequest, name: str) -> FetchRequest:
     """The request for the terrain of a preset under the imagery of another, beside its file."""
     return replace(

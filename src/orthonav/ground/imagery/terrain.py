@@ -186,8 +186,9 @@ class Dem:
         """Raise `ImageryError` where heights do not count from the sea. `why`: what needs them."""
         if not self.datum.is_known:
             raise ImageryError(
-                f"{why}, and the terrain file does not state its vertical datum; see its "
-                f"documentation and give {OPTION}: {self.path}"
+                f"{why}, and the vertical datum of the terrain file is not known (not stated, or "
+                "a geoid grid is missing); see its documentation and give "
+                f"{OPTION}: {self.path}"
             )
 
     def covers(self, lat_deg: float, lon_deg: float) -> bool:

@@ -29,6 +29,7 @@ MAX_BYTES = 100_000_000
 _SYNONYMS = {
     "file": ("file", "filename", "image", "sourcefile", "frame"),
     "yaw": ("gimbalyaw", "yaw", "heading"),
+    "body_yaw": ("yaw", "heading"),
     "pitch": ("gimbalpitch", "pitch"),
     "roll": ("gimbalroll", "roll"),
     "agl": ("agl", "height"),
@@ -132,6 +133,7 @@ def read_image_table(path: Path) -> ImageTable:
     numbers = [(line, texts, _numbers(texts, columns, line, comma, path)) for line, texts in lines]
     gimbal = _is_gimbal(columns, [values for _, _, values in numbers])
     unrecorded = _is_unrecorded(gimbal, [values for _, _, values in numbers])
+    _head(unrecorded, [values for _, _, values in numbers])
     rows: dict[str, ImageRow] = {}
     for order, (line, texts, values) in enumerate(numbers):
         name = str(PurePosixPath(texts["file"].replace("\\", "/").lower()))
@@ -215,6 +217,13 @@ def _is_unrecorded(gimbal: bool, rows: Sequence[Mapping[str, float]]) -> bool:
     """Whether a gimbal reports 0 in all rows, where it would look at the horizon."""
     angles = [values.get(name, 0.0) for values in rows for name in ("pitch", "roll")]
     return gimbal and not any(angles)
+
+
+def _head(unrecorded: bool, rows: Sequence[dict[str, float]]) -> None:
+    """Give views the heading of the aircraft where that of the gimbal was not recorded either."""
+    if unrecorded and not any(values.get("yaw") for values in rows):
+        for values in rows:
+            values["yaw"] = values.get("body_yaw", math.nan)
 
 
 def _row(

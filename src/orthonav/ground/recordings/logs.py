@@ -4,6 +4,7 @@ import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -205,6 +206,7 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
             amsl=altitude_series(position),
             hae=_hae(gps, shift_us),
             position=position,
+            tilt=AUTOPILOT if gps else replace(AUTOPILOT, aided_deg=AUTOPILOT.unaided_deg),
             velocity=None
             if "vx" not in local
             else _series(
