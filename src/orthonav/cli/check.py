@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orthonav.cli.common import add_options, print_json, progress
-from orthonav.core.records import DEFAULT_TILT_STD_DEG
+from orthonav.core.tilt import UNSTATED
 
 EXAMPLE = "area.onav --route route.kml --agl-m 120 --out check"
 EVERYDAY = (
@@ -78,8 +78,8 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     number("--relief-m", default=3.0, help=f"{text}(default 3)")
     text = "standard deviation of the error of the reported pitch and roll, which displaces fixes "
     text += "by 1.7 %% of the height a degree (docs/flights.md has that of each source; "
-    text += f"default {DEFAULT_TILT_STD_DEG:g}, as where it is not stated)"
-    number("--tilt-std-deg", default=DEFAULT_TILT_STD_DEG, help=text)
+    text += f"default {UNSTATED.aided_deg:g}, as where it is not stated)"
+    number("--tilt-std-deg", default=UNSTATED.aided_deg, help=text)
     text = "camera and map imagery are of different kinds (drone against satellite, infrared): "
     group.add_argument("--other-sensor", action="store_true", help=f"{text}predicts fewer fixes")
 
