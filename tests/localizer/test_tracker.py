@@ -114,6 +114,12 @@ def test_a_flight_is_followed(usual):
     assert last.evidence["vel_north_mps"] == pytest.approx(SPEED_MPS * math.cos(0.61), abs=3)
 
 
+def test_the_confidence_of_a_track_is_that_of_its_covariance_and_place(usual):
+    for *_, fix in usual[2]:
+        if isinstance(fix, Fix):
+            assert fix.confidence == pytest.approx(fix.probability_within(fix.radius_m))
+
+
 @pytest.mark.long
 def test_biases_of_heading_height_and_mount_are_estimated(localizer, monkeypatch):
     """Uncorrected, 5 deg of pitch are 13 m from 150 m. Over known ground single views show their

@@ -4,6 +4,8 @@ Most have a locator that is always right about where an image was exposed, but n
 itself, with all faults over generated landscapes: `python -m benchmarks.faults`.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from benchmarks.fault_flights import CAMERA, Fault, FaultFlight, World
@@ -14,6 +16,8 @@ from fake_autopilot import FakeLocator, fix
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
+from orthonav.core.records import Telemetry
+from orthonav.onboard.fly import _with_latency
 
 FAULTS = {each.name: each for each in (*CAMERA_FAULTS, *TELEMETRY_FAULTS, *COMBINED_FAULTS)}
 FRAME = LocalFrame(48.0, 2.0)
@@ -56,6 +60,13 @@ def test_the_covariance_includes_the_latency():
     values = np.linalg.eigvalsh(flight.gate._last.cov_en_m2)
     speed = np.hypot(flight.path.reported(22.0).north, flight.path.reported(22.0).east)
     assert values == pytest.approx([4.0, 4.0 + (0.03 * speed) ** 2], rel=0.03)
+
+
+def test_the_confidence_includes_the_latency():
+    """At 30 m/s an image 1 s off is 30 m off."""
+    exact = replace(fix(48.0, 2.0), place_probability=0.999)
+    later = _with_latency(exact, Telemetry(0, 0.0, 0.0, 0.0, 100.0, vel_en_mps=(30.0, 0.0)), 1.0)
+    assert later.confidence == later.probability_within(exact.radius_m) < exact.confidence - 0.1
 
 
 @pytest.mark.parametrize(

@@ -354,6 +354,18 @@ def test_measured_positions_calibrate_the_mount():
     assert math.degrees(math.sqrt(estimate.covariance[6, 6])) < 1.0
 
 
+def test_a_measured_position_is_in_a_jump_of_the_biases_too():
+    flight, mixture = Flight(12), Mixture(MODEL, EXTENT)
+    mixture.start(flight.place, 50.0)
+    mixture.predict(1.0, camera=flight.moved())
+    mixture.measure_position(flight.place, 1.0)
+    kept, jumped = mixture._with_bias_jump(mixture.hypotheses[0])
+    assert jumped.share < kept.share
+    for each in (kept, jumped):
+        assert each.covariance[0, 0] < 1.01
+        np.testing.assert_allclose(each.mean[:2], flight.place, atol=0.5)
+
+
 def test_a_track_coasts_while_views_do_not_show_the_map():
     flight, mixture, _ = flown(3, false_share=0.0)
     assert mixture.estimate(RADIUS_M).state is State.TRACKING

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -229,6 +229,13 @@ class Fix:
     def probability_within(self, limit_m: float) -> float:
         """Probability that the error is at most `limit_m`; NaN where the confidence is unknown."""
         return self.right_probability * (1 - probability_beyond(self.cov_en_m2, max(limit_m, 0.0)))
+
+    def with_covariance(self, cov_en_m2: NDArray[np.float64]) -> "Fix":
+        """With another one (2, 2), m2, and the confidence that follows from it."""
+        made = replace(self, cov_en_m2=cov_en_m2)
+        within = made.probability_within(self.radius_m)
+        known = math.isfinite(self.place_probability) and math.isfinite(within)
+        return replace(made, confidence=within) if known else made
 
     def protection_level_m(self, risk: float = DEFAULT_RISK) -> float:
         """The smallest limit that the error exceeds with a probability of at most `risk`, m.

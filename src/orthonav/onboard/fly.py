@@ -590,14 +590,14 @@ def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> 
 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
-    """Fix whose covariance includes the distance flown in the standard deviation of the latency, in
-    all directions where the velocity is not known."""
+    """Fix whose covariance and confidence include the distance flown in the standard deviation of
+    the latency, in all directions where the velocity is not known."""
     evidence = fix.evidence
     own = evidence.get("vel_east_mps", math.nan), evidence.get("vel_north_mps", math.nan)
     velocity = np.array(telemetry.vel_en_mps or own)
     if not np.isfinite(velocity).all():
-        return replace(fix, cov_en_m2=fix.cov_en_m2 + (std_s * ASSUMED_MPS) ** 2 * np.eye(2))
-    return replace(fix, cov_en_m2=fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
+        return fix.with_covariance(fix.cov_en_m2 + (std_s * ASSUMED_MPS) ** 2 * np.eye(2))
+    return fix.with_covariance(fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
 
 
 def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:

@@ -210,7 +210,7 @@ class SearchedSheet:
         camera_from_pose = np.eye(4)
         camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
         spread = camera_from_pose @ covariance @ camera_from_pose.T
-        spread[:2, :2] += np.eye(2) * self.floor_px**2
+        spread[:2, :2] += np.eye(2) * (self.floor_m(view) / self.grid.gsd_m) ** 2
         metres = np.diag([self.grid.gsd_m, -self.grid.gsd_m, 1.0, 1.0])
         return np.asarray(metres @ spread @ metres)
 

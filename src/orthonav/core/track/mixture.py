@@ -165,6 +165,20 @@ def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
     return replace(each, mean=mean, covariance=turned @ each.covariance @ turned.T)
 
 
+def at_position(each: Hypothesis, mean_en_m: Array, noise: Array) -> Hypothesis:
+    """After a measurement of the position (2,) with `noise` (2, 2)."""
+    spread = each.covariance[POSITION, POSITION] + noise
+    innovation = mean_en_m - each.mean[POSITION]
+    gain = np.linalg.solve(spread, each.covariance[POSITION]).T
+    after = each.covariance - gain @ spread @ gain.T
+    return replace(
+        each,
+        share=each.share * math.exp(max(log_density(innovation, spread), -700.0)),
+        mean=each.mean + gain @ innovation,
+        covariance=(after + after.T) / 2,
+    )
+
+
 def distance(one: Hypothesis, other: Hypothesis) -> float:
     return math.dist(one.mean[POSITION], other.mean[POSITION])
 
@@ -247,6 +261,7 @@ class Mixture:
         self._last: Hypothesis | None = None  # of the track, dead-reckoned since
         self._against: Hypothesis | None = None  # the place that contradicts it, dead-reckoned too
         self._ground = self._restored = 0.0  # new in this view; recognized there
+        self._measured: tuple[Array, Array] | None = None  # position since the last prediction
 
     def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
         self._extent = np.array(extent_en_m)
@@ -278,21 +293,8 @@ class Mixture:
         if not self.hypotheses:
             self.start(mean_en_m, std_m)
             return
-        made, noise = [], np.eye(2) * std_m**2
-        for each in self.hypotheses:
-            spread = each.covariance[POSITION, POSITION] + noise
-            innovation = mean_en_m - each.mean[POSITION]
-            gain = np.linalg.solve(spread, each.covariance[POSITION]).T
-            after = each.covariance - gain @ spread @ gain.T
-            share = each.share * math.exp(max(log_density(innovation, spread), -700.0))
-            made.append(
-                replace(
-                    each,
-                    share=share,
-                    mean=each.mean + gain @ innovation,
-                    covariance=(after + after.T) / 2,
-                )
-            )
+        self._measured = mean_en_m, np.eye(2) * std_m**2
+        made = [at_position(each, *self._measured) for each in self.hypotheses]
         # Belief elsewhere is spread over the map: its density at this position remains.
         elsewhere = self.elsewhere / self.area_m2
         made += self._born_at(mean_en_m, std_m, START_SHARE * elsewhere)
@@ -314,6 +316,7 @@ class Mixture:
         """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
         (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
+        self._measured = None
         stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
         made = []
         for each in self.hypotheses:
@@ -545,13 +548,12 @@ class Mixture:
         if each.expected is None or each.share < MINOR_SHARE:
             return [each]
         expected = after_bias_jump(self.model, each.expected)
-        other = replace(
-            each,
-            share=each.share * rare,
-            mean=expected.mean,
-            covariance=expected.covariance,
-            expected=expected,
+        jumped = replace(
+            each, mean=expected.mean, covariance=expected.covariance, expected=expected
         )
+        if self._measured is not None:
+            jumped = at_position(jumped, *self._measured)  # its likelihood is in the share already
+        other = replace(jumped, share=each.share * rare)
         return [replace(each, share=each.share * (1 - rare)), other]
 
     def _updated(

@@ -20,8 +20,9 @@ from orthonav.core.track.model import (
 
 VELOCITY_JITTER = 0.3
 """Of the error of a reported velocity, independent at every view (docs/tracking.md)."""
-VELOCITY_STD_MPS, VELOCITY_SHARE = 1.0, 0.02
-"""Of a reported velocity without deviation, and fraction of the speed (docs/tracking.md)."""
+VELOCITY_STD_MPS, VELOCITY_SHARE = 3.0, 0.02
+"""Of a reported velocity without deviation, and fraction of the speed: of an autopilot without
+GNSS, whose velocity was wrong by 1 to 3 m/s (docs/decisions/tracking.md)."""
 
 
 def usual_velocity_std_mps(speed_mps: float) -> float:

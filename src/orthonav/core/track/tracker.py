@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
+from orthonav.core.integrity import probability_beyond
 from orthonav.core.localize.camera import CameraFound
-from orthonav.core.localize.confidence import within
 from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.localize.place import Place
@@ -248,9 +248,8 @@ class Tracker:
         spread = float(np.trace(smoothed.covariance[:2, :2]))
         if isinstance(before, Fix) and spread > float(np.trace(before.cov_en_m2)):
             return before
-        inside = within(smoothed.mean, smoothed.covariance, self._radius_m(telemetry))
         place = min(smoothed.belief, 1.0)
-        return self._fix(smoothed.mean, smoothed.covariance, place, place * inside, telemetry, {})
+        return self._fix(smoothed.mean, smoothed.covariance, place, telemetry, {})
 
     def _radius_m(self, telemetry: Telemetry) -> float:
         high = RADIUS_SHARE * telemetry.agl_m
@@ -269,7 +268,7 @@ class Tracker:
             }
             mean, covariance = estimate.mean, estimate.covariance
             place = estimate.place_probability
-            outcome = self._fix(mean, covariance, place, estimate.confidence, telemetry, more)
+            outcome = self._fix(mean, covariance, place, telemetry, more)
             if not self._heading_known:
                 outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
         if self._history is not None:
@@ -600,7 +599,6 @@ class Tracker:
         mean: Array,
         covariance: Array,
         place_probability: float,
-        confidence: float,
         telemetry: Telemetry,
         more: dict[str, float],
     ) -> Fix:
@@ -608,6 +606,7 @@ class Tracker:
         lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
         spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
         spread.flags.writeable = False
+        radius_m = self._radius_m(telemetry)
         pitch, roll = np.degrees(mean[TILT])
         whole = mean[TILT] + mean[HORIZON]
         evidence = {
@@ -625,9 +624,9 @@ class Tracker:
             lat_deg=float(lat),
             lon_deg=float(lon),
             cov_en_m2=spread,
-            confidence=confidence,
+            confidence=place_probability * (1 - probability_beyond(spread, radius_m)),
             place_probability=place_probability,
-            radius_m=self._radius_m(telemetry),
+            radius_m=radius_m,
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
             evidence=MappingProxyType(evidence),
