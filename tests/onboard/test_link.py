@@ -289,7 +289,7 @@ def stds(flying):
 
 
 ABSOLUTE, DEAD_RECKONING = 831, 303
-GNSS_AIDED, UNAIDED = (None, 1.0), (5.0, 3.0)
+GNSS_AIDED, UNAIDED = (1.0, 1.0), (5.0, 3.0)
 
 
 class Reporting(Flying):

@@ -136,7 +136,9 @@ def test_the_autopilot_is_asked_for_its_origin_at_a_modest_interval():
         assert (asked["command"], asked["param1"]) == (512, 49.0)
         assert (asked["target_system"], asked["target_component"]) == (3, 1)
     assert find_origin(sending, 5, ORIGIN) == []
-    assert find_origin(Sending("gps-input", "global-position", origin=ORIGIN), 10) == []
+    assert find_origin(Sending("gps-input", "global-position"), 10) == []
+    # A start without GNSS needs one whatever is sent.
+    assert "SET_GPS_GLOBAL_ORIGIN" in find_origin(Sending("global-position", origin=ORIGIN), 10)
 
 
 def test_an_origin_is_set_on_the_ground_where_the_autopilot_has_none():

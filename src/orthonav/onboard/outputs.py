@@ -131,7 +131,8 @@ class Messenger:
 
     @property
     def needs_origin(self) -> bool:
-        return any(kind in LOCAL for kind in self._kinds)
+        """Whether messages are local, or the autopilot is to start at an origin of ours."""
+        return self._own_origin is not None or any(kind in LOCAL for kind in self._kinds)
 
     def find_origin(self) -> None:
         """Ask for the origin of the local frame until it is known. Where there is none, set our own

@@ -48,8 +48,8 @@ FASTEST_MPS = 300.0
 """A faster velocity is an error."""
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
-UNAIDED_VEL_STD_MPS = 5.0
-"""Of the velocity without GNSS: PX4's was 2 to 5 m/s off in simulated flights."""
+AIDED_VEL_STD_MPS, UNAIDED_VEL_STD_MPS = 1.0, 5.0
+"""Of the velocity with and without GNSS: PX4's was 2 to 5 m/s off in simulated flights."""
 LARGEST_AIDED_MPS = 1.0
 """A filter that claims more for its velocity does not fuse GNSS, whatever the receiver has."""
 STATUS_NS, FIX_NS = 5 * 10**9, 3 * 10**9
@@ -412,9 +412,9 @@ class Aiding:
         )
 
     def stds(self, now_ns: int) -> tuple[float, float]:
-        """Standard deviations of velocity (m/s; NaN: as usual) and horizon (deg)."""
+        """Standard deviations of velocity (m/s) and horizon (deg)."""
         if self.is_aided(now_ns):
-            return math.nan, self._source.aided_deg
+            return AIDED_VEL_STD_MPS, self._source.aided_deg
         return max(UNAIDED_VEL_STD_MPS, self._claimed_mps(now_ns)), self._source.unaided_deg
 
     def _claimed_mps(self, now_ns: int) -> float:
