@@ -24,7 +24,7 @@ TRUSTED = (0.1, 0.5)
 """Views with less probability of their own do not count, above the second fully."""
 LEAST_NEW = 0.15
 """Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
-ROUNDING = 1e-9  # of variances: where a view shows less than its camera, rounding has no root
+ROUNDING = 1e-7  # of variances: where a view shows less than its camera, rounding has no root
 MOST_OF_ONE = 0.75  # of a single view: less than `CONFIRMED`
 POSE = slice(2, 4)
 SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end

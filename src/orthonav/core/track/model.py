@@ -55,7 +55,7 @@ class Model:
     """Of the autopilot's horizon, in pitch and roll, without `tilt_std_deg`."""
     horizon_s: float = 15.0  # its correlation time: 10 to 30 s in real autopilots
     tilt_walk: float = math.radians(0.01)  # of the misalignment, rad per root of a second
-    sighting_noise_m: float = 2.0  # of two dates beyond the covariance of a registration, per axis
+    sighting_noise_m: float = 1.0  # of two dates beyond the covariance of a registration, per axis
     map_m: float = MAP_STD_M  # of the map as a whole, per axis: added to the covariance of a fix
     bias_jump: float = 0.01
     """Per view: a gimbal that moved (by `off_tilt_rad`), a compass that was reset."""
