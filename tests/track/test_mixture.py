@@ -18,6 +18,7 @@ from orthonav.core.track import (
     Sighting,
     State,
 )
+from orthonav.core.track.mixture import Hypothesis
 from orthonav.core.track.model import WHITE_SHARE
 from orthonav.core.track.smooth import History
 
@@ -352,6 +353,18 @@ def test_measured_positions_calibrate_the_mount():
     estimate = mixture.estimate(RADIUS_M)
     assert math.degrees(estimate.mean[6]) == pytest.approx(5.0, abs=1.0)
     assert math.degrees(math.sqrt(estimate.covariance[6, 6])) < 1.0
+
+
+def test_a_hypothesis_of_no_weight_between_two_places_is_not_the_best():
+    mixture = Mixture(MODEL, EXTENT)
+    mean, covariance = mixture._nowhere()
+    covariance[:2, :2] = 4.0 * np.eye(2)
+    places = ((0.5, 0.0), (0.5 - 1e-6, 60.0), (1e-6, 30.0))
+    mixture.hypotheses = [
+        Hypothesis(share, np.array([east, *mean[1:]]), covariance, 0.0, number)
+        for number, (share, east) in enumerate(places)
+    ]
+    assert mixture._best(35.0).share > 0.1
 
 
 def test_a_measured_position_is_in_a_jump_of_the_biases_too():

@@ -509,8 +509,9 @@ class Mixture:
         return self.hypotheses[0] if self.hypotheses else None
 
     def _best(self, radius_m: float) -> Hypothesis:
-        """With the highest probability around it, of the eight most likely."""
-        heaviest = self.hypotheses[:8]
+        """With the highest probability around it, of the eight most likely that count."""
+        least = MINOR_OF_GROUP * self.hypotheses[0].share
+        heaviest = [each for each in self.hypotheses[:8] if each.share >= least]
         return max(heaviest, key=lambda one: self._inside(radius_m, one.mean[POSITION]))
 
     def _inside(self, radius_m: float, middle: Array) -> float:
