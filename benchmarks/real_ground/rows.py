@@ -7,13 +7,7 @@ from pathlib import Path
 
 from benchmarks.closed_loop.replays import flights
 from benchmarks.real_ground.mapping import STRIPS, Windows
-from benchmarks.real_ground.maps import (
-    BARE,
-    COARSE,
-    FLAT,
-    SURFACE,
-    Map,
-)
+from benchmarks.real_ground.maps import BARE, COARSE, FLAT, SURFACE, Map
 from benchmarks.real_ground.score import Row, placed
 from benchmarks.real_ground.views import OverLevel, OverRelief, Recording, Replay
 from benchmarks.scenes import DATA, PAST, PRESENT, SCENES, Pair, Scene, leave_one_out_pairs
@@ -181,11 +175,11 @@ def _relief() -> Iterator[Question]:
     yield from _rendered("naip", "relief", [SCENES["naip"].pair("20090818", "20180716")], 5.0)
     lab = SCENES["generated_31"].pair(PAST, PRESENT)
     yield from _rendered("houses and trees", "houses", [lab], 5.0)
-    fine = [
-        Scene(f"roofs_{seed}", f"generated:{seed}:{ROOFS_GSD_M}", ROOFS_GSD_M, (PAST, PRESENT))
+    dates = PAST, PRESENT
+    roofs = [
+        Scene(f"roofs_{seed}", f"generated:{seed}:{ROOFS_GSD_M}", ROOFS_GSD_M, dates).pair(*dates)
         for seed in ROOFS_SEEDS
     ]
-    roofs = [each.pair(PAST, PRESENT) for each in fine]
     yield from _rendered("roofs at 0.2 m", "houses", roofs, 2.0, tilts=[(0.0, 0.0), (0.0, None)])
 
 

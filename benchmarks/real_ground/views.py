@@ -89,8 +89,8 @@ class OverRelief:
                 with replacing(path) as part:
                     cv2.imwrite(str(part), seen[..., 0])
             grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-            level = level_telemetry(true, np.random.default_rng([SEED, number, 1]))
-            reported = replace(level, tilt_std_deg=self.stated_deg)
+            rng = np.random.default_rng([SEED, number, 1])
+            reported = level_telemetry(true, rng, self.stated_deg)
             yield Seen(View(grey, camera, reported), (float(lat), float(lon)), true.agl_m)
 
     def _heights(self, work: Path) -> Path:
@@ -184,8 +184,8 @@ class OverLevel:
         for number, each in enumerate(views_in(self._flight(work, base, views))):
             place, true = each.truth_latlon_deg, each.view.telemetry
             if is_covered(base.registration, place, WIDTH_PX):
-                level = level_telemetry(true, np.random.default_rng([SEED, number]))
-                reported = replace(level, tilt_std_deg=self.stated_deg)
+                rng = np.random.default_rng([SEED, number])
+                reported = level_telemetry(true, rng, self.stated_deg)
                 yield Seen(replace(each.view, telemetry=reported), place, true.agl_m)
 
     def _flight(self, work: Path, base: Localizer, views: int) -> Path:
@@ -195,8 +195,11 @@ class OverLevel:
         return flight(path, work, views=views, errors=errors, seed=SEED, agl_m=agl_m)
 
 
-def level_telemetry(true: Telemetry, rng: np.random.Generator) -> Telemetry:
-    """Telemetry that reports a level camera, with errors of heading and height."""
+def level_telemetry(
+    true: Telemetry, rng: np.random.Generator, stated_deg: float | None = None
+) -> Telemetry:
+    """Telemetry that reports a level camera, with errors of heading and height; `stated_deg`: the
+    deviation of its tilt."""
     turn, log = rng.normal(0, 1, 2)
     return replace(
         true,
@@ -206,7 +209,7 @@ def level_telemetry(true: Telemetry, rng: np.random.Generator) -> Telemetry:
         agl_m=true.agl_m * max(0.5, 1 + float(log) * AGL_STD),
         yaw_std_deg=YAW_STD_DEG,
         agl_std_m=AGL_STD * true.agl_m,
-        tilt_std_deg=None,
+        tilt_std_deg=stated_deg,
     )
 
 

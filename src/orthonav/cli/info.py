@@ -182,7 +182,7 @@ def unknown_ground_text(relief: str | None) -> list[str]:
     )
     return [
         f"none: {relief or DEFAULT_RELIEF} land is assumed (slopes of {100 * slope:.0f} %); the "
-        f"standard deviation",
+        "standard deviation",
         f"of the camera per axis is {known} of the height where its tilt is known to 1 deg, "
         f"{unknown} where it is not",
     ]

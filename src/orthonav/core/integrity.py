@@ -24,6 +24,11 @@ def probability_beyond(cov_en_m2: Array, limit_m: float) -> float:
     return float(_beyond(_scales_m2(np.asarray(cov_en_m2)[None]), np.array([limit_m]))[0])
 
 
+def probability_within(place_probability: float, cov_en_m2: Array, limit_m: float) -> float:
+    """That a place is right and its error at most a limit; NaN for an unknown covariance."""
+    return place_probability * (1 - probability_beyond(cov_en_m2, limit_m))
+
+
 def protection_level_m(place_probability: float, cov_en_m2: Array, risk: float) -> float:
     """Smallest limit that the error exceeds with a probability of at most `risk`.
 

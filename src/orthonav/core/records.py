@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
-from orthonav.core.integrity import probability_beyond, protection_level_m
+from orthonav.core.integrity import probability_within, protection_level_m
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.tilt import UNSTATED
 
@@ -228,7 +228,7 @@ class Fix:
 
     def probability_within(self, limit_m: float) -> float:
         """Probability that the error is at most `limit_m`; NaN where the confidence is unknown."""
-        return self.right_probability * (1 - probability_beyond(self.cov_en_m2, max(limit_m, 0.0)))
+        return probability_within(self.right_probability, self.cov_en_m2, max(limit_m, 0.0))
 
     def with_covariance(self, cov_en_m2: NDArray[np.float64]) -> "Fix":
         """With another one (2, 2), m2, and the confidence that follows from it."""

@@ -49,7 +49,7 @@ FASTEST_MPS = 300.0
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
 AIDED_VEL_STD_MPS, UNAIDED_VEL_STD_MPS = 1.0, 5.0
-"""Of the velocity with and without GNSS: PX4's was 2 to 5 m/s off in simulated flights."""
+"""Of the velocity with GNSS and without, where PX4's was 2 to 5 m/s off in simulated flights."""
 LARGEST_AIDED_MPS = 1.0
 """A filter that claims more for its velocity does not fuse GNSS, whatever the receiver has."""
 STATUS_NS, FIX_NS = 5 * 10**9, 3 * 10**9

@@ -7,7 +7,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.integrity import probability_beyond
+from orthonav.core.integrity import probability_within
 from orthonav.core.localize.camera import CameraFound, tilt_std_deg
 from orthonav.core.localize.ground import SearchedSheet
 from orthonav.core.localize.place import Place
@@ -50,7 +50,7 @@ def fix_of(search: Search, best: Place) -> Fix:
         lat_deg=float(lat),
         lon_deg=float(lon),
         cov_en_m2=found.cov_en_m2,
-        confidence=place * (1 - probability_beyond(found.cov_en_m2, radius_m)),
+        confidence=probability_within(place, found.cov_en_m2, radius_m),
         radius_m=radius_m,
         heading_deg=heading_deg % 360,
         agl_m=found.agl_m,

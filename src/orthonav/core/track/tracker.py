@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
-from orthonav.core.integrity import probability_beyond
+from orthonav.core.integrity import probability_within
 from orthonav.core.localize.camera import CameraFound
 from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import Localizer
@@ -624,7 +624,7 @@ class Tracker:
             lat_deg=float(lat),
             lon_deg=float(lon),
             cov_en_m2=spread,
-            confidence=place_probability * (1 - probability_beyond(spread, radius_m)),
+            confidence=probability_within(place_probability, spread, radius_m),
             place_probability=place_probability,
             radius_m=radius_m,
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,

@@ -131,9 +131,10 @@ def read_image_table(path: Path) -> ImageTable:
         raise FlightError(f"{error}: {path}") from error
     comma = delimiter != ","
     numbers = [(line, texts, _numbers(texts, columns, line, comma, path)) for line, texts in lines]
-    gimbal = _is_gimbal(columns, [values for _, _, values in numbers])
-    unrecorded = _is_unrecorded(gimbal, [values for _, _, values in numbers])
-    _head(unrecorded, [values for _, _, values in numbers])
+    found = [values for _, _, values in numbers]
+    gimbal = _is_gimbal(columns, found)
+    unrecorded = _is_unrecorded(gimbal, found)
+    _head(unrecorded, found)
     rows: dict[str, ImageRow] = {}
     for order, (line, texts, values) in enumerate(numbers):
         name = str(PurePosixPath(texts["file"].replace("\\", "/").lower()))
