@@ -183,22 +183,6 @@ def test_a_view_that_shows_hardly_anything_of_its_camera_is_used_all_the_same():
     assert np.isfinite(mixture.estimate(RADIUS_M).covariance).all()
 
 
-@pytest.mark.parametrize("away_m", [300.0, 0.0])
-def test_a_place_that_dead_reckoning_contradicts_is_not_believed(away_m):
-    """A camera that consistently shows a place 300 m away; the aircraft cannot have come there."""
-    flight, mixture, places = Flight(5), Mixture(MODEL, EXTENT), []
-    for view in range(40):
-        shown = flight.place + np.array([away_m if view > 10 else 0.0, 0.0])
-        mixture.update(flight.reported(), [flight.sighting(4.0, shown)])
-        found = mixture.estimate(RADIUS_M)
-        if view > 10 and found.state is State.TRACKING and math.dist(found.mean[:2], shown) < 30:
-            places.append(found.place_probability)
-        mixture.predict(1.0, ReportedVelocity(SPEED, None, 1.0), flight.moved())
-    assert len(places) > 16
-    assert max(places[:8]) <= 0.8 if away_m else min(places) > 0.999
-    assert min(places[-4:]) > 0.999  # eight views of new ground: the dead reckoning was wrong
-
-
 def test_without_sightings_it_becomes_lost_and_its_covariance_grows():
     flight, mixture, _ = flown(3)
     spread = [np.trace(mixture.estimate(RADIUS_M).covariance[:2, :2])]
@@ -215,7 +199,8 @@ def test_without_sightings_it_becomes_lost_and_its_covariance_grows():
 
 
 def test_a_kidnapped_aircraft_is_found_again():
-    flight, mixture, _ = flown(4)
+    """A short track, so that a few more views are believed against it."""
+    flight, mixture, _ = flown(4, views=10)
     flight.place = -flight.place
     states, confident_wrong = [], 0
     for _ in range(18):
@@ -225,7 +210,7 @@ def test_a_kidnapped_aircraft_is_found_again():
         wrong = off_m(mixture, flight) > RADIUS_M
         confident_wrong += wrong and mixture.estimate(RADIUS_M).confidence > 0.9
     assert states[-1] is State.TRACKING and off_m(mixture, flight) < 10
-    assert confident_wrong <= 4
+    assert confident_wrong == 0
 
 
 def test_false_places_that_come_and_go_are_not_followed():
@@ -382,9 +367,9 @@ def test_a_measured_position_is_in_a_jump_of_the_biases_too():
 def test_a_track_coasts_while_views_do_not_show_the_map():
     flight, mixture, _ = flown(3, false_share=0.0)
     assert mixture.estimate(RADIUS_M).state is State.TRACKING
-    velocity = ReportedVelocity(np.array(SPEED), np.array(SPEED), 1.0)
+    velocity = ReportedVelocity(np.array(SPEED), np.array(SPEED), 3.0, 15.0)
     rows = []
-    for _ in range(15):
+    for _ in range(30):
         flight.moved()
         mixture.predict(1.0, velocity)
         mixture.update(flight.reported(), [])
@@ -392,8 +377,6 @@ def test_a_track_coasts_while_views_do_not_show_the_map():
     assert rows[0].state is State.COASTING and rows[-1].state is State.LOST
     assert rows[0].confidence <= 0.8
     assert np.all(np.diff([each.confidence for each in rows]) <= 0)
-    std_m = [math.sqrt(each.covariance[0, 0]) for each in rows]
-    assert std_m[9] == pytest.approx(MODEL.coasting_walk * math.sqrt(9**3 / 3), rel=0.2)
 
 
 @pytest.mark.parametrize(("confirms", "state"), [(False, State.SEARCHING), (True, State.TRACKING)])
@@ -406,7 +389,7 @@ def test_only_places_that_competed_with_all_others_confirm_a_track(confirms, sta
         mixture.update(flight.reported(), [flight.sighting(4.0)], confirms=confirms or not view)
     estimate = mixture.estimate(RADIUS_M)
     assert estimate.belief > 0.9 and np.hypot(*(estimate.mean[:2] - flight.place)) < 10
-    assert (estimate.state, estimate.followed) == (state, state is State.TRACKING)
+    assert (estimate.state, estimate.shown.followed) == (state, state is State.TRACKING)
 
 
 @pytest.mark.parametrize(
@@ -485,15 +468,8 @@ def contradicted(displacements_m):
     return rows[11:]
 
 
-def views_until_believed(rows, away_m):
-    """Tracked views there, before the first with a place probability above 0.8; None: all."""
-    here = [
-        found
-        for found, off_m in rows
-        if found.state is State.TRACKING and math.dist(off_m, away_m) < 30
-    ]
-    believed = [found.place_probability > 0.8 for found in here]
-    return believed.index(True) if True in believed else None
+def states(displacements_m):
+    return [found.state for found, _ in contradicted(displacements_m)]
 
 
 EAST, WEST = (300.0, 0.0), (-420.0, 0.0)
@@ -522,40 +498,64 @@ def test_the_confidence_of_a_flight_is_below_its_place_probability(seed):
         assert found.confidence <= found.place_probability
 
 
-def test_a_place_shown_at_every_second_view_only_is_not_believed():
-    """The other place makes the track coast, and often does not end it."""
-    rows = contradicted([EAST, WEST] * 30)
-    assert all(found.place_probability <= 0.8 for found, _ in rows)
-    assert {State.TRACKING, State.COASTING} <= {found.state for found, _ in rows[20:]}
+LOST, TRACKING = State.LOST, State.TRACKING
 
 
-def test_two_contradicting_places_by_turns_are_not_believed():
-    """Neither was recognized on enough new ground, although both together were."""
-    rows = contradicted(([EAST] * 5 + [WEST] * 5) * 5)
-    tracked = [found for found, _ in rows if found.state is State.TRACKING]
-    assert len(tracked) > 20
-    assert max(found.place_probability for found in tracked) <= 0.8
+def test_a_place_that_dead_reckoning_contradicts_is_believed_after_more_ground_than_the_track():
+    """Eleven views of the track; a camera that consistently shows another place."""
+    rows = contradicted([EAST] * 24)
+    assert [found.state for found, _ in rows] == [LOST] * 12 + [TRACKING] * 12
+    assert all(found.place_probability <= 0.8 for found, _ in rows[:12])
+    assert all(math.dist(off_m, EAST) < 15 for _, off_m in rows)
 
 
-@pytest.mark.parametrize("unseen", [0, 3, 14])
-def test_another_contradicting_place_is_counted_anew(unseen):
-    rows = contradicted([EAST] * 9 + [None] * unseen + [WEST] * 24)
-    assert views_until_believed(rows[:9], EAST) is None
-    assert sum(found.state is State.TRACKING for found, _ in rows[:9]) > 5
-    assert views_until_believed(rows[9 + unseen :], WEST) >= 8
+@pytest.mark.parametrize(
+    "displacements_m",
+    [[EAST, WEST] * 30, ([EAST] * 5 + [WEST] * 5) * 6, [EAST] * 9 + [WEST] * 11],
+    ids=["every view", "every five", "after nine"],
+)
+def test_two_contradicting_places_by_turns_are_not_believed(displacements_m):
+    """Neither was shown on enough new ground, although both together were."""
+    assert set(states(displacements_m)) == {LOST}
 
 
-def test_a_contradicting_place_is_counted_anew_after_a_loss():
-    rows = contradicted([EAST] * 9 + [WEST] + [EAST] * 24)
-    assert rows[9][0].state is State.LOST
-    assert views_until_believed(rows[:9], EAST) is None
-    assert views_until_believed(rows[10:], EAST) >= 8
+def test_views_that_show_nothing_count_against_a_contradicting_place():
+    """As many views as the ground they do not show longer."""
+    assert states([EAST] * 9 + [None] * 3 + [EAST] * 8)[-8:] == [LOST] * 8
 
 
-def test_a_contradicting_place_is_counted_on_after_views_that_show_nothing():
-    rows = contradicted([EAST] * 9 + [None] * 3 + [EAST] * 3)
-    assert {found.state for found, _ in rows[9:12]} == {State.COASTING}
-    assert views_until_believed(rows, EAST) == 8
+@pytest.mark.parametrize("away", [1, 9])
+def test_the_track_is_found_at_once_where_the_camera_shows_it_again(away):
+    """Its dead-reckoned place stays a hypothesis while another one contradicts it."""
+    rows = contradicted([EAST] * away + [(0.0, 0.0)] * 4)[away:]
+    assert {found.state for found, _ in rows} == {TRACKING}
+    assert all(math.hypot(*off_m) < 10 for _, off_m in rows)
+
+
+@pytest.mark.parametrize(("off_m", "views"), [(20.0, 4), (600.0, 11)])
+def test_a_start_counts_as_eight_views_against_other_places(off_m, views):
+    flight, mixture, found = Flight(5), Mixture(MODEL, EXTENT), []
+    mixture.start(flight.place + np.array([off_m, 0.0]), 30.0)
+    for _ in range(14):
+        mixture.update(flight.reported(), [flight.sighting(4.0)])
+        found.append(mixture.estimate(RADIUS_M))
+        mixture.predict(1.0, ReportedVelocity(SPEED, None, 1.0), flight.moved())
+    tracked = [each.state for each in found].index(TRACKING)
+    assert tracked <= 3 if off_m < 100 else 6 <= tracked < views
+    assert all(each.confidence <= 0.8 for each in found[:tracked])
+
+
+def test_a_heading_that_only_the_camera_tells_does_not_leave_the_reported_one():
+    """A mirrored camera in a turn: what it sees of the turn is opposite to what is reported."""
+    flight, mixture, _ = flown(5)
+    velocity = ReportedVelocity(SPEED, SPEED, 1.0)
+    for _ in range(12):
+        moved = replace(flight.moved(), turned_rad=math.radians(-15.0))
+        mixture.predict(1.0, velocity, moved)
+        mixture.update(flight.reported(), [])
+    estimate = mixture.estimate(RADIUS_M)
+    assert abs(math.degrees(estimate.mean[4])) < 28 + 2
+    assert math.hypot(*(estimate.mean[2:4] - SPEED)) < 12
 
 
 def test_hypotheses_are_merged_and_ordered_at_views_that_cannot_be_used():

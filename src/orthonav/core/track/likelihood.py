@@ -20,12 +20,9 @@ from orthonav.core.track.model import (
     Sighting,
 )
 
-TRUSTED = (0.1, 0.5)
-"""Views with less probability of their own do not count, above the second fully."""
 LEAST_NEW = 0.15
 """Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
 ROUNDING = 1e-7  # of variances: where a view shows less than its camera, rounding has no root
-MOST_OF_ONE = 0.75  # of a single view: less than `CONFIRMED`
 POSE = slice(2, 4)
 SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end
 MAX_LOG_ODDS = 7.0  # of a single view
@@ -195,10 +192,3 @@ def recognition(
     agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
     odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement
     return np.asarray(odds / (1 + odds))
-
-
-def confirmed_ground(alone: float, ground: float) -> float:
-    """New ground, in views; `ground`: fraction of the view that the last one did not show."""
-    low, high = TRUSTED
-    trust = min(max((alone - low) / (high - low), 0.0), 1.0)
-    return min(ground * trust, MOST_OF_ONE)

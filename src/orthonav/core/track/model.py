@@ -39,8 +39,6 @@ class Model:
     accel_mps2: float = 4.0  # while no velocity is reported, per axis
     reported_velocity_s: float = 120.0
     """Correlation time of the error of a reported velocity (docs/decisions/tracking.md)."""
-    coasting_walk: float = 1.3
-    """Of its drift while views do not show the map, m/s per root of a second."""
     heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)  # of the constant error,
     heading_noise_rad: float = math.radians(2.0)  # from view to view, without `yaw_std_deg`,
     heading_walk: float = math.radians(0.05)

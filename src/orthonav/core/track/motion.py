@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from orthonav.core.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG
 from orthonav.core.track.likelihood import log_density
 from orthonav.core.track.model import (
     HEADING,
@@ -23,6 +24,12 @@ VELOCITY_JITTER = 0.3
 VELOCITY_STD_MPS, VELOCITY_SHARE = 3.0, 0.02
 """Of a reported velocity without deviation, and fraction of the speed: of an autopilot without
 GNSS, whose velocity was wrong by 1 to 3 m/s (docs/decisions/tracking.md)."""
+
+PLAUSIBLE_SIGMAS = 4.0
+MOST_HEADING_RAD = PLAUSIBLE_SIGMAS * math.radians(DEFAULT_YAW_STD_DEG)
+MOST_LOG_SCALE = PLAUSIBLE_SIGMAS * DEFAULT_AGL_STD
+"""A heading, height or velocity that differs more from the reported one is that of odometry which
+is wrong for long."""
 
 
 def usual_velocity_std_mps(speed_mps: float) -> float:
@@ -94,16 +101,14 @@ def predicted(
     telemetry_noise: Array,
     camera: CameraDisplacement | None = None,
     *,
-    coasting: bool = False,
     overlap: float = 0.0,
 ) -> Expected:
     """The state after so many seconds, by the reported velocity or else its own.
 
     `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view, added to
     their biases unless the `camera` measured the change, and of the horizon (Gauss-Markov,
-    `Model.horizon_s`). The displacement itself is added by `by_camera`. While `coasting`, the error
-    of a reported velocity drifts (`Model.coasting_walk`). `overlap`:
-    fraction of the view that the last one showed too."""
+    `Model.horizon_s`). The displacement itself is added by `by_camera`. `overlap`: fraction of the
+    view that the last one showed too."""
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)
@@ -126,8 +131,8 @@ def predicted(
     else:
         like_before = 0.0
         after[VELOCITY] = velocity.now_en_mps
-        known_mps = model.speed_mps / 2 if coasting else 3 * velocity.std_mps
-        if velocity.before_en_mps is not None and covariance[2, 2] < known_mps**2:
+        known_m2ps2 = (3 * velocity.std_mps) ** 2
+        if velocity.before_en_mps is not None and covariance[2, 2] < known_m2ps2:
             like_before = math.exp(-seconds / (velocity.correlation_s or model.reported_velocity_s))
             after[VELOCITY] += like_before * (mean[VELOCITY] - velocity.before_en_mps)
         after[POSITION] += seconds * after[VELOCITY]
@@ -136,9 +141,6 @@ def predicted(
         added = velocity.std_mps**2 * (1 - like_before**2)
         jitter = (VELOCITY_JITTER * velocity.std_mps * seconds) ** 2
         _add(noise, added * seconds**2 + jitter, added * seconds, added)
-        if coasting:
-            power = model.coasting_walk**2
-            _add(noise, power * seconds**3 / 3, power * seconds**2 / 2, power * seconds)
     return Expected(
         after, step @ covariance @ step.T + noise, mean, covariance, covariance @ step.T
     )
@@ -186,6 +188,19 @@ def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected,
         mean[now], joint[now, now], mean[before], joint[before, before], joint[before, now]
     )
     return after, log_density(innovation, spread)
+
+
+def is_plausible(mean: Array, velocity: ReportedVelocity | None) -> bool:
+    """Whether heading, height and velocity of a state (16,) are as reported.
+
+    The camera measures how they change, and nothing else would hold them: a mirrored camera turned
+    the heading by 170 deg."""
+    if abs(mean[HEADING]) > MOST_HEADING_RAD or abs(mean[SCALE]) > MOST_LOG_SCALE:
+        return False
+    if velocity is None:
+        return True
+    most_mps = PLAUSIBLE_SIGMAS * max(velocity.std_mps, VELOCITY_STD_MPS)
+    return float(np.hypot(*(mean[VELOCITY] - velocity.now_en_mps))) <= most_mps
 
 
 def velocity_forgotten(model: Model, covariance: Array) -> Array:

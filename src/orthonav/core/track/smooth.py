@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from orthonav.core.track.mixture import Hypothesis, Mixture
+from orthonav.core.track.hypothesis import Hypothesis
+from orthonav.core.track.mixture import Mixture
 from orthonav.core.track.model import STATE, Array
 from orthonav.core.track.motion import Expected
 

@@ -264,7 +264,7 @@ class Tracker:
             more = {
                 "hypotheses": float(len(self.mixture.hypotheses)),
                 "elsewhere": self.mixture.elsewhere,
-                "recognized": estimate.recognized,
+                "recognized": estimate.shown.now,
             }
             mean, covariance = estimate.mean, estimate.covariance
             place = estimate.place_probability
@@ -452,7 +452,7 @@ class Tracker:
         """`NoFix` where the view shows too little."""
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
-        if expected is not None and expected.followed and self._must_compete(expected):
+        if expected is not None and expected.shown.followed and self._must_compete(expected):
             self._whole_map = not self._whole_map  # the whole map and the surroundings by turns
         searched = self._search_area(expected, whole_map=self._whole_map)
         prior = self._prior(searched)
@@ -510,11 +510,11 @@ class Tracker:
         Not while a reported start is likely."""
         if expected.state is State.SEARCHING:
             return expected.belief < LOCAL_SHARE
-        return not (expected.state.is_followed and expected.confirmed)
+        return not (expected.state.is_followed and expected.shown.is_confirmed)
 
     def _search_area(self, expected: Estimate | None, *, whole_map: bool) -> SearchArea:
         """Around a nearly certain position, else all. `whole_map`: places there have to compete."""
-        if expected is None or not expected.followed:
+        if expected is None or not expected.shown.followed:
             return WHOLE_MAP  # an unconfirmed place must compete with the whole map
         competes = self._must_compete(expected)
         is_lost = expected.state is State.TRACKING and expected.confidence < LOCAL_SHARE

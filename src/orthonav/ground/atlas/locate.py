@@ -30,8 +30,8 @@ from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_f
 from orthonav.core.localize.view import MIN_VIEW_PX, check_footprint, check_view, pose_prior
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.track import Model, State
-from orthonav.core.track.mixture import MOST_SIGHTED
 from orthonav.core.track.tracker import Tracker
+from orthonav.core.track.trust import MOST_LATELY
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.cut import cut_in_memory
 from orthonav.ground.atlas.search import (
@@ -398,7 +398,8 @@ class LocalTrack:
             if prior is not None:  # agreement has confirmed this place
                 mixture, prior = self._tracker.mixture, None
                 mixture.hypotheses = [
-                    replace(each, sighted=MOST_SIGHTED) for each in mixture.hypotheses
+                    replace(each, shown=replace(each.shown, ground=MOST_LATELY))
+                    for each in mixture.hypotheses
                 ]
         self._take(seen, last, found.confidence)
         here = [(self._last.lat_deg, self._last.lon_deg)]
