@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -27,10 +28,13 @@ from benchmarks.closed_loop.physics import (
 from benchmarks.closed_loop.replays import CAMERA, Area, Grey, Rule, is_wrong, plain, stated
 from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.record import Section, Table, number, quantiles, say
+from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
+from orthonav.core.records import MAP_STD_M, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import FrozenCheck
+from orthonav.onboard.gnss.biases import DIFFERENTIAL
+from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
 from orthonav.onboard.messages.estimate import (
     Clock,
     FilterCovariance,
@@ -54,6 +58,8 @@ LATENCY_S = 0.1
 GRADES = {"px4": CONSUMER, "ardupilot": CALM}
 START_STD_M, PRIOR_STD_M = 30.0, 100.0
 """Error of the position at a start without GNSS, and the deviation of every prior."""
+SBAS_STD_M = 1.0
+"""Stated by a receiver with corrections by SBAS."""
 START_STD_MPS = {True: 3.0, False: 0.5}
 """The same of the velocity; a vehicle without an airspeed hovers."""
 SETTLING_S = {True: 5.0, False: 15.0}
@@ -162,7 +168,9 @@ class Route:
 
 
 class Sight:
-    """Camera and orthonav of one flight, as `orthonav fly` joins them."""
+    """Camera and orthonav of one flight, as `orthonav fly --gnss watch` joins them.
+
+    The map is displaced by what fixes state."""
 
     def __init__(
         self,
@@ -173,12 +181,25 @@ class Sight:
     ) -> None:
         self._area, self._scenario, self._rule, self._seed = area, scenario, rule, seed
         self._tracker, self.gate = Tracker(area.localizer), Gate(clock=Clock.BOOT)
+        self._solutions: deque[GnssSample] = deque()
+        self._watch = GnssWatch(area.frame, live_solutions(self._solutions))
         self._frozen, self._covariance = FrozenCheck(), FilterCovariance()
         self._before: Grey | None = None
+        self._displaced_m = np.random.default_rng([seed, 7]).normal(0.0, MAP_STD_M, 2)
 
     @property
     def frame(self) -> LocalFrame:
         return self._area.frame
+
+    def hear(self, time_s: float, place_ne: Array, velocity: Array) -> None:
+        """A solution of a receiver with corrections by SBAS."""
+        lat, lon = self.frame.latlon_from_en(place_ne[::-1])
+        time_ns, vel_en_mps = round(time_s * 1e9), (float(velocity[1]), float(velocity[0]))
+        self._solutions.append(
+            GnssSample(
+                time_ns, time_ns, float(lat), float(lon), DIFFERENTIAL, SBAS_STD_M, vel_en_mps
+            )
+        )
 
     def look(
         self, time_s: float, truth: Motion, estimate: Motion, *, gnss: bool
@@ -193,6 +214,9 @@ class Sight:
             outcome, latency_ms = locate_view(self._tracker, view)
             state = self._tracker.state_name
             result = ViewResult("", telemetry.time_ns, outcome, latency_ms, state)
+            self._watch.tick(telemetry.time_ns)
+            result = self._watch.view(result, telemetry.time_ns)
+            outcome = result.outcome
             made = estimate_from_result(result, clock=Clock.BOOT, processing_s=LATENCY_S)
         admitted = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
         stated = None
@@ -217,7 +241,9 @@ class Sight:
         if fault == "frozen" and self._before is not None:
             return self._before
         yaw, pitch, roll = np.degrees(euler_rad(truth.rotation)).tolist()
-        place = truth.position[[1, 0]] + [300.0 if fault == "shifted" else 0.0, 0.0]
+        place = (
+            truth.position[[1, 0]] + self._displaced_m + [300.0 if fault == "shifted" else 0.0, 0.0]
+        )
         rng = np.random.default_rng([self._seed, round(time_s * 1e3)])
         height_m = float(-truth.position[2])
         grey = self._area.picture(place, (yaw, pitch, roll), height_m, rng)
@@ -315,7 +341,7 @@ def fly(
                 flown.views.append(located)
                 if sent is not None and not gnss:
                     _give(estimator, sight.frame, sent, scenario.send == "position+velocity")
-        _sense(step, estimator, instruments, aircraft, wind, gnss=gnss)
+        _sense(step, estimator, instruments, aircraft, wind, sight, gnss=gnss)
         before = aircraft.motion
         aircraft.step(wind.next())
         estimator.feel(instruments.imu(increments(before, aircraft.motion)))
@@ -380,6 +406,7 @@ def _sense(
     instruments: Instruments,
     aircraft: Vehicle,
     wind: Wind,
+    sight: Sight | None,
     *,
     gnss: bool,
 ) -> None:
@@ -396,6 +423,8 @@ def _sense(
         estimator.measure(lambda: estimator.fuse_air(airspeed_mps))
     if gnss and step % 10 == 0:
         place, velocity = instruments.gnss(motion)
+        if sight is not None:
+            sight.hear(step * STEP_S, place, velocity)
         tuning = estimator.tuning
         estimator.measure(lambda: estimator.fuse_position(place, tuning.gnss_m))
         estimator.measure(lambda: estimator.fuse_velocity(velocity, tuning.gnss_mps))
@@ -489,8 +518,8 @@ def measure(options: argparse.Namespace) -> Section:
                 rows[-1][0] += f", seed {seed}"
             say(f"{' | '.join(rows[-1])} {flown.withheld}")
     notes = (
-        f"{options.minutes:g} minutes without GNSS, {GNSS_S:g} s with it; position, velocity, "
-        "tilt: errors of the autopilot; slope: of errors of fixes with height "
+        f"{options.minutes:g} minutes without GNSS, {GNSS_S:g} s with it; the map is displaced by "
+        f"{MAP_STD_M:g} m per axis; position, velocity, tilt: errors of the autopilot; slope: of errors of fixes with height "
         "times the tangent of the autopilot's error of tilt, ahead and right; false: sent, and "
         f"more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )

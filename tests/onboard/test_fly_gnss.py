@@ -14,6 +14,7 @@ from test_fly import AHEAD_NS, Flight
 from orthonav.cli.flying import gnss_watch
 from orthonav.core.flight.gnss import FAULTS, GnssSample
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.records import ViewResult
 from orthonav.onboard.gnss.biases import unknown
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
 from orthonav.onboard.state import SavedState, learnt_biases, reference_biases, save
@@ -219,6 +220,66 @@ def test_an_error_of_the_monitor_does_not_end_the_flight(begin, caplog):
     flight.health()
     assert len(flight.sent("GLOBAL_POSITION_SENSOR")) == 10 and all(results)
     assert caplog.text.count("could not be compared with GNSS") == 1
+
+
+def corrected_by(differences_m, std_m=3.6, fix_type=3, known=None):
+    """Correction (2,) and standard deviation of a fix after GNSS is lost.
+
+    GNSS less map (2,) at views of every second before."""
+    solutions, en_m = deque(), np.zeros(2)
+    watch = GnssWatch(FRAME, live_solutions(solutions), digest="d", known=known or {})
+    moved_m, after = en_m, None
+    for second, difference_m in enumerate([*differences_m, *[None] * 6]):
+        time_ns = (100 + second) * S
+        en_m = np.add(en_m, [0.0, SPEED_MPS])
+        gnss_m = en_m + (np.zeros(2) if difference_m is None else np.asarray(difference_m))
+        lat, lon = FRAME.latlon_from_en(gnss_m)
+        kind = 1 if difference_m is None else fix_type
+        velocity = (0.0, SPEED_MPS)
+        solutions.append(GnssSample(time_ns, time_ns, float(lat), float(lon), kind, 1.0, velocity))
+        lat, lon = FRAME.latlon_from_en(en_m)
+        made = fix(float(lat), float(lon), std_m=std_m)
+        result = ViewResult("", time_ns, made, 0.0, "tracking")
+        after = watch.view(result, time_ns).outcome
+        watch.tick(time_ns)
+        moved_m = FRAME.en_from_latlon(after.lat_deg, after.lon_deg) - en_m
+    return moved_m, after.std_m
+
+
+def test_fixes_are_corrected_by_what_was_seen_before_gnss_failed():
+    moved_m, std_m = corrected_by([(4.0, 0.0)] * 90, fix_type=4)
+    assert 1.5 < moved_m[0] < 4 and abs(moved_m[1]) < 0.5 and std_m < 3.2
+    less_m, wider_m = corrected_by([(4.0, 0.0)] * 90)  # a receiver without corrections
+    assert 0.5 < less_m[0] < moved_m[0] and std_m < wider_m < 3.6
+
+
+def test_nothing_is_corrected_without_gnss_nor_where_no_displacement_is_included():
+    moved_m, std_m = corrected_by([])
+    assert moved_m == pytest.approx([0, 0], abs=0.01) and std_m == pytest.approx(3.6)
+    moved_m, std_m = corrected_by([(4.0, 0.0)] * 90, std_m=2.0)
+    assert moved_m == pytest.approx([0, 0], abs=0.01) and std_m == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    "differences_m",
+    [
+        [(40.0, 0.0)] * 200,
+        [(0.0, 0.0)] * 60 + [(0.4 * second, 0.0) for second in range(60)],
+        [(0.0, 0.0)] * 60 + [(0.1 * second, 0.0) for second in range(300)],
+        [(0.0, 0.0)] * 60 + [(30.0, 0.0)] * 30,
+    ],
+    ids=["offset", "dragged", "dragged slowly", "step"],
+)
+def test_a_spoofed_receiver_moves_fixes_by_six_metres_at_most(differences_m):
+    moved_m, _ = corrected_by(differences_m, fix_type=4)
+    assert np.hypot(*moved_m) <= 6.0
+
+
+def test_the_displacement_of_an_earlier_flight_corrects_a_flight_without_gnss():
+    learnt = replace(unknown(), mean=np.array([4.0, -2.0, 0, 0, 0]), agreed_s=3600.0)
+    learnt = replace(learnt, cov=learnt.cov * np.diag([1e-3, 1e-3, 1, 1, 1]))
+    moved_m, std_m = corrected_by([], known={"d": learnt})
+    assert moved_m == pytest.approx([3.7, -1.8], abs=0.4) and std_m < 2.6
 
 
 def test_a_watch_without_solutions_reports_nothing():

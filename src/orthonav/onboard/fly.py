@@ -373,9 +373,11 @@ class Runner:
 
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
         state, risk = self._locator.state_name, self.options.risk
-        accepted = self._accepts(outcome) if isinstance(outcome, Fix) else None
-        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, accepted, risk)
-        return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
+        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, risk=risk)
+        if self._gnss is not None:
+            result = self._gnss.view(result, image.exposed_ns)
+        fix = result.outcome
+        return replace(result, accepted=self._accepts(fix) if isinstance(fix, Fix) else None)
 
     def _accepts(self, fix: Fix) -> bool:
         accept = self.options.accept

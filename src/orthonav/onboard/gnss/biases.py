@@ -68,6 +68,10 @@ _PRIOR_STD = np.array([30.0, 30.0, math.radians(1.5), math.radians(1.5), 0.2])
 was aligned by eye to 3 deg and a latency of 0.4 s are 2 sigma."""
 _BETWEEN_STD = np.array([0.0, 0.0, math.radians(0.3), math.radians(0.3), 0.03])
 """Change from flight to flight: a camera that was taken off, a latency that was measured again."""
+MOST_DISPLACED_M = 2 * MAP_STD_M
+"""A larger displacement does not correct fixes."""
+_TRACK_STD = np.array([MAP_STD_M, MAP_STD_M, *_BETWEEN_STD[2:]])
+"""Of what a track leaves: its covariance includes the displacement, it estimates the mount."""
 PLAUSIBLE_SIGMAS = 5.0
 """A displacement beyond so many of the standard deviations that every fix includes for it
 (`MAP_STD_M`) is that of a wrong map, or of a spoofed receiver."""
@@ -113,6 +117,19 @@ class Biases:
         """Whether the displacement may be that of a map as accurate as fixes state."""
         largest_m = PLAUSIBLE_SIGMAS * MAP_STD_M + 2 * self.std_m
         return float(np.hypot(*self.en_m)) <= largest_m
+
+    @property
+    def displacement(self) -> tuple[Array, Array] | None:
+        """That of a map as accurate as fixes state: mean (2,) and covariance (2, 2), metres.
+
+        None where it is larger than `MOST_DISPLACED_M`: less than that is what a spoofed receiver
+        can move a position by."""
+        known = np.linalg.inv(self.cov)
+        # They were learnt from a wider prior, which that of a track replaces.
+        cov = np.linalg.inv(known + np.diag(_TRACK_STD**-2 - _PRIOR_STD**-2))
+        mean = (cov @ known @ self.mean)[:2]
+        close = float(np.hypot(*mean)) <= MOST_DISPLACED_M
+        return (mean, np.asarray(cov[:2, :2])) if close else None
 
     def variance_m2(self, design: Array) -> float:
         """Variance of GNSS minus map along the worst axis, for the `design` (2, 5) of a view."""
@@ -213,6 +230,9 @@ WINDOW_S = 60.0
 GNSS_STD_M, GNSS_TAU_S = 3.0, 120.0
 """Least standard deviation per axis of the slowly varying error of GNSS (receivers state less), and
 its correlation time."""
+DIFFERENTIAL, DIFFERENTIAL_STD_M = 4, 1.0
+"""From which GPS_FIX_TYPE on corrections by SBAS or a reference station are used, and that least
+deviation with them, where biases are learnt."""
 MAP_TAU_S, MOUNT_TAU_S = 60.0, 600.0
 """Correlation times of the map's local errors, and of the part that turns with the aircraft."""
 MOUNT_SHARE, WHITE_SHARE = 0.4, 0.2
@@ -518,7 +538,7 @@ class _Filter:
         """Derivatives (2, 11) of a value by the state; slow errors have unit variance."""
         made = np.zeros((2, _STATES))
         made[:, _BIAS] = value.design
-        made[:, _GNSS] = max(value.gnss_std_m, GNSS_STD_M) * np.eye(2)
+        made[:, _GNSS] = value.gnss_std_m * np.eye(2)
         made[:, _LOCAL] = math.sqrt(LOCAL_SHARE) * value.map_std_m * np.eye(2)
         sin, cos = math.sin(value.heading_rad), math.cos(value.heading_rad)
         turned = np.array([[cos, sin], [-sin, cos]])

@@ -16,6 +16,8 @@ from orthonav.core.flight.gnss import FAULTS, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import (
     BIN_S,
+    DIFFERENTIAL,
+    DIFFERENTIAL_STD_M,
     FAULT_SIGMAS,
     GNSS_STD_M,
     GNSS_TAU_S,
@@ -281,6 +283,13 @@ class GnssMonitor:
         return self._learner.learnt
 
     @property
+    def undisturbed(self) -> Biases:
+        """Estimate that no fault has touched: during one, from all values before it; else from
+        those whose quarantine has ended."""
+        faulty = self.status.state in (GnssState.ALARM, GnssState.RETURNING)
+        return self._anchor if faulty else self._learner.learnt
+
+    @property
     def reference(self) -> Biases:
         return self._learner.reference
 
@@ -342,7 +351,8 @@ class GnssMonitor:
         velocity = position.vel_en_mps
         if velocity is None:
             velocity = np.array(sample.vel_en_mps or (0.0, 0.0))
-        std_m = sample.std_m if math.isfinite(sample.std_m) else GNSS_STD_M
+        least_m = GNSS_STD_M if sample.fix_type < DIFFERENTIAL else DIFFERENTIAL_STD_M
+        std_m = max(sample.std_m, least_m) if math.isfinite(sample.std_m) else GNSS_STD_M
         heading = math.radians(position.heading_deg)
         time_s = position.time_ns * NANOSECONDS
         made = Difference(

@@ -17,7 +17,7 @@ import numpy as np
 from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import CONFIDENT, Fix, ViewResult
+from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult
 from orthonav.onboard.gnss.biases import (
     NANOSECONDS,
     Array,
@@ -111,8 +111,23 @@ class GnssWatch:
             position = self._position(fix, now_ns)
             for monitor in self._monitors.values():
                 monitor.position(position)
+        if isinstance(fix, Fix):
+            fix = self._corrected(fix)
         evidence = MappingProxyType({**fix.evidence, **self._evidence(now_ns)})
         return replace(result, outcome=replace(fix, evidence=evidence))
+
+    def _corrected(self, fix: Fix) -> Fix:
+        """By the displacement of the map, as far as it is known, where the fix includes one."""
+        first = self._monitors.get(0)
+        found = (self._start if first is None else first.undisturbed).displacement
+        includes = float(np.linalg.eigvalsh(fix.cov_en_m2)[0]) >= MAP_STD_M**2
+        if found is None or not includes:
+            return fix
+        en_m, cov = found
+        place_m = np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)) + en_m
+        lat, lon = self._frame.latlon_from_en(place_m)
+        moved = fix.with_covariance(fix.cov_en_m2 + cov - np.eye(2) * MAP_STD_M**2)
+        return replace(moved, lat_deg=float(lat), lon_deg=float(lon))
 
     def tick(self, mono_ns: int) -> list[GnssText]:
         """Judge at a time of the monotonic clock; messages about changes since the last call."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import OrthonavError
-from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult, error_ellipse
+from orthonav.core.records import CONFIDENT, Fix, ViewResult, error_ellipse
 
 AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4
 """Time over which the filters of autopilots average positions, for a claim of `AT_STD_M`; it grows
@@ -188,12 +188,11 @@ def for_filter(
 ) -> NavigationEstimate:
     """The estimate with the covariance that makes the claim of a receiving filter right.
 
-    `min_std_m`: lower bound of the standard deviation, at least that of the map's displacement,
-    which does not average out. An invalid covariance stays as it is.
+    `min_std_m`: lower bound of the standard deviation. An invalid covariance stays as it is.
     """
     if math.isnan(estimate.horizontal_std_m()):
         return estimate
-    cov = floored(estimate.cov_en_m2, max(MAP_STD_M, min_std_m))
+    cov = floored(estimate.cov_en_m2, min_std_m)
     count = messages_averaged(error_ellipse(cov)[0], interval_s)
     return replace(estimate, cov_en_m2=cov * count)
 
