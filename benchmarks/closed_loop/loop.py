@@ -519,8 +519,9 @@ def measure(options: argparse.Namespace) -> Section:
             say(f"{' | '.join(rows[-1])} {flown.withheld}")
     notes = (
         f"{options.minutes:g} minutes without GNSS, {GNSS_S:g} s with it; the map is displaced by "
-        f"{MAP_STD_M:g} m per axis; position, velocity, tilt: errors of the autopilot; slope: of errors of fixes with height "
-        "times the tangent of the autopilot's error of tilt, ahead and right; false: sent, and "
+        f"{MAP_STD_M:g} m per axis; position, velocity, tilt: errors of the autopilot; slope: of "
+        "errors of fixes with height times the tangent of the autopilot's error of tilt, ahead and "
+        "right; false: sent, and "
         f"more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
     title = f"{options.vehicle}, filter like {options.filter}'s, sent: {options.send}"
