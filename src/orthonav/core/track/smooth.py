@@ -1,7 +1,6 @@
 """Smoothing: hypotheses followed back through their parents (Rauch, Tung and Striebel 1965); where
 a track was born again, smoothing begins again."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,7 +14,6 @@ from orthonav.core.track.motion import Expected
 SIZES = [STATE, STATE**2] * 3 + [STATE**2]
 """Of a state, its prediction, the state before, and their covariance."""
 STARTS = np.cumsum(SIZES)[:-1]
-ROWS_OF_BLOCK = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,46 +26,23 @@ class Smoothed:
 
 
 class _Kept(NamedTuple):
+    """`numbers`: state, prediction, state before and their covariance, in one array: many small
+    ones would hold on to more memory."""
+
     parent: int
     share: float
-    row: int
+    numbers: Array
     is_predicted: bool
 
+    def state(self) -> tuple[Array, Array]:
+        mean, covariance = np.split(self.numbers[: sum(SIZES[:2])], STARTS[:1])
+        return mean, covariance.reshape(STATE, STATE)
 
-class _Rows:
-    """Rows of numbers in large blocks: single arrays would hold on to four times the memory."""
-
-    def __init__(self) -> None:
-        self._blocks: list[Array] = []
-        self._free: list[int] = []
-
-    def add(self, parts: Sequence[Array]) -> int:
-        if not self._free:
-            first = ROWS_OF_BLOCK * len(self._blocks)
-            self._blocks.append(np.empty((ROWS_OF_BLOCK, sum(SIZES))))
-            self._free = list(range(first + ROWS_OF_BLOCK - 1, first - 1, -1))
-        number = self._free.pop()
-        made = np.concatenate([part.ravel() for part in parts])
-        self._row(number)[: len(made)] = made
-        return number
-
-    def remove(self, number: int) -> None:
-        self._free.append(number)
-
-    def state(self, number: int) -> tuple[Array, Array]:
-        mean, covariance, *_ = np.split(self._row(number), STARTS)
-        return mean.copy(), covariance.reshape(STATE, STATE).copy()
-
-    def expected(self, number: int) -> Expected:
-        _, _, mean, covariance, mean_before, covariance_before, cross = (
-            part if part.size == STATE else part.reshape(STATE, STATE)
-            for part in np.split(self._row(number), STARTS)
+    def expected(self) -> Expected:
+        parts = np.split(self.numbers, STARTS)[2:]
+        return Expected(
+            *(each if each.size == STATE else each.reshape(STATE, STATE) for each in parts)
         )
-        return Expected(mean, covariance, mean_before, covariance_before, cross)
-
-    def _row(self, number: int) -> Array:
-        block, row = divmod(number, ROWS_OF_BLOCK)
-        return np.asarray(self._blocks[block][row])
 
 
 class History:
@@ -75,18 +50,19 @@ class History:
 
     def __init__(self) -> None:
         self._views: list[dict[int, _Kept]] = []
-        self._rows = _Rows()
 
     def record(self, mixture: Mixture) -> None:
         self._views.append({each.number: self._kept(each) for each in mixture.hypotheses})
         self._forget()
 
-    def _kept(self, each: Hypothesis) -> _Kept:
+    @staticmethod
+    def _kept(each: Hypothesis) -> _Kept:
         parts, expected = [each.mean, each.covariance], each.expected
         if expected is not None:
             parts += [expected.mean, expected.covariance]
             parts += [expected.mean_before, expected.covariance_before, expected.cross]
-        return _Kept(each.parent, each.share, self._rows.add(parts), expected is not None)
+        numbers = np.concatenate([part.ravel() for part in parts])
+        return _Kept(each.parent, each.share, numbers, expected is not None)
 
     def _forget(self) -> None:
         """Without successors, except the most likely one of each view."""
@@ -98,7 +74,7 @@ class History:
             if not left:
                 return
             for number in left:
-                self._rows.remove(view.pop(number).row)
+                del view[number]
 
     def smoothed(self, last: int | None = None) -> list[Smoothed | None]:
         """Of all views, or the `last` ones; None where none exists even then."""
@@ -109,11 +85,9 @@ class History:
             before = None if after is None else view.get(after.parent)
             if after is None or before is None or not after.is_predicted or later is None:
                 after = view[_likeliest(view)] if view else None
-                later = (
-                    None if after is None else Smoothed(*self._rows.state(after.row), after.share)
-                )
+                later = None if after is None else Smoothed(*after.state(), after.share)
             else:
-                later = _one_back(self._rows.expected(after.row), later)
+                later = _one_back(after.expected(), later)
                 after = before
             out.append(later)
         return out[::-1]
