@@ -49,7 +49,7 @@ class Model:
     tilt_rad: float = math.radians(0.5)  # of a good mount, in pitch and roll; see `at_height`
     off_tilt_rad: float = math.radians(6.0)  # of a bad mount (docs/decisions/tracking.md),
     off_mount: float = 0.03  # and its probability
-    horizon_rad: float = math.radians(1.5)
+    horizon_rad: float = math.radians(2.0)
     """Of the autopilot's horizon, in pitch and roll, without `tilt_std_deg`."""
     horizon_s: float = 15.0  # its correlation time: 10 to 30 s in real autopilots
     tilt_walk: float = math.radians(0.01)  # of the misalignment, rad per root of a second
