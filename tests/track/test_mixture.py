@@ -26,7 +26,7 @@ AREA_M2 = 4e6
 SIDE_M = math.sqrt(AREA_M2)
 EXTENT = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
 RADIUS_M = 35.0
-MODEL = Model()
+MODEL = Model(horizon_rad=math.radians(1.5))
 SPEED = np.array([12.0, 5.0])
 BIAS = np.array([math.radians(5.0), 0.04, math.radians(-2.0), math.radians(1.5)])
 
