@@ -35,7 +35,7 @@ OPTIONAL_COLUMNS = (
 
 @dataclass(frozen=True)
 class GnssSample:
-    """Solution of a GNSS receiver, for comparison only: never a source of our positions.
+    """Solution of a GNSS receiver, for comparison with positions by the map.
 
     `time_ns`: time of the solution, by the clock of the exposures.
     `arrived_ns`: time of arrival by the same clock.
