@@ -129,8 +129,8 @@ def _add_flight(parser: argparse.ArgumentParser) -> None:
     add("--state", type=Path, metavar="FILE", help=text)
     text = "largest age of a saved position that a flight starts from (default 300)"
     add("--state-max-age-s", type=float, default=300.0, metavar="S", help=text)
-    text = "watch: compare GNSS with the map, report faults, learn displacement, mount and latency, "
-    text += "and correct positions by the displacement (default off)"
+    text = "watch: compare GNSS with the map, report faults, learn displacement, mount and "
+    text += "latency, and correct positions by the displacement (default off)"
     add("--gnss", choices=("off", "watch"), default="off", help=text)
     text = "largest age of a view when its processing starts; older ones are dropped (default 500)"
     add("--deadline-ms", type=float, default=500.0, metavar="MS", help=text)
