@@ -23,7 +23,7 @@ CHANCE = 0.73
 share of it and times the root of n. A track may be worse by one standard error: the difference to
 single views of the same places varies as much where errors correlate by 0.5."""
 LEAST_M = 0.2
-"""And by this distance, which matters where errors are below a metre."""
+"""And by this distance, which counts where errors are below a metre."""
 HEADER = (
     *("flight", "views"),
     *(f"{name} m: {row}" for name in PERCENTS for row in ("single", "track")),
