@@ -8,6 +8,7 @@ from pathlib import Path
 from benchmarks.closed_loop.replays import flights
 from benchmarks.real_ground.mapping import STRIPS, Windows
 from benchmarks.real_ground.maps import BARE, COARSE, FLAT, SURFACE, Map
+from benchmarks.real_ground.pairs import SINGLE, TRACKED
 from benchmarks.real_ground.score import Row, placed
 from benchmarks.real_ground.views import OverLevel, OverRelief, Recording, Replay
 from benchmarks.scenes import DATA, PAST, PRESENT, SCENES, Pair, Scene, leave_one_out_pairs
@@ -90,13 +91,13 @@ def _is_there(built: Map, source: AnySource) -> bool:
 
 def both(name: str, part: str, *legs: tuple[Map, AnySource]) -> Iterator[Question]:
     """Single views and a track."""
-    yield Question(f"{name}, single", part, legs)
-    yield Question(f"{name}, tracked", part, legs, tracked=True)
+    yield Question(f"{name}{SINGLE}", part, legs)
+    yield Question(f"{name}{TRACKED}", part, legs, tracked=True)
 
 
 def _flights() -> Iterator[Question]:
     for month in ("2014-01", "2014-03"):
-        flown = Recording("arroio_drone_1", ARROIO_STD_M)
+        flown = Recording("arroio_drone_1", ARROIO_STD_M, track=9)  # all its views, as single ones
         yield from both(f"arroio on {month}", "flights", (Map(f"arroio_maps/{month}.tif"), flown))
     taichung = Recording("taichung_drone", TAICHUNG_STD_M)
     yield from both("taichung", "flights", (Map("taichung_drone/map.tif"), taichung))

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -42,8 +42,16 @@ class Seen:
 
 @dataclass(frozen=True)
 class Placed:
-    """A fix against the truth; `level_m`: its protection level at `RISK`."""
+    """A fix against the truth.
 
+    - `time_s`: of the view, by the clock of the flight.
+    - `state`: of the track at the view; None for a single view.
+    - `variance_m2`: stated, mean of both axes. `nees` and `level_m`, the protection level at
+      `RISK`, add the error of the truth to it.
+    """
+
+    time_s: float
+    state: str | None
     confident: bool
     error_m: float
     wrong: bool
@@ -64,11 +72,13 @@ def placed(locator: Locator, seen: Iterable[Seen], frame: LocalFrame, std_m: flo
         took_ms = 1e3 * (time.process_time() - start)
         if each.judged:
             times_ms.append(took_ms)
-            found += compared(outcome, each, frame, std_m)
+            found += compared(outcome, each, frame, std_m, locator.state_name)
     return Row(found, times_ms)
 
 
-def compared(outcome: Fix | NoFix, each: Seen, frame: LocalFrame, std_m: float) -> list[Placed]:
+def compared(
+    outcome: Fix | NoFix, each: Seen, frame: LocalFrame, std_m: float, state: str | None = None
+) -> list[Placed]:
     """The fix against the truth; nothing where there is none."""
     if not isinstance(outcome, Fix):
         return []
@@ -81,6 +91,8 @@ def compared(outcome: Fix | NoFix, each: Seen, frame: LocalFrame, std_m: float) 
     total, error_m = cov + std_m**2 * np.eye(2), float(np.hypot(*off))
     return [
         Placed(
+            time_s=each.view.telemetry.time_ns / 1e9,
+            state=state,
             confident=outcome.is_confident,
             error_m=error_m,
             wrong=error_m > max(FAR_M, RADIUS_SHARE * each.height_m),
@@ -101,8 +113,8 @@ class Row:
     def __add__(self, other: "Row") -> "Row":
         return Row(self.found + other.found, self.times_ms + other.times_ms)
 
-    def values(self) -> dict[str, float | None]:
-        """The numbers of the row, as JSON; None where nothing is confident."""
+    def values(self) -> dict[str, Any]:
+        """The numbers of the row and its fixes, as JSON; None where nothing is confident."""
         sure = [each for each in self.found if each.confident]
         right = [each for each in self.found if not each.wrong]
         views = len(self.times_ms)
@@ -110,7 +122,8 @@ class Row:
         def of(name: str) -> Array:
             return np.array([getattr(each, name) for each in sure], np.float64)
 
-        found: dict[str, float | None] = {
+        found: dict[str, Any] = {
+            "fixes": [asdict(each) for each in self.found],
             "views": views,
             "confident": len(sure) / max(views, 1),
             "of_right": sum(each.confident for each in right) / max(len(right), 1),

@@ -1,12 +1,14 @@
 """The gate of real ground, and the relief that its views show."""
 
 import json
+from dataclasses import asdict, replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from benchmarks.real_ground import gate
+from benchmarks.real_ground import gate, over_time, pairs
 from benchmarks.real_ground.maps import COARSE_STD_M, coarse_of, fractal_relief
-from benchmarks.real_ground.score import Row, Seen, compared
+from benchmarks.real_ground.score import Placed, Row, Seen, compared
 from benchmarks.real_ground.views import level_telemetry
 from benchmarks.scenes import root_agl_of
 
@@ -65,6 +67,72 @@ def test_renewed_figures_keep_views_and_bands(tmp_path):
     made = json.loads((tmp_path / "gate.json").read_text())
     assert made["valley"] == {**kept["valley"], "median_m": 4.0, "of_right": 0.9, "exceeded": 1}
     assert made["suburb"] == {"views": 3}
+
+
+def fix(time_s, error_m, state=None, confident=True):
+    level_m = 30.0 if confident else np.inf
+    return Placed(time_s, state, confident, error_m, False, 4.0, 2.0, level_m)
+
+
+SINGLE = [fix(float(second), 1.0 + second / 10) for second in range(20)]
+TRACK = [replace(each, state="tracking") for each in SINGLE]
+
+
+def rows(single, track):
+    """Values of both rows of a flight, as read from a file."""
+    made = {"valley, single": single, "valley, tracked": track}
+    values = {name: {"fixes": [asdict(each) for each in fixes]} for name, fixes in made.items()}
+    return json.loads(json.dumps(values))
+
+
+def worse(single, track):
+    return [line[1] for line in pairs.failures(pairs.paired(rows(single, track)))]
+
+
+def farther(fixes, factor):
+    return [replace(each, error_m=each.error_m * factor) for each in fixes]
+
+
+def test_a_track_as_good_as_its_single_views_passes():
+    assert worse(SINGLE, TRACK) == []
+    assert worse(SINGLE, farther(TRACK, 1.1)) == []  # by chance
+
+
+def test_a_track_worse_than_its_single_views_fails():
+    assert worse(SINGLE, farther(TRACK, 1.5)) == ["median m", "95 % m"]
+    assert worse(SINGLE, TRACK[:-2] + farther(TRACK[-2:], 2.0)) == ["95 % m"]
+    assert worse(SINGLE, []) == ["confident fixes"]
+    found = gate.judged({}, rows(SINGLE, farther(TRACK, 1.5)), [])
+    assert found.failed and found.tables[-1].rows[0][0] == "valley, tracked"
+
+
+def test_only_views_where_both_are_confident_are_compared():
+    hard = [fix(float(second), 9.0, "coasting") for second in range(20, 40)]
+    assert worse(SINGLE, TRACK + hard) == []
+    unsure = [replace(each, confident=False) for each in hard]
+    assert worse(SINGLE + unsure, TRACK + hard) == []
+    assert worse(SINGLE[:9], TRACK[:9] + hard) == ["median m", "95 % m"]  # too few of both
+
+
+def test_a_row_without_its_counterpart_is_no_pair():
+    values = rows(SINGLE, TRACK)
+    del values["valley, single"]
+    assert pairs.paired(values) == {}
+
+
+def test_the_table_of_tracks_has_both_errors():
+    made = pairs.table(pairs.paired(rows(SINGLE, farther(TRACK, 2.0))))
+    assert made.rows == [["valley", "20", "1.95", "3.90", "2.80", "5.61"]]
+
+
+def test_errors_over_time_are_drawn_by_kind_of_fix(tmp_path):
+    track = [*TRACK[:-2], fix(18.0, 8.0, "coasting", False), fix(19.0, 9.0, "lost", False)]
+    found = pairs.paired(rows(SINGLE, track))
+    over_time.write(found, tmp_path)
+    assert (tmp_path / "over_time" / "valley.png").stat().st_size > 0
+    svg = ElementTree.fromstring(over_time.drawing("valley", found["valley"]).svg)
+    texts = {"".join(each.itertext()) for each in svg.iter("{http://www.w3.org/2000/svg}text")}
+    assert {"time since the first view (s)", "error (m)", *over_time.MARKS} <= texts
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.02, 0.1])
