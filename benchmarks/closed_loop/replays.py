@@ -366,7 +366,7 @@ class Monitored:
             self.monitor.observe(arrived_ns, view.grey, view.camera, *known)
 
     def _located(self, view: View, latency: Latency) -> Fix | NoFix:
-        if latency.reason is not None:
+        if latency.reason is not None and not latency.comparing:
             return NoFix(latency.reason, latency.detail)
         telemetry, before_ns = view.telemetry, self.tracked_ns
         self.tracked_ns = time_ns = telemetry.time_ns
@@ -375,10 +375,10 @@ class Monitored:
             view = replace(view, telemetry=replace(telemetry, vel_en_mps=mean))
         outcome = self.track.locate(view)
         result = ViewResult("", time_ns, outcome, 0.0, self.state_name)
-        if not result.is_recognized or not isinstance(outcome, Fix):
-            return outcome
-        place = outcome.lat_deg, outcome.lon_deg
-        doubt = self.monitor.located(latency, place, outcome.std_m)
+        doubt = latency.reason
+        if result.is_recognized and isinstance(outcome, Fix):
+            place = outcome.lat_deg, outcome.lon_deg
+            doubt = self.monitor.located(latency, place, outcome.std_m)
         return outcome if doubt is None else NoFix(doubt, "")
 
 
@@ -533,7 +533,7 @@ def _withheld_cells(rows: Sequence[Row]) -> list[str]:
         phase, time_s = before.exposure.phase, row.exposure.time_s
         if phase in (SHIFTED, MIRRORED) and row.exposure.phase != phase:
             begins_s[phase] = time_s
-        elif time_s - before.exposure.time_s > GAP_S:
+        elif time_s - before.exposure.time_s > 1:
             begins_s[OFF] = time_s
     until_s = {
         phase: next((each - begin_s for each in passed_s if each >= begin_s), math.inf)

@@ -32,6 +32,7 @@ from orthonav.onboard.motion import (
 from orthonav.onboard.telemetry import VehicleState
 
 UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mismatch"
+COMPARING = "the stated camera latency is compared with the first images"
 LARGEST_STD_S = 0.3
 """A latency that is known less well is refused: 5 m at 15 m/s."""
 STATED_STD_S = 0.03
@@ -41,7 +42,7 @@ FIRST_NS = 5 * 10**9
 SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
 """Interval at which reported states are stored, and how far back after a time without images;
 telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_NS`)."""
-EXPLAINED, UNEXPLAINED = 0.6, 0.3
+EXPLAINED, UNEXPLAINED = 0.6, 0.4
 """Fractions of the motion common to images and report from which they agree, below which turns
 contradict."""
 SECONDS, LEAST_PAIRS = 4.0, 12
@@ -68,13 +69,16 @@ LONGEST_S, LEAST_S, STEP_S = 12.0, 0.5, 0.1
 @dataclass(frozen=True)
 class Latency:
     """`arrived_ns`: of an image, by our clock. `delay_s`, `std_s`: from its exposure; 0 and NaN
-    where not stated. `reason`: why they must not be used. `detail`: one sentence about it."""
+    where not stated. `reason`: why they must not be used. `detail`: one sentence about it.
+    `comparing`: nothing contradicts them, but images have not agreed yet: the view may be located,
+    not sent."""
 
     arrived_ns: int
     delay_s: float
     std_s: float
     reason: str | None = None
     detail: str = ""
+    comparing: bool = False
 
 
 class LatencyMonitor:
@@ -109,7 +113,9 @@ class LatencyMonitor:
         if interruptions != self._interruptions or arrived_ns - frozen_ns > GAP_S * 1e9:
             self._interruptions = interruptions
             self._compare_again()
-        return Latency(arrived_ns, self._delay_s, self._std_s, *self._doubt())
+        reason, detail = self._doubt()
+        comparing = detail == COMPARING
+        return Latency(arrived_ns, self._delay_s, self._std_s, reason, detail, comparing)
 
     def frozen(self, arrived_ns: int) -> None:
         # The stream may be stalled.
@@ -185,7 +191,7 @@ class LatencyMonitor:
             jumped = f"the position jumped as by a change of the latency of {self._jump_s:+.1f} s"
             return UNSTEADY, f"{jumped}: it is withheld until images move as reported, in turns"
         if not self._compared:
-            return UNKNOWN, "the stated camera latency is compared with the first images"
+            return UNKNOWN, COMPARING
         return None, ""
 
     def _sample(self, state_at: Callable[[int], VehicleState], covered_ns: int | None) -> None:
