@@ -43,8 +43,8 @@ SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
 """Interval at which reported states are stored, and how far back after a time without images;
 telemetry is kept for 20 s (`orthonav.onboard.telemetry.KEEP_NS`)."""
 EXPLAINED, UNEXPLAINED = 0.6, 0.4
-"""Fractions of the motion common to images and report from which they agree, below which turns
-contradict."""
+"""Fractions of the motion common to images and report from which they agree, and below which turns
+contradict the latency."""
 SECONDS, LEAST_PAIRS = 4.0, 12
 """Images of so many seconds are compared, at least so many pairs. After images or positions
 contradicted the latency, nothing may contradict it for so long."""
@@ -52,8 +52,8 @@ SCALES = 0.4, 2.5
 """Range of the seen over the reported speed: height and heading may be off."""
 LEAST_OFF = 0.016
 """Shift of the picture, less the reported one, over `SUMMED` pairs, from which it contradicts the
-latency where they do not agree: in flights of PX4 without GNSS, whose pitch and roll err by more
-than its velocity, it was up to 0.0143 (benchmarks.closed_loop replays)."""
+latency where they do not agree: errors of pitch and roll of PX4 without GNSS made up to 0.0143
+(docs/closed-loop.md)."""
 SUMMED, STANDS_OUT = 4, 3.0
 """Successive pairs that are summed; their motion counts from so many least standard deviations."""
 OUTLIER, OUTLIER_SHARE, MAD_TO_STD = 6.0, 0.1, 1.4826
