@@ -47,6 +47,8 @@ class ComputedOdometry:
         if np.hypot(*shift) > FARTHEST:
             return None
         wrong = flight.wrong(flight.exposed_s)
+        if flight.mirrored:
+            turn, shift = -turn, shift * [-1, 1]
         return ImageMotion(start[0], arrived_ns, float(turn) + wrong / 2, shift + wrong)
 
 
@@ -60,6 +62,7 @@ class ComputedFlight:
         self.monitor, self.odometry = latencies.LatencyMonitor(stated_s), ComputedOdometry(self)
         self.interruptions, self.states = 0, {}
         self.wrong = lambda exposed_s: 0.0  # added to the motion that is seen
+        self.mirrored, self.velocity_off = False, 0.0
         self.images = []  # seconds since the start, reason or None, error of the position
 
     def truth(self, at_s):
@@ -74,6 +77,7 @@ class ComputedFlight:
             angles = np.add(angles, (3.0, 0.3, 0.2)) + self.rng.normal(0, 0.1, 3)
             turn = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
             off = self.rng.normal(0, 0.1, 2)
+            off += self.velocity_off
             velocity = north + 0.3 + off[0], east - 0.2 + off[1], 0.0
             self.states[time_ns] = VehicleState(
                 turn, velocity_ned_mps=velocity, height_m=1.05 * self.flown.agl_m

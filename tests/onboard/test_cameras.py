@@ -84,8 +84,9 @@ def test_images_that_stop_for_a_while_are_interruptions():
         return found
 
     assert interruptions([0.1, 0.2] * 20) == [0] * 40
-    assert interruptions([0.1] * 10 + [2.0] + [0.1] * 5) == [0] * 10 + [1] * 6
-    assert interruptions([1.0] * 10) == [0, *[1] * 9]  # a slow camera
+    assert interruptions([0.1] * 10 + [2.0] + [0.1] * 5) == [0] * 16  # positions show it
+    assert interruptions([0.1] * 10 + [4.0] + [0.1] * 5) == [0] * 10 + [1] * 6
+    assert interruptions([1.0] * 10) == [0] * 10  # a slow camera
 
 
 def test_a_camera_that_stops_comes_back():

@@ -83,6 +83,35 @@ def test_a_step_that_is_over_is_forgiven_in_turns():
     assert len(sent(after)) == len(after)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_errors_of_pitch_and_roll_do_not_accuse_the_camera(seed):
+    """PX4 without GNSS: 1 deg within a second, and 2 m/s."""
+    flight = ComputedFlight(straight(60, seed=seed), 0.12, lambda at_s: 0.12)
+    flight.wrong = lambda at_s: 0.018 * np.sin(1.2 * at_s) / flight.rate_hz
+    flight.velocity_off = 2.0
+    flight.fly(START_S)
+    images = flight.fly(45)
+    assert len(sent(images)) == len(images)
+
+
+def test_a_mirrored_image_is_forgiven_seconds_after_it_ended():
+    flight = ComputedFlight(Flown(70, seed=1), 0.12, lambda at_s: 0.12)
+    flight.fly(20)
+    flight.mirrored = True
+    assert not [at_s for at_s, _ in sent(flight.fly(30)) if at_s > 26]
+    flight.mirrored = False
+    assert sent(flight.fly(45))[0][0] < 30 + 7.5
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_images_late_by_a_gap_of_two_seconds_are_noticed(seed):
+    flown = straight(70, seed=seed)
+    flight = ComputedFlight(flown, 0.12, lambda at_s: 0.12 if at_s < 25 else 2.12)
+    flight.fly(25)
+    images = flight.fly(40, arrives=lambda at_s: at_s > 27)
+    assert sent(images) == []
+
+
 def test_a_growing_latency_is_noticed_before_it_matters():
     flight = ComputedFlight(Flown(70, seed=3), 0.12, lambda at_s: 0.12 + 0.1 * max(0, at_s - 25))
     errors = [error_m for _, error_m in sent(flight.fly(40))]

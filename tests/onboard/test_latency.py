@@ -54,6 +54,12 @@ def test_an_undisturbed_flight_keeps_its_messages_and_states_the_latency():
     assert plain == {"latency_ms": 120.0, "latency_std_ms": 30.0, "latency": "stated"}
 
 
+def test_views_are_located_but_not_sent_until_images_agree():
+    flight, report = fly(Fault("none", "none", 0.2), lead_s=1.8)
+    assert report.sent == [] and set(report.withheld) == {"latency_unknown"}
+    assert flight.runner.counter.total["processed"] >= 5
+
+
 def test_the_covariance_includes_the_latency():
     flight, report = fly(Fault("none", "none", 0.2), lead_s=7.0)
     assert report.sent

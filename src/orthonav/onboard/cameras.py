@@ -26,8 +26,9 @@ from orthonav.onboard.telemetry import Clocks, VehicleState
 log = logging.getLogger(__name__)
 RETRY_S = (0.5, 1.0, 2.0, 5.0)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
-GAP_S, GAP_INTERVALS = 0.5, 3.0
-"""A longer time without images, also in usual intervals, may change the latency."""
+GAP_S, GAP_INTERVALS = 3.0, 3.0
+"""A longer time without images, also in usual intervals, may change the latency. After a shorter
+one, images can be late by as much: positions show it (`orthonav.onboard.latency.PositionCheck`)."""
 FROZEN_LEVELS = 0.25
 """Mean difference in grey levels below which two images are the same; noise is four times that."""
 FROZEN_SIDE_PX = 64

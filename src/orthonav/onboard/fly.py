@@ -203,7 +203,7 @@ class Runner:
         try:
             vehicle, telemetry = self._telemetry(image)
             view = View(image.grey, camera, telemetry)
-            if latency is not None and latency.reason is not None:
+            if latency is not None and latency.reason is not None and not latency.comparing:
                 return self._withheld(image, view, vehicle, latency)
             refused = self._unusable(telemetry)
             if refused is not None:
@@ -341,9 +341,10 @@ class Runner:
 
     def _doubt(self, result: ViewResult, latency: Latency | None) -> str | None:
         fix = result.outcome
-        if self._latency is None or latency is None or not result.is_recognized:
+        if self._latency is None or latency is None:
             return None
-        assert isinstance(fix, Fix)
+        if not isinstance(fix, Fix) or not result.is_recognized:
+            return latency.reason
         return self._latency.located(latency, (fix.lat_deg, fix.lon_deg), fix.std_m)
 
     def _confident_fix(self, result: ViewResult) -> Fix | None:

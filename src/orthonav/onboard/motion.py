@@ -216,6 +216,9 @@ class StateHistory:
     def velocity(self, times_ns: Times) -> Array:
         return self._at(times_ns)[:, 9:11]
 
+    def height_m(self, times_ns: Times) -> Array:
+        return self._at(times_ns)[:, 12]
+
     def _at(self, times_ns: Times) -> Array:
         if len(self._times) < 2:
             return np.full((len(times_ns), 13), math.nan)
@@ -233,11 +236,12 @@ def varying(values: Array, seconds: Array) -> Array:
     return np.asarray(values - rates * seconds[:, None])
 
 
-def explained_part(seen: Array, off: Array, least: float) -> float:
+def explained_part(seen: Array, off: Array, least: float, least_off: float = 0.0) -> float:
     """Share of seen motion (N, K) that is explained, `off`: seen less reported; NaN where neither
-    is at least `least`."""
+    is at least `least`, or `off` is less than `least_off`."""
     seen2, off2 = np.square(seen).sum(axis=1), np.square(off).sum(axis=1)
     modelled2 = np.square(seen - off).sum(axis=1)  # reported motion that is not seen counts too
     used = np.argsort(off2)[: round((1 - TRIMMED) * len(off2))]
     moved = max(float(seen2[used].mean()), float(modelled2[used].mean()))
-    return 1 - float(off2[used].mean()) / moved if moved > least**2 else math.nan
+    left = float(off2[used].mean())
+    return 1 - left / moved if moved > least**2 and left >= least_off**2 else math.nan
