@@ -54,7 +54,16 @@ from orthonav.core.track.motion import (
     predicted,
     velocity_forgotten,
 )
-from orthonav.core.track.trust import BLIND, UNCERTAIN, UNCONFIRMED, Shown, State, Trust
+from orthonav.core.track.trust import (
+    BLIND,
+    EXACT_M,
+    UNCERTAIN,
+    UNCONFIRMED,
+    UNRECOGNIZED,
+    Shown,
+    State,
+    Trust,
+)
 
 MIN_SPLIT = 1e-5
 """Least share to be followed. Values without a source: by the flights of docs/tracking.md."""
@@ -96,6 +105,7 @@ class Mixture:
         self.trust = Trust()
         self._numbers = 0
         self._new = 1.0  # fraction of this view that the last one did not show
+        self._is_rival_searched = False  # for the place that contradicts the track
         self._measured: tuple[Array, Array] | None = None  # position since the last prediction
 
     def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
@@ -156,26 +166,34 @@ class Mixture:
         self._measured = None
         stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
         made = [one for each in self.hypotheses for one in self._split(each, *moves)]
-        self.trust.moved(lambda each: self._dead_reckoned(each, *moves))
+        blind_s = seconds if camera is None else 0.0
+        self.trust.moved(lambda each: self._dead_reckoned(each, 1 - overlap, *moves), blind_s)
+        elsewhere = self.elsewhere
         if self.trust.rival is not None and self.trust.track is not None:
-            left, share = UNCONFIRMED, sum(each.share for each in made) + self.elsewhere
-            made = [replace(each, share=each.share * left) for each in made]
-            made.append(replace(self.trust.track.place, share=share * (1 - left)))
-            self.elsewhere *= left
+            total = sum(each.share for each in made) + elsewhere
+            followed = sum(each.share for each in made if each.shown.followed)
+            added = max(1 - UNCONFIRMED - followed / total, 0.0)
+            made = [replace(each, share=each.share * (1 - added)) for each in made]
+            elsewhere *= 1 - added
+            made.append(replace(self.trust.track.place, share=total * added))
         self.hypotheses = [replace(each, share=each.share * stays) for each in made]
-        self.elsewhere += (1 - stays) * (1 - self.elsewhere)
-        self._new, self._is_split = 1 - overlap, True
+        self.elsewhere = elsewhere + (1 - stays) * (1 - elsewhere)
+        self._new, self._is_rival_searched, self._is_split = 1 - overlap, False, True
 
     def _split(self, each: Hypothesis, *moves: Any) -> Iterator[Hypothesis]:
         for share, expected in self._predictions(each, *moves):
             on_map = held_to_map(self.model, expected, self.area_m2)
             yield self._from(each, on_map, each.share * share)
 
-    def _dead_reckoned(self, each: Hypothesis, *moves: Any) -> Hypothesis:
-        """As one Gaussian: odometry that may be an outlier makes it less certain."""
+    def _dead_reckoned(self, each: Hypothesis, new: float, *moves: Any) -> Hypothesis:
+        """As one Gaussian: odometry that may be an outlier makes it less certain. What was shown
+        there is forgotten as at any view, unless the dead reckoning is exact."""
         splits = list(self._split(replace(each, share=1.0), *moves))
         mean, covariance = moments(splits)
-        return replace(splits[0], share=1.0, mean=mean, covariance=covariance)
+        best = max(splits, key=lambda split: split.share)
+        exact = float(np.trace(covariance[POSITION, POSITION])) <= 2 * EXACT_M**2
+        shown = best.shown if exact else best.shown.missed(new)
+        return replace(best, share=1.0, mean=mean, covariance=covariance, shown=shown)
 
     def _predictions(
         self,
@@ -192,7 +210,19 @@ class Mixture:
         model, likely = self.model, 1 - self.model.odometry_outlier
         step = partial(predicted, model, each.mean, overlap=overlap)
         dead_reckoned = step(each.covariance, seconds, velocity, telemetry_noise)
-        if camera is None:
+        turns, splits = [(likely, each.covariance)], []
+        if each.share >= MINOR_SHARE and velocity is None:
+            turns = [
+                (likely * (1 - model.turn), each.covariance),
+                (likely * model.turn, velocity_forgotten(model, each.covariance)),
+            ]
+        if camera is not None:
+            for share, covariance in turns:
+                turned = step(covariance, seconds, velocity, telemetry_noise, camera)
+                seen, log_fit = by_camera(turned, camera)
+                if is_plausible(model, seen.mean, velocity):
+                    splits.append((math.log(share) + log_fit, seen))
+        if camera is None or not splits:
             chance = 0.0
             if velocity is None and each.share >= MAJOR_SHARE:  # nothing measures the displacement
                 chance = 1 - (1 - model.turn) ** seconds
@@ -202,18 +232,7 @@ class Mixture:
             return
         # An outlier lies anywhere within the radius of the search.
         outlier = math.log(model.odometry_outlier / (math.pi * camera.reach_m**2))
-        splits = [(outlier, dead_reckoned)]
-        turns = [(likely, each.covariance)]
-        if each.share >= MINOR_SHARE and velocity is None:
-            turns = [
-                (likely * (1 - model.turn), each.covariance),
-                (likely * model.turn, velocity_forgotten(model, each.covariance)),
-            ]
-        for share, covariance in turns:
-            turned = step(covariance, seconds, velocity, telemetry_noise, camera)
-            seen, log_fit = by_camera(turned, camera)
-            if is_plausible(seen.mean, velocity):
-                splits.append((math.log(share) + log_fit, seen))
+        splits.append((outlier, dead_reckoned))
         best, _ = max(splits, key=lambda split: split[0])
         shares = [math.exp(max(log_share - best, -700.0)) for log_share, _ in splits]
         least = MIN_SPLIT * sum(shares) if each.share >= MINOR_SHARE else max(shares)
@@ -249,20 +268,23 @@ class Mixture:
             made += self._updated(split, seen, found, new, confirms)
             made += self._born(seen, confirms)
         self._merge(made, self.elsewhere)
+        rival = self.trust.rival
+        self._is_rival_searched = rival is not None and self._is_searched(rival.place, searched)
         self.trust.viewed(newness, shown=bool(self.hypotheses) and self.hypotheses[0].shown.is_now)
 
     def _missed(
         self, each: Hypothesis, newness: float, new: float, searched: tuple[Array, float] | None
     ) -> Hypothesis:
         """For which the view was taken at none of the places found; see `update`."""
-        in_search = self._on_map(each.mean)
-        if searched is not None:
-            in_search &= math.dist(each.mean[:2], searched[0]) < searched[1]
         share = each.share
-        if in_search:
+        if self._is_searched(each, searched):
             blind = BLIND**self.trust.unseen if each.shown.followed else 1.0
             share *= self.model.miss ** (newness * blind)
         return replace(each, share=share, shown=each.shown.missed(new))
+
+    def _is_searched(self, each: Hypothesis, searched: tuple[Array, float] | None) -> bool:
+        near = searched is None or math.dist(each.mean[POSITION], searched[0]) < searched[1]
+        return near and self._on_map(each.mean)
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
         """The best cluster, None without hypotheses. Updates the state, except `between_views`."""
@@ -280,7 +302,8 @@ class Mixture:
             now=self._shown_at(mean, covariance, near),
         )
         if not between_views:
-            self.trust.judge(Hypothesis(1.0, mean, covariance, shown, 0), confidence, self._new)
+            here = Hypothesis(1.0, mean, covariance, shown, 0)
+            self.trust.judge(here, confidence, self._new, self._missed_by_rival(radius_m))
             if self.trust.state is State.TRACKING:
                 self._follow(near)
                 shown = replace(shown, followed=True)
@@ -288,6 +311,16 @@ class Mixture:
         place = min(belief, self.trust.most)
         confidence = min(confidence, place)
         return Estimate(mean, covariance, confidence, place, self.trust.state, belief, shown)
+
+    def _missed_by_rival(self, radius_m: float) -> float:
+        """New ground of this view that counts against the rival: less where it shows nothing than
+        where it shows the map farther away than `radius_m`."""
+        rival = self.trust.rival
+        if rival is None or not self._is_rival_searched:
+            return 0.0
+        shown = [each for each in major(self.hypotheses) if each.shown.is_now]
+        another = any(distance(each, rival.place) > radius_m for each in shown)
+        return self._new * (1.0 if another else UNRECOGNIZED)
 
     def _shown_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
         """Largest probability of having recognized the map, of hypotheses no farther away than it

@@ -26,8 +26,6 @@ VELOCITY_STD_MPS, VELOCITY_SHARE = 3.0, 0.02
 GNSS, whose velocity was wrong by 1 to 3 m/s (docs/decisions/tracking.md)."""
 
 PLAUSIBLE_SIGMAS = 4.0
-MOST_HEADING_RAD = PLAUSIBLE_SIGMAS * math.radians(DEFAULT_YAW_STD_DEG)
-MOST_LOG_SCALE = PLAUSIBLE_SIGMAS * DEFAULT_AGL_STD
 """A heading, height or velocity that differs more from the reported one is that of odometry which
 is wrong for long."""
 
@@ -190,12 +188,15 @@ def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected,
     return after, log_density(innovation, spread)
 
 
-def is_plausible(mean: Array, velocity: ReportedVelocity | None) -> bool:
+def is_plausible(model: Model, mean: Array, velocity: ReportedVelocity | None) -> bool:
     """Whether heading, height and velocity of a state (16,) are as reported.
 
     The camera measures how they change, and nothing else would hold them: a mirrored camera turned
     the heading by 170 deg."""
-    if abs(mean[HEADING]) > MOST_HEADING_RAD or abs(mean[SCALE]) > MOST_LOG_SCALE:
+    most = PLAUSIBLE_SIGMAS * np.maximum(
+        [model.heading_rad, model.log_scale], [math.radians(DEFAULT_YAW_STD_DEG), DEFAULT_AGL_STD]
+    )
+    if (np.abs(mean[[HEADING, SCALE]]) > most).any():
         return False
     if velocity is None:
         return True

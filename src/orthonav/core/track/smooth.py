@@ -1,7 +1,7 @@
 """Smoothing: hypotheses followed back through their parents (Rauch, Tung and Striebel 1965); where
 a track was born again, smoothing begins again."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -50,9 +50,11 @@ class History:
 
     def __init__(self) -> None:
         self._views: list[dict[int, _Kept]] = []
+        self._most: list[float] = []  # largest belief that each view allows
 
     def record(self, mixture: Mixture) -> None:
         self._views.append({each.number: self._kept(each) for each in mixture.hypotheses})
+        self._most.append(mixture.trust.most)
         self._forget()
 
     @staticmethod
@@ -81,13 +83,17 @@ class History:
         out: list[Smoothed | None] = []
         after: _Kept | None = None
         later: Smoothed | None = None
-        for view in reversed(self._views if last is None else self._views[-last:]):
+        first = 0 if last is None else -last
+        views = zip(self._views[first:], self._most[first:], strict=True)
+        for view, most in reversed(list(views)):
             before = None if after is None else view.get(after.parent)
             if after is None or before is None or not after.is_predicted or later is None:
                 after = view[_likeliest(view)] if view else None
-                later = None if after is None else Smoothed(*after.state(), after.share)
+                share = 0.0 if after is None else min(after.share, most)
+                later = None if after is None else Smoothed(*after.state(), share)
             else:
-                later = _one_back(after.expected(), later)
+                belief = max(later.belief, min(before.share, most))
+                later = replace(_one_back(after.expected(), later), belief=belief)
                 after = before
             out.append(later)
         return out[::-1]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from orthonav.core.track.hypothesis import Hypothesis
 
 RECOGNIZED = 0.2  # probability from which on a view shows the map
-COUNTS = (0.1, 0.5)  # views with less probability of their own do not count, above the second fully
+SURE = (0.1, 0.5)  # probability by a view alone up to which it does not count, from which fully
 MOST_OF_ONE = 0.75  # of a single view: less than `CONFIRMED`
 CONFIRMED = 1.25
 """New ground, in views, on which a place must have been shown: no single view confirms, nor further
@@ -28,7 +28,11 @@ UNRECOGNIZED, UNCERTAIN = 0.5, 0.5
 position is less certain than `Model.wide_m`."""
 LIKELY = 0.5  # confidence that a track keeps
 UNCONFIRMED = 0.8  # most that is stated except while tracking
-REPORTED = 8.0  # new ground, in views, that a reported position is worth against other places
+REPORTED, MOST_BELIEVED = 8.0, 24.0
+"""New ground, in views, that a reported position is worth against other places, and the most that a
+track is worth."""
+HALVED_S = 10.0  # without odometry, in which it is halved: a reported velocity is wrong for long
+EXACT_M = 7.5  # deviation per axis of a dead reckoning that is as good as tracking
 REACHED = 6.0  # squared error over its covariance, exceeded with a probability of 0.05
 BLIND = 0.5
 """Factor on the evidence against a followed track of a view that does not show the map, for each
@@ -80,7 +84,7 @@ class Shown:
         `competed`: with all other places where the aircraft may be; others do not count."""
         if now < RECOGNIZED:
             return replace(self.missed(new), now=now)
-        low, high = COUNTS
+        low, high = SURE
         waiting = min(self.waiting + new, 1.0)
         # Only of a followed track all that waits: chance has many views to agree with a new one.
         counted = (waiting if self.followed else new) * min(max((alone - low) / (high - low), 0), 1)
@@ -109,57 +113,62 @@ class Trust:
         self.rival: Claim | None = None
         self.unseen = 0.0  # new evidence of views in a row that did not show the map
 
+    @property
+    def most(self) -> float:
+        """Largest probability of the place that may be stated."""
+        return 1.0 if self.state is State.TRACKING else UNCONFIRMED
+
     def reported(self, place: "Hypothesis | None") -> None:
         """A position by other means, None: one that does not contradict other places."""
         self.track = None if place is None else Claim(place, REPORTED)
         self.rival = None
 
-    def moved(self, step: "Callable[[Hypothesis], Hypothesis]") -> None:
-        """Dead-reckoned, or to another plane."""
-        self.track, self.rival = (
+    def moved(self, step: "Callable[[Hypothesis], Hypothesis]", blind_s: float = 0.0) -> None:
+        """Dead-reckoned, or to another plane. `blind_s`: time that no odometry covers."""
+        track, rival = (
             None if each is None else each._replace(place=step(each.place))
             for each in (self.track, self.rival)
         )
+        if track is not None:
+            track = track._replace(ground=track.ground * 0.5 ** (blind_s / HALVED_S))
+        self.track, self.rival = track, rival
 
     def viewed(self, newness: float, *, shown: bool) -> None:
         """After a view; `newness`: share that counts as new evidence."""
         blind = self.state is not State.SEARCHING and not shown
         self.unseen = self.unseen + newness if blind else 0.0
 
-    @property
-    def most(self) -> float:
-        """Largest probability of the place that may be stated."""
-        return 1.0 if self.state is State.TRACKING else UNCONFIRMED
+    def judge(self, here: "Hypothesis", confidence: float, new: float, missed: float) -> None:
+        """Judge the best place after a view, `new` of which the last one did not show.
 
-    def judge(self, here: "Hypothesis", confidence: float, new: float) -> None:
-        """Judge the best place after a view, `new` of which the last one did not show."""
+        `missed`: what counts against the place that contradicts the track, unless shown here."""
         shown, was_followed = here.shown, self.state.is_followed
         stays = was_followed and shown.followed and confidence >= LIKELY
         is_shown = (stays or confidence >= CONFIDENT) and shown.is_confirmed and shown.is_now
-        if is_shown and self._leads_to(here, new):
-            known = shown.ground if self.track is None else self.track.ground
+        ground = self._ground_of(here, new) if is_shown else None
+        if ground is not None:
             followed = replace(here, shown=replace(shown, followed=True))
-            self.state, self.track, self.rival = State.TRACKING, Claim(followed, known + new), None
+            self.track, self.rival = Claim(followed, min(ground, MOST_BELIEVED)), None
+            self.state = State.TRACKING
             return
         if not is_shown and self.rival is not None:
-            left = self.rival.ground - new
+            left = self.rival.ground - missed
             self.rival = self.rival._replace(ground=left) if left > 0 else None
         if stays and not is_shown:
             self.state = State.COASTING
         elif self.state is not State.SEARCHING:
             self.state = State.LOST
 
-    def _leads_to(self, here: "Hypothesis", new: float) -> bool:
-        """Whether dead reckoning does, or more new ground showed this place than the track."""
-        if self.track is None or _is_reached(here, self.track.place):
-            return True
+    def _ground_of(self, here: "Hypothesis", new: float) -> float | None:
+        """New ground that showed a place in total; None where it is not believed."""
+        if self.track is None:
+            return here.shown.ground
+        if _is_reached(here, self.track.place):
+            return self.track.ground + new
         again = self.rival is not None and _is_reached(here, self.rival.place)
-        shown = self.rival.ground + new if self.rival is not None and again else here.shown.ground
-        self.rival = Claim(here, shown)
-        if shown <= self.track.ground:
-            return False
-        self.track = self.rival
-        return True
+        ground = self.rival.ground + new if self.rival is not None and again else CONFIRMED
+        self.rival = Claim(here, ground)
+        return ground if ground > self.track.ground else None
 
 
 def _is_reached(here: "Hypothesis", last: "Hypothesis") -> bool:

@@ -68,8 +68,7 @@ _PRIOR_STD = np.array([30.0, 30.0, math.radians(1.5), math.radians(1.5), 0.2])
 was aligned by eye to 3 deg and a latency of 0.4 s are 2 sigma."""
 _BETWEEN_STD = np.array([0.0, 0.0, math.radians(0.3), math.radians(0.3), 0.03])
 """Change from flight to flight: a camera that was taken off, a latency that was measured again."""
-MOST_DISPLACED_M = 2 * MAP_STD_M
-"""A larger displacement does not correct fixes."""
+MOST_DISPLACED_M = 2 * MAP_STD_M  # by which fixes are corrected
 _TRACK_STD = np.array([MAP_STD_M, MAP_STD_M, *_BETWEEN_STD[2:]])
 """Of what a track leaves: its covariance includes the displacement, it estimates the mount."""
 PLAUSIBLE_SIGMAS = 5.0
@@ -119,17 +118,19 @@ class Biases:
         return float(np.hypot(*self.en_m)) <= largest_m
 
     @property
-    def displacement(self) -> tuple[Array, Array] | None:
+    def displacement(self) -> tuple[Array, Array]:
         """That of a map as accurate as fixes state: mean (2,) and covariance (2, 2), metres.
 
-        None where it is larger than `MOST_DISPLACED_M`: less than that is what a spoofed receiver
-        can move a position by."""
+        The mean is at most `MOST_DISPLACED_M`, then with the covariance of fixes: no spoofed
+        receiver moves a position by more."""
         known = np.linalg.inv(self.cov)
         # They were learnt from a wider prior, which that of a track replaces.
         cov = np.linalg.inv(known + np.diag(_TRACK_STD**-2 - _PRIOR_STD**-2))
         mean = (cov @ known @ self.mean)[:2]
-        close = float(np.hypot(*mean)) <= MOST_DISPLACED_M
-        return (mean, np.asarray(cov[:2, :2])) if close else None
+        length_m = float(np.hypot(*mean))
+        if length_m > MOST_DISPLACED_M:
+            return mean * (MOST_DISPLACED_M / length_m), np.eye(2) * MAP_STD_M**2
+        return mean, np.asarray(cov[:2, :2])
 
     def variance_m2(self, design: Array) -> float:
         """Variance of GNSS minus map along the worst axis, for the `design` (2, 5) of a view."""
@@ -341,7 +342,7 @@ class DifferenceWindow:
         sizes = np.einsum("kab,nkb,n->ka", spread, weights, off)
         length = np.hypot(*sizes.T)
         along = np.einsum("ka,kab,kb->k", sizes, spread, sizes)
-        std = np.sqrt(along) / np.maximum(length, 1e-9)
+        std = np.maximum(np.sqrt(along) / np.maximum(length, 1e-9), 1e-9)
         excess = (length - MULTIPATH_M) / std
         likelihood = np.einsum("ka,kab,kb->k", sizes, information, sizes)
         likelihood[excess <= FAULT_SIGMAS] = 0.0
