@@ -251,6 +251,17 @@ def test_a_reported_start_holds_until_views_contradict_it():
     assert off_m(right, flight) < 10 and off_m(wrong, flight) < 10
 
 
+def test_smoothing_does_not_believe_what_no_view_was_believed_for():
+    flight, mixture, history = Flight(5), Mixture(MODEL, EXTENT), History()
+    for away_m in [(0.0, 0.0)] * 11 + [EAST] * 8:
+        mixture.update(flight.reported(), [flight.sighting(4.0, flight.place + np.array(away_m))])
+        mixture.estimate(RADIUS_M)
+        history.record(mixture)
+        mixture.predict(1.0, ReportedVelocity(SPEED, None, 1.0), flight.moved())
+    beliefs = [each.belief for each in history.smoothed()]
+    assert min(beliefs[:11]) > 0.99 and max(beliefs[11:]) <= 0.8
+
+
 def test_smoothing_reduces_error_and_covariance():
     before, after, ratios = [], [], []
     for seed in range(3):
