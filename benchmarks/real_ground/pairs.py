@@ -18,10 +18,10 @@ SINGLE, TRACKED = ", single", ", tracked"
 MIN_SHARED = 10
 """With fewer views where both are confident, all confident views of each row are compared."""
 PERCENTS = {"median": 50, "95 %": 95}
-CHANCE = 0.73
-"""Standard error of the median, and of the 95 % error, of n independent errors (Rayleigh), as a
-share of it and times the root of n. A track may be worse by one standard error: the difference to
-single views of the same places varies as much where errors correlate by 0.5."""
+CHANCE = 2 * 0.73
+"""Two standard errors of the median, and of the 95 % error, of n independent errors (Rayleigh), as
+a share of it and times the root of n. A track may be worse by as much: the difference to single
+views of the same places varies by one standard error where errors correlate by 0.5."""
 LEAST_M = 0.2
 """And by this distance, which counts where errors are below a metre."""
 HEADER = (
@@ -31,8 +31,8 @@ HEADER = (
 NOTES = (
     f"errors at views where both are confident; where these are fewer than {MIN_SHARED}, at all "
     "confident views of each, whose numbers are given with a slash",
-    f"failed: a track whose median or 95 % error is worse by {CHANCE:.0%} / sqrt(views), one "
-    f"standard error, and {LEAST_M:g} m",
+    f"failed: a track whose median or 95 % error is worse by {CHANCE:.0%} / sqrt(views), two "
+    f"standard errors, and {LEAST_M:g} m",
 )
 Array = NDArray[np.float64]
 
