@@ -361,7 +361,8 @@ def test_gnss_of_a_first_leg_calibrates_the_mount(localizer):
     seen = []
     for grey, telemetry, place in views(10, tilt=(5.0, 0.0), year=lit, every_s=10):
         lat, lon = frame.latlon_from_en(place)
-        seen.append((grey, replace(telemetry, prior=Prior(float(lat), float(lon), 2.0)), place))
+        known = {"prior": Prior(float(lat), float(lon), 2.0), "tilt_std_deg": 1.0}
+        seen.append((grey, replace(telemetry, **known), place))
     rows = followed(tracker, localizer, seen)
     evidence = rows[-1][3].evidence
     assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.5)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.records import MAP_STD_M, error_ellipse
+from orthonav.core.records import error_ellipse
 from orthonav.onboard.messages.estimate import (
     AT_STD_M,
     FilterCovariance,
@@ -36,9 +36,8 @@ def test_a_message_without_one_before_counts_once(interval_s: float) -> None:
 def test_the_covariance_is_scaled_as_a_whole(interval_s: float, long_m: float, short_m: float):
     cov = np.diag([long_m**2, short_m**2])
     made = for_filter(replace(ESTIMATE, cov_en_m2=cov), interval_s).cov_en_m2
-    floored = np.maximum(np.diag(cov), MAP_STD_M**2)
-    count = messages_averaged(math.sqrt(floored.max()), interval_s)
-    np.testing.assert_allclose(made, np.diag(floored) * count)
+    count = messages_averaged(max(long_m, short_m), interval_s)
+    np.testing.assert_allclose(made, cov * count)
 
 
 @given(st.lists(st.floats(0.05, 1.0), min_size=10, max_size=30))
@@ -49,9 +48,9 @@ def test_the_information_does_not_depend_on_the_rate(steps_s: list[float]) -> No
     assert sum(inverse) == pytest.approx(sum(steps_s) / averaging_s / COV[0, 0])
 
 
-def test_what_does_not_average_out_is_a_floor() -> None:
+def test_a_deviation_may_have_a_floor() -> None:
     narrow = replace(ESTIMATE, cov_en_m2=np.eye(2) * 0.01)
-    assert for_filter(narrow, math.inf).horizontal_std_m() == pytest.approx(MAP_STD_M)
+    assert for_filter(narrow, math.inf).horizontal_std_m() == pytest.approx(0.1)
     assert for_filter(narrow, math.inf, min_std_m=20.0).horizontal_std_m() == pytest.approx(20.0)
 
 
