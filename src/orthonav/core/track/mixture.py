@@ -134,7 +134,7 @@ class Mixture:
             yield Hypothesis(share * mount, mean, covariance, Shown(followed=True), self._numbers)
 
     def measure_position(self, mean_en_m: Array, std_m: float) -> None:
-        """By other means, such as GNSS, (2,), `std_m` per axis."""
+        """By other means, such as GNSS, (2,), `std_m` per axis: they confirm what views show."""
         if not self.hypotheses:
             self.start(mean_en_m, std_m)
             return
@@ -143,6 +143,7 @@ class Mixture:
         # Belief elsewhere is spread over the map: its density at this position remains.
         elsewhere = self.elsewhere / self.area_m2
         made += self._born_at(mean_en_m, std_m, START_SHARE * elsewhere)
+        made = [replace(each, shown=each.shown.confirmed()) for each in made]
         self._merge(made, elsewhere * (1 - START_SHARE))
         self.trust.reported(None)
 

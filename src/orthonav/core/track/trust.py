@@ -73,6 +73,10 @@ class Shown:
     def is_confirmed(self) -> bool:
         return self.ground >= CONFIRMED
 
+    def confirmed(self) -> "Shown":
+        """By other means than views."""
+        return replace(self, ground=max(self.ground, CONFIRMED), followed=True)
+
     def missed(self, new: float) -> "Shown":
         """After a view that does not show the map, `new` of which the last one did not show."""
         ground = self.ground * float(UNRECOGNIZED**new)
