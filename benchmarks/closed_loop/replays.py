@@ -366,8 +366,8 @@ class Monitored:
             self.monitor.observe(arrived_ns, view.grey, view.camera, *known)
 
     def _located(self, view: View, latency: Latency) -> Fix | NoFix:
-        if latency.reason is not None and not latency.comparing:
-            return NoFix(latency.reason, latency.detail)
+        if not latency.may_locate:
+            return NoFix(latency.reason or "", latency.detail)
         telemetry, before_ns = view.telemetry, self.tracked_ns
         self.tracked_ns = time_ns = telemetry.time_ns
         if before_ns is not None and time_ns - before_ns > LONG_GAP_NS:

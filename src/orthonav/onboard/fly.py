@@ -203,7 +203,7 @@ class Runner:
         try:
             vehicle, telemetry = self._telemetry(image)
             view = View(image.grey, camera, telemetry)
-            if latency is not None and latency.reason is not None and not latency.comparing:
+            if latency is not None and not latency.may_locate:
                 return self._withheld(image, view, vehicle, latency)
             refused = self._unusable(telemetry)
             if refused is not None:

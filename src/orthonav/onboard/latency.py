@@ -69,16 +69,19 @@ LONGEST_S, LEAST_S, STEP_S = 12.0, 0.5, 0.1
 @dataclass(frozen=True)
 class Latency:
     """`arrived_ns`: of an image, by our clock. `delay_s`, `std_s`: from its exposure; 0 and NaN
-    where not stated. `reason`: why they must not be used. `detail`: one sentence about it.
-    `comparing`: nothing contradicts them, but images have not agreed yet: the view may be located,
-    not sent."""
+    where not stated. `reason`: why they must not be used. `detail`: one sentence about it."""
 
     arrived_ns: int
     delay_s: float
     std_s: float
     reason: str | None = None
     detail: str = ""
-    comparing: bool = False
+
+    @property
+    def may_locate(self) -> bool:
+        """Whether nothing contradicts them; a view with a `reason` is then located, and not sent,
+        because images have not agreed yet."""
+        return self.reason is None or self.detail == COMPARING
 
 
 class LatencyMonitor:
@@ -113,9 +116,7 @@ class LatencyMonitor:
         if interruptions != self._interruptions or arrived_ns - frozen_ns > GAP_S * 1e9:
             self._interruptions = interruptions
             self._compare_again()
-        reason, detail = self._doubt()
-        comparing = detail == COMPARING
-        return Latency(arrived_ns, self._delay_s, self._std_s, reason, detail, comparing)
+        return Latency(arrived_ns, self._delay_s, self._std_s, *self._doubt())
 
     def frozen(self, arrived_ns: int) -> None:
         # The stream may be stalled.

@@ -35,7 +35,7 @@ class _Kept(NamedTuple):
     is_predicted: bool
 
     def state(self) -> tuple[Array, Array]:
-        mean, covariance = np.split(self.numbers[: sum(SIZES[:2])], STARTS[:1])
+        mean, covariance = np.split(self.numbers, STARTS[:2])[:2]
         return mean, covariance.reshape(STATE, STATE)
 
     def expected(self) -> Expected:

@@ -58,10 +58,11 @@ from orthonav.core.track.odometry import (
     tilt_lever_m,
 )
 from orthonav.core.track.smooth import History, Smoothed
+from orthonav.core.track.trust import EXACT_M
 
 LOCAL_SHARE = 0.75  # Belief to search around it only. Values without a source: docs/tracking.md.
 LOCAL_SIGMAS = 4.0  # half width of that search,
-MIN_LOCAL_M = 30.0  # and its least
+MIN_LOCAL_M = LOCAL_SIGMAS * EXACT_M  # and its least
 LIKELY_NATS = 5.0  # places so much less likely than the best one are not examined for their tilt
 UNSEEN_TILT_RAD = math.radians(20.0)  # standard deviation of a tilt that a view does not show
 LEAST_TILT_STD_DEG = 0.1  # least that a track expects of a view

@@ -118,9 +118,9 @@ class GnssWatch:
 
     def _corrected(self, fix: Fix) -> Fix:
         """By the displacement of the map, as far as it is known, where the fix includes one."""
-        first = self._monitors.get(0)
         if not float(np.linalg.eigvalsh(fix.cov_en_m2)[0]) >= MAP_STD_M**2:
             return fix
+        first = self._monitors.get(0)
         en_m, cov = (self._start if first is None else first.undisturbed).displacement
         place_m = np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)) + en_m
         lat, lon = self._frame.latlon_from_en(place_m)
