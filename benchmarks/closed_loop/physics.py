@@ -26,12 +26,19 @@ def cross(vector: Array) -> Array:
 
 def turned(vector: Array) -> Array:
     """The rotation (3, 3) by a rotation vector (3,), rad (Rodrigues)."""
-    angle = math.sqrt(float(vector @ vector))
-    by = cross(vector)
-    if angle < 1e-6:
-        return np.eye(3) + by + by @ by / 2
-    return np.asarray(
-        np.eye(3) + math.sin(angle) / angle * by + (1 - math.cos(angle)) / angle**2 * by @ by
+    x, y, z = vector.tolist()
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
+    sine, rest = math.sin(angle) / angle if angle else 1.0, 0.5
+    if angle > 1e-6:
+        rest = (1 - math.cos(angle)) / square
+    by_x, by_y, by_z = rest * x, rest * y, rest * z
+    return np.array(
+        [
+            [1 - by_y * y - by_z * z, by_x * y - sine * z, by_x * z + sine * y],
+            [by_x * y + sine * z, 1 - by_x * x - by_z * z, by_y * z - sine * x],
+            [by_x * z - sine * y, by_y * z + sine * x, 1 - by_x * x - by_y * y],
+        ]
     )
 
 

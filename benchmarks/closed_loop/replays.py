@@ -64,26 +64,24 @@ Angles = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Area:
-    """A map of one date and pictures of another; the map lies in a folder of work.
+    """A map and an orthophoto of another date, which the camera sees.
 
-    `mount_deg`: unreported pitch and roll of the camera in the body. `dem`: terrain of the map.
+    `mount_deg`: unreported pitch and roll of the camera in the body.
     """
 
-    past: Path
-    present: Path
-    work: Path
+    map_path: Path
+    seen: Path
     mount_deg: tuple[float, float] = (0.0, 0.0)
-    dem: Path | None = None
 
     @classmethod
     def demo(cls, work: Path) -> "Area":
         """The area of `orthonav demo`, over whose level ground the flights were flown."""
-        dem = IMAGERY / "dem.tif"
-        return cls(IMAGERY / f"{PAST}.tif", IMAGERY / f"{PRESENT}.tif", work, dem=dem)
+        built = map_of(IMAGERY / f"{PAST}.tif", work, dem=IMAGERY / "dem.tif")
+        return cls(built, IMAGERY / f"{PRESENT}.tif")
 
     @cached_property
     def localizer(self) -> Localizer:
-        return Localizer(open_map(map_of(self.past, self.work, dem=self.dem)))
+        return Localizer(open_map(self.map_path))
 
     @property
     def frame(self) -> LocalFrame:
@@ -91,7 +89,7 @@ class Area:
 
     @cached_property
     def _ground(self) -> Ground:
-        return Ground(self.present, self.localizer)
+        return Ground(self.seen, self.localizer)
 
     def picture(
         self, place_en_m: Array, attitude_deg: Angles, agl_m: float, rng: np.random.Generator
