@@ -52,6 +52,8 @@ from orthonav.ground.evaluate.statistics import runs, upper_bound
 NAME = "flight_hours"
 UNDISTURBED, FAULTS = ("fixes", "start"), ("shifted", "mirrored", "frozen")
 """Scenarios of `closed_loop.loop`."""
+FAULTY_ROUNDS, ROUNDS = 3, 16
+"""Of so many rounds the first ones fly faults too, which take twice the time of a flight hour."""
 QUICK_HOURS = 0.02
 GENERATED_SEEDS = range(100, 120)
 AGL_PX, LEAST_AGL_M = 167.0, 250.0
@@ -266,8 +268,10 @@ def tasks_of(options: argparse.Namespace) -> Iterator[tuple[str, Task]]:
     }
     if not any(large.values()):
         raise SystemExit("no such pair of dates that is large enough to fly over")
-    names, number = UNDISTURBED if options.quick else (*UNDISTURBED, *FAULTS), 0
+    number = 0
     while True:
+        faults = () if options.quick or number % ROUNDS >= FAULTY_ROUNDS else FAULTS
+        names = (*UNDISTURBED, *faults)
         chance = np.random.default_rng([number, 9])
         pairs = [each[chance.integers(len(each))] for each in large.values() if each]
         for turn in range(len(names)):
