@@ -20,7 +20,7 @@ LEAST_SHIFT_M = 0.3
 
 EXAMPLE = "--ortho ortho.tif --route route.kml --band-m 600 --out area.onav"
 EVERYDAY = (
-    *("--other-date", "--dem", "--relief"),
+    *("--other-date", "--dem", "--surface", "--relief"),
     *("--route", "--bounds", "--band-m"),
     *("--gsd-m", "--work", "--json"),
 )
@@ -37,7 +37,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     add_options(parser, "--json")
     imagery = parser.add_argument_group("imagery")
-    add_options(imagery, "--ortho", "--dem", "--dem-datum", "--relief")
+    add_options(imagery, "--ortho", "--dem", "--surface", "--dem-datum", "--relief")
     text = "orthophoto of the same area at another date, from which confidence and covariance are "
     text += "calibrated; it does not become part of the map; may be repeated"
     imagery.add_argument(
@@ -82,6 +82,7 @@ def asked(options: argparse.Namespace) -> dict[str, Any]:
         "route": read_route(options.route) if options.route else None,
         "band_m": options.band_m,
         "dem": options.dem,
+        "surface": options.surface,
         "dem_datum": options.dem_datum,
         "relief": options.relief,
     }

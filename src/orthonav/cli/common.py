@@ -90,9 +90,17 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "metavar": "FILE",
         "help": "terrain model (any raster that GDAL reads) for heights above ground",
     },
+    "--surface": {
+        "type": Path,
+        "action": "append",
+        "default": [],
+        "metavar": "FILE",
+        "help": "surface model with houses and trees (any raster that GDAL reads), which stand on "
+        "the terrain of --dem or on its own lower envelope; may be repeated",
+    },
     "--dem-datum": {
         "metavar": "NAME",
-        "help": "vertical datum of the terrain model, where the file does not state it: egm96, "
+        "help": "vertical datum of --dem and --surface, where the file does not state it: egm96, "
         "egm2008, msl, ellipsoid or EPSG:NUMBER of a vertical system",
     },
     "--relief": {

@@ -49,7 +49,7 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
     tile_level = {"tile_radius_m": radius_m, "tiles_calibrated": calibrated}
     if registered is not None:
         radius_m, calibrated = registered.get("radius_m"), registered.get("confidence") is not None
-    terrain = manifest.sheets[0].terrain
+    terrain, surface = manifest.sheets[0].terrain, manifest.sheets[0].surface
     return {
         "map": str(path),
         "created_by": manifest.created_by,
@@ -63,6 +63,7 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         **tile_level,
         "registration": _registration(manifest),
         "terrain": None if terrain is None else asdict(terrain),
+        "surface": None if surface is None else asdict(surface),
         "relief": manifest.sheets[0].relief,
         "sheets": [
             {
@@ -143,6 +144,10 @@ def summary_text(plain: dict[str, Any]) -> str:
     else:
         first, second = unknown_ground_text(plain["relief"])
         lines += [f"terrain    {first}", f"           {second}"]
+    if (surface := plain["surface"]) is not None:
+        named = "".join(c for c in surface["name"] if c.isprintable())
+        every = f"every {surface['posting_m']:g} m ({named})"
+        lines.append(f"surface    houses and trees up to {surface['high_m']:.0f} m, {every}")
     for source in plain["imagery"]:
         files = f"{source['files']} files  " if source.get("files") else ""
         dates = " to ".join(texts(source, "date_from", "date")) or "date unknown"

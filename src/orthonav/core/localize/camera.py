@@ -236,7 +236,7 @@ def _compared(
         _expected(seen, pose, orientation),
         blocks,
         ground,
-        seen.relief.errors(slopes),
+        seen.relief.errors(ground, slopes),
         -by_picture @ picture_by_camera(camera, orientation, ground, by_ground),
         by_lens,
     )
@@ -248,7 +248,7 @@ def _templates(
     """Rectified under an orientation; over level ground the first is the search's."""
     if first and seen.is_level(pose) and not is_oblique(seen.view.view):
         return seen.view.templates
-    return seen.templates_at(pose, level, orientation)
+    return seen.templates_at(pose, level, orientation, smooth=first)
 
 
 def _middle_covariance(

@@ -15,14 +15,20 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import sight_on_ground
 from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.rectify import Orientation, node_px, orthorectified, rectified_level
+from orthonav.core.localize.rectify import (
+    NODE_PX,
+    Orientation,
+    node_px,
+    orthorectified,
+    rectified_level,
+)
 from orthonav.core.localize.systematic import GroundErrors, terrain_errors, unknown_ground
 from orthonav.core.localize.tiles import TileProposer
 from orthonav.core.localize.view import MIN_AGL_STD, PreparedView
 from orthonav.core.mapfile.manifest import SheetInfo, TerrainInfo
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import DEFAULT_AGL_STD
-from orthonav.core.register.pose import SIGMAS, Pose, PosePrior, ScaleMap
+from orthonav.core.register.pose import SIGMAS, Pose, PosePrior, ScaleMap, rotation
 from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
 from orthonav.core.register.window import GreyPyramid, Reference
@@ -53,9 +59,12 @@ class Relief:
         grid: TileGrid,
         info: TerrainInfo | None = None,
         land: str | None = None,
+        surface: Terrain | None = None,
     ) -> None:
-        """`info`: of the terrain; `land`: what it is like without one. None: not known."""
+        """`info`: of the terrain; `land`: what it is like without one; `surface`: heights of houses
+        and trees above it. None: not known."""
         self.terrain, self.grid, self.info, self.land = terrain, grid, info, land
+        self.surface = surface
         self.level_errors = unknown_ground(land)
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
@@ -73,6 +82,21 @@ class Relief:
         points = self.en_m(map_px)
         return np.concatenate([points, self.terrain.at_en_m(points)[..., None]], axis=-1)
 
+    def surface_m(self, map_px: Array) -> Array:
+        """The same with houses and trees, unless they are unknown at more than half of them."""
+        ground = self.ground_m(map_px)
+        above_m = self._above_m(ground)
+        if above_m is not None:
+            ground[..., 2] += above_m
+        return ground
+
+    def _above_m(self, ground_m: Array) -> Array | None:
+        """Heights of houses and trees (...) at (..., 3), NaN where unknown; None: mostly unknown."""
+        if self.surface is None:
+            return None
+        above_m = self.surface.at_en_m(ground_m[..., :2])
+        return above_m if np.isfinite(above_m).mean() >= MIN_KNOWN else None
+
     def slopes(self, ground_m: Array) -> Array:
         """Rise (N, 2) per metre east and north at (N, 3)."""
         if self.is_level:
@@ -81,9 +105,12 @@ class Relief:
         ahead, behind = np.split(self.terrain.at_en_m(ground_m[:, None, :2] + steps), 2, axis=1)
         return np.asarray((ahead - behind) / (2 * SLOPE_M))
 
-    def errors(self, slopes: Array) -> GroundErrors:
-        """Of the heights under a view, by slopes (N, 2) there."""
-        return self.level_errors if self.is_level else terrain_errors(self.info, slopes)
+    def errors(self, ground_m: Array, slopes: Array) -> GroundErrors:
+        """Of the heights under a view, by points (N, 3) and slopes (N, 2) there."""
+        if self.is_level:
+            return self.level_errors
+        has_surface = self._above_m(ground_m) is not None
+        return terrain_errors(self.info, slopes, has_surface=has_surface)
 
     def levelled(self) -> "Relief":
         """Level ground that is known as well as this: of simulated views."""
@@ -92,26 +119,30 @@ class Relief:
         sides_px = self.grid.width_px, self.grid.height_px
         nodes_px = [np.linspace(0.0, side, LEVELLED_NODES) for side in sides_px]
         found = Relief(LevelTerrain(), self.grid, self.info, self.land)
-        slopes = self.slopes(self.en_m(np.stack(np.meshgrid(*nodes_px), -1).reshape(-1, 2)))
-        found.level_errors = terrain_errors(self.info, slopes)
+        ground_m = self.ground_m(np.stack(np.meshgrid(*nodes_px), -1).reshape(-1, 2))
+        found.level_errors = self.errors(ground_m, self.slopes(ground_m))
         return found
 
     def expected(self, view: PreparedView) -> PosePrior:
-        """The view's prior, with scales by the height above sea at each place."""
+        """The view's prior, with scales by the height above sea at each place, or else by that of
+        the ground below the camera over the ground in the view."""
         telemetry, prior = view.telemetry, view.prior
         below, agl_m = telemetry.below, telemetry.agl_m
-        if below is None:
-            return prior
-        own_m = DEFAULT_AGL_STD * agl_m
-        if telemetry.agl_std_m is not None:
-            own_m = math.sqrt(max(telemetry.agl_std_m**2 - below.std_m**2, 0.0))
         means, step_px = self._mean_heights(view.side_px)
-        over = np.maximum(1 + (below.height_m - means) / agl_m, 0.05)
+        below_m: Array | float = math.nan if below is None else below.height_m
+        if below is None and prior.turn_rad is not None:
+            below_m = self._at_nodes(step_px, rotation(prior.turn_rad) @ view.camera_px)
+        over = np.maximum(1 + (below_m - means) / agl_m, 0.05)
         values = np.log(np.where(np.isfinite(over), over, 1.0)).astype(np.float32)
+        if below is None and np.abs(values).max() < LEAST_RISE:
+            return prior
+        own_m, std_m = DEFAULT_AGL_STD * agl_m, 0.0 if below is None else below.std_m
+        if telemetry.agl_std_m is not None:
+            own_m = math.sqrt(max(telemetry.agl_std_m**2 - std_m**2, 0.0))
         focal_std = view.view.camera.focal_std
         std = max(math.hypot(own_m / agl_m, focal_std), MIN_AGL_STD)
         reach = min(float(np.abs(values).max()) + SIGMAS * std, SIGMAS * prior.log_scale_std)
-        if below.std_m / agl_m > std:
+        if std_m / agl_m > std:
             reach = float(np.abs(values).max()) + SIGMAS * std
         widest = min(reach / SIGMAS, LARGEST_STD)
         return replace(
@@ -120,14 +151,19 @@ class Relief:
             scale_map=ScaleMap(values, step_px, min(std, prior.log_scale_std)),
         )
 
+    def _at_nodes(self, step_px: float, moved_px: Array) -> Array:
+        """Heights (H, W) at nodes over the sheet, each moved by (2,)."""
+        size = self.grid.width_px, self.grid.height_px
+        x, y = (np.arange(0.0, side + step_px, step_px) for side in size)
+        return np.asarray(self.ground_m(np.stack(np.meshgrid(x, y), -1) + moved_px)[..., 2])
+
     def _mean_heights(self, side_px: float) -> tuple[NDArray[np.float32], float]:
         """Under windows at nodes over the sheet, and the spacing of these, pixels of level 0."""
         key = round(math.log2(max(side_px, 1.0)))
         if key not in self._means:
             size = self.grid.width_px, self.grid.height_px
             step = max(max(size) / MAP_NODES, 2.0**key / 4)
-            x, y = (np.arange(0.0, side + step, step) for side in size)
-            heights = self.ground_m(np.stack(np.meshgrid(x, y), -1))[..., 2]
+            heights = self._at_nodes(step, np.zeros(2))
             known = np.isfinite(heights).astype(np.float32)
             box = (max(round(2.0**key / step), 1),) * 2
             border = cv2.BORDER_REPLICATE
@@ -140,9 +176,12 @@ class Relief:
         return self._means[key]
 
 
+LEAST_RISE = 0.05  # of the ground below the camera over that in the view, of the height
 REFERENCE_NODES = 9  # across a window, for its mean height
 MIN_KNOWN = 0.5  # windows of which less is known are registered on level ground
 LEVEL_PX = 0.2  # relief that displaces less (pixels of the final level) is left out
+SURFACE_NODE_M = 2.0  # largest spacing of heights among houses
+SMOOTH_M = 10.0  # width over which these are smoothed for the search
 
 
 class SearchedSheet:
@@ -159,6 +198,7 @@ class SearchedSheet:
         propose: TileProposer | None = None,
         plan: SearchPlan = DEFAULT_PLAN,
         terrain: TerrainLayer | None = None,
+        surface: TerrainLayer | None = None,
     ) -> None:
         """`confidence`: None before it is learnt: no place is proven. `radius_m`: its error.
 
@@ -171,7 +211,7 @@ class SearchedSheet:
         self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
         self.propose, self.plan = propose, plan
         info = None if terrain is None else terrain.info
-        self.relief = Relief(terrain or LevelTerrain(), self.grid, info, sheet.relief)
+        self.relief = Relief(terrain or LevelTerrain(), self.grid, info, sheet.relief, surface)
 
     @property
     def pyramid(self) -> GreyPyramid:
@@ -229,9 +269,16 @@ class ViewOverGround:
         self._last_ground: tuple[Pose, Array] | None = None
 
     def templates_at(
-        self, pose: Pose, level: int, orientation: Orientation | None = None
+        self,
+        pose: Pose,
+        level: int,
+        orientation: Orientation | None = None,
+        *,
+        smooth: bool = False,
     ) -> ViewTemplates | None:
-        """The view orthorectified under a pose; None where less than half of it is known."""
+        """The view orthorectified under a pose; None where less than half of it is known.
+
+        `smooth`: over houses and trees smoothed, as at coarse levels anyway."""
         orientation = orientation or self.orientation(pose)
         if orientation is None:
             return None
@@ -245,9 +292,27 @@ class ViewOverGround:
             en_from_window = self._en_from_window(pose, level, middle)
             made = rectified_level(picture, orientation, en_from_window, shape)
         if made is None:
-            ground = self.relief.ground_m(pose.map_px((node_px(shape) - middle) * 2.0**level))
+            smooth = smooth or level >= self.view.levels.judged
+            ground = self._nodes_m(pose, level, shape, smooth=smooth)
             made = orthorectified(picture, orientation, ground, shape)
         return ViewTemplates(*made, level)
+
+    def _nodes_m(
+        self, pose: Pose, level: int, shape: tuple[int, int], *, smooth: bool
+    ) -> Array:
+        """East, north, above sea (h, w, 3) at `node_px` of a window of a level: with houses and
+        trees as they are, or smoothed, which more cameras near the right one fit."""
+        middle, unit = np.array([shape[1], shape[0]]) / 2, 2.0**level
+        if self.relief.surface is None:
+            return self.relief.ground_m(pose.map_px((node_px(shape) - middle) * unit))
+        node_m = NODE_PX * self.relief.grid.gsd_m * unit
+        finer = max(math.ceil(node_m / SURFACE_NODE_M), 1)
+        nodes = self.relief.surface_m(pose.map_px((node_px(shape, finer) - middle) * unit))
+        across_m = SMOOTH_M if smooth else node_m if finer > 1 else 0.0
+        side = round(across_m * finer / node_m)
+        if side > 1:
+            nodes[..., 2] = cv2.blur(nodes[..., 2], (side, side))
+        return np.ascontiguousarray(nodes[::finer, ::finer])
 
     def _en_from_window(self, pose: Pose, level: int, middle: Array) -> Array:
         """Metres by pixels of a window of a level (3, 3)."""
@@ -285,11 +350,17 @@ class ViewOverGround:
             self._last_ground = last
         return last[1]
 
+    def _surface_m(self, pose: Pose) -> Array:
+        """The same with houses and trees."""
+        if self.relief.surface is None:
+            return self._ground_m(pose)
+        return self.relief.surface_m(pose.map_px(self._reference_px))
+
     def is_level(self, pose: Pose) -> bool:
         """Whether relief displaces the window by less than is visible."""
         if self.relief.is_level:
             return True
-        ground = self._ground_m(pose)
+        ground = self._surface_m(pose)
         orientation = self.orientation(pose)
         if orientation is None or not np.isfinite(ground).all():
             return False

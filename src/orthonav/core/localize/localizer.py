@@ -19,7 +19,7 @@ from orthonav.core.localize.view import PreparedView, check_view, prepare
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, NoFix, Prior, View
 from orthonav.core.tiles.position import PositionRule
 
@@ -159,6 +159,7 @@ class RegistrationLocalizer(SearchedSheet):
             propose=propose,
             plan=plan,
             terrain=TerrainLayer.of(opened),
+            surface=TerrainLayer.of(opened, layer=SURFACE),
         )
         if level_ground:
             made.relief = made.relief.levelled()

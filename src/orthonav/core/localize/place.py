@@ -6,7 +6,7 @@ level ground where that is as good. Scores over those of the strongest rival say
 out."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -252,26 +252,36 @@ class Placer:
         if twin is None or place.searched:
             return place.around
         assert twin.terrain is not None
-        place.searched = True
-        pose, level, side_px = place.judged.pose, self.levels.coarse, self._ground.view.side_px
+        place.searched, pose = True, place.judged.pose
+        starts, scales = [(pose, twin.terrain)], self.prior.scale_map
+        expected = scales.at(pose.x_px, pose.y_px) if scales else pose.log_scale
+        if abs(expected - pose.log_scale) > max(NEAR_SCALES):  # level ground may fit at another
+            raised = replace(pose, log_scale=expected)
+            made = self._ground.templates_at(raised, self.levels.judged)
+            starts += [] if made is None else [(raised, made)]
+        found = [
+            Place(fit, place.judged.score, made)
+            for start, made in starts
+            for fit in self._around(start, made)
+        ]
+        place.around = max([twin, *found], key=lambda each: each.judged.score)
+        return place.around
+
+    def _around(self, pose: Pose, templates: ViewTemplates) -> Iterator[Fit]:
+        """By a search around a pose at the coarse level."""
+        level, side_px = self.levels.coarse, self._ground.view.side_px
         poses = [
             (pose.turn_rad + turn, pose.log_scale + scale)
             for turn in NEAR_TURNS_RAD
             for scale in NEAR_SCALES
         ]
         recipe = self.levels.recipe(level)
-        template = twin.terrain.at(level, recipe)
+        template = templates.at(level, recipe)
         middle, half_px = (pose.x_px, pose.y_px), largest_half_px(template, poses)
         windows, reach_px = SearchWindows(self.reference), NEAR_REACH * side_px
         window = windows.part(level, recipe, side_px, middle, reach_px, half_px)
-        best = twin.judged
         for near in search(template, window, poses, 1, self.prior.scale_map):
-            found = self._rejudged(near.pose, twin.terrain)
-            best = max(best, found, key=lambda each: each.score)
-        place.around = twin
-        if best is not twin.judged:
-            place.around = Place(best, place.judged.score, twin.terrain)
-        return place.around
+            yield self._rejudged(near.pose, templates)
 
     # Finishing
 

@@ -51,9 +51,10 @@ class Orientation:
         return seen_px(camera, rays)
 
 
-def node_px(shape: tuple[int, int]) -> Array:
-    """Of the nodes (h, w, 2) of a window, x and y."""
-    rows, cols = (np.arange(0.5, side + 2 * NODE_PX, NODE_PX) for side in shape)
+def node_px(shape: tuple[int, int], finer: int = 1) -> Array:
+    """Of the nodes (h, w, 2) of a window, x and y; with so many times as many per axis."""
+    step = NODE_PX / finer
+    rows, cols = (np.arange(0.5, side + 2 * NODE_PX, step) for side in shape)
     return np.stack(np.meshgrid(cols, rows), axis=-1)
 
 

@@ -17,7 +17,8 @@ from orthonav.core.mapfile.manifest import TerrainInfo
 
 OBJECTS_M = 3.0, 15.0
 """Houses and trees: 6 to 8 m high on a fifth of the ground."""
-SURFACE_M = 0.5, 10.0  # a surface model, whose houses and trees are those of another date
+SURFACE_M = 0.5, 10.0
+"""A surface model, whose houses and trees are those of another date."""
 BARE_EARTH_M = 0.5, 50.0
 """Bare earth of laser scanning or photogrammetry, 0.1 to 0.5 m (docs/decisions/camera.md)."""
 COARSE_STD_M, COARSE_POSTING_M = 6.0, 30.0
@@ -64,17 +65,23 @@ def unknown_ground(relief: str | None) -> GroundErrors:
     return GroundErrors(slope / math.sqrt(2), ((per_slope_m * slope, length_m), OBJECTS_M))
 
 
-def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
+def terrain_errors(
+    source: TerrainInfo | None, slopes: Array, *, has_surface: bool = False
+) -> GroundErrors:
     """Errors of a map's terrain with slopes (N, 2) under a view, NaN where unknown.
 
-    `source`: None: a terrain like Copernicus'."""
+    `source`: None: a terrain like Copernicus'. `has_surface`: whether the map knows houses and
+    trees above it."""
+    if has_surface:
+        return GroundErrors(0.0, (SURFACE_M,))
     known = slopes[np.isfinite(slopes).all(axis=1)]
     steep = math.sqrt(float((known**2).sum(axis=1).mean())) if len(known) else math.inf
     posting_m = COARSE_POSTING_M
     if source is not None:
         posting_m = source.source_posting_m or source.posting_m
-        if (source.roughness_m or 0.0) > max(ROUGH_M, ROUGH_PER_SLOPE_M * steep):
-            return GroundErrors(0.0, (SURFACE_M,))
+        rough_m = source.roughness_m or 0.0
+        if rough_m > max(ROUGH_M, ROUGH_PER_SLOPE_M * steep):  # houses and trees, smoothed
+            return GroundErrors(0.0, (SURFACE_M, (rough_m, OBJECTS_M[1])))
     least_m, least_length_m = BARE_EARTH_M
     coarser = min(posting_m / COARSE_POSTING_M, MOST_COARSER)
     most_m = max(COARSE_STD_M * coarser, least_m)

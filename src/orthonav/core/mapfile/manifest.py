@@ -22,7 +22,7 @@ MAX_TOP_PX = 8192
 CODEC = "jpeg"
 TERRAIN_CODEC = "delta-zlib"
 MAX_CODE = 65_535  # of heights above the lowest one of a layer
-MAX_POSTING_M = 1000.0
+MIN_POSTING_M, MAX_POSTING_M = 0.25, 1000.0
 UNKNOWN_DATUM = "unknown"
 MIN_SOURCE_POSTING_M, MAX_SOURCE_POSTING_M = 0.01, 100_000.0
 MAX_ROUGHNESS_M = 1000.0
@@ -66,12 +66,13 @@ class GreyInfo:
 
 @dataclass(frozen=True)
 class TerrainInfo:
-    """Heights of the ground at samples in the sheet's plane.
+    """Heights at samples in the sheet's plane: of the ground above mean sea level, or of a surface
+    above that ground.
 
-    `west_m`, `north_m`: outer north-west corner, half a posting from sample (0, 0). `posting_m`: 1
-    to 1000. `chunk_px`: samples, 16 to 1024. `low_m`, `high_m`: heights above mean sea level, -500
-    to 9000. `unit_m`: per step, 0.01 to 10. `known`: samples with a height. `name`, `datum`: of the
-    source; heights over `UNKNOWN_DATUM` can only be compared with each other.
+    `west_m`, `north_m`: outer north-west corner, half a posting from sample (0, 0). `posting_m`:
+    0.25 to 1000. `chunk_px`: samples, 16 to 1024. `low_m`, `high_m`: least and greatest height,
+    -500 to 9000. `unit_m`: per step, 0.01 to 10. `known`: samples with a height. `name`, `datum`:
+    of the source; heights over `UNKNOWN_DATUM` can only be compared with each other.
 
     `source_posting_m`: of the source, 0.01 to 100,000; None in older maps: `posting_m`.
     `roughness_m`: root mean square difference of the heights of the source from those of the layer,
@@ -107,7 +108,7 @@ class TerrainInfo:
         source_m, roughness_m = info.source_posting_m, info.roughness_m
         sane = (
             _get(plain, "codec", str) == TERRAIN_CODEC
-            and 1 <= info.posting_m <= MAX_POSTING_M
+            and MIN_POSTING_M <= info.posting_m <= MAX_POSTING_M
             and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
             and min(info.rows, info.cols) >= 1
             and max(info.rows, info.cols) * info.posting_m <= most
@@ -127,7 +128,7 @@ class TerrainInfo:
 @dataclass(frozen=True)
 class SheetInfo:
     """`area_km2`: number of tiles times stride squared. `relief`: of ground without terrain, a key
-    of `RELIEF_SLOPES`, None if nobody said."""
+    of `RELIEF_SLOPES`, None if nobody said. `surface`: of houses and trees above `terrain`."""
 
     frame: LocalFrame
     grid: TileGrid
@@ -136,12 +137,13 @@ class SheetInfo:
     grey: GreyInfo | None = None
     terrain: TerrainInfo | None = None
     relief: str | None = None
+    surface: TerrainInfo | None = None
 
     def to_plain(self) -> dict[str, Any]:
-        terrain = {} if self.terrain is None else {"terrain": self.terrain.to_plain()}
+        heights = {"terrain": self.terrain, "surface": self.surface}
         relief = {} if self.relief is None else {"relief": self.relief}
         return {
-            **terrain,
+            **{name: info.to_plain() for name, info in heights.items() if info is not None},
             **relief,
             "origin_lat_deg": self.frame.lat_deg,
             "origin_lon_deg": self.frame.lon_deg,
@@ -173,12 +175,17 @@ class SheetInfo:
             raise MapFileError(f"map has an impossible sheet origin: {error}") from error
         layer = plain.get("grey")
         grey = None if layer is None else GreyInfo.from_plain(layer, grid)
-        layer = plain.get("terrain")
-        terrain = None if layer is None else TerrainInfo.from_plain(layer)
+        terrain, surface = (
+            None if plain.get(name) is None else TerrainInfo.from_plain(plain[name])
+            for name in ("terrain", "surface")
+        )
+        if surface is not None and terrain is None:
+            raise MapFileError("map has a surface without the terrain that it stands on")
         relief = None if plain.get("relief") is None else _get(plain, "relief", str)
         if relief is not None and relief not in RELIEF_SLOPES:
             raise MapFileError(f"map has an unknown relief: {relief!r:.80}")
-        return cls(frame, grid, tiles, _number(plain, "area_km2"), grey, terrain, relief)
+        area_km2 = _number(plain, "area_km2")
+        return cls(frame, grid, tiles, area_km2, grey, terrain, relief, surface)
 
 
 @dataclass(frozen=True)

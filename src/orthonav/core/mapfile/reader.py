@@ -32,7 +32,7 @@ MIN_FILE_BYTES = 10
 BLOCK_BYTES = 16 * 2**10  # unit of verification of ranges, about one chunk (docs/map-format.md)
 _BLOCK_DIGEST_BYTES = 16
 _PIECE_BYTES = 64 * BLOCK_BYTES
-_IN_RANGES = re.compile(r"sheet\d+/(grey/(mask_)?|terrain/)bytes")
+_IN_RANGES = re.compile(r"sheet\d+/(grey/(mask_)?|(terrain|surface)/)bytes")
 """Parts that are read in ranges: the largest of a map."""
 _DTYPES: dict[str, type[np.generic]] = {
     "F16": np.float16,

@@ -1,4 +1,6 @@
-"""The terrain layer of a map (`docs/map-format.md`); untrusted, so every length is checked."""
+"""The layers of heights of a map (`docs/map-format.md`): the terrain, and the surface above it.
+
+Untrusted, so every length is checked."""
 
 import zlib
 from itertools import product
@@ -14,35 +16,39 @@ from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
 from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
 
 CACHE_BYTES = 16 * 2**20  # 400 km2 at 10 m
-FEW_CHUNKS, FEW_SAMPLES = 4, 2**18  # that are read as one part, as those under a view
+FEW_CHUNKS, FEW_SAMPLES = 16, 2**18  # that are read as one part, as those under a view
+TERRAIN, SURFACE = "terrain", "surface"
 _MAX_BYTES_PER_SAMPLE = 4
 _CHUNK_HEADER_BYTES = 1024
 Array = NDArray[np.float64]
 Heights = NDArray[np.float32]
 
 
-def terrain_part_names(sheet: int) -> tuple[str, str]:
-    return f"sheet{sheet}/terrain/bytes", f"sheet{sheet}/terrain/offsets"
+def terrain_part_names(sheet: int, layer: str = TERRAIN) -> tuple[str, str]:
+    return f"sheet{sheet}/{layer}/bytes", f"sheet{sheet}/{layer}/offsets"
 
 
 class TerrainLayer:
-    """Heights under one sheet, above mean sea level; NaN where unknown. Threads may share it.
+    """Heights of one sheet, NaN where unknown: of its ground above mean sea level, or of its
+    surface above that. Threads may share it.
 
     Calling it with latitudes and longitudes makes it `orthonav.core.geo.ground.TerrainHeights`."""
 
-    def __init__(self, opened: MapFile, sheet: int, info: TerrainInfo) -> None:
-        self.info = info
+    def __init__(
+        self, opened: MapFile, sheet: int, info: TerrainInfo, layer: str = TERRAIN
+    ) -> None:
+        self.info, self._layer = info, layer
         self.frame: LocalFrame = opened.manifest.sheets[sheet].frame
         self._path = opened.path
         self._table = ChunkTable(info.rows, info.cols, 1, info.chunk_px)
-        self._blobs = Blobs(opened, *terrain_part_names(sheet), self._table.count)
+        self._blobs = Blobs(opened, *terrain_part_names(sheet, layer), self._table.count)
         self._cache = ByteCache[int, Heights](CACHE_BYTES, _bytes_of)
 
     @classmethod
-    def of(cls, opened: MapFile, sheet: int = 0) -> "TerrainLayer | None":
-        """None if the map has none. Raises `MapFileError`."""
-        info = opened.manifest.sheets[sheet].terrain
-        return None if info is None else cls(opened, sheet, info)
+    def of(cls, opened: MapFile, sheet: int = 0, layer: str = TERRAIN) -> "TerrainLayer | None":
+        """`TERRAIN` or `SURFACE`; None if the map has none. Raises `MapFileError`."""
+        info: TerrainInfo | None = getattr(opened.manifest.sheets[sheet], layer)
+        return None if info is None else cls(opened, sheet, info, layer)
 
     def __call__(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
         return self.at_en_m(self.frame.en_from_latlon(lat_deg, lon_deg))
@@ -116,8 +122,8 @@ class TerrainLayer:
                 found = decode_terrain(self._blobs.blob(number), shape, self.info)
             except MapFileError as error:
                 raise MapFileError(
-                    f"map's terrain layer is damaged (chunk {chunk_row}, {chunk_col}: {error}): "
-                    f"{self._path}"
+                    f"map's {self._layer} layer is damaged (chunk {chunk_row}, {chunk_col}: "
+                    f"{error}): {self._path}"
                 ) from error
             self._cache.put(number, found)
         return found

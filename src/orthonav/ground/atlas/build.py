@@ -63,11 +63,12 @@ class AtlasRequest:
     replace: bool = False
     index: bool = True  # also make the index of the coarse tiles
     dem: Path | None = None  # terrain model of which sheets get a terrain layer
+    surface: Sequence[Path] = ()  # surface models, of which they get a surface layer
     dem_datum: str | None = None  # what its heights count from
     relief: str | None = None  # what the land is like, as in `BuildRequest`; not with `dem`
 
     def __post_init__(self) -> None:
-        with_paths(self, "orthos", "dem")
+        with_paths(self, "orthos", "dem", "surface")
 
 
 @dataclass(frozen=True)
@@ -135,9 +136,12 @@ def request_digest(
         for name, size, changed_ns in source.stamp
     ]
     depends: list[Any] = [recipe.to_plain(), dict(made_by), part.common_stamp, stamps]
-    if request.dem is not None:
-        found, name = request.dem.stat(), request.dem.name
+    heights = [] if request.dem is None else [request.dem]
+    for path in (*heights, *request.surface):
+        found, name = path.stat(), path.name
         depends.append([name, found.st_size, found.st_mtime_ns // 10**9, request.dem_datum])
+    if request.surface:
+        depends.append(["surface", len(request.surface)])
     if request.relief is not None:
         depends.append(request.relief)
     return digest(depends)
@@ -318,7 +322,7 @@ def build_atlas(
     `MissingFileError`; `AtlasError` where present sheets are of other imagery or versions;
     `WorkerError` where a worker has other versions; `StorageError`."""
     started_s = time.monotonic()
-    require_relief(request.relief, request.dem)
+    require_relief(request.relief, request.dem, request.surface)
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
     recipe = recipe_for(request, mosaic)
@@ -396,6 +400,7 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
         bounds_deg=bounds_deg,
         workers=1,
         dem=task.request.dem,
+        surface=task.request.surface,
         dem_datum=task.request.dem_datum,
         dem_needed=False,
         relief=task.request.relief,

@@ -43,7 +43,7 @@ from orthonav.core.localize.confidence import (
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo, TerrainInfo
 from orthonav.core.mapfile.reader import MapFile, open_map, write_map
-from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, TerrainLayer
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.represent import HARMONICS, OrientedGradients
@@ -53,6 +53,7 @@ from orthonav.ground.atlas.catalog import Atlas, Sheet
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
 from orthonav.ground.build.layer import (
     GreyLayerWriter,
+    HeightLayers,
     Parts,
     StoredCells,
     TerrainParts,
@@ -96,6 +97,7 @@ class SheetSource:
     layer: GreyLayer
     cells: StoredCells
     terrain: TerrainLayer | None
+    surface: TerrainLayer | None
 
     @property
     def frame(self) -> LocalFrame:
@@ -379,7 +381,8 @@ def _source(opened: MapFile, sheet: Sheet) -> SheetSource:
         raise AtlasError(
             f"sheet {sheet.id} has no {lacking}, from which maps are cut; {REBUILD}: {opened.path}"
         )
-    return SheetSource(sheet, opened.manifest, layer, cells, TerrainLayer.of(opened))
+    heights = (TerrainLayer.of(opened, layer=each) for each in (TERRAIN, SURFACE))
+    return SheetSource(sheet, opened.manifest, layer, cells, *heights)
 
 
 def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
@@ -440,10 +443,23 @@ def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
     return tuple(sources[key] for _, _, key in dated)
 
 
-def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> TerrainParts | None:
-    """The terrain layer of a map cut from sheets; None where none of them has one. A place has the
-    height of the sheet whose box holds it, else of one that reaches over its border."""
-    layers = [(each, each.terrain) for each in members if each.terrain is not None]
+def cut_heights(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> HeightLayers:
+    """The layers of heights of a map cut from sheets. It has a terrain if one of them has, a
+    surface if all have: elsewhere houses would count as known to be absent."""
+    terrains = [(each, each.terrain) for each in members if each.terrain is not None]
+    surfaces = [(each, each.surface) for each in members if each.surface is not None]
+    whole = len(surfaces) == len(members)
+    return HeightLayers(
+        _cut_heights(terrains, area, grid, TERRAIN),
+        _cut_heights(surfaces if whole else [], area, grid, SURFACE),
+    )
+
+
+def _cut_heights(
+    layers: Sequence[tuple[SheetSource, TerrainLayer]], area: Area, grid: TileGrid, layer: str
+) -> TerrainParts | None:
+    """A place has the height of the sheet whose box holds it, else of one that reaches over its
+    border."""
     if not layers:
         return None
     infos = [layer.info for _, layer in layers]
@@ -455,7 +471,9 @@ def cut_terrain(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> T
         points = np.stack([west_m + col * posting_m, north_m - row * posting_m], axis=-1)
         return _heights(layers, *area.frame.latlon_from_en(points))
 
-    made = terrain_parts(area, grid, posting_m, ", ".join(names), ", ".join(datums), sampled)
+    named = ", ".join(names), ", ".join(datums)
+    unit_m = min(info.unit_m for info in infos)
+    made = terrain_parts(area, grid, posting_m, *named, sampled, layer=layer, unit_m=unit_m)
     if made is None:
         return None
     source_m = [each.source_posting_m for each in infos if each.source_posting_m is not None]
@@ -591,9 +609,11 @@ def _learnt(
     centres = grid.centres_en_m(tiles_rc)
     grey, grey_parts = cutter.layer.finish()
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
-    made = cut_terrain(members, area, grid)
-    terrain, terrain_parts = (None, {}) if made is None else made
-    sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, _relief(members))
+    heights = cut_heights(members, area, grid)
+    terrain, surface = heights.infos
+    sheet = SheetInfo(
+        *(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, _relief(members), surface)
+    )
     manifest = pooled_manifest(members, _shares(area, centres, members), sheet)
     return manifest, {
         "sheet0/centres_en_m": centres.astype(np.float32),
@@ -601,7 +621,7 @@ def _learnt(
         "sheet0/preview_jpeg": cutter.preview.jpeg(),
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
         **grey_parts,
-        **terrain_parts,
+        **heights.arrays,
     }
 
 

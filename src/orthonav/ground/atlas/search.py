@@ -272,7 +272,7 @@ def part_of(
     )
     if sheet.relief is not None:
         whole = sheet.relief
-        part.relief = Relief(whole.terrain, part_grid, whole.info, whole.land)
+        part.relief = Relief(whole.terrain, part_grid, whole.info, whole.land, whole.surface)
     return part
 
 

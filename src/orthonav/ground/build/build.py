@@ -48,7 +48,7 @@ from orthonav.ground.build.encoders import (
     stored_representation,
     usual_edges,
 )
-from orthonav.ground.build.layer import TerrainParts, cell_parts, terrain_of_dem
+from orthonav.ground.build.layer import HeightLayers, cell_parts, height_layers
 from orthonav.ground.build.sheet import SheetPictures, SheetReader, grid_of, read_pictures, tiles_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
@@ -84,9 +84,11 @@ class BuildRequest:
     - `workers`: threads that read the imagery and make batches for a network, 1 to 64.
     - `device`: where a network is learnt, "auto" (a GPU if there is one), "cpu" or "cuda".
     - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
-    - `dem_datum`: what its heights count from, where the file does not state it
+    - `surface`: surface models with houses and trees; earlier ones take precedence. Without `dem`
+      their lower envelope is the terrain.
+    - `dem_datum`: what heights of both count from, where the file does not state it
       (`orthonav.ground.imagery.terrain.OPTION`).
-    - `dem_needed`: whether an area in which the model has no height is refused.
+    - `dem_needed`: whether an area in which a model has no height is refused.
     - `relief`: what the land is like where there is no terrain, a key of
       `orthonav.core.geo.ground.RELIEF_SLOPES`; None: not stated. Not together with `dem`.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
@@ -110,6 +112,7 @@ class BuildRequest:
     work: Path | None = None
     workers: int | None = None
     dem: Path | None = None
+    surface: Sequence[Path] = ()
     dem_datum: str | None = None
     dem_needed: bool = True
     relief: str | None = None
@@ -120,7 +123,7 @@ class BuildRequest:
     def __post_init__(self) -> None:
         if isinstance(self.orthos, str | Path):
             object.__setattr__(self, "orthos", (self.orthos,))
-        with_paths(self, "orthos", "out", "other_dates", "work", "dem")
+        with_paths(self, "orthos", "out", "other_dates", "work", "dem", "surface")
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,7 @@ class _Inputs:
     other_dates: tuple[Mosaic, ...]
     recipe: WhitenedRecipe | EncoderRecipe
     sheet: SheetReader
-    terrain: TerrainParts | None
+    heights: HeightLayers
 
     @classmethod
     def open(cls, request: BuildRequest) -> "_Inputs":
@@ -145,7 +148,7 @@ class _Inputs:
         mosaic = Mosaic.open(request.orthos, request.epoch)
         other_dates = tuple(Mosaic.open([path], request.epoch) for path in request.other_dates)
         inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]
-        inputs += [] if request.dem is None else [request.dem]
+        inputs += [*request.surface, *([] if request.dem is None else [request.dem])]
         if request.out.exists() and any(request.out.samefile(path) for path in inputs):
             raise OutputError(
                 f"the map would replace an orthophoto or terrain; name another file: {request.out}"
@@ -153,10 +156,9 @@ class _Inputs:
         area = _area(request, mosaic)
         grid = grid_of(area, mosaic.gsd_m, request.gsd_m, request.tile_px, request.overlap)
         _check_numbers(request)
-        terrain = None
-        if request.dem is not None:
-            dem = open_dem(request.dem, request.dem_datum)
-            terrain = terrain_of_dem(dem, area, grid, needed=request.dem_needed)
+        dem = None if request.dem is None else open_dem(request.dem, request.dem_datum)
+        models = [open_dem(path, request.dem_datum) for path in request.surface]
+        heights = height_layers(dem, models, area, grid, needed=request.dem_needed)
         # Networks and visual words learn from images of the tiles, not from cell means.
         needs_pictures = not isinstance(recipe, WhitenedRecipe)
         sheet = SheetReader(
@@ -168,7 +170,7 @@ class _Inputs:
             registration=request.registration,
             pictures=SheetPictures(grid, representation) if needs_pictures else None,
         )
-        return cls(request, other_dates, recipe, sheet, terrain)
+        return cls(request, other_dates, recipe, sheet, heights)
 
 
 def _check_numbers(request: BuildRequest) -> None:
@@ -181,15 +183,17 @@ def _check_numbers(request: BuildRequest) -> None:
         )
     if request.workers is not None and not 1 <= request.workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {request.workers}")
-    require_relief(request.relief, request.dem)
+    require_relief(request.relief, request.dem, request.surface)
 
 
-def require_relief(relief: str | None, dem: Path | None) -> None:
-    """Raise `VariantError` for an unknown relief, and for one beside a terrain model."""
+def require_relief(relief: str | None, dem: Path | None, surface: Sequence[Path]) -> None:
+    """Raise `VariantError` for an unknown relief, and for one beside a terrain or surface model."""
     if relief is not None and relief not in RELIEF_SLOPES:
         raise VariantError(f"relief must be {', '.join(RELIEF_SLOPES)}, got '{relief:.40}'")
-    if relief is not None and dem is not None:
-        raise VariantError("the terrain model says what the land is like: give --dem or --relief")
+    if relief is not None and (dem is not None or surface):
+        raise VariantError(
+            "the terrain model says what the land is like: give --dem, --surface or --relief"
+        )
 
 
 def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
@@ -266,17 +270,19 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         "sheet0/preview_jpeg": sheet.preview.jpeg(),
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
     }
-    grey = terrain = None
+    grey = None
     if sheet.layer is not None:
         grey, parts = sheet.layer.finish()
         arrays |= parts
-    if inputs.terrain is not None:
-        terrain = inputs.terrain.info
-        arrays |= inputs.terrain.arrays
+    arrays |= inputs.heights.arrays
+    terrain, surface = inputs.heights.infos
     if request.cells and isinstance(inputs.recipe, WhitenedRecipe):
         arrays |= cell_parts(sheet.cells)
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
-    info = SheetInfo(sheet.area.frame, grid, len(tiles_rc), area_km2, grey, terrain, request.relief)
+    info = SheetInfo(
+        *(sheet.area.frame, grid, len(tiles_rc), area_km2),
+        *(grey, terrain, request.relief, surface),
+    )
     manifest = _manifest(inputs, info, embedder, calibration)
     if request.registration:
         found = _registration(inputs, tiles, embedder, manifest, arrays, progress)

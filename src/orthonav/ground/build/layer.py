@@ -1,4 +1,4 @@
-"""Layers of a map: the grey pyramid of registration, the means of micro-cells, terrain.
+"""Layers of a map: the grey pyramid of registration, the means of micro-cells, terrain, surface.
 
 A chunk is encoded as soon as it is complete, and passed at half the resolution to the next level,
 so memory holds compressed chunks and incomplete ones. Cell means, from which new tiles are embedded
@@ -9,8 +9,9 @@ float16: the rounding error is at most 0.4 % of the largest.
 import logging
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from orthonav.core.mapfile.layer import ChunkTable, part_names
 from orthonav.core.mapfile.manifest import (
     MAX_CODE,
     MAX_LEVELS,
+    MAX_NAME,
     MAX_POSTING_M,
     MAX_ROUGHNESS_M,
     MAX_SOURCE_POSTING_M,
@@ -34,7 +36,7 @@ from orthonav.core.mapfile.manifest import (
     TerrainInfo,
 )
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.mapfile.terrain import encode_terrain, terrain_part_names
+from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, encode_terrain, terrain_part_names
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.imagery.terrain import Dem
@@ -247,9 +249,17 @@ POSTING_M = 10.0
 """Distance of samples; that of the terrain model where it is coarser."""
 TERRAIN_CHUNK_PX = 128
 UNIT_M = 0.1
+SURFACE_POSTING_M, SURFACE_UNIT_M = 1.0, 0.25
+"""Of houses and trees above the terrain: twice as many samples as views are rectified with."""
+ENVELOPE_POSTING_M, WIDEST_M = 2.0, 40.0
+"""Of the lower envelope that stands for bare earth, without narrower houses and trees."""
+LOW_PERCENT, OFFSET_SAMPLES = 5, 256
+"""So much of a surface at least is bare ground, of samples across: where datums differ."""
 ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
 """Squares per side of the area in which roughness is measured, their width in postings, and the
 most samples of the source across a posting."""
+PlaneSampler = Callable[[float, float, float, int, int], NDArray[np.float64]]
+"""Takes the arguments of `Dem.in_plane`, without the plane."""
 HeightSampler = Callable[[float, float, int, int], NDArray[np.float64]]
 """Heights above mean sea level of rows and columns of samples from a north-west corner, metres."""
 log = logging.getLogger(__name__)
@@ -280,13 +290,142 @@ def terrain_of_dem(
 
     made = terrain_parts(area, grid, posting_m, dem.path.name, dem.datum.name, sampled)
     if made is None and needed:
-        centre = area.frame.lat_deg, area.frame.lon_deg
-        hint = swapped_hint(*centre, dem.covers)
-        raise AreaError(
-            f"the terrain has no height in the area, at {centre[0]:.4f}, {centre[1]:.4f}{hint}: "
-            f"{dem.path}"
-        )
+        raise _no_height("terrain", area, dem)
     return None if made is None else made._replace(info=_with_source(made.info, dem, area))
+
+
+def _no_height(what: str, area: Area, dem: Dem) -> AreaError:
+    centre = area.frame.lat_deg, area.frame.lon_deg
+    hint = swapped_hint(*centre, dem.covers)
+    return AreaError(
+        f"the {what} has no height in the area, at {centre[0]:.4f}, {centre[1]:.4f}{hint}: "
+        f"{dem.path}"
+    )
+
+
+class Surface:
+    """Heights of surface models, earlier ones before later ones, in the plane of an area."""
+
+    def __init__(self, models: Sequence[Dem], area: Area) -> None:
+        self.models, self.area = models, area
+        self.gsd_m = min(each.gsd_m for each in models)
+        self.name = ", ".join(each.path.name for each in models)[:MAX_NAME]
+        self.datum = ", ".join(sorted({each.datum.name for each in models}))[:MAX_NAME]
+
+    def sampled(
+        self, west_m: float, north_m: float, posting_m: float, rows: int, cols: int
+    ) -> NDArray[np.float64]:
+        """Means of squares, NaN for holes; arguments as of `Dem.in_plane`."""
+        found = np.full((rows, cols), np.nan)
+        for each in self.models:
+            if np.isnan(found).any():
+                more = each.in_plane(self.area.frame, west_m, north_m, posting_m, rows, cols)
+                found = np.where(np.isnan(found), more, found)
+        return found
+
+    def above_m(self, dem: Dem) -> float:
+        """Height of bare ground above that of a terrain model, where the datum of either is not
+        known."""
+        if all(each.datum.is_known for each in (dem, *self.models)):
+            return 0.0
+        west, south, east, north = self.area.extent_en_m
+        posting_m = max(east - west, north - south) / OFFSET_SAMPLES
+        rows, cols = (max(round(side / posting_m), 1) for side in (north - south, east - west))
+        off_m = self.sampled(west, north, posting_m, rows, cols)
+        off_m -= dem.in_plane(self.area.frame, west, north, posting_m, rows, cols)
+        if not np.isfinite(off_m).any():
+            return 0.0
+        low_m = float(np.nanpercentile(off_m, LOW_PERCENT))
+        log.info("the surface is taken to lie %.1f m above the terrain on bare ground", low_m)
+        return low_m
+
+    def envelope(
+        self, west_m: float, north_m: float, posting_m: float, rows: int, cols: int
+    ) -> NDArray[np.float64]:
+        """The same of bare earth: the surface without what is narrower than `WIDEST_M`, by a
+        morphological opening."""
+        fine = min(max(1, round(posting_m / max(ENVELOPE_POSTING_M, self.gsd_m))), MAX_FINER)
+        fine_m = posting_m / fine
+        side = 2 * math.ceil(WIDEST_M / fine_m / 2) + 1
+        shape = rows * fine + 2 * side, cols * fine + 2 * side
+        corner = west_m - side * fine_m, north_m + side * fine_m
+        heights = self.sampled(*corner, fine_m, *shape).astype(np.float32)
+        window = np.ones((side, side), np.uint8)
+        low = cv2.erode(np.nan_to_num(heights, nan=np.inf), window)
+        low[np.isinf(low)] = np.nan
+        high = cv2.dilate(np.nan_to_num(low, nan=-np.inf), window)
+        high[np.isinf(high)] = np.nan
+        inside = high[side:-side, side:-side].reshape(rows, fine, cols, fine)
+        return np.asarray(inside.mean(axis=(1, 3)), np.float64)
+
+
+class HeightLayers(NamedTuple):
+    terrain: TerrainParts | None
+    surface: TerrainParts | None
+
+    @property
+    def infos(self) -> tuple[TerrainInfo | None, TerrainInfo | None]:
+        terrain, surface = (None if each is None else each.info for each in self)
+        return terrain, surface
+
+    @property
+    def arrays(self) -> Parts:
+        return {name: part for each in self if each for name, part in each.arrays.items()}
+
+
+def height_layers(
+    dem: Dem | None, models: Sequence[Dem], area: Area, grid: TileGrid, *, needed: bool = True
+) -> HeightLayers:
+    """Of a terrain model and of surface models. Without a terrain model the lower envelope of the
+    surface stands for it.
+
+    `needed`: `AreaError` where the area has no height; else a layer without one is left out."""
+    terrain = None if dem is None else terrain_of_dem(dem, area, grid, needed=needed)
+    if not models:
+        return HeightLayers(terrain, None)
+    surface = Surface(models, area)
+    if dem is None:
+        terrain, ground = _bare_earth(surface, area, grid), surface.envelope
+    else:
+        ground = partial(_raised, dem, area, surface.above_m(dem))
+    made = None if terrain is None else _above(surface, ground, terrain.info, area, grid)
+    if made is None and needed:
+        raise _no_height("surface", area, models[0])
+    return HeightLayers(terrain, made)
+
+
+def _bare_earth(surface: Surface, area: Area, grid: TileGrid) -> TerrainParts | None:
+    posting_m = min(max(POSTING_M, rounded_gsd_m(surface.gsd_m)), MAX_POSTING_M)
+
+    def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
+        return surface.envelope(west_m, north_m, posting_m, rows, cols)
+
+    return terrain_parts(area, grid, posting_m, surface.name, surface.datum, sampled)
+
+
+def _raised(dem: Dem, area: Area, by_m: float, *window: Any) -> NDArray[np.float64]:
+    return dem.in_plane(area.frame, *window) + by_m
+
+
+def _above(
+    surface: Surface, ground: PlaneSampler, info: TerrainInfo, area: Area, grid: TileGrid
+) -> TerrainParts | None:
+    """The layer of houses and trees above a terrain `info` with heights `ground`."""
+    posting_m = min(max(SURFACE_POSTING_M, rounded_gsd_m(surface.gsd_m)), MAX_POSTING_M)
+
+    def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
+        heights = surface.sampled(west_m, north_m, posting_m, rows, cols)
+        row, col = np.mgrid[:rows, :cols] + 0.5
+        col = (west_m + col * posting_m - info.west_m) / info.posting_m - 0.5
+        row = (info.north_m - north_m + row * posting_m) / info.posting_m - 0.5
+        left, top = (math.floor(float(each.min())) for each in (col, row))
+        size = math.ceil(float(row.max())) - top + 2, math.ceil(float(col.max())) - left + 2
+        corner = info.west_m + left * info.posting_m, info.north_m - top * info.posting_m
+        below = ground(*corner, info.posting_m, *size)
+        return heights - bilinear(lambda r, c: below[r, c], below.shape, col - left, row - top)
+
+    name, datum, unit_m = surface.name, "terrain", SURFACE_UNIT_M
+    return terrain_parts(area, grid, posting_m, name, datum, sampled, layer=SURFACE, unit_m=unit_m)
 
 
 def _with_source(info: TerrainInfo, dem: Dem, area: Area) -> TerrainInfo:
@@ -336,7 +475,15 @@ def _firsts(count: int, side: int) -> list[int]:
 
 
 def terrain_parts(
-    area: Area, grid: TileGrid, posting_m: float, name: str, datum: str, sampled: HeightSampler
+    area: Area,
+    grid: TileGrid,
+    posting_m: float,
+    name: str,
+    datum: str,
+    sampled: HeightSampler,
+    *,
+    layer: str = TERRAIN,
+    unit_m: float = UNIT_M,
 ) -> TerrainParts | None:
     """None where the source has no height; smaller holes stay holes, and a warning names them."""
     west_m, north_m = grid.west_m - posting_m, grid.north_m + posting_m
@@ -367,13 +514,13 @@ def terrain_parts(
         return None
     if unknown:
         log.warning(
-            "terrain has no height for %.1f %% of the area: these holes stay holes in the map (%s)",
+            "%s has no height for %.1f %% of the area: these holes stay holes in the map (%s)",
+            layer,
             100 * unknown / inside,
             name,
         )
     low_m = math.floor(min(float(np.nanmin(each)) for each in found.values()) * 10) / 10
     high_m = max(float(np.nanmax(each)) for each in found.values())
-    unit_m = UNIT_M
     while high_m - low_m > unit_m * MAX_CODE:
         unit_m *= 2
     known = sum(int(np.isfinite(each).sum()) for each in found.values())
@@ -396,6 +543,6 @@ def terrain_parts(
         encode_terrain(found[number], info) if number in found else b""
         for number in range(table.count)
     ]
-    data, offsets = terrain_part_names(0)
+    data, offsets = terrain_part_names(0, layer)
     ends = np.cumsum([0, *map(len, blobs)]).astype(np.int64)
     return TerrainParts(info, {data: np.frombuffer(b"".join(blobs), np.uint8), offsets: ends})
