@@ -1,4 +1,4 @@
-"""Maps of the rows, built by the path of `orthonav build --dem`, and the heights they are given."""
+"""Maps of the rows, as `orthonav build` makes them, and the heights they are given."""
 
 import hashlib
 from dataclasses import dataclass
@@ -68,7 +68,9 @@ class Map:
             out.parent.mkdir(parents=True, exist_ok=True)
             more: dict[str, Any] = {} if self.land is None else {"relief": self.land}
             if self.ground is not None:
-                more |= {"dem": self.heights(work), "dem_datum": self.datum}
+                heights, datum = self.heights(work), {"dem_datum": self.datum}
+                is_surface = Path(self.ground).stem == SURFACE
+                more |= datum | ({"surface": [heights]} if is_surface else {"dem": heights})
             build_map(BuildRequest([found(self.ortho, work)], out, **more))
 
     def heights(self, work: Path) -> Path:

@@ -159,7 +159,7 @@ def test_sheets_made_otherwise_are_refused_or_replaced(built, make_ortho, ortho,
 def test_another_relief_is_another_request(built, ortho):
     with pytest.raises(AtlasError, match="--replace"):
         made(built[0], ortho, relief="level")
-    with pytest.raises(VariantError, match="give --dem or --relief"):
+    with pytest.raises(VariantError, match="--dem, --surface or --relief"):
         made(built[0], ortho, relief="level", dem=ortho)
 
 

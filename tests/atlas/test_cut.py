@@ -22,7 +22,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
-from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
@@ -32,8 +32,10 @@ from orthonav.ground.atlas.cut import (
     _relief,
     _roughness_m,
     check_shown,
+    cut_heights,
     cut_in_memory,
     cut_map,
+    opened_sheets,
 )
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
@@ -77,14 +79,23 @@ def folder(ortho, names, middle, tmp_path_factory):
         patch.setattr("orthonav.ground.build.calibrate.CROPS", 12)
         patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
         dem = write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0)
+        trees = write_dem(folder.parent / "trees.tif", middle, wooded, half_m=900.0, px_m=2.0)
         for name in names:
-            terrain = {"dem": dem, "dem_datum": "msl"}
-            put(atlas, name, built(ortho, name, folder.parent / "sheet.onav", **terrain))
+            heights = {"dem": dem, "dem_datum": "msl", "surface": [trees]}
+            put(atlas, name, built(ortho, name, folder.parent / "sheet.onav", **heights))
     return folder
 
 
 def ground(east_m, north_m):
     return 200 + 0.1 * np.asarray(east_m) - 0.2 * np.asarray(north_m)
+
+
+def above(east_m, north_m):
+    return 5 + 5 * np.sin(np.asarray(east_m) / 8) * np.cos(np.asarray(north_m) / 8)
+
+
+def wooded(east_m, north_m):
+    return ground(east_m, north_m) + above(east_m, north_m)
 
 
 def built(ortho, name, out, **request):
@@ -155,6 +166,21 @@ def test_terrain_is_that_of_the_sheets(cut, middle):
     points = np.random.default_rng(0).uniform(-150, 150, (300, 2))
     found = layer(*middle.latlon_from_en(points))
     np.testing.assert_allclose(found, ground(*points.T), atol=0.2)  # two times rounded
+
+
+def test_surface_is_that_of_the_sheets_if_all_have_one(folder, cut, middle):
+    layer = TerrainLayer.of(cut, layer=SURFACE)
+    assert (layer.info.name, layer.info.posting_m, layer.info.unit_m) == ("trees.tif", 2, 0.25)
+    points = np.random.default_rng(0).uniform(-150, 150, (300, 2))
+    found = layer(*middle.latlon_from_en(points))
+    np.testing.assert_allclose(found, above(*points.T), atol=0.6)  # two times between samples
+    atlas, sheet = Atlas.open(str(folder)), cut.manifest.sheets[0]
+    area = area_around(middle, 150)
+    members = opened_sheets(atlas, atlas.over(bounds_around(middle, 150)), sheet.grid)
+    assert cut_heights(members, area, sheet.grid).surface is not None
+    members[0] = replace(members[0], surface=None)
+    without = cut_heights(members, area, sheet.grid)
+    assert without.surface is None and without.terrain is not None
 
 
 def test_terrain_is_a_surface_model_only_where_all_of_it_is_one(cut):

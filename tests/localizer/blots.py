@@ -26,16 +26,16 @@ from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 
 SIDE_M = 620
-SURFACE = TerrainInfo(
+ROUGH = TerrainInfo(
     *(0.0, 0.0, 1.0, 16, 16, 16, 0.0, 0.0, 0.1, 256, "surface", "none"),
     source_posting_m=1.0,
     roughness_m=2.0,
 )
-"""A terrain that shows houses and trees, as that of the ground without any does."""
+"""A terrain that was made of a surface model."""
 
 
 class Flat:
-    """A surface model of level ground without houses."""
+    """Level ground, or a surface without houses."""
 
     def at_en_m(self, points_en_m):
         return np.zeros(np.shape(points_en_m)[:-1])

@@ -5,7 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, FINEST_M, GROUND, SURFACE, as_grey, error_m, known_map, rendered
+from blots import (
+    AGL_M,
+    CAMERA,
+    FINEST_M,
+    GROUND,
+    ROUGH,
+    Flat,
+    as_grey,
+    error_m,
+    known_map,
+    rendered,
+)
 from lab.terrain import random_relief, seen_view
 
 from orthonav.core.geo.ground import Ground
@@ -14,6 +25,7 @@ from orthonav.core.localize.camera import VARIANCE, VARIANCE_POWER
 from orthonav.core.localize.ground import Relief, ViewOverGround
 from orthonav.core.localize.place import MAX_RATIO
 from orthonav.core.localize.rectify import Orientation
+from orthonav.core.localize.systematic import SURFACE_M
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.register.pose import Pose
@@ -62,7 +74,7 @@ def relief():
 
 def on_terrain(opened, relief):
     localizer = Localizer(opened)
-    localizer.registration.relief = Relief(Terrain(relief), localizer.grid, SURFACE)
+    localizer.registration.relief = Relief(Terrain(relief), localizer.grid, surface=Flat())
     return localizer
 
 
@@ -177,7 +189,9 @@ def test_the_camera_over_a_hole_of_the_terrain_is_found(opened, grey, relief):
 def test_simulated_level_ground_is_known_as_well_as_the_terrain(opened):
     localizer = on_terrain(opened, hills(0.05))
     known = localizer.registration.relief
-    known.info = replace(SURFACE, roughness_m=None, source_posting_m=30.0)
+    assert known.levelled().level_errors.fields == (SURFACE_M,)
+    known.info = replace(ROUGH, roughness_m=None, source_posting_m=30.0)
+    known.surface = None
     levelled, unknown = known.levelled(), Localizer(opened).registration.relief
     assert levelled.is_level and levelled.level_errors.slope == 0 < unknown.level_errors.slope
     (std_m, _), _ = levelled.level_errors.fields

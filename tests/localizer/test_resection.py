@@ -5,7 +5,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, SURFACE, Flat, as_grey, known_map, rendered
+from blots import AGL_M, CAMERA, GROUND, Flat, as_grey, known_map, rendered
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer, systematic
@@ -32,7 +32,7 @@ def localizer(made_once, make_ortho):
     """The same on a map with a surface model."""
     made = Localizer(open_map(known_map(made_once, make_ortho).path))
     made.registration.floor_px = 0.0
-    made.registration.relief = Relief(Flat(), made.grid, SURFACE)
+    made.registration.relief = Relief(Flat(), made.grid, surface=Flat())
     return made
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blots import SURFACE
+from blots import ROUGH
 
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.localize.camera import ground_by_picture, picture_by_camera, picture_by_ground
@@ -127,9 +127,11 @@ def test_unknown_ground_is_as_steep_as_the_map_says(relief, slope):
 
 
 def test_errors_of_terrain_follow_its_source():
-    bare = replace(SURFACE, roughness_m=0.3, source_posting_m=1.0)
+    bare = replace(ROUGH, roughness_m=0.3, source_posting_m=1.0)
     coarse = replace(bare, source_posting_m=30.0)
-    assert terrain_errors(SURFACE, SLOPES).fields == (SURFACE_M,)
+    assert terrain_errors(ROUGH, SLOPES).fields == (SURFACE_M, (ROUGH.roughness_m, OBJECTS_M[1]))
+    for source in (ROUGH, bare, coarse, None):
+        assert terrain_errors(source, SLOPES, has_surface=True).fields == (SURFACE_M,)
     assert terrain_errors(bare, SLOPES).fields == (BARE_EARTH_M, OBJECTS_M)
     (std_m, length_m), objects = terrain_errors(coarse, SLOPES).fields
     assert 2.0 < std_m < COARSE_STD_M and length_m == 150.0 and objects == OBJECTS_M
@@ -146,7 +148,7 @@ def test_errors_of_terrain_follow_its_source():
 @pytest.mark.parametrize("posting_m", [90.0, 250.0])
 def test_a_coarser_terrain_is_not_believed_more(posting_m):
     """The slope of its error stays, and it leaves out undulation."""
-    info = replace(SURFACE, roughness_m=None, source_posting_m=30.0)
+    info = replace(ROUGH, roughness_m=None, source_posting_m=30.0)
     (fine_m, fine_length_m), _ = terrain_errors(info, 10 * SLOPES).fields
     coarse = replace(info, source_posting_m=posting_m)
     (std_m, length_m), undulation, _ = terrain_errors(coarse, 10 * SLOPES).fields

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, GROUND, SURFACE, Flat, Ground, known_map, place_of, rendered
+from blots import AGL_M, GROUND, Flat, Ground, known_map, place_of, rendered
 
 from orthonav.core.errors import CameraError, MapFileError
 from orthonav.core.geo.camera import Camera
@@ -124,7 +124,7 @@ def test_the_confidence_of_a_track_is_that_of_its_covariance_and_place(usual):
 def test_biases_of_heading_height_and_mount_are_estimated(localizer, monkeypatch):
     """Uncorrected, 5 deg of pitch are 13 m from 150 m. Over known ground single views show their
     tilt themselves."""
-    relief = Relief(Flat(), localizer.grid, SURFACE)
+    relief = Relief(Flat(), localizer.grid, surface=Flat())
     monkeypatch.setattr(localizer.registration, "relief", relief)
     tracker = Tracker(localizer)
     seen = list(

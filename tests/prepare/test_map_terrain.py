@@ -168,7 +168,7 @@ def test_terrain_elsewhere_is_refused(tmp_path):
 
 def test_build_names_what_is_wrong_before_the_work(run, area, dem, tmp_path):
     build = ("build", "--ortho", area.past, "--out", tmp_path / "a.onav", "--dem")
-    assert "give --dem or --relief" in run(*build, dem, "--relief", "level").err
+    assert "--dem, --surface or --relief" in run(*build, dem, "--relief", "level").err
     assert "is a picture" in run(*build, area.past, "--dem-datum", "msl").err
     assert "does not exist: no.tif" in run(*build, "no.tif").err
     done = run("build", "--ortho", area.past, "--dem", dem, "--dem-datum", "msl", "--out", dem)

@@ -1,0 +1,97 @@
+"""Views over houses on a map that knows them, against rays that are followed to the roofs."""
+
+import numpy as np
+import pytest
+from blots import AGL_M, CAMERA, GROUND, as_grey, error_m, known_map
+from lab.terrain import seen_view
+
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.ground import MIN_KNOWN, Relief
+from orthonav.core.localize.systematic import SURFACE_M
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Telemetry, View
+from orthonav.ground.simulate.render import Raster
+
+SIDE_M, FINEST_M, BASE_M = 700.0, 0.5, 100.0
+ATTITUDE = (70.0, 30.0, 0.0)
+PLACE = np.array([30.0, -90.0])
+
+
+class Heights:
+    """A raster as a layer of a map gives it; NaN west of `from_m`."""
+
+    def __init__(self, raster, from_m=-np.inf):
+        self.raster, self.from_m = raster, from_m
+
+    def at_en_m(self, points_en_m):
+        points = np.asarray(points_en_m, float)
+        found = self.raster.at(points[..., 0], points[..., 1])
+        return np.where(points[..., 0] < self.from_m, np.nan, found)
+
+
+def raster(values):
+    return Raster(values.astype(np.float32), -SIDE_M / 2, SIDE_M / 2, FINEST_M)
+
+
+@pytest.fixture(scope="module")
+def opened(made_once, make_ortho):
+    return open_map(known_map(made_once, make_ortho).path)
+
+
+@pytest.fixture(scope="module")
+def town():
+    """Ground of 2 % and houses of 12 m above it, up to 10 m high."""
+    at = np.arange(FINEST_M / 2, SIDE_M, FINEST_M) - SIDE_M / 2
+    east, north = np.meshgrid(at, -at)
+    number = np.floor(east / 30.0) * 17 + np.floor(north / 30.0) * 5
+    houses = (np.mod(east, 30.0) < 12.0) & (np.mod(north, 30.0) < 12.0)
+    above = houses * (4.0 + np.mod(number, 7.0))
+    grey = as_grey(GROUND(east, north)).astype(np.float32)
+    return raster(grey), raster(BASE_M + 0.02 * east), raster(above)
+
+
+def on(opened, ground, surface):
+    localizer = Localizer(opened)
+    registration = localizer.registration
+    registration.relief = Relief(Heights(ground), localizer.grid, None, None, surface)
+    return localizer
+
+
+@pytest.fixture(scope="module")
+def view(town):
+    grey, ground, above = town
+    solid = Raster(ground.values + above.values, ground.west_m, ground.north_m, FINEST_M)
+    below = float(ground.at(PLACE[:1], PLACE[1:])[0])
+    position = np.array([*PLACE, below + AGL_M / 2])
+    picture, _ = seen_view(grey, solid, CAMERA, ATTITUDE, position, finer=1)
+    return View(picture, CAMERA, Telemetry(0, 72.0, 31.0, -1.0, 1.04 * AGL_M / 2))
+
+
+def test_the_camera_is_found_among_houses_to_decimetres(opened, town, view):
+    _, ground, above = town
+    known = (localizer := on(opened, ground, Heights(above))).locate(view)
+    unknown = (bare := on(opened, ground, None)).locate(view)
+    error = error_m(localizer, known, PLACE)
+    assert error < 0.4 and known.confidence > 0.9
+    assert error < 0.5 * error_m(bare, unknown, PLACE)
+    assert np.trace(known.cov_en_m2) < 0.5 * np.trace(unknown.cov_en_m2)
+    assert error**2 < 9.0 * np.trace(known.cov_en_m2)
+
+
+def test_a_surface_counts_where_most_of_it_is_known(town, opened):
+    _, ground, above = town
+    grid = opened.manifest.sheets[0].grid
+    px = np.stack(np.meshgrid(np.linspace(50, 250, 40), np.linspace(50, 250, 40)), -1)
+    east_m = grid.west_m + np.linspace(50, 250, 40) * grid.gsd_m
+    for share in (0.2, 0.8):
+        surface = Heights(above, from_m=float(np.quantile(east_m, 1 - share)))
+        relief = Relief(Heights(ground), grid, None, None, surface)
+        found, level = relief.surface_m(px)[..., 2], relief.ground_m(px)[..., 2]
+        errors = relief.errors(relief.ground_m(px).reshape(-1, 3), np.zeros((1600, 2)))
+        if share < MIN_KNOWN:
+            np.testing.assert_array_equal(found, level)
+            assert SURFACE_M not in errors.fields
+        else:
+            assert np.isnan(found).mean() == pytest.approx(1 - share, abs=0.03)
+            assert np.nanmax(found - level) > 3.0
+            assert errors.fields == (SURFACE_M,)
