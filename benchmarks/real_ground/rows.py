@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 from benchmarks.closed_loop.replays import flights
@@ -16,7 +17,7 @@ from orthonav.cli.demo import IMAGERY
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.run import Locator, SingleViews
 
-PARTS = ("flights", "replays", "oblique", "flat", "relief", "houses", "lens", "mapping")
+PARTS = ("flights", "replays", "oblique", "flat", "relief", "houses", "towns", "lens", "mapping")
 REPLAYED = ("px4_plane", "px4_quad", "px4_plane_on_e05f2ea8", "px4_quad_on_e05f2ea8")
 ARROIO_STD_M = 5.0
 """The truth is good to 7 to 10 m (README of the data): 5 to 7 m per axis. The smaller, so that the
@@ -35,6 +36,7 @@ LAND = {2.0: "level", 5.0: "rolling", 10.0: "hills"}
 TILTS = (0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)
 """Standard deviations of the true pitch and roll, and as stated, degrees."""
 ROOFS_GSD_M, ROOFS_SEEDS = 0.2, (1, 11, 25)  # of generated towns
+TOWN_AGL_M, TOWN_AHEAD_DEG = (120.0, 80.0, 50.0), (0.0, 30.0, 45.0)
 
 
 AnySource = OverRelief | OverLevel | Recording | Replay | Windows
@@ -182,6 +184,15 @@ def _relief() -> Iterator[Question]:
         for seed in ROOFS_SEEDS
     ]
     yield from _rendered("roofs at 0.2 m", "houses", roofs, 2.0, tilts=[(0.0, 0.0), (0.0, None)])
+    for agl_m, ahead_deg in product(TOWN_AGL_M, TOWN_AHEAD_DEG):
+        maps = [dict(_grounds(pair.map, 2.0)) for pair in roofs]
+        for ground in ("no terrain", "bare earth", "surface"):
+            legs = tuple(
+                (on[ground], OverRelief(pair, 2.0, 1.0, agl_m=agl_m, ahead_deg=ahead_deg))
+                for on, pair in zip(maps, roofs, strict=True)
+            )
+            name = f"town from {agl_m:g} m, {ahead_deg:g} deg ahead, {ground}"
+            yield Question(name, "towns", legs)
 
 
 def _known() -> Iterator[Question]:

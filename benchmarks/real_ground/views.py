@@ -20,7 +20,7 @@ from benchmarks.real_ground.score import Seen
 from benchmarks.scenes import DATA, Pair, flight, root_agl_of
 from orthonav.core.files import replacing
 from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.geo.camera import FOV_STD, Camera
+from orthonav.core.geo.camera import FOV_STD, Camera, axis_on_ground_en_m
 from orthonav.core.localize import Localizer
 from orthonav.core.records import Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -47,6 +47,8 @@ class OverRelief:
     - `tilt_std_deg`: of the true pitch and roll, reported as 0; `stated_deg`: the deviation that is
       reported with them.
     - `nominal`: whether the lens is known by its field of view only.
+    - `agl_m`: height; None: that from which a view is `WIDTH_PX` of the map across. `ahead_deg`:
+      how far the camera looks ahead.
     """
 
     pair: Pair
@@ -55,10 +57,13 @@ class OverRelief:
     stated_deg: float | None = None
     nominal: bool = False
     std_m: float = 0.0
+    agl_m: float | None = None
+    ahead_deg: float = 0.0
 
     def pictures(self) -> str:
         """Name of the folder of pictures, which rows share."""
         lens = "-nominal" if self.nominal else ""
+        lens += "" if self.agl_m is None else f"-{self.agl_m:g}m-{self.ahead_deg:g}deg"
         name = self.pair.name.replace(" ", "").replace(">", "-")
         return f"{name}-{self.slope:g}-{self.tilt_std_deg:g}{lens}"
 
@@ -90,7 +95,7 @@ class OverRelief:
                     cv2.imwrite(str(part), seen[..., 0])
             grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
             rng = np.random.default_rng([SEED, number, 1])
-            reported = level_telemetry(true, rng, self.stated_deg)
+            reported = level_telemetry(true, rng, self.stated_deg, self.ahead_deg)
             yield Seen(View(grey, camera, reported), (float(lat), float(lon)), true.agl_m)
 
     def _heights(self, work: Path) -> Path:
@@ -128,22 +133,24 @@ class OverRelief:
     def _pose(
         self, base: Localizer, inside_m: Array, rng: np.random.Generator
     ) -> tuple[Telemetry, Array]:
-        """A true pose whose view shows imagery only, and its place (2,)."""
+        """A true pose, and its place (2,): the middle of the view shows imagery, and that of a view
+        straight down shows nothing else."""
         assert base.registration is not None
         grid = base.grid
-        agl_m = root_agl_of(WIDTH_PX, grid.gsd_m)
+        agl_m = self.agl_m or root_agl_of(WIDTH_PX, grid.gsd_m)
         reach_m = math.hypot(*CAMERA.extent) / 2 * agl_m
         rows, cols = inside_m.shape
         while True:
             share = rng.uniform(0, 1, 2)
             at = np.array([share[0] * cols, -share[1] * rows]) * grid.gsd_m
-            place = np.array([grid.west_m, grid.north_m]) + at
+            middle = np.array([grid.west_m, grid.north_m]) + at
             yaw, (pitch, roll) = float(rng.uniform(0, 360)), rng.normal(0, 1, 2).tolist()
-            lat, lon = (float(v) for v in base.sheet.frame.latlon_from_en(place))
+            lat, lon = (float(v) for v in base.sheet.frame.latlon_from_en(middle))
             seen = inside_m[int(share[1] * rows), int(share[0] * cols)] >= reach_m
             if seen and is_covered(base.registration, (lat, lon), WIDTH_PX):
-                tilt = pitch * self.tilt_std_deg, roll * self.tilt_std_deg
-                return Telemetry(0, yaw, *tilt, agl_m), place
+                pitch, roll = self.ahead_deg + pitch * self.tilt_std_deg, roll * self.tilt_std_deg
+                ahead_m = np.array(axis_on_ground_en_m(yaw, self.ahead_deg, 0.0, agl_m))
+                return Telemetry(0, yaw, pitch, roll, agl_m), middle - ahead_m
 
     def _lens(self, rng: np.random.Generator) -> tuple[Camera, Camera]:
         """The lens of a view, and as the localizer knows it."""
@@ -196,15 +203,18 @@ class OverLevel:
 
 
 def level_telemetry(
-    true: Telemetry, rng: np.random.Generator, stated_deg: float | None = None
+    true: Telemetry,
+    rng: np.random.Generator,
+    stated_deg: float | None = None,
+    pitch_deg: float = 0.0,
 ) -> Telemetry:
-    """Telemetry that reports a level camera, with errors of heading and height; `stated_deg`: the
-    deviation of its tilt."""
+    """Telemetry that reports a level camera, or one that looks ahead by `pitch_deg`, with errors of
+    heading and height; `stated_deg`: the deviation of its tilt."""
     turn, log = rng.normal(0, 1, 2)
     return replace(
         true,
         yaw_deg=(true.yaw_deg + float(turn) * YAW_STD_DEG) % 360,
-        pitch_deg=0.0,
+        pitch_deg=pitch_deg,
         roll_deg=0.0,
         agl_m=true.agl_m * max(0.5, 1 + float(log) * AGL_STD),
         yaw_std_deg=YAW_STD_DEG,

@@ -392,6 +392,7 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, accept: Acceptance)
     terrain, ground = sheet.terrain, "level ground"
     if terrain is not None:
         ground = f"terrain of {terrain.low_m:.0f} to {terrain.high_m:.0f} m"
+        ground += " with houses and trees" if sheet.surface is not None else ""
     recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
     telemetry = ", ".join(each for each in (options.autopilot, recorded) if each)
     kinds = dict.fromkeys(options.send or ["global-position"])

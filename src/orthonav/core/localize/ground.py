@@ -91,7 +91,7 @@ class Relief:
         return ground
 
     def _above_m(self, ground_m: Array) -> Array | None:
-        """Heights of houses and trees (...) at (..., 3), NaN where unknown; None: mostly unknown."""
+        """Of houses and trees (...) at (..., 3), NaN where unknown; None: mostly unknown."""
         if self.surface is None:
             return None
         above_m = self.surface.at_en_m(ground_m[..., :2])
