@@ -35,6 +35,7 @@ MIDDLE_STD, BARREL = 0.01, 0.05
 """Errors of a nominal lens beside that of its focal length (`FOV_STD`): standard deviation of the
 principal point as a share of the width, and the largest k1."""
 CAMERA, EFFECTS = DEFAULT_CAMERA.fitted(640, 480), ViewEffects()
+RIM_PX = 50.0  # of the map, over which no camera is: heights end there
 LEAD = 50  # views with GNSS before a track is judged
 Array = NDArray[np.float64]
 
@@ -133,8 +134,8 @@ class OverRelief:
     def _pose(
         self, base: Localizer, inside_m: Array, rng: np.random.Generator
     ) -> tuple[Telemetry, Array]:
-        """A true pose, and its place (2,): the middle of the view shows imagery, and that of a view
-        straight down shows nothing else."""
+        """A true pose over the map, and its place (2,): the middle of the view shows imagery, and a
+        view straight down from above it would show nothing else."""
         assert base.registration is not None
         grid = base.grid
         agl_m = self.agl_m or root_agl_of(WIDTH_PX, grid.gsd_m)
@@ -147,10 +148,12 @@ class OverRelief:
             yaw, (pitch, roll) = float(rng.uniform(0, 360)), rng.normal(0, 1, 2).tolist()
             lat, lon = (float(v) for v in base.sheet.frame.latlon_from_en(middle))
             seen = inside_m[int(share[1] * rows), int(share[0] * cols)] >= reach_m
+            place = middle - axis_on_ground_en_m(yaw, self.ahead_deg, 0.0, agl_m)
+            col, row = (place - [grid.west_m, grid.north_m]) / [grid.gsd_m, -grid.gsd_m]
+            seen &= RIM_PX < col < cols - RIM_PX and RIM_PX < row < rows - RIM_PX
             if seen and is_covered(base.registration, (lat, lon), WIDTH_PX):
                 pitch, roll = self.ahead_deg + pitch * self.tilt_std_deg, roll * self.tilt_std_deg
-                ahead_m = np.array(axis_on_ground_en_m(yaw, self.ahead_deg, 0.0, agl_m))
-                return Telemetry(0, yaw, pitch, roll, agl_m), middle - ahead_m
+                return Telemetry(0, yaw, pitch, roll, agl_m), place
 
     def _lens(self, rng: np.random.Generator) -> tuple[Camera, Camera]:
         """The lens of a view, and as the localizer knows it."""

@@ -143,7 +143,7 @@ def test_a_damaged_chunk_is_an_error(tmp_path, name):
 @pytest.mark.parametrize(
     "change",
     [
-        {"posting_m": 0.5},
+        {"posting_m": 0.2},
         {"posting_m": 1001.0},
         {"rows": 0},
         {"cols": 10**6},
