@@ -168,7 +168,7 @@ def test_terrain_is_that_of_the_sheets(cut, middle):
     np.testing.assert_allclose(found, ground(*points.T), atol=0.2)  # two times rounded
 
 
-def test_surface_is_that_of_the_sheets_if_all_have_one(folder, cut, middle):
+def test_surface_is_that_of_the_sheets_that_have_one(folder, cut, middle):
     layer = TerrainLayer.of(cut, layer=SURFACE)
     assert (layer.info.name, layer.info.posting_m, layer.info.unit_m) == ("trees.tif", 2, 0.25)
     points = np.random.default_rng(0).uniform(-150, 150, (300, 2))
@@ -177,9 +177,11 @@ def test_surface_is_that_of_the_sheets_if_all_have_one(folder, cut, middle):
     atlas, sheet = Atlas.open(str(folder)), cut.manifest.sheets[0]
     area = area_around(middle, 150)
     members = opened_sheets(atlas, atlas.over(bounds_around(middle, 150)), sheet.grid)
-    assert cut_heights(members, area, sheet.grid).surface is not None
+    whole = cut_heights(members, area, sheet.grid).surface
     members[0] = replace(members[0], surface=None)
-    without = cut_heights(members, area, sheet.grid)
+    partly = cut_heights(members, area, sheet.grid).surface
+    assert 0 < partly.info.known < whole.info.known
+    without = cut_heights([replace(each, surface=None) for each in members], area, sheet.grid)
     assert without.surface is None and without.terrain is not None
 
 

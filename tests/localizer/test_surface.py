@@ -6,7 +6,7 @@ from blots import AGL_M, CAMERA, GROUND, as_grey, error_m, known_map
 from lab.terrain import seen_view
 
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.ground import MIN_KNOWN, Relief
+from orthonav.core.localize.ground import MIN_KNOWN, Relief, _smoothed
 from orthonav.core.localize.systematic import SURFACE_M
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Telemetry, View
@@ -76,6 +76,59 @@ def test_the_camera_is_found_among_houses_to_decimetres(opened, town, view):
     assert error < 0.5 * error_m(bare, unknown, PLACE)
     assert np.trace(known.cov_en_m2) < 0.5 * np.trace(unknown.cov_en_m2)
     assert error**2 < 9.0 * np.trace(known.cov_en_m2)
+
+
+def test_a_hole_hides_no_more_than_itself(opened, town, view):
+    """Smoothing leaves out what is unknown: a hole, and all beyond the map, next to the view."""
+    _, ground, above = town
+    at = ground.west_m + FINEST_M * (np.arange(ground.values.shape[1]) + 0.5)
+    near = (np.abs(at[None, :] - PLACE[0] - 20.0) < 4.0) & (np.abs(-at[:, None] - PLACE[1]) < 4.0)
+    beyond = np.broadcast_to(at[None, :] < PLACE[0] - 40.0, near.shape)
+    whole = on(opened, ground, Heights(above)).locate(view)
+    for missing in (near, beyond):
+        holed = raster(np.where(missing, np.nan, ground.values))
+        fix = (localizer := on(opened, holed, Heights(above))).locate(view)
+        assert error_m(localizer, fix, PLACE) < 0.5
+        assert np.trace(fix.cov_en_m2) < 3.0 * np.trace(whole.cov_en_m2)
+
+
+@pytest.mark.parametrize("side", [2, 5, 12])
+def test_smoothing(side):
+    rng = np.random.default_rng(0)
+    heights = rng.normal(0.0, 1.0, (60, 80))
+    heights[20:24, 30:34] = np.nan
+    made = _smoothed(heights, side)
+    np.testing.assert_array_equal(np.isnan(made), np.isnan(heights))
+    half = side // 2
+    for row, col in ((22, 36), (40, 40), (30, 60)):
+        around = heights[row - half : row + half + 1, col - half : col + half + 1]
+        assert made[row, col] == pytest.approx(np.nanmean(around))
+    assert _smoothed(heights, 1) is heights
+
+
+def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
+    """A valley 40 m deep east of the camera: the scale of views that look into it is larger."""
+    grey, _, _ = town
+    at = np.arange(FINEST_M / 2, SIDE_M, FINEST_M) - SIDE_M / 2
+    cliff = raster(np.broadcast_to(np.where(at > 0, 60.0, 100.0), grey.values.shape))
+    registration = on(opened, cliff, None).registration
+    agl_m = AGL_M / 2
+
+    def expected(heading_deg, ahead_deg):
+        telemetry = Telemetry(0, heading_deg, ahead_deg, 0.0, agl_m)
+        picture = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
+        prepared = registration.prepared(View(picture, CAMERA, telemetry), True)
+        return registration.relief.expected(prepared), prepared
+
+    nadir, prepared = expected(90.0, 0.0)
+    assert nadir is prepared.prior
+    found, prepared = expected(90.0, 45.0)
+    values = found.scale_map.values
+    # From the level ground beyond the cliff into the valley, and over either of the two alone.
+    assert values.max() == pytest.approx(np.log1p(40.0 / agl_m), abs=0.1)
+    assert np.abs(values[:, [0, -1]]).max() < 0.02
+    away, _ = expected(270.0, 45.0)
+    assert away.scale_map.values.min() < -0.15  # what lies above the ground below the camera
 
 
 def test_a_surface_counts_where_most_of_it_is_known(town, opened):

@@ -130,7 +130,9 @@ class Relief:
         below, agl_m = telemetry.below, telemetry.agl_m
         means, step_px = self._mean_heights(view.side_px)
         below_m: Array | float = math.nan if below is None else below.height_m
-        if below is None and prior.turn_rad is not None:
+        if below is None:
+            if prior.turn_rad is None or np.hypot(*view.camera_px) < AHEAD * view.side_px:
+                return prior
             below_m = self._at_nodes(step_px, rotation(prior.turn_rad) @ view.camera_px)
         over = np.maximum(1 + (below_m - means) / agl_m, 0.05)
         values = np.log(np.where(np.isfinite(over), over, 1.0)).astype(np.float32)
@@ -176,11 +178,14 @@ class Relief:
         return self._means[key]
 
 
-LEAST_RISE = 0.05  # of the ground below the camera over that in the view, of the height
+AHEAD, LEAST_RISE = 0.5, 0.05
+"""Least distance of the camera from the middle of its view, of the view's side, and least rise of
+the ground below it over that in the view, of the height, at which scales are expected by place."""
 REFERENCE_NODES = 9  # across a window, for its mean height
 MIN_KNOWN = 0.5  # windows of which less is known are registered on level ground
 LEVEL_PX = 0.2  # relief that displaces less (pixels of the final level) is left out
-SURFACE_NODE_M = 2.0  # largest spacing of heights among houses
+SURFACE_NODE_M = 2.0  # largest spacing of heights among houses,
+SURFACE_NODES = 320  # but at most so many across a view
 SMOOTH_M = 10.0  # width over which these are smoothed for the search
 
 
@@ -255,6 +260,17 @@ class SearchedSheet:
         return np.asarray(metres @ spread @ metres)
 
 
+def _smoothed(heights: Array, side: int) -> Array:
+    """Means (h, w) over squares, of what is known; NaN stays where it was."""
+    side |= 1  # the middle of an even one lies between samples
+    if side < 3:
+        return heights
+    known = np.isfinite(heights)
+    share = cv2.blur(known.astype(np.float64), (side, side))
+    mean = cv2.blur(np.where(known, heights, 0.0), (side, side)) / np.maximum(share, 1e-9)
+    return np.where(known, mean, np.nan)
+
+
 class ViewOverGround:
     def __init__(self, relief: Relief, view: PreparedView) -> None:
         self.relief, self.view = relief, view
@@ -297,21 +313,18 @@ class ViewOverGround:
             made = orthorectified(picture, orientation, ground, shape)
         return ViewTemplates(*made, level)
 
-    def _nodes_m(
-        self, pose: Pose, level: int, shape: tuple[int, int], *, smooth: bool
-    ) -> Array:
+    def _nodes_m(self, pose: Pose, level: int, shape: tuple[int, int], *, smooth: bool) -> Array:
         """East, north, above sea (h, w, 3) at `node_px` of a window of a level: with houses and
         trees as they are, or smoothed, which more cameras near the right one fit."""
         middle, unit = np.array([shape[1], shape[0]]) / 2, 2.0**level
         if self.relief.surface is None:
             return self.relief.ground_m(pose.map_px((node_px(shape) - middle) * unit))
         node_m = NODE_PX * self.relief.grid.gsd_m * unit
-        finer = max(math.ceil(node_m / SURFACE_NODE_M), 1)
+        finer = min(math.ceil(node_m / SURFACE_NODE_M), SURFACE_NODES * NODE_PX // max(shape))
+        finer = max(finer, 1)
         nodes = self.relief.surface_m(pose.map_px((node_px(shape, finer) - middle) * unit))
         across_m = SMOOTH_M if smooth else node_m if finer > 1 else 0.0
-        side = round(across_m * finer / node_m)
-        if side > 1:
-            nodes[..., 2] = cv2.blur(nodes[..., 2], (side, side))
+        nodes[..., 2] = _smoothed(nodes[..., 2], round(across_m * finer / node_m))
         return np.ascontiguousarray(nodes[::finer, ::finer])
 
     def _en_from_window(self, pose: Pose, level: int, middle: Array) -> Array:

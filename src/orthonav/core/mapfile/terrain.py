@@ -15,7 +15,7 @@ from orthonav.core.mapfile.layer import ChunkTable
 from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
 from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
 
-CACHE_BYTES = 16 * 2**20  # 400 km2 at 10 m
+CACHE_BYTES = 16 * 2**20  # 400 km2 of terrain every 10 m, 4 km2 of surface every 1 m
 FEW_CHUNKS, FEW_SAMPLES = 16, 2**18  # that are read as one part, as those under a view
 TERRAIN, SURFACE = "terrain", "surface"
 _MAX_BYTES_PER_SAMPLE = 4
@@ -102,12 +102,15 @@ class TerrainLayer:
         chunk_rows, chunk_cols = rows // side, cols // side
         found = np.full(rows.shape, np.nan)
         across = int(chunk_cols.max(initial=0)) + 1
-        for key in np.unique(chunk_rows * across + chunk_cols).tolist():
-            chunk_row, chunk_col = divmod(key, across)
+        keys = (chunk_rows * across + chunk_cols).ravel()
+        order = np.argsort(keys, kind="stable")
+        ends = np.append(np.flatnonzero(np.diff(keys[order])) + 1, len(order))
+        for here in np.split(order, ends[:-1]) if len(order) else []:
+            chunk_row, chunk_col = divmod(int(keys[here[0]]), across)
             heights = self._chunk(chunk_row, chunk_col)
             if heights is not None:
-                here = (chunk_rows == chunk_row) & (chunk_cols == chunk_col)
-                found[here] = heights[rows[here] % side, cols[here] % side]
+                row, col = (each.ravel()[here] % side for each in (rows, cols))
+                found.ravel()[here] = heights[row, col]
         return found
 
     def _chunk(self, chunk_row: int, chunk_col: int) -> Heights | None:

@@ -65,7 +65,7 @@ class AtlasRequest:
     dem: Path | None = None  # terrain model of which sheets get a terrain layer
     surface: Sequence[Path] = ()  # surface models, of which they get a surface layer
     dem_datum: str | None = None  # what its heights count from
-    relief: str | None = None  # what the land is like, as in `BuildRequest`; not with `dem`
+    relief: str | None = None  # what the land is like, as in `BuildRequest`; not with heights
 
     def __post_init__(self) -> None:
         with_paths(self, "orthos", "dem", "surface")
@@ -327,7 +327,10 @@ def build_atlas(
     mosaic = Mosaic.open(orthos)
     recipe = recipe_for(request, mosaic)
     dem = request.dem and open_dem(Path(request.dem).absolute(), request.dem_datum).path
-    request = replace(request, url=Store(request.url).url, orthos=orthos, dem=dem)
+    surface = tuple(
+        open_dem(Path(path).absolute(), request.dem_datum).path for path in request.surface
+    )
+    request = replace(request, url=Store(request.url).url, orthos=orthos, dem=dem, surface=surface)
     tasks = plan_sheets(request, recipe, mosaic)
     atlas = Atlas.open_or_create(request.url, recipe)
     known = atlas.sheets()

@@ -444,14 +444,11 @@ def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
 
 
 def cut_heights(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> HeightLayers:
-    """The layers of heights of a map cut from sheets. It has a terrain if one of them has, a
-    surface if all have: elsewhere houses would count as known to be absent."""
+    """The layers of heights of a map cut from sheets; where a sheet has none, they have holes."""
     terrains = [(each, each.terrain) for each in members if each.terrain is not None]
     surfaces = [(each, each.surface) for each in members if each.surface is not None]
-    whole = len(surfaces) == len(members)
     return HeightLayers(
-        _cut_heights(terrains, area, grid, TERRAIN),
-        _cut_heights(surfaces if whole else [], area, grid, SURFACE),
+        _cut_heights(terrains, area, grid, TERRAIN), _cut_heights(surfaces, area, grid, SURFACE)
     )
 
 

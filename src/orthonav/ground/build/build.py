@@ -90,7 +90,7 @@ class BuildRequest:
       (`orthonav.ground.imagery.terrain.OPTION`).
     - `dem_needed`: whether an area in which a model has no height is refused.
     - `relief`: what the land is like where there is no terrain, a key of
-      `orthonav.core.geo.ground.RELIEF_SLOPES`; None: not stated. Not together with `dem`.
+      `orthonav.core.geo.ground.RELIEF_SLOPES`; None: not stated. Not with `dem` or `surface`.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
     """

@@ -1,7 +1,8 @@
 """Layers of a map: the grey pyramid of registration, the means of micro-cells, terrain, surface.
 
 A chunk is encoded as soon as it is complete, and passed at half the resolution to the next level,
-so memory holds compressed chunks and incomplete ones. Cell means, from which new tiles are embedded
+so memory holds compressed chunks and incomplete ones; heights are held as float32, 4 MB per km2 of
+a surface. Cell means, from which new tiles are embedded
 without imagery, are quantized to a byte each, relative to the largest of a cell, which is a
 float16: the rounding error is at most 0.4 % of the largest.
 """
@@ -19,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError, MapFileError
+from orthonav.core.errors import AreaError, ImageryError, MapFileError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import bilinear
 from orthonav.core.geo.swapped import swapped_hint
@@ -250,11 +251,14 @@ POSTING_M = 10.0
 TERRAIN_CHUNK_PX = 128
 UNIT_M = 0.1
 SURFACE_POSTING_M, SURFACE_UNIT_M = 1.0, 0.25
-"""Of houses and trees above the terrain: twice as many samples as views are rectified with."""
+"""Of houses and trees above the terrain: half the 2 m at which views are rectified."""
 ENVELOPE_POSTING_M, WIDEST_M = 2.0, 40.0
 """Of the lower envelope that stands for bare earth, without narrower houses and trees."""
-LOW_PERCENT, OFFSET_SAMPLES = 5, 256
-"""So much of a surface at least is bare ground, of samples across: where datums differ."""
+LOW_PERCENT, OFFSET_SAMPLES, MOST_OFF_M = 5, 256, 10.0
+"""At least this percentage of a surface is bare ground; samples across the area that show it; its
+largest height above a terrain of the same datum."""
+MAX_SURFACE_M = 3.0
+"""Coarsest surface model: wider samples do not show houses."""
 ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
 """Squares per side of the area in which roughness is measured, their width in postings, and the
 most samples of the source across a posting."""
@@ -317,17 +321,18 @@ class Surface:
     ) -> NDArray[np.float64]:
         """Means of squares, NaN for holes; arguments as of `Dem.in_plane`."""
         found = np.full((rows, cols), np.nan)
+        ends_m = np.array([[0, 0], [0, -rows], [cols, 0], [cols, -rows]]) * posting_m
+        corners = self.area.frame.latlon_from_en(ends_m + np.array([west_m, north_m]))
         for each in self.models:
-            if np.isnan(found).any():
+            if np.isnan(found).any() and each.meets(*corners):
                 more = each.in_plane(self.area.frame, west_m, north_m, posting_m, rows, cols)
                 found = np.where(np.isnan(found), more, found)
         return found
 
     def above_m(self, dem: Dem) -> float:
         """Height of bare ground above that of a terrain model, where the datum of either is not
-        known."""
-        if all(each.datum.is_known for each in (dem, *self.models)):
-            return 0.0
+        known. Raises `ImageryError` where they are known and differ by more than `MOST_OFF_M`."""
+        known = all(each.datum.is_known for each in (dem, *self.models))
         west, south, east, north = self.area.extent_en_m
         posting_m = max(east - west, north - south) / OFFSET_SAMPLES
         rows, cols = (max(round(side / posting_m), 1) for side in (north - south, east - west))
@@ -336,6 +341,13 @@ class Surface:
         if not np.isfinite(off_m).any():
             return 0.0
         low_m = float(np.nanpercentile(off_m, LOW_PERCENT))
+        if known and abs(low_m) > MOST_OFF_M:
+            raise ImageryError(
+                f"bare ground of the surface lies {low_m:.0f} m above the terrain: check unit and "
+                f"vertical datum of {self.name} and {dem.path.name}"
+            )
+        if known:
+            return 0.0
         log.info("the surface is taken to lie %.1f m above the terrain on bare ground", low_m)
         return low_m
 
@@ -379,10 +391,17 @@ def height_layers(
     """Of a terrain model and of surface models. Without a terrain model the lower envelope of the
     surface stands for it.
 
-    `needed`: `AreaError` where the area has no height; else a layer without one is left out."""
+    `needed`: `AreaError` where the area has no height; else a layer without one is left out.
+    Raises `ImageryError` for a surface that shows no houses, or is of another datum."""
     terrain = None if dem is None else terrain_of_dem(dem, area, grid, needed=needed)
     if not models:
         return HeightLayers(terrain, None)
+    for each in models:
+        if each.gsd_m > MAX_SURFACE_M:
+            raise ImageryError(
+                f"surface model has a height every {each.gsd_m:.3g} m, which shows no houses; give "
+                f"it as --dem ({MAX_SURFACE_M:g} m at most): {each.path}"
+            )
     surface = Surface(models, area)
     if dem is None:
         terrain, ground = _bare_earth(surface, area, grid), surface.envelope

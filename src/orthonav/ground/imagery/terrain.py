@@ -195,6 +195,15 @@ class Dem:
         col, row = self._pixels(np.array([lat_deg]), np.array([lon_deg]))
         return bool(0 <= col[0] <= self._data.width and 0 <= row[0] <= self._data.height)
 
+    def meets(self, lat_deg: Array, lon_deg: Array) -> bool:
+        """Whether the box around positions may hold heights of the file."""
+        col, row = self._pixels(np.asarray(lat_deg).ravel(), np.asarray(lon_deg).ravel())
+        ends = ((col, self._data.width), (row, self._data.height))
+        return all(
+            bool(np.isfinite(at).all()) and at.max() >= -1 and at.min() <= side + 1
+            for at, side in ends
+        )
+
     def in_plane(
         self,
         frame: LocalFrame,
