@@ -178,7 +178,7 @@ class Relief:
         return self._means[key]
 
 
-AHEAD, LEAST_RISE = 0.5, 0.05
+AHEAD, LEAST_RISE = 0.2, 0.05
 """Least distance of the camera from the middle of its view, of the view's side, and least rise of
 the ground below it over that in the view, of the height, at which scales are expected by place."""
 REFERENCE_NODES = 9  # across a window, for its mean height
