@@ -41,6 +41,18 @@ class Flat:
         return np.zeros(np.shape(points_en_m)[:-1])
 
 
+class Heights:
+    """A raster as a layer of heights of a map gives it; NaN west of `from_m`."""
+
+    def __init__(self, raster, from_m=-np.inf):
+        self.raster, self.from_m = raster, from_m
+
+    def at_en_m(self, points_en_m):
+        points = np.asarray(points_en_m, float)
+        found = self.raster.at(points[..., 0], points[..., 1])
+        return np.where(points[..., 0] < self.from_m, np.nan, found)
+
+
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 AGL_M = 150.0
 FINEST_M = 0.5

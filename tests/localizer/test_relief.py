@@ -12,6 +12,7 @@ from blots import (
     GROUND,
     ROUGH,
     Flat,
+    Heights,
     as_grey,
     error_m,
     known_map,
@@ -35,17 +36,6 @@ SIDE_M, POSTING_M = 700.0, 10.0
 PLACE = np.array([30.0, -40.0])
 ATTITUDE = (70.0, 4.0, -3.0)
 BASE_M = 100.0
-
-
-class Terrain:
-    """Heights of a raster, as a terrain layer gives them."""
-
-    def __init__(self, raster):
-        self.raster = raster
-
-    def at_en_m(self, points_en_m):
-        points = np.asarray(points_en_m, float)
-        return self.raster.at(points[..., 0], points[..., 1])
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +64,7 @@ def relief():
 
 def on_terrain(opened, relief):
     localizer = Localizer(opened)
-    localizer.registration.relief = Relief(Terrain(relief), localizer.grid, surface=Flat())
+    localizer.registration.relief = Relief(Heights(relief), localizer.grid, surface=Flat())
     return localizer
 
 
@@ -220,7 +210,7 @@ def test_formulas_for_level_ground_agree_with_those_for_any(opened, attitude):
     picture = rendered(GROUND, PLACE, ATTITUDE)
     prepared = registration.prepared(View(picture, CAMERA, telemetry(ATTITUDE)), True)
     flat = Relief(
-        Terrain(Raster(np.zeros((70, 70), np.float32), -7e4, 7e4, 2e3)), registration.grid
+        Heights(Raster(np.zeros((70, 70), np.float32), -7e4, 7e4, 2e3)), registration.grid
     )
     seen, any_seen = (ViewOverGround(each, prepared) for each in (registration.relief, flat))
     assert seen.relief.is_level and not flat.is_level

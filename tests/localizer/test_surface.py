@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, as_grey, error_m, known_map
+from blots import AGL_M, CAMERA, GROUND, Heights, as_grey, error_m, known_map
 from lab.terrain import seen_view
 
 from orthonav.core.localize import Localizer
@@ -15,18 +15,6 @@ from orthonav.ground.simulate.render import Raster
 SIDE_M, FINEST_M, BASE_M = 700.0, 0.5, 100.0
 ATTITUDE = (70.0, 30.0, 0.0)
 PLACE = np.array([30.0, -90.0])
-
-
-class Heights:
-    """A raster as a layer of a map gives it; NaN west of `from_m`."""
-
-    def __init__(self, raster, from_m=-np.inf):
-        self.raster, self.from_m = raster, from_m
-
-    def at_en_m(self, points_en_m):
-        points = np.asarray(points_en_m, float)
-        found = self.raster.at(points[..., 0], points[..., 1])
-        return np.where(points[..., 0] < self.from_m, np.nan, found)
 
 
 def raster(values):

@@ -128,12 +128,14 @@ class Relief:
         the ground below the camera over the ground in the view."""
         telemetry, prior = view.telemetry, view.prior
         below, agl_m = telemetry.below, telemetry.agl_m
+        ahead = np.hypot(*view.camera_px) >= AHEAD * view.side_px
+        if below is None and (prior.turn_rad is None or not ahead):
+            return prior
         means, step_px = self._mean_heights(view.side_px)
-        below_m: Array | float = math.nan if below is None else below.height_m
-        if below is None:
-            if prior.turn_rad is None or np.hypot(*view.camera_px) < AHEAD * view.side_px:
-                return prior
-            below_m = self._at_nodes(step_px, rotation(prior.turn_rad) @ view.camera_px)
+        if below is not None:
+            below_m: Array | float = below.height_m
+        else:
+            below_m = self._at_nodes(step_px, rotation(prior.turn_rad or 0.0) @ view.camera_px)
         over = np.maximum(1 + (below_m - means) / agl_m, 0.05)
         values = np.log(np.where(np.isfinite(over), over, 1.0)).astype(np.float32)
         if below is None and np.abs(values).max() < LEAST_RISE:

@@ -356,7 +356,7 @@ class Surface:
     ) -> NDArray[np.float64]:
         """The same of bare earth: the surface without what is narrower than `WIDEST_M`, by a
         morphological opening."""
-        fine = min(max(1, round(posting_m / max(ENVELOPE_POSTING_M, self.gsd_m))), MAX_FINER)
+        fine = round(posting_m / max(ENVELOPE_POSTING_M, self.gsd_m))
         fine_m = posting_m / fine
         side = 2 * math.ceil(WIDEST_M / fine_m / 2) + 1
         shape = rows * fine + 2 * side, cols * fine + 2 * side
@@ -414,12 +414,10 @@ def height_layers(
 
 
 def _bare_earth(surface: Surface, area: Area, grid: TileGrid) -> TerrainParts | None:
-    posting_m = min(max(POSTING_M, rounded_gsd_m(surface.gsd_m)), MAX_POSTING_M)
-
     def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
-        return surface.envelope(west_m, north_m, posting_m, rows, cols)
+        return surface.envelope(west_m, north_m, POSTING_M, rows, cols)
 
-    return terrain_parts(area, grid, posting_m, surface.name, surface.datum, sampled)
+    return terrain_parts(area, grid, POSTING_M, surface.name, surface.datum, sampled)
 
 
 def _raised(dem: Dem, area: Area, by_m: float, *window: Any) -> NDArray[np.float64]:
@@ -430,7 +428,7 @@ def _above(
     surface: Surface, ground: PlaneSampler, info: TerrainInfo, area: Area, grid: TileGrid
 ) -> TerrainParts | None:
     """The layer of houses and trees above a terrain `info` with heights `ground`."""
-    posting_m = min(max(SURFACE_POSTING_M, rounded_gsd_m(surface.gsd_m)), MAX_POSTING_M)
+    posting_m = max(SURFACE_POSTING_M, rounded_gsd_m(surface.gsd_m))
 
     def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
         heights = surface.sampled(west_m, north_m, posting_m, rows, cols)
