@@ -58,6 +58,8 @@ QUICK_HOURS = 0.02
 GENERATED_SEEDS = range(100, 120)
 AGL_PX, LEAST_AGL_M = 167.0, 250.0
 """Height in pixels of the map, and at least."""
+HIGHEST_QUAD_M = 500.0
+"""Above it fly airplanes only."""
 MARGIN_AGL, LEAST_REACH_M = 1.8, 250.0
 """The route stays so many heights inside of the imagery; half the sides of the smallest route."""
 HEADER = (
@@ -141,7 +143,7 @@ def row_of(task: Task) -> dict[str, Any]:
         "hours": task.hours,
         "view_s": task.view_s,
         "fault_s": [flown.fault_s - flown.gnss_s, flown.lasts_s],
-        "limit_m": max(LIMIT_M, RADIUS_SHARE * course.agl_m),
+        "limit_m": max(LIMIT_M, area.radius_m, RADIUS_SHARE * course.agl_m),
         "took_s": time.process_time() - begun_s,
         "views": [
             _plain(view, flown.gnss_s) for view in found.views if view.time_s >= flown.gnss_s
@@ -278,6 +280,8 @@ def tasks_of(options: argparse.Namespace) -> Iterator[tuple[str, Task]]:
             for place, pair in enumerate(pairs):
                 name = names[(turn + place) % len(names)]
                 vehicle, autopilot = chance.choice(list(VEHICLES)), chance.choice(list(FILTERS))
+                if course_of(pair, options.work, options.every).agl_m > HIGHEST_QUAD_M:
+                    vehicle = "plane"
                 has_terrain = number % 2 == 0
                 about = f"{number} {name}, {pair.name}, {vehicle}, {autopilot}"
                 yield (

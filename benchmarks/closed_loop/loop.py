@@ -63,6 +63,8 @@ SBAS_STD_M = 1.0
 START_STD_MPS = {True: 3.0, False: 0.5}
 """The same of the velocity; a vehicle without an airspeed hovers."""
 SETTLING_S = {True: 5.0, False: 15.0}
+MESSAGE_STEPS = 10
+"""Between messages to the filter: 5 a second, as of a camera, however rare the views are."""
 Array = NDArray[np.float64]
 
 
@@ -204,7 +206,7 @@ class Sight:
     def look(
         self, time_s: float, truth: Motion, estimate: Motion, *, gnss: bool
     ) -> tuple[Located, NavigationEstimate | None]:
-        """Locate one view, and the estimate to send, None where the gate withholds it."""
+        """Locate one view, and the estimate of its message, None where the gate withholds it."""
         telemetry = self._telemetry(time_s, estimate, gnss)
         view = View(self._picture(time_s, truth), CAMERA, telemetry)
         if self._frozen.is_repeat(view.grey):
@@ -219,11 +221,28 @@ class Sight:
             outcome = result.outcome
             made = estimate_from_result(result, clock=Clock.BOOT, processing_s=LATENCY_S)
         admitted = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
-        stated = None
-        if admitted is not None:
-            stated = self._covariance.prepare("", admitted, telemetry.time_ns)
-            self._covariance.sent("", telemetry.time_ns)
-        return self._judged(time_s, truth, estimate, outcome, stated), stated
+        stated = None if admitted is None else self.stated(admitted, telemetry.time_ns)
+        return self._judged(time_s, truth, estimate, outcome, stated), admitted
+
+    def stated(self, admitted: NavigationEstimate, exposed_ns: int) -> NavigationEstimate:
+        """As its message states it."""
+        return self._covariance.prepare("", admitted, exposed_ns)
+
+    def message(
+        self, admitted: NavigationEstimate, seen: Motion, time_s: float, now: Motion
+    ) -> NavigationEstimate:
+        """Of an estimate, with the errors that it had when `seen`, at another moment: the errors of
+        overlapping views are alike."""
+        place = self.frame.en_from_latlon(admitted.lat_deg, admitted.lon_deg)
+        lat, lon = self.frame.latlon_from_en(place + (now.position - seen.position)[[1, 0]])
+        velocity = admitted.vel_en_mps
+        if velocity is not None:
+            east, north = (np.array(velocity) + (now.velocity - seen.velocity)[[1, 0]]).tolist()
+            velocity = east, north
+        exposed_ns = round(time_s * 1e9)
+        sent = self.stated(admitted, exposed_ns)
+        self._covariance.sent("", exposed_ns)
+        return replace(sent, lat_deg=float(lat), lon_deg=float(lon), vel_en_mps=velocity)
 
     def _telemetry(self, time_s: float, estimate: Motion, gnss: bool) -> Telemetry:
         yaw, pitch, roll = np.degrees(euler_rad(estimate.rotation)).tolist()
@@ -323,6 +342,7 @@ def fly(
         sight = Sight(area, scenario, partial(rule, autopilot), seed)
     flown, route = Flown(scenario), Route(course)
     view_steps = round(course.view_s / STEP_S)
+    held: tuple[NavigationEstimate, Motion] | None = None  # what is sent, and the truth at its view
     for step in range(round(scenario.seconds / STEP_S)):
         time_s = step * STEP_S
         gnss = time_s < scenario.gnss_s
@@ -337,10 +357,13 @@ def fly(
             claimed_m = math.sqrt(float(np.diag(estimator.covariance)[6:8].mean()))
             flown.samples.append(Sample(time_s, truth, estimate, claimed_m))
             if sight is not None:
-                located, sent = sight.look(time_s, truth, estimate, gnss=gnss)
+                located, admitted = sight.look(time_s, truth, estimate, gnss=gnss)
                 flown.views.append(located)
-                if sent is not None and not gnss:
-                    _give(estimator, sight.frame, sent, scenario.send == "position+velocity")
+                held = None if admitted is None else (admitted, truth)
+        if sight is not None and held is not None and step % MESSAGE_STEPS == 0:
+            sent = sight.message(*held, time_s, aircraft.motion)
+            if not gnss:
+                _give(estimator, sight.frame, sent, scenario.send == "position+velocity")
         _sense(step, estimator, instruments, aircraft, wind, sight, gnss=gnss)
         before = aircraft.motion
         aircraft.step(wind.next())

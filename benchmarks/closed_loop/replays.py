@@ -87,6 +87,12 @@ class Area:
     def frame(self) -> LocalFrame:
         return self.localizer.sheet.frame
 
+    @property
+    def radius_m(self) -> float:
+        """Within which a fix is correct."""
+        registration = self.localizer.registration
+        return math.inf if registration is None else registration.radius_m
+
     @cached_property
     def _ground(self) -> Ground:
         return Ground(self.seen, self.localizer)

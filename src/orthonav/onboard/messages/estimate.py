@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from orthonav.core.errors import OrthonavError
 from orthonav.core.records import CONFIDENT, Fix, ViewResult, error_ellipse
 
-AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4
-"""Time over which the filters of autopilots average positions, for a claim of `AT_STD_M`; it grows
-with this power of the claim (docs/decisions/correlated-errors.md)."""
+AVERAGING_S = 3.0
+"""Over which the filters of autopilots average positions (docs/decisions/correlated-errors.md)."""
 
 
 class EstimateError(OrthonavError, ValueError):
@@ -169,18 +168,16 @@ def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
     return np.eye(2) * std_mps**2 if math.isfinite(std_mps) else None
 
 
-def messages_averaged(std_m: float, interval_s: float) -> float:
+def messages_averaged(interval_s: float) -> float:
     """Number of messages, 1 or more, that a receiver averages.
 
     Errors of consecutive fixes (of the map, the tilt, the track) last longer than that: a receiver
     that takes n of them as independent claims n times too small a variance.
 
-    `std_m`: standard deviation that its claim should come to. `interval_s`: since the message
-    before; infinite for the first. After a clock was set back it counts as infinite.
+    `interval_s`: since the message before; infinite for the first. After a clock was set back it
+    counts as infinite.
     """
-    if not interval_s > 0:
-        return 1.0
-    return max(AVERAGING_S * math.pow(std_m / AT_STD_M, EXPONENT) / interval_s, 1.0)
+    return max(AVERAGING_S / interval_s, 1.0) if interval_s > 0 else 1.0
 
 
 def for_filter(
@@ -193,8 +190,7 @@ def for_filter(
     if math.isnan(estimate.horizontal_std_m()):
         return estimate
     cov = floored(estimate.cov_en_m2, min_std_m)
-    count = messages_averaged(error_ellipse(cov)[0], interval_s)
-    return replace(estimate, cov_en_m2=cov * count)
+    return replace(estimate, cov_en_m2=cov * messages_averaged(interval_s))
 
 
 @dataclass
