@@ -19,6 +19,7 @@ from orthonav.core.localize.systematic import (
     GroundErrors,
     field_modes,
     lens_px,
+    surface_errors,
     systematic,
     terrain_errors,
     unknown_ground,
@@ -130,8 +131,6 @@ def test_errors_of_terrain_follow_its_source():
     bare = replace(ROUGH, roughness_m=0.3, source_posting_m=1.0)
     coarse = replace(bare, source_posting_m=30.0)
     assert terrain_errors(ROUGH, SLOPES).fields == (SURFACE_M, (ROUGH.roughness_m, OBJECTS_M[1]))
-    for source in (ROUGH, bare, coarse, None):
-        assert terrain_errors(source, SLOPES, has_surface=True).fields == (SURFACE_M,)
     assert terrain_errors(bare, SLOPES).fields == (BARE_EARTH_M, OBJECTS_M)
     (std_m, length_m), objects = terrain_errors(coarse, SLOPES).fields
     assert 2.0 < std_m < COARSE_STD_M and length_m == 150.0 and objects == OBJECTS_M
@@ -143,6 +142,20 @@ def test_errors_of_terrain_follow_its_source():
     half = np.where(np.arange(36)[:, None] < 18, np.nan, SLOPES)
     assert terrain_errors(coarse, half).fields == terrain_errors(coarse, SLOPES).fields
     assert terrain_errors(coarse, np.full((36, 2), np.nan)).fields[0][0] == COARSE_STD_M
+
+
+def test_houses_that_lean_are_displaced_on_the_map():
+    above = np.where(np.arange(36) % 3 == 0, 6.0, np.nan)
+    upright, leaning = surface_errors(0.0, above), surface_errors(0.1, above)
+    assert upright.fields == leaning.fields == (SURFACE_M,) and upright.shift is None
+    assert leaning.shift == pytest.approx((0.6, SURFACE_M[1]))
+    _, found = displaced(leaning)
+    more = found.moves_px[:, :, found.components[-1].at]
+    both = np.einsum("nak,nbk->ab", more, more) / len(more)
+    wide = displaced(GroundErrors(0.0, (leaning.shift,)))[1]
+    alone = wide.moves_px[:, :, wide.components[0].at]
+    assert both[0, 0] == pytest.approx(both[1, 1]) and abs(both[0, 1]) < 1e-9 < both[0, 0]
+    assert alone.shape[2] * 2 == more.shape[2]
 
 
 @pytest.mark.parametrize("posting_m", [90.0, 250.0])

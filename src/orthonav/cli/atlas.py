@@ -69,7 +69,7 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
     text = "greatest width of a sheet (default 10)"
     group.add_argument("--sheet-km", type=float, help=text)
     add_recipe(group, any_method=False)
-    add_options(group, "--dem", "--surface", "--dem-datum", "--relief")
+    add_options(group, "--dem", "--surface", "--true-ortho", "--dem-datum", "--relief")
     text = "rebuild sheets that have other imagery or versions"
     group.add_argument("--replace", action="store_true", help=text)
     add = parser.add_argument_group("coarse tiles, for views without a prior").add_argument

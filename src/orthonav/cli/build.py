@@ -37,7 +37,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     add_options(parser, "--json")
     imagery = parser.add_argument_group("imagery")
-    add_options(imagery, "--ortho", "--dem", "--surface", "--dem-datum", "--relief")
+    add_options(imagery, "--ortho", "--dem", "--surface", "--true-ortho", "--dem-datum", "--relief")
     text = "orthophoto of the same area at another date, from which confidence and covariance are "
     text += "calibrated; it does not become part of the map; may be repeated"
     imagery.add_argument(
@@ -83,6 +83,7 @@ def asked(options: argparse.Namespace) -> dict[str, Any]:
         "band_m": options.band_m,
         "dem": options.dem,
         "surface": options.surface,
+        "true_ortho": options.true_ortho,
         "dem_datum": options.dem_datum,
         "relief": options.relief,
     }

@@ -98,6 +98,11 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "help": "surface model with houses and trees (any raster that GDAL reads), which stand on "
         "the terrain of --dem or on its own lower envelope; may be repeated",
     },
+    "--true-ortho": {
+        "action": "store_true",
+        "help": "houses stand upright in the orthophotos (true orthophotos): no lean is estimated "
+        "from --surface",
+    },
     "--dem-datum": {
         "metavar": "NAME",
         "help": "vertical datum of --dem and --surface, where the file does not state it: egm96, "

@@ -64,6 +64,7 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         "registration": _registration(manifest),
         "terrain": None if terrain is None else asdict(terrain),
         "surface": None if surface is None else asdict(surface),
+        "lean": None if (lean := manifest.sheets[0].lean) is None else asdict(lean),
         "relief": manifest.sheets[0].relief,
         "sheets": [
             {
@@ -148,6 +149,7 @@ def summary_text(plain: dict[str, Any]) -> str:
         named = "".join(c for c in surface["name"] if c.isprintable())
         every = f"every {surface['posting_m']:g} m ({named})"
         lines.append(f"surface    houses and trees up to {surface['high_m']:.0f} m, {every}")
+        lines.append(f"           {_lean_text(plain['lean'])}")
     for source in plain["imagery"]:
         files = f"{source['files']} files  " if source.get("files") else ""
         dates = " to ".join(texts(source, "date_from", "date")) or "date unknown"
@@ -218,3 +220,14 @@ def imagery_text(imagery: Iterable[Mapping[str, Any]]) -> str:
 
 def texts(source: Mapping[str, Any], *keys: str) -> list[str]:
     return [str(source[key]) for key in keys if source.get(key)]
+
+
+def _lean_text(lean: dict[str, float] | None) -> str:
+    if lean is None:
+        return "they may lean in the orthophoto by up to 0.3 m per m of height: not known"
+    if not lean["std"]:
+        return "a true orthophoto: they stand upright"
+    return (
+        f"they lean by {lean['east']:g} m east, {lean['north']:g} m north per m of height, as the "
+        "orthophoto shows"
+    )

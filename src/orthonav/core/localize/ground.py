@@ -22,10 +22,15 @@ from orthonav.core.localize.rectify import (
     orthorectified,
     rectified_level,
 )
-from orthonav.core.localize.systematic import GroundErrors, terrain_errors, unknown_ground
+from orthonav.core.localize.systematic import (
+    GroundErrors,
+    surface_errors,
+    terrain_errors,
+    unknown_ground,
+)
 from orthonav.core.localize.tiles import TileProposer
 from orthonav.core.localize.view import MIN_AGL_STD, PreparedView
-from orthonav.core.mapfile.manifest import SheetInfo, TerrainInfo
+from orthonav.core.mapfile.manifest import Lean, SheetInfo, TerrainInfo
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import DEFAULT_AGL_STD
 from orthonav.core.register.pose import SIGMAS, Pose, PosePrior, ScaleMap, rotation
@@ -36,6 +41,7 @@ from orthonav.core.register.window import GreyPyramid, Reference
 MAP_NODES = 256  # of expected scales across the map, at most
 LEVELLED_NODES = 32  # across the map, for the slopes of its terrain
 SLOPE_M = 10.0  # half the base over which slopes are measured
+UNKNOWN_LEAN = Lean(0.0, 0.0, 0.15)  # up to 0.3 between the middles of overlapping pictures
 LARGEST_STD = 0.3  # of scales searched: three are 0.41 to 2.46
 Array = NDArray[np.float64]
 
@@ -60,17 +66,24 @@ class Relief:
         info: TerrainInfo | None = None,
         land: str | None = None,
         surface: Terrain | None = None,
+        lean: Lean | None = None,
     ) -> None:
         """`info`: of the terrain; `land`: what it is like without one; `surface`: heights of houses
-        and trees above it. None: not known."""
+        and trees above it, where the map shows them; `lean`: of these. None: not known."""
         self.terrain, self.grid, self.info, self.land = terrain, grid, info, land
-        self.surface = surface
+        self.surface, self._lean = surface, lean or UNKNOWN_LEAN
+        self.lean_en = np.array([self._lean.east, self._lean.north])
         self.level_errors = unknown_ground(land)
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
     @property
     def is_level(self) -> bool:
         return isinstance(self.terrain, LevelTerrain)
+
+    @property
+    def leans(self) -> bool:
+        """Whether the map shows houses and trees beside their place, and how far is known."""
+        return self.surface is not None and bool(self.lean_en.any())
 
     def en_m(self, map_px: Array) -> Array:
         """Of map coordinates (..., 2) at level 0."""
@@ -82,12 +95,15 @@ class Relief:
         points = self.en_m(map_px)
         return np.concatenate([points, self.terrain.at_en_m(points)[..., None]], axis=-1)
 
-    def surface_m(self, map_px: Array) -> Array:
-        """The same with houses and trees, unless they are unknown at more than half of them."""
+    def surface_m(self, map_px: Array, smooth: int = 0) -> Array:
+        """The same of what the map shows there, houses and trees, unless these are unknown at more
+        than half. `smooth`: samples over which their heights are means."""
         ground = self.ground_m(map_px)
         above_m = self._above_m(ground)
         if above_m is not None:
+            above_m = _smoothed(above_m, smooth)
             ground[..., 2] += above_m
+            ground[..., :2] -= above_m[..., None] * self.lean_en
         return ground
 
     def _above_m(self, ground_m: Array) -> Array | None:
@@ -109,8 +125,10 @@ class Relief:
         """Of the heights under a view, by points (N, 3) and slopes (N, 2) there."""
         if self.is_level:
             return self.level_errors
-        has_surface = self._above_m(ground_m) is not None
-        return terrain_errors(self.info, slopes, has_surface=has_surface)
+        above_m = self._above_m(ground_m)
+        if above_m is None:
+            return terrain_errors(self.info, slopes)
+        return surface_errors(self._lean.std, above_m)
 
     def levelled(self) -> "Relief":
         """Level ground that is known as well as this: of simulated views."""
@@ -218,7 +236,9 @@ class SearchedSheet:
         self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
         self.propose, self.plan = propose, plan
         info = None if terrain is None else terrain.info
-        self.relief = Relief(terrain or LevelTerrain(), self.grid, info, sheet.relief, surface)
+        self.relief = Relief(
+            terrain or LevelTerrain(), self.grid, info, sheet.relief, surface, sheet.lean
+        )
 
     @property
     def pyramid(self) -> GreyPyramid:
@@ -311,23 +331,34 @@ class ViewOverGround:
             made = rectified_level(picture, orientation, en_from_window, shape)
         if made is None:
             smooth = smooth or level >= self.view.levels.judged
-            ground = self._nodes_m(pose, level, shape, smooth=smooth)
-            made = orthorectified(picture, orientation, ground, shape)
+            ground, shown = self._nodes_m(pose, level, shape, smooth=smooth)
+            sheared = None
+            if shown is not None:  # straight lines of sight stay straight
+                camera_m = orientation.position_m.copy()
+                camera_m[:2] += self.relief.lean_en * (camera_m[2] - self.reference_m(pose))
+                sheared = shown, camera_m
+            made = orthorectified(picture, orientation, ground, shape, sheared)
         return ViewTemplates(*made, level)
 
-    def _nodes_m(self, pose: Pose, level: int, shape: tuple[int, int], *, smooth: bool) -> Array:
+    def _nodes_m(
+        self, pose: Pose, level: int, shape: tuple[int, int], *, smooth: bool
+    ) -> tuple[Array, Array | None]:
         """East, north, above sea (h, w, 3) at `node_px` of a window of a level: with houses and
-        trees as they are, or smoothed, which more cameras near the right one fit."""
+        trees as they are, or smoothed, which more cameras near the right one fit. And, where they
+        lean, the same where the map shows them."""
         middle, unit = np.array([shape[1], shape[0]]) / 2, 2.0**level
         if self.relief.surface is None:
-            return self.relief.ground_m(pose.map_px((node_px(shape) - middle) * unit))
+            return self.relief.ground_m(pose.map_px((node_px(shape) - middle) * unit)), None
         node_m = NODE_PX * self.relief.grid.gsd_m * unit
         finer = min(math.ceil(node_m / SURFACE_NODE_M), SURFACE_NODES * NODE_PX // max(shape))
         finer = max(finer, 1)
-        nodes = self.relief.surface_m(pose.map_px((node_px(shape, finer) - middle) * unit))
         across_m = SMOOTH_M if smooth else node_m if finer > 1 else 0.0
-        nodes[..., 2] = _smoothed(nodes[..., 2], round(across_m * finer / node_m))
-        return np.ascontiguousarray(nodes[::finer, ::finer])
+        map_px = pose.map_px((node_px(shape, finer) - middle) * unit)
+        nodes = self.relief.surface_m(map_px, round(across_m * finer / node_m))
+        nodes, shown = np.ascontiguousarray(nodes[::finer, ::finer]), None
+        if self.relief.leans:
+            shown = np.dstack([self.relief.en_m(map_px[::finer, ::finer]), nodes[..., 2]])
+        return nodes, shown
 
     def _en_from_window(self, pose: Pose, level: int, middle: Array) -> Array:
         """Metres by pixels of a window of a level (3, 3)."""

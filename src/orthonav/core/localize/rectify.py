@@ -59,13 +59,18 @@ def node_px(shape: tuple[int, int], finer: int = 1) -> Array:
 
 
 def orthorectified(
-    view: View, orientation: Orientation, nodes_m: Array, shape: tuple[int, int]
+    view: View,
+    orientation: Orientation,
+    nodes_m: Array,
+    shape: tuple[int, int],
+    sheared_m: tuple[Array, Array] | None = None,
 ) -> tuple[NDArray[np.uint8], Mask]:
     """Grey and valid (H, W) of a window of ground; grey 0 where not valid.
 
-    `nodes_m` (h, w, 3): east, north, above sea at `node_px`; NaN where unknown."""
+    `nodes_m` (h, w, 3): east, north, above sea at `node_px`; NaN where unknown. `sheared_m`: these
+    at even distances and the camera (3,), sheared alike; None: they are even."""
     index = orientation.seen_px(view.camera, nodes_m) - 0.5
-    usable = _fine(view, index) & ~hidden(nodes_m, orientation.position_m)
+    usable = _fine(view, index) & ~hidden(*(sheared_m or (nodes_m, orientation.position_m)))
     index[~usable] = np.nan
     return _at_nodes(view.grey, index, shape)
 

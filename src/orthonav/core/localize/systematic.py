@@ -52,10 +52,12 @@ Field = tuple[float, float]
 class GroundErrors:
     """Errors of the heights that are assumed under a view.
 
-    `slope`: standard deviation of its unknown slope, per axis (rise over run)."""
+    `slope`: standard deviation of its unknown slope, per axis (rise over run). `shift`: of its
+    picture on the map, per axis."""
 
     slope: float
     fields: tuple[Field, ...]
+    shift: Field | None = None
 
 
 def unknown_ground(relief: str | None) -> GroundErrors:
@@ -65,15 +67,18 @@ def unknown_ground(relief: str | None) -> GroundErrors:
     return GroundErrors(slope / math.sqrt(2), ((per_slope_m * slope, length_m), OBJECTS_M))
 
 
-def terrain_errors(
-    source: TerrainInfo | None, slopes: Array, *, has_surface: bool = False
-) -> GroundErrors:
+def surface_errors(lean_std: float, above_m: Array) -> GroundErrors:
+    """Errors of a map that knows houses and trees, `above_m` (N,) above its terrain under a view,
+    NaN where unknown, which lean in its picture by more or less than known."""
+    high_m = math.sqrt(float(np.nanmean(above_m**2)))
+    shift = (lean_std * high_m, SURFACE_M[1]) if lean_std * high_m > 0 else None
+    return GroundErrors(0.0, (SURFACE_M,), shift)
+
+
+def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
     """Errors of a map's terrain with slopes (N, 2) under a view, NaN where unknown.
 
-    `source`: None: a terrain like Copernicus'. `has_surface`: whether the map knows houses and
-    trees above it."""
-    if has_surface:
-        return GroundErrors(0.0, (SURFACE_M,))
+    `source`: None: a terrain like Copernicus'."""
     known = slopes[np.isfinite(slopes).all(axis=1)]
     steep = math.sqrt(float((known**2).sum(axis=1).mean())) if len(known) else math.inf
     posting_m = COARSE_POSTING_M
@@ -129,14 +134,19 @@ def systematic(
         heights_m[0] = np.concatenate([sloped_m, heights_m[0]], axis=1)
         least[0] = LEAST_UNKNOWN
     moves_px = [by_height_px[:, :, None] * each[:, None] for each in heights_m]
-    stretch_px = field_modes(places_m / gsd_m, STRETCH_PX, block_px)
-    none_px = np.zeros(stretch_px.shape)
-    stretched_px = [[stretch_px, none_px], [none_px, stretch_px]]
-    moves_px.append(np.concatenate([np.stack(each, axis=1) for each in stretched_px], axis=2))
+    on_map = [STRETCH_PX]
+    if errors.shift is not None:
+        on_map.append((errors.shift[0] / gsd_m, errors.shift[1] / gsd_m))
+    for each in on_map:
+        along_px = field_modes(places_m / gsd_m, each, block_px)
+        none_px = np.zeros(along_px.shape)
+        both_px = [[along_px, none_px], [none_px, along_px]]
+        moves_px.append(np.concatenate([np.stack(axis, axis=1) for axis in both_px], axis=2))
+    least += [LEAST_KNOWN] * len(on_map)
     ends = np.cumsum([each.shape[2] for each in moves_px]).tolist()
     components = tuple(
         Component(slice(start, end), low)
-        for start, end, low in zip([0, *ends[:-1]], ends, [*least, LEAST_KNOWN], strict=True)
+        for start, end, low in zip([0, *ends[:-1]], ends, least, strict=True)
     )
     if by_lens_px is not None:
         moves_px.append(by_lens_px)

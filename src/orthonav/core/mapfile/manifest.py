@@ -126,9 +126,27 @@ class TerrainInfo:
 
 
 @dataclass(frozen=True)
+class Lean:
+    """How houses and trees lean in an orthophoto that is no true one: displaced by metres `east`
+    and `north` per metre of height, within 1; `std`: per axis, 0 to 1."""
+
+    east: float
+    north: float
+    std: float
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "Lean":
+        lean = cls(**_fields(cls, plain))
+        if not (max(abs(lean.east), abs(lean.north)) <= 1 and 0 <= lean.std <= 1):
+            raise MapFileError(f"map has an impossible lean of its houses: {plain!r:.300}")
+        return lean
+
+
+@dataclass(frozen=True)
 class SheetInfo:
     """`area_km2`: number of tiles times stride squared. `relief`: of ground without terrain, a key
-    of `RELIEF_SLOPES`, None if nobody said. `surface`: of houses and trees above `terrain`."""
+    of `RELIEF_SLOPES`, None if nobody said. `surface`: of houses and trees above `terrain`, where
+    the orthophoto shows them; `lean`: in it, None where not known."""
 
     frame: LocalFrame
     grid: TileGrid
@@ -138,6 +156,7 @@ class SheetInfo:
     terrain: TerrainInfo | None = None
     relief: str | None = None
     surface: TerrainInfo | None = None
+    lean: Lean | None = None
 
     def to_plain(self) -> dict[str, Any]:
         heights = {"terrain": self.terrain, "surface": self.surface}
@@ -145,6 +164,7 @@ class SheetInfo:
         return {
             **{name: info.to_plain() for name, info in heights.items() if info is not None},
             **relief,
+            **({} if self.lean is None else {"lean": vars(self.lean)}),
             "origin_lat_deg": self.frame.lat_deg,
             "origin_lon_deg": self.frame.lon_deg,
             "grid": vars(self.grid),
@@ -185,7 +205,8 @@ class SheetInfo:
         if relief is not None and relief not in RELIEF_SLOPES:
             raise MapFileError(f"map has an unknown relief: {relief!r:.80}")
         area_km2 = _number(plain, "area_km2")
-        return cls(frame, grid, tiles, area_km2, grey, terrain, relief, surface)
+        lean = None if plain.get("lean") is None else Lean.from_plain(plain["lean"])
+        return cls(frame, grid, tiles, area_km2, grey, terrain, relief, surface, lean)
 
 
 @dataclass(frozen=True)

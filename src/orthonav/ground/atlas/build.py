@@ -64,6 +64,7 @@ class AtlasRequest:
     index: bool = True  # also make the index of the coarse tiles
     dem: Path | None = None  # terrain model of which sheets get a terrain layer
     surface: Sequence[Path] = ()  # surface models, of which they get a surface layer
+    true_ortho: bool = False  # houses stand upright in the orthophotos
     dem_datum: str | None = None  # what its heights count from
     relief: str | None = None  # what the land is like, as in `BuildRequest`; not with heights
 
@@ -141,7 +142,7 @@ def request_digest(
         found, name = path.stat(), path.name
         depends.append([name, found.st_size, found.st_mtime_ns // 10**9, request.dem_datum])
     if request.surface:
-        depends.append(["surface", len(request.surface)])
+        depends.append(["surface", len(request.surface), request.true_ortho])
     if request.relief is not None:
         depends.append(request.relief)
     return digest(depends)
@@ -404,6 +405,7 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
         workers=1,
         dem=task.request.dem,
         surface=task.request.surface,
+        true_ortho=task.request.true_ortho,
         dem_datum=task.request.dem_datum,
         dem_needed=False,
         relief=task.request.relief,

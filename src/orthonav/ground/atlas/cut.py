@@ -40,8 +40,9 @@ from orthonav.core.localize.confidence import (
     Chances,
     RegisteredConfidence,
 )
+from orthonav.core.localize.ground import UNKNOWN_LEAN
 from orthonav.core.mapfile.layer import GreyLayer
-from orthonav.core.mapfile.manifest import Manifest, SheetInfo, TerrainInfo
+from orthonav.core.mapfile.manifest import Lean, Manifest, SheetInfo, TerrainInfo
 from orthonav.core.mapfile.reader import MapFile, open_map, write_map
 from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, TerrainLayer
 from orthonav.core.tiles import embed, represent
@@ -448,8 +449,21 @@ def cut_heights(members: Sequence[SheetSource], area: Area, grid: TileGrid) -> H
     terrains = [(each, each.terrain) for each in members if each.terrain is not None]
     surfaces = [(each, each.surface) for each in members if each.surface is not None]
     return HeightLayers(
-        _cut_heights(terrains, area, grid, TERRAIN), _cut_heights(surfaces, area, grid, SURFACE)
+        _cut_heights(terrains, area, grid, TERRAIN),
+        _cut_heights(surfaces, area, grid, SURFACE),
+        _common_lean([each.manifest.sheets[0].lean for each, _ in surfaces]),
     )
+
+
+def _common_lean(leans: Sequence[Lean | None]) -> Lean | None:
+    """The mean, as uncertain as the sheets differ from it; None where none is known."""
+    if not any(leans):
+        return None
+    known = [each or UNKNOWN_LEAN for each in leans]
+    vectors = np.array([[each.east, each.north] for each in known])
+    east, north = vectors.mean(axis=0).tolist()
+    spread = float(np.abs(vectors - [east, north]).max())
+    return Lean(east, north, max(spread, *(each.std for each in known)))
 
 
 def _cut_heights(
@@ -609,7 +623,8 @@ def _learnt(
     heights = cut_heights(members, area, grid)
     terrain, surface = heights.infos
     sheet = SheetInfo(
-        *(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, _relief(members), surface)
+        *(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, _relief(members), surface),
+        heights.lean,
     )
     manifest = pooled_manifest(members, _shares(area, centres, members), sheet)
     return manifest, {

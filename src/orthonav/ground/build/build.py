@@ -91,6 +91,7 @@ class BuildRequest:
     - `dem_needed`: whether an area in which a model has no height is refused.
     - `relief`: what the land is like where there is no terrain, a key of
       `orthonav.core.geo.ground.RELIEF_SLOPES`; None: not stated. Not with `dem` or `surface`.
+    - `true_ortho`: houses stand upright in the orthophotos; else how far they lean is estimated.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
     """
@@ -113,6 +114,7 @@ class BuildRequest:
     workers: int | None = None
     dem: Path | None = None
     surface: Sequence[Path] = ()
+    true_ortho: bool = False
     dem_datum: str | None = None
     dem_needed: bool = True
     relief: str | None = None
@@ -158,7 +160,8 @@ class _Inputs:
         _check_numbers(request)
         dem = None if request.dem is None else open_dem(request.dem, request.dem_datum)
         models = [open_dem(path, request.dem_datum) for path in request.surface]
-        heights = height_layers(dem, models, area, grid, needed=request.dem_needed)
+        imagery = None if request.true_ortho else mosaic
+        heights = height_layers(dem, models, area, grid, imagery, needed=request.dem_needed)
         # Networks and visual words learn from images of the tiles, not from cell means.
         needs_pictures = not isinstance(recipe, WhitenedRecipe)
         sheet = SheetReader(
@@ -281,7 +284,7 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     info = SheetInfo(
         *(sheet.area.frame, grid, len(tiles_rc), area_km2),
-        *(grey, terrain, request.relief, surface),
+        *(grey, terrain, request.relief, surface, inputs.heights.lean),
     )
     manifest = _manifest(inputs, info, embedder, calibration)
     if request.registration:

@@ -34,12 +34,15 @@ from orthonav.core.mapfile.manifest import (
     MAX_SOURCE_POSTING_M,
     MIN_SOURCE_POSTING_M,
     GreyInfo,
+    Lean,
     TerrainInfo,
 )
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, encode_terrain, terrain_part_names
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
+from orthonav.ground.build.lean import TRUE_ORTHO, as_shown, visible_lean
+from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import Dem
 from orthonav.ground.planning.area import Area
 
@@ -372,24 +375,33 @@ class Surface:
 
 
 class HeightLayers(NamedTuple):
+    """`surface`: where the orthophoto shows it, by `lean`; None: not known."""
+
     terrain: TerrainParts | None
     surface: TerrainParts | None
+    lean: Lean | None = None
 
     @property
     def infos(self) -> tuple[TerrainInfo | None, TerrainInfo | None]:
-        terrain, surface = (None if each is None else each.info for each in self)
+        terrain, surface = (None if each is None else each.info for each in self[:2])
         return terrain, surface
 
     @property
     def arrays(self) -> Parts:
-        return {name: part for each in self if each for name, part in each.arrays.items()}
+        return {name: part for each in self[:2] if each for name, part in each.arrays.items()}
 
 
 def height_layers(
-    dem: Dem | None, models: Sequence[Dem], area: Area, grid: TileGrid, *, needed: bool = True
+    dem: Dem | None,
+    models: Sequence[Dem],
+    area: Area,
+    grid: TileGrid,
+    imagery: Mosaic | None = None,
+    *,
+    needed: bool = True,
 ) -> HeightLayers:
     """Of a terrain model and of surface models. Without a terrain model the lower envelope of the
-    surface stands for it.
+    surface stands for it. `imagery`: None: a true orthophoto, in which houses stand upright.
 
     `needed`: `AreaError` where the area has no height; else a layer without one is left out.
     Raises `ImageryError` for a surface that shows no houses, or is of another datum."""
@@ -407,10 +419,14 @@ def height_layers(
         terrain, ground = _bare_earth(surface, area, grid), surface.envelope
     else:
         ground = partial(_raised, dem, area, surface.above_m(dem))
-    made = None if terrain is None else _above(surface, ground, terrain.info, area, grid)
+    made = lean = None
+    if terrain is not None:
+        above = partial(_above, surface, ground, terrain.info)
+        lean = TRUE_ORTHO if imagery is None else visible_lean(imagery, above, area)
+        made = _surface_parts(surface, as_shown(above, lean or TRUE_ORTHO), area, grid)
     if made is None and needed:
         raise _no_height("surface", area, models[0])
-    return HeightLayers(terrain, made)
+    return HeightLayers(terrain, made, lean)
 
 
 def _bare_earth(surface: Surface, area: Area, grid: TileGrid) -> TerrainParts | None:
@@ -425,21 +441,34 @@ def _raised(dem: Dem, area: Area, by_m: float, *window: Any) -> NDArray[np.float
 
 
 def _above(
-    surface: Surface, ground: PlaneSampler, info: TerrainInfo, area: Area, grid: TileGrid
+    surface: Surface,
+    ground: PlaneSampler,
+    info: TerrainInfo,
+    west_m: float,
+    north_m: float,
+    posting_m: float,
+    rows: int,
+    cols: int,
+) -> NDArray[np.float64]:
+    """Houses and trees above a terrain `info` with heights `ground`; a `PlaneSampler`."""
+    heights = surface.sampled(west_m, north_m, posting_m, rows, cols)
+    row, col = np.mgrid[:rows, :cols] + 0.5
+    col = (west_m + col * posting_m - info.west_m) / info.posting_m - 0.5
+    row = (info.north_m - north_m + row * posting_m) / info.posting_m - 0.5
+    left, top = (math.floor(float(each.min())) for each in (col, row))
+    size = math.ceil(float(row.max())) - top + 2, math.ceil(float(col.max())) - left + 2
+    corner = info.west_m + left * info.posting_m, info.north_m - top * info.posting_m
+    below = ground(*corner, info.posting_m, *size)
+    return heights - bilinear(lambda r, c: below[r, c], below.shape, col - left, row - top)
+
+
+def _surface_parts(
+    surface: Surface, above: PlaneSampler, area: Area, grid: TileGrid
 ) -> TerrainParts | None:
-    """The layer of houses and trees above a terrain `info` with heights `ground`."""
     posting_m = max(SURFACE_POSTING_M, rounded_gsd_m(surface.gsd_m))
 
     def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
-        heights = surface.sampled(west_m, north_m, posting_m, rows, cols)
-        row, col = np.mgrid[:rows, :cols] + 0.5
-        col = (west_m + col * posting_m - info.west_m) / info.posting_m - 0.5
-        row = (info.north_m - north_m + row * posting_m) / info.posting_m - 0.5
-        left, top = (math.floor(float(each.min())) for each in (col, row))
-        size = math.ceil(float(row.max())) - top + 2, math.ceil(float(col.max())) - left + 2
-        corner = info.west_m + left * info.posting_m, info.north_m - top * info.posting_m
-        below = ground(*corner, info.posting_m, *size)
-        return heights - bilinear(lambda r, c: below[r, c], below.shape, col - left, row - top)
+        return above(west_m, north_m, posting_m, rows, cols)
 
     name, datum, unit_m = surface.name, "terrain", SURFACE_UNIT_M
     return terrain_parts(area, grid, posting_m, name, datum, sampled, layer=SURFACE, unit_m=unit_m)
