@@ -27,6 +27,9 @@ GROUND_STEP_M = 1.0  # of a point of the ground
 MIN_TILT_STD_DEG = 0.05  # of a tilt that is reported as exact
 FIRST_REACH_PX, REACH_PX = 7, 4
 """Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
+SURFACE_REACHES_PX = 16, 8
+"""The first reaches over houses and trees, at the finer level: coarser ones do not show the camera
+(docs/decisions/terrain.md)."""
 AGAIN_PX = 1.0
 """A view is orthorectified once more where its correction moves a block by more pixels of the final
 level."""
@@ -86,25 +89,38 @@ class CameraFound:
     middle_covariance: Array | None
 
 
+def approached(seen: ViewOverGround, reference: Reference, pose: Pose) -> Orientation | None:
+    """The camera of a view that was placed at `pose`, known to some pixels; None where too few
+    blocks are seen."""
+    orientation, finer = seen.orientation(pose), seen.relief.surface is not None
+    for reach_px in SURFACE_REACHES_PX if finer else (FIRST_REACH_PX,):
+        if orientation is None:
+            return None
+        far = _compared(seen, reference, pose, orientation, reach_px, finer=finer)
+        correction = None if far is None else far.climbed()
+        orientation = None if correction is None else orientation.moved(correction)
+    return orientation
+
+
 def camera_found(
-    seen: ViewOverGround, reference: Reference, pose: Pose, local_ratio: float
+    seen: ViewOverGround,
+    reference: Reference,
+    pose: Pose,
+    local_ratio: float,
+    start: Orientation | None = None,
 ) -> CameraFound | None:
     """Position, attitude and covariance of the camera of a view that was placed at `pose`; None
     where too few blocks are seen, or the camera would be below the ground.
 
-    `local_ratio`: of the scores of the place."""
+    `local_ratio`: of the scores of the place. `start`: `approached`, where it is known."""
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
         level = Relief(LevelTerrain(), seen.relief.grid, land=seen.relief.land)
         seen = ViewOverGround(level, seen.view)
-    orientation = seen.orientation(pose)
-    if orientation is None:
+    start = start or approached(seen, reference, pose)
+    if start is None:
         return None
     variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
-    far = _compared(seen, reference, pose, orientation, first=True)
-    correction = None if far is None else far.climbed()
-    if far is None or correction is None:
-        return None
-    near = _fitted(seen, reference, pose, orientation.moved(correction), variance)
+    near = _fitted(seen, reference, pose, start, variance)
     if near is not None and near.moved_px > AGAIN_PX * 2.0**seen.view.levels.final:
         near = _fitted(seen, reference, pose, near.orientation, variance)
     if near is None:
@@ -149,7 +165,7 @@ class _Fitted(NamedTuple):
 def _fitted(
     seen: ViewOverGround, reference: Reference, pose: Pose, start: Orientation, variance: float
 ) -> _Fitted | None:
-    near = _compared(seen, reference, pose, start, first=False)
+    near = _compared(seen, reference, pose, start, REACH_PX, finer=True)
     found = None if near is None else near.resected(variance)
     if near is None or found is None:
         return None
@@ -207,20 +223,26 @@ class _Compared:
 
 
 def _compared(
-    seen: ViewOverGround, reference: Reference, pose: Pose, orientation: Orientation, *, first: bool
+    seen: ViewOverGround,
+    reference: Reference,
+    pose: Pose,
+    orientation: Orientation,
+    reach_px: int,
+    *,
+    finer: bool,
 ) -> _Compared | None:
-    """The blocks of a view under an orientation, compared with the map; None: too few pixels. At
-    first at the final level and a coarser one, then at a finer one too."""
+    """The blocks of a view under an orientation, compared with the map, moved by up to `reach_px`
+    pixels of the level; None: too few pixels. At the final level and a coarser one, or at a finer
+    one too."""
     final = seen.view.levels.final
-    finest = final if first else max(final - 1, 0)
-    made = _templates(seen, pose, finest, orientation, first=first)
+    finest = max(final - 1, 0) if finer else final
+    made = _templates(seen, pose, finest, orientation, first=not finer)
     if made is None:
         return None
     coarsest = min(final + 1, reference.levels - 1)
     levels = [at for at in range(finest, coarsest + 1) if min(made.shape(at)) >= BLOCKS]
     if not levels:
         return None
-    reach_px = FIRST_REACH_PX if first else REACH_PX
     blocks = [(block_scores(made.at(at), reference, pose, reach_px), 2.0**at) for at in levels]
     camera = seen.view.picture_at(finest).camera
     ground = seen.relief.ground_m(pose.map_px(blocks[0][0].middles_px * blocks[0][1]))

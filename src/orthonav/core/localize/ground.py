@@ -233,6 +233,7 @@ class SearchedSheet:
         self.pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
         self.reference = Reference(layer)
         self.windows = SearchWindows(self.reference)
+        self.is_finer = surface is not None  # than views over bare ground are compared
         self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
         self.propose, self.plan = propose, plan
         info = None if terrain is None else terrain.info

@@ -184,4 +184,6 @@ class RegistrationLocalizer(SearchedSheet):
         return Search(self, prepared, prior)
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
-        return prepare(view, self.grid.gsd_m, self.pyramid.levels, heading_known)
+        return prepare(
+            view, self.grid.gsd_m, self.pyramid.levels, heading_known, finer=self.is_finer
+        )

@@ -15,7 +15,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.localize.camera import approached
 from orthonav.core.localize.ground import ViewOverGround
+from orthonav.core.localize.rectify import Orientation
 from orthonav.core.register.pose import Pose, PosePrior
 from orthonav.core.register.refine import Fit, Refiner
 from orthonav.core.register.search import SearchWindows, largest_half_px, search
@@ -63,6 +65,7 @@ class Place:
       `gain`: over the one on level ground; None: finished there.
     - `score`: `total` less the cost of its prior. `finer`: one level finer, NaN: not needed;
       `fine`: sum.
+    - `camera`: under which it was compared there, None: by telemetry.
     - `scores`: of the best place, see `docs/reference/formats.md`. `rivals`: other finished places,
       best first, near ones too.
     - `below_camera`: the pose with the height counted from the ground below the camera."""
@@ -82,6 +85,7 @@ class Place:
     score: float = math.nan
     finer: float = math.nan
     fine: float = math.nan
+    camera: Orientation | None = None
     scores: dict[str, float] = field(default_factory=dict)
     rivals: tuple["Place", ...] = ()
     below_camera: Pose | None = None
@@ -123,6 +127,10 @@ class Placer:
     def _ground(self) -> ViewOverGround:
         assert self._view_over_ground is not None
         return self._view_over_ground
+
+    @property
+    def _has_houses(self) -> bool:
+        return not self.is_level and self._ground.relief.surface is not None
 
     @property
     def _exclusion_px(self) -> float:
@@ -292,11 +300,11 @@ class Placer:
         direct: Sequence[Place] = (),
         *,
         kept: int = KEPT_TO_FINISH,
-        finer: bool = False,
+        closer: bool = False,
     ) -> Place:
         """The best of judged places, found by searches of `candidates` in all: the best `kept` and
-        all `direct` ones at the final level, with `finer` the best `KEPT_TO_FINEST` one level
-        finer."""
+        all `direct` ones at the final level, with `closer` the best `KEPT_TO_FINEST` one level
+        finer, where there is one, and as their houses show them."""
         ranked = sorted(places, key=lambda each: -self._value(each.judged))
         chosen = self._apart([each.judged for each in ranked], self._exclusion_px, kept)
         apart = [ranked[number] for number in chosen]
@@ -305,7 +313,11 @@ class Placer:
         for each in finalists:
             self._finish(each)
         finalists.sort(key=lambda each: -each.score)
-        if finer:
+        if closer and self._has_houses:
+            for each in finalists[:KEPT_TO_FINEST]:
+                self._see_houses(each)
+            finalists.sort(key=lambda each: -each.score)
+        if closer and self.levels.final > 0:
             finalists = [
                 replace(each, fine=each.score + self._finer_score(each))
                 for each in finalists[:KEPT_TO_FINEST]
@@ -370,12 +382,31 @@ class Placer:
         place.final, place.templates, place.total, place.again = final, made, total, again
         place.gain = again / max(on_level, 1e-6)
 
+    def _see_houses(self, place: Place) -> None:
+        """Once, under the camera that the picture shows there, not the reported one: among houses
+        and trees that is the difference between the right place and chance."""
+        if place.camera is not None or place.gain is None:
+            return
+        pose, levels = place.fit.pose, self.levels
+        place.camera = approached(self._ground, self.reference, pose)
+        made = self._ground.templates_at(pose, levels.final, place.camera)
+        if place.camera is None or made is None:
+            return
+        final = self.refiner(levels.final, made).place(pose, FULL_STEPS, ROUGH_STEP_PX)
+        again = total = final.score
+        if levels.final != levels.judged:
+            again = self.refiner(levels.judged, made).place(final.pose, 0).score
+            total += again
+        if total > place.total:
+            place.final, place.templates, place.total, place.again = final, made, total, again
+            place.score = total - self.prior.cost(final.pose)
+
     def _finer_score(self, place: Place) -> float:
         """One level finer than the final one, once."""
         if math.isnan(place.finer):
             level, made = self.levels.final - 1, None
             if place.gain is not None:
-                made = self._ground.templates_at(place.fit.pose, level)
+                made = self._ground.templates_at(place.fit.pose, level, place.camera)
             refiner = Refiner((made or self._finer_on_level).at(level), self.reference)
             place.finer = refiner.place(place.fit.pose, FINER_STEPS).score
         return place.finer

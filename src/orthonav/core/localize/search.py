@@ -168,7 +168,7 @@ class Search:
     def camera(self, place: Place) -> CameraFound | None:
         """None where too few blocks of the view are seen."""
         ratio = place.scores.get("local_ratio", 1.0)  # of the best place only
-        return camera_found(self.ground, self.sheet.reference, place.fit.pose, ratio)
+        return camera_found(self.ground, self.sheet.reference, place.fit.pose, ratio, place.camera)
 
     # What is tried
 
@@ -393,8 +393,8 @@ class Search:
         places = self.placer.on_terrain(self.places, policy.trials)
         compared_all = is_level and last.level == levels.judged and not last.from_tiles
         doubt = policy.doubt if at_final else policy.trial_doubt
-        for finer in (False, True):
-            found = self._finished(places, policy.trials, finer=finer)
+        for closer in (False, True):
+            found = self._finished(places, policy.trials, closer=closer)
             if not compared_all and not self._is_clear(found, policy.trial_clear):
                 return None
             if self._is_proven(found, doubt):
@@ -413,15 +413,15 @@ class Search:
         for kept, cost_ms in passes if levels.final != levels.judged else ():
             if self._is_proven(found, policy.doubt) or not self.budget.allows(cost_ms):
                 break
-            found = self._finished(places, kept, finer=levels.final > 0)
+            found = self._finished(places, kept, closer=True)
         if self.budget.cut_short:
             found.scores["cut_short"] = 1.0
         return found
 
     def _finished(
-        self, places: Sequence[Place], kept: int = KEPT_TO_FINISH, *, finer: bool = False
+        self, places: Sequence[Place], kept: int = KEPT_TO_FINISH, *, closer: bool = False
     ) -> Place:
-        return self.placer.finished(places, self.candidates, self.direct, kept=kept, finer=finer)
+        return self.placer.finished(places, self.candidates, self.direct, kept=kept, closer=closer)
 
     def _is_clear(self, best: Place, margin: ClearMargin) -> bool:
         scores = best.scores

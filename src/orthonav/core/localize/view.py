@@ -172,8 +172,10 @@ class PreparedView:
         return _rectified(self.picture_at(level), self.gsd_m, self.levels, level)
 
 
-def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> PreparedView | NoFix:
-    """`gsd_m`: of level 0 of the map."""
+def prepare(
+    view: View, gsd_m: float, map_levels: int, heading_known: bool, *, finer: bool = False
+) -> PreparedView | NoFix:
+    """`gsd_m`: of level 0 of the map; `finer`: as of `Levels.of`."""
     camera, telemetry = view.camera, view.telemetry
     nominal_m = footprint_side_m(telemetry, camera)
     if is_oblique(view):
@@ -181,7 +183,7 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
         if near is None:
             return NoFix("too_small", "the view shows no ground that is near enough")
         nominal_m = NEAR_SHARE * math.sqrt(near.area_m2)
-    levels = Levels.of(nominal_m / gsd_m, map_levels)
+    levels = Levels.of(nominal_m / gsd_m, map_levels, finer=finer)
     unit_px = 2**levels.final
     picture = downsampled(view, gsd_m * unit_px)
     rectified = _rectified(picture, gsd_m, levels, levels.final)

@@ -212,9 +212,11 @@ class Levels:
     final: int
 
     @classmethod
-    def of(cls, view_px: float, levels: int) -> "Levels":
-        """For a view of `view_px` pixels of level 0 across (root of its area)."""
-        judged = max(0, min(round(math.log2(max(view_px, 1.0) / JUDGED_PX)), levels - 1))
+    def of(cls, view_px: float, levels: int, *, finer: bool = False) -> "Levels":
+        """For a view of `view_px` pixels of level 0 across (root of its area); `finer`: by one
+        level, among houses and trees."""
+        judged = round(math.log2(max(view_px, 1.0) / JUDGED_PX)) - finer
+        judged = max(0, min(judged, levels - 1))
         return cls(min(judged + 1, levels - 1), judged, max(judged - 1, 0))
 
     def recipe(self, level: int) -> ChannelRecipe:

@@ -301,7 +301,7 @@ class Trier:
     def _final_level(self) -> int:
         registration = self._registration
         side_px = self._conditions.side_m / registration.grid.gsd_m
-        return Levels.of(side_px, registration.pyramid.levels).final
+        return Levels.of(side_px, registration.pyramid.levels, finer=registration.is_finer).final
 
     @property
     def _level(self) -> int:
