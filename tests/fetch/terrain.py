@@ -167,6 +167,23 @@ def height_files(folder):
     return found, step, west, north
 
 
+def surface_file(folder):
+    """One file of heights at 0.5 m in LV95, as those of swissSURFACE3D, and its item by name."""
+    to_crs = Transformer.from_crs("EPSG:4326", "EPSG:2056", always_xy=True)
+    size, (x, y) = 1024, to_crs.transform(LON_DEG, LAT_DEG)
+    west, north = round(x) - size / 4, round(y) + size / 4
+    steps = (np.arange(size) + 0.5) / 2
+    lon, lat = _to_degrees("EPSG:2056").transform(*np.meshgrid(west + steps, north - steps))
+    raw, path = folder / "town.raw.tif", folder / "town.tif"
+    with rasterio.open(
+        raw, "w", driver="GTiff", width=size, height=size, count=1, dtype="float32",
+        crs="EPSG:2056", nodata=-9999, transform=Affine(0.5, 0, west, 0, -0.5, north),
+    ) as data:  # fmt: skip
+        data.write(heights(lat, lon).astype(np.float32)[None])
+    rasterio.shutil.copy(raw, path, driver="COG", COMPRESS="LZW", OVERVIEW_RESAMPLING="AVERAGE")
+    return {"/town.tif": path.read_bytes(), "town": item("town", "./town.tif", bounds(256))}
+
+
 def plain(value):
     """JSON as bytes."""
     return json.dumps(value).encode()

@@ -11,7 +11,7 @@ import servers
 import terrain
 
 from orthonav.cli import main
-from orthonav.ground.fetch.presets import presets, terrain_preset, terrain_spec
+from orthonav.ground.fetch.presets import ImageryOptions, parse_source, presets, terrain_preset
 from orthonav.ground.fetch.run import holds_heights
 from orthonav.ground.imagery.source import open_sources
 from orthonav.ground.imagery.terrain import open_dem
@@ -84,11 +84,17 @@ def test_a_dry_run_fetches_no_tile(command, area, tmp_path, names_below):
 
 @pytest.fixture
 def offered(monkeypatch):
-    """Function that puts the terrain known by name at an address."""
+    """Function that puts the heights known by name at an address, and those of a source at one."""
 
-    def put(url):
-        known = replace(presets()["copernicus-dem"], url=f"{url}/api/", token_url=None)
-        found = presets() | {"copernicus-dem": known}
+    def put(url, surface_of=()):
+        terrain_, surface = (
+            replace(presets()[name], url=f"{url}/api/", token_url=None)
+            for name in ("copernicus-dem", "swisssurface3d")
+        )
+        found = presets() | {"copernicus-dem": terrain_, "swisssurface3d": surface}
+        for name, address in surface_of:
+            ours = replace(presets()["swissimage-stac"], protocol="xyz", url=address, terrain=None)
+            found[name] = ours
         monkeypatch.setattr("orthonav.ground.fetch.presets.presets", lambda: found)
         monkeypatch.setattr("orthonav.ground.fetch.web.RequestLimits", lambda **_: servers.QUICK)
 
@@ -123,6 +129,40 @@ def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
     dem = open_dem(dem_path)
     lat, lon = np.array([terrain.LAT_DEG]), np.array([west - 3 * step])
     np.testing.assert_allclose(dem(lat, lon), terrain.heights(lat, lon), atol=0.05)
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, caplog, broken):
+    """In place of a terrain of Copernicus; if it cannot be fetched, the imagery is kept."""
+    found, url, asked_for = terrain.surface_file(tmp_path), [], []
+    out, dsm_path = tmp_path / "ortho.tif", tmp_path / "ortho_dsm.tif"
+    answer = servers.searching(found, url, asked_for)
+    with (
+        servers.serving((lambda _: servers.Answer(b"no", 503)) if broken else answer) as heights,
+        servers.serving(servers.tiles) as server,
+    ):
+        url.append(heights.url)
+        offered(heights.url, [("town", f"{server.url}/{{z}}/{{x}}/{{y}}.png")])
+        fetch = (area, "--source", "town", "--gsd-m", 1, "--out", out, "--with-surface")
+        dry = json.loads(command(*fetch, "--dry-run", "--json", terrain=True)[1])
+        assert dry["surface"] == "swisssurface3d" and dry["terrain"] is None
+        code, stdout, _ = command(*fetch, "--json", terrain=True)
+        plain = json.loads(stdout)
+        assert code == 0 and plain["terrain"] is None and (plain["surface"] is None) == broken
+        stdout = command(*fetch, terrain=True)[1]
+    line = f"orthonav build --ortho {out} "
+    if broken:
+        assert "no surface was fetched" in caplog.text and "--source swisssurf" in caplog.text
+        assert out.is_file() and not dsm_path.exists()
+        assert line in stdout and "--surface" not in stdout
+        return
+    assert plain["surface"]["out"] == str(dsm_path) and plain["surface"]["datum"] == "EPSG:5728"
+    assert f"{line}--surface {dsm_path} " in stdout and "--dem" not in stdout
+    assert asked_for[0]["collections"] == ["ch.swisstopo.swisssurface3d-raster"]
+    lat, lon = terrain.LAT_DEG + np.array([-5e-4, 5e-4]), terrain.LON_DEG + np.array([0, 9e-4])
+    dsm = open_dem(dsm_path)
+    assert dsm.gsd_m == pytest.approx(1, rel=0.01)
+    np.testing.assert_allclose(dsm(lat, lon), terrain.heights(lat, lon), atol=0.05)
 
 
 def test_no_terrain_comes_with_heights(tmp_path):
@@ -162,7 +202,7 @@ def test_imagery_is_kept_where_terrain_fails(command, area, tmp_path, offered, c
 def test_the_terrain_is_that_of_the_country_or_of_copernicus(source, name):
     assert terrain_preset(source) == name
     if name is not None:
-        spec = terrain_spec(name)
+        spec = parse_source(name, ImageryOptions())
         assert spec.provenance.datum
         assert spec.options.gsd_m == (5.0 if name in ("ign-terrain", "swissalti3d") else None)
 
@@ -193,8 +233,10 @@ def test_services_known_by_name_are_listed(command):
     assert (
         code == 0 and "ign: IGN" in stdout and "1950-1965" in stdout and "DATAFORSYNINGEN" in stdout
     )
+    assert "--with-surface fetches swisssurface3d" in stdout
     code, stdout, _ = command("--list", "--json")
     assert code == 0 and json.loads(stdout)[0]["licence"]
+    assert json.loads(stdout)[0]["surface"] == "ign-surface"
 
 
 @pytest.mark.parametrize(
@@ -204,6 +246,8 @@ def test_services_known_by_name_are_listed(command):
         (["--source", "ign:2021"], "give a --source .* and an --out"),
         (["--source", "ign:2021", "--out", "o.tif"], "give one area"),
         (["--source", "file:///etc/passwd", "--out", "o.tif"], "write the protocol"),
+        (["--bounds=3,46,3.1,46.1", "--source", "nrw", "--out", "o.tif", "--with-surface"],
+         "no surface model is known for 'nrw'; sources with one: .*ign.*swissimage"),
         (["--bounds=3,46,3.1,46.1", "--source", "xyz:http://a/{z}/{x}/{y}", "--out", "o.jpg"],
          "must be a .tif"),
         (["--parallel", "99", "--source", "ign", "--out", "o.tif"], "--parallel is 1 to 16"),

@@ -9,6 +9,7 @@ from orthonav.ground.fetch.presets import (
     ImageryOptions,
     parse_source,
     presets,
+    surface_preset,
 )
 from orthonav.ground.fetch.urls import checked_url
 from orthonav.ground.imagery.terrain import datum_of
@@ -24,7 +25,7 @@ def test_a_service_and_its_layers_are_complete(name, monkeypatch):
     assert ("{key}" in preset.url) == (preset.key_env is not None)
     if preset.key_env:
         monkeypatch.setenv(preset.key_env, "x" * 8)
-    assert preset.terrain is None or presets()[preset.terrain].datum
+    assert all(presets()[each].datum for each in (preset.terrain, preset.surface) if each)
     coarsest_m = 1 if preset.datum is None else 30
     for id_, layer in preset.layers.items():
         assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= coarsest_m, id_
@@ -39,12 +40,28 @@ def test_a_service_and_its_layers_are_complete(name, monkeypatch):
         assert "express" not in id_ or "no other date" in spec.provenance.note
 
 
-def test_terrain_names_the_datum_of_its_heights():
+def test_terrain_names_the_datum_of_its_heights(monkeypatch):
+    monkeypatch.setenv("DATAFORSYNINGEN_TOKEN", "x" * 8)
     terrain = {name: preset.datum for name, preset in presets().items() if preset.datum}
-    assert len(terrain) == 5
+    assert len(terrain) == 12
     for name, datum in terrain.items():
         assert not datum_of(datum).above_ellipsoid
         assert parse_source(name, ImageryOptions()).provenance.datum == datum
+
+
+def test_surfaces_are_fetched_as_finely_as_a_map_takes_them(monkeypatch):
+    monkeypatch.setenv("DATAFORSYNINGEN_TOKEN", "x" * 8)
+    for name in filter(None, (preset.surface for preset in presets().values())):
+        assert parse_source(name, ImageryOptions()).options.gsd_m == 1
+        assert parse_source(name, ImageryOptions(gsd_m=2)).options.gsd_m == 2
+
+
+def test_sources_without_a_surface_are_told_those_with_one():
+    assert surface_preset("ign:2021") == "ign-surface" and surface_preset("pdok") == "ahn-surface"
+    for source in ("naip:2020", "ahn-surface", "wms:https://a.example/wms?token=abcdef"):
+        with pytest.raises(FetchError, match=r"no surface model .* one: dataforsyningen") as no:
+            surface_preset(source)
+        assert "ign-wms, pdok, swissimage" in str(no.value) and "abcdef" not in str(no.value)
 
 
 def test_unknown_names_list_the_known_ones():

@@ -1,5 +1,6 @@
 """What comes from a real WMTS and WMS is the ground, in its place to a twentieth of a pixel."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,8 @@ from pyproj import Transformer
 from rasterio.io import MemoryFile
 
 from orthonav.core.errors import FetchError
-from orthonav.ground.fetch.presets import ImageryOptions, parse_source, presets
-from orthonav.ground.fetch.run import FetchRequest, fetch
+from orthonav.ground.fetch.presets import CURRENT, ImageryOptions, parse_source, presets
+from orthonav.ground.fetch.run import FetchRequest, estimate_fetch, fetch
 from orthonav.ground.imagery.source import open_sources
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area
@@ -110,54 +111,123 @@ CAPABILITIES = """<WMS_Capabilities version="1.3.0" xmlns="http://www.opengis.ne
  xmlns:xlink="http://www.w3.org/1999/xlink"><Service><Name>WMS</Name><Title>t</Title></Service>
 <Capability><Request><GetMap><Format>image/jpeg</Format><Format>image/geotiff</Format>
 <DCPType><HTTP><Get><OnlineResource xlink:href="URL/map"/></Get></HTTP></DCPType></GetMap></Request>
-<Layer><Title>t</Title><CRS>EPSG:2154</CRS>
-<Layer><Name>ELEVATION.ELEVATIONGRIDCOVERAGE.HIGHRES</Name><Title>t</Title></Layer></Layer>
+<Layer><Title>t</Title><CRS>CODE</CRS>
+<Layer><Name>LAYER</Name><Title>t</Title></Layer></Layer>
 </Capability></WMS_Capabilities>"""
+COVERAGE = """<CoverageDescription version="1.0.0" xmlns="http://www.opengis.net/wcs"
+ xmlns:gml="http://www.opengis.net/gml"><CoverageOffering><name>LAYER</name><label>t</label>
+<domainSet><spatialDomain><gml:Envelope srsName="CODE"><gml:pos>0 0</gml:pos></gml:Envelope>
+</spatialDomain></domainSet><rangeSet><RangeSet><name>1</name><label>t</label></RangeSet></rangeSet>
+<supportedCRSs><requestResponseCRSs>EPSG:4326 CODE</requestResponseCRSs>
+<nativeCRSs>CODE</nativeCRSs></supportedCRSs><supportedFormats nativeFormat="image/tiff">
+<formats>GEOTIFF JPEG2000</formats><formats>GEOTIFF_FLOAT32</formats></supportedFormats>
+</CoverageOffering></CoverageDescription>"""
+EXCEPTION = """<ServiceExceptionReport version="1.2.0"><ServiceException code="CoverageNotDefined">
+no such coverage</ServiceException></ServiceExceptionReport>"""
+SLOPES = 0.01, 0.02
+"""Rise of the ground per metre to the east and north, from the point where it is 0."""
+DESCRIBED = {"GetCapabilities": CAPABILITIES, "DescribeCoverage": COVERAGE}
 
 
-@pytest.mark.parametrize("broken", ["", "cut", "page"])
-def test_heights_of_a_wms(tmp_path, monkeypatch, broken):
-    """Numbers of 32 bits, as the preset of IGN asks for them; -99999 is no data."""
-    url = []
+@pytest.fixture
+def heights_service(monkeypatch):
+    """Function that serves the heights of a preset of WMS or WCS: its spec and the requests."""
 
-    def answer(asked):
-        if asked.query["REQUEST"] == "GetCapabilities":
-            return servers.Answer(CAPABILITIES.replace("URL", url[0]).encode(), kind="text/xml")
-        assert asked.query["FORMAT"] == "image/geotiff" and asked.query["CRS"] == "EPSG:2154"
-        west, south, east, north = (float(v) for v in asked.query["BBOX"].split(","))
-        width, height = int(asked.query["WIDTH"]), int(asked.query["HEIGHT"])
-        x = west + (np.arange(width) + 0.5) * (east - west) / width
-        y = north - (np.arange(height) + 0.5) * (north - south) / height
-        values = (0.01 * (x - 700_000)[None, :] + 0.02 * (y - 6_600_000)[:, None]).astype("f4")
-        values[abs(y - middle_y) < 8] = -99999
-        if broken == "page":
-            return servers.Answer(b"<html>busy</html>", kind="text/html")
-        with MemoryFile() as file:
-            profile = {"driver": "GTiff", "count": 1, "dtype": "float32"}
-            with file.open(width=width, height=height, **profile) as data:
-                data.write(values[None])
-            body = file.read()
-        return servers.Answer(body[:-400] if broken else body, kind="image/geotiff")
+    @contextmanager
+    def served(name, broken="", no_data_m=-99999.0, **options):
+        preset, url = presets()[name], []
+        known = preset.layers[CURRENT].options
+        middle = Transformer.from_crs(4326, known.crs, always_xy=True).transform(
+            terrain.LON_DEG, terrain.LAT_DEG
+        )
 
-    middle_x, middle_y = Transformer.from_crs(4326, 2154, always_xy=True).transform(
-        terrain.LON_DEG, terrain.LAT_DEG
-    )
-    with servers.serving(answer) as server:
-        url.append(server.url)
-        known = replace(presets()["ign-terrain"], url=server.url)
-        monkeypatch.setattr("orthonav.ground.fetch.presets.presets", lambda: {"ign-terrain": known})
-        area = Area.from_bounds(terrain.bounds(60))
-        spec = parse_source("ign-terrain", ImageryOptions(tile_px=128))
+        def answer(asked):
+            assert preset.key_env is None or asked.query["TOKEN"] == "abcdef"
+            text = DESCRIBED.get(asked.query["REQUEST"])
+            if text is not None:
+                if asked.query.get("COVERAGE", known.layer) != known.layer:
+                    return servers.Answer(EXCEPTION.encode(), kind="text/xml")
+                for part, value in (("CODE", known.crs), ("LAYER", known.layer), ("URL", url[0])):
+                    text = text.replace(part, value)
+                return servers.Answer(text.encode(), kind="text/xml")
+            if broken == "page":
+                return servers.Answer(b"<html>busy</html>", kind="text/html")
+            body = height_tiff(asked.query, middle, no_data_m)
+            return servers.Answer(body[:-400] if broken else body, kind="image/tiff")
+
+        with servers.serving(answer) as server:
+            url.append(server.url)
+            ours = replace(preset, url=server.url + preset.url.partition(".dk")[2])
+            monkeypatch.setenv("DATAFORSYNINGEN_TOKEN", "abcdef")
+            monkeypatch.setattr("orthonav.ground.fetch.presets.presets", lambda: {name: ours})
+            yield parse_source(name, ImageryOptions(tile_px=128, **options)), middle, server.log
+
+    return served
+
+
+def height_tiff(query, middle, no_data_m):
+    """The heights of a box (x before y), without a strip through the middle."""
+    west, south, east, north = (float(v) for v in query["BBOX"].split(","))
+    width, height = int(query["WIDTH"]), int(query["HEIGHT"])
+    x = west + (np.arange(width) + 0.5) * (east - west) / width - middle[0]
+    y = north - (np.arange(height) + 0.5) * (north - south) / height - middle[1]
+    values = (SLOPES[0] * x[None, :] + SLOPES[1] * y[:, None]).astype("f4")
+    values[abs(y) < 8] = no_data_m
+    with MemoryFile() as file:
+        profile = {"driver": "GTiff", "count": 1, "dtype": "float32"}
+        with file.open(width=width, height=height, **profile) as data:
+            data.write(values[None])
+        return file.read()
+
+
+@pytest.mark.parametrize(
+    "name, datum, gsd_m, no_data_m, asked_for",
+    [
+        ("ign-terrain", "NGF-IGN69", 5, -99999, {"FORMAT": "image/geotiff", "CRS": "EPSG:2154"}),
+        ("ign-surface", "NGF-IGN69", 1, -9999, {"FORMAT": "image/geotiff", "CRS": "EPSG:2154"}),
+        ("ahn-surface", "NAP", 1, 3.4028235e38, {"COVERAGE": "dsm_05m", "CRS": "EPSG:28992"}),
+        ("dhm-surface", "DVR90", 1, -9999, {"FORMAT": "GEOTIFF_FLOAT32", "VERSION": "1.0.0"}),
+        ("kartverket-surface", "NN2000", 1, -3.4028235e38, {"COVERAGE": "nhm_dom_topo_25833"}),
+    ],
+)  # fmt: skip
+def test_heights_of_a_wms_and_of_a_wcs(
+    tmp_path, heights_service, name, datum, gsd_m, no_data_m, asked_for
+):
+    """Numbers of 32 bits at the resolution of the preset; impossible heights are no data."""
+    area = Area.from_bounds(terrain.bounds(60))
+    with heights_service(name, no_data_m=no_data_m) as (spec, middle, requests):
         request = FetchRequest(spec, area, tmp_path / "dem.tif", margin_m=0, limits=servers.QUICK)
-        if broken:
-            with pytest.raises(FetchError, match="tiles failed"):
-                fetch(request)
-            return
         fetch(request)
+    assert asked_for.items() <= requests[-1].query.items()
     dem = open_dem(tmp_path / "dem.tif")
-    assert dem.datum.name == "NGF-IGN69 height" and dem.gsd_m == pytest.approx(5, rel=0.01)
-    x, y = middle_x + np.array([-40.0, 31.5]), middle_y + np.array([-30.0, 44.0])
-    lon, lat = Transformer.from_crs(2154, 4326, always_xy=True).transform(x, y)
-    expected = 0.01 * (x - 700_000) + 0.02 * (y - 6_600_000)
-    np.testing.assert_allclose(dem(lat, lon), expected, atol=0.02)
+    assert dem.datum.name == f"{datum} height" and dem.gsd_m == pytest.approx(gsd_m, rel=0.01)
+    off = np.array([[-40.0, 31.5], [-30.0, 44.0]])
+    x, y = np.array(middle)[:, None] + off
+    lon, lat = Transformer.from_crs(spec.options.crs, 4326, always_xy=True).transform(x, y)
+    np.testing.assert_allclose(dem(lat, lon), SLOPES @ off, atol=0.02)
     assert np.isnan(dem(np.array([terrain.LAT_DEG]), np.array([terrain.LON_DEG])))
+
+
+@pytest.mark.parametrize("name", ["ign-terrain", "ahn-surface"])
+@pytest.mark.parametrize("broken", ["cut", "page"])
+def test_broken_heights_are_not_written(tmp_path, heights_service, name, broken):
+    area, out = Area.from_bounds(terrain.bounds(60)), tmp_path / "dem.tif"
+    with heights_service(name, broken) as (spec, _, _), pytest.raises(FetchError, match="tiles fa"):
+        fetch(FetchRequest(spec, area, out, margin_m=0, limits=servers.QUICK))
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"layer": "dsm_5m"}, "an error of the service .*no such coverage"),
+        ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; available: .*EPSG:28992"),
+        ({"format": "image/jpeg"}, "not come as image/jpeg; available: GEOTIFF, GEOTIFF_FLOAT32"),
+    ],
+)
+def test_what_a_wcs_does_not_have_is_listed(tmp_path, heights_service, options, words):
+    area = Area.from_bounds(terrain.bounds(60))
+    with heights_service("ahn-surface", **options) as (spec, _, _):
+        request = FetchRequest(spec, area, tmp_path / "dem.tif", limits=servers.QUICK)
+        with pytest.raises(FetchError, match=words):
+            estimate_fetch(request)

@@ -20,17 +20,20 @@ log = logging.getLogger(__name__)
 EXAMPLE = "--route route.kml --source ign --out ortho.tif"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
-    *("--layer", "--time", "--date", "--key-env", "--cache", "--no-terrain", "--json"),
+    *("--layer", "--time", "--date", "--key-env", "--cache", "--no-terrain", "--with-surface"),
+    "--json",
 )
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    text = "a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..."
+    text = "a service by name, such as ign:2021, or wmts|wms|wcs|xyz|tms|stac|cog:https://..."
     parser.add_argument("--source", metavar="NAME[:YEAR]|PROTOCOL:ADDRESS", help=text)
     parser.add_argument("--list", action="store_true", help="list the services known by name")
     parser.add_argument("--out", type=Path, metavar="ORTHO.tif", help="GeoTIFF to write")
     text = "omit the terrain model that is written beside the imagery, as ORTHO_dem.tif"
     parser.add_argument("--no-terrain", dest="terrain", action="store_false", help=text)
+    text = "also write a surface model of houses and trees, as ORTHO_dsm.tif, where one is known"
+    parser.add_argument("--with-surface", dest="surface", action="store_true", help=text)
     text = "print the estimated cost and fetch nothing"
     parser.add_argument("--dry-run", action="store_true", help=text)
     add_options(parser, "--json")
@@ -97,66 +100,82 @@ def run(options: argparse.Namespace) -> None:
     if options.source is None or (options.out is None and not options.dry_run):
         raise FetchError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
-    from orthonav.ground.fetch.presets import terrain_preset
-    from orthonav.ground.fetch.run import estimate_fetch, fetch, holds_heights, terrain_request
+    from orthonav.ground.fetch.run import estimate_fetch, fetch, holds_heights
 
     request = _request(options)
-    name = terrain_preset(options.source) if options.terrain else None
+    names = _heights_presets(options)
     if options.dry_run:
-        _print_estimate(options, estimate_fetch(request), name)
+        _print_estimate(options, estimate_fetch(request), names)
         return
     with progress(options) as shown:
         result = fetch(
             request, shown, lambda estimate: _say(options, f"fetching {estimate.text()}")
         )
-    found = [(request, result)]
     imagery = request.spec.provenance.datum is None and not holds_heights(options.out)
-    if name is not None and imagery:
-        found += _terrain(options, terrain_request(request, name), name)
+    found: dict[str, tuple[Path, FetchResult]] = {}
+    for kind, name in names.items():
+        if name is not None and imagery:
+            found |= _heights(options, request, kind, name)
     if options.json:
-        terrain = [{"out": str(each.out), **got.describe()} for each, got in found[1:]]
-        more = {"terrain": terrain[0] if terrain else None}
+        more: dict[str, object] = dict.fromkeys(names)
+        more |= {kind: {"out": str(out), **got.describe()} for kind, (out, got) in found.items()}
         print_json({"out": str(options.out), **result.describe(), **more})
         return
-    print("\n\n".join(_summary(each.out, got) for each, got in found))
-    if options.terrain and imagery:
-        print(f"\nbuild the map:\n  {_build_line(options, [each.out for each, _ in found[1:]])}")
+    parts = [(options.out, result), *found.values()]
+    print("\n\n".join(_summary(out, got) for out, got in parts))
+    if any(names.values()) and imagery:
+        paths = {kind: out for kind, (out, _) in found.items()}
+        print(f"\nbuild the map:\n  {_build_line(options, paths)}")
+
+
+def _heights_presets(options: argparse.Namespace) -> dict[str, str | None]:
+    """Presets of the heights that are fetched too, by kind; None where there are none."""
+    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN, surface_preset, terrain_preset
+
+    surface = surface_preset(options.source) if options.surface else None
+    terrain = terrain_preset(options.source) if options.terrain else None
+    if surface is not None and terrain == DEFAULT_TERRAIN:
+        terrain = None  # it includes trees and houses: the lower envelope of the surface is better
+    return {"terrain": terrain, "surface": surface}
 
 
 def _print_estimate(
-    options: argparse.Namespace, estimate: "CostEstimate", terrain: str | None
+    options: argparse.Namespace, estimate: "CostEstimate", names: dict[str, str | None]
 ) -> None:
     if options.json:
-        print_json(vars(estimate) | {"provenance": vars(estimate.provenance), "terrain": terrain})
+        print_json(vars(estimate) | {"provenance": vars(estimate.provenance), **names})
     else:
-        more = "" if terrain is None else f", and terrain from {terrain}"
+        more = "".join(f", and {kind} from {name}" for kind, name in names.items() if name)
         print(f"would fetch {estimate.text()}{more}")
 
 
-def _terrain(
-    options: argparse.Namespace, request: "FetchRequest", name: str
-) -> "list[tuple[FetchRequest, FetchResult]]":
-    """Nothing, with a warning, where it cannot be had: the imagery is kept."""
+def _heights(
+    options: argparse.Namespace, imagery: "FetchRequest", kind: str, name: str
+) -> "dict[str, tuple[Path, FetchResult]]":
+    """Nothing, with a warning, where they cannot be had: the imagery is kept."""
     from orthonav.core.errors import AreaError, OutputError
     from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
-    from orthonav.ground.fetch.run import fetch_terrain
+    from orthonav.ground.fetch.run import fetch_heights, heights_request
 
-    _say(options, f"fetching the terrain of {name}")
+    _say(options, f"fetching the {kind} of {name}")
     try:
+        request = heights_request(imagery, kind, name)
         with progress(options) as shown:
-            return [(request, fetch_terrain(request, shown))]
+            return {kind: (request.out, fetch_heights(request, shown))}
     except (FetchError, AreaError, OutputError) as error:
+        other = DEFAULT_TERRAIN if kind == "terrain" else name
         log.warning(
-            "no terrain was fetched (%s); the imagery is complete; fetch a terrain with --source "
-            "%s, or build with one of your own, or without: %s",
-            *(error, DEFAULT_TERRAIN, options.out),
+            "no %s was fetched (%s); the imagery is complete; fetch a %s with --source %s, or "
+            "build with one of your own, or without: %s",
+            *(kind, error, kind, other, options.out),
         )
-        return []
+        return {}
 
 
-def _build_line(options: argparse.Namespace, terrain: list[Path]) -> str:
+def _build_line(options: argparse.Namespace, heights: dict[str, Path]) -> str:
     words = ["orthonav", "build", "--ortho", options.out]
-    words += [word for path in terrain for word in ("--dem", path)]
+    for kind, option in (("terrain", "--dem"), ("surface", "--surface")):
+        words += [option, heights[kind]] if kind in heights else []
     if options.bounds is not None:
         words.append(f"--bounds={','.join(map(str, options.bounds))}")
     else:
@@ -238,5 +257,7 @@ def _print_presets(as_json: bool) -> None:
         print(f"{preset.name}: {preset.title} ({preset.country})")
         print(f"  {', '.join(preset.layers)}")
         print(f"  {preset.licence}; {preset.attribution}")
+        if preset.surface:
+            print(f"  --with-surface fetches {preset.surface}")
         if preset.key_env:
             print(f"  needs a key in {preset.key_env}")

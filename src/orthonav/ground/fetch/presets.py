@@ -27,12 +27,13 @@ FORMATS = ("image/jpeg", "image/png", "image/webp")
 HEIGHTS_FORMAT = "image/geotiff"
 """Media type of heights, numbers of 32 bits. Taken where a preset or user names it."""
 TERRAIN_GSD_M = 5.0
-"""Ground resolution of heights where none is given: half the posting of a map's terrain."""
+"""Ground resolution of heights where neither user nor preset says: half the posting of a map's
+terrain."""
 DEFAULT_TERRAIN = "copernicus-dem"
 MAX_COARSER = 1.5
 """Where no level is fine enough, the finest one is taken if it is at most this much coarser."""
 _DATE = re.compile(r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?")
-PROTOCOLS = ("wmts", "wms", "xyz", "tms", "stac", "cog")
+PROTOCOLS = ("wmts", "wms", "wcs", "xyz", "tms", "stac", "cog")
 CURRENT = "current"
 
 
@@ -48,7 +49,7 @@ class ImageryOptions:
     zoom: str | None = None  # zoom level, or name of a tile matrix
     gsd_m: float | None = None  # metres on the ground per pixel
     time: str | None = None  # ISO 8601; for STAC an interval with a slash
-    tile_px: int | None = None  # width of tiles (XYZ) or of the images requested (WMS)
+    tile_px: int | None = None  # width of tiles (XYZ) or of the images requested (WMS, WCS)
     max_zoom: int | None = None  # finest zoom level, where the service does not say
     empty: str | None = None  # colour of missing imagery: "black" or "white"
     collection: str | None = None  # of a STAC API
@@ -172,6 +173,7 @@ class Preset:
     note: str | None = None
     datum: str | None = None  # as in `Provenance`
     terrain: str | None = None  # preset of the terrain of the same country
+    surface: str | None = None  # preset of the surface of the same country
 
 
 @cache
@@ -188,10 +190,16 @@ def terrain_preset(text: str) -> str | None:
     return None if preset.datum is not None else preset.terrain or DEFAULT_TERRAIN
 
 
-def terrain_spec(name: str) -> SourceSpec:
-    """Of a preset of terrain, at a ground resolution that suits maps."""
-    finer = presets()[name].layers[CURRENT].gsd_m < TERRAIN_GSD_M
-    return parse_source(name, ImageryOptions(gsd_m=TERRAIN_GSD_M if finer else None))
+def surface_preset(text: str) -> str:
+    """The surface that belongs to the imagery of a source. Raises `FetchError` if it has none."""
+    preset = presets().get(text.partition(":")[0])
+    if preset is None or preset.surface is None:
+        names = [name for name, each in presets().items() if each.surface is not None]
+        raise FetchError(
+            f"no surface model is known for '{shown(text)}'; sources with one: {listed(names)}; "
+            "for others, fetch or download one yourself and give it to build --surface"
+        )
+    return preset.surface
 
 
 def parse_source(
@@ -203,7 +211,7 @@ def parse_source(
     attribution: str | None = None,
     key_env: str | None = None,
 ) -> SourceSpec:
-    """`NAME[:YEAR]` of a service known by name, or `wmts|wms|xyz|tms|stac|cog:ADDRESS`.
+    """`NAME[:YEAR]` of a service known by name, or `PROTOCOL:ADDRESS`, see `PROTOCOLS`.
 
     Raises `FetchError` for unknown names, addresses that are not http or https, and missing keys.
     """
@@ -259,6 +267,7 @@ def _preset(name: str, values: dict[str, Any]) -> Preset:
                 for key, value in entry.items()
             }
             options = _options(filled).over(_options(values))
+            options = replace(options, gsd_m=filled.get("default_gsd_m"))
             if filled["id"] in layers:
                 raise ValueError(f"preset {name} has {filled['id']} twice")
             layers[filled["id"]] = PresetLayer(

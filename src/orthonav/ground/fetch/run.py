@@ -28,17 +28,18 @@ from orthonav.core.errors import FetchError, OutputError
 from orthonav.core.files import Progress, no_progress, not_written, replacing
 from orthonav.ground.fetch.files import cog_source, stac_source
 from orthonav.ground.fetch.grid import Selection, select
-from orthonav.ground.fetch.presets import Provenance, SourceSpec, terrain_spec
+from orthonav.ground.fetch.presets import ImageryOptions, Provenance, SourceSpec, parse_source
 from orthonav.ground.fetch.service import CellPixels, CellReader, CellSource
-from orthonav.ground.fetch.tiles import wms_cells, wmts_tiles, xyz_tiles
+from orthonav.ground.fetch.tiles import wcs_cells, wms_cells, wmts_tiles, xyz_tiles
 from orthonav.ground.fetch.web import RequestLimits, Web
 from orthonav.ground.planning.area import Area
 
 _SECONDS_PER_TILE = 0.3  # usual latency of a tile service; an assumption for the estimate
 _BYTES_PER_SECOND = 3e6  # usual throughput of a connection; an assumption for the estimate
 _OURS = re.compile(r"[0-9a-f]|mosaic-\w+")  # names in a cache that GDAL and this program make
-TERRAIN_MARGIN_M = 1000.0
-"""Width of terrain beyond the imagery: a view from 450 m sees so far 65 deg off nadir."""
+BESIDE = {"terrain": ("dem", 1000.0), "surface": ("dsm", 0.0)}
+"""Heights fetched beside imagery: end of the file's name, and metres beyond the imagery, as a view
+from 450 m sees so far 65 deg off nadir; a surface is used below the imagery only."""
 GIVE_UP_AFTER = 20  # failed cells in a row after which the service counts as down
 _BATCH_PER_THREAD = 8  # cells that may wait in memory until they are written
 log = logging.getLogger(__name__)
@@ -175,17 +176,18 @@ def holds_heights(path: Path) -> bool:
         return bool(data.count == 1 and data.dtypes[0].startswith(("float", "int")))
 
 
-def terrain_request(request: FetchRequest, name: str) -> FetchRequest:
-    """The request for the terrain of a preset under the imagery of another, beside its file."""
+def heights_request(request: FetchRequest, kind: str, name: str) -> FetchRequest:
+    """The request for heights of a preset, beside the imagery of another; `kind` as in `BESIDE`."""
+    end, beyond_m = BESIDE[kind]
     return replace(
         request,
-        spec=terrain_spec(name),
-        out=request.out.with_name(f"{request.out.stem}_dem{request.out.suffix}"),
-        margin_m=request.margin_m + TERRAIN_MARGIN_M,
+        spec=parse_source(name, ImageryOptions()),
+        out=request.out.with_name(f"{request.out.stem}_{end}{request.out.suffix}"),
+        margin_m=request.margin_m + beyond_m,
     )
 
 
-def fetch_terrain(request: FetchRequest, progress: Progress = no_progress) -> FetchResult:
+def fetch_heights(request: FetchRequest, progress: Progress = no_progress) -> FetchResult:
     """As `fetch`, but another's file of that name is not replaced."""
     if request.out.exists():
         with suppress(RasterioError), rasterio.open(request.out) as data:
@@ -219,6 +221,8 @@ def open_cells(web: Web, spec: SourceSpec, area: Area, margin_m: float) -> CellS
         return wmts_tiles(web, spec, area)
     if spec.protocol == "wms":
         return wms_cells(web, spec, area)
+    if spec.protocol == "wcs":
+        return wcs_cells(web, spec, area)
     if spec.protocol in ("xyz", "tms"):
         return xyz_tiles(spec, area)
     if spec.protocol == "cog":

@@ -94,7 +94,7 @@ def service_source(
     """
     address, heights = service["ServerUrl"], format_ == HEIGHTS_FORMAT
     checked_url(re.sub(r"\$?\{[^{}]*\}", "0", address))
-    is_tiled = service["name"] != "WMS"
+    is_tiled = service["name"] in ("TMS", "VirtualEarth")
     width, height = grid.cell_w_px, grid.cell_h_px
 
     def reader(web: Web, selection: Selection, cache: Path) -> CellReader:

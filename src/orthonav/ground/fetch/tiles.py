@@ -1,4 +1,5 @@
-"""Tiles and images of services: by address template (XYZ, TMS), WMTS 1.0.0, WMS 1.1.1 and 1.3.0.
+"""Tiles and images of services: by address template (XYZ, TMS), WMTS 1.0.0, WMS 1.1.1 and 1.3.0,
+and heights of WCS 1.0.0.
 
 Tiles of a WMTS (OGC 07-057r7) are read by address template, as those of XYZ: GDAL's own driver of
 WMTS takes the default time only, and resolutions as they are rounded in the document.
@@ -285,11 +286,6 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     wanted_crs = options.crs or ("EPSG:3857" if "EPSG:3857" in names else None)
     crs = choose(list(names), wanted_crs, f"layer {name} does not come in")
     format_ = choose_format(texts(get_map, "Format"), options, "service")
-    cell_px = options.tile_px or CELL_PX
-    gsd_m = options.wanted_gsd_m
-    if format_ == HEIGHTS_FORMAT and options.gsd_m is None:
-        gsd_m = TERRAIN_GSD_M
-    res_x, res_y = (gsd_m / scale for scale in ground_scale(crs, frame))
     service = {
         "name": "WMS",
         "Version": version,
@@ -302,8 +298,55 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     }
     if version == "1.3.0" and not names[crs].startswith("CRS:") and north_first(crs):
         service["BBoxOrder"] = "yxYX"
-    grid = CellGrid(crs, 0.0, 0.0, res_x, res_y, cell_px, cell_px)
-    return service_source(spec, grid, format_, service)
+    return service_source(spec, _any_box(crs, format_, options, frame), format_, service)
+
+
+def wcs_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
+    """Heights of a coverage of WCS 1.0.0 (OGC 03-065r6) as cells of a fixed grid.
+
+    `BBOX` holds the outer edges, x before y in every coordinate system. GDAL's driver of coverages
+    of the OGC API fills in the address; its driver of WCS knows neither keys nor this cache. Raises
+    `FetchError` with the available choices.
+    """
+    url, options = spec.url, spec.options
+    query = {"SERVICE": "WCS", "VERSION": "1.0.0"}
+    query |= {} if options.layer is None else {"COVERAGE": options.layer}
+    root = web.get_xml(with_query(url, query | {"REQUEST": "DescribeCoverage"}))
+    layers = {name: each for each in root.iterfind("CoverageOffering") for name in _name(each)}
+    name = choose_layer(list(layers), options.layer, url)
+    tags = ("supportedCRSs/nativeCRSs", "supportedCRSs/requestResponseCRSs")
+    names = _crs_names([crs for tag in tags for crs in texts(layers[name], tag)])
+    crs = choose(list(names), options.crs, f"coverage {name} does not come in")
+    formats = " ".join(texts(layers[name], "supportedFormats/formats")).split()
+    tiffs = [each for each in formats if "tif" in each.lower()]
+    tiffs.sort(key=lambda each: "float32" not in each.lower())
+    wanted = options.format or (tiffs or ["GeoTIFF"])[0]
+    query |= {
+        "REQUEST": "GetCoverage",
+        "COVERAGE": name,
+        "CRS": names[crs],
+        "FORMAT": choose(tiffs, wanted, f"coverage {name} does not come as"),
+        "BBOX": "{minx},{miny},{maxx},{maxy}",
+        "WIDTH": "{width}",
+        "HEIGHT": "{height}",
+    }
+    address = re.sub(r"\{(?!key\})", "${", with_query(url, query))
+    service = {"name": "OGCAPICoverage", "ServerUrl": address}
+    grid = _any_box(crs, HEIGHTS_FORMAT, options, area.frame)
+    return service_source(spec, grid, HEIGHTS_FORMAT, service)
+
+
+def _name(element: Element) -> list[str]:
+    return texts(element, "name")[:1]
+
+
+def _any_box(crs: str, format_: str, options: ImageryOptions, frame: LocalFrame) -> CellGrid:
+    """The grid of a service that renders any box at any resolution."""
+    gsd_m, cell_px = options.wanted_gsd_m, options.tile_px or CELL_PX
+    if format_ == HEIGHTS_FORMAT and options.gsd_m is None:
+        gsd_m = TERRAIN_GSD_M
+    res_x, res_y = (gsd_m / scale for scale in ground_scale(crs, frame))
+    return CellGrid(crs, 0.0, 0.0, res_x, res_y, cell_px, cell_px)
 
 
 def _wms_layers(root: Element) -> dict[str, list[Element]]:
