@@ -14,12 +14,15 @@ from blots import CAMERA, GROUND, as_grey, rendered
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import Manifest, SheetInfo, write_map
+from orthonav.core.mapfile.manifest import TerrainInfo
+from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, encode_terrain, terrain_part_names
 from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.build.layer import GreyLayerWriter
 from orthonav.ground.view.server import Pages, Server, load_assets
 
 FRAME = LocalFrame(46.5, 2.5)
 WEST_M, NORTH_M, GSD_M = -180.0, 160.0, 0.5
+HEIGHTS_FROM = WEST_M, NORTH_M, 1.0
 HEIGHT_PX, WIDTH_PX, CHUNK_PX = 620, 700, 256
 AGL_M = 60.0
 COV_EN_M2 = np.array([[9.0, 4.0], [4.0, 16.0]])
@@ -40,9 +43,10 @@ def plane(height, width, level=0):
     return WEST_M + cols * step_m, NORTH_M - rows * step_m
 
 
-def write_small_map(path, *, layer=True):
-    """The ground as a map; its south-east corner shows nothing."""
-    grey = as_grey(GROUND(*plane(HEIGHT_PX, WIDTH_PX)))
+def write_small_map(path, *, layer=True, ground=GROUND, heights=()):
+    """A ground as a map; its south-east corner shows nothing. `heights`: terrain (and surface)
+    every metre (H, W) from the corner of the map."""
+    grey = as_grey(ground(*plane(HEIGHT_PX, WIDTH_PX)))
     valid = np.ones(grey.shape, bool)
     valid[-100:, -150:] = False
     grid = TileGrid(WEST_M, NORTH_M, GSD_M, 100, 20, 27, 31)
@@ -52,10 +56,18 @@ def write_small_map(path, *, layer=True):
         writer = GreyLayerWriter(*grey.shape, chunk_px=CHUNK_PX)
         writer.add(0, 0, np.where(valid, grey, 0).astype(np.uint8), valid)
         info, parts = writer.finish()
+    infos = {}
+    for name, values in zip((TERRAIN, SURFACE), heights, strict=False):
+        limits = float(np.nanmin(values)), float(np.nanmax(values)), 0.05
+        known = int(np.isfinite(values).sum())
+        infos[name] = TerrainInfo(*HEIGHTS_FROM, *values.shape, 1024, *limits, known, name, "msl")
+        data = np.frombuffer(encode_terrain(values, infos[name]), np.uint8)
+        names = terrain_part_names(0, name)
+        parts |= zip(names, (data, np.array([0, len(data)])), strict=True)
     small = cv2.resize(grey, (350, 310), interpolation=cv2.INTER_AREA)
     manifest = Manifest(
         recipe={"method": "gradient"},
-        sheets=(SheetInfo(FRAME, grid, 27 * 31, 0.08, info),),
+        sheets=(SheetInfo(FRAME, grid, 27 * 31, 0.08, info, **infos),),
         imagery=(),
         view={"heading_step_deg": 6.0, "min_valid_share": 0.4, "position_std_m": 7.0},
         confidence=None,

@@ -1,6 +1,7 @@
 """The page as people have it: drawn, reached by keys and by touch, in a real browser."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from axe_playwright_python.sync_playwright import Axe
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
 from browsing import LAPTOP, Visit, painted
 from playwright.sync_api import expect
-from small_run import CHUNK_PX, GSD_M, PLACES_EN_M, WRONG, result, serving
+from small_run import CHUNK_PX, GSD_M, NO_FIX, PLACES_EN_M, WRONG, result, serving
 
 from orthonav.core.flight.fixes import result_to_json, write_results
 from orthonav.ground.view.run import ViewRequest, open_run
@@ -119,6 +120,29 @@ def test_two_runs_enlarged_images_and_coordinates(visit, small, tmp_path):
         expect(page.locator("#ground")).to_contain_text(
             f"{fix['lat_deg']:.7f}, {fix['lon_deg']:.7f}"
         )
+
+
+def test_a_view_as_recorded_beside_the_map_from_its_fix(page):
+    show_wrong(page)
+    page.keyboard.press("c")
+    expect(page.locator("#img-view")).to_have_attribute("src", re.compile("raw.jpg"))
+    expect(page.locator("#img-fix")).to_have_attribute("src", re.compile("map-in-view.png"))
+    expect(page.locator("#figure-fix figcaption")).to_have_text("map seen from the fix")
+    page.settled()
+    view, over, fix = (
+        page.locator(f"#img-{name}").bounding_box() for name in ("view", "over", "fix")
+    )
+    assert over == fix and fix["width"] == pytest.approx(view["width"], abs=1)
+    assert fix["height"] == pytest.approx(fix["width"] * 240 / 320, abs=1)
+    for part in ("#figure-truth", "#put", "#ring"):
+        expect(page.locator(part)).to_be_hidden()
+    page.select_option("#which", "none")
+    page.pictured(NO_FIX)
+    page.select_option("#which", "wrong")
+    expect(page.locator("#img-fix")).to_have_attribute("src", re.compile(f"/{WRONG}/map-in-view"))
+    page.click("#perspective")
+    page.pictured(WRONG)
+    expect(page.locator("#put")).to_be_visible()
 
 
 def test_stepping_by_keys_is_seen_and_announced(page):

@@ -18,10 +18,12 @@ from orthonav.core.geo.camera import (
     axis_on_ground_en_m,
     footprint_en_m,
 )
+from orthonav.core.localize.ground import LevelTerrain
 from orthonav.core.localize.rectify import MAX_REACH, downsampled, rectify
 from orthonav.core.localize.view import check_telemetry
 from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View, ViewResult
 
 MIN_PX, MAX_PX = 256, 1024
@@ -117,21 +119,27 @@ def jpeg(grey: Grey, quality: int = 95) -> bytes:
 
 
 def shrunk(grey: Grey, max_px: int) -> Grey:
-    rows, cols = grey.shape
-    share = min(1.0, max_px / max(rows, cols))
-    if share == 1:
-        return grey
-    size = (max(1, round(share * cols)), max(1, round(share * rows)))
+    size = shrunk_px((grey.shape[1], grey.shape[0]), max_px)
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
+def shrunk_px(size_px: tuple[int, int], max_px: int) -> tuple[int, int]:
+    """Width and height, of which the larger is at most `max_px`."""
+    share = min(1.0, max_px / max(size_px))
+    return max(1, round(share * size_px[0])), max(1, round(share * size_px[1]))
+
+
 class SheetImagery:
-    """The first sheet of a map: its grey layer, or its preview where it has none."""
+    """The first sheet of a map: its grey layer, or its preview where it has none, and its heights.
+
+    `terrain`: level where the map has none; `surface`: of houses and trees above it, if known."""
 
     def __init__(self, opened: MapFile) -> None:
         self.sheet = opened.manifest.sheets[0]
         self.frame, self.grid = self.sheet.frame, self.sheet.grid
         self._layer = GreyLayer.of(opened)
+        self.terrain = TerrainLayer.of(opened) or LevelTerrain()
+        self.surface = TerrainLayer.of(opened, layer=SURFACE)
         self.preview = b""
         drawn = "preview_jpeg" if self._layer is None else "grey/bytes"
         self._drawn_id = str(opened.manifest.parts[f"sheet0/{drawn}"].get("sha256"))[:12]

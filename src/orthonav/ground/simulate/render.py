@@ -12,7 +12,6 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from orthonav.core.errors import FlightError
 from orthonav.core.geo.camera import (
@@ -179,6 +178,8 @@ class Raster:
 
 def rays_enu(camera: Camera, attitude_deg: tuple[float, float, float], finer: int) -> Array:
     """Directions (H, W, 3) east, north, up of `finer` rays along both sides of each pixel."""
+    from scipy.spatial.transform import Rotation  # `orthonav view` has no need of SciPy
+
     shares = (np.arange(finer) + 0.5) / finer
     cols = (np.arange(camera.width_px)[:, None] + shares).reshape(-1)
     rows = (np.arange(camera.height_px)[:, None] + shares).reshape(-1)
@@ -253,13 +254,7 @@ def coloured(
 ) -> NDArray[np.uint8]:
     """The picture (H, W) or (H, W, C) of ground points (h, w, 3), of one or more rays a pixel.
     Where a ray stands for more than a pixel of the imagery, this is averaged."""
-    range_m = np.linalg.norm(ground_m - position_m, axis=-1)
-    drop_m = np.maximum(position_m[2] - ground_m[..., 2], 1e-3)
-    ray_px = camera.width_px / ground_m.shape[1]
-    # A ray stands for range / focal length across and, on level ground, range / cos along.
-    ray_m = range_m * ray_px / camera.fx_px * np.sqrt(range_m / drop_m)
-    level = np.floor(np.log2(np.maximum(ray_m / imagery.pixel_m, 1.0)))
-    level = np.where(np.isfinite(level), np.minimum(level, MAX_HALVED), -1)
+    level = np.minimum(halved_for(ground_m, camera, position_m, imagery.pixel_m), MAX_HALVED)
     values = np.full((*ground_m.shape[:2], *imagery.values.shape[2:]), SKY)
     for number in range(int(level.max(initial=-1)) + 1):
         if number:
@@ -269,3 +264,15 @@ def coloured(
     size = camera.width_px, camera.height_px
     small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
     return np.rint(np.clip(small, 0, 255)).astype(np.uint8)
+
+
+def halved_for(ground_m: Array, camera: Camera, position_m: Array, pixel_m: float) -> Array:
+    """How often (h, w) to halve the resolution of imagery with this pixel before drawing a picture
+    of ground points (h, w, 3); -1 where a ray meets none."""
+    range_m = np.linalg.norm(ground_m - position_m, axis=-1)
+    drop_m = np.maximum(position_m[2] - ground_m[..., 2], 1e-3)
+    ray_px = camera.width_px / ground_m.shape[1]
+    # A ray stands for range / focal length across and, on level ground, range / cos along.
+    ray_m = range_m * ray_px / camera.fx_px * np.sqrt(range_m / drop_m)
+    level = np.floor(np.log2(np.maximum(ray_m / pixel_m, 1.0)))
+    return np.where(np.isfinite(level), level, -1)

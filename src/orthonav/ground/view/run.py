@@ -43,9 +43,11 @@ from orthonav.ground.report.imagery import (
     png,
     rectified,
     shrunk,
+    shrunk_px,
     window_of,
 )
 from orthonav.ground.view.feed import Batch, LineFeed, LogReader, Shot
+from orthonav.ground.view.perspective import map_in_view
 
 Array = NDArray[np.float64]
 LatLon = tuple[float, float]
@@ -187,6 +189,17 @@ class Run:
         window = self._placed(result)[2]
         box = window.box_at(np.asarray(self.sheet.frame.en_from_latlon(*place)))
         return png(*self.sheet.crop(box, (window.size_px, window.size_px)))
+
+    def map_in_view_png(self, index: int) -> bytes:
+        """The map from the fix, in the picture of the camera, as large as `raw_jpeg`."""
+        result = self._result(index)
+        place = _place(result.outcome)
+        if place is None:
+            raise FlightError(f"view {result.frame} has no fix")
+        shot, telemetry, _ = self._placed(result)
+        size_px = shrunk_px((shot.camera.width_px, shot.camera.height_px), RAW_PX)
+        at_en_m = np.asarray(self.sheet.frame.en_from_latlon(*place))
+        return png(*map_in_view(self.sheet, shot.camera.resized(*size_px), telemetry, at_en_m))
 
     def _result(self, index: int) -> ViewResult:
         with self._lock:

@@ -101,6 +101,7 @@ class Pages:
             rf"{view}/view\.png": lambda i, query: png(run.view_png(int(i))),
             rf"{view}/raw\.jpg": lambda i, query: raw(run.raw_jpeg(int(i))),
             rf"{view}/map-(fix|truth)\.png": lambda i, at, query: png(run.map_png(int(i), at)),
+            rf"{view}/map-in-view\.png": lambda i, query: png(run.map_in_view_png(int(i))),
             rf"/tiles/{number}/{number}/{number}": self._tile,
             r"/preview\.jpg": self._preview,
         }

@@ -1,5 +1,5 @@
 // The selected view beside the map at its fix and at its true position, and overlaid on both to
-// compare by eye: faded, or blinking.
+// compare by eye: faded, or blinking; rectified, or as its camera saw it.
 
 import { getJson, mapUrl, rawUrl, viewUrl } from "./api.js";
 import { L, at } from "./map.js";
@@ -21,6 +21,7 @@ export class Compare {
     this.find("on-map").addEventListener("change", () => this.#fade());
     this.find("blink").addEventListener("click", () => this.blink());
     this.find("enlarge").addEventListener("click", () => this.enlarge());
+    this.find("perspective").addEventListener("click", () => this.perspective());
     this.find("copy").addEventListener("click", () => this.#copy());
   }
 
@@ -30,6 +31,13 @@ export class Compare {
     this.find("enlarge").setAttribute("aria-pressed", String(on));
     this.find("main").classList.toggle("enlarged", on);
     this.map.invalidateSize();
+  }
+
+  /** Shows the view as recorded beside the map as seen from the fix, or both rectified. */
+  perspective() {
+    const on = this.find("perspective").getAttribute("aria-pressed") !== "true";
+    this.find("perspective").setAttribute("aria-pressed", String(on));
+    this.show();
   }
 
   /** Copies the coordinates of the fix. */
@@ -106,22 +114,27 @@ export class Compare {
       return;
     }
     const name = c.frame[i];
-    this.#image("img-view", viewUrl(i, generation), `View ${name}, rectified, north up`);
+    const seen = placed && this.find("perspective").getAttribute("aria-pressed") === "true";
+    this.find("compare").classList.toggle("perspective", seen);
+    const [url, how, where, at] = seen ? [rawUrl, "as recorded", "seen from the fix", "in-view"]
+      : [viewUrl, "rectified, north up", "at the fix", "fix"];
+    this.#image("img-view", url(i, generation), `View ${name}, ${how}`, `view, ${how}`);
     this.find("figure-fix").hidden = !placed;
     // Near the fix it would show the same.
-    const apart = taken && !(c.err[i] <= this.store.run.radius_m);
+    const apart = taken && !seen && !(c.err[i] <= this.store.run.radius_m);
     this.find("figure-truth").hidden = !apart;
     if (placed) {
-      this.#image("img-fix", mapUrl(i, "fix", generation), "Map at the fix");
-      this.#image("img-over", viewUrl(i, generation), "");
+      this.#image("img-fix", mapUrl(i, at, generation), `Map ${where}`, `map ${where}`);
+      this.#image("img-over", url(i, generation), "");
     }
     if (apart) this.#image("img-truth", mapUrl(i, "truth", generation), "Map at the true position");
     this.#crosses(i, window);
     this.#layOver(placed ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]], window, viewUrl(i, generation), placed || taken);
   }
 
-  #image(id, url, alt) {
+  #image(id, url, alt, caption) {
     const image = this.find(id);
+    if (caption) image.parentElement.querySelector("figcaption").textContent = caption;
     image.alt = alt;
     image.src = url;
   }

@@ -24,6 +24,7 @@ export function listen(store, actions, root) {
     "[": () => actions.fade(-10),
     "]": () => actions.fade(10),
     o: actions.onMap,
+    c: actions.perspective,
     e: actions.enlarge,
     z: actions.zoom,
     a: actions.whole,

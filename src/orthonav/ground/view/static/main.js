@@ -140,6 +140,7 @@ function steps({ store, map, compare, course }, play) {
     blink: () => compare.blink(),
     fade: (percent) => compare.fadeBy(percent),
     enlarge: () => compare.enlarge(),
+    perspective: () => compare.perspective(),
     onMap: () => compare.toggleOnMap(),
     zoom: () => compare.zoomTo(),
     whole: () => fitRun(map, store),
