@@ -1,6 +1,8 @@
 """The whole check of a small map with real and synthetic trials, and as a command."""
 
 import json
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -125,6 +127,43 @@ def test_a_route_over_both_halves(checked, frame):
     assert west == pytest.approx(-450, abs=1) and cells.north_m == pytest.approx(100, abs=1)
     corners = cells.probability[[0, 0, -1, -1], [0, -1, 0, -1]]
     assert np.isnan(corners).all()  # of the box, outside the round ends of the band
+
+
+def code_of(result):
+    """That of the finding on houses and trees."""
+    codes = {"surface", "no_surface", "houses"} & {each.code for each in result.verdict.reasons}
+    return codes.pop()
+
+
+def test_what_the_map_knows_of_houses_and_trees(checked, opened, monkeypatch):
+    """Blocks of 10 m, 30 m apart, in the west; nothing known in the north."""
+    assert code_of(checked()) == "no_surface" and code_of(checked(relief_m=0.0)) == "surface"
+    assert code_of(checked(agl_m=80.0)) == "houses"
+
+    class Surface:
+        def __init__(self, west_m, south_m):
+            self.west_m, self.south_m = west_m, south_m
+
+        def at_en_m(self, points_en_m):
+            east, north = np.moveaxis(points_en_m, -1, 0)
+            block = (np.mod(east, 30.0) < 15.0) & (np.mod(north, 30.0) < 15.0)
+            known = np.where(block & (east < self.west_m), 10.0, 0.25)
+            return np.where(north < self.south_m, known, np.nan)
+
+    def found(*shape, **changed):
+        layer = SimpleNamespace(of=lambda *_, **__: Surface(*shape))
+        monkeypatch.setattr(check_run, "TerrainLayer", layer)
+        result = checked(**changed)
+        text = next(each.text for each in result.verdict.reasons if each.code == code_of(result))
+        return code_of(result), text
+
+    code, text = found(0.0, 1e9, agl_m=80.0)
+    assert code == "houses"
+    assert 45 < float(re.search(r"at ([\d.]+) % of the places\.", text)[1]) < 60
+    assert found(-1e9, 1e9, agl_m=80.0)[0] == "surface"
+    code, text = found(-1e9, 0.0)
+    assert code == "no_surface"
+    assert 40 < float(re.search(r"does not know them at ([\d.]+) %", text)[1]) < 60
 
 
 def test_trials_end_when_the_answer_holds(checked):
@@ -256,9 +295,13 @@ def test_changed_ground_is_named(run, unwritten, half_blank, frame, tmp_path):
 def test_exit_codes(run, unwritten, half_blank, tmp_path, monkeypatch, word):
     judge = check_run.verdict_of
     monkeypatch.setattr(check_run, "verdict_of", lambda found: Verdict(word, judge(found).reasons))
-    done = run("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
+    more = ("--camera-pitch-deg", "30", "--json", "--out", tmp_path / "report")
+    done = run("check", half_blank.map, *VIEWS, *more)
     assert (done.code, done.err) == (word.exit_code, "")
-    assert json.loads(done.out)["verdict"]["word"] == word.value
+    plain = json.loads(done.out)
+    assert plain["verdict"]["word"] == word.value
+    assert {"no_surface", "oblique"} < {each["code"] for each in plain["verdict"]["reasons"]}
+    assert plain["conditions"]["camera_pitch_deg"] == 30.0
 
 
 def test_the_height_of_a_route(run, unwritten, half_blank, route_path, tmp_path):

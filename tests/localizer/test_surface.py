@@ -119,6 +119,16 @@ def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
     assert away.scale_map.values.min() < -0.15  # what lies above the ground below the camera
 
 
+def test_views_on_level_ground_know_the_surface_of_a_route(town, opened):
+    """Most of the sheet is off the route: neither ground nor houses are known there."""
+    _, ground, above = town
+    grid = opened.manifest.sheets[0].grid
+    from_m = grid.west_m + 0.7 * grid.width_px * grid.gsd_m
+    parts = Heights(ground, from_m=from_m), Heights(above, from_m=from_m)
+    relief = Relief(parts[0], grid, None, None, parts[1])
+    assert relief.levelled().level_errors.fields == (SURFACE_M,)
+
+
 def test_a_surface_counts_where_most_of_it_is_known(town, opened):
     _, ground, above = town
     grid = opened.manifest.sheets[0].grid

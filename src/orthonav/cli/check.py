@@ -75,7 +75,9 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     text = "standard deviation of the prior position, per axis (default 150)"
     prior.add_argument("--prior-std-m", type=float, default=150.0, help=text)
     text = "standard deviation of the height of houses and trees, which causes relief displacement "
-    number("--relief-m", default=3.0, help=f"{text}(default 3)")
+    number("--relief-m", default=3.0, help=f"{text}(default 3; 0: there are none)")
+    text = "how far the camera looks ahead of straight down, 0 to 65 (default 0); trial views look "
+    number("--camera-pitch-deg", default=0.0, help=f"{text}straight down, findings say the rest")
     text = "standard deviation of the error of the reported pitch and roll, which displaces fixes "
     text += "by 1.7 %% of the height a degree (docs/flights.md has that of each source; "
     text += f"default {UNSTATED.aided_deg:g}, as where it is not stated)"
@@ -148,6 +150,7 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         risk=options.risk,
         speed_mps=options.speed_mps,
         relief_m=options.relief_m,
+        camera_pitch_deg=options.camera_pitch_deg,
         effort=options.effort,
         workers=options.workers,
         tilt_std_deg=options.tilt_std_deg,

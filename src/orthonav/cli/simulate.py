@@ -21,7 +21,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_options(where, "--route")
     text = "fly N views at random positions and headings"
     where.add_argument("--random", type=int, metavar="N", help=text)
-    add_options(parser, "--ortho", "--camera", "--dem", "--dem-datum", "--agl-m", "--json")
+    add_options(
+        parser, "--ortho", "--camera", "--dem", "--surface", "--dem-datum", "--agl-m", "--json"
+    )
     add_options(parser, "--seed", default=0)
     parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR", help="to write")
     number = partial(parser.add_argument, type=float)
@@ -57,6 +59,7 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.geo.camera_files import read_camera_file
+    from orthonav.ground.imagery.terrain import open_dem
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.simulate.flight import (
         DEFAULT_CAMERA,
@@ -67,8 +70,9 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.ground.simulate.receiver import receiver_of
 
     dem, given = dem_of(options), vars(options)
-    if dem is not None:
-        dem.require_datum("heights of simulated flights are above the sea")
+    surface = [open_dem(path, options.dem_datum) for path in options.surface]
+    for each in (*surface, *([] if dem is None else [dem])):
+        each.require_datum("heights of simulated flights are above the sea")
     request = SimulateRequest(
         orthos=options.ortho,
         out=options.out,
@@ -84,6 +88,7 @@ def run(options: argparse.Namespace) -> None:
         seed=options.seed,
         turn_radius_m=options.turn_radius_m,
         terrain=dem,
+        surface=surface,
         terrain_posting_m=1.0 if dem is None else dem.gsd_m,
         camera_pitch_deg=options.camera_pitch_deg,
         gnss=receiver_of(options.receiver) if options.receiver else None,

@@ -129,7 +129,7 @@ def open_source(
 def dem_of(options: argparse.Namespace, route: "Route | None" = None) -> "Dem | None":
     """The terrain of `--dem`; at least one waypoint of the route lies in it."""
     if options.dem is None:
-        if options.dem_datum is not None:
+        if options.dem_datum is not None and not getattr(options, "surface", None):
             raise FlightError("--dem-datum needs a terrain model: give --dem too")
         return None
     if getattr(options, "ground_alt_m", None) is not None:

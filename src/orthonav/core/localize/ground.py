@@ -138,6 +138,8 @@ class Relief:
         nodes_px = [np.linspace(0.0, side, LEVELLED_NODES) for side in sides_px]
         found = Relief(LevelTerrain(), self.grid, self.info, self.land)
         ground_m = self.ground_m(np.stack(np.meshgrid(*nodes_px), -1).reshape(-1, 2))
+        if (known := np.isfinite(ground_m[:, 2])).any():  # others lie off the route of the map
+            ground_m = ground_m[known]
         found.level_errors = self.errors(ground_m, self.slopes(ground_m))
         return found
 

@@ -314,6 +314,13 @@ class Surface:
     """Heights of surface models, earlier ones before later ones, in the plane of an area."""
 
     def __init__(self, models: Sequence[Dem], area: Area) -> None:
+        """Raises `ImageryError` for models that show no houses."""
+        for each in models:
+            if each.gsd_m > MAX_SURFACE_M:
+                raise ImageryError(
+                    f"surface model has a height every {each.gsd_m:.3g} m, which shows no houses; "
+                    f"give it as --dem ({MAX_SURFACE_M:g} m at most): {each.path}"
+                )
         self.models, self.area = models, area
         self.gsd_m = min(each.gsd_m for each in models)
         self.name = ", ".join(each.path.name for each in models)[:MAX_NAME]
@@ -408,12 +415,6 @@ def height_layers(
     terrain = None if dem is None else terrain_of_dem(dem, area, grid, needed=needed)
     if not models:
         return HeightLayers(terrain, None)
-    for each in models:
-        if each.gsd_m > MAX_SURFACE_M:
-            raise ImageryError(
-                f"surface model has a height every {each.gsd_m:.3g} m, which shows no houses; give "
-                f"it as --dem ({MAX_SURFACE_M:g} m at most): {each.path}"
-            )
     surface = Surface(models, area)
     if dem is None:
         terrain, ground = _bare_earth(surface, area, grid), surface.envelope

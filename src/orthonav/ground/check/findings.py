@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.records import (
     LEAST_RISK,
+    OBJECT_M,
     Along,
     Conditions,
     Flights,
@@ -131,6 +132,16 @@ MOST_UNCERTAIN = 0.5
 NARROW_PX, WIDE_PRIOR_PX = 140.0, 100.0
 """Views narrower than this (root of their area), searched for more widely than in a prior of this
 standard deviation: a second date has to show that they are found (docs/check.md)."""
+MANY_PLACES = 0.1
+"""Fraction of the places from which houses and trees count."""
+DISPLACED = 0.03
+"""Displacement of houses and trees, a fraction of a view, from which it is named: a view is
+registered at about as many pixels from any height. At 4 % (from 120 m, 65 deg wide) a surface made
+positions six times as accurate (docs/benchmarks.md); 3 % is 155 m, and 470 m 30 deg ahead."""
+NARROW_M, OBLIQUE_DEG = 110.0, 15.0
+"""Views narrower than this (root of their area) were confident less often over towns than GO asks
+for: of 132, 88 and 55 m as `TOWNS` says, 0 and 45 deg ahead (docs/benchmarks.md)."""
+TOWNS = "92, 50 and 42 %", "67, 42 and 17 %"
 MIN_WRONG = 2
 _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
 
@@ -145,6 +156,8 @@ class Findings(NamedTuple):
     `after_fix_m`: protection level right after a fix, over the cells or points of the route.
     `view_px`: root of the area of a view in pixels of the map; `prior_px`: standard deviation of
     the prior position, infinite without one; `second_date`: tried on one.
+    `objects`: fraction of the places whose view shows many houses and trees, as the map knows;
+    `unknown`: where the map does not know, 1 without a surface.
     """
 
     mean: Range
@@ -159,6 +172,8 @@ class Findings(NamedTuple):
     view_px: float
     prior_px: float
     second_date: bool
+    objects: float = 0.0
+    unknown: float = 0.0
 
 
 def verdict_of(found: Findings) -> Verdict:
@@ -176,6 +191,7 @@ def verdict_of(found: Findings) -> Verdict:
         text = f"At least {percent_text(found.changed)} of the ground {where} changed since the "
         text += "map was made: fixes are less likely there; build the map from newer imagery."
         reasons += [Reason("changed_ground", text, CHANGED.word(_exact(found.changed)))]
+    reasons += [_objects(found), *_oblique(found.conditions)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
 
@@ -200,6 +216,38 @@ def interval_text(figure: Range, as_text: Callable[[float], str]) -> str:
 def range_text(figure: Range, as_text: Callable[[float], str]) -> str:
     """Median and interval, as `62 % (41 % to 78 %)`."""
     return f"{as_text(figure.median)} {interval_text(figure, as_text)}"
+
+
+def _objects(found: Findings) -> Reason:
+    """What the map knows of houses and trees, and what that means for these views."""
+    conditions, unknown = found.conditions, found.unknown
+    code, text = "surface", "The map has no surface here: it does not know houses and trees."
+    if unknown < 1:
+        text = "The map knows houses and trees (its surface), which cover a tenth of a view or "
+        text += f"more at {percent_text(found.objects)} of the places"
+        text += f"; it does not know them at {percent_text(unknown)}." if unknown > 0 else "."
+    if conditions.relief_m == 0:  # said to be none
+        unknown = 0.0
+    share = conditions.displaced_share
+    if unknown > MANY_PLACES and share > DISPLACED:
+        code = "no_surface"
+        text += f" One of {OBJECT_M:g} m is displaced by up to {percent_text(share)} of a view, "
+        text += "and positions among them are less accurate: build the map with --surface "
+        text += "(docs/terrain.md)."
+    if conditions.side_m < NARROW_M and found.objects + unknown > MANY_PLACES:
+        code, oblique = "houses", conditions.camera_pitch_deg >= OBLIQUE_DEG
+        text += f" Views are narrower than {NARROW_M:g} m: over generated towns, with a surface, "
+        text += f"{TOWNS[oblique]} of views 132, 88 and 55 m wide were confident"
+        text += ", 45 deg ahead" * oblique + " (docs/benchmarks.md); among houses the prediction "
+        text += "may be too high."
+    return Reason(code, text, Word.MARGINAL if code == "houses" else Word.GO)
+
+
+def _oblique(conditions: Conditions) -> list[Reason]:
+    ahead_deg = conditions.camera_pitch_deg
+    text = f"Trial views look straight down, this camera looks {ahead_deg:g} deg ahead: how often "
+    text += "its views are localized is not predicted; try simulate --camera-pitch-deg."
+    return [Reason("oblique", text, Word.MARGINAL)] if ahead_deg >= OBLIQUE_DEG else []
 
 
 def _trust(found: Findings) -> list[Reason]:

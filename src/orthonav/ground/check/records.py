@@ -29,6 +29,8 @@ from orthonav.ground.report import metres_text
 Array = NDArray[np.float64]
 LEAST_LIMIT_M, LIMIT_SHARE = 35.0, 0.025
 """The alert limit that is not given: at least so many metres, and this fraction of the height."""
+OBJECT_M, FARTHEST_OFF = 8.0, math.radians(80.0)
+"""Height of a house or tree, and the farthest off nadir that is considered."""
 LEAST_RISK = round(Model.lost / 10, 6)
 """At a lower one too few fixes have a protection level: of the belief in other places that returns
 with every view, eight of ten views leave at most a tenth (docs/check.md)."""
@@ -80,7 +82,9 @@ class CheckRequest:
     `speed_mps`: ground speed; 20 m/s is the cruise of a small fixed-wing aircraft.
     `drift`: error of dead reckoning per metre flown, 0 to 1; with an airspeed sensor and a known
     wind usually 0.02 to 0.05.
-    `relief_m`: standard deviation of the height of houses and trees; 3 m in open country.
+    `relief_m`: standard deviation of the height of houses and trees; 3 m in open country, 0: none.
+    `camera_pitch_deg`: how far the camera looks ahead of straight down, 0 to 65; trial views look
+    straight down, and findings say what that leaves out.
     `effort`: factor on the number of trials, 0.05 to 50.
     `workers`: processes; None: one per core.
     `alert_limit_m`: largest error that the mission allows; None: 2.5 % of the height, at least 35.
@@ -105,6 +109,7 @@ class CheckRequest:
     speed_mps: float = 20.0
     drift: float = 0.03
     relief_m: float = 3.0
+    camera_pitch_deg: float = 0.0
     effort: float = 1.0
     workers: int | None = None
     seed: int = 1
@@ -130,6 +135,7 @@ class CheckRequest:
             "drift": (self.drift, 0.0, 1.0, " (metres per metre flown: 0.03 is 3 %)"),
             "tilt_std_deg": (self.tilt_std_deg, 0.0, 20.0, " deg"),
             "relief_m": (self.relief_m, 0.0, 1000.0, " m"),
+            "camera_pitch_deg": (self.camera_pitch_deg, 0.0, 65.0, " deg"),
             "effort": (self.effort, 0.05, 50.0, ""),
             "workers": (self.workers, 1, 1000, " processes"),
             "seed": (self.seed, 0, 2**63, ""),
@@ -162,11 +168,16 @@ class Conditions:
     risk: float = DEFAULT_RISK
     tilt_std_deg: float = 0.0
     other_sensor: bool = False
+    relief_m: float = 3.0
+    camera_pitch_deg: float = 0.0
 
     @classmethod
     def of(cls, request: CheckRequest, agl_m: float, radius_m: float) -> "Conditions":
         camera = request.camera
-        names = ("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift", "risk")
+        names = (
+            *("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift", "risk"),
+            *("tilt_std_deg", "other_sensor", "relief_m", "camera_pitch_deg"),
+        )
         given_m = request.alert_limit_m
         return cls(
             width_m=agl_m * camera.width_px / camera.fx_px,
@@ -175,13 +186,21 @@ class Conditions:
             radius_m=radius_m,
             alert_limit_m=given_m or max(LEAST_LIMIT_M, round(LIMIT_SHARE * agl_m)),
             limit_given=given_m is not None,
-            **{name: getattr(request, name) for name in (*names, "tilt_std_deg", "other_sensor")},
+            **{name: getattr(request, name) for name in names},
         )
 
     @property
     def side_m(self) -> float:
         """Side of the square with the area of the footprint."""
         return math.sqrt(self.width_m * self.height_m)
+
+    @property
+    def displaced_share(self) -> float:
+        """Largest displacement of the image of a house or tree, a fraction of `side_m`: its height
+        times the tangent of the angle off nadir, at the far rim of a view."""
+        rim = math.atan(max(self.width_m, self.height_m) / 2 / self.agl_m)
+        off = min(math.radians(self.camera_pitch_deg) + rim, FARTHEST_OFF)
+        return OBJECT_M * math.tan(off) / self.side_m
 
     @property
     def states_level(self) -> bool:

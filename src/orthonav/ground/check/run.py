@@ -17,8 +17,10 @@ from orthonav.core.errors import AreaError, CameraError, MapFileError
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize.ground import MIN_KNOWN
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import MAP_STD_M
 from orthonav.core.register.window import GreyPyramid
 from orthonav.ground.changes.record import CellGrid, ChangedGround
@@ -69,6 +71,8 @@ PRECISE = 0.25
 to scene, and the last batch did not change the verdict."""
 MASK_PX = 2048
 """The coverage of the map is read at the finest level no larger than this."""
+LOWEST_OBJECT_M, MANY_OBJECTS = 2.5, 0.1
+"""A house or tree is higher; a view shows many where they are at least this fraction of it."""
 _REDRAWS = 6
 _MAX_POINTS = 500_000
 
@@ -104,6 +108,8 @@ class _Check:
         registration = registration_of(opened)
         self.sheet = registration.sheet
         self.coverage = MapCoverage.of(registration.pyramid, self.sheet.grid)
+        surface = TerrainLayer.of(opened, layer=SURFACE)
+        self.above_m = None if surface is None else self.coverage.of_each(surface.at_en_m)
         self.calibrated = registration.confidence is not None
         agl_m = request.agl_m or self.sheet.grid.tile_m / min(request.camera.extent)
         self.conditions = Conditions.of(request, agl_m, registration.radius_m)
@@ -218,6 +224,7 @@ class _Check:
             outside = float(np.mean(~self.coverage.covers(along.points_en_m)))
         chances = cells.probability[known] if known.any() else np.zeros(1)
         mean = Range.of(shifted(chances, shifts).mean(axis=1))
+        objects, unknown = self._objects(cells.grid.centres_en_m[known.ravel()])
         findings = Findings(
             mean=flights.probability if flights else mean,
             flights=flights,
@@ -231,6 +238,8 @@ class _Check:
             view_px=conditions.side_m / self.sheet.grid.gsd_m,
             prior_px=math.inf if prior_m is None else prior_m / self.sheet.grid.gsd_m,
             second_date=bool(other),
+            objects=objects,
+            unknown=unknown,
         )
         return CheckResult(
             about=replace(request.about, map_sha256=self.opened.manifest.sha256),
@@ -315,6 +324,19 @@ class _Check:
         share = lasting.seen_share(points, side_m) / np.maximum(whole, 1e-6)
         return np.clip(1 - share, 0.0, 1.0) * (whole > 0)
 
+    def _objects(self, places: Array) -> tuple[float, float]:
+        """Fractions of places (N, 2) whose view shows many houses and trees, and for which the map
+        does not know."""
+        if self.above_m is None or not len(places):
+            return 0.0, 1.0
+        side_m, pixels = self.conditions.side_m, self.coverage.pixels
+        shown, known = (
+            MapCoverage(pixels, each).seen_share(places, side_m)
+            for each in (self.above_m > LOWEST_OBJECT_M, np.isfinite(self.above_m))
+        )
+        unknown = known < MIN_KNOWN * self.coverage.seen_share(places, side_m)
+        return float(((shown >= MANY_OBJECTS) & ~unknown).mean()), float(unknown.mean())
+
     def _along(self, predictor: Predictor) -> Along | None:
         if self.area is None:
             return None
@@ -345,6 +367,11 @@ class MapCoverage:
             return self
         changed = changes.covers(self.pixels.centres_en_m, frame).reshape(self.valid.shape)
         return replace(self, valid=self.valid & ~changed)
+
+    def of_each(self, at_en_m: Callable[[Array], Array]) -> Array:
+        """Values (rows, cols) at the pixels, a row at a time."""
+        rows = self.pixels.centres_en_m.reshape(*self.valid.shape, 2)
+        return np.stack([at_en_m(row) for row in rows])
 
     def covers(self, points_en_m: Array) -> NDArray[np.bool_]:
         numbers = self.pixels.numbers(points_en_m)

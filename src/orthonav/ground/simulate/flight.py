@@ -20,13 +20,16 @@ from orthonav.core.geo.camera import Camera, footprint_en_m
 from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import Prior, Telemetry
+from orthonav.ground.build.layer import Surface
 from orthonav.ground.imagery.mosaic import Mosaic
+from orthonav.ground.imagery.terrain import Dem
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import DEFAULT_CAMERA as DEFAULT_CAMERA
 from orthonav.ground.simulate.ground import (
     Coverage,
     GroundImagery,
+    bare_earth,
     ground_below_m,
     near_ground_en_m,
     reported_heights,
@@ -126,8 +129,9 @@ class SimulateRequest:
     `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot. `terrain`:
     heights of the ground or surface above mean sea level. Views are then true perspectives of it,
     and the telemetry reports heights above sea level and, on a route, above the first view, and no
-    measured one above ground. `camera_pitch_deg`: angle by which the camera looks ahead of straight
-    down, 0..65; reported.
+    measured one above ground. `surface`: models with houses and trees, which views then show;
+    heights above ground count from `terrain`, or else from their lower envelope.
+    `camera_pitch_deg`: angle by which the camera looks ahead of straight down, 0..65; reported.
     """
 
     orthos: Sequence[Path]  # orthophotos to fly over; earlier ones take precedence
@@ -144,7 +148,8 @@ class SimulateRequest:
     turn_radius_m: float = 0.0
     clouds: Callable[[int, int], Clouds] | None = None  # by the number of views and the seed
     terrain: TerrainHeights | None = None
-    terrain_posting_m: float = 5.0  # resolution of the terrain
+    terrain_posting_m: float = 5.0  # resolution of the terrain, if there is no surface
+    surface: Sequence[Dem] = ()  # earlier ones take precedence; above sea, as the terrain
     camera_pitch_deg: float = 0.0
     gnss: Good | None = None  # receiver whose solutions are written to `gnss.csv`; only on a route
 
@@ -156,7 +161,8 @@ class SimulateRequest:
     @property
     def in_perspective(self) -> bool:
         """Whether views are rendered ray by ray; else as level ground seen without the horizon."""
-        return self.terrain is not None or self.camera_pitch_deg > 0
+        has_heights = self.terrain is not None or bool(self.surface)
+        return has_heights or self.camera_pitch_deg > 0
 
 
 @dataclass(frozen=True)
@@ -195,6 +201,10 @@ def simulate_flight(
     mosaic = Mosaic.open(request.orthos)
     outline = mosaic.outline_latlon_deg
     area = Area.from_outline(outline[:, 0], outline[:, 1])
+    model = Surface(request.surface, area) if request.surface else None
+    if model is not None:
+        terrain = bare_earth(model, request.terrain)
+        request = replace(request, terrain=terrain, terrain_posting_m=model.gsd_m)
     agl_m = request.agl_m or 256 * mosaic.gsd_m / min(request.camera.extent)
     west, south, east, north = area.extent_en_m
     gsd_m = max(mosaic.gsd_m, request.camera.gsd_m(agl_m) * 0.75)
@@ -214,7 +224,9 @@ def simulate_flight(
         surface = None
         if request.in_perspective:
             posting_m = request.terrain_posting_m
-            surface = surface_of(request.terrain, area.frame, area.extent_en_m, posting_m)
+            surface = surface_of(request.terrain, area.frame, area.extent_en_m, posting_m, model)
+            if model is not None:
+                _require_above(surface, poses)
         clouds = request.clouds(len(poses), request.seed) if request.clouds else None
         note = f"simulated over {mosaic.sources[0].path.name}, seed {request.seed}"
         writer = FlightWriter(folder, request.camera, note)
@@ -262,6 +274,18 @@ def _check(request: SimulateRequest) -> None:
     given = [name for name, value in on_a_route.items() if value]
     if request.route is None and given:
         raise FlightError(f"{', '.join(given)}: only along a route, not at random positions")
+
+
+def _require_above(surface: Raster, poses: Sequence[_Pose]) -> None:
+    """Raise `FlightError` for a camera in a house or tree."""
+    places = np.array([pose.position_en_m for pose in poses])
+    tops_m = surface.at(*places.T)
+    for number, (pose, top_m) in enumerate(zip(poses, tops_m.tolist(), strict=True), start=1):
+        if pose.amsl_m is not None and pose.amsl_m < top_m + 1:
+            raise FlightError(
+                f"view {number} is {pose.agl_m:.0f} m above ground, in a house or tree; fly higher "
+                "(--agl-m)"
+            )
 
 
 def _sees_ground(coverage: Coverage, request: SimulateRequest, pose: _Pose) -> bool:

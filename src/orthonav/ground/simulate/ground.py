@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
 from orthonav.core.errors import AreaError
@@ -13,7 +13,9 @@ from orthonav.core.geo.camera import Camera, ground_en_m
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.records import Telemetry
+from orthonav.ground.build.layer import POSTING_M, Surface
 from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
+from orthonav.ground.imagery.terrain import Dem
 from orthonav.ground.planning.area import Area
 from orthonav.ground.simulate.render import Raster, coloured, met, rays_enu
 
@@ -117,6 +119,31 @@ def reflected(first: int, count: int, sides: Array) -> NDArray[np.int64]:
     return np.asarray(low + np.minimum(folded, 2 * (high - low) - 1 - folded))
 
 
+def bare_earth(surface: Surface, terrain: TerrainHeights | None) -> TerrainHeights:
+    """Heights of the ground among houses and trees: of a terrain, or else the lower envelope of the
+    surface, as `build` takes them. Raises `ImageryError` where terrain and surface disagree."""
+    if terrain is not None:
+        if isinstance(terrain, Dem):
+            surface.above_m(terrain)
+        return terrain
+    frame, (west, south, east, north) = surface.area.frame, surface.area.extent_en_m
+    posting_m = max(POSTING_M, max(east - west, north - south) / MAX_NODES)
+    rows, cols = (math.ceil(side / posting_m) for side in (north - south, east - west))
+    parts = [
+        surface.envelope(
+            west, north - start * posting_m, posting_m, min(READ_ROWS, rows - start), cols
+        )
+        for start in range(0, rows, READ_ROWS)
+    ]
+    raster = Raster(np.concatenate(parts), west, north, posting_m)
+
+    def at(lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
+        points = frame.en_from_latlon(lat_deg, lon_deg)
+        return raster.at(points[..., 0], points[..., 1])
+
+    return at
+
+
 def ground_below_m(terrain: TerrainHeights, frame: LocalFrame, places_en_m: Array) -> Array:
     """Heights of the ground (N,) above mean sea level below places (N, 2) of a plane."""
     lat, lon = frame.latlon_from_en(places_en_m)
@@ -150,9 +177,10 @@ def surface_of(
     frame: LocalFrame,
     extent_en_m: tuple[float, float, float, float],
     posting_m: float,
+    model: Surface | None = None,
 ) -> Raster:
-    """Heights over a plane, west, south, east, north; holes have the height of their border. Level
-    ground at 0 without `terrain`."""
+    """Heights over a plane, west, south, east, north: of a surface `model` where it has some, else
+    of `terrain`; holes have the height of their border. Level ground at 0 without `terrain`."""
     west, south, east, north = extent_en_m
     across = max(east - west, north - south)
     if terrain is None:
@@ -160,14 +188,21 @@ def surface_of(
     posting_m = max(posting_m, across / MAX_NODES)
     x = west + (np.arange(math.ceil((east - west) / posting_m)) + 0.5) * posting_m
     y = north - (np.arange(math.ceil((north - south) / posting_m)) + 0.5) * posting_m
-    rows = []
+    rows, reached = [], False
     for start in range(0, len(y), READ_ROWS):
         points = np.stack(np.meshgrid(x, y[start : start + READ_ROWS]), axis=-1)
-        rows.append(terrain(*frame.latlon_from_en(points)))
+        found = terrain(*frame.latlon_from_en(points))
+        if model is not None:
+            corner = west, north - start * posting_m
+            seen = model.sampled(*corner, posting_m, *found.shape)
+            reached |= bool(np.isfinite(seen).any())
+            found = np.where(np.isfinite(seen), seen, found)
+        rows.append(found)
     heights = np.concatenate(rows)
     unknown = ~np.isfinite(heights)
-    if unknown.all():
-        raise AreaError("the terrain does not reach to the imagery that is flown over")
+    if unknown.all() or (model is not None and not reached):
+        what = "terrain" if model is None else "surface"
+        raise AreaError(f"the {what} does not reach to the imagery that is flown over")
     nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
     return Raster(heights[tuple(nearest)].astype(np.float32), west, north, posting_m)
 
