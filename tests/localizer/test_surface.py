@@ -6,10 +6,14 @@ from blots import AGL_M, CAMERA, GROUND, Heights, as_grey, error_m, known_map
 from lab.terrain import seen_view
 
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.ground import MIN_KNOWN, Relief, _smoothed
+from orthonav.core.localize.camera import approached
+from orthonav.core.localize.ground import MIN_KNOWN, Relief, ViewOverGround, _smoothed
+from orthonav.core.localize.rectify import hidden
 from orthonav.core.localize.systematic import SURFACE_M
 from orthonav.core.mapfile import open_map
+from orthonav.core.mapfile.manifest import Lean
 from orthonav.core.records import Telemetry, View
+from orthonav.ground.build.lean import as_shown
 from orthonav.ground.simulate.render import Raster
 
 SIDE_M, FINEST_M, BASE_M = 700.0, 0.5, 100.0
@@ -38,10 +42,10 @@ def town():
     return raster(grey), raster(BASE_M + 0.02 * east), raster(above)
 
 
-def on(opened, ground, surface):
+def on(opened, ground, surface, lean=None):
     localizer = Localizer(opened)
     registration = localizer.registration
-    registration.relief = Relief(Heights(ground), localizer.grid, None, None, surface)
+    registration.relief = Relief(Heights(ground), localizer.grid, None, None, surface, lean)
     return localizer
 
 
@@ -64,6 +68,64 @@ def test_the_camera_is_found_among_houses_to_decimetres(opened, town, view):
     assert error < 0.5 * error_m(bare, unknown, PLACE)
     assert np.trace(known.cov_en_m2) < 0.5 * np.trace(unknown.cov_en_m2)
     assert error**2 < 9.0 * np.trace(known.cov_en_m2)
+
+
+def test_the_camera_is_approached_from_metres_and_degrees(opened, town, view):
+    """Where only the finer level shows it."""
+    _, ground, above = town
+    registration = on(opened, ground, Heights(above)).registration
+    prepared = registration.prepared(view, True)
+    seen = ViewOverGround(registration.relief, prepared)
+    below = float(ground.at(PLACE[:1], PLACE[1:])[0])
+    off = np.array([PLACE[0] + 2.0, PLACE[1] - 1.5, np.radians(ATTITUDE[0] + 1.0), np.log(0.98)])
+    pose = registration.pose_of(prepared, off)
+    found = approached(seen, registration.reference, pose)
+    start = seen.orientation(pose)
+    truth = np.array([*PLACE, below + AGL_M / 2])
+    assert np.linalg.norm(start.position_m - truth) > 2.0
+    assert np.linalg.norm(found.position_m - truth) < 0.7
+    assert np.abs(found.attitude_deg - ATTITUDE).max() < 0.4
+
+
+@pytest.mark.parametrize("east, north", [(0.3, -0.2), (-0.25, 0.0)])
+def test_houses_that_lean_on_the_map_are_seen_where_they_stand(opened, town, view, east, north):
+    _, ground, above = town
+    lean, side = Lean(east, north, 0.0), len(above.values)
+
+    def high(west_m, north_m, posting_m, rows, cols):
+        at = np.meshgrid(np.arange(cols) + 0.5, np.arange(rows) + 0.5)
+        return above.at(west_m + at[0] * posting_m, north_m - at[1] * posting_m)
+
+    shown = raster(as_shown(high, lean)(-SIDE_M / 2, SIDE_M / 2, FINEST_M, side, side))
+    registration = on(opened, ground, Heights(shown), lean).registration
+    prepared = registration.prepared(view, True)
+    seen = ViewOverGround(registration.relief, prepared)
+    pose = registration.pose_of(prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
+    nodes, on_map = seen._nodes_m(pose, 0, (120, 160), smooth=False)
+    level_m = registration.relief.terrain.at_en_m(on_map[..., :2])
+    high_m = nodes[..., 2] - level_m
+    off_m = on_map[..., :2] - nodes[..., :2] - high_m[..., None] * [east, north]
+    assert np.nanmax(np.abs(off_m)) < 1e-6 and np.nanmax(high_m) > 5.0
+
+
+def test_a_leaning_house_hides_the_ground_behind_it():
+    """As an upright one: on the map, with its camera, everything is sheared."""
+    at, lean = np.arange(80.0), Lean(0.5, -0.25, 0.0)
+    east, north = np.meshgrid(at, -at)
+    high = np.where((abs(east - 40) < 8) & (abs(north + 40) < 8), 8.0, 0.0)
+
+    def above(west_m, north_m, posting_m, rows, cols):
+        rim = (rows - 80) // 2
+        return np.pad(high, rim, constant_values=np.nan) if rim else high
+
+    camera = np.array([10.0, -30.0, 25.0])
+    upright = hidden(np.dstack([east, north, high]), camera)
+    shown = as_shown(above, lean)(0.0, 0.0, 1.0, 80, 80)
+    sheared = camera + camera[2] * np.array([lean.east, lean.north, 0.0])
+    leaning = hidden(np.dstack([east, north, shown]), sheared)
+    ground = (high == 0) & (shown == 0)
+    assert upright[ground].sum() > 100
+    assert (upright != leaning)[ground].mean() < 0.02
 
 
 def test_a_hole_hides_no_more_than_itself(opened, town, view):

@@ -333,7 +333,7 @@ class ViewOverGround:
             en_from_window = self._en_from_window(pose, level, middle)
             made = rectified_level(picture, orientation, en_from_window, shape)
         if made is None:
-            smooth = smooth or level >= self.view.levels.judged
+            smooth = smooth or level > final
             ground, shown = self._nodes_m(pose, level, shape, smooth=smooth)
             sheared = None
             if shown is not None:  # straight lines of sight stay straight

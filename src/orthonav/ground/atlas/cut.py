@@ -624,7 +624,7 @@ def _learnt(
     terrain, surface = heights.infos
     sheet = SheetInfo(
         *(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, _relief(members), surface),
-        heights.lean,
+        lean=heights.lean,
     )
     manifest = pooled_manifest(members, _shares(area, centres, members), sheet)
     return manifest, {

@@ -284,7 +284,8 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     info = SheetInfo(
         *(sheet.area.frame, grid, len(tiles_rc), area_km2),
-        *(grey, terrain, request.relief, surface, inputs.heights.lean),
+        *(grey, terrain, request.relief, surface),
+        lean=inputs.heights.lean,
     )
     manifest = _manifest(inputs, info, embedder, calibration)
     if request.registration:

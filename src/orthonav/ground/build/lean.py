@@ -19,10 +19,11 @@ TRUE_ORTHO = Lean(0.0, 0.0, 0.0)
 MOST, STEP = 0.5, 0.05
 """Largest lean per axis that is looked for, and the steps, whose half is the least error."""
 POSTING_M, WINDOW_PX, WINDOWS = 0.5, 600, 3  # where it is looked for; along both sides of the area
+HIGHEST_M = 100.0
 EDGE_M, LEAST_EDGES = 2.0, 2000  # least height of an edge, and number of pixels on edges
-VISIBLE, VISIBLE_OVER_UPRIGHT = 1.6, 1.15
-"""Least score over the median of all leans, and over that of upright houses. Of generated towns
-that lean by 0.15 to 0.3 it is 2.0 to 2.6 and 1.2 to 2; in a real wooded valley 1.2 to 1.4."""
+VISIBLE, OVER_UPRIGHT = 1.3, 1.1
+"""Least score over the median of all leans, and over that of upright houses. By generated towns and
+a real wooded valley: 1.4 to 1.9, and 1.15 to 1.4 where they lean by 0.15 or more."""
 Array = NDArray[np.float64]
 HeightsAbove = Callable[[float, float, float, int, int], Array]
 """Above the terrain at rows and columns of samples, NaN where unknown: west and north of their
@@ -32,23 +33,20 @@ corner, posting, rows, columns."""
 def visible_lean(imagery: Mosaic, above: HeightsAbove, area: Area) -> Lean | None:
     """The lean at which edges of the picture fit those of houses best; None where none stands out.
 
-    Shadows end along displaced edges too, but with the dark on the same side everywhere: such a sum
-    is taken off."""
+    Shadows end along displaced edges too, but on two sides of a house only."""
     leans = np.arange(-MOST, MOST + STEP / 2, STEP)
-    total, shape = np.zeros((2, len(leans), len(leans))), (len(leans), len(leans))
-    edges = 0
+    total, edges = np.zeros((len(leans), len(leans))), 0
     for grey, high in _windows(imagery, above, area):
-        found = _fits(grey, high, leans)
-        if found is not None:
-            strength, signed, count = found
-            total += np.stack([strength, signed])
-            edges += count
+        strength, count = _fits(grey, high, leans)
+        total += strength
+        edges += count
     if edges < LEAST_EDGES:
         return None
-    scores = cv2.blur((total[0] - np.abs(total[1])) / edges, (3, 3))
-    row, col = np.unravel_index(int(scores.argmax()), shape)
-    upright, best = scores[len(leans) // 2, len(leans) // 2], scores[row, col]
-    if best < max(VISIBLE * float(np.median(scores)), VISIBLE_OVER_UPRIGHT * upright):
+    scores = cv2.blur(total / edges, (3, 3))
+    row, col = divmod(int(scores.argmax()), len(leans))
+    if scores[row, col] < OVER_UPRIGHT * scores[len(leans) // 2, len(leans) // 2]:
+        row = col = len(leans) // 2
+    if scores[row, col] < VISIBLE * float(np.median(scores)):
         return None
     return Lean(round(float(leans[col]), 2), round(float(leans[row]), 2), STEP)
 
@@ -81,28 +79,24 @@ def _windows(
         yield grey, high.astype(np.float32)
 
 
-def _fits(
-    grey: NDArray[np.float32], high: NDArray[np.float32], leans: Array
-) -> tuple[Array, Array, int] | None:
+def _fits(grey: NDArray[np.float32], high: NDArray[np.float32], leans: Array) -> tuple[Array, int]:
     """Sums (leans, leans), north by east, of the picture's gradients across edges of heights, each
-    displaced: of their sizes, and signed; and the number of edge pixels."""
+    displaced, over those around; and the number of edge pixels."""
     right, up = (np.nan_to_num(each) for each in _gradients(grey))
     size = np.hypot(right, up)
     usual = cv2.blur(size, (31, 31)) + 0.2 * float(size.mean()) + 1e-6
     low = cv2.erode(np.nan_to_num(high), np.ones((3, 3), np.uint8))
     rows, cols = np.nonzero(high - low > EDGE_M)  # the upper side of edges
-    if not len(rows):
-        return None
     across_right, across_up = (np.nan_to_num(each)[rows, cols] for each in _gradients(high))
     steep = np.maximum(np.hypot(across_right, across_up), 1e-6)
     moved_px = high[rows, cols] / POSTING_M
-    strength, signed = np.zeros((2, len(leans), len(leans)))
+    strength = np.zeros((len(leans), len(leans)))
     for (row, north), (col, east) in product(enumerate(leans), enumerate(leans)):
         y = np.clip(np.rint(rows - north * moved_px), 0, len(grey) - 1).astype(np.intp)
         x = np.clip(np.rint(cols + east * moved_px), 0, grey.shape[1] - 1).astype(np.intp)
         across = (across_right * right[y, x] + across_up * up[y, x]) / (steep * usual[y, x])
-        strength[row, col], signed[row, col] = np.abs(across).sum(), across.sum()
-    return strength, signed, len(rows)
+        strength[row, col] = np.abs(across).sum()
+    return strength, len(rows)
 
 
 def _gradients(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -113,20 +107,20 @@ def _gradients(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArra
     )
 
 
-def as_shown(above: HeightsAbove, lean: Lean, highest_m: float = 100.0) -> HeightsAbove:
+def as_shown(above: HeightsAbove, lean: Lean) -> HeightsAbove:
     """Heights where a picture with this lean shows them: the higher of two at one place; NaN for
-    walls. Displacement of heights above `highest_m` is that of this height."""
+    walls. Heights above `HIGHEST_M` are displaced as these."""
     if not (lean.east or lean.north):
         return above
 
     def shown(west_m: float, north_m: float, posting_m: float, rows: int, cols: int) -> Array:
-        rim = math.ceil(max(abs(lean.east), abs(lean.north)) * highest_m / posting_m)
+        rim = math.ceil(max(abs(lean.east), abs(lean.north)) * HIGHEST_M / posting_m)
         corner = west_m - rim * posting_m, north_m + rim * posting_m
         high = above(*corner, posting_m, rows + 2 * rim, cols + 2 * rim)
-        moved = np.clip(np.nan_to_num(high), 0.0, highest_m) / posting_m
-        row, col = np.indices(high.shape)
-        row = np.rint(row - lean.north * moved).astype(np.intp) - rim
-        col = np.rint(col + lean.east * moved).astype(np.intp) - rim
+        moved = np.clip(np.nan_to_num(high), 0.0, HIGHEST_M) / posting_m
+        down, right = np.indices(high.shape)
+        row = np.rint(down - lean.north * moved).astype(np.intp) - rim
+        col = np.rint(right + lean.east * moved).astype(np.intp) - rim
         inside = np.isfinite(high) & (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
         made = np.full((rows, cols), -np.inf)
         np.maximum.at(made, (row[inside], col[inside]), high[inside])

@@ -38,9 +38,13 @@ def map_in_view(
     below_m = float(sheet.terrain.at_en_m(place_en_m))
     above_m = telemetry.agl_m + (below_m if np.isfinite(below_m) else float(around.mean()))
     attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg
+    lean = sheet.sheet.lean
+    # Sheared as houses lean on the map, straight rays stay straight.
+    shear = np.zeros(2) if lean is None else np.array([lean.east, lean.north])
+    place_en_m = place_en_m + shear * telemetry.agl_m
     pose = Orientation(np.array([*place_en_m, above_m]), np.array(attitude))
     lowest_m = float(around.min())
-    rays = _rays_enu(camera, pose, _pixels(camera, RAY_PX))
+    rays = _rays_enu(camera, pose, _pixels(camera, RAY_PX), shear)
     down = rays[rays[..., 2] < -1e-6]
     ends = down[:, :2] * ((lowest_m - above_m) / down[:, 2:])
     ends = place_en_m + np.clip(np.vstack([ends, np.zeros((1, 2))]), -reach_m, reach_m)
@@ -48,7 +52,7 @@ def map_in_view(
     known = np.isfinite(heights.values)
     # Unknown ground hides nothing.
     solid = replace(heights, values=np.where(known, heights.values, lowest_m))
-    ground = _met(solid, camera, pose, rays)
+    ground = _met(solid, camera, pose, rays, shear)
     ground[np.linalg.norm(ground - pose.position_m, axis=-1) > reach_m] = np.nan
     share = replace(heights, values=known.astype(np.float32))
     ground[share.at(ground[..., 0], ground[..., 1]) < 0.5] = np.nan
@@ -62,13 +66,15 @@ def _pixels(camera: Camera, every: int = 1) -> Array:
     return np.asarray(np.stack(np.meshgrid(*middles), axis=-1), np.float64)
 
 
-def _rays_enu(camera: Camera, pose: Orientation, px: Array) -> Array:
-    """Directions (..., 3) of pixels (..., 2); NaN beyond the lens."""
+def _rays_enu(camera: Camera, pose: Orientation, px: Array, shear: Array) -> Array:
+    """Directions (..., 3) of pixels (..., 2), sheared by (2,) metres per metre up; NaN beyond the
+    lens."""
     rays = camera_rays(camera, px.reshape(-1, 2)) @ enu_from_camera(*pose.attitude_deg.tolist()).T
+    rays[:, :2] += rays[:, 2:] * shear
     return np.asarray(rays.reshape(*px.shape[:-1], 3))
 
 
-def _met(heights: Raster, camera: Camera, pose: Orientation, rays: Array) -> Array:
+def _met(heights: Raster, camera: Camera, pose: Orientation, rays: Array, shear: Array) -> Array:
     """Ground points (H, W, 3), NaN for none, by `rays` (h, w, 3) and, at edges, those between."""
     few, size_px = met(heights, rays, pose.position_m), (camera.width_px, camera.height_px)
     ground = np.asarray(cv2.resize(few, size_px, interpolation=cv2.INTER_LINEAR))
@@ -78,7 +84,7 @@ def _met(heights: Raster, camera: Camera, pose: Orientation, rays: Array) -> Arr
     # On level ground a pixel is range^2 / (focal length * drop) long.
     edge = ~(moved_m * drop_m < RAY_PX / camera.fx_px * range_m**2)
     px = _pixels(camera)[edge][None]
-    ground[edge] = met(heights, _rays_enu(camera, pose, px), pose.position_m)[0]
+    ground[edge] = met(heights, _rays_enu(camera, pose, px, shear), pose.position_m)[0]
     return np.asarray(ground, np.float64)
 
 
