@@ -48,7 +48,8 @@ def visible_lean(imagery: Mosaic, above: HeightsAbove, area: Area) -> Lean | Non
         row = col = len(leans) // 2
     if scores[row, col] < VISIBLE * float(np.median(scores)):
         return None
-    return Lean(round(float(leans[col]), 2), round(float(leans[row]), 2), STEP)
+    east, north = (round(float(leans[each]), 2) + 0.0 for each in (col, row))  # no -0.0
+    return Lean(east, north, STEP)
 
 
 def _windows(
