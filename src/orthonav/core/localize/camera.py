@@ -92,14 +92,54 @@ class CameraFound:
 def approached(seen: ViewOverGround, reference: Reference, pose: Pose) -> Orientation | None:
     """The camera of a view that was placed at `pose`, known to some pixels; None where too few
     blocks are seen."""
-    orientation, finer = seen.orientation(pose), seen.relief.surface is not None
-    for reach_px in SURFACE_REACHES_PX if finer else (FIRST_REACH_PX,):
-        if orientation is None:
-            return None
-        far = _compared(seen, reference, pose, orientation, reach_px, finer=finer)
-        correction = None if far is None else far.climbed()
-        orientation = None if correction is None else orientation.moved(correction)
-    return orientation
+    start = seen.orientation(pose)
+    if start is None:
+        return None
+    smooth = _climbed(seen, reference, pose, start, FIRST_REACH_PX, finer=False)
+    if seen.relief.surface is None:
+        return smooth
+    end = _among_houses(seen, reference, pose, start)
+    if end is None or smooth is None:
+        return None if end is None else end[1]
+    away = np.concatenate([smooth.position_m - end[1].position_m, _turn(end[1], smooth)])
+    if end[0].moves_px(away) < SURFACE_REACHES_PX[0] * 2.0 ** (seen.view.levels.final - 1):
+        return end[1]
+    # Over roofs the fit may end at another camera; that which fits best is right.
+    other = _among_houses(seen, reference, pose, smooth)
+    return end[1] if other is None or other[0].fit <= end[0].fit else other[1]
+
+
+def _turn(one: Orientation, other: Orientation) -> Array:
+    """From one attitude to the other (3,), within half a turn."""
+    return np.asarray((other.attitude_deg - one.attitude_deg + 180.0) % 360.0 - 180.0)
+
+
+def _among_houses(
+    seen: ViewOverGround, reference: Reference, pose: Pose, start: Orientation
+) -> "tuple[_Compared, Orientation] | None":
+    """The camera where the fit ends, with the blocks there."""
+    orientation: Orientation | None = start
+    for reach_px in SURFACE_REACHES_PX:
+        if orientation is not None:
+            orientation = _climbed(seen, reference, pose, orientation, reach_px, finer=True)
+    if orientation is None:
+        return None
+    end = _compared(seen, reference, pose, orientation, REACH_PX, finer=True)
+    return None if end is None else (end, orientation)
+
+
+def _climbed(
+    seen: ViewOverGround,
+    reference: Reference,
+    pose: Pose,
+    start: Orientation,
+    reach_px: int,
+    *,
+    finer: bool,
+) -> Orientation | None:
+    compared = _compared(seen, reference, pose, start, reach_px, finer=finer)
+    correction = None if compared is None else compared.climbed()
+    return None if correction is None else start.moved(correction)
 
 
 def camera_found(
@@ -193,6 +233,13 @@ class _Compared:
     @property
     def block_px(self) -> float:
         return self.seen.view.side_px / BLOCKS
+
+    @property
+    def fit(self) -> float:
+        """Sum of the correlations of the finest blocks where they are, over what chance makes."""
+        correlations, pixels, _ = self.blocks[0][0]
+        middle = correlations.shape[1] // 2
+        return float((correlations[:, middle, middle] * np.sqrt(pixels)).sum())
 
     def moves_px(self, correction: Array) -> float:
         """How far a correction (6,) moves a block, pixels of level 0."""
