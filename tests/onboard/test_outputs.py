@@ -179,7 +179,7 @@ def test_the_accuracy_for_filters_grows_with_the_rate():
     first, again = sending.frames[:3], sending.frames[3:]
     assert (first[0]["eph"], first[1]["horiz_accuracy"]) == (3.0, 3.0)
     assert first[2]["pose_covariance"][0] == 9.0
-    averaged = messages_averaged(3.0, 0.5)
+    averaged = messages_averaged(0.5)
     assert averaged > 5
     assert again[0]["eph"] == pytest.approx(3.0 * math.sqrt(averaged))
     assert again[1]["horiz_accuracy"] == pytest.approx(3.0 * math.sqrt(averaged))

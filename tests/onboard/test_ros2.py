@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from orthonav.core.errors import CameraError
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import ViewResult, error_ellipse
+from orthonav.core.records import ViewResult
 from orthonav.ground.recordings.opening import open_source
 from orthonav.onboard.messages.estimate import (
     Clock,
@@ -551,7 +551,7 @@ def test_covariances_are_for_filters(peer, publishing):
     flying.publish(fix(), 8 * S)  # 0.2 s later
     wait_for(lambda: len(peer.heard("/orthonav/fix")) > 1)
     first, again = peer.heard("/orthonav/fix")
-    averaged = messages_averaged(error_ellipse(COV)[0], 0.2)
+    averaged = messages_averaged(0.2)
     found = [np.reshape(each.position_covariance, (3, 3))[:2, :2] for each in (first, again)]
     assert found[0] == pytest.approx(COV) and found[1] == pytest.approx(COV * averaged)
     wait_for(lambda: len(peer.heard("/orthonav/pose")) > 1)
