@@ -108,6 +108,22 @@ def test_houses_that_lean_on_the_map_are_seen_where_they_stand(opened, town, vie
     assert np.nanmax(np.abs(off_m)) < 1e-6 and np.nanmax(high_m) > 5.0
 
 
+def test_an_unknown_height_at_the_rim_hides_nothing_less(opened, town, view):
+    _, ground, above = town
+    holed = raster(np.where(np.arange(len(above.values))[:, None] < 940, above.values, np.nan))
+    hides = []
+    for surface in (above, holed):
+        registration = on(opened, ground, Heights(surface)).registration
+        seen = ViewOverGround(registration.relief, registration.prepared(view, True))
+        pose = registration.pose_of(seen.view, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
+        nodes, _ = seen._nodes_m(pose, 0, (200, 260), smooth=False)
+        assert np.isfinite(nodes[..., :2]).all()
+        hides.append(hidden(nodes, seen.orientation(pose).position_m))
+    known = np.isfinite(nodes[..., 2])
+    assert hides[0][known].sum() > 50
+    assert hides[1][known].sum() > 0.5 * hides[0][known].sum()  # not none
+
+
 def test_a_leaning_house_hides_the_ground_behind_it():
     """As an upright one: on the map, with its camera, everything is sheared."""
     at, lean = np.arange(80.0), Lean(0.5, -0.25, 0.0)

@@ -100,6 +100,17 @@ def test_upright_houses_and_houses_that_are_not_seen(found, town):
     assert found(pictured(town, Lean(0.2, -0.1, 0.0)), 0 * town[2]) is None
 
 
+def test_no_lean_is_claimed_where_it_cannot_be_told(found, town):
+    high = town[2]
+    blank = np.full(high.shape, 120, np.uint8)
+    assert found(blank, high) is None
+    assert found(pictured(town, Lean(0.7, 0.0, 0.0)), high) is None  # beyond what is looked for
+    west, east = (pictured(town, Lean(lean, 0.0, 0.0)) for lean in (-0.25, 0.25))
+    mixed = np.where(np.arange(high.shape[1]) < high.shape[1] // 2, west, east)
+    lean = found(mixed, high)
+    assert lean is None or lean.std >= 0.05
+
+
 def test_a_roof_is_where_the_picture_shows_it():
     high = np.zeros((40, 40))
     high[20:30, 10:20] = 8.0

@@ -148,6 +148,12 @@ def test_a_surface_elsewhere(grid, surface, tmp_path):
     assert height_layers(None, [open_dem(surface)], far, there, needed=False)[:2] == (None, None)
 
 
+def test_a_true_orthophoto_needs_a_surface(run, make_ortho, tmp_path):
+    ortho = make_ortho(tmp_path / "past.tif")
+    told = run("build", "--ortho", ortho, "--true-ortho", "--out", tmp_path / "a.onav")
+    assert told.code != 0 and "--surface" in told.err
+
+
 def test_a_surface_says_what_the_land_is_like(run, make_ortho, surface, tmp_path):
     ortho = make_ortho(tmp_path / "past.tif")
     build = ("build", "--ortho", ortho, "--out", tmp_path / "a.onav", "--surface", surface)

@@ -225,8 +225,10 @@ def texts(source: Mapping[str, Any], *keys: str) -> list[str]:
 def _lean_text(lean: dict[str, float] | None) -> str:
     if lean is None:
         return "they may lean in the orthophoto by up to 0.3 m per m of height: not known"
-    if not lean["std"]:
+    if not any(lean.values()):
         return "a true orthophoto: they stand upright"
+    if not (lean["east"] or lean["north"]):
+        return f"they stand upright in the orthophoto, to {lean['std']:g} m per m of height"
     return (
         f"they lean by {lean['east']:g} m east, {lean['north']:g} m north per m of height, as the "
         "orthophoto shows"

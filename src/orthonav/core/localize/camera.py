@@ -100,7 +100,7 @@ def approached(seen: ViewOverGround, reference: Reference, pose: Pose) -> Orient
         return smooth
     end = _among_houses(seen, reference, pose, start)
     if end is None or smooth is None:
-        return None if end is None else end[1]
+        return smooth if end is None else end[1]
     away = np.concatenate([smooth.position_m - end[1].position_m, _turn(end[1], smooth)])
     if end[0].moves_px(away) < SURFACE_REACHES_PX[0] * 2.0 ** (seen.view.levels.final - 1):
         return end[1]
@@ -155,7 +155,7 @@ def camera_found(
     `local_ratio`: of the scores of the place. `start`: `approached`, where it is known."""
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
         level = Relief(LevelTerrain(), seen.relief.grid, land=seen.relief.land)
-        seen = ViewOverGround(level, seen.view)
+        seen, start = ViewOverGround(level, seen.view), None
     start = start or approached(seen, reference, pose)
     if start is None:
         return None

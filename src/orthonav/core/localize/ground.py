@@ -82,7 +82,7 @@ class Relief:
 
     @property
     def leans(self) -> bool:
-        """Whether the map shows houses and trees beside their place, and how far is known."""
+        """Whether the map shows houses and trees a known distance beside their place."""
         return self.surface is not None and bool(self.lean_en.any())
 
     def en_m(self, map_px: Array) -> Array:
@@ -103,7 +103,7 @@ class Relief:
         if above_m is not None:
             above_m = _smoothed(above_m, smooth)
             ground[..., 2] += above_m
-            ground[..., :2] -= above_m[..., None] * self.lean_en
+            ground[..., :2] -= np.nan_to_num(above_m)[..., None] * self.lean_en
         return ground
 
     def _above_m(self, ground_m: Array) -> Array | None:
@@ -338,7 +338,8 @@ class ViewOverGround:
             sheared = None
             if shown is not None:  # straight lines of sight stay straight
                 camera_m = orientation.position_m.copy()
-                camera_m[:2] += self.relief.lean_en * (camera_m[2] - self.reference_m(pose))
+                above_m = camera_m[2] - np.nan_to_num(np.nanmean(ground[..., 2]))
+                camera_m[:2] += self.relief.lean_en * above_m
                 sheared = shown, camera_m
             made = orthorectified(picture, orientation, ground, shape, sheared)
         return ViewTemplates(*made, level)

@@ -65,7 +65,7 @@ class Place:
       `gain`: over the one on level ground; None: finished there.
     - `score`: `total` less the cost of its prior. `finer`: one level finer, NaN: not needed;
       `fine`: sum.
-    - `camera`: under which it was compared there, None: by telemetry.
+    - `camera`: under which it fits better there, None: that of the telemetry; `seen`: sought.
     - `scores`: of the best place, see `docs/reference/formats.md`. `rivals`: other finished places,
       best first, near ones too.
     - `below_camera`: the pose with the height counted from the ground below the camera."""
@@ -86,6 +86,7 @@ class Place:
     finer: float = math.nan
     fine: float = math.nan
     camera: Orientation | None = None
+    seen: bool = False
     scores: dict[str, float] = field(default_factory=dict)
     rivals: tuple["Place", ...] = ()
     below_camera: Pose | None = None
@@ -385,31 +386,46 @@ class Placer:
     def _see_houses(self, place: Place) -> None:
         """Once, under the camera that the picture shows there, not the reported one: among houses
         and trees that is the difference between the right place and chance."""
-        if place.camera is not None or place.gain is None:
+        if place.seen:
             return
-        pose, levels = place.fit.pose, self.levels
-        place.camera = approached(self._ground, self.reference, pose)
-        made = self._ground.templates_at(pose, levels.final, place.camera)
-        if place.camera is None or made is None:
+        place.seen, pose, levels = True, place.fit.pose, self.levels
+        camera = approached(self._ground, self.reference, pose)
+        if camera is None:
+            return
+        made = self._ground.templates_at(pose, levels.final, camera)
+        if made is None:
             return
         final = self.refiner(levels.final, made).place(pose, FULL_STEPS, ROUGH_STEP_PX)
         again = total = final.score
         if levels.final != levels.judged:
             again = self.refiner(levels.judged, made).place(final.pose, 0).score
             total += again
+        if total > place.total or levels.final > 0:
+            place.camera = camera  # one level finer it may fit even so
         if total > place.total:
+            on_level = place.judged.score if place.level_score is None else place.level_score
             place.final, place.templates, place.total, place.again = final, made, total, again
             place.score = total - self.prior.cost(final.pose)
+            place.gain = again / max(on_level, 1e-6)
 
     def _finer_score(self, place: Place) -> float:
         """One level finer than the final one, once."""
         if math.isnan(place.finer):
-            level, made = self.levels.final - 1, None
-            if place.gain is not None:
-                made = self._ground.templates_at(place.fit.pose, level, place.camera)
-            refiner = Refiner((made or self._finer_on_level).at(level), self.reference)
-            place.finer = refiner.place(place.fit.pose, FINER_STEPS).score
+            place.finer = self._finer_under(place, None)
+            if place.camera is not None:
+                score = self._finer_under(place, place.camera)
+                if score > place.finer:
+                    place.finer = score
+                else:
+                    place.camera = None
         return place.finer
+
+    def _finer_under(self, place: Place, camera: Orientation | None) -> float:
+        level, made = self.levels.final - 1, None
+        if place.gain is not None or camera is not None:
+            made = self._ground.templates_at(place.fit.pose, level, camera)
+        refiner = Refiner((made or self._finer_on_level).at(level), self.reference)
+        return refiner.place(place.fit.pose, FINER_STEPS).score
 
     @cached_property
     def _finer_on_level(self) -> ViewTemplates:

@@ -67,8 +67,9 @@ def orthorectified(
 ) -> tuple[NDArray[np.uint8], Mask]:
     """Grey and valid (H, W) of a window of ground; grey 0 where not valid.
 
-    `nodes_m` (h, w, 3): east, north, above sea at `node_px`; NaN where unknown. `sheared_m`: these
-    at even distances and the camera (3,), sheared alike; None: they are even."""
+    `nodes_m` (h, w, 3): east, north, above sea at `node_px`; NaN where unknown. `sheared_m`: where
+    houses lean, the nodes where the map shows them, an even grid, and the camera (3,) moved alike.
+    """
     index = orientation.seen_px(view.camera, nodes_m) - 0.5
     usable = _fine(view, index) & ~hidden(*(sheared_m or (nodes_m, orientation.position_m)))
     index[~usable] = np.nan

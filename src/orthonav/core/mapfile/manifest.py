@@ -206,6 +206,8 @@ class SheetInfo:
             raise MapFileError(f"map has an unknown relief: {relief!r:.80}")
         area_km2 = _number(plain, "area_km2")
         lean = None if plain.get("lean") is None else Lean.from_plain(plain["lean"])
+        if lean is not None and surface is None:
+            raise MapFileError("map has a lean of its houses without a surface")
         return cls(frame, grid, tiles, area_km2, grey, terrain, relief, surface, lean)
 
 

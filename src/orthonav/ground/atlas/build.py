@@ -30,7 +30,7 @@ from orthonav.ground.atlas.cluster import Failure, TaskRunner
 from orthonav.ground.atlas.coarse import coarse_grid, write_coarse
 from orthonav.ground.atlas.cut import box_around, box_deg, turned
 from orthonav.ground.atlas.store import Store
-from orthonav.ground.build.build import BuildRequest, build_map, require_relief
+from orthonav.ground.build.build import BuildRequest, build_map, require_relief, require_surface
 from orthonav.ground.build.layer import rounded_gsd_m
 from orthonav.ground.build.sheet import digest, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -324,6 +324,7 @@ def build_atlas(
     `WorkerError` where a worker has other versions; `StorageError`."""
     started_s = time.monotonic()
     require_relief(request.relief, request.dem, request.surface)
+    require_surface(request.surface, true_ortho=request.true_ortho)
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
     recipe = recipe_for(request, mosaic)

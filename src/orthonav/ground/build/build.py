@@ -187,6 +187,13 @@ def _check_numbers(request: BuildRequest) -> None:
     if request.workers is not None and not 1 <= request.workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {request.workers}")
     require_relief(request.relief, request.dem, request.surface)
+    require_surface(request.surface, true_ortho=request.true_ortho)
+
+
+def require_surface(surface: Sequence[Path], *, true_ortho: bool) -> None:
+    """Raise `VariantError` for true orthophotos without a surface, where it changes nothing."""
+    if true_ortho and not surface:
+        raise VariantError("--true-ortho says how houses of --surface stand: give one")
 
 
 def require_relief(relief: str | None, dem: Path | None, surface: Sequence[Path]) -> None:

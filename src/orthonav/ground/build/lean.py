@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.localize.ground import UNKNOWN_LEAN
 from orthonav.core.mapfile.manifest import Lean
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
@@ -31,41 +32,53 @@ corner, posting, rows, columns."""
 
 
 def visible_lean(imagery: Mosaic, above: HeightsAbove, area: Area) -> Lean | None:
-    """The lean at which edges of the picture fit those of houses best; None where none stands out.
+    """The lean at which edges of the picture fit those of houses best; None where none stands out,
+    or where windows differ as much as leans that are not known.
 
     Shadows end along displaced edges too, but on two sides of a house only."""
     leans = np.arange(-MOST, MOST + STEP / 2, STEP)
-    total, edges = np.zeros((len(leans), len(leans))), 0
+    total, edges, alone = np.zeros((len(leans), len(leans))), 0, []
     for grey, high in _windows(imagery, above, area):
         strength, count = _fits(grey, high, leans)
         total += strength
         edges += count
-    if edges < LEAST_EDGES:
+        if count >= LEAST_EDGES and (best := _best(strength, leans)) is not None:
+            alone.append(best)
+    found = _best(total, leans) if edges >= LEAST_EDGES else None
+    if found is None:
         return None
-    scores = cv2.blur(total / edges, (3, 3))
+    spread = max((max(abs(e - found[0]), abs(n - found[1])) for e, n in alone), default=0.0)
+    if spread >= UNKNOWN_LEAN.std:
+        return None
+    return Lean(*found, max(spread, STEP))
+
+
+def _best(strength: Array, leans: Array) -> tuple[float, float] | None:
+    """East and north, of sums of `_fits`."""
+    scores, upright = cv2.blur(strength, (3, 3)), len(leans) // 2
     row, col = divmod(int(scores.argmax()), len(leans))
-    if scores[row, col] < OVER_UPRIGHT * scores[len(leans) // 2, len(leans) // 2]:
-        row = col = len(leans) // 2
-    if scores[row, col] < VISIBLE * float(np.median(scores)):
+    if scores[row, col] < OVER_UPRIGHT * scores[upright, upright]:
+        row = col = upright
+    at_rim = {row, col} & {0, len(leans) - 1}
+    if at_rim or not scores[row, col] > VISIBLE * float(np.median(scores)):
         return None
     east, north = (round(float(leans[each]), 2) + 0.0 for each in (col, row))  # no -0.0
-    return Lean(east, north, STEP)
+    return east, north
 
 
 def _windows(
     imagery: Mosaic, above: HeightsAbove, area: Area
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Grey and heights (H, W) of windows spread over the area."""
+    """Grey and heights (H, W), NaN where unknown, of windows spread over the area."""
     west, south, east, north = area.extent_en_m
-    sides_m = east - west, north - south
-    cols, rows = (min(round(side / POSTING_M), WINDOW_PX) for side in sides_m)
+    sides_m = np.array([east - west, north - south])
+    cols, rows = (min(round(side / POSTING_M), WINDOW_PX) for side in sides_m.tolist())
     if min(rows, cols) < 2:
         return
-    for down, right in product(np.linspace(0, 1, WINDOWS), repeat=2):
-        corner = (
-            west + right * (sides_m[0] - cols * POSTING_M),
-            north - down * (sides_m[1] - rows * POSTING_M),
-        )
+    left_m = sides_m - np.array([cols, rows]) * POSTING_M
+    counts = np.minimum(np.ceil(sides_m / (WINDOW_PX * POSTING_M)), WINDOWS).astype(int)
+    for down, right in product(_spread(counts[1]), _spread(counts[0])):
+        corner = west + right * left_m[0], north - down * left_m[1]
         high = above(*corner, POSTING_M, rows, cols)
         with imagery.sheet(
             area.frame,
@@ -80,14 +93,20 @@ def _windows(
         yield grey, high.astype(np.float32)
 
 
+def _spread(count: int) -> list[float]:
+    """From 0 to 1; in the middle where it is one."""
+    return [0.5] if count == 1 else np.linspace(0, 1, count).tolist()
+
+
 def _fits(grey: NDArray[np.float32], high: NDArray[np.float32], leans: Array) -> tuple[Array, int]:
     """Sums (leans, leans), north by east, of the picture's gradients across edges of heights, each
     displaced, over those around; and the number of edge pixels."""
     right, up = (np.nan_to_num(each) for each in _gradients(grey))
     size = np.hypot(right, up)
     usual = cv2.blur(size, (31, 31)) + 0.2 * float(size.mean()) + 1e-6
-    low = cv2.erode(np.nan_to_num(high), np.ones((3, 3), np.uint8))
-    rows, cols = np.nonzero(high - low > EDGE_M)  # the upper side of edges
+    low = cv2.erode(np.nan_to_num(high, nan=np.inf), np.ones((3, 3), np.uint8))
+    # The upper side of edges.
+    rows, cols = np.nonzero((high - low > EDGE_M) & np.isfinite(grey))
     across_right, across_up = (np.nan_to_num(each)[rows, cols] for each in _gradients(high))
     steep = np.maximum(np.hypot(across_right, across_up), 1e-6)
     moved_px = high[rows, cols] / POSTING_M

@@ -39,7 +39,7 @@ def map_in_view(
     above_m = telemetry.agl_m + (below_m if np.isfinite(below_m) else float(around.mean()))
     attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg
     lean = sheet.sheet.lean
-    # Sheared as houses lean on the map, straight rays stay straight.
+    # Sheared as houses lean on the map, straight rays stay straight; a slope is taken for level.
     shear = np.zeros(2) if lean is None else np.array([lean.east, lean.north])
     place_en_m = place_en_m + shear * telemetry.agl_m
     pose = Orientation(np.array([*place_en_m, above_m]), np.array(attitude))
