@@ -90,8 +90,8 @@ class Area:
     @property
     def radius_m(self) -> float:
         """Within which a fix is correct."""
-        registration = self.localizer.registration
-        return math.inf if registration is None else registration.radius_m
+        assert self.localizer.registration is not None
+        return self.localizer.registration.radius_m
 
     @cached_property
     def _ground(self) -> Ground:

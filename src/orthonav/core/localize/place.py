@@ -371,17 +371,22 @@ class Placer:
             if self._ground.moved_px(pose, final.pose) < AGAIN_PX * 2**levels.final:
                 break
             pose = final.pose
-        again, total = final.score, final.score
-        if levels.final != levels.judged:
-            again = self.refiner(levels.judged, made).place(final.pose, 0).score
-            total += again
-        on_level = place.judged.score if place.level_score is None else place.level_score
+        again, total = self._again(final, made)
+        on_level = _on_level(place)
         if again < on_level:
             self._finish_on_level(place)
             if place.total > total:
                 return
         place.final, place.templates, place.total, place.again = final, made, total, again
         place.gain = again / max(on_level, 1e-6)
+
+    def _again(self, final: Fit, templates: ViewTemplates | None) -> tuple[float, float]:
+        """Score at the judged level of a fit at the final one, and both added."""
+        levels = self.levels
+        if levels.final == levels.judged:
+            return final.score, final.score
+        again = self.refiner(levels.judged, templates).place(final.pose, 0).score
+        return again, final.score + again
 
     def _see_houses(self, place: Place) -> None:
         """Once, under the camera that the picture shows there, not the reported one: among houses
@@ -396,17 +401,13 @@ class Placer:
         if made is None:
             return
         final = self.refiner(levels.final, made).place(pose, FULL_STEPS, ROUGH_STEP_PX)
-        again = total = final.score
-        if levels.final != levels.judged:
-            again = self.refiner(levels.judged, made).place(final.pose, 0).score
-            total += again
+        again, total = self._again(final, made)
         if total > place.total or levels.final > 0:
             place.camera = camera  # one level finer it may fit even so
         if total > place.total:
-            on_level = place.judged.score if place.level_score is None else place.level_score
             place.final, place.templates, place.total, place.again = final, made, total, again
             place.score = total - self.prior.cost(final.pose)
-            place.gain = again / max(on_level, 1e-6)
+            place.gain = again / max(_on_level(place), 1e-6)
 
     def _finer_score(self, place: Place) -> float:
         """One level finer than the final one, once."""
@@ -498,6 +499,11 @@ class Placer:
             "agreement": final.agreement,
             "overlap": final.overlap,
         }
+
+
+def _on_level(place: Place) -> float:
+    """Its judged score on level ground."""
+    return place.judged.score if place.level_score is None else place.level_score
 
 
 def _weight(place: Place, best: Place) -> float:

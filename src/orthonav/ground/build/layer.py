@@ -41,7 +41,7 @@ from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, encode_terrain, terrain_part_names
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
-from orthonav.ground.build.lean import TRUE_ORTHO, as_shown, visible_lean
+from orthonav.ground.build.lean import TRUE_ORTHO, PlaneSampler, as_shown, visible_lean
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import Dem
 from orthonav.ground.planning.area import Area
@@ -265,8 +265,6 @@ MAX_SURFACE_M = 3.0
 ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
 """Squares per side of the area in which roughness is measured, their width in postings, and the
 most samples of the source across a posting."""
-PlaneSampler = Callable[[float, float, float, int, int], NDArray[np.float64]]
-"""Takes the arguments of `Dem.in_plane`, without the plane."""
 HeightSampler = Callable[[float, float, int, int], NDArray[np.float64]]
 """Heights above mean sea level of rows and columns of samples from a north-west corner, metres."""
 log = logging.getLogger(__name__)

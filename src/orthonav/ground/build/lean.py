@@ -26,12 +26,12 @@ VISIBLE, OVER_UPRIGHT = 1.3, 1.1
 """Least score over the median of all leans, and over that of upright houses. By generated towns and
 a real wooded valley: 1.4 to 1.9, and 1.15 to 1.4 where they lean by 0.15 or more."""
 Array = NDArray[np.float64]
-HeightsAbove = Callable[[float, float, float, int, int], Array]
-"""Above the terrain at rows and columns of samples, NaN where unknown: west and north of their
-corner, posting, rows, columns."""
+PlaneSampler = Callable[[float, float, float, int, int], Array]
+"""Takes the arguments of `Dem.in_plane`, without the plane: west and north of a corner, posting,
+rows, columns; NaN where unknown."""
 
 
-def visible_lean(imagery: Mosaic, above: HeightsAbove, area: Area) -> Lean | None:
+def visible_lean(imagery: Mosaic, above: PlaneSampler, area: Area) -> Lean | None:
     """The lean at which edges of the picture fit those of houses best; None where none stands out,
     or where windows differ as much as leans that are not known.
 
@@ -67,7 +67,7 @@ def _best(strength: Array, leans: Array) -> tuple[float, float] | None:
 
 
 def _windows(
-    imagery: Mosaic, above: HeightsAbove, area: Area
+    imagery: Mosaic, above: PlaneSampler, area: Area
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Grey and heights (H, W), NaN where unknown, of windows spread over the area."""
     west, south, east, north = area.extent_en_m
@@ -127,7 +127,7 @@ def _gradients(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArra
     )
 
 
-def as_shown(above: HeightsAbove, lean: Lean) -> HeightsAbove:
+def as_shown(above: PlaneSampler, lean: Lean) -> PlaneSampler:
     """Heights where a picture with this lean shows them: the higher of two at one place; NaN for
     walls. Heights above `HIGHEST_M` are displaced as these."""
     if not (lean.east or lean.north):
