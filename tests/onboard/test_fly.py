@@ -965,15 +965,15 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
     path, folder, _, _ = flown
     state = tmp_path / "state.json"
 
-    def start(lines):
+    def start(lines, images):
         arguments = [
-            *(lines, tmp_path / "release", "fly", path, folder),
+            *(lines, tmp_path / "release", "fly", path, images),
             *("--state", state, "--jsonl", lines),
             *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
         ]
         return subprocess.Popen([sys.executable, PACED, *map(str, arguments)])
 
-    first = start(tmp_path / "1.jsonl")
+    first = start(tmp_path / "1.jsonl", folder)
     try:
         wait_for(state.exists)
     finally:
@@ -981,7 +981,11 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
         first.wait()
     heard = len(autopilot.named("GLOBAL_POSITION_SENSOR"))
     assert heard > 0
-    second = start(tmp_path / "2.jsonl")
+    rest = shutil.copytree(folder, tmp_path / "rest")  # the aircraft flies on from there
+    names, *views = (rest / "telemetry.csv").read_text().splitlines()
+    flown_views = (tmp_path / "1.jsonl").read_text().count('"frame"')
+    (rest / "telemetry.csv").write_text("\n".join([names, *views[flown_views:]]) + "\n")
+    second = start(tmp_path / "2.jsonl", rest)
     try:
         wait_for(lambda: len(autopilot.named("GLOBAL_POSITION_SENSOR")) > heard)
     finally:
