@@ -5,8 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.core.track import CameraDisplacement
-from orthonav.core.track.odometry import Terrain, ViewDisplacement, over_terrain
+from orthonav.core.localize.odometry import (
+    CameraDisplacement,
+    Terrain,
+    ViewDisplacement,
+    over_terrain,
+)
 
 AGL_M, HALF_M = 200.0, 100.0
 BELOW = np.zeros(2)

@@ -7,8 +7,8 @@ import pytest
 from blots import AGL_M, GROUND, rendered
 
 from orthonav.core.geo.camera import Camera
+from orthonav.core.localize.odometry import OdometryView, displacement
 from orthonav.core.records import Telemetry, View
-from orthonav.core.track.odometry import OdometryView, displacement
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 NOISE = np.array([1e-3, 4e-4, 1e-3])

@@ -13,9 +13,9 @@ from orthonav.core.errors import CameraError, MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.ground import Relief
+from orthonav.core.localize.odometry import OdometryView, displacement
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
-from orthonav.core.track.odometry import OdometryView, displacement
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings.localize import localize_flight, smoothed_track
 

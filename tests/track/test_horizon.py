@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from orthonav.core.geo.camera import axis_on_ground_en_m
+from orthonav.core.localize.odometry import CameraDisplacement
+from orthonav.core.localize.sighting import Sighting
 from orthonav.core.track import (
-    CameraDisplacement,
     Mixture,
     Model,
     ReportedAttitude,
     ReportedVelocity,
-    Sighting,
 )
 from orthonav.core.track.model import SEEN, WHITE_SHARE
 

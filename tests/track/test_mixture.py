@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize.odometry import CameraDisplacement
+from orthonav.core.localize.sighting import Sighting
 from orthonav.core.track import (
-    CameraDisplacement,
     Mixture,
     Model,
     ReportedAttitude,
     ReportedVelocity,
-    Sighting,
     State,
 )
 from orthonav.core.track.mixture import Hypothesis

@@ -17,6 +17,7 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.core.track import Model
+from orthonav.core.track import tracker as tracker_module
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.run import MountCorrected, locate_view
 
@@ -49,7 +50,7 @@ def confirmed(localizer, seen):
 def tracker(localizer, confirmed):
     """A copy of it."""
     tracker, _ = confirmed
-    shared = (localizer, localizer.registration, tracker._confidence, tracker._before)
+    shared = (localizer, localizer.registration, tracker._before)
     return copy.deepcopy(tracker, {id(each): each for each in shared})
 
 
@@ -106,7 +107,9 @@ def expected_m(seen, number):
 
 
 def owner_of(tracker, part):
-    """The object of a dotted name, and the name of its method."""
+    """The object of a dotted name, or the module, and the name of its function."""
+    if hasattr(tracker_module, part):
+        return tracker_module, part
     *owners, name = part.split(".")
     for each in owners:
         tracker = getattr(tracker, each)
@@ -131,7 +134,7 @@ PARTS = [
     "_prior",
     "_correction",
     "_registration.search",
-    "_sightings",
+    "sightings",
     "mixture.update",
     "mixture._updated",
     "mixture._merge",
@@ -189,7 +192,7 @@ def test_behind_a_mount_an_error_view_is_predicted_once(localizer, tracker, seen
     """Each correction makes new telemetry."""
     level = Bias(0.0, 0.0, 0.0)
     locator = MountCorrected(tracker, Mount(level, level, level, level, 10))
-    faults.at(tracker, "_sightings")
+    faults.at(tracker_module, "sightings")
     rows = results(locator, seen[FIRST:], faults, ValueError("odd"))
     for number in range(1, BROKEN):
         moved_m = en_m(localizer, rows[number][0]) - en_m(localizer, rows[number - 1][0])

@@ -20,9 +20,9 @@ Below them, `orthonav.core.register` compares a view with the map. Where a map h
 layer, or with `registration=False`, `tiles.TileLocalizer` takes the place of steps 2 to 5: the view
 is embedded under a few headings and put on the most similar tile.
 
-`orthonav.core.track.tracker` places the views of a flight one after another: a search gives it
-places with their odds, `camera` their pitch and roll, `orthonav.core.track.odometry` the
-displacement between views, and `orthonav.core.track.mixture` joins all of it to one track."""
+`orthonav.core.track.tracker` places the views of a flight one after another: `sighting` gives it
+the places of a view with their odds, `odometry` the displacement between views, and
+`orthonav.core.track.mixture` joins all of it to one track."""
 
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify

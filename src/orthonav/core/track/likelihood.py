@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthonav.core.localize.confidence import RegisteredConfidence, logit
-from orthonav.core.localize.place import Place
+from orthonav.core.localize.sighting import Sighting
 from orthonav.core.track.model import (
     COMMON,
     HEADING_FLOOR_RAD,
@@ -17,7 +16,6 @@ from orthonav.core.track.model import (
     Array,
     Model,
     ReportedAttitude,
-    Sighting,
 )
 
 LEAST_NEW = 0.15
@@ -26,53 +24,6 @@ ROUNDING = 1e-7  # of variances: where a view shows less than its camera, roundi
 POSE = slice(2, 4)
 SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end
 MAX_LOG_ODDS = 7.0  # of a single view
-WORTH_LOG_ODDS = -12.0  # less likely places are left out
-LEAST_PLACE = 1e-12  # least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds
-
-
-def places_of(
-    best: Place, confidence: RegisteredConfidence, near_px: float, searched_share: float
-) -> list[tuple[float, float, Place]]:
-    """Log odds, probability by the view alone, and place: the best, and rivals `near_px` apart.
-
-    A search of a share of the map finds fewer rivals, and chance is lower: the log odds are those
-    within the area times `searched_share`, or, if less, those of a whole search whose rivals are
-    what chance makes (docs/decisions/tracking.md)."""
-    share, chances = math.log(searched_share), confidence.chances
-    chance = {
-        "rival": chances.of_strength(best.scores),
-        "look_rival": chances.look,
-        "fine_rival": chances.fine,
-    }
-    out: list[tuple[float, float, Place]] = []
-    for place in (best, *best.rivals):
-        if any(place.pose.distance_px(other.pose) < near_px for *_, other in out):
-            continue
-        scores = _as_rival(best, place) if out else best.scores
-        alone = confidence(
-            scores
-            | {k: max(scores[k], least) for k, least in chance.items() if not math.isnan(scores[k])}
-        )
-        log_odds = min(logit(confidence(scores), LEAST_PLACE) + share, logit(alone, LEAST_PLACE))
-        if out:  # the best place may have won in detail, against stronger scores elsewhere
-            log_odds, alone = min(log_odds, out[0][0]), min(alone, out[0][1])
-        if not out or log_odds > WORTH_LOG_ODDS:
-            out.append((log_odds, alone, place))
-    return out
-
-
-def _as_rival(best: Place, place: Place) -> dict[str, float]:
-    """As if it were the best place, and the best one its rival."""
-    share = place.score / max(best.score, 1e-6)
-    look = best.scores["look"]
-    return best.scores | {
-        "strength": place.score,
-        "rival": best.score,
-        "look": look * share,
-        "look_rival": look,
-        "fine": math.nan,
-        "fine_rival": math.nan,
-    }
 
 
 @dataclass(frozen=True, eq=False)

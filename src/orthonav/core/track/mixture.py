@@ -16,6 +16,8 @@ import numpy as np
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.confidence import within
+from orthonav.core.localize.odometry import CameraDisplacement
+from orthonav.core.localize.sighting import Sighting
 from orthonav.core.track.hypothesis import (
     MINOR_OF_GROUP,
     Hypothesis,
@@ -41,10 +43,8 @@ from orthonav.core.track.model import (
     Array,
     Model,
     ReportedAttitude,
-    Sighting,
 )
 from orthonav.core.track.motion import (
-    CameraDisplacement,
     Expected,
     ReportedVelocity,
     after_bias_jump,

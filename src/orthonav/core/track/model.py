@@ -98,17 +98,3 @@ class ReportedAttitude:
     heading_rad: float | None
     pitch_rad: float
     roll_rad: float
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """One place where a view may have been taken.
-
-    `mean` (6,), `covariance` (6, 6): metres east and north, heading (rad), log scale, pitch, roll
-    (rad). `log_odds`: of this place, given that the aircraft is on the map. `alone`: probability by
-    the view."""
-
-    mean: Array
-    covariance: Array
-    log_odds: float
-    alone: float = 1.0

@@ -1,10 +1,11 @@
 """Prediction of the state: by time, by the reported velocity, and by the camera's odometry."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from orthonav.core.localize.odometry import CameraDisplacement
 from orthonav.core.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG
 from orthonav.core.track.likelihood import log_density
 from orthonav.core.track.model import (
@@ -45,27 +46,6 @@ class ReportedVelocity:
     before_en_mps: Array | None
     std_mps: float
     correlation_s: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class CameraDisplacement:
-    """The displacement since the last view, measured by the camera.
-
-    `moved_en_m` (2,), `covariance` (2, 2): rotated by heading and scaled by height as reported
-    before, and so subject to their errors. `reach_m`: radius of the search. `turned_rad`, `scaled`:
-    change of heading and log scale beyond the reported one. `levers_m` (2, 2, 2): metres east and
-    north by an error of pitch and roll (rad), now and before; `corrected_rad` (2, 2): what they
-    were corrected by."""
-
-    moved_en_m: Array
-    covariance: Array
-    reach_m: float
-    turned_rad: float = 0.0
-    scaled: float = 0.0
-    turned_std_rad: float = math.radians(0.4)
-    scaled_std: float = 0.004
-    levers_m: Array = field(default_factory=lambda: np.zeros((2, 2, 2)))
-    corrected_rad: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,26 +16,30 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.integrity import probability_within
-from orthonav.core.localize.camera import CameraFound
-from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.localize.place import Place
-from orthonav.core.localize.search import Search
-from orthonav.core.localize.view import PreparedView, check_view
+from orthonav.core.localize.odometry import (
+    CameraDisplacement,
+    OdometryView,
+    Terrain,
+    ViewDisplacement,
+    corrected_by,
+    displacement,
+    over_terrain,
+)
+from orthonav.core.localize.sighting import Sighting, sightings
+from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
 from orthonav.core.track import (
-    CameraDisplacement,
     Estimate,
     Mixture,
     Model,
     ReportedAttitude,
     ReportedVelocity,
-    Sighting,
     State,
 )
-from orthonav.core.track.likelihood import LEAST_NEW, places_of
+from orthonav.core.track.likelihood import LEAST_NEW
 from orthonav.core.track.model import (
     BIASES,
     HEADING,
@@ -48,23 +52,12 @@ from orthonav.core.track.model import (
     WHITE_SHARE,
 )
 from orthonav.core.track.motion import usual_velocity_std_mps
-from orthonav.core.track.odometry import (
-    OdometryView,
-    Terrain,
-    ViewDisplacement,
-    corrected_by,
-    displacement,
-    over_terrain,
-    tilt_lever_m,
-)
 from orthonav.core.track.smooth import History, Smoothed
 from orthonav.core.track.trust import EXACT_M
 
 LOCAL_SHARE = 0.75  # Belief to search around it only. Values without a source: docs/tracking.md.
 LOCAL_SIGMAS = 4.0  # half width of that search,
 MIN_LOCAL_M = LOCAL_SIGMAS * EXACT_M  # and its least
-LIKELY_NATS = 5.0  # places so much less likely than the best one are not examined for their tilt
-UNSEEN_TILT_RAD = math.radians(20.0)  # standard deviation of a tilt that a view does not show
 LEAST_TILT_STD_DEG = 0.1  # least that a track expects of a view
 UNAIDED_STD_MPS, UNAIDED_S = 3.0, 15.0
 """A reported velocity with at least this deviation errs for so long: an autopilot without aids."""
@@ -72,10 +65,8 @@ LEARNT_S = 10.0  # over which the error of a reported velocity is learnt from od
 LONGEST_GAP_S = 600.0
 """As which longer gaps are predicted: the position is then known to no more than the map."""
 UNKNOWN_STEP_S = 1.0  # where the clock stands still or jumps back
-NEAR_SHARE = 0.05  # of the side of a view: closer places are one
 KNOWN_MPS = 5.0  # least certainty of an estimated velocity that predicts the next displacement
 KNOWN_PLACE_M = 50.0  # least certainty of a position whose ground is known
-SIGHT_STEPS = 4  # to the ground that a view shows: each leaves a fraction of the error
 Array = NDArray[np.float64]
 
 
@@ -140,7 +131,7 @@ class Tracker:
         registration = localizer.registration
         if registration is None or registration.confidence is None:
             raise MapFileError("a track needs a map with a registration layer and its confidence")
-        self._registration, self._confidence = registration, registration.confidence
+        self._registration = registration
         self._localizer = localizer
         return localizer.grid.extent_en_m
 
@@ -429,25 +420,18 @@ class Tracker:
         ahead_en_m = (before.ahead_en_m + now.ahead_en_m) / 2
         # What both views show lies half a displacement ahead of what the earlier one shows.
         common_en_m = ahead_en_m + made.displacement.moved_en_m / 2
-        terrain = self._terrain(self._registration.relief, heights_m[0], common_en_m)
+        terrain = self._terrain(heights_m[0], common_en_m)
         return over_terrain(made, heights_m, terrain, ahead_en_m)
 
-    def _terrain(self, relief: Relief, agl_m: float, ahead_en_m: Array) -> Terrain | None:
+    def _terrain(self, agl_m: float, ahead_en_m: Array) -> Terrain | None:
         """None where unknown. `ahead_en_m` (2,): as reported, on level ground."""
         best = self.mixture.likeliest
         if best is None or np.trace(best.covariance[POSITION, POSITION]) > KNOWN_PLACE_M**2:
             return None
-        place, scale = best.mean[POSITION], math.exp(best.mean[SCALE])
+        scale = math.exp(best.mean[SCALE])
         ahead_m = rotation(-best.mean[HEADING], scale) @ ahead_en_m
-        seen, rise = place, 0.0
-        for _ in range(SIGHT_STEPS):
-            seen = place + (1 - rise) * ahead_m
-            ground_m = relief.terrain.at_en_m(np.stack([place, seen]))
-            rise = float(ground_m[1] - ground_m[0]) / (agl_m * scale)
-        slopes = relief.slopes(np.stack([place, seen]))
-        if not (np.isfinite(slopes).all() and math.isfinite(rise)):
-            return None
-        return Terrain(slopes[0], slopes[1], rise)
+        relief = self._registration.relief
+        return Terrain.ahead(relief, best.mean[POSITION], agl_m * scale, ahead_m)
 
     def _update(self, view: View, overlap: float, ground: float) -> NoFix | None:
         """`NoFix` where the view shows too little."""
@@ -469,19 +453,18 @@ class Tracker:
         search = self._registration.search(corrected, prior, self._heading_known)
         if isinstance(search, NoFix):
             return search
-        sightings, newness = [], max(1 - overlap, LEAST_NEW)
+        newness = max(1 - overlap, LEAST_NEW)
         best = search.run()
         if not isinstance(best, NoFix):
             share = min(searched.area_m2 / self.mixture.area_m2, 1.0)
-            sightings = self._sightings(search, best, known, bias[1], share)
+            self._seen = list(sightings(search, best, known, bias[1], share))
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
         )
-        self._seen = sightings
         self.mixture.update(
-            attitude, sightings, newness, searched.circle, ground, confirms=searched.confirms
+            attitude, self._seen, newness, searched.circle, ground, confirms=searched.confirms
         )
         return None
 
@@ -535,65 +518,6 @@ class Tracker:
         middle, reach_m = area.circle
         lat, lon = self._localizer.sheet.frame.latlon_from_en(middle)
         return Prior(float(lat), float(lon), reach_m / PRIOR_SIGMAS)
-
-    def _sightings(
-        self,
-        search: Search,
-        best: Place,
-        telemetry: Telemetry,
-        log_scale: float,
-        searched_share: float,
-    ) -> list[Sighting]:
-        """`telemetry`: corrected, its height by `log_scale`. `searched_share`: of the map."""
-        near_px = NEAR_SHARE * search.view.side_px
-        places = places_of(best, self._confidence, near_px, searched_share)
-        made = []
-        for log_odds, alone, place in places:
-            likely = log_odds > places[0][0] - LIKELY_NATS
-            camera = search.camera(place) if likely else None
-            if camera is None:
-                mean, covariance = self._by_similarity(search, place, telemetry)
-            else:
-                mean, covariance = self._by_camera(search.view, camera, telemetry)
-            mean[3] += log_scale
-            if np.isfinite(covariance).all():
-                made.append(Sighting(mean, covariance, log_odds, alone))
-        return made
-
-    def _by_camera(
-        self, prepared: PreparedView, camera: CameraFound, telemetry: Telemetry
-    ) -> tuple[Array, Array]:
-        """Mean (6,) and covariance (6, 6) by the view alone."""
-        rad, agl_m = math.pi / 180, camera.agl_m
-        east, north, up_m = camera.alone.position_m.tolist()
-        heading, pitch, roll = np.radians(camera.alone.attitude_deg).tolist()
-        above_m = agl_m + up_m - float(camera.orientation.position_m[2])
-        scale = math.log(max(above_m, agl_m / 2) / telemetry.agl_m)
-        units = np.diag([1.0, 1.0, 1 / agl_m, rad, rad, rad])
-        order = [0, 1, 3, 2, 4, 5]
-        covariance = (units @ camera.alone_covariance @ units)[np.ix_(order, order)]
-        floor_m = self._registration.floor_m(prepared)
-        covariance[:2, :2] += np.eye(2) * floor_m**2 * camera.variance
-        return np.array([east, north, heading, scale, pitch, roll]), covariance
-
-    def _by_similarity(
-        self, search: Search, place: Place, telemetry: Telemetry
-    ) -> tuple[Array, Array]:
-        """The same of a view that does not show its tilt."""
-        registration, pose, spread = self._registration, place.pose, place.fit.covariance
-        if spread is None:
-            spread = search.placer.covariance_at(pose)
-        tilt_rad = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-        mean = np.concatenate([registration.seen_from(search.view, pose), tilt_rad])
-        heading_deg = math.degrees(pose.turn_rad)
-        lever = tilt_lever_m(replace(telemetry, yaw_deg=heading_deg))
-        covariance = np.zeros((6, 6))
-        covariance[:4, :4] = registration.camera_covariance(search.view, pose, spread)
-        covariance[:2, :2] += UNSEEN_TILT_RAD**2 * lever @ lever.T
-        covariance[:2, 4:] = -(UNSEEN_TILT_RAD**2) * lever
-        covariance[4:, :2] = covariance[:2, 4:].T
-        covariance[4:, 4:] = UNSEEN_TILT_RAD**2 * np.eye(2)
-        return mean, covariance
 
     def _fix(
         self,

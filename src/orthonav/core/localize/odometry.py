@@ -1,12 +1,13 @@
 """Odometry by the camera: the displacement between two views, by registering one on the other."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import axis_on_ground_en_m
+from orthonav.core.localize.ground import Relief
 from orthonav.core.localize.place import Placer
 from orthonav.core.localize.rectify import downsampled, rectify_footprint
 from orthonav.core.localize.view import check_footprint
@@ -17,7 +18,6 @@ from orthonav.core.register.refine import Fit
 from orthonav.core.register.search import SearchWindows, bank, largest_half_px, search
 from orthonav.core.register.template import Levels, ViewTemplates
 from orthonav.core.register.window import Reference
-from orthonav.core.track import CameraDisplacement
 
 VIEW_PX = 160
 """Across: half that of a fix. Values without a source: by the flights of docs/tracking.md."""
@@ -42,6 +42,7 @@ SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
 LEVER_STEP_DEG = 0.05  # of numerical derivatives by pitch and roll
 UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
 """Of ground without a known slope, and the fraction of it that a terrain leaves."""
+SIGHT_STEPS = 4  # to the ground that a view shows: each leaves a fraction of the error
 LEAST_SCALED = 0.5  # least height or distance over the one expected: the rest is an error
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
@@ -164,6 +165,27 @@ class OdometryView:
 
 
 @dataclass(frozen=True, eq=False)
+class CameraDisplacement:
+    """The displacement since the last view, measured by the camera.
+
+    `moved_en_m` (2,), `covariance` (2, 2): rotated by heading and scaled by height as reported
+    before, and so subject to their errors. `reach_m`: radius of the search. `turned_rad`, `scaled`:
+    change of heading and log scale beyond the reported one. `levers_m` (2, 2, 2): metres east and
+    north by an error of pitch and roll (rad), now and before; `corrected_rad` (2, 2): what they
+    were corrected by."""
+
+    moved_en_m: Array
+    covariance: Array
+    reach_m: float
+    turned_rad: float = 0.0
+    scaled: float = 0.0
+    turned_std_rad: float = math.radians(0.4)
+    scaled_std: float = 0.004
+    levers_m: Array = field(default_factory=lambda: np.zeros((2, 2, 2)))
+    corrected_rad: Array = field(default_factory=lambda: np.zeros((2, 2)))
+
+
+@dataclass(frozen=True, eq=False)
 class ViewDisplacement:
     """`overlap`: fraction of the later view that the earlier one shows too."""
 
@@ -221,6 +243,21 @@ class Terrain:
     below: Array
     seen: Array
     rise: float
+
+    @classmethod
+    def ahead(
+        cls, relief: Relief, place: Array, agl_m: float, ahead_en_m: Array
+    ) -> "Terrain | None":
+        """At a place (2,); None where unknown. `ahead_en_m` (2,): on level ground."""
+        seen, rise = place, 0.0
+        for _ in range(SIGHT_STEPS):
+            seen = place + (1 - rise) * ahead_en_m
+            ground_m = relief.terrain.at_en_m(np.stack([place, seen]))
+            rise = float(ground_m[1] - ground_m[0]) / agl_m
+        slopes = relief.slopes(np.stack([place, seen]))
+        if not (np.isfinite(slopes).all() and math.isfinite(rise)):
+            return None
+        return cls(slopes[0], slopes[1], rise)
 
 
 LEVEL = Terrain(np.zeros(2), np.zeros(2), 0.0)
