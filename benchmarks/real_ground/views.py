@@ -42,7 +42,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OverRelief:
-    """Views rendered over relief, or over the surface of generated ground.
+    """Views rendered over relief, or over the surface of generated ground; heights count from bare
+    ground.
 
     - `pair`: imagery of the map and of the views. `slope`: of the relief, per cent.
     - `tilt_std_deg`: of the true pitch and roll, reported as 0; `stated_deg`: the deviation that is
@@ -78,7 +79,7 @@ class OverRelief:
         folder.mkdir(parents=True, exist_ok=True)
         imagery, inside_m = self._imagery(work, base)
         relief: Raster | None = None
-        heights = open_dem(self._heights(work))
+        ground = open_dem(self._heights(work, BARE))
         for number in range(views):
             rng = np.random.default_rng([SEED, number])
             true, place = self._pose(base, inside_m, rng)
@@ -87,7 +88,7 @@ class OverRelief:
             path = folder / f"{number:04d}.png"
             if not path.is_file():
                 relief = relief or self._relief(work, base)
-                above = float(heights(lat[None], lon[None])[0]) + true.agl_m
+                above = float(ground(lat[None], lon[None])[0]) + true.agl_m
                 attitude = true.yaw_deg, true.pitch_deg, true.roll_deg
                 position = np.array([*place, above])
                 grey, _ = seen_view(imagery, relief, lens, attitude, position, 1)
@@ -99,9 +100,9 @@ class OverRelief:
             reported = level_telemetry(true, rng, self.stated_deg, self.ahead_deg)
             yield Seen(View(grey, camera, reported), (float(lat), float(lon)), true.agl_m)
 
-    def _heights(self, work: Path) -> Path:
+    def _heights(self, work: Path, kind: str) -> Path:
         if self.pair.views.startswith("generated:"):
-            return landscape_heights(self.pair.views, work, self.slope, SURFACE)
+            return landscape_heights(self.pair.views, work, self.slope, kind)
         return relief_file(self.pair.map, work, self.slope, BARE)
 
     def _imagery(self, work: Path, base: Localizer) -> tuple[Raster, Array]:
@@ -126,7 +127,7 @@ class OverRelief:
         cols, rows = (
             math.ceil(side * grid.gsd_m / posting_m) for side in (grid.width_px, grid.height_px)
         )
-        dem = open_dem(self._heights(work))
+        dem = open_dem(self._heights(work, SURFACE))
         made = dem.in_plane(base.sheet.frame, grid.west_m, grid.north_m, posting_m, rows, cols)
         made = np.where(np.isfinite(made), made, np.nanmean(made))  # a rim that no view shows
         return Raster(made.astype(np.float32), grid.west_m, grid.north_m, posting_m)
