@@ -45,7 +45,7 @@ WIDE = Errors(yaw_std_deg=10.0, agl_std=0.1)
 class Scene:
     """One place at several dates.
 
-    - `name`, `folder`: name, and folder below `DATA`, or `generated:SEED` or `generated:SEED:GSD`.
+    - `name`, `folder`: name, and folder below `DATA`, or `generated:SEED[:GSD[:SIDE_M]]`.
     - `gsd_m`: metres per pixel, nominal.
     - `dates`: names of the orthophotos, in order.
     """
@@ -164,17 +164,19 @@ def is_there(*names: str) -> bool:
 
 
 def ortho(name: str, work: Path) -> Path:
-    """The orthophoto of a name; generated ones, of 2000 x 2000 px, lie in `work`."""
+    """The orthophoto of a name; generated ones lie in `work`."""
     if not _generated(name):
         return DATA / name
-    seed, gsd_m, date = generated(name)
-    return area(work, date, side_m=round(SIDE_PX * gsd_m), gsd_m=gsd_m, seed=seed)
+    seed, gsd_m, side_m, date = generated(name)
+    return area(work, date, side_m=side_m, gsd_m=gsd_m, seed=seed)
 
 
-def generated(name: str) -> tuple[int, float, str]:
-    """Seed, metres per pixel and date of a generated orthophoto's name."""
-    _, seed, *gsd, date = name.split(":")
-    return int(seed), float(gsd[0]) if gsd else 1.0, date
+def generated(name: str) -> tuple[int, float, int, str]:
+    """Seed, metres per pixel, side in metres (`SIDE_PX` pixels without) and date of a generated
+    orthophoto's name."""
+    _, seed, *more, date = name.split(":")
+    gsd_m = float(more[0]) if more else 1.0
+    return int(seed), gsd_m, int(more[1]) if more[1:] else round(SIDE_PX * gsd_m), date
 
 
 def area(

@@ -1,6 +1,7 @@
 """Maps of the rows, as `orthonav build` makes them, and the heights they are given."""
 
 import hashlib
+import math
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
 from benchmarks.real_ground.mapping import strip_ortho
-from benchmarks.scenes import DATA, SIDE_PX, generated, ortho
+from benchmarks.scenes import DATA, generated, ortho
 from orthonav.core.files import replacing
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
@@ -34,7 +35,10 @@ ROUGHNESS = 1.5
 """Power of the wavelength with which amplitudes grow: a fractal dimension of 2.5, the rough end of
 measured terrain (2.1 to 2.5)."""
 BASE_M = 200.0
-BARE, FLAT, COARSE, SURFACE = "bare", "flat", "coarse", "surface"
+BARE, FLAT, COARSE, SURFACE, WORN = "bare", "flat", "coarse", "surface", "worn"
+GONE_SHARE, WORN_STD_M, WORN_POSTING_M, LEAST_HOUSE_M = 0.1, 0.3, 1.0, 2.5
+"""Of a `WORN` surface: share of the houses and groups of trees, at least so high, that it lacks,
+and its noise, independent at so many metres."""
 Heights = NDArray[np.float32]
 
 
@@ -44,7 +48,7 @@ class Map:
 
     - `ortho`: orthophoto as `scenes.ortho` takes it, `scaled:GSD:NAME` or
       `strip:NUMBER:NAME`.
-    - `ground`: one of `BARE` to `SURFACE` of `relief`, or a file of heights below `DATA`; None: the
+    - `ground`: one of `BARE` to `WORN` of `relief`, or a file of heights below `DATA`; None: the
       map has no terrain.
     - `relief`: root mean square slope of the ground in per cent; None: the ground is not rendered.
     - `land`: what the build says of land without terrain; None: nothing.
@@ -69,7 +73,7 @@ class Map:
             more: dict[str, Any] = {} if self.land is None else {"relief": self.land}
             if self.ground is not None:
                 heights, datum = self.heights(work), {"dem_datum": self.datum}
-                is_surface = Path(self.ground).stem == SURFACE
+                is_surface = Path(self.ground).stem in (SURFACE, WORN)
                 more |= datum | ({"surface": [heights]} if is_surface else {"dem": heights})
             build_map(BuildRequest([found(self.ortho, work)], out, **more))
 
@@ -166,16 +170,41 @@ def written(out: Path, heights: Heights, transform: Any, crs: Any) -> Path:
 
 
 def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
-    """Heights under generated imagery: `BARE`, or the `SURFACE` of the date of the name."""
-    seed, gsd_m, date = generated(name)
-    side_m = SIDE_PX * gsd_m
-    folder = work / f"area-{seed}-{side_m:g}m-{gsd_m:g}m-hills{slope:g}"
+    """Heights under generated imagery: `BARE`, or the `SURFACE` of the date of the name, or this as
+    a survey of another year would have it (`WORN`)."""
+    seed, gsd_m, side_m, date = generated(name)
+    folder = work / f"area-{seed}-{side_m}m-{gsd_m:g}m-hills{slope:g}"
+    if kind == WORN:
+        out = folder / f"{date}_worn.tif"
+        return (
+            out
+            if out.is_file()
+            else _worn(out, landscape_heights(name, work, slope, SURFACE), seed)
+        )
     path = folder / ("dem.tif" if kind == BARE else f"{date}_dsm.tif")
     if not path.is_file():
         dates = [each for each in DEFAULT_DATES if each.name == date]
         area = partial(generate_heights, size_m=(side_m, side_m), gsd_m=gsd_m, seed=seed)
         area(folder, slope=slope / 100, dates=dates)
     return path
+
+
+def _worn(out: Path, surface: Path, seed: int) -> Path:
+    rng = np.random.default_rng([seed, 6])
+    with rasterio.open(surface) as source:
+        heights, transform, crs = source.read(1), source.transform, source.crs
+    with rasterio.open(surface.with_name("dem.tif")) as source:
+        size = heights.shape[::-1]
+        bare = cv2.resize(source.read(1), size, interpolation=cv2.INTER_LINEAR)
+    high = (heights - bare > LEAST_HOUSE_M).astype(np.uint8)
+    count, labels = cv2.connectedComponents(high)
+    gone = np.asarray(rng.random(count) < GONE_SHARE, np.bool_)
+    gone[0] = False  # the ground
+    lacking = cv2.dilate(gone[labels].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    heights[lacking] = bare[lacking]
+    coarse = tuple(math.ceil(side * transform.a / WORN_POSTING_M) for side in heights.shape)
+    noise = cv2.resize(rng.normal(0.0, WORN_STD_M, coarse), size, interpolation=cv2.INTER_NEAREST)
+    return written(out, np.asarray(heights + noise, np.float32), transform, crs)
 
 
 def scaled_copy(name: str, work: Path) -> Path:

@@ -3,12 +3,13 @@
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 from benchmarks.closed_loop.replays import flights
 from benchmarks.real_ground.mapping import STRIPS, Windows
-from benchmarks.real_ground.maps import BARE, COARSE, FLAT, SURFACE, Map
+from benchmarks.real_ground.maps import BARE, COARSE, FLAT, SURFACE, WORN, Map
 from benchmarks.real_ground.pairs import SINGLE, TRACKED
 from benchmarks.real_ground.score import Row, placed
 from benchmarks.real_ground.views import OverLevel, OverRelief, Recording, Replay
@@ -36,6 +37,8 @@ LAND = {2.0: "level", 5.0: "rolling", 10.0: "hills"}
 TILTS = (0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)
 """Standard deviations of the true pitch and roll, and as stated, degrees."""
 ROOFS_GSD_M, ROOFS_SEEDS = 0.2, (1, 11, 25)  # of generated towns
+TOWN_SEEDS, TOWN_SIDE_M, TOWN_WITHIN_M = (253, 286, 288), 1000, 250.0
+"""The seeds of 1 to 300 that have a town nearest to the middle of their first square kilometre."""
 TOWN_AGL_M, TOWN_AHEAD_DEG = (120.0, 80.0, 50.0), (0.0, 30.0, 45.0)
 
 
@@ -140,7 +143,7 @@ def _grounds(name: str, slope: float) -> Iterator[tuple[str, Map]]:
     if slope in LAND:
         yield f"no terrain, {LAND[slope]}", Map(name, relief=slope, land=LAND[slope])
     if name.startswith("generated:"):
-        kinds = {"bare earth": BARE, "surface": SURFACE}
+        kinds = {"bare earth": BARE, "surface": SURFACE, "surface of another year": WORN}
     else:
         kinds = {"30 m terrain": COARSE, "bare earth": BARE}
     for kind, ground in kinds.items():
@@ -184,12 +187,22 @@ def _relief() -> Iterator[Question]:
         for seed in ROOFS_SEEDS
     ]
     yield from _rendered("roofs at 0.2 m", "houses", roofs, 2.0, tilts=[(0.0, 0.0), (0.0, None)])
+    yield from _towns()
+
+
+def _towns() -> Iterator[Question]:
+    folder = f"generated:{{}}:{ROOFS_GSD_M}:{TOWN_SIDE_M}"
+    dates = PAST, PRESENT
+    towns = [
+        Scene(f"town_{seed}", folder.format(seed), ROOFS_GSD_M, dates).pair(*dates)
+        for seed in TOWN_SEEDS
+    ]
     for agl_m, ahead_deg in product(TOWN_AGL_M, TOWN_AHEAD_DEG):
-        maps = [dict(_grounds(pair.map, 2.0)) for pair in roofs]
-        for ground in ("no terrain", "bare earth", "surface"):
+        maps = [dict(_grounds(pair.map, 2.0)) for pair in towns]
+        for ground in ("no terrain", "bare earth", "surface", "surface of another year"):
+            views = partial(OverRelief, agl_m=agl_m, ahead_deg=ahead_deg, within_m=TOWN_WITHIN_M)
             legs = tuple(
-                (on[ground], OverRelief(pair, 2.0, 1.0, agl_m=agl_m, ahead_deg=ahead_deg))
-                for on, pair in zip(maps, roofs, strict=True)
+                (on[ground], views(pair, 2.0, 1.0)) for on, pair in zip(maps, towns, strict=True)
             )
             name = f"town from {agl_m:g} m, {ahead_deg:g} deg ahead, {ground}"
             yield Question(name, "towns", legs)

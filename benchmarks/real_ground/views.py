@@ -50,7 +50,8 @@ class OverRelief:
       reported with them.
     - `nominal`: whether the lens is known by its field of view only.
     - `agl_m`: height; None: that from which a view is `WIDTH_PX` of the map across. `ahead_deg`:
-      how far the camera looks ahead.
+      how far the camera looks ahead. `within_m`: ground in the middle of the view lies so far from
+      the middle of the map at most.
     """
 
     pair: Pair
@@ -61,6 +62,7 @@ class OverRelief:
     std_m: float = 0.0
     agl_m: float | None = None
     ahead_deg: float = 0.0
+    within_m: float = math.inf
 
     def pictures(self) -> str:
         """Name of the folder of pictures, which rows share."""
@@ -149,6 +151,7 @@ class OverRelief:
             yaw, (pitch, roll) = float(rng.uniform(0, 360)), rng.normal(0, 1, 2).tolist()
             lat, lon = (float(v) for v in base.sheet.frame.latlon_from_en(middle))
             seen = inside_m[int(share[1] * rows), int(share[0] * cols)] >= reach_m
+            seen &= math.hypot(*((share - 0.5) * [cols, rows])) * grid.gsd_m <= self.within_m
             place = middle - axis_on_ground_en_m(yaw, self.ahead_deg, 0.0, agl_m)
             col, row = (place - [grid.west_m, grid.north_m]) / [grid.gsd_m, -grid.gsd_m]
             seen &= RIM_PX < col < cols - RIM_PX and RIM_PX < row < rows - RIM_PX

@@ -1,5 +1,7 @@
 """Views over houses on a map that knows them, against rays that are followed to the roofs."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from blots import AGL_M, CAMERA, GROUND, Heights, as_grey, error_m, known_map
@@ -7,7 +9,13 @@ from lab.terrain import seen_view
 
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.camera import approached
-from orthonav.core.localize.ground import MIN_KNOWN, Relief, ViewOverGround, _smoothed
+from orthonav.core.localize.ground import (
+    MIN_KNOWN,
+    Relief,
+    SearchedSheet,
+    ViewOverGround,
+    _smoothed,
+)
 from orthonav.core.localize.rectify import hidden
 from orthonav.core.localize.systematic import SURFACE_M
 from orthonav.core.mapfile import open_map
@@ -195,6 +203,17 @@ def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
     assert np.abs(values[:, [0, -1]]).max() < 0.02
     away, _ = expected(270.0, 45.0)
     assert away.scale_map.values.min() < -0.15  # what lies above the ground below the camera
+
+
+@pytest.mark.parametrize(("share", "finer"), [(0.02, False), (0.98, True)])
+def test_views_are_compared_one_level_finer_where_houses_are_mostly_known(opened, share, finer):
+    made = Localizer(opened).registration
+    known = round(share * made.sheet.area_km2 * 1e6)
+    surface = SimpleNamespace(info=SimpleNamespace(known_m2=known))
+    found = SearchedSheet(
+        made.sheet, made.pyramid, confidence=None, radius_m=9.0, floor_px=1.0, surface=surface
+    )
+    assert found.is_finer == finer
 
 
 def test_views_on_level_ground_know_the_surface_of_a_route(town, opened):

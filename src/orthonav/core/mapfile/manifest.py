@@ -97,6 +97,10 @@ class TerrainInfo:
     def is_above_sea(self) -> bool:
         return UNKNOWN_DATUM not in self.datum.split(", ")
 
+    @property
+    def known_m2(self) -> float:
+        return self.known * self.posting_m**2
+
     def to_plain(self) -> dict[str, Any]:
         known = {name: value for name, value in vars(self).items() if value is not None}
         return {"codec": TERRAIN_CODEC, **known}
