@@ -23,16 +23,29 @@ import numpy as np
 import pyproj
 import rasterio
 from console import ROOT, check_page, read_steps
+from lab.landscape import DEFAULT_DATES, generate_area, generate_heights
 from matplotlib.patches import Ellipse
 from PIL import Image
 from rasterio.windows import Window
 
 from orthonav.core.flight import FlightFolder, open_flight, read_image, read_truth
+from orthonav.core.flight.fixes import read_results
 from orthonav.core.geo.camera import footprint_en_m
 from orthonav.core.localize import downsampled, rectify
-from orthonav.core.records import Telemetry, View
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles import represent
 from orthonav.core.variants import make_variant
+from orthonav.ground.build import BuildRequest, build_map
+from orthonav.ground.imagery.terrain import open_dem
+from orthonav.ground.report.imagery import SheetImagery, as_fixed
+from orthonav.ground.simulate.flight import (
+    DEFAULT_CAMERA,
+    Errors,
+    SimulateRequest,
+    simulate_flight,
+)
+from orthonav.ground.view.perspective import map_in_view
 
 TUTORIAL = ROOT / "docs" / "tutorials" / "operator.md"
 FIGURES = ROOT / "docs" / "figures"
@@ -45,6 +58,7 @@ TILE_EN_PX = (690, 420, 256)
 WINDOW_M, ZOOM_M = 460.0, 36.0
 TRUE, FIXED = "#E69F00", "#0072B2"
 SIGMAS_95 = math.sqrt(-2 * math.log(0.05))
+TOWN_SEED, TOWN_SIDE_M, TOWN_AGL_M, TOWN_PITCH_DEG, TOWN_VIEWS = 25, 400.0, 80.0, 30.0, 8
 BROWSER_S = 90
 JPEG: dict[str, Any] = {"quality": 80, "optimize": True}
 WIDEST_PX = 1200
@@ -64,6 +78,7 @@ def main() -> int:
             print("printed otherwise than shown: python tools/docs/console.py --update PAGE")
             return 1
         _draw(folder)
+        _figure("town.jpg", (11, 3.2), lambda figure: _draw_town(figure, Path(name) / "town"))
         _photograph(folder)
     return 0
 
@@ -202,6 +217,48 @@ def _north_up(
     view = downsampled(View(picture, flight.camera, telemetry), 1.0)
     turned = rectify(view, gsd_m=1.0, size_px=round(WINDOW_M))
     return np.where(turned.valid, turned.grey, 255)
+
+
+def _draw_town(figure: Any, folder: Path) -> None:
+    """A view over houses, the map as the camera would see it from the fix, and both as one."""
+    past, present = DEFAULT_DATES[:2]
+    area = {"size_m": (TOWN_SIDE_M, TOWN_SIDE_M), "gsd_m": 0.2, "seed": TOWN_SEED}
+    generate_area(folder, dates=[past, present], **area)
+    generate_heights(folder, dates=[past, present], slope=0.02, **area)
+    town = folder / "town.onav"
+    surface = [folder / f"{past.name}_dsm.tif"]
+    build_map(BuildRequest([folder / f"{past.name}.tif"], town, surface=surface))
+    request = SimulateRequest(
+        [folder / f"{present.name}.tif"],
+        folder / "flight",
+        random=TOWN_VIEWS,
+        agl_m=TOWN_AGL_M,
+        camera=DEFAULT_CAMERA.fitted(640, 480),
+        errors=Errors(yaw_std_deg=10.0, agl_std=0.1, mount_std_deg=1.0),
+        surface=[open_dem(folder / f"{present.name}_dsm.tif")],
+        camera_pitch_deg=TOWN_PITCH_DEG,
+    )
+    simulate_flight(request)
+    fixes = folder / "fixes.jsonl"
+    command = [Path(sys.executable).with_name("orthonav"), "localize", "-q", town]
+    subprocess.run([*command, folder / "flight", "--out", fixes], check=True)
+    flight, sheet = open_flight(folder / "flight"), SheetImagery(open_map(town))
+    views = {each.frame: each for each in flight.views}
+    found = [each for each in read_results(fixes) if isinstance(each.outcome, Fix)]
+    result = max(found, key=lambda each: each.outcome.confidence)
+    view, fix = views[result.frame], result.outcome
+    truth = read_truth(folder / "flight" / "truth.csv")[result.frame]
+    place, true = (
+        np.asarray(sheet.frame.en_from_latlon(*at)) for at in ((fix.lat_deg, fix.lon_deg), truth)
+    )
+    mapped, valid = map_in_view(sheet, flight.camera, as_fixed(view.telemetry, result), place)
+    off_m = float(np.hypot(*(place - true)))
+    axes = figure.subplots(1, 3)
+    _show(axes[0], view.grey(), "the view, October 2021", cmap="gray")
+    title = f"the map of July 2016 from the fix, {off_m:.1f} m off"
+    _show(axes[1], np.where(valid, mapped, 255), title, cmap="gray")
+    both = np.dstack([view.grey(), mapped, mapped])
+    _show(axes[2], np.where(valid[..., None], both, 255), "red: the view, cyan: the map")
 
 
 def _photograph(folder: Path) -> None:
