@@ -2,8 +2,9 @@
 
 Real imagery is optional: it is looked for beside the checkout (`../shared/data`), or in the folder
 that ORTHONAV_DATA names. Orthophotos are named by their file below it, generated ones by
-`generated:SEED:DATE`, or `generated:SEED:GSD:DATE` at another scale than 1 m. Maps, generated areas
-and flights stay in a folder of work: use another one after the code that makes them has changed.
+`generated:SEED[:GSD[:SIDE_M]]:DATE`, of 1 m and 2000 x 2000 px unless they say otherwise. Maps,
+generated areas and flights stay in a folder of work: use another one after the code that makes them
+has changed.
 """
 
 import hashlib

@@ -176,11 +176,9 @@ def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
     folder = work / f"area-{seed}-{side_m}m-{gsd_m:g}m-hills{slope:g}"
     if kind == WORN:
         out = folder / f"{date}_worn.tif"
-        return (
-            out
-            if out.is_file()
-            else _worn(out, landscape_heights(name, work, slope, SURFACE), seed)
-        )
+        if not out.is_file():
+            _worn(out, landscape_heights(name, work, slope, SURFACE), seed)
+        return out
     path = folder / ("dem.tif" if kind == BARE else f"{date}_dsm.tif")
     if not path.is_file():
         dates = [each for each in DEFAULT_DATES if each.name == date]
@@ -189,7 +187,7 @@ def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
     return path
 
 
-def _worn(out: Path, surface: Path, seed: int) -> Path:
+def _worn(out: Path, surface: Path, seed: int) -> None:
     rng = np.random.default_rng([seed, 6])
     with rasterio.open(surface) as source:
         heights, transform, crs = source.read(1), source.transform, source.crs
@@ -204,7 +202,7 @@ def _worn(out: Path, surface: Path, seed: int) -> Path:
     heights[lacking] = bare[lacking]
     coarse = tuple(math.ceil(side * transform.a / WORN_POSTING_M) for side in heights.shape)
     noise = cv2.resize(rng.normal(0.0, WORN_STD_M, coarse), size, interpolation=cv2.INTER_NEAREST)
-    return written(out, np.asarray(heights + noise, np.float32), transform, crs)
+    written(out, np.asarray(heights + noise, np.float32), transform, crs)
 
 
 def scaled_copy(name: str, work: Path) -> Path:

@@ -38,7 +38,8 @@ TILTS = (0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)
 """Standard deviations of the true pitch and roll, and as stated, degrees."""
 ROOFS_GSD_M, ROOFS_SEEDS = 0.2, (1, 11, 25)  # of generated towns
 TOWN_SEEDS, TOWN_SIDE_M, TOWN_WITHIN_M = (253, 286, 288), 1000, 250.0
-"""The seeds of 1 to 300 that have a town nearest to the middle of their first square kilometre."""
+"""Of seeds 1 to 300 those whose first square kilometre has a town, and nearest to its middle; its
+side, and how far from the middle of it the views look."""
 TOWN_AGL_M, TOWN_AHEAD_DEG = (120.0, 80.0, 50.0), (0.0, 30.0, 45.0)
 
 

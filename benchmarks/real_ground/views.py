@@ -67,7 +67,8 @@ class OverRelief:
     def pictures(self) -> str:
         """Name of the folder of pictures, which rows share."""
         lens = "-nominal" if self.nominal else ""
-        lens += "" if self.agl_m is None else f"-{self.agl_m:g}m-{self.ahead_deg:g}deg"
+        if self.agl_m is not None:
+            lens += f"-{self.agl_m:g}m-{self.ahead_deg:g}deg-within-{self.within_m:g}m"
         name = self.pair.name.replace(" ", "").replace(">", "-")
         return f"{name}-{self.slope:g}-{self.tilt_std_deg:g}{lens}"
 

@@ -19,7 +19,7 @@ from orthonav.core.localize.ground import (
 from orthonav.core.localize.rectify import hidden
 from orthonav.core.localize.systematic import SURFACE_M
 from orthonav.core.mapfile import open_map
-from orthonav.core.mapfile.manifest import Lean
+from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import Telemetry, View
 from orthonav.ground.build.lean import as_shown
 from orthonav.ground.simulate.render import Raster
@@ -205,11 +205,13 @@ def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
     assert away.scale_map.values.min() < -0.15  # what lies above the ground below the camera
 
 
-@pytest.mark.parametrize(("share", "finer"), [(0.02, False), (0.98, True)])
+@pytest.mark.parametrize(("share", "finer"), [(0.45, False), (0.55, True)])
 def test_views_are_compared_one_level_finer_where_houses_are_mostly_known(opened, share, finer):
     made = Localizer(opened).registration
-    known = round(share * made.sheet.area_km2 * 1e6)
-    surface = SimpleNamespace(info=SimpleNamespace(known_m2=known))
+    imagery_m2, posting_m = made.sheet.grey.valid_px * made.grid.gsd_m**2, 0.5
+    known = round(share * imagery_m2 / posting_m**2)
+    info = TerrainInfo(0.0, 0.0, posting_m, 9, 9, 16, 0.0, 9.0, 0.1, known, "surface", "none")
+    surface = SimpleNamespace(info=info)
     found = SearchedSheet(
         made.sheet, made.pyramid, confidence=None, radius_m=9.0, floor_px=1.0, surface=surface
     )

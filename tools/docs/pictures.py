@@ -245,7 +245,9 @@ def _draw_town(figure: Any, folder: Path) -> None:
     flight, sheet = open_flight(folder / "flight"), SheetImagery(open_map(town))
     views = {each.frame: each for each in flight.views}
     found = [each for each in read_results(fixes) if isinstance(each.outcome, Fix)]
-    result = max(found, key=lambda each: each.outcome.confidence)
+    if not found:
+        raise SystemExit("no view over the town was placed")
+    result = max(found, key=lambda each: each.outcome.confidence)  # the figure shows a good one
     view, fix = views[result.frame], result.outcome
     truth = read_truth(folder / "flight" / "truth.csv")[result.frame]
     place, true = (

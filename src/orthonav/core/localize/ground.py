@@ -228,7 +228,6 @@ class SearchedSheet:
         surface: TerrainLayer | None = None,
     ) -> None:
         """`confidence`: None before it is learnt: no place is proven. `radius_m`: its error.
-        `is_finer`: views are compared one level finer, where houses and trees are mostly known.
 
         `floor_px`: standard deviation with which maps of two dates agree, pixels of level 0.
         Without `propose` candidates come from FFT only; without `terrain` the ground is level."""
@@ -236,8 +235,10 @@ class SearchedSheet:
         self.pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
         self.reference = Reference(layer)
         self.windows = SearchWindows(self.reference)
-        houses_m2 = 0.0 if surface is None else surface.info.known_m2
-        self.is_finer = houses_m2 > MIN_KNOWN * 1e6 * sheet.area_km2
+        known_m2 = 0.0 if surface is None else surface.info.known_m2
+        imagery_px = 0 if sheet.grey is None else sheet.grey.valid_px
+        # Whether all views are compared one level finer than over bare ground.
+        self.is_finer = known_m2 > MIN_KNOWN * imagery_px * self.grid.gsd_m**2
         self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
         self.propose, self.plan = propose, plan
         info = None if terrain is None else terrain.info

@@ -248,7 +248,8 @@ class Terrain:
     def ahead(
         cls, relief: Relief, place: Array, agl_m: float, ahead_en_m: Array
     ) -> "Terrain | None":
-        """At a place (2,); None where unknown. `ahead_en_m` (2,): on level ground."""
+        """Below a camera at a place (2,), `agl_m` above the ground there, and where it looks; None
+        where unknown. `ahead_en_m` (2,): where it would look on level ground."""
         seen, rise = place, 0.0
         for _ in range(SIGHT_STEPS):
             seen = place + (1 - rise) * ahead_en_m

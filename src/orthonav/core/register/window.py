@@ -31,7 +31,6 @@ def thread_memory(name: str, size: int) -> NDArray[np.float32]:
 Array = NDArray[np.float32]
 LONGEST_PX = 32768  # that the kernel and OpenCV sample
 WHOLE_LEVEL_PX = 2_000_000  # smaller levels are made ready whole, once (16 bytes each)
-LARGEST_KEPT_PX = 1_000_000  # of a window of other levels, kept for the next one
 
 
 class GreyPyramid(Protocol):
@@ -54,7 +53,6 @@ class Reference:
     def __init__(self, pyramid: GreyPyramid) -> None:
         self.pyramid = pyramid
         self._whole: OrderedDict[tuple[int, ChannelRecipe], Array] = OrderedDict()
-        self._last: dict[tuple[int, ChannelRecipe], tuple[int, int, Array]] = {}  # row, column
         self._lock = threading.Lock()
 
     @property
@@ -82,26 +80,10 @@ class Reference:
     def window(
         self, level: int, row: int, col: int, height: int, width: int, recipe: ChannelRecipe = FINE
     ) -> Array:
-        """(height, width, 4); zero beyond the sheet. One inside the last one of its kind is cut out
-        of that: the camera of a view is fitted to one place."""
+        """(height, width, 4); zero beyond the sheet."""
+        rows, cols = self.shape(level)
         if self.caches(level):
             return cut(self.whole(level, recipe), row, col, height, width)
-        last = self._last.get((level, recipe))
-        if last is not None:
-            top, left, made = last
-            down, right = row - top, col - left
-            inside = down + height <= made.shape[0] and right + width <= made.shape[1]
-            if min(down, right) >= 0 and inside:
-                return made[down : down + height, right : right + width]
-        made = self._made(level, row, col, height, width, recipe)
-        if height * width <= LARGEST_KEPT_PX:
-            self._last[level, recipe] = row, col, made
-        return made
-
-    def _made(
-        self, level: int, row: int, col: int, height: int, width: int, recipe: ChannelRecipe
-    ) -> Array:
-        rows, cols = self.shape(level)
         # No more than the sheet: a window beyond it costs nothing.
         margin = recipe.margin_px
         top, left = max(row - margin, 0), max(col - margin, 0)
