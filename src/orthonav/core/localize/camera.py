@@ -30,6 +30,9 @@ FIRST_REACH_PX, REACH_PX = 7, 4
 SURFACE_REACHES_PX = 16, 8
 """The first reaches over houses and trees, at the finer level: coarser ones do not show the camera
 (docs/decisions/terrain.md)."""
+CLOSE_FIT = 0.15
+"""Mean correlation of the blocks from which on a camera close to the reported one is not sought any
+farther: right ones had 0.15 to 0.28, wrong ones up to 0.13 (docs/decisions/terrain.md)."""
 AGAIN_PX = 1.0
 """A view is orthorectified once more where its correction moves a block by more pixels of the final
 level."""
@@ -114,12 +117,27 @@ def _turn(one: Orientation, other: Orientation) -> Array:
     return np.asarray((other.attitude_deg - one.attitude_deg + 180.0) % 360.0 - 180.0)
 
 
+def _close(
+    seen: ViewOverGround, reference: Reference, pose: Pose
+) -> "tuple[_Compared, Orientation] | None":
+    """The camera among houses, with the blocks there, where it is close to the reported one."""
+    start = seen.orientation(pose)
+    if seen.relief.surface is None or start is None:
+        return None
+    end = _among_houses(seen, reference, pose, start, SURFACE_REACHES_PX[-1:])
+    return None if end is None or end[0].mean_correlation < CLOSE_FIT else end
+
+
 def _among_houses(
-    seen: ViewOverGround, reference: Reference, pose: Pose, start: Orientation
+    seen: ViewOverGround,
+    reference: Reference,
+    pose: Pose,
+    start: Orientation,
+    reaches_px: tuple[int, ...] = SURFACE_REACHES_PX,
 ) -> "tuple[_Compared, Orientation] | None":
     """The camera where the fit ends, with the blocks there."""
     orientation: Orientation | None = start
-    for reach_px in SURFACE_REACHES_PX:
+    for reach_px in reaches_px:
         if orientation is not None:
             orientation = _climbed(seen, reference, pose, orientation, reach_px, finer=True)
     if orientation is None:
@@ -156,11 +174,14 @@ def camera_found(
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
         level = Relief(LevelTerrain(), seen.relief.grid, land=seen.relief.land)
         seen, start = ViewOverGround(level, seen.view), None
+    close = None if start is not None else _close(seen, reference, pose)
+    if close is not None:
+        start = close[1]
     start = start or approached(seen, reference, pose)
     if start is None:
         return None
     variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
-    near = _fitted(seen, reference, pose, start, variance)
+    near = _fitted(seen, reference, pose, start, variance, close and close[0])
     if near is not None and near.moved_px > AGAIN_PX * 2.0**seen.view.levels.final:
         near = _fitted(seen, reference, pose, near.orientation, variance)
     if near is None:
@@ -203,9 +224,15 @@ class _Fitted(NamedTuple):
 
 
 def _fitted(
-    seen: ViewOverGround, reference: Reference, pose: Pose, start: Orientation, variance: float
+    seen: ViewOverGround,
+    reference: Reference,
+    pose: Pose,
+    start: Orientation,
+    variance: float,
+    near: "_Compared | None" = None,
 ) -> _Fitted | None:
-    near = _compared(seen, reference, pose, start, REACH_PX, finer=True)
+    """`near`: the blocks under `start`, None: to be compared."""
+    near = near or _compared(seen, reference, pose, start, REACH_PX, finer=True)
     found = None if near is None else near.resected(variance)
     if near is None or found is None:
         return None
@@ -240,6 +267,11 @@ class _Compared:
         correlations, pixels, _ = self.blocks[0][0]
         middle = correlations.shape[1] // 2
         return float((correlations[:, middle, middle] * np.sqrt(pixels)).sum())
+
+    @property
+    def mean_correlation(self) -> float:
+        """Of the same blocks, weighted by the roots of their pixels."""
+        return self.fit / max(float(np.sqrt(self.blocks[0][0].pixels).sum()), 1.0)
 
     def moves_px(self, correction: Array) -> float:
         """How far a correction (6,) moves a block, pixels of level 0."""
