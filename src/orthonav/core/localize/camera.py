@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthonav.core.geo.camera import Camera, enu_from_camera, seen_px
 from orthonav.core.localize.ground import LevelTerrain, Relief, ViewOverGround
 from orthonav.core.localize.rectify import Orientation, is_oblique
-from orthonav.core.localize.resection import Expected, Resection, climbed, resected
+from orthonav.core.localize.resection import Expected, Resection, climbed, resected, values
 from orthonav.core.localize.systematic import GroundErrors, lens_px, systematic
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
 from orthonav.core.register.blocks import BlockScores, block_scores
@@ -30,9 +30,10 @@ FIRST_REACH_PX, REACH_PX = 7, 4
 SURFACE_REACHES_PX = 16, 8
 """The first reaches over houses and trees, at the finer level: coarser ones do not show the camera
 (docs/decisions/terrain.md)."""
-CLOSE_FIT = 0.15
-"""Mean correlation of the blocks from which on a camera close to the reported one is not sought any
-farther: right ones had 0.15 to 0.28, wrong ones up to 0.13 (docs/decisions/terrain.md)."""
+LEAST_FIT, CLOSE_FIT = 0.075, 0.15
+"""Mean correlation of the blocks of a view among houses: below the first the camera is not shown,
+from the second on one close to the reported one is not sought any farther. Right ones had 0.09 to
+0.28 (docs/decisions/terrain.md)."""
 AGAIN_PX = 1.0
 """A view is orthorectified once more where its correction moves a block by more pixels of the final
 level."""
@@ -40,6 +41,8 @@ VARIANCE, VARIANCE_POWER, LEAST_RATIO = 1.6, -0.8, 0.5
 """Variance of the errors of blocks over what their curvature says: the first, times the local ratio
 of the place (at least the third) to the power of the second (docs/decisions/camera.md)."""
 Array = NDArray[np.float64]
+STAYS: Array = np.zeros(6)
+"""No correction of a camera."""
 
 
 def picture_by_ground(camera: Camera, orientation: Orientation, ground_m: Array) -> Array:
@@ -109,7 +112,7 @@ def approached(seen: ViewOverGround, reference: Reference, pose: Pose) -> Orient
         return end[1]
     # Over roofs the fit may end at another camera; that which fits best is right.
     other = _among_houses(seen, reference, pose, smooth)
-    return end[1] if other is None or other[0].fit <= end[0].fit else other[1]
+    return end[1] if other is None or other[0].fit() <= end[0].fit() else other[1]
 
 
 def _turn(one: Orientation, other: Orientation) -> Array:
@@ -125,7 +128,7 @@ def _close(
     if seen.relief.surface is None or start is None:
         return None
     end = _among_houses(seen, reference, pose, start, SURFACE_REACHES_PX[-1:])
-    return None if end is None or end[0].mean_correlation < CLOSE_FIT else end
+    return None if end is None or end[0].mean_correlation() < CLOSE_FIT else end
 
 
 def _among_houses(
@@ -184,7 +187,7 @@ def camera_found(
     near = _fitted(seen, reference, pose, start, variance, close and close[0])
     if near is not None and near.moved_px > AGAIN_PX * 2.0**seen.view.levels.final:
         near = _fitted(seen, reference, pose, near.orientation, variance)
-    if near is None:
+    if near is None or not near.is_shown:
         return None
     found, orientation = near.found, near.orientation
     east, north, above_sea_m = orientation.position_m.tolist()
@@ -212,11 +215,14 @@ def tilt_std_deg(telemetry: Telemetry) -> float:
 
 
 class _Fitted(NamedTuple):
-    """A resection from `start`; it moved a block by up to `moved_px`, pixels of level 0."""
+    """A resection from `start`; it moved a block by up to `moved_px`, pixels of level 0.
+
+    `is_shown`: whether the blocks fit the map there; over bare ground they are not asked."""
 
     start: Orientation
     found: Resection
     moved_px: float
+    is_shown: bool
 
     @property
     def orientation(self) -> Orientation:
@@ -236,7 +242,9 @@ def _fitted(
     found = None if near is None else near.resected(variance)
     if near is None or found is None:
         return None
-    return _Fitted(start, found, near.moves_px(found.correction))
+    is_shown = not seen.relief.shows_houses(near.ground_m)
+    is_shown = is_shown or near.mean_correlation(found.correction) >= LEAST_FIT
+    return _Fitted(start, found, near.moves_px(found.correction), is_shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,17 +269,16 @@ class _Compared:
     def block_px(self) -> float:
         return self.seen.view.side_px / BLOCKS
 
-    @property
-    def fit(self) -> float:
-        """Sum of the correlations of the finest blocks where they are, over what chance makes."""
-        correlations, pixels, _ = self.blocks[0][0]
-        middle = correlations.shape[1] // 2
-        return float((correlations[:, middle, middle] * np.sqrt(pixels)).sum())
+    def fit(self, correction: Array = STAYS) -> float:
+        """Sum of the correlations of the finest blocks under a correction (6,), over what chance
+        makes."""
+        (correlations, pixels, _), pixel = self.blocks[0]
+        moved_px = np.nan_to_num(self.moved_px @ correction) / pixel
+        return float((values(correlations, moved_px) * np.sqrt(pixels)).sum())
 
-    @property
-    def mean_correlation(self) -> float:
+    def mean_correlation(self, correction: Array = STAYS) -> float:
         """Of the same blocks, weighted by the roots of their pixels."""
-        return self.fit / max(float(np.sqrt(self.blocks[0][0].pixels).sum()), 1.0)
+        return self.fit(correction) / max(float(np.sqrt(self.blocks[0][0].pixels).sum()), 1.0)
 
     def moves_px(self, correction: Array) -> float:
         """How far a correction (6,) moves a block, pixels of level 0."""

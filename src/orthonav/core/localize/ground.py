@@ -113,6 +113,10 @@ class Relief:
         above_m = self.surface.at_en_m(ground_m[..., :2])
         return above_m if np.isfinite(above_m).mean() >= MIN_KNOWN else None
 
+    def shows_houses(self, ground_m: Array) -> bool:
+        """Whether houses and trees are mostly known at (N, 3)."""
+        return self._above_m(ground_m) is not None
+
     def slopes(self, ground_m: Array) -> Array:
         """Rise (N, 2) per metre east and north at (N, 3)."""
         if self.is_level:

@@ -253,7 +253,7 @@ class _Blocks:
         """The most likely one of corrections (S, 6)."""
         mean, information = expected
         moved = corrections @ self._by_level.T
-        here = _values(self.correlations, moved.reshape(len(corrections), -1, 2))
+        here = values(self.correlations, moved.reshape(len(corrections), -1, 2))
         usual = self._usual(here).max(axis=0)
         odds = self._weights(usual) * (here - usual / 2)
         # Of 1 + exp(odds): the product of the rest is at most 2 to the power of the blocks.
@@ -372,7 +372,7 @@ def _quadratic(surfaces: Array, moved_px: Array) -> tuple[Array, Array, Array]:
     return value * inside, slope * inside[:, None], _positive(curvature) * inside[:, None, None]
 
 
-def _values(surfaces: Array, moved_px: Array) -> Array:
+def values(surfaces: Array, moved_px: Array) -> Array:
     """Of surfaces (N, S, S) at the pixel nearest to displacements (.., N, 2), else 0."""
     reach = surfaces.shape[-1] // 2
     nearest = np.rint(np.minimum(np.maximum(moved_px, -reach), reach)).astype(int) + reach
