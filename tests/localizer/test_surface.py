@@ -1,14 +1,16 @@
 """Views over houses on a map that knows them, against rays that are followed to the roofs."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from blots import AGL_M, CAMERA, GROUND, Heights, as_grey, error_m, known_map
 from lab.terrain import seen_view
 
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.camera import approached
+from orthonav.core.localize.camera import approached, camera_found
 from orthonav.core.localize.ground import (
     MIN_KNOWN,
     Relief,
@@ -93,6 +95,21 @@ def test_the_camera_is_approached_from_metres_and_degrees(opened, town, view):
     assert np.linalg.norm(start.position_m - truth) > 2.0
     assert np.linalg.norm(found.position_m - truth) < 0.7
     assert np.abs(found.attitude_deg - ATTITUDE).max() < 0.4
+
+
+def test_a_camera_that_the_picture_does_not_show_among_houses_is_not_found(opened, town, view):
+    _, ground, above = town
+    rng = np.random.default_rng(0)
+    blots = cv2.GaussianBlur(rng.normal(0.0, 1.0, view.grey.shape), (0, 0), 3.0)
+    other = np.clip(128 + 40 * blots / blots.std(), 0, 255).astype(np.uint8)
+    for surface, shown in ((Heights(above), False), (None, True)):  # over bare ground not asked
+        registration = on(opened, ground, surface).registration
+        for picture, found in ((view.grey, True), (other, shown)):
+            prepared = registration.prepared(replace(view, grey=picture), True)
+            seen = ViewOverGround(registration.relief, prepared)
+            pose = registration.pose_of(prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
+            camera = camera_found(seen, registration.reference, pose, 1.0)
+            assert (camera is not None) == found
 
 
 @pytest.mark.parametrize("east, north", [(0.3, -0.2), (-0.25, 0.0)])
