@@ -275,9 +275,12 @@ class Dem:
     ) -> Iterator[tuple[NDArray[np.intp], int, int, Array]]:
         """Positions of each window that holds some, its first column and row, and its heights."""
         which = np.flatnonzero(inside)
-        blocks = np.stack([col[which], row[which]], axis=1) // BLOCK_PX
-        for corner in np.unique(blocks.astype(np.intp), axis=0).tolist():
-            some = which[(blocks == corner).all(axis=1)]
+        across = self._data.width // BLOCK_PX + 1
+        blocks = (row[which] // BLOCK_PX * across + col[which] // BLOCK_PX).astype(np.intp)
+        order = np.argsort(blocks, kind="stable")
+        found, starts = np.unique(blocks[order], return_index=True)
+        for block, some in zip(found.tolist(), np.split(which[order], starts[1:]), strict=False):
+            corner = block % across, block // across
             left, top = (max(0, at * BLOCK_PX - 1) for at in corner)
             right, bottom = ((at + 1) * BLOCK_PX + 1 for at in corner)
             right, bottom = min(right, self._data.width), min(bottom, self._data.height)
