@@ -133,12 +133,18 @@ def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
 
 @pytest.mark.parametrize("broken", [False, True])
 def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, caplog, broken):
-    """In place of a terrain of Copernicus; if it cannot be fetched, the imagery is kept."""
+    """In place of a terrain of Copernicus, which is fetched where the surface cannot be."""
     found, url, asked_for = terrain.surface_file(tmp_path), [], []
     out, dsm_path = tmp_path / "ortho.tif", tmp_path / "ortho_dsm.tif"
+    if broken:
+        found = terrain.height_files(tmp_path)[0]
     answer = servers.searching(found, url, asked_for)
+
+    def without_surface(asked):
+        return servers.Answer(b"no", 503) if b"surface3d" in asked.body else answer(asked)
+
     with (
-        servers.serving((lambda _: servers.Answer(b"no", 503)) if broken else answer) as heights,
+        servers.serving(without_surface if broken else answer) as heights,
         servers.serving(servers.tiles) as server,
     ):
         url.append(heights.url)
@@ -148,13 +154,14 @@ def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, capl
         assert dry["surface"] == "swisssurface3d" and dry["terrain"] is None
         code, stdout, _ = command(*fetch, "--json", terrain=True)
         plain = json.loads(stdout)
-        assert code == 0 and plain["terrain"] is None and (plain["surface"] is None) == broken
+        assert code == 0 and (plain["terrain"] is None) == (plain["surface"] is not None)
         stdout = command(*fetch, terrain=True)[1]
     line = f"orthonav build --ortho {out} "
     if broken:
         assert "no surface was fetched" in caplog.text and "--source swisssurf" in caplog.text
         assert out.is_file() and not dsm_path.exists()
-        assert line in stdout and "--surface" not in stdout
+        assert plain["terrain"]["out"] == str(tmp_path / "ortho_dem.tif")
+        assert f"{line}--dem " in stdout and "--surface" not in stdout
         return
     assert plain["surface"]["out"] == str(dsm_path) and plain["surface"]["datum"] == "EPSG:5728"
     assert f"{line}--surface {dsm_path} " in stdout and "--dem" not in stdout

@@ -100,6 +100,7 @@ def run(options: argparse.Namespace) -> None:
     if options.source is None or (options.out is None and not options.dry_run):
         raise FetchError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
+    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
     from orthonav.ground.fetch.run import estimate_fetch, fetch, holds_heights
 
     request = _request(options)
@@ -116,6 +117,8 @@ def run(options: argparse.Namespace) -> None:
     for kind, name in names.items():
         if name is not None and imagery:
             found |= _heights(options, request, kind, name)
+    if options.terrain and names["surface"] and imagery and not found:
+        found = _heights(options, request, "terrain", DEFAULT_TERRAIN)
     if options.json:
         more: dict[str, object] = dict.fromkeys(names)
         more |= {kind: {"out": str(out), **got.describe()} for kind, (out, got) in found.items()}
