@@ -59,14 +59,28 @@ def on(opened, ground, surface, lean=None):
     return localizer
 
 
-@pytest.fixture(scope="module")
-def view(town):
-    grey, ground, above = town
+def shown(above, lean):
+    """Heights of houses where a map with this lean shows them."""
+
+    def high(west_m, north_m, posting_m, rows, cols):
+        at = np.meshgrid(np.arange(cols) + 0.5, np.arange(rows) + 0.5)
+        return above.at(west_m + at[0] * posting_m, north_m - at[1] * posting_m)
+
+    side = len(above.values)
+    return raster(as_shown(high, lean)(-SIDE_M / 2, SIDE_M / 2, FINEST_M, side, side))
+
+
+def seen_by_camera(grey, ground, above):
     solid = Raster(ground.values + above.values, ground.west_m, ground.north_m, FINEST_M)
     below = float(ground.at(PLACE[:1], PLACE[1:])[0])
     position = np.array([*PLACE, below + AGL_M / 2])
     picture, _ = seen_view(grey, solid, CAMERA, ATTITUDE, position, finer=1)
     return View(picture, CAMERA, Telemetry(0, 72.0, 31.0, -1.0, 1.04 * AGL_M / 2))
+
+
+@pytest.fixture(scope="module")
+def view(town):
+    return seen_by_camera(*town)
 
 
 def test_the_camera_is_found_among_houses_to_decimetres(opened, town, view):
@@ -115,14 +129,8 @@ def test_a_camera_that_the_picture_does_not_show_among_houses_is_not_found(opene
 @pytest.mark.parametrize("east, north", [(0.3, -0.2), (-0.25, 0.0)])
 def test_houses_that_lean_on_the_map_are_seen_where_they_stand(opened, town, view, east, north):
     _, ground, above = town
-    lean, side = Lean(east, north, 0.0), len(above.values)
-
-    def high(west_m, north_m, posting_m, rows, cols):
-        at = np.meshgrid(np.arange(cols) + 0.5, np.arange(rows) + 0.5)
-        return above.at(west_m + at[0] * posting_m, north_m - at[1] * posting_m)
-
-    shown = raster(as_shown(high, lean)(-SIDE_M / 2, SIDE_M / 2, FINEST_M, side, side))
-    registration = on(opened, ground, Heights(shown), lean).registration
+    lean = Lean(east, north, 0.0)
+    registration = on(opened, ground, Heights(shown(above, lean)), lean).registration
     prepared = registration.prepared(view, True)
     seen = ViewOverGround(registration.relief, prepared)
     pose = registration.pose_of(prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
@@ -131,6 +139,22 @@ def test_houses_that_lean_on_the_map_are_seen_where_they_stand(opened, town, vie
     high_m = nodes[..., 2] - level_m
     off_m = on_map[..., :2] - nodes[..., :2] - high_m[..., None] * [east, north]
     assert np.nanmax(np.abs(off_m)) < 1e-6 and np.nanmax(high_m) > 5.0
+
+
+def test_the_camera_is_found_on_a_map_whose_houses_lean(opened, town):
+    """Roofs are as the map shows them, which is beside the place where they are seen."""
+    grey, ground, above = town
+    lean, high = Lean(0.3, -0.2, 0.0), above.values
+    at = np.arange(FINEST_M / 2, SIDE_M, FINEST_M) - SIDE_M / 2
+    east, north = np.meshgrid(at, -at)
+    roofs = raster(grey.at(east + lean.east * high, north + lean.north * high))
+    view = seen_by_camera(roofs, ground, above)
+    found = (localizer := on(opened, ground, Heights(shown(above, lean)), lean)).locate(view)
+    upright = (bare := on(opened, ground, Heights(above))).locate(view)
+    error = error_m(localizer, found, PLACE)
+    assert error < 0.4 and found.confidence > 0.9
+    assert error**2 < 9.0 * np.trace(found.cov_en_m2)
+    assert error < 0.7 * error_m(bare, upright, PLACE)
 
 
 def test_an_unknown_height_at_the_rim_hides_nothing_less(opened, town, view):
