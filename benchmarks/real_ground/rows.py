@@ -40,7 +40,9 @@ ROOFS_GSD_M, ROOFS_SEEDS = 0.2, (1, 11, 25)  # of generated towns
 TOWN_SEEDS, TOWN_SIDE_M, TOWN_WITHIN_M = (253, 286, 288), 1000, 250.0
 """Of seeds 1 to 300 those whose first square kilometre has a town, and nearest to its middle; its
 side, and how far from the middle of it the views look."""
-TOWN_AGL_M, TOWN_AHEAD_DEG = (120.0, 80.0, 50.0), (0.0, 30.0, 45.0)
+TOWN_AGL_M, TOWN_AHEAD_DEG = (250.0, 120.0, 80.0, 50.0), (0.0, 30.0, 45.0, 60.0)
+TOWN_NOMINAL = 80.0, 30.0
+"""Height and pitch of the views by a lens of which the field of view is known only."""
 
 
 AnySource = OverRelief | OverLevel | Recording | Replay | Windows
@@ -198,14 +200,22 @@ def _towns() -> Iterator[Question]:
         Scene(f"town_{seed}", folder.format(seed), ROOFS_GSD_M, dates).pair(*dates)
         for seed in TOWN_SEEDS
     ]
-    for agl_m, ahead_deg in product(TOWN_AGL_M, TOWN_AHEAD_DEG):
+    asked = [(*each, False) for each in product(TOWN_AGL_M, TOWN_AHEAD_DEG)]
+    for agl_m, ahead_deg, nominal in [*asked, (*TOWN_NOMINAL, True)]:
         maps = [dict(_grounds(pair.map, 2.0)) for pair in towns]
         for ground in ("no terrain", "bare earth", "surface", "surface of another year"):
-            views = partial(OverRelief, agl_m=agl_m, ahead_deg=ahead_deg, within_m=TOWN_WITHIN_M)
+            views = partial(
+                OverRelief,
+                agl_m=agl_m,
+                ahead_deg=ahead_deg,
+                nominal=nominal,
+                within_m=TOWN_WITHIN_M,
+            )
             legs = tuple(
                 (on[ground], views(pair, 2.0, 1.0)) for on, pair in zip(maps, towns, strict=True)
             )
-            name = f"town from {agl_m:g} m, {ahead_deg:g} deg ahead, {ground}"
+            lens = ", nominal lens" * nominal
+            name = f"town from {agl_m:g} m, {ahead_deg:g} deg ahead{lens}, {ground}"
             yield Question(name, "towns", legs)
 
 
