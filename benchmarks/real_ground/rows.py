@@ -40,9 +40,11 @@ ROOFS_GSD_M, ROOFS_SEEDS = 0.2, (1, 11, 25)  # of generated towns
 TOWN_SEEDS, TOWN_SIDE_M, TOWN_WITHIN_M = (253, 286, 288), 1000, 250.0
 """Of seeds 1 to 300 those whose first square kilometre has a town, and nearest to its middle; its
 side, and how far from the middle of it the views look."""
-TOWN_AGL_M, TOWN_AHEAD_DEG = (250.0, 120.0, 80.0, 50.0), (0.0, 30.0, 45.0, 60.0)
+TOWN_LOOKS = *product((120.0, 80.0, 50.0), (0.0, 30.0, 45.0)), (250.0, 0.0), (250.0, 30.0)
+"""Heights of views, and how far they look ahead; farther ahead they would show land beyond the
+map."""
 TOWN_NOMINAL = 80.0, 30.0
-"""Height and pitch of the views by a lens of which the field of view is known only."""
+"""The same of views by a lens of which only the field of view is known."""
 
 
 AnySource = OverRelief | OverLevel | Recording | Replay | Windows
@@ -200,8 +202,8 @@ def _towns() -> Iterator[Question]:
         Scene(f"town_{seed}", folder.format(seed), ROOFS_GSD_M, dates).pair(*dates)
         for seed in TOWN_SEEDS
     ]
-    asked = [(*each, False) for each in product(TOWN_AGL_M, TOWN_AHEAD_DEG)]
-    for agl_m, ahead_deg, nominal in [*asked, (*TOWN_NOMINAL, True)]:
+    asked = [*((*each, False) for each in TOWN_LOOKS), (*TOWN_NOMINAL, True)]
+    for agl_m, ahead_deg, nominal in asked:
         maps = [dict(_grounds(pair.map, 2.0)) for pair in towns]
         for ground in ("no terrain", "bare earth", "surface", "surface of another year"):
             views = partial(

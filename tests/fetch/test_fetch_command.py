@@ -136,6 +136,7 @@ def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, capl
     """In place of a terrain of Copernicus, which is fetched where the surface cannot be."""
     found, url, asked_for = terrain.surface_file(tmp_path), [], []
     out, dsm_path = tmp_path / "ortho.tif", tmp_path / "ortho_dsm.tif"
+    dem_path = tmp_path / "ortho_dem.tif"
     if broken:
         found = terrain.height_files(tmp_path)[0]
     answer = servers.searching(found, url, asked_for)
@@ -155,12 +156,15 @@ def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, capl
         code, stdout, _ = command(*fetch, "--json", terrain=True)
         plain = json.loads(stdout)
         assert code == 0 and (plain["terrain"] is None) == (plain["surface"] is not None)
-        stdout = command(*fetch, terrain=True)[1]
+        code, stdout, _ = command(*fetch, terrain=True)
+        assert code == 0 and dem_path.exists() == broken
+        dem_path.unlink(missing_ok=True)
+        assert command(*fetch)[0] == 0 and not dem_path.exists()  # --no-terrain
     line = f"orthonav build --ortho {out} "
     if broken:
         assert "no surface was fetched" in caplog.text and "--source swisssurf" in caplog.text
-        assert out.is_file() and not dsm_path.exists()
-        assert plain["terrain"]["out"] == str(tmp_path / "ortho_dem.tif")
+        assert out.is_file() and not dsm_path.exists() and plain["surface"] is None
+        assert plain["terrain"]["out"] == str(dem_path)
         assert f"{line}--dem " in stdout and "--surface" not in stdout
         return
     assert plain["surface"]["out"] == str(dsm_path) and plain["surface"]["datum"] == "EPSG:5728"

@@ -117,7 +117,7 @@ def run(options: argparse.Namespace) -> None:
     for kind, name in names.items():
         if name is not None and imagery:
             found |= _heights(options, request, kind, name)
-    if options.terrain and names["surface"] and imagery and not found:
+    if options.terrain and names["terrain"] is None and names["surface"] and imagery and not found:
         found = _heights(options, request, "terrain", DEFAULT_TERRAIN)
     if options.json:
         more: dict[str, object] = dict.fromkeys(names)

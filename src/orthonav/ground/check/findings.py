@@ -137,10 +137,11 @@ MANY_PLACES = 0.1
 DISPLACED = 0.03
 """Displacement of houses and trees, a fraction of a view, from which it is named: a view is
 registered at about as many pixels from any height. At 4 % (from 120 m, 65 deg wide) a surface made
-positions six times as accurate (docs/benchmarks.md); 3 % is 155 m, and 470 m 30 deg ahead."""
+positions over ten times as accurate (docs/benchmarks.md); 3 % is 155 m, and 470 m 30 deg ahead."""
 NARROW_M, OBLIQUE_DEG = 110.0, 15.0
-"""Views narrower than this (root of their area) were confident less often over towns than GO asks
-for: of 132, 88 and 55 m as `TOWNS` says, 0 and 45 deg ahead (docs/benchmarks.md)."""
+"""Views narrower than this (root of their area) were confident over towns as often as `TOWNS` says,
+of 132, 88 and 55 m, 0 and 45 deg ahead: at 45 deg less often than GO asks for (docs/benchmarks.md).
+"""
 TOWNS = "92, 83 and 83 %", "92, 67 and 50 %"
 MIN_WRONG = 2
 _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
