@@ -30,10 +30,10 @@ FIRST_REACH_PX, REACH_PX = 7, 4
 SURFACE_REACHES_PX = 16, 8
 """The first reaches over houses and trees, at the finer level: coarser ones do not show the camera
 (docs/decisions/terrain.md)."""
-LEAST_FIT, CLOSE_FIT = 0.075, 0.15
+LEAST_FIT, CLOSE_FIT = 0.13, 0.15
 """Mean correlation of the blocks of a view among houses: below the first the camera is not shown,
-from the second on one close to the reported one is not sought any farther. Right ones had 0.09 to
-0.28 (docs/decisions/terrain.md)."""
+from the second on one close to the reported one is not sought any farther. Over towns right ones
+had 0.15 and more, wrong ones at most 0.12 (docs/decisions/terrain.md)."""
 AGAIN_PX = 1.0
 """A view is orthorectified once more where its correction moves a block by more pixels of the final
 level."""
