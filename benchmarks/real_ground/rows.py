@@ -202,9 +202,9 @@ def _towns() -> Iterator[Question]:
         Scene(f"town_{seed}", folder.format(seed), ROOFS_GSD_M, dates).pair(*dates)
         for seed in TOWN_SEEDS
     ]
+    maps = [dict(_grounds(pair.map, 2.0)) for pair in towns]
     asked = [*((*each, False) for each in TOWN_LOOKS), (*TOWN_NOMINAL, True)]
     for agl_m, ahead_deg, nominal in asked:
-        maps = [dict(_grounds(pair.map, 2.0)) for pair in towns]
         for ground in ("no terrain", "bare earth", "surface", "surface of another year"):
             views = partial(
                 OverRelief,
