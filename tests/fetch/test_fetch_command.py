@@ -153,6 +153,8 @@ def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, capl
         fetch = (area, "--source", "town", "--gsd-m", 1, "--out", out, "--with-surface")
         dry = json.loads(command(*fetch, "--dry-run", "--json", terrain=True)[1])
         assert dry["surface"] == "swisssurface3d" and dry["terrain"] is None
+        assert "terrain from copernicus-dem where" in command(*fetch, "--dry-run", terrain=True)[1]
+        assert "copernicus" not in command(*fetch, "--dry-run")[1]
         code, stdout, _ = command(*fetch, "--json", terrain=True)
         plain = json.loads(stdout)
         assert code == 0 and (plain["terrain"] is None) == (plain["surface"] is not None)
