@@ -40,6 +40,7 @@ YAW_STD_DEG, AGL_STD, TILT_STD_DEG = 5.0, 0.05, 3.0
 FIELD, BASE_M, MAP_M, SIDE_M = 0.96, 200.0, 2000, 4000
 """Metres that a camera sees for each metre of height; height of the ground; sides of the generated
 map and of the ground around it."""
+NEAR_PX = 5  # of the map: positions within are correct
 MAX_OFF_NADIR_DEG = 65.0
 """Views farther off nadir are refused, and not drawn."""
 HEADER = (
@@ -115,7 +116,8 @@ def measure(options: argparse.Namespace) -> Section:
     rows = [line for row in chosen for line in _lines(row, options)]
     notes = (
         "no prior, heading off by 5 deg (standard deviation), imagery of another date over random "
-        "hills; correct: camera within 15 m, off nadir within 25 m or 3 % of the distance",
+        f"hills; correct: camera within 15 m or {NEAR_PX} px of the map, off nadir within 25 m or "
+        "3 % of the distance",
     )
     return Section("Over terrain", [Table("Views of hills", HEADER, rows, notes)])
 
@@ -151,7 +153,8 @@ def _lines(row: Row, options: argparse.Namespace) -> Iterator[list[str]]:
                 found.setdefault(way, []).extend(placed)
     for way, placed in found.items():
         errors_m, confidences, took_ms, ranges_m = np.array(placed, np.float64).T
-        limits = np.maximum(25.0, 0.03 * ranges_m) if row.part == "oblique" else 15.0
+        near_m = max(15.0, NEAR_PX * opened.manifest.sheets[0].grid.gsd_m)
+        limits = np.maximum(25.0, 0.03 * ranges_m) if row.part == "oblique" else near_m
         right, confident = errors_m <= limits, confidences >= CONFIDENT
         height = "measured" if row.measured else "above sea"
         line = [
