@@ -349,7 +349,7 @@ class ViewOverGround:
                 camera_m[:2] += self.relief.lean_en * above_m
                 sheared = shown, camera_m
             made = orthorectified(picture, orientation, ground, shape, sheared)
-        return ViewTemplates(*made, level)
+        return ViewTemplates(*made, level, self.view.templates.grey_share)
 
     def _nodes_m(
         self, pose: Pose, level: int, shape: tuple[int, int], *, smooth: bool

@@ -13,7 +13,7 @@ from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.fix import fix_of
 from orthonav.core.localize.ground import SearchedSheet
 from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.search import Search
+from orthonav.core.localize.search import Found, Search, found_by
 from orthonav.core.localize.tiles import TileLocalizer, TileProposer
 from orthonav.core.localize.view import PreparedView, check_view, prepare
 from orthonav.core.mapfile.layer import GreyLayer
@@ -166,11 +166,17 @@ class RegistrationLocalizer(SearchedSheet):
         return made
 
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
+        found = self.found(view, prior, heading_known)
+        return found if isinstance(found, NoFix) else fix_of(*found)
+
+    def found(
+        self, view: View, prior: Prior | None = None, heading_known: bool = True
+    ) -> Found | NoFix:
+        """Where a view was taken; `NoFix` where it shows too little or fits nowhere."""
         search = self.search(view, prior, heading_known)
         if isinstance(search, NoFix):
             return search
-        best = search.run()
-        return best if isinstance(best, NoFix) else fix_of(search, best)
+        return found_by(search)
 
     def search(
         self, view: View, prior: Prior | None = None, heading_known: bool = True

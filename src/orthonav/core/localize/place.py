@@ -432,7 +432,7 @@ class Placer:
     def _finer_on_level(self) -> ViewTemplates:
         level = self.levels.final - 1
         made = self._ground.view.rectified_at(level)
-        return ViewTemplates(made.grey, made.valid, level)
+        return ViewTemplates(made.grey, made.valid, level, self.templates.grey_share)
 
     def _with_covariance(self, pose: Pose, templates: ViewTemplates | None = None) -> Fit:
         """At the final level, once more."""

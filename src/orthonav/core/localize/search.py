@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from orthonav.core.localize.ground import SearchedSheet, ViewOverGround
 from orthonav.core.localize.place import KEPT_TO_FINISH, Place, Placer
 from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
-from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior
+from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, NoFix, Prior
 from orthonav.core.register.pose import rotation
 from orthonav.core.register.search import PLACES_AT_ONCE, Peak, best_near, largest_half_px, search
 from orthonav.core.tiles.position import rows_within
@@ -142,12 +143,15 @@ class Search:
         self.budget = Budget(self.plan.budget_ms)
 
     def run(self) -> Place | NoFix:
+        """By both kinds of channels alone."""
+        return self.outcome(self.best() if self.touches_map else None)
+
+    def outcome(self, best: Place | None) -> Place | NoFix:
         """With its height counted from the ground below the camera."""
-        if not self.touches_map:
-            return NoFix("outside_map", "the area of the prior is outside the map")
-        best = self.best()
         if best is not None:
             return self.placer.below_camera(best)
+        if not self.touches_map:
+            return NoFix("outside_map", "the area of the prior is outside the map")
         detail = "no place of the map could be compared with the view"
         if self.prior is None:
             detail += "; a large map needs a prior, or views as large as its tiles"
@@ -155,6 +159,10 @@ class Search:
 
     def best(self) -> Place | None:
         """None where nothing was found."""
+        return self.at_once() or self.concluded()
+
+    def at_once(self) -> Place | None:
+        """The place that stands out; None where all steps leave doubt."""
         for step in self.steps():
             if early := self._proven_before(step):
                 return early
@@ -163,7 +171,13 @@ class Search:
             self._take(step)
             if clear := self._clear_after(step):
                 return clear
-        return self._concluded() if self.places else None
+        return None
+
+    def by_gradients(self) -> "Search":
+        """The same without grey levels, in the time that is left."""
+        made = Search(self.sheet, self.view.by_gradients(), self.prior)
+        made.budget = self.budget
+        return made
 
     def camera(self, place: Place) -> CameraFound | None:
         """None where too few blocks of the view are seen."""
@@ -403,9 +417,11 @@ class Search:
                 return None
         return None
 
-    def _concluded(self) -> Place:
+    def concluded(self) -> Place | None:
         """After all steps. While none is proven, more are finished and compared one level finer."""
         policy, levels, places = self.policy, self.levels, self.places
+        if not places:
+            return None
         if not self.placer.is_level and self.budget.allows(0.0):
             places = self.placer.on_terrain(places, policy.terrain_candidates)
         found = self._finished(places)
@@ -434,3 +450,42 @@ class Search:
     def _is_proven(self, best: Place, doubt: float) -> bool:
         confidence = self.sheet.confidence
         return confidence is not None and confidence(best.scores) > 1 - doubt
+
+    def likelihood(self, place: Place | None) -> float:
+        """Probability that the place is right, 0 for none."""
+        if place is None or self.sheet.confidence is None:
+            return 0.0
+        return self.sheet.confidence(place.scores)
+
+    def tentative(self) -> Place | None:
+        """The best place so far, finished as it is."""
+        return self._finished(self.places) if self.places else None
+
+
+class Found(NamedTuple):
+    """A place, and the search that found it."""
+
+    search: Search
+    place: Place
+
+
+def found_by(search: Search) -> Found | NoFix:
+    """By both kinds of channels; where these do not recognize the place, by gradients alone, if
+    that is more likely right. Other light (infrared, night, snow) changes grey levels more than
+    edges."""
+    best = search.at_once() if search.touches_map else None
+    if search.touches_map and search.sheet.confidence and search.likelihood(best) < CONFIDENT:
+        search, best = _likelier(search, best)
+    best = best or search.concluded()
+    place = search.outcome(best)
+    return place if isinstance(place, NoFix) else Found(search, place)
+
+
+def _likelier(search: Search, best: Place | None) -> tuple[Search, Place | None]:
+    """Of the search and that by gradients, with its place if that stands out. Only one of them is
+    concluded, which takes longer than the rest."""
+    other = search.by_gradients()
+    found = other.at_once()
+    one = search.likelihood(best or search.tentative())
+    another = other.likelihood(found or other.tentative())
+    return (other, found) if another > one else (search, best)

@@ -1,7 +1,7 @@
 """A view checked and rectified with its own heading up. What cannot be placed becomes a `NoFix`."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -167,6 +167,10 @@ class PreparedView:
         if level not in self._pictures:
             self._pictures[level] = downsampled(self.view, self.gsd_m * 2**level)
         return self._pictures[level]
+
+    def by_gradients(self) -> "PreparedView":
+        """The same, compared without its grey levels."""
+        return replace(self, templates=self.templates.by_gradients())
 
     def rectified_at(self, level: int) -> RectifiedView:
         return _rectified(self.picture_at(level), self.gsd_m, self.levels, level)

@@ -15,18 +15,18 @@ from orthonav.core.register.kernel import KERNEL
 Array = NDArray[np.float32]
 CHANNELS = 4  # cosine and sine of the doubled edge direction, grey, valid
 GROUPS = (slice(0, 2), slice(2, 3))
+GREY_SHARE = 0.6  # weight of grey beside gradients
 
 
 @dataclass(frozen=True)
 class ChannelRecipe:
     """Windows in pixels of the level: `contrast_px` of gradients' surroundings, `mean_px`,
-    `deviation_px` of grey; `grey_share`: weight of grey beside gradients."""
+    `deviation_px` of grey."""
 
     gradient_sigma_px: float = 1.0
     contrast_px: int = 27
     mean_px: int = 11
     deviation_px: int = 21
-    grey_share: float = 0.6
 
     @property
     def margin_px(self) -> int:

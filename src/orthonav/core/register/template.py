@@ -12,6 +12,7 @@ from orthonav.core.register.channels import (
     CHANNELS,
     COARSE,
     FINE,
+    GREY_SHARE,
     GROUPS,
     ChannelRecipe,
     channel_planes,
@@ -34,9 +35,14 @@ class Template:
 
     @classmethod
     def of(
-        cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: ChannelRecipe
+        cls,
+        grey: NDArray[np.uint8],
+        valid: NDArray[np.bool_],
+        level: int,
+        recipe: ChannelRecipe,
+        grey_share: float,
     ) -> "Template":
-        planes, weights = channel_planes(grey, valid, recipe), (1.0, recipe.grey_share)
+        planes, weights = channel_planes(grey, valid, recipe), (1.0, grey_share)
         for group, weight in zip(GROUPS, weights, strict=True):
             energy = energy_of(planes[group])
             planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
@@ -226,8 +232,14 @@ class Levels:
 class ViewTemplates:
     """Templates at the levels of a map, made when asked for, of a view at level `finest`."""
 
-    def __init__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], finest: int) -> None:
-        self.finest = finest
+    def __init__(
+        self,
+        grey: NDArray[np.uint8],
+        valid: NDArray[np.bool_],
+        finest: int,
+        grey_share: float = GREY_SHARE,
+    ) -> None:
+        self.finest, self.grey_share = finest, grey_share
         self._pictures = [(grey, valid)]
         self._made: dict[tuple[int, ChannelRecipe], Template] = {}
 
@@ -243,8 +255,11 @@ class ViewTemplates:
     def at(self, level: int, recipe: ChannelRecipe = FINE) -> Template:
         key = (level, recipe)
         if key not in self._made:
-            self._made[key] = Template.of(*self.picture(level), level, recipe)
+            self._made[key] = Template.of(*self.picture(level), level, recipe, self.grey_share)
         return self._made[key]
+
+    def by_gradients(self) -> "ViewTemplates":
+        return ViewTemplates(*self._pictures[0], self.finest, 0.0)
 
     def shape(self, level: int) -> tuple[int, int]:
         rows, cols = self.picture(level)[0].shape

@@ -26,6 +26,7 @@ from orthonav.core.localize.odometry import (
     displacement,
     over_terrain,
 )
+from orthonav.core.localize.search import Found, found_by
 from orthonav.core.localize.sighting import Sighting, sightings
 from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
@@ -454,10 +455,10 @@ class Tracker:
         if isinstance(search, NoFix):
             return search
         newness = max(1 - overlap, LEAST_NEW)
-        best = search.run()
-        if not isinstance(best, NoFix):
+        found = found_by(search)
+        if isinstance(found, Found):
             share = min(searched.area_m2 / self.mixture.area_m2, 1.0)
-            self._seen = list(sightings(search, best, known, bias[1], share))
+            self._seen = list(sightings(*found, known, bias[1], share))
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),

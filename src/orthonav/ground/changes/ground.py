@@ -123,13 +123,10 @@ def beside_map(
     std_m = math.hypot(math.sqrt(float(np.trace(fix.cov_en_m2)) / 2), tilt_m)
     if not math.isfinite(std_m):
         return None
-    search = registration.search(view, Prior(fix.lat_deg, fix.lon_deg, std_m))
-    if isinstance(search, NoFix):
+    found = registration.found(view, Prior(fix.lat_deg, fix.lon_deg, std_m))
+    if isinstance(found, NoFix) or not found.place.fit.blocks_t >= MIN_BLOCKS_T:
         return None
-    found = search.run()
-    if isinstance(found, NoFix) or not found.fit.blocks_t >= MIN_BLOCKS_T:
-        return None
-    return _compared(registration, grid, search.view, found.pose)
+    return _compared(registration, grid, found.search.view, found.place.pose)
 
 
 def _compared(

@@ -22,7 +22,6 @@ from orthonav.core.errors import AreaError, MapFileError, WorkerError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.fix import fix_of
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import level_shape
@@ -373,11 +372,9 @@ class Trier:
             at = place_en_m + rng.normal(0, conditions.prior_std_m, 2)
             lat, lon = registration.sheet.frame.latlon_from_en(at)
             prior = Prior(float(lat), float(lon), conditions.prior_std_m)
-        search = registration.search(view, prior, conditions.yaw_std_deg is not None)
-        best = search if isinstance(search, NoFix) else search.run()
-        if isinstance(search, NoFix) or isinstance(best, NoFix):
+        fix = registration.locate(view, prior, conditions.yaw_std_deg is not None)
+        if isinstance(fix, NoFix):
             return Trial(here, math.nan, expected)
-        fix = fix_of(search, best)
         found = registration.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
         error_m = float(np.hypot(*(found - place_en_m)))
         accepted, near = fix.confidence >= conditions.accept, error_m <= fix.radius_m
