@@ -7,15 +7,18 @@ shadow), `hills`, `sensor`, and `scene` and `area`, which combine them.
 """
 
 from lab.landscape.area import generate_area, generate_heights
-from lab.landscape.epoch import DEFAULT_DATES, Epoch, Season
+from lab.landscape.epoch import DEFAULT_DATES, OTHER_LIGHT, Epoch, Season
+from lab.landscape.looks import Look
 from lab.landscape.scene import GSD_RANGE_M, ORIGIN_M, Landscape
 
 __all__ = [
     "DEFAULT_DATES",
     "GSD_RANGE_M",
     "ORIGIN_M",
+    "OTHER_LIGHT",
     "Epoch",
     "Landscape",
+    "Look",
     "Season",
     "generate_area",
     "generate_heights",

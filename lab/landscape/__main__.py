@@ -1,4 +1,4 @@
-"""Generate orthophotos of one area at three dates: `python -m lab.landscape --out area`."""
+"""Generate orthophotos of one area at several dates: `python -m lab.landscape --out area`."""
 
 import argparse
 import sys
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from lab.landscape import generate_area, generate_heights
+from lab.landscape import DEFAULT_DATES, OTHER_LIGHT, generate_area, generate_heights
 from orthonav.cli.common import Progress
 from orthonav.core.errors import OrthonavError
 
@@ -26,7 +26,10 @@ def main(arguments: Sequence[str]) -> None:
                     **area,
                 )
             dates = generate_area(
-                options.out, progress=lambda share: shown("landscape", share), **area
+                options.out,
+                dates=DEFAULT_DATES + OTHER_LIGHT * options.other_light,
+                progress=lambda share: shown("landscape", share),
+                **area,
             )
     except OrthonavError as error:
         sys.exit(f"error: {error}")
@@ -53,6 +56,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="SLOPE",
         help="also write the terrain dem.tif, hills of this root mean square slope (0.15), "
         "and for each date the surface model *_dsm.tif with its buildings and trees",
+    )
+    parser.add_argument(
+        "--other-light",
+        action="store_true",
+        help="also write the area under snow and flood, with bare trees, in near infrared, at "
+        "night, and by a thermal camera",
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the landscape (default 1)")
     return parser

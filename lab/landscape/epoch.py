@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from enum import Enum
 from types import MappingProxyType
 
+from lab.landscape.looks import Look
+
 
 class Season(Enum):
     """State of crops and leaves; the value is the column in the colour tables."""
@@ -30,6 +32,7 @@ class Epoch:
     white_balance: factors on red, green and blue; 1 is neutral.
     noise: standard deviation of the sensor noise, grey levels.
     water_level_m: outward displacement of every shore from its mean line, metres.
+    look: what the picture shows, colour in daylight or another light.
     """
 
     name: str
@@ -44,6 +47,7 @@ class Epoch:
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     noise: float = 2.0
     water_level_m: float = 0.0
+    look: Look = Look.COLOUR
 
     @property
     def time_years(self) -> float:
@@ -98,3 +102,31 @@ DEFAULT_DATES: tuple[Epoch, ...] = (
     ),
 )
 """Dates of the demo area: the first for the map, the second for the flight, the third older."""
+
+
+def _other(
+    look: Look, month: int, season: Season, elevation_deg: float, noise: float = 3.0
+) -> Epoch:
+    name = f"2021-{month:02d}-{look.value.replace(' ', '-')}"
+    return Epoch(
+        name=name,
+        year=2021,
+        month=month,
+        season=season,
+        sun_azimuth_deg=205.0,
+        sun_elevation_deg=elevation_deg,
+        noise=noise,
+        look=look,
+    )
+
+
+OTHER_LIGHT: tuple[Epoch, ...] = (
+    _other(Look.SNOW, 1, Season.AUTUMN, 18.0),
+    _other(Look.FLOOD, 11, Season.AUTUMN, 24.0),
+    _other(Look.BARE, 2, Season.SPRING, 22.0),
+    _other(Look.NEAR_INFRARED, 6, Season.SUMMER, 55.0),
+    _other(Look.NIGHT, 10, Season.AUTUMN, 31.0, noise=8.0),
+    _other(Look.THERMAL, 7, Season.SUMMER, 58.0, noise=4.0),
+    _other(Look.DAWN, 8, Season.SUMMER, 50.0, noise=4.0),
+)
+"""The same ground as of `DEFAULT_DATES`, five years after the first, in other light."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lab.landscape.crops import appearance_of
 from lab.landscape.epoch import Epoch
+from lab.landscape.looks import Cover, Look, seen
 from lab.landscape.network import Network
 from lab.landscape.noise import Float32
 from lab.landscape.plan import CellPlan, make_plan, outline_box
@@ -102,13 +103,17 @@ class Landscape:
         labels = label_parcels(plans, wide)
         appearance = appearance_of(plans, date)
         rgb = paint_parcels(labels, appearance, wide, self.seed, date)
-        closed = paint_lines(rgb, plans, self._network, wide, date)
-        height = paint_wood(rgb, labels, appearance, closed, wide, self.seed, date)
-        paint_orchards(rgb, height, labels, appearance, closed, wide, date)
+        lines = paint_lines(rgb, plans, self._network, wide, date)
+        height = paint_wood(rgb, labels, appearance, lines.open, wide, self.seed, date)
+        paint_orchards(rgb, height, labels, appearance, lines.open, wide, date)
         paint_trees(rgb, height, plans, wide, date)
         image = np.clip(rgb, 0.0, 255.0).astype(np.uint8)
         roofs = paint_buildings(image, height, plans, wide, date)
         light = lighting(height, roofs, wide, date)
+        if date.look is not Look.COLOUR:
+            cover = Cover.of(lines.roads, lines.water, roofs, height)
+            rgb, light = seen(date.look, image.astype(np.float32), light, cover, wide, self.seed)
+            image = np.clip(rgb, 0.0, 255.0).astype(np.uint8)
         inner = np.s_[margin:-margin, margin:-margin]
         return expose(image, light, wide, date)[inner], height[inner]
 

@@ -1,6 +1,7 @@
 """Colour of the ground surface: parcels with their texture, then water, roads and borders."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -103,10 +104,18 @@ def _rows(labels: Labels, appearance: Appearance, window: PixelWindow, wander: F
     return np.asarray(rows, np.float32)
 
 
+class Lines(NamedTuple):
+    """Cover (H, W), 0..255: ground without woods, roads, water."""
+
+    open: Mask
+    roads: Mask
+    water: Mask
+
+
 def paint_lines(
     rgb: Float32, plans: Sequence[CellPlan], network: Network, window: PixelWindow, epoch: Epoch
-) -> Mask:
-    """Draw borders, roads and water into `rgb` (H, W, 3); return the mask without woods (H, W)."""
+) -> Lines:
+    """Draw borders, roads and water into `rgb` (H, W, 3); return what they cover."""
     seed = network.seed
     fine = fractal_grid(
         key_of(seed, "ways"), window.east_m, window.north_m, (21.0, 5.0, 2.3, 1.1, 0.5), 0.8
@@ -130,17 +139,20 @@ def paint_lines(
     street = _mask(window, lines, LineKind.STREET)
     _blend(rgb, street, np.array(_SURFACE_RGB[LineKind.STREET], np.float32), 0.08 * fine)
     np.maximum(open_ground, street, out=open_ground)
-    shore, water = _rivers(network, window, epoch.water_level_m)
-    _paint_water(rgb, shore, water, window, seed, epoch)
+    roads = street.copy()
+    shore, rivers = _rivers(network, window, epoch.water_level_m)
+    _paint_water(rgb, shore, rivers, window, seed, epoch)
     np.maximum(open_ground, track, out=open_ground)
     np.maximum(open_ground, shore, out=open_ground)
     for kind in (LineKind.MINOR, LineKind.MAIN):
         road = _mask(window, lines, kind)
         _blend(rgb, road, np.array(_SURFACE_RGB[kind], np.float32), 0.08 * fine)
-        np.maximum(open_ground, road, out=open_ground)
+        np.maximum(roads, road, out=roads)
+    np.maximum(open_ground, roads, out=open_ground)
     shore, water = _ponds(plans, window, epoch.water_level_m)
     _paint_water(rgb, shore, water, window, seed, epoch)
-    return np.maximum(open_ground, shore)
+    water = np.maximum(water, np.minimum(rivers, 255 - roads))
+    return Lines(np.maximum(open_ground, shore), roads, water)
 
 
 def _blend(rgb: Float32, mask: Mask, colour: Float32, tone: Float32, strength: float = 1.0) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape, generate_area
+from lab.landscape import DEFAULT_DATES, ORIGIN_M, OTHER_LIGHT, Landscape, Look, generate_area
 from lab.landscape.__main__ import main
 from lab.landscape.network import Network
 from lab.landscape.noise import fractal_grid, key_of, noise_at, noise_grid, white_grid
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import AreaError
 
 SUMMER, AUTUMN, SPRING = DEFAULT_DATES
+IN_LIGHT = {each.look: each for each in OTHER_LIGHT}
 WEST_M, NORTH_M = ORIGIN_M[0] + 600.0, ORIGIN_M[1] + 1500.0
 
 
@@ -62,6 +63,8 @@ def test_other_seed_other_land(pair):
         pytest.param(0.3, SUMMER, (WEST_M + 700.1, NORTH_M + 0.25), marks=pytest.mark.slow),
         pytest.param(0.7, SPRING, (WEST_M - 40000.3, NORTH_M + 30000.7), marks=pytest.mark.slow),
         (3.0, SPRING, (WEST_M - 500.0, NORTH_M + 300.0)),
+        (1.0, IN_LIGHT[Look.NIGHT], (WEST_M, NORTH_M)),  # with light of lamps beyond the border
+        pytest.param(1.0, IN_LIGHT[Look.DAWN], (WEST_M, NORTH_M), marks=pytest.mark.slow),
     ],
 )
 def test_quarters_meet_without_seam(gsd_m, date, corner_m):
@@ -103,6 +106,28 @@ def test_dates_differ_but_edges_stay_in_place(pair):
     row, col = np.unravel_index(correlation.argmax(), correlation.shape)
     assert min(row, 360 - row) <= 1
     assert min(col, 400 - col) <= 1
+
+
+def test_other_light_keeps_edges_and_not_their_contrast(pair):
+    land = Landscape(1)
+
+    def seen(look):
+        return land.render(IN_LIGHT[look], WEST_M, NORTH_M, 400, 360, 1.0)
+
+    def alike(look):
+        """Correlation of edge directions, and of grey levels, with those of a summer's day."""
+        edges, by_day = (oriented_gradients(each).ravel() for each in (seen(look), pair[0]))
+        levels = [each.astype(np.float32).mean(axis=2).ravel() for each in (seen(look), pair[0])]
+        product = np.vdot(edges, by_day).real / (np.linalg.norm(edges) * np.linalg.norm(by_day))
+        return product, np.corrcoef(levels)[0, 1]
+
+    assert set(IN_LIGHT) == set(Look) - {Look.COLOUR}
+    for look in (Look.NEAR_INFRARED, Look.THERMAL, Look.DAWN):
+        edges, levels = alike(look)
+        assert edges > 0.15 and levels < 0.5, look
+    assert alike(Look.BARE)[0] > 0.1
+    snow, night = seen(Look.SNOW), seen(Look.NIGHT)
+    assert np.median(snow) > 215 and np.median(night) < 15 and np.percentile(night, 99) > 60
 
 
 @pytest.mark.parametrize("gsd_m", [0.5, 1.0])
@@ -213,6 +238,8 @@ def test_the_command_writes_three_dates(tmp_path: Path, capsys):
     main(["--out", str(out), "--size-m", "120", "100", "--gsd-m", "2"])
     printed = [Path(line) for line in capsys.readouterr().out.splitlines()]
     assert sorted(printed) == sorted(out.iterdir()) and len(printed) == 3
+    main(["--out", str(out), "--size-m", "120", "100", "--gsd-m", "2", "--other-light"])
+    assert {f"{each.name}.tif" for each in OTHER_LIGHT} < {each.name for each in out.iterdir()}
     with pytest.raises(SystemExit, match="error: size_m must be"):
         main(["--out", str(tmp_path / "no"), "--size-m", "-5", "5"])
     assert not (tmp_path / "no").exists()
