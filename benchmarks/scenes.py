@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from lab.landscape import DEFAULT_DATES, generate_area
+from lab.landscape import DEFAULT_DATES, OTHER_LIGHT, generate_area
 
 from benchmarks.placing import FlownView, views_in
 from orthonav.core.errors import OutputError
@@ -187,7 +187,7 @@ def area(
     folder = work / f"area-{seed}-{side_m}m-{gsd_m:g}m"
     path = folder / f"{date}.tif"
     if not path.is_file():
-        dates = [each for each in DEFAULT_DATES if each.name == date]
+        dates = [each for each in DEFAULT_DATES + OTHER_LIGHT if each.name == date]
         generate_area(folder, size_m=(side_m, side_m), gsd_m=gsd_m, dates=dates, seed=seed)
     return path
 

@@ -1,0 +1,283 @@
+"""Views in other light than the map's: infrared, night, snow, flood, thermal, other seasons.
+
+`python -m benchmarks.other_light [--views 30] [--workers 2]` places real pairs where the optional
+imagery is there, and rendered ones of generated landscapes, on whole maps without a prior, and
+writes a picture of the best and of the worst case of each row.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from lab.landscape import OTHER_LIGHT
+from numpy.typing import NDArray
+
+from benchmarks.placing import views_in
+from benchmarks.record import Section, Table, number, resumed, rows_path, run, say
+from benchmarks.scenes import (
+    DATA,
+    PAST,
+    PRESENT,
+    SCENES,
+    USUAL,
+    agl_of,
+    far_m,
+    flight,
+    gsd_of,
+    localizer_of,
+    ortho,
+)
+from orthonav.core.files import replacing
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.fix import fix_of
+from orthonav.core.localize.search import Search
+from orthonav.core.records import Fix, NoFix, View
+
+NAME = "other_light"
+SEED, WIDTH_PX = 3, 256
+FAR_SHARE = 0.05
+"""A position of unreported tilt is wrong beyond this share of the height, too."""
+SEEDS = 31, 32
+WAYS = BOTH, GRADIENTS, DEFAULT = "both kinds", "gradients", "default"
+HEADER = (
+    *("views > map", "views", *(f"{way}: right, accepted" for way in WAYS)),
+    *("accepted and wrong", "ms both kinds", "ms default"),
+)
+Place = tuple[float, float]
+Case = tuple[View, Place | None, bool]
+"""A view, the truth of the camera, or of the ground in the middle of the picture if the last; None:
+the map shows other ground."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Views of `views` on the map of `map`, names as of `benchmarks.scenes.ortho`; a folder of
+    views, or imagery they are rendered of, of which `band` is seen (0: colour). `elsewhere`: the
+    map shows other ground."""
+
+    name: str
+    map: str
+    views: str
+    band: int = 0
+    elsewhere: bool = False
+
+    def seen(self, work: Path, count: int) -> Iterator[Case]:
+        if (DATA / self.views).is_dir():
+            folder = DATA / self.views
+            recorded = open_flight(folder)
+            truth = read_truth(folder / "truth_ground.csv")
+            for each in list(recorded.views)[:count]:
+                place = None if self.elsewhere else truth[each.frame]
+                yield View(each.grey(), recorded.camera, each.telemetry), place, True
+            return
+        path = ortho(self.views, work) if self.band == 0 else _band(self.views, self.band, work)
+        agl_m = agl_of(WIDTH_PX, gsd_of(path))
+        for flown in views_in(
+            flight(path, work, views=count, errors=USUAL, seed=SEED, agl_m=agl_m)
+        ):
+            yield flown.view, None if self.elsewhere else flown.truth_latlon_deg, False
+
+
+def _band(name: str, band: int, work: Path) -> Path:
+    """One band of an orthophoto as a file of its own."""
+    path = work / f"{Path(name).stem}-band{band}.tif"
+    if not path.is_file():
+        with rasterio.open(DATA / name) as source:
+            profile = {
+                name: source.profile[name]
+                for name in ("driver", "width", "height", "crs", "transform", "dtype")
+            }
+            with (
+                replacing(path) as part,
+                rasterio.open(part, "w", count=1, **profile) as target,
+            ):
+                target.write(source.read(band), 1)
+    return path
+
+
+def rows() -> Iterator[Row]:
+    """Those whose imagery is there."""
+    light = "other_light"
+    chongqing, bordeaux = (f"{light}/{each}_near_infrared" for each in ("chongqing", "bordeaux"))
+    night = f"{light}/night_lights"
+    naip = [SCENES["naip"].file(each) for each in ("20090818", "20120731", "20180716")]
+    found = [
+        Row("near infrared, town (Chongqing)", f"{chongqing}/map.tif", chongqing),
+        Row("near infrared, town (Bordeaux)", f"{bordeaux}/map.tif", bordeaux),
+        Row("night lights, coast", f"{night}/map.tif", f"{night}/views"),
+        Row("near infrared, fields (North Dakota, 2009 > 2018)", naip[2], naip[0], 4),
+        Row("near infrared, fields (North Dakota, 2018 > 2012)", naip[1], naip[2], 4),
+    ]
+    for scene, past, present in (
+        ("atlanta", "2021_08", "2024_02"),
+        ("atlanta", "2012_11", "2021_08"),
+        ("garching", "2001_09", "2015_04"),
+        ("garching", "2020_03", "2009_04"),
+    ):
+        pair = SCENES[scene].pair(past, present)
+        found.append(Row(f"season: {scene} {present} > {past}", pair.map, pair.views))
+    for date in (PRESENT, *(each.name for each in OTHER_LIGHT)):
+        for seed in SEEDS:
+            folder = f"generated:{seed}"
+            name = f"rendered {date} > {PAST}, landscape {seed}"
+            found.append(Row(name, f"{folder}:{PAST}", f"{folder}:{date}"))
+    for each in OTHER_LIGHT:
+        names = f"generated:1:{PAST}", f"generated:{SEEDS[0]}:{each.name}"
+        found.append(Row(f"other ground: rendered {each.name}", *names, elsewhere=True))
+    for name, where, views in (
+        ("Chongqing on Bordeaux", bordeaux, chongqing),
+        ("Bordeaux on Chongqing", chongqing, bordeaux),
+        ("night lights on Chongqing", chongqing, f"{night}/views"),
+        ("night lights on Bordeaux", bordeaux, f"{night}/views"),
+        ("Chongqing on night lights' map", night, chongqing),
+    ):
+        found.append(Row(f"other ground: {name}", f"{where}/map.tif", views, elsewhere=True))
+    for row in found:
+        if all(
+            each.startswith("generated") or (DATA / each).exists() for each in (row.map, row.views)
+        ):
+            yield row
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--views", type=int, default=30, help="views of a row")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--only", nargs="+", metavar="TEXT", help="rows whose name has this")
+
+
+def measure(options: argparse.Namespace) -> Section:
+    count = 4 if options.quick else options.views
+    asked = [
+        each for each in rows() if not options.only or any(t in each.name for t in options.only)
+    ]
+    for name in dict.fromkeys(each.map for each in asked):
+        localizer_of(name, options.work)
+    tasks = {f"{each.name} {count}": (each.name, count, options.work) for each in asked}
+    lines, total = [], {True: np.zeros(2, int), False: np.zeros(2, int)}
+    stored = rows_path(options.work, "rows")
+    for row, found in zip(asked, resumed(stored, measured, tasks, options.workers), strict=True):
+        total[row.elsewhere] += [found["wrong"][DEFAULT], found["views"]]
+        cells = [row.name, str(found["views"])]
+        for way in WAYS:
+            right = "-" if row.elsewhere else str(found["right"][way])
+            cells.append(f"{right}, {found['accepted'][way]}")
+        cells += [str(found["wrong"][DEFAULT])]
+        lines.append([*cells, *(number(found["ms"][way]) for way in (BOTH, DEFAULT))])
+        say("  ".join(lines[-1]))
+    notes = (
+        f"accepted and wrong, in all: {total[False][0]} of {total[False][1]} views; of other "
+        f"ground {total[True][0]} of {total[True][1]}",
+        "whole map, no prior; heading off by 10 deg and height by 10 % (standard deviations, "
+        f"reported), tilt by {USUAL.mount_std_deg:g} deg each of mount and horizon, or 3 deg in "
+        "near infrared towns, unreported; right: within 35 m or 10 px of the map, in recorded "
+        f"views within {FAR_SHARE:.0%} of the height, of the ground in the picture",
+        "ms: processor time, mean",
+    )
+    return Section("Other light", [Table("Views in other light", HEADER, lines, notes)])
+
+
+def measured(task: tuple[str, int, Path]) -> dict[str, Any]:
+    """What a row says."""
+    name, count, work = task
+    cv2.setNumThreads(1)
+    row = next(each for each in rows() if each.name == name)
+    localizer = localizer_of(row.map, work)
+    found: dict[str, Any] = {"views": 0, "ms": dict.fromkeys(WAYS, 0.0)}
+    found |= {key: dict.fromkeys(WAYS, 0) for key in ("right", "accepted", "wrong")}
+    cases: list[tuple[float, View, Fix | NoFix]] = []
+    for view, truth, of_ground in row.seen(work, count):
+        found["views"] += 1
+        for way, locate in _ways(localizer):
+            start = time.process_time()
+            fix = locate(view)
+            found["ms"][way] += 1e3 * (time.process_time() - start)
+            if not isinstance(fix, Fix):
+                continue
+            right = truth is not None and _is_right(localizer, fix, truth, view, of_ground)
+            found["right"][way] += right
+            found["accepted"][way] += fix.is_confident
+            found["wrong"][way] += fix.is_confident and not right
+        rank = fix.confidence if isinstance(fix, Fix) else 0.0
+        cases.append((rank, view, fix))
+    found["ms"] = {way: each / max(found["views"], 1) for way, each in found["ms"].items()}
+    if cases and not row.elsewhere:
+        cases.sort(key=lambda each: each[0])
+        _draw(work / "pictures" / f"{row.name}.png", localizer, [cases[-1], cases[0]])
+    return found
+
+
+def _is_right(localizer: Localizer, fix: Fix, truth: Place, view: View, of_ground: bool) -> bool:
+    place = fix.ground_latlon_deg if of_ground else (fix.lat_deg, fix.lon_deg)
+    if place is None:
+        return False
+    off = localizer.sheet.frame.en_from_latlon(*place) - localizer.sheet.frame.en_from_latlon(
+        *truth
+    )
+    limit_m = far_m(localizer.grid.gsd_m)
+    if of_ground:
+        limit_m = max(limit_m, FAR_SHARE * view.telemetry.agl_m)
+    return bool(np.hypot(*off) <= limit_m)
+
+
+def _ways(localizer: Localizer) -> Iterator[tuple[str, Any]]:
+    assert localizer.registration is not None
+    registration = localizer.registration
+
+    def alone(view: View, gradients: bool) -> Fix | NoFix:
+        search = registration.search(view)
+        if isinstance(search, Search) and gradients:
+            search = search.by_gradients()
+        best = search if isinstance(search, NoFix) else search.run()
+        if isinstance(search, NoFix) or isinstance(best, NoFix):
+            return NoFix("no_match", "not placed")
+        return fix_of(search, best)
+
+    yield BOTH, partial(alone, gradients=False)
+    yield GRADIENTS, partial(alone, gradients=True)
+    yield DEFAULT, localizer.locate
+
+
+def _draw(path: Path, localizer: Localizer, cases: list[tuple[float, View, Fix | NoFix]]) -> None:
+    """Views, left, beside the map where they were placed, best above worst."""
+    lines = []
+    for confidence, view, fix in cases:
+        side = 256
+        picture = cv2.resize(view.grey, (side * 4 // 3, side))
+        beside = np.zeros_like(picture)
+        if isinstance(fix, Fix) and fix.ground_latlon_deg is not None:
+            beside = _map_at(localizer, fix, view, beside.shape)
+        pair = np.hstack([picture, beside])
+        cv2.putText(pair, f"{confidence:.2f}", (6, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.7, 255, 2)
+        lines.append(pair)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.vstack(lines))
+
+
+def _map_at(
+    localizer: Localizer, fix: Fix, view: View, shape: tuple[int, ...]
+) -> NDArray[np.uint8]:
+    """The map (H, W) around the ground in the middle of a view, turned as the view."""
+    assert localizer.registration is not None and fix.ground_latlon_deg is not None
+    pyramid, grid = localizer.registration.pyramid, localizer.grid
+    x, y = localizer.registration.px_of(
+        localizer.sheet.frame.en_from_latlon(*fix.ground_latlon_deg)
+    )
+    width_m = fix.agl_m * view.camera.width_px / view.camera.fx_px
+    scale = shape[1] * grid.gsd_m / width_m
+    turn = np.asarray(cv2.getRotationMatrix2D((x, y), fix.heading_deg, scale), np.float64)
+    turn[:, 2] += np.array([shape[1], shape[0]]) / 2 - [x, y]
+    whole, _ = pyramid.read(0, 0, 0, *pyramid.shape(0))
+    return np.asarray(cv2.warpAffine(whole, turn, (shape[1], shape[0])), np.uint8)
+
+
+if __name__ == "__main__":
+    sys.exit(run(NAME, __doc__, measure, add))
