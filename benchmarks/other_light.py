@@ -32,7 +32,6 @@ from benchmarks.scenes import (
     far_m,
     flight,
     gsd_of,
-    localizer_of,
     ortho,
 )
 from orthonav.core.files import replacing
@@ -40,7 +39,9 @@ from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.fix import fix_of
 from orthonav.core.localize.search import Search
+from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, View
+from orthonav.ground.build import BuildRequest, build_map
 
 NAME = "other_light"
 SEED, WIDTH_PX = 3, 256
@@ -160,7 +161,7 @@ def measure(options: argparse.Namespace) -> Section:
         each for each in rows() if not options.only or any(t in each.name for t in options.only)
     ]
     for name in dict.fromkeys(each.map for each in asked):
-        localizer_of(name, options.work)
+        _localizer(name, options.work)
     tasks = {f"{each.name} {count}": (each.name, count, options.work) for each in asked}
     lines, total = [], {True: np.zeros(2, int), False: np.zeros(2, int)}
     stored = rows_path(options.work, "rows")
@@ -185,12 +186,21 @@ def measure(options: argparse.Namespace) -> Section:
     return Section("Other light", [Table("Views in other light", HEADER, lines, notes)])
 
 
+def _localizer(name: str, work: Path) -> Localizer:
+    """On a map of level land."""
+    path = ortho(name, work)
+    out = work / f"{path.parent.name}-{path.stem}-level.onav"
+    if not out.is_file():
+        build_map(BuildRequest([path], out, relief="level"))
+    return Localizer(open_map(out))
+
+
 def measured(task: tuple[str, int, Path]) -> dict[str, Any]:
     """What a row says."""
     name, count, work = task
     cv2.setNumThreads(1)
     row = next(each for each in rows() if each.name == name)
-    localizer = localizer_of(row.map, work)
+    localizer = _localizer(row.map, work)
     found: dict[str, Any] = {"views": 0, "ms": dict.fromkeys(WAYS, 0.0)}
     found |= {key: dict.fromkeys(WAYS, 0) for key in ("right", "accepted", "wrong")}
     cases: list[tuple[float, View, Fix | NoFix]] = []

@@ -213,6 +213,15 @@ def test_images_are_converted(image):
     np.testing.assert_array_equal(found, GREY)
 
 
+@pytest.mark.parametrize("first, step", [(7000, 3), (29_000, 8), (0, 16), (300, 31)])
+def test_a_small_part_of_16_bits_is_stretched(first, step):
+    """Thermal cameras of 14 bits, temperatures in 0.01 K, and 12 bits in 16."""
+    found = View((GREY.astype(np.uint16) * step + first).astype(np.uint16), CAMERA, NADIR).grey
+    assert np.ptp(found) == 255 and np.corrcoef(found.ravel(), GREY.ravel())[0, 1] > 0.999
+    noise = np.random.default_rng(1).normal(first, 1.3, GREY.shape).clip(0).astype(np.uint16)
+    assert View(noise, CAMERA, NADIR).grey.std() < 3  # still uniform
+
+
 @pytest.mark.parametrize(
     ("image", "said"),
     [

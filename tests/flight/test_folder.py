@@ -13,7 +13,7 @@ import pytest
 from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.flight import FlightWriter, open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera
-from orthonav.core.records import Prior, Telemetry
+from orthonav.core.records import STRETCHED_PERCENT, Prior, Telemetry
 
 CAMERA = Camera(64, 48, 60.0, 61.5, 32.25, 23.75, (0.01, -0.02, 1e-4, 2e-4))
 FULL = Telemetry(
@@ -244,8 +244,13 @@ def test_thumbnails_padding_and_previews_do_not_hide_a_cut(tmp_path):
 def test_every_depth_and_kind_becomes_8_bit_grey(tmp_path):
     grey, colours = scene(), rgb()[..., ::-1]
     colour, deep = cv2.cvtColor(rgb(), cv2.COLOR_RGB2GRAY), grey.astype(np.uint16) * 257
+    celsius = (grey / 12.0 - 5).astype(np.float32)
+    dark, bright = np.percentile(grey, STRETCHED_PERCENT)
+    filled = ((grey - dark) * 255 / (bright - dark)).clip(0, 255)
     for name, image, expected in (
         ("deep.png", deep, grey),
+        ("thermal.png", grey.astype(np.uint16) * 4 + 7000, filled),
+        ("celsius.tif", celsius, filled),
         ("clear.png", np.dstack([colours, np.full_like(grey, 7)]), colour),
         ("deep.tif", deep, grey),
         ("colour.TIFF", colours, colour),

@@ -104,6 +104,12 @@ def test_bayer(messages, order, depth):
         assert np.abs(grey[inner].astype(int) - expected[inner]).max() <= 2
 
 
+def test_a_thermal_camera_of_14_bits_shows_its_ground(messages):
+    image = messages.image(0, picture(1).astype("<u2") * 5 + 8000, "16UC1")
+    found = grey_of_image(image, "x").ravel()
+    assert np.ptp(found) == 255 and np.corrcoef(found, picture(1).ravel())[0, 1] > 0.999
+
+
 COLOURS = np.stack([picture(1), picture(2), picture(3)], axis=-1)
 GREY = cv2.cvtColor(COLOURS, cv2.COLOR_RGB2GRAY)
 FULL = np.full((48, 64, 1), 255, np.uint8)

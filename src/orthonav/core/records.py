@@ -329,7 +329,8 @@ EXPECTED = (
 def grey_levels(image: Any) -> NDArray[np.uint8]:
     """Grey levels (H, W) uint8 of a grey, BGR or BGRA image; uint8 grey is returned as it is.
 
-    uint16 counts to 65535, floating point to 1 where no value is above 1, else to 255. Raises
+    uint16 counts to 65535, floating point to 1 where no value is above 1, else to 255. Pictures
+    that use a small part of 16 bits, as of thermal cameras, are stretched (`stretched`). Raises
     `FlightError`."""
     if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.ndim == 2 and image.size:
         return image
@@ -351,7 +352,10 @@ def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
     if array.dtype == np.uint8:
         return array
     if array.dtype == np.uint16:
-        return (array >> 8).astype(np.uint8)  # as OpenCV reads files of 16 bits
+        low, high = np.percentile(array, STRETCHED_PERCENT)
+        if high - low < NARROW_COUNTS:
+            return stretched(array, max(float(high - low), LEAST_COUNTS))
+        return (array >> 8).astype(np.uint8)
     if array.dtype.kind not in "iuf":
         raise FlightError(f"the image has values of type {array.dtype}; {EXPECTED}")
     low, high = float(array.min()), float(array.max())
@@ -359,6 +363,20 @@ def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
         raise FlightError(f"the image has values of {low:g} to {high:g}; {EXPECTED}")
     scale = 255.0 if array.dtype.kind == "f" and high <= 1 else 1.0
     return np.rint(array * scale).astype(np.uint8)
+
+
+STRETCHED_PERCENT = 0.1, 99.9
+NARROW_COUNTS, LEAST_COUNTS = 8192.0, 128.0
+"""Values of 16 bits that span less than the first are stretched: 12 and 14 bits, temperatures. As
+if they spanned the second where they span less, so that noise does not look like ground."""
+
+
+def stretched(array: NDArray[Any], span: float) -> NDArray[np.uint8]:
+    """Grey levels of measured values, from dark to bright over `span`, around their middle."""
+    low, high = np.percentile(array, STRETCHED_PERCENT)
+    first = (low + high - span) / 2
+    levels = (array.astype(np.float32) - np.float32(first)) * np.float32(255 / span)
+    return np.asarray(np.rint(levels.clip(0, 255)), np.uint8)
 
 
 _ROUNDING = 1e-9  # negative eigenvalues up to this fraction of the largest are rounding errors

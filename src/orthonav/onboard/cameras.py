@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.files import require_file
 from orthonav.core.flight import open_flight
-from orthonav.core.records import NoFix, Telemetry
+from orthonav.core.records import NoFix, Telemetry, grey_levels
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
@@ -32,6 +32,7 @@ one, images can be late by as much: positions show it (`orthonav.onboard.latency
 FROZEN_LEVELS = 0.25
 """Mean difference in grey levels below which two images are the same; noise is four times that."""
 FROZEN_SIDE_PX = 64
+Y16 = cv2.VideoWriter.fourcc(*"Y16 ")  # grey of 16 bits, as of thermal cameras
 Grey = NDArray[np.uint8]
 
 
@@ -99,7 +100,7 @@ class LiveCamera:
         self._count_interruptions(arrived_ns)
         found, frame = self._capture.retrieve()
         self._number += 1
-        grey = _grey(frame) if found else None
+        grey = grey_levels(frame) if found else None
         problem = None if grey is not None else NoFix("bad_image", "image could not be decoded")
         return CameraImage(
             self._number,
@@ -245,7 +246,7 @@ def _video(capture: Any) -> Iterator[RecordedImage]:
         while capture.grab():
             time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             found, frame = capture.retrieve()
-            grey = _grey(frame) if found else None
+            grey = grey_levels(frame) if found else None
             yield RecordedImage(f"{number:06d}", time_ns, partial(_loaded, grey, number))
             number += 1
     finally:
@@ -258,14 +259,12 @@ def _loaded(grey: Grey | None, number: int) -> Grey:
     return grey
 
 
-def _grey(frame: NDArray[Any]) -> Grey:
-    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if frame.ndim == 3 else frame
-    return np.asarray(grey, dtype=np.uint8)
-
-
 def _capture(name: int | str) -> Any:
     if isinstance(name, int):
-        return cv2.VideoCapture(name, cv2.CAP_V4L2)
+        device = cv2.VideoCapture(name, cv2.CAP_V4L2)
+        if int(device.get(cv2.CAP_PROP_FOURCC)) == Y16:
+            device.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits
+        return device
     limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 3000]
     capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the camera describes the sensor

@@ -18,7 +18,13 @@ from orthonav.core.errors import CameraError, FlightError, MissingFileError, Out
 from orthonav.core.files import require_file
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.core.records import Prior, Telemetry
+from orthonav.core.records import (
+    STRETCHED_PERCENT,
+    Prior,
+    Telemetry,
+    grey_levels,
+    stretched,
+)
 from orthonav.core.tables import TableError, TableRows
 
 TELEMETRY_COLUMNS = ("frame", "time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m")
@@ -33,7 +39,8 @@ MAX_TEXT_BYTES = 500_000_000
 MAX_VIEWS = 1_000_000
 """Rows of a table of a flight: as many views as `simulate` makes, 55 hours at 5 Hz."""
 # The camera describes the sensor: an orientation tag must not rotate the image.
-_DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+LEAST_SPAN = 2.0  # of temperatures (deg C) or other real numbers, as if spread over so much
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
@@ -109,7 +116,7 @@ def _fitted(camera: Camera, views: Iterable[FlightView]) -> Camera:
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """Grey levels (H, W) uint8 of an image file; 16-bit images are scaled down.
+    """Grey levels (H, W) uint8 of an image file, as `decode_image`.
 
     Raises `MissingFileError` or, where it cannot be decoded or was cut short, `FlightError`.
     """
@@ -126,6 +133,8 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
     """Grey levels (H, W) uint8 of an encoded image (JPEG, PNG, TIFF); `where` is for errors.
 
+    16 bits as `grey_levels`; real numbers, such as temperatures, are stretched.
+
     Raises `FlightError` where it cannot be decoded or was cut short.
     """
     if _is_cut_jpeg(data):
@@ -136,7 +145,12 @@ def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
         image = None
     if image is None:
         raise FlightError(f"image of the flight cannot be decoded: {where}")
-    return np.asarray(image, dtype=np.uint8)
+    if image.dtype.kind == "f":
+        if not np.isfinite(image).all():
+            raise FlightError(f"image of the flight has values that are not finite: {where}")
+        low, high = np.percentile(image, STRETCHED_PERCENT)
+        return stretched(image, max(float(high - low), LEAST_SPAN))
+    return grey_levels(image)
 
 
 def _is_cut_jpeg(data: bytes) -> bool:

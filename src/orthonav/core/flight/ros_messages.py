@@ -11,6 +11,7 @@ from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import decode_image
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import camera_from_numbers
+from orthonav.core.records import grey_levels
 from orthonav.core.tilt import stated_deg
 
 
@@ -91,7 +92,7 @@ def grey_of_message(message: Any, where: str) -> Grey:
 
 
 def grey_of_image(message: Any, where: str) -> Grey:
-    """Grey levels (H, W) uint8 of a `sensor_msgs/Image`; 16-bit ones are scaled down.
+    """Grey levels (H, W) uint8 of a `sensor_msgs/Image`; of 16 bits as `grey_levels`.
 
     Raises `FlightError` for unknown encodings and data of a wrong size.
     """
@@ -110,7 +111,7 @@ def grey_of_image(message: Any, where: str) -> Grey:
         pixels = pixels[..., 0]
     if conversion is not None:
         pixels = cv2.cvtColor(pixels.astype(pixels.dtype.newbyteorder("=")), conversion)
-    return np.asarray(pixels if width == 1 else pixels >> 8, dtype=np.uint8)
+    return grey_levels(pixels.astype(pixels.dtype.newbyteorder("="), copy=False))
 
 
 def camera_of_info(message: Any) -> Camera:
