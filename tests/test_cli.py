@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -182,6 +183,25 @@ def test_localize(run, map_path, flight_path, short_flight, out, names_in):
     assert f"{len(cameras) - 1} camera positions: " in text.out
     refused(run("localize", map_path, few, *to, "--export", "shp=a.shp"), "odm-geo")
     assert "confident (confidence 0.9 or more), " in text.out
+
+
+def test_localize_without_what_a_mask_hides(run, map_path, short_flight, out):
+    flight = shorten(shutil.copytree(short_flight, out / "flight"), 3)
+    frames = sorted((flight / "frames").iterdir())
+    rows, cols = cv2.imread(str(frames[0]), cv2.IMREAD_GRAYSCALE).shape
+    mask = np.full((rows, cols), 255, np.uint8)
+    mask[: rows // 3] = 0
+    cv2.imwrite(str(out / "mask.png"), mask)
+    text = np.random.default_rng(1).integers(0, 255, (rows // 3, cols, 1))
+    for path in frames:
+        image = cv2.imread(str(path))
+        image[: rows // 3] = text
+        cv2.imwrite(str(path), image)
+    to = ["localize", map_path, flight, "--out", out / "fixes.jsonl", "--json", "--mask"]
+    assert json.loads(run(*to, out / "mask.png").out)["n_confident"] == 3
+    refused(run(*to, out / "none.png"), "mask of the camera")
+    copy = run("import", flight, "--out", out / "copy", "--mask", out / "mask.png")
+    refused(copy, "keeps no mask")
 
 
 def test_locate_pixel(run, map_path, short_flight, out):

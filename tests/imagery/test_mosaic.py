@@ -97,12 +97,21 @@ def test_one_band_that_may_hold_heights_is_refused(tmp_path, dtype):
         Mosaic.open([path])
 
 
-def test_a_palette_is_refused_with_the_command_that_writes_its_colours(tmp_path):
-    path = write(tmp_path / "ortho.tif", SCENE[:1])
+@pytest.mark.parametrize("gsd_m", [1, 2])
+@pytest.mark.parametrize("nodata", [None, 0])
+def test_a_palette_is_read_as_its_colours(tmp_path, gsd_m, nodata):
+    path = write(tmp_path / "ortho.tif", np.where(MASK > 0, SCENE[:1], 0), nodata=nodata)
     with rasterio.open(path, "r+") as data:
         data.write_colormap(1, {value: (value, 255 - value, 7, 255) for value in range(256)})
-    with pytest.raises(ImageryError, match=r"palette.*gdal_translate -expand rgb 'ortho\.tif'"):
-        Mosaic.open([path])
+    plain = write(tmp_path / "grey.tif", np.where(MASK > 0, SCENE[:1], 0), nodata=nodata)
+    pixels, expected = read(path, gsd_m=gsd_m), read(plain, gsd_m=gsd_m)
+    np.testing.assert_array_equal(pixels.valid, expected.valid)
+    inner = np.s_[8 // gsd_m : -8 // gsd_m, 8 // gsd_m : -8 // gsd_m]
+    valid = expected.valid[inner]
+    level = expected.rgb[inner][valid][:, 0].astype(int)
+    red, green, blue = pixels.rgb[inner][valid].astype(int).T
+    assert np.abs(red - level).max() <= 2 and np.abs(green - 255 + level).max() <= 2
+    assert np.abs(blue - 7).max() <= 2 and level.std() > 20
 
 
 @pytest.mark.parametrize("dtype, top", [("uint8", 255), ("uint16", 65_535)])

@@ -23,7 +23,6 @@ from orthonav.core.flight.logged import (
     TELEMETRY,
     VIEW,
     LoggedView,
-    camera_plain,
     lossless_png,
     picture_message,
     telemetry_message,
@@ -102,7 +101,7 @@ def crafted(path, messages, profile=PROFILE, compression=CompressionType.ZSTD):
 
 
 def session(**changes):
-    plain = {"format": 1, "run": "a", "views": "full", "camera": camera_plain(CAMERA)}
+    plain = {"format": 1, "run": "a", "views": "full", "camera": CAMERA.numbers()}
     return SESSION, 0, to_json({**plain, **changes})
 
 
@@ -432,7 +431,7 @@ def test_invalid_telemetry_is_left_out(tmp_path, data):
      {"distortion": [0.1] * 10**4}, {"model": []}],
 )  # fmt: skip
 def test_invalid_cameras_are_rejected(tmp_path, changes):
-    camera = {**camera_plain(CAMERA), **changes}
+    camera = {**CAMERA.numbers(), **changes}
     with pytest.raises(OrthonavError, match=r"a\.mcap"):
         open_source(crafted(tmp_path / "a.mcap", [session(camera=camera), reported(), shown()]))
 

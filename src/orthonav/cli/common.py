@@ -85,6 +85,12 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "metavar": "FILE",
         "help": "camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
     },
+    "--mask": {
+        "type": Path,
+        "metavar": "PNG",
+        "help": "grey image of the size of the camera's, black where the picture never shows "
+        "ground: landing gear, propellers, text",
+    },
     "--dem": {
         "type": Path,
         "metavar": "FILE",

@@ -48,7 +48,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def _add_inputs(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("camera")
     add = group.add_argument
-    add_options(group, "--camera", "--mount-deg", "--mount")
+    add_options(group, "--camera", "--mask", "--mount-deg", "--mount")
     text = "live cameras: time from exposure to arrival; without it nothing is sent"
     add("--camera-latency-ms", metavar="MS|FILE", help=f"{text} (`orthonav calibrate --latency`)")
 

@@ -25,7 +25,7 @@ from orthonav.core.flight.gnss import FILE, GnssSample, read_gnss
 from orthonav.core.flight.heights import DATUM_ADVICE
 from orthonav.core.flight.mount import MOST_MS, CameraLatency, Mount, read_latency, read_mount
 from orthonav.core.geo.camera import Camera
-from orthonav.core.geo.camera_files import read_camera_file
+from orthonav.core.geo.camera_files import masked, read_camera_file
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize import Localizer
@@ -94,6 +94,8 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     for line in plan_lines(options, opened, accept):
         console.say(line)
     camera = camera or source.wait_for_camera()
+    if options.mask is not None:
+        camera = masked(camera, options.mask)
     console.say(camera_line(options, camera))
     digest = opened.manifest.sha256
     gnss = None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from orthonav.cli.common import add_options, counted, print_json, progress
 from orthonav.cli.source import add_source, open_source
+from orthonav.core.errors import FlightError
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,8 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.core.geo.headings import RADIANS
     from orthonav.ground.recordings import import_flight
 
+    if options.mask is not None:
+        raise FlightError("a flight folder keeps no mask: give --mask where it is read")
     recording = open_source(options.source, options)
     with progress(options) as shown:
         done = import_flight(

@@ -49,7 +49,7 @@ def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     add("--telemetry", type=Path, metavar="LOG", help=f"{text}images by file name")
     text = "offset that is added to the times of images to get times of the log (default 0)"
     add("--time-offset-s", type=float, default=0.0, help=text)
-    add_options(group, "--camera", "--mount-deg")
+    add_options(group, "--camera", "--mask", "--mount-deg")
     text = "ROS topic for image, camera_info, attitude, velocity, position or height"
     names: dict[str, Any] = {"dest": "topics", "metavar": "ROLE=NAME"}
     add("--topic", type=topic, action="append", default=[], help=text, **names)

@@ -50,7 +50,6 @@ from orthonav.core.flight.logged import (
     LoggedView,
     Message,
     calibration_message,
-    camera_plain,
     lossless_png,
     navsat_message,
     picture_message,
@@ -131,7 +130,7 @@ class FlightLog:
             "run": os.urandom(8).hex(),  # distinguishes files of two runs of one name
             "version": __version__,
             "views": views,
-            "camera": camera_plain(camera),
+            "camera": camera.numbers(),
             "map": dict(map_info),
             "options": {},
         }
@@ -229,7 +228,7 @@ class FlightLog:
         if camera == self._camera:
             return
         self._camera = camera
-        session = self._session = {**self._session, "camera": camera_plain(self._camera)}
+        session = self._session = {**self._session, "camera": self._camera.numbers()}
         self._add(lambda: [self._session_message(session)], 1000)
 
     def _has_room(self, size_bytes: int) -> bool:

@@ -5,7 +5,7 @@ import json
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from decimal import Decimal
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -219,7 +219,10 @@ def camera_from_plain(raw: Any) -> Camera:
     return Camera(
         width_px=int(raw["width_px"]),
         height_px=int(raw["height_px"]),
-        **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
+        fx_px=float(raw["fx_px"]),
+        fy_px=float(raw["fy_px"]),
+        cx_px=float(raw["cx_px"]),
+        cy_px=float(raw["cy_px"]),
         distortion=tuple(float(value) for value in distortion),
         model=str(raw.get("model", "brown")),
         focal_std=float(raw.get("focal_std", 0.0)),
@@ -356,8 +359,7 @@ class FlightWriter:
         _write_csv(self._folder / "telemetry.csv", columns, table)
         if self._truth:
             _write_csv(self._folder / "truth.csv", ("frame", "lat_deg", "lon_deg"), self._truth)
-        camera = asdict(self._camera)
-        text = json.dumps({"camera": camera, "note": self._note}, indent=1)
+        text = json.dumps({"camera": self._camera.numbers(), "note": self._note}, indent=1)
         (self._folder / "flight.json").write_text(text + "\n", encoding="utf-8")
 
 

@@ -290,13 +290,8 @@ def view_of(data: bytes) -> LoggedView:
     return LoggedView(index, number, frame, telemetry, picture, latency_ms, withheld)
 
 
-def camera_plain(camera: Camera) -> dict[str, Any]:
-    """A camera as in `flight.json`, exactly."""
-    return asdict(camera)
-
-
 def camera_of(plain: Any) -> Camera:
-    """Inverse of `camera_plain`. Raises `FlightError` or `CameraError`."""
+    """Inverse of `Camera.numbers`. Raises `FlightError` or `CameraError`."""
     try:
         return camera_from_plain(plain)
     except CameraError:

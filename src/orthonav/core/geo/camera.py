@@ -12,10 +12,12 @@ and calibration method", with four numbers of the angle off the optical axis."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,7 +44,8 @@ class Camera:
     (pixel-is-area: its centre is 0.5, 0.5). With `model` "brown", `distortion` is empty or
     k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
     OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
-    for a calibrated camera. Raises `CameraError` on values no camera has."""
+    for a calibrated camera. `mask` (H, W), see `masked`, is no part of comparisons. Raises
+    `CameraError` on values no camera has."""
 
     width_px: int
     height_px: int
@@ -53,6 +56,7 @@ class Camera:
     distortion: tuple[float, ...] = ()
     model: str = "brown"
     focal_std: float = 0.0
+    mask: NDArray[np.uint8] | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.distortion and not any(self.distortion):
@@ -117,6 +121,23 @@ class Camera:
 
         return read_camera_file(Path(path))
 
+    def masked(self, mask: NDArray[Any]) -> "Camera":
+        """The camera whose pixels never show ground where `mask` (H, W) is 0, as behind landing
+        gear or text in the picture. A mask of another size is scaled."""
+        shown = np.asarray(np.where(np.asarray(mask) > 0, 255, 0), np.uint8)
+        if shown.ndim != 2 or not shown.any():
+            raise CameraError(
+                f"mask must be (H, W) grey, 0 where no ground is seen, got {shown.shape}, "
+                f"{np.count_nonzero(shown)} pixels above 0"
+            )
+        fitted = self.fitted(shown.shape[1], shown.shape[0])
+        made = replace(fitted, mask=shown)
+        return made.resized(self.width_px, self.height_px)
+
+    def numbers(self) -> dict[str, Any]:
+        """All but the mask, as in `flight.json`."""
+        return {name: each for name, each in vars(self).items() if name != "mask"}
+
     @property
     def is_pinhole(self) -> bool:
         return self.model == "brown" and not self.distortion
@@ -153,8 +174,13 @@ class Camera:
     def resized(self, width_px: int, height_px: int) -> "Camera":
         """The camera of the same picture resampled to another size."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
+        mask = self.mask
+        if mask is not None and mask.shape != (height_px, width_px):
+            size = width_px, height_px
+            mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.uint8)
         return replace(
             self,
+            mask=mask,
             width_px=width_px,
             height_px=height_px,
             fx_px=self.fx_px * sx,

@@ -73,6 +73,20 @@ def read_camera_file(path: Path) -> Camera:
         ) from error
 
 
+def masked(camera: Camera, path: Path) -> Camera:
+    """A camera with the mask of an image file, see `Camera.masked`.
+
+    Raises `MissingFileError` or `CameraError`."""
+    path = require_file(path, "mask of the camera")
+    mask = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if mask is None:
+        raise CameraError(f"mask cannot be decoded: {path}")
+    try:
+        return camera.masked(mask)
+    except CameraError as error:
+        raise CameraError(f"{error}: {path}") from error
+
+
 def camera_from_numbers(
     size_px: Sequence[int], matrix: Sequence[float], distortion: Sequence[float], model: str
 ) -> Camera:

@@ -3,7 +3,9 @@
 Over flat ground, north up or heading up, or over a terrain. Rolling shutter is ignored."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -27,6 +29,7 @@ NODE_PX = 4
 """Spacing of heights and projections: at most one and a half postings of a usual terrain."""
 MAX_COARSER = 3.0
 """Coarser ground, over the window's pixel and the view's finest ground, does not count."""
+SHOWN = 254  # grey level of a rectified mask above which a pixel shows nothing but ground
 SIGHT_STEPS = 48  # of a line of sight, at most
 CLEAR_M = 0.5  # error of interpolation
 FASTER_FROM, FASTER_TO = 3, 256  # factors by which the kernel makes pictures smaller, as OpenCV
@@ -73,7 +76,18 @@ def orthorectified(
     index = orientation.seen_px(view.camera, nodes_m) - 0.5
     usable = _fine(view, index) & ~hidden(*(sheared_m or (nodes_m, orientation.position_m)))
     index[~usable] = np.nan
-    return _at_nodes(view.grey, index, shape)
+    return _unmasked(view, lambda picture: _at_nodes(picture, index, shape))
+
+
+def _unmasked(
+    view: View, rectified: Callable[[NDArray[np.uint8]], tuple[NDArray[np.uint8], Mask]]
+) -> tuple[NDArray[np.uint8], Mask]:
+    """Grey and valid (H, W), not valid where the camera's mask hides the ground."""
+    grey, valid = rectified(view.grey)
+    if view.camera.mask is None:
+        return grey, valid
+    shown = rectified(view.camera.mask)[0] > SHOWN
+    return np.where(shown, grey, 0).astype(np.uint8), valid & shown
 
 
 def _at_nodes(
@@ -113,7 +127,7 @@ def rectified_level(
     # Areas of pixels on the ground grow with the cube of the depth: all are fine enough.
     if not 0 < depth.max() < MAX_COARSER ** (2 / 3) * depth.min():
         return None
-    return _warped(view, camera_from_window, shape, corners)
+    return _unmasked(view, partial(_warped, view.camera, camera_from_window, shape, corners))
 
 
 def _corners(shape: tuple[int, int]) -> Array:
@@ -252,6 +266,8 @@ def downsampled(view: View, gsd_m: float) -> View:
         return view
     # Whole multiples only: what is left over at the right and below is not worth a slower path.
     whole = replace(camera, width_px=width * factor, height_px=height * factor)
+    if camera.mask is not None:
+        whole = replace(whole, mask=camera.mask[: whole.height_px, : whole.width_px])
     used = view.grey[: whole.height_px, : whole.width_px]
     return replace(view, grey=_thinned(used, factor), camera=whole.resized(width, height))
 
@@ -334,28 +350,30 @@ def _window(
     corners = _corners(shape)
     depth = corners @ camera_from_window[2]
     if not view.camera.is_pinhole or depth.min() <= 0:
-        return _remapped(view, camera_from_window, shape)
-    return _warped(view, camera_from_window, shape, corners)
+        return _unmasked(view, partial(_remapped, view.camera, camera_from_window, shape))
+    return _unmasked(view, partial(_warped, view.camera, camera_from_window, shape, corners))
 
 
 def _warped(
-    view: View, camera_from_window: Array, shape: tuple[int, int], corners: Array
+    camera: Camera,
+    camera_from_window: Array,
+    shape: tuple[int, int],
+    corners: Array,
+    picture: NDArray[np.uint8],
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Without distortion and horizon: one homography."""
     size = shape[1], shape[0]
-    px_from_window = view.camera.matrix @ camera_from_window
+    px_from_window = camera.matrix @ camera_from_window
     matrix = counted_from_centres(px_from_window)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    grey = cv2.warpPerspective(
-        view.grey, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
-    )
+    grey = cv2.warpPerspective(picture, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     projected = corners @ px_from_window.T
     seen = projected[:, :2] / projected[:, 2:]
-    height, width = view.grey.shape
+    height, width = picture.shape
     if (seen >= -EDGE_PX).all() and (seen <= np.array([width, height]) + EDGE_PX).all():
         valid = np.ones(shape, dtype=np.bool_)
     else:
-        inside = np.full(view.grey.shape, 255, dtype=np.uint8)
+        inside = np.full(picture.shape, 255, dtype=np.uint8)
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
         valid = cv2.warpPerspective(inside, matrix, size, flags=flags) > 0
         grey = np.where(valid, grey, 0)
@@ -363,15 +381,17 @@ def _warped(
 
 
 def _remapped(
-    view: View, camera_from_window: Array, shape: tuple[int, int]
+    camera: Camera,
+    camera_from_window: Array,
+    shape: tuple[int, int],
+    picture: NDArray[np.uint8],
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Every pixel through lens and horizon."""
-    camera = view.camera
     height, width = shape
     # Seldom needed for every pixel: between nodes straight lines are exact enough.
     sides = [np.arange(0.5, side + 3 * NODE_PX, NODE_PX, dtype=np.float64) for side in shape]
     nodes = _seen_px(camera, camera_from_window, *sides) - 0.5
-    if _is_smooth(nodes, view.grey.shape):
+    if _is_smooth(nodes, picture.shape):
         part = np.array([[1 / NODE_PX, 0, 0], [0, 1 / NODE_PX, 0]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         index = cv2.warpAffine(nodes.astype(np.float32), part, (width, height), flags=flags)
@@ -379,11 +399,11 @@ def _remapped(
         sides = [np.arange(0.5, side, dtype=np.float64) for side in shape]
         index = (_seen_px(camera, camera_from_window, *sides) - 0.5).astype(np.float32)
     x, y = cv2.split(np.asarray(index, np.float32))
-    high, wide = view.grey.shape
+    high, wide = picture.shape
     with np.errstate(invalid="ignore"):
         valid = (x >= -0.5) & (y >= -0.5) & (x <= wide - 0.5) & (y <= high - 0.5)
     x[~valid] = -10
-    grey = cv2.remap(view.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     grey[~valid] = 0
     return np.asarray(grey, np.uint8), np.asarray(valid, np.bool_)
 

@@ -164,6 +164,8 @@ def _values(source: Source, place: str, band: int) -> str:
     kind, more = "SimpleSource", ""
     if source.masks:
         kind, more = "ComplexSource", "<UseMaskBand>true</UseMaskBand>"
+    if source.is_indexed:
+        kind, more = "ComplexSource", f"<ColorTableComponent>{band + 1}</ColorTableComponent>{more}"
     return f"<{kind}>{place}<SourceBand>{source.bands[band]}</SourceBand>{more}</{kind}>"
 
 
@@ -202,6 +204,7 @@ def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:
     alike = (
         first.crs == other.crs
         and len(first.bands) == len(other.bands)
+        and first.is_indexed == other.is_indexed
         and first.dtype == other.dtype
     )
     if not alike:

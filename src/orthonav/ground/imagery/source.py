@@ -82,6 +82,8 @@ class Source:
     """Of acquisition, YYYY[-MM[-DD]]."""
     masks: tuple[str, ...] = ()
     """Bands that tell where it is valid, as GDAL's VRT names them; empty where it is everywhere."""
+    is_indexed: bool = False
+    """The only band holds numbers of colours, and is used for red, green and blue."""
     folder: Path | None = None
     """Given by the user."""
     stamp: tuple[tuple[str, int, int], ...] = ()
@@ -185,11 +187,6 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
             f"raster of one band of {dataset.dtypes[0]} may hold heights; an orthophoto has bands "
             f"of 8 or 16 bits without a sign: {path}"
         )
-    if dataset.colorinterp[0] == ColorInterp.palette:
-        raise ImageryError(
-            "orthophoto has a palette; write its colours first: gdal_translate -expand rgb "
-            f"'{path.name}' rgb.tif: {path}"
-        )
     outline = _outline(path, dataset, system)
     return Source(
         path=path,
@@ -205,6 +202,7 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
         outline_latlon_deg=outline,
         date=date_of(dataset.tags(), names),
         masks=_masks(path, dataset, bands),
+        is_indexed=_is_indexed(dataset),
         folder=folder,
         stamp=_stamp(path, dataset),
         terms=_terms(dataset.tags()),
@@ -266,7 +264,13 @@ def _stamp(path: Path, dataset: Any) -> tuple[tuple[str, int, int], ...]:
     return tuple((name, about.st_size, about.st_mtime_ns) for name, about in found)
 
 
+def _is_indexed(dataset: Any) -> bool:
+    return dataset.count == 1 and dataset.colorinterp[0] == ColorInterp.palette
+
+
 def _bands(dataset: Any) -> tuple[int, ...]:
+    if _is_indexed(dataset):
+        return 1, 1, 1
     by_colour = {
         colour: index for index, colour in reversed(list(enumerate(dataset.colorinterp, 1)))
     }

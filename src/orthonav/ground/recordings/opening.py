@@ -1,7 +1,7 @@
 """Opening a recording of any kind, and importing it."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -9,6 +9,7 @@ from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.files import replacing_folder, require_file
 from orthonav.core.flight import FlightFolder, FlightWriter, open_flight, read_truth
 from orthonav.core.flight.folder import encoded
+from orthonav.core.geo.camera_files import masked
 from orthonav.core.geo.headings import seem_radians
 from orthonav.ground.recordings.flightlog import is_flight_log, open_flight_log
 from orthonav.ground.recordings.image_table import is_image_table
@@ -36,7 +37,15 @@ def open_source(path: Path | Sequence[Path], options: SourceOptions | None = Non
     `MissingFileError`, `FlightError`, `CameraError` or `MissingExtraError`.
     """
     paths = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
-    path, options = paths[0], options or SourceOptions()
+    options = options or SourceOptions()
+    found = _opened(paths, options)
+    if options.mask is None:
+        return found
+    return replace(found, camera=masked(found.camera, options.mask))
+
+
+def _opened(paths: list[Path], options: SourceOptions) -> Recording:
+    path = paths[0]
     for each in paths:
         if not each.exists():
             raise MissingFileError(f"source does not exist: {each}")

@@ -62,10 +62,12 @@ class SourceOptions:
     """Whether the camera looked straight down where pitch and roll were not recorded."""
     over_terrain: bool = False
     """Whether a terrain turns the heights of the recording into heights above ground later on."""
+    mask: Path | None = None
+    """Grey image, 0 where the picture never shows ground; None: it shows ground everywhere."""
     skip_bad_images: bool = False  # whether images that a flight folder names may be missing
 
     def __post_init__(self) -> None:
-        with_paths(self, "camera", "telemetry")
+        with_paths(self, "camera", "telemetry", "mask")
         for name in ("rate_hz", "prior_std_m", "sensor_width_mm", "agl_m", "fov_deg"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
