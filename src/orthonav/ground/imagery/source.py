@@ -265,7 +265,7 @@ def _stamp(path: Path, dataset: Any) -> tuple[tuple[str, int, int], ...]:
 
 
 def _is_indexed(dataset: Any) -> bool:
-    return dataset.count == 1 and dataset.colorinterp[0] == ColorInterp.palette
+    return bool(dataset.count == 1 and dataset.colorinterp[0] == ColorInterp.palette)
 
 
 def _bands(dataset: Any) -> tuple[int, ...]:
