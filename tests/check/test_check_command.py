@@ -108,9 +108,12 @@ def checked(untried, half_blank):
     return check
 
 
-def test_another_sensor_lowers_what_is_predicted(checked):
-    usual, other = checked(), checked(other_sensor=True)
+@pytest.mark.parametrize("kind", ["other", "near-infrared", "thermal"])
+def test_other_light_lowers_what_is_predicted(checked, kind):
+    usual, other = checked(), checked(camera_kind=kind)
     assert halves(other.cells)[0] < halves(usual.cells)[0] - 0.02
+    thermal = [each.word for each in other.verdict.reasons if each.code == "thermal"]
+    assert thermal == [Word.MARGINAL] * (kind == "thermal")
     low, lower = (np.nanmean(each.cells.low) for each in (usual, other))
     assert lower < low - 0.05
 

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orthonav.cli.common import add_options, print_json, progress
+from orthonav.core.limits import CAMERA_KINDS
 from orthonav.core.tilt import UNSTATED
 
 EXAMPLE = "area.onav --route route.kml --agl-m 120 --out check"
 EVERYDAY = (
-    *("--route", "--band-m", "--other-date", "--other-sensor", "--changes", "--camera", "--agl-m"),
+    *("--route", "--band-m", "--other-date", "--camera-kind", "--changes", "--camera", "--agl-m"),
     *("--dem", "--alert-limit-m", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior"),
     *("--quick", "--json"),
 )
@@ -82,8 +83,9 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     text += "by 1.7 %% of the height a degree (docs/flights.md has that of each source; "
     text += f"default {UNSTATED.aided_deg:g}, as where it is not stated)"
     number("--tilt-std-deg", default=UNSTATED.aided_deg, help=text)
-    text = "camera and map imagery are of different kinds (drone against satellite, infrared): "
-    group.add_argument("--other-sensor", action="store_true", help=f"{text}predicts fewer fixes")
+    text = "light that the camera sees, if not that of the map's imagery: predicts fewer fixes; "
+    text += "other: drone against satellite (default colour)"
+    group.add_argument("--camera-kind", choices=CAMERA_KINDS, default="colour", help=text)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -154,7 +156,7 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         effort=options.effort,
         workers=options.workers,
         tilt_std_deg=options.tilt_std_deg,
-        other_sensor=options.other_sensor,
+        camera_kind=options.camera_kind,
         changes=_changes(options),
         about=replace(_checked_inputs(options, route), height=origin),
     )

@@ -52,9 +52,10 @@ class Recalibration:
         """Standard deviation of the logit from scene to scene for views of this width."""
         return self.std + self.std_narrow * _octaves(view_px)
 
-    def other_sensor(self) -> "Recalibration":
-        std = math.hypot(self.std, OTHER_SENSOR_STD)
-        return replace(self, shift=self.shift + OTHER_SENSOR_SHIFT, std=std)
+    def of_camera(self, kind: str) -> "Recalibration":
+        """For a camera of a kind of `CAMERA_KINDS`."""
+        shift, std = CAMERA_SHIFTS[kind]
+        return replace(self, shift=self.shift + shift, std=math.hypot(self.std, std))
 
 
 def _octaves(view_px: float) -> float:
@@ -77,9 +78,15 @@ PLAIN = Recalibration(0.0, 1.0, 0.0, 0.0, 0.6)
 LEARNT = Recalibration(0.85, 0.54, -0.51, -0.2, 0.8, 0.4)
 """What checks use: fitted to 57 conditions of nine scenes of two dates; the spread is wider for
 narrow views than these ask for (docs/check.md)."""
-OTHER_SENSOR_SHIFT, OTHER_SENSOR_STD = -0.8, 0.8
-"""An assumption that rests on one flight: a drone over two satellite maps was placed less often
-than predicted by 0.6 and 1.0 (docs/check.md)."""
+CAMERA_SHIFTS = {
+    "colour": (0.0, 0.0),
+    "other": (-0.8, 0.8),
+    "near-infrared": (-0.8, 0.8),
+    "thermal": (-1.0, 1.6),
+}
+"""What cameras in other light than the map's add to the logit, and its standard deviation.
+Assumptions: *other* rests on one flight, a drone over two satellite maps (-0.6, -1.0), the next on
+four real and two rendered pairs, *thermal* on rendered ones only (docs/check.md)."""
 
 
 # Chosen on generated landscapes by the calibration error of `benchmarks.prediction` at d63ac91.

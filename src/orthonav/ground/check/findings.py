@@ -192,7 +192,7 @@ def verdict_of(found: Findings) -> Verdict:
         text = f"At least {percent_text(found.changed)} of the ground {where} changed since the "
         text += "map was made: fixes are less likely there; build the map from newer imagery."
         reasons += [Reason("changed_ground", text, CHANGED.word(_exact(found.changed)))]
-    reasons += [_objects(found), *_oblique(found.conditions)]
+    reasons += [_objects(found), *_oblique(found.conditions), *_thermal(found.conditions)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
 
@@ -242,6 +242,14 @@ def _objects(found: Findings) -> Reason:
         text += ", 45 deg ahead" * oblique + " (docs/benchmarks.md); among houses the prediction "
         text += "may be too high."
     return Reason(code, text, Word.MARGINAL if code == "houses" else Word.GO)
+
+
+def _thermal(conditions: Conditions) -> list[Reason]:
+    if conditions.camera_kind != "thermal":
+        return []
+    text = "No flight with a thermal camera over a map was seen: the prediction rests on rendered "
+    text += "views."
+    return [Reason("thermal", text, Word.MARGINAL)]
 
 
 def _oblique(conditions: Conditions) -> list[Reason]:

@@ -17,7 +17,7 @@ from orthonav.core.errors import CheckError
 from orthonav.core.files import with_paths
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.limits import ALERT_LIMITS_M, DEFAULT_RISK, RISKS
+from orthonav.core.limits import ALERT_LIMITS_M, CAMERA_KINDS, DEFAULT_RISK, RISKS
 from orthonav.core.records import CONFIDENT, DEFAULT_TILT_STD_DEG
 from orthonav.core.track.model import Model
 from orthonav.ground.changes.record import CellGrid, ChangedGround
@@ -90,7 +90,7 @@ class CheckRequest:
     `alert_limit_m`: largest error that the mission allows; None: 2.5 % of the height, at least 35.
     `risk`: allowed probability of an error beyond it.
     `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20.
-    `other_sensor`: the camera differs from the map's sensor by more than years do.
+    `camera_kind`: of `CAMERA_KINDS`: how the camera's light differs from that of the map's imagery.
     `changes`: ground that changed since the map was made, as a flight saw it.
     """
 
@@ -114,15 +114,18 @@ class CheckRequest:
     workers: int | None = None
     seed: int = 1
     tilt_std_deg: float = DEFAULT_TILT_STD_DEG
-    other_sensor: bool = False
+    camera_kind: str = "colour"
     recalibration: Recalibration = LEARNT
     changes: ChangedGround | None = None
     about: CheckedInputs = field(default_factory=CheckedInputs)
 
     def __post_init__(self) -> None:
         with_paths(self, "map_path", "other_date")
-        if self.other_sensor and self.other_date is not None:
-            raise CheckError("--other-sensor is for checks without --other-date, which shows it")
+        if self.camera_kind not in CAMERA_KINDS:
+            kinds = ", ".join(CAMERA_KINDS)
+            raise CheckError(f"camera_kind must be {kinds}, got '{self.camera_kind:.40}'")
+        if self.camera_kind != "colour" and self.other_date is not None:
+            raise CheckError("--camera-kind is for checks without --other-date, which shows it")
         limits: dict[str, tuple[float | None, float, float, str]] = {
             "height above ground": (self.agl_m, 1.0, 50_000.0, " m"),
             "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, " deg"),
@@ -167,7 +170,7 @@ class Conditions:
     limit_given: bool = False
     risk: float = DEFAULT_RISK
     tilt_std_deg: float = 0.0
-    other_sensor: bool = False
+    camera_kind: str = "colour"
     relief_m: float = 3.0
     camera_pitch_deg: float = 0.0
 
@@ -176,7 +179,7 @@ class Conditions:
         camera = request.camera
         names = (
             *("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift", "risk"),
-            *("tilt_std_deg", "other_sensor", "relief_m", "camera_pitch_deg"),
+            *("tilt_std_deg", "camera_kind", "relief_m", "camera_pitch_deg"),
         )
         given_m = request.alert_limit_m
         return cls(

@@ -260,9 +260,7 @@ class _Check:
     def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:
         request, side_m = self.request, self.conditions.side_m
         lasting = self.coverage.without(request.changes, self.sheet.frame)
-        recalibration = request.recalibration
-        if request.other_sensor:
-            recalibration = recalibration.other_sensor()
+        recalibration = request.recalibration.of_camera(request.camera_kind)
         recalibrated: Callable[[Array], Array] = np.asarray  # a second date needs no recalibration
         scenes_std = recalibration.std
         if request.other_date is None:

@@ -70,11 +70,10 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
             else f"{metres_text(prior)} per axis (standard deviation)"
         ),
         "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)",
-        "sensor": (
-            "of another kind than the map's (assumed)"
-            if conditions.other_sensor
-            else "like the map's, of another year"
-        ),
+        "camera": {
+            "colour": "colour or grey, in daylight, as the map's imagery",
+            "other": "of another kind than that of the map's imagery (assumed)",
+        }.get(conditions.camera_kind, f"{conditions.camera_kind} (assumed)"),
         "confident fix": f"confidence of {conditions.accept:g} or more",
         "correct fix": f"error of at most {metres_text(conditions.radius_m)}",
         "ground speed": f"{conditions.speed_mps:g} m/s",
