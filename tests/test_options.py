@@ -56,3 +56,10 @@ def test_every_command_has_help_all(line, capsys):
     with pytest.raises(SystemExit) as ended:
         main([*line.split(), "--help-all"])
     assert ended.value.code == 0 and f"usage: orthonav {line}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["build", "fetch"])
+def test_bands_are_numbers(command, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--bands", "r,g"])
+    assert ended.value.code == 2 and "expected numbers from 1" in capsys.readouterr().err

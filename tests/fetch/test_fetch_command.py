@@ -264,7 +264,6 @@ def test_services_known_by_name_are_listed(command):
         (["--bounds=3,46,3.1,46.1", "--source", "xyz:http://a/{z}/{x}/{y}", "--out", "o.jpg"],
          "must be a .tif"),
         (["--parallel", "99", "--source", "ign", "--out", "o.tif"], "--parallel is 1 to 16"),
-        (["--bands", "r,g", "--source", "ign", "--out", "o.tif"], "--bands are numbers"),
         (["--gsd-m", "0", "--source", "ign", "--out", "o.tif"], "--gsd-m must be above 0"),
     ],
 )  # fmt: skip

@@ -114,6 +114,16 @@ def test_a_palette_is_read_as_its_colours(tmp_path, gsd_m, nodata):
     assert np.abs(blue - 7).max() <= 2 and level.std() > 20
 
 
+def test_bands_as_asked(tmp_path):
+    path = write(tmp_path / "ortho.tif", with_band(SCENE, SCENE[1]), colours=[*RGB, NIR])
+    grey = Mosaic.open([path], bands=(2,))
+    assert grey.sources[0].bands == (2,) and len(Mosaic.open([path]).sources[0].bands) == 3
+    with pytest.raises(ImageryError, match=r"has bands 1 to 4, not 5: .*ortho\.tif"):
+        Mosaic.open([path], bands=(5,))
+    with pytest.raises(ImageryError, match="one or three, not 1, 2"):
+        Mosaic.open([path], bands=(1, 2))
+
+
 @pytest.mark.parametrize("dtype, top", [("uint8", 255), ("uint16", 65_535)])
 def test_a_band_marked_alpha_that_is_a_picture_masks_nothing(tmp_path, caplog, dtype, top):
     scene = np.tile(SCENE, (1, 9, 9)).astype(dtype) * (top // 255)

@@ -37,7 +37,16 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     add_options(parser, "--json")
     imagery = parser.add_argument_group("imagery")
-    add_options(imagery, "--ortho", "--dem", "--surface", "--true-ortho", "--dem-datum", "--relief")
+    add_options(
+        imagery,
+        "--ortho",
+        "--dem",
+        "--surface",
+        "--true-ortho",
+        "--dem-datum",
+        "--relief",
+        "--bands",
+    )
     text = "orthophoto of the same area at another date, from which confidence and covariance are "
     text += "calibrated; it does not become part of the map; may be repeated"
     imagery.add_argument(
@@ -106,6 +115,7 @@ def run(options: argparse.Namespace) -> None:
         workers=options.workers,
         device=options.device,
         epoch=options.epoch,
+        bands=options.bands,
         **asked(options),
         **recipe_of(options),
     )

@@ -50,6 +50,13 @@ def _within(least: float, most: float) -> Callable[[str], float]:
     return number
 
 
+def _bands(text: str) -> tuple[int, ...]:
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and int(part) > 0 for part in parts):
+        raise argparse.ArgumentTypeError(f"expected numbers from 1, such as 1,2,3, got '{text}'")
+    return tuple(map(int, parts))
+
+
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "--accept": {
         "default": "confidence:0.9",
@@ -84,6 +91,12 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "type": Path,
         "metavar": "FILE",
         "help": "camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
+    },
+    "--bands": {
+        "type": _bands,
+        "metavar": "N[,N,N]",
+        "help": "bands of the files, one or three, from 1: 4 is often near infrared (default: red, "
+        "green and blue, or the first)",
     },
     "--mask": {
         "type": Path,

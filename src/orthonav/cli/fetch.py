@@ -88,7 +88,7 @@ def _add_imagery(parser: argparse.ArgumentParser) -> None:
     add("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
     add("--collection", help="collection of a STAC")
     add("--asset", help="asset of each STAC item")
-    add("--bands", help="bands of files, such as 1,2,3 (stac, cog)")
+    add_options(group, "--bands", help="bands of the files, such as 1,2,3 (stac, cog)")
     text = "colour of missing imagery: large patches of exactly this colour are masked"
     add("--nodata-colour", dest="empty", choices=("black", "white"), help=text)
 
@@ -231,11 +231,8 @@ def _imagery(options: argparse.Namespace) -> "ImageryOptions":
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
-    bands = options.bands and options.bands.split(",")
-    if bands and not all(part.strip().isdecimal() and int(part) > 0 for part in bands):
-        raise FetchError(f"--bands are numbers from 1, such as 1,2,3, got '{options.bands}'")
     named = {name: getattr(options, name) for name in vars(ImageryOptions()) if name in options}
-    return ImageryOptions(**named | {"bands": bands and tuple(map(int, bands))})
+    return ImageryOptions(**named)
 
 
 def _say(options: argparse.Namespace, text: str) -> None:

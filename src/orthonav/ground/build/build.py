@@ -91,6 +91,8 @@ class BuildRequest:
     - `dem_needed`: whether an area in which a model has no height is refused.
     - `relief`: what the land is like where there is no terrain, a key of
       `orthonav.core.geo.ground.RELIEF_SLOPES`; None: not stated. Not with `dem` or `surface`.
+    - `bands`: that are used, one or three, from 1, such as near infrared; None: colours, or the
+      first.
     - `true_ortho`: houses stand upright in the orthophotos; else how far they lean is estimated.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
@@ -115,6 +117,7 @@ class BuildRequest:
     dem: Path | None = None
     surface: Sequence[Path] = ()
     true_ortho: bool = False
+    bands: tuple[int, ...] | None = None
     dem_datum: str | None = None
     dem_needed: bool = True
     relief: str | None = None
@@ -147,8 +150,10 @@ class _Inputs:
         representation = make_variant(represent.TABLE, request.edges or usual_edges(request.method))
         recipe = method_recipe(request.method, representation)
         check_device(request.device)
-        mosaic = Mosaic.open(request.orthos, request.epoch)
-        other_dates = tuple(Mosaic.open([path], request.epoch) for path in request.other_dates)
+        mosaic = Mosaic.open(request.orthos, request.epoch, request.bands)
+        other_dates = tuple(
+            Mosaic.open([path], request.epoch, request.bands) for path in request.other_dates
+        )
         inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]
         inputs += [*request.surface, *([] if request.dem is None else [request.dem])]
         if request.out.exists() and any(request.out.samefile(path) for path in inputs):

@@ -273,14 +273,20 @@ class Mosaic:
     stretches: tuple[ContrastStretch | None, ...]
 
     @classmethod
-    def open(cls, paths: Sequence[Path], epoch: float | None = None) -> "Mosaic":
-        """Nothing stays open. `epoch`: decimal year of positions that drift with a plate."""
+    def open(
+        cls, paths: Sequence[Path], epoch: float | None = None, bands: tuple[int, ...] | None = None
+    ) -> "Mosaic":
+        """Nothing stays open. `epoch`: decimal year of positions that drift with a plate; `bands`:
+        as of `open_sources`."""
         if not paths:
             raise ImageryError("no orthophoto was given")
         sources: list[Source] = []
         for are_folders, group in groupby(map(Path, paths), Path.is_dir):
             some = list(group)
-            sources += chain(*map(sources_in, some)) if are_folders else open_sources(some)
+            if are_folders:
+                sources += chain(*(sources_in(each, bands) for each in some))
+            else:
+                sources += open_sources(some, bands=bands)
         if epoch is not None:
             sources = at_epoch(sources, epoch)
         with rasterio.Env(**GDAL_OPTIONS):

@@ -107,8 +107,10 @@ class UnfitError(ImageryError):
     """A raster that is not an orthophoto: heights, or not georeferenced."""
 
 
-def sources_in(folder: Path) -> list[Source]:
-    """The orthophotos of a folder, newest first, then the finest; other files are logged."""
+def sources_in(folder: Path, bands: tuple[int, ...] | None = None) -> list[Source]:
+    """The orthophotos of a folder, newest first, then the finest; other files are logged.
+
+    `bands`: as of `open_sources`."""
     if not folder.is_dir():
         raise MissingFileError(f"folder of orthophotos does not exist: {folder}")
     paths = (path for path in folder.rglob("*") if path.is_file() and path.name[0] != ".")
@@ -122,7 +124,7 @@ def sources_in(folder: Path) -> list[Source]:
         skipped_vrts = by_kind.pop(".vrt", [])  # of the files that are there
         by_kind |= {"virtual rasters (.vrt)": skipped_vrts} if skipped_vrts else {}
     files = sorted(path for kind in RASTERS for path in by_kind.pop(kind, ()))
-    sources = open_sources(files, folder)
+    sources = open_sources(files, folder, bands)
     seen = ", ".join(f"{len(others)} {kind}" for kind, others in by_kind.items()) or "nothing"
     if not sources:
         raise ImageryError(
@@ -138,12 +140,16 @@ def _preference(source: Source) -> tuple[object, ...]:
     return date, round(source.gsd_m, 3), source.crs, source.dtype, source.bands, str(source.path)
 
 
-def open_sources(paths: Sequence[Path], folder: Path | None = None) -> list[Source]:
-    """Inspect orthophotos, several at a time; in a `folder` of the user, skip other rasters."""
+def open_sources(
+    paths: Sequence[Path], folder: Path | None = None, bands: tuple[int, ...] | None = None
+) -> list[Source]:
+    """Inspect orthophotos, several at a time; in a `folder` of the user, skip other rasters.
+
+    `bands`: that are used, one or three, from 1; None: the colours, or the first."""
     sources: list[Source] = []
     skipped = 0
     with quiet(), ThreadPoolExecutor(OPENED_AT_ONCE) as pool:
-        for found in pool.map(lambda path: _opened(Path(path), folder), paths):
+        for found in pool.map(lambda path: _opened(Path(path), folder, bands), paths):
             if isinstance(found, Source):
                 sources.append(found)
             else:
@@ -157,11 +163,13 @@ def open_sources(paths: Sequence[Path], folder: Path | None = None) -> list[Sour
     return sources
 
 
-def _opened(path: Path, folder: Path | None) -> "Source | UnfitError":
+def _opened(
+    path: Path, folder: Path | None, bands: tuple[int, ...] | None
+) -> "Source | UnfitError":
     require_file(path, "orthophoto")
     try:
         with rasterio.open(path) as dataset:
-            return _inspect(path, dataset, folder)
+            return _inspect(path, dataset, folder, bands)
     except UnfitError as error:
         if folder is None:
             raise
@@ -170,7 +178,9 @@ def _opened(path: Path, folder: Path | None) -> "Source | UnfitError":
         raise unreadable(path, error) from error
 
 
-def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
+def _inspect(
+    path: Path, dataset: Any, folder: Path | None, bands: tuple[int, ...] | None
+) -> Source:
     if dataset.count < 1 or dataset.dtypes[0].startswith(("complex", "c")):
         raise ImageryError(f"orthophoto has no band of real numbers: {path}")
     names = _names_of(path, folder)
@@ -181,8 +191,11 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
     system = _system(path, dataset, names)
     if dataset.transform.is_identity or dataset.transform.determinant == 0:
         raise ImageryError(f"orthophoto has no georeference (geotransform or world file): {path}")
-    bands = _bands(dataset)
-    if len(bands) == 1 and dataset.dtypes[0] in HEIGHT_TYPES:
+    indexed = bands is None and _is_indexed(dataset)
+    if bands is not None:
+        _check_bands(path, dataset, bands)
+    bands = bands or _bands(dataset)
+    if len(bands) == 1 and dataset.dtypes[bands[0] - 1] in HEIGHT_TYPES:
         raise UnfitError(
             f"raster of one band of {dataset.dtypes[0]} may hold heights; an orthophoto has bands "
             f"of 8 or 16 bits without a sign: {path}"
@@ -202,7 +215,7 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
         outline_latlon_deg=outline,
         date=date_of(dataset.tags(), names),
         masks=_masks(path, dataset, bands),
-        is_indexed=_is_indexed(dataset),
+        is_indexed=indexed,
         folder=folder,
         stamp=_stamp(path, dataset),
         terms=_terms(dataset.tags()),
@@ -262,6 +275,14 @@ def _stamp(path: Path, dataset: Any) -> tuple[tuple[str, int, int], ...]:
     known = {str(Path(file).resolve()) for file in files}
     found = [(name, Path(name).stat()) for name in sorted(known) if Path(name).is_file()]
     return tuple((name, about.st_size, about.st_mtime_ns) for name, about in found)
+
+
+def _check_bands(path: Path, dataset: Any, bands: tuple[int, ...]) -> None:
+    text = ", ".join(map(str, bands))
+    if len(bands) not in (1, 3):
+        raise ImageryError(f"bands of an orthophoto are one or three, not {text}")
+    if not all(1 <= band <= dataset.count for band in bands):
+        raise ImageryError(f"orthophoto has bands 1 to {dataset.count}, not {text}: {path}")
 
 
 def _is_indexed(dataset: Any) -> bool:
