@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-from orthonav.core.register.channels import FINE
+from orthonav.core.register.channels import FINE, GREY_SHARE
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import SearchWindow, bank, best_near, search
 from orthonav.core.register.template import Template
@@ -151,7 +151,8 @@ def test_windows_smaller_than_the_view_are_no_crash(reference, size, view_px, ma
 
 
 def test_nothing_to_compare_is_no_crash(reference):
-    blank = Template.of(np.full((48, 64), 99, np.uint8), np.ones((48, 64), bool), LEVEL, FINE)
+    grey, valid = np.full((48, 64), 99, np.uint8), np.ones((48, 64), bool)
+    blank = Template.of(grey, valid, LEVEL, FINE, GREY_SHARE)
     nothing = SearchWindow(np.zeros((100, 100, 4), np.float32), LEVEL, 0, 0, 55)
     pose = Pose(200.0, 200.0, 0.0, 0.0)
     for template, window in (

@@ -21,7 +21,8 @@ from orthonav.core.localize.place import KEPT_TO_FINISH, Place, Placer
 from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, NoFix, Prior
-from orthonav.core.register.pose import rotation
+from orthonav.core.register.channels import SOUGHT_SHARE
+from orthonav.core.register.pose import Pose, rotation
 from orthonav.core.register.search import PLACES_AT_ONCE, Peak, best_near, largest_half_px, search
 from orthonav.core.tiles.position import rows_within
 
@@ -70,7 +71,7 @@ class FftStep(Step):
         """The peaks of correlation; those of a far level at their best places near by."""
         made, view, level = self.search, self.search.view, self.level
         recipe = view.levels.recipe(level)
-        template = view.templates.at(level, recipe)
+        template = made.sought.at(level, recipe)
         if made.prior is None:
             window = made.sheet.windows.whole(level, recipe, view.side_px)
         else:
@@ -138,6 +139,8 @@ class Search:
         self.chances = sheet.confidence.chances if sheet.confidence else USUAL_CHANCES
         self.places: list[Place] = []
         self.direct: list[Place] = []
+        self.sought = view.templates.weighing_grey(SOUGHT_SHARE)
+        self.found: list[tuple[Step, list[Pose]]] = []
         self.candidates = 0
         self.last: Step | None = None
         self.budget = Budget(self.plan.budget_ms)
@@ -174,9 +177,11 @@ class Search:
         return None
 
     def by_gradients(self) -> "Search":
-        """The same without grey levels, in the time that is left."""
+        """With the same candidates, compared without grey levels, in the time that is left."""
         made = Search(self.sheet, self.view.by_gradients(), self.prior)
         made.budget = self.budget
+        for each in self.found:
+            made._judge(*each)
         return made
 
     def camera(self, place: Place) -> CameraFound | None:
@@ -335,7 +340,7 @@ class Search:
     def _moved(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
         level, windows = self.levels.coarse, self.sheet.windows
         recipe, side_px = self.levels.recipe(level), self.view.templates.side_px
-        template, whole = self.view.templates.at(level, recipe), None
+        template, whole = self.sought.at(level, recipe), None
         if math.prod(self.sheet.reference.shape(level)) <= WHOLE_WINDOW_PX:
             whole = windows.whole(level, recipe, side_px)
             whole.prepare_near(template)
@@ -363,7 +368,10 @@ class Search:
     # When it ends
 
     def _take(self, step: Step) -> None:
-        found = [each.pose for each in step.run()]
+        self._judge(step, [each.pose for each in step.run()])
+
+    def _judge(self, step: Step, found: list[Pose]) -> None:
+        self.found.append((step, found))
         self.candidates += len(found)
         self.last = step
         if step.level < self.levels.judged:
@@ -471,21 +479,12 @@ class Found(NamedTuple):
 
 def found_by(search: Search) -> Found | NoFix:
     """By both kinds of channels; where these do not recognize the place, by gradients alone, if
-    that is more likely right. Other light (infrared, night, snow) changes grey levels more than
-    edges."""
+    that is more likely right: other light (infrared, night, snow) changes grey levels more than
+    edges. Only one of both is concluded, which takes long."""
     best = search.at_once() if search.touches_map else None
-    if search.touches_map and search.sheet.confidence and search.likelihood(best) < CONFIDENT:
-        search, best = _likelier(search, best)
-    best = best or search.concluded()
-    place = search.outcome(best)
+    if search.places and search.sheet.confidence and search.likelihood(best) < CONFIDENT:
+        other = search.by_gradients()
+        if other.likelihood(other.tentative()) > search.likelihood(best or search.tentative()):
+            search, best = other, None
+    place = search.outcome(best or search.concluded())
     return place if isinstance(place, NoFix) else Found(search, place)
-
-
-def _likelier(search: Search, best: Place | None) -> tuple[Search, Place | None]:
-    """Of the search and that by gradients, with its place if that stands out. Only one of them is
-    concluded, which takes longer than the rest."""
-    other = search.by_gradients()
-    found = other.at_once()
-    one = search.likelihood(best or search.tentative())
-    another = other.likelihood(found or other.tentative())
-    return (other, found) if another > one else (search, best)

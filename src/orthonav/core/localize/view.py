@@ -170,7 +170,7 @@ class PreparedView:
 
     def by_gradients(self) -> "PreparedView":
         """The same, compared without its grey levels."""
-        return replace(self, templates=self.templates.by_gradients())
+        return replace(self, templates=self.templates.weighing_grey(0.0))
 
     def rectified_at(self, level: int) -> RectifiedView:
         return _rectified(self.picture_at(level), self.gsd_m, self.levels, level)

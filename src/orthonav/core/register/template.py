@@ -258,8 +258,11 @@ class ViewTemplates:
             self._made[key] = Template.of(*self.picture(level), level, recipe, self.grey_share)
         return self._made[key]
 
-    def by_gradients(self) -> "ViewTemplates":
-        return ViewTemplates(*self._pictures[0], self.finest, 0.0)
+    def weighing_grey(self, share: float) -> "ViewTemplates":
+        """The same view with another weight of grey beside gradients."""
+        made = ViewTemplates(*self._pictures[0], self.finest, share)
+        made._pictures = self._pictures
+        return made
 
     def shape(self, level: int) -> tuple[int, int]:
         rows, cols = self.picture(level)[0].shape

@@ -1,0 +1,71 @@
+"""Views in other light than the map's: contrast turns over, edges stay."""
+
+import numpy as np
+import pytest
+from blots import AGL_M, CAMERA, GROUND, Ground, error_m, known_map, rendered
+
+from orthonav.core.localize import Localizer
+from orthonav.core.localize.search import Found, found_by
+from orthonav.core.mapfile import open_map
+from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
+
+OTHER = Ground(seed=5)
+PLACES = [(-120.0, 95.0), (60.3, -110.7), (133.1, 140.2), (-30.0, 5.5), (10.0, -80.0)]
+
+
+@pytest.fixture(scope="module")
+def localizer(made_once, make_ortho):
+    return Localizer(open_map(known_map(made_once, make_ortho).path))
+
+
+def infrared(east_m, north_m):
+    """A negative of the ground, and as much that the map does not show."""
+    seen = GROUND(east_m, north_m), OTHER(east_m, north_m)
+    return 128 - 0.8 * (seen[0] - 128) + 0.8 * (seen[1] - 128)
+
+
+def elsewhere(east_m, north_m):
+    return infrared(np.asarray(east_m) + 4000.0, np.asarray(north_m) - 900.0)
+
+
+def view(ground, place, yaw_deg=40.0):
+    reported = Telemetry(0, yaw_deg + 4, 0.0, 0.0, AGL_M * 1.04, tilt_std_deg=0.5)
+    return View(rendered(ground, place, (yaw_deg, 0.0, 0.0)), CAMERA, reported)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_ground_whose_contrast_turns_over_is_found_by_its_edges(localizer, place):
+    seen = view(infrared, place)
+    fix = localizer.locate(seen)
+    assert isinstance(fix, Fix) and fix.is_confident
+    assert error_m(localizer, fix, place) < 0.5
+    assert fix.evidence["grey_correlation"] == 0 < fix.evidence["gradient_correlation"]
+    both = localizer.registration.search(seen)
+    assert both.likelihood(both.run()) < 0.5
+
+
+def test_by_day_grey_levels_count(localizer):
+    fix = localizer.locate(view(GROUND, PLACES[0]))
+    assert fix.is_confident and fix.evidence["grey_correlation"] > 0.5
+
+
+def test_other_ground_in_other_light_is_not_recognized(localizer):
+    for place in PLACES:
+        fix = localizer.locate(view(elsewhere, place))
+        assert isinstance(fix, NoFix) or not fix.is_confident
+
+
+def test_the_same_candidates_are_compared_again(localizer):
+    search = localizer.registration.search(view(infrared, PLACES[1]))
+    search.at_once()
+    again = search.by_gradients()
+    assert again.candidates == search.candidates > 0
+    assert len(again.places) == len(search.places) and again.budget is search.budget
+    assert again.view.templates.grey_share == 0 < search.sought.grey_share
+
+
+def test_a_prior_beside_the_map_finds_nothing(localizer):
+    lat, lon = localizer.sheet.frame.latlon_from_en(np.array([9000.0, 0.0]))
+    search = localizer.registration.search(view(GROUND, PLACES[0]), Prior(lat, lon, 10.0))
+    found = found_by(search)
+    assert not isinstance(found, Found) and found.reason == "outside_map"
