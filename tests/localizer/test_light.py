@@ -60,7 +60,7 @@ def test_the_same_candidates_are_compared_again(localizer):
     search.at_once()
     again = search.by_gradients()
     assert again.candidates == search.candidates > 0
-    assert len(again.places) == len(search.places) and again.budget is search.budget
+    assert again.found == search.found and again.budget is search.budget
     assert again.view.templates.grey_share == 0 < search.sought.grey_share
 
 
