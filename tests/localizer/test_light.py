@@ -57,7 +57,7 @@ def test_other_ground_in_other_light_is_not_recognized(localizer):
 
 def test_the_same_candidates_are_compared_again(localizer):
     search = localizer.registration.search(view(infrared, PLACES[1]))
-    search.at_once()
+    search.best()
     again = search.by_gradients()
     assert again.candidates == search.candidates > 0
     assert again.found == search.found and again.budget is search.budget

@@ -147,7 +147,7 @@ class Search:
 
     def run(self) -> Place | NoFix:
         """By both kinds of channels alone."""
-        return self.outcome(self.best() if self.touches_map else None)
+        return self.outcome(self.best())
 
     def outcome(self, best: Place | None) -> Place | NoFix:
         """With its height counted from the ground below the camera."""
@@ -162,10 +162,8 @@ class Search:
 
     def best(self) -> Place | None:
         """None where nothing was found."""
-        return self.at_once() or self.concluded()
-
-    def at_once(self) -> Place | None:
-        """The place that stands out; None where all steps leave doubt."""
+        if not self.touches_map:
+            return None
         for step in self.steps():
             if early := self._proven_before(step):
                 return early
@@ -174,7 +172,7 @@ class Search:
             self._take(step)
             if clear := self._clear_after(step):
                 return clear
-        return None
+        return self.concluded()
 
     def by_gradients(self) -> "Search":
         """With the same candidates, compared without grey levels, in the time that is left."""
@@ -465,10 +463,6 @@ class Search:
             return 0.0
         return self.sheet.confidence(place.scores)
 
-    def tentative(self) -> Place | None:
-        """The best place so far, finished as it is."""
-        return self._finished(self.places) if self.places else None
-
 
 class Found(NamedTuple):
     """A place, and the search that found it."""
@@ -480,11 +474,12 @@ class Found(NamedTuple):
 def found_by(search: Search) -> Found | NoFix:
     """By both kinds of channels; where these do not recognize the place, by gradients alone, if
     that is more likely right: other light (infrared, night, snow) changes grey levels more than
-    edges. Only one of both is concluded, which takes long."""
-    best = search.at_once() if search.touches_map else None
-    if search.places and search.sheet.confidence and search.likelihood(best) < CONFIDENT:
+    edges."""
+    best = search.best()
+    if best is not None and search.sheet.confidence and search.likelihood(best) < CONFIDENT:
         other = search.by_gradients()
-        if other.likelihood(other.tentative()) > search.likelihood(best or search.tentative()):
-            search, best = other, None
-    place = search.outcome(best or search.concluded())
+        found = other.concluded()
+        if other.likelihood(found) > search.likelihood(best):
+            search, best = other, found
+    place = search.outcome(best)
     return place if isinstance(place, NoFix) else Found(search, place)
