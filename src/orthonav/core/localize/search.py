@@ -139,7 +139,8 @@ class Search:
         self.chances = sheet.confidence.chances if sheet.confidence else USUAL_CHANCES
         self.places: list[Place] = []
         self.direct: list[Place] = []
-        self.sought = view.templates.weighing_grey(SOUGHT_SHARE)
+        share = min(SOUGHT_SHARE, view.templates.grey_share)
+        self.sought = view.templates.weighing_grey(share)
         self.found: list[tuple[Step, list[Pose]]] = []
         self.candidates = 0
         self.last: Step | None = None
@@ -175,11 +176,15 @@ class Search:
         return self.concluded()
 
     def by_gradients(self) -> "Search":
-        """With the same candidates, compared without grey levels, in the time that is left."""
+        """The same candidates and the likeliest ones without grey levels, compared without them, in
+        the time that is left."""
         made = Search(self.sheet, self.view.by_gradients(), self.prior)
         made.budget = self.budget
         for each in self.found:
             made._judge(*each)
+        step = made._likeliest()
+        if math.isfinite(step.cost_ms) and self.budget.allows(step.cost_ms):
+            made._take(step)
         return made
 
     def camera(self, place: Place) -> CameraFound | None:
@@ -233,6 +238,14 @@ class Search:
             return [coarse]
         count = policy.candidates_from(self.tiles)
         return [coarse, TileStep(self, level, tried, count, len(tried))]
+
+    def _likeliest(self) -> Step:
+        """The first stage at the judged level, or the coarse one where that takes too long."""
+        policy = self.policy
+        rated = policy.directions(self.view.prior, policy.judged_steps)
+        some = [each for each, nats in rated if nats < policy.stages_nats[1]] or [rated[0][0]]
+        step = FftStep(self, self.levels.judged, some, policy.candidates, len(some))
+        return step if step.cost_ms <= policy.last_ms else self._coarse_steps()[0]
 
     def _likely_first(self, step: Step) -> Iterator[Step]:
         """Likely directions first; all at once where the heading is known."""
