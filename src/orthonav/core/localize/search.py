@@ -470,6 +470,10 @@ class Search:
         confidence = self.sheet.confidence
         return confidence is not None and confidence(best.scores) > 1 - doubt
 
+    def tentative(self) -> Place | None:
+        """The best place so far, not compared one level finer."""
+        return self._finished(self.places) if self.places else None
+
     def likelihood(self, place: Place | None) -> float:
         """Probability that the place is right, 0 for none."""
         if place is None or self.sheet.confidence is None:
@@ -491,7 +495,8 @@ def found_by(search: Search) -> Found | NoFix:
     best = search.best()
     if best is not None and search.sheet.confidence and search.likelihood(best) < CONFIDENT:
         other = search.by_gradients()
-        found = other.concluded()
+        hopeful = other.likelihood(other.tentative()) > search.likelihood(best)
+        found = other.concluded() if hopeful else None
         if other.likelihood(found) > search.likelihood(best):
             search, best = other, found
     place = search.outcome(best)
