@@ -2,8 +2,8 @@
 
 `python -m benchmarks.check_trust --work DIR [--views 20] [--fit]` checks maps of
 scenes of two dates without the second date, and places simulated views of that date. Views are 256,
-160 and 112 px of the map wide, with a prior position and without: each pair is measured under three
-of these six conditions, so that all occur in every scene. What is predicted for a scene is
+160, 112 and 80 px of the map wide, with a prior position and without: each pair is measured under
+four of these eight conditions, so that all occur in every scene. What is predicted for a scene is
 recalibrated by the others. `--fit` prints the recalibration by all scenes. Rerun to resume.
 """
 
@@ -45,7 +45,7 @@ from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 from orthonav.onboard.run import SingleViews, locate_view
 
 NAME = "check_trust"
-WIDTHS_PX = (256, 160, 112)
+WIDTHS_PX = (256, 160, 112, 80)
 PRIOR_PX, EFFORT = 60.0, 0.05
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
 STDS, STDS_NARROW = np.arange(4, 25, 2) / 10, np.arange(0, 15, 2) / 10
