@@ -1,21 +1,30 @@
 """Views in other light than the map's: contrast turns over, edges stay."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, Ground, error_m, known_map, rendered
+from blots import AGL_M, CAMERA, GROUND, Ground, error_m, known_map, planned, rendered
 
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.search import Found, found_by
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.core.register.blocks import block_scores
+from orthonav.core.track.tracker import Tracker
 
 OTHER = Ground(seed=5)
 PLACES = [(-120.0, 95.0), (60.3, -110.7), (133.1, 140.2), (-30.0, 5.5), (10.0, -80.0)]
 
 
 @pytest.fixture(scope="module")
-def localizer(made_once, make_ortho):
-    return Localizer(open_map(known_map(made_once, make_ortho).path))
+def map_path(made_once, make_ortho):
+    return known_map(made_once, make_ortho).path
+
+
+@pytest.fixture(scope="module")
+def localizer(map_path):
+    return Localizer(open_map(map_path))
 
 
 def infrared(east_m, north_m):
@@ -70,3 +79,32 @@ def test_a_prior_beside_the_map_finds_nothing(localizer):
     search = localizer.registration.search(view(GROUND, PLACES[0]), Prior(lat, lon, 10.0))
     found = found_by(search)
     assert not isinstance(found, Found) and found.reason == "outside_map"
+
+
+def test_a_search_that_was_cut_short_is_not_followed_by_another(map_path):
+    hasty = Localizer(open_map(map_path), plan=planned(budget_ms=1e-6))
+    search = hasty.registration.search(view(infrared, PLACES[1]))
+    found = found_by(search)
+    assert isinstance(found, Found) and found.search is search and search.budget.cut_short
+
+
+def test_a_track_follows_ground_whose_contrast_turns_over(localizer):
+    tracker = Tracker(localizer)
+    for number in range(12):
+        place = np.array([-100.0 + 14 * number, 60.0])
+        seen = view(infrared, place)
+        fix = tracker.locate(
+            replace(seen, telemetry=replace(seen.telemetry, time_ns=number * 10**9))
+        )
+    assert isinstance(fix, Fix) and tracker.state_name == "tracking"
+    assert error_m(localizer, fix, place) < 2
+
+
+@pytest.mark.parametrize("share", [0.6, 0.0])
+def test_blocks_of_the_same_ground_fit(localizer, share):
+    registration = localizer.registration
+    prepared = registration.prepared(view(GROUND, PLACES[3]), True)
+    fit = registration.search(view(GROUND, PLACES[3])).run().fit
+    templates = prepared.templates.weighing_grey(share)
+    scores = block_scores(templates.at(prepared.levels.final), registration.reference, fit.pose, 3)
+    assert np.median(scores.correlations.max(axis=(1, 2))) > 0.85

@@ -16,6 +16,7 @@ from orthonav.core.localize.rectify import (
     orthorectified,
     rectify_footprint,
 )
+from orthonav.core.localize.view import check_picture
 from orthonav.core.records import Telemetry, View
 
 LENS = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -77,9 +78,22 @@ def test_a_mask_of_another_size_is_scaled_and_stays_with_the_camera(tmp_path):
 def test_masks_that_cannot_be(mask):
     with pytest.raises(CameraError):
         LENS.masked(mask)
+    with pytest.raises(CameraError):
+        replace(LENS, mask=mask[:240])
 
 
-def test_a_file_that_is_no_mask(tmp_path):
-    (tmp_path / "mask.png").write_text("no picture")
+def test_a_mask_of_truths_is_one():
+    assert set(np.unique(replace(LENS, mask=GEAR > 0).mask)) == {0, 255}
+
+
+def test_what_is_behind_the_mask_is_not_too_bright():
+    white = np.where(GEAR > 0, 3, 255).astype(np.uint8)
+    assert check_picture(white, GEAR).reason == "too_dark"
+    assert check_picture(np.where(GEAR > 0, TEXTURE, 0).astype(np.uint8), GEAR) is None
+
+
+@pytest.mark.parametrize("content", ["", "no picture"])
+def test_a_file_that_is_no_mask(tmp_path, content):
+    (tmp_path / "mask.png").write_text(content)
     with pytest.raises(CameraError, match=r"cannot be decoded: .*mask\.png"):
         masked(LENS, tmp_path / "mask.png")

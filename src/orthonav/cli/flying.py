@@ -382,6 +382,7 @@ def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[st
         "registration": "on",
         "accept": None,
         "alert_limit_m": options.alert_limit_m,
+        "mask": None if options.mask is None else str(options.mask),
         "risk": options.risk,
         "track": True,
         "mount": None if mount is None else asdict(mount),

@@ -352,10 +352,8 @@ def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
     if array.dtype == np.uint8:
         return array
     if array.dtype == np.uint16:
-        low, high = np.percentile(array, STRETCHED_PERCENT)
-        if high - low < NARROW_COUNTS:
-            return stretched(array, max(float(high - low), LEAST_COUNTS))
-        return (array >> 8).astype(np.uint8)
+        narrow = stretched(array, LEAST_COUNTS, NARROW_COUNTS)
+        return (array >> 8).astype(np.uint8) if narrow is None else narrow
     if array.dtype.kind not in "iuf":
         raise FlightError(f"the image has values of type {array.dtype}; {EXPECTED}")
     low, high = float(array.min()), float(array.max())
@@ -365,17 +363,29 @@ def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
     return np.rint(array * scale).astype(np.uint8)
 
 
-STRETCHED_PERCENT = 0.1, 99.9
+STRETCHED_PERCENT = 0.5, 99.5  # as those of orthophotos
+SAMPLED_PX = 1_000_000
 NARROW_COUNTS, LEAST_COUNTS = 8192.0, 128.0
 """Values of 16 bits that span less than the first are stretched: 12 and 14 bits, temperatures. As
 if they spanned the second where they span less, so that noise does not look like ground."""
 
 
-def stretched(array: NDArray[Any], span: float) -> NDArray[np.uint8]:
-    """Grey levels of measured values, from dark to bright over `span`, around their middle."""
-    low, high = np.percentile(array, STRETCHED_PERCENT)
-    first = (low + high - span) / 2
-    levels = (array.astype(np.float32) - np.float32(first)) * np.float32(255 / span)
+def stretched(
+    array: NDArray[Any], least: float, most: float = math.inf
+) -> NDArray[np.uint8] | None:
+    """Grey levels of measured values, from dark to bright, as if they spanned at least `least`;
+    None where they span `most` or more. What is not finite counts as their middle."""
+    step = max(1, round(math.sqrt(array.size / SAMPLED_PX)))
+    sample = array[::step, ::step]
+    known = sample[np.isfinite(sample)]
+    if known.size == 0:
+        return np.zeros(array.shape, np.uint8)
+    low, high = (float(each) for each in np.percentile(known, STRETCHED_PERCENT))
+    if high - low >= most:
+        return None
+    span, middle = max(high - low, least), (low + high) / 2
+    levels = (array.astype(np.float32) - np.float32(middle)) * np.float32(255 / span) + 127.5
+    levels = np.nan_to_num(levels, nan=127.5, posinf=255.0, neginf=0.0)
     return np.asarray(np.rint(levels.clip(0, 255)), np.uint8)
 
 

@@ -100,8 +100,12 @@ class LiveCamera:
         self._count_interruptions(arrived_ns)
         found, frame = self._capture.retrieve()
         self._number += 1
-        grey = grey_levels(frame) if found else None
-        problem = None if grey is not None else NoFix("bad_image", "image could not be decoded")
+        grey, why = None, "image could not be decoded"
+        try:
+            grey = grey_levels(frame) if found else None
+        except FlightError as error:  # a format that was not negotiated
+            why = str(error)
+        problem = NoFix("bad_image", why) if grey is None else None
         return CameraImage(
             self._number,
             f"{self._number:08d}",
@@ -135,6 +139,8 @@ class LiveCamera:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        if int(capture.get(cv2.CAP_PROP_FOURCC)) == Y16:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits
         return capture
 
 
@@ -261,10 +267,7 @@ def _loaded(grey: Grey | None, number: int) -> Grey:
 
 def _capture(name: int | str) -> Any:
     if isinstance(name, int):
-        device = cv2.VideoCapture(name, cv2.CAP_V4L2)
-        if int(device.get(cv2.CAP_PROP_FOURCC)) == Y16:
-            device.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits
-        return device
+        return cv2.VideoCapture(name, cv2.CAP_V4L2)
     limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 3000]
     capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # the camera describes the sensor

@@ -19,7 +19,7 @@ from orthonav.core.files import require_file
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import (
-    STRETCHED_PERCENT,
+    LEAST_COUNTS,
     Prior,
     Telemetry,
     grey_levels,
@@ -133,7 +133,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
     """Grey levels (H, W) uint8 of an encoded image (JPEG, PNG, TIFF); `where` is for errors.
 
-    16 bits as `grey_levels`; real numbers, such as temperatures, are stretched.
+    16 bits as `grey_levels`; other numbers, such as temperatures, are stretched.
 
     Raises `FlightError` where it cannot be decoded or was cut short.
     """
@@ -145,12 +145,10 @@ def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
         image = None
     if image is None:
         raise FlightError(f"image of the flight cannot be decoded: {where}")
-    if image.dtype.kind == "f":
-        if not np.isfinite(image).all():
-            raise FlightError(f"image of the flight has values that are not finite: {where}")
-        low, high = np.percentile(image, STRETCHED_PERCENT)
-        return stretched(image, max(float(high - low), LEAST_SPAN))
-    return grey_levels(image)
+    if image.dtype in (np.uint8, np.uint16):
+        return grey_levels(image)
+    made = stretched(image, LEAST_SPAN if image.dtype.kind == "f" else LEAST_COUNTS)
+    return np.zeros(image.shape, np.uint8) if made is None else made
 
 
 def _is_cut_jpeg(data: bytes) -> bool:

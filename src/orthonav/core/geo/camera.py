@@ -64,6 +64,7 @@ class Camera:
         for name in ("width_px", "height_px"):
             if not 1 <= getattr(self, name) <= MAX_DIMENSION_PX:
                 raise CameraError(f"camera {name} must be 1 to {MAX_DIMENSION_PX}: {self}")
+        self._check_mask()
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
         if not all(math.isfinite(number) for number in numbers):
             raise CameraError(f"camera has a value that is not finite: {self}")
@@ -81,6 +82,17 @@ class Camera:
                 f"camera distortion of a {self.model} lens must be empty or {names}, "
                 f"got {self.distortion}"
             )
+
+    def _check_mask(self) -> None:
+        if self.mask is None:
+            return
+        shown = np.asarray(np.where(self.mask > 0, 255, 0), np.uint8)
+        if shown.shape != (self.height_px, self.width_px) or not shown.any():
+            raise CameraError(
+                f"camera mask must be {self.width_px} x {self.height_px} px, 0 where no ground is "
+                f"seen, got {shown.shape[::-1]} with {np.count_nonzero(shown)} above 0"
+            )
+        object.__setattr__(self, "mask", shown)
 
     @classmethod
     def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
@@ -124,15 +136,10 @@ class Camera:
     def masked(self, mask: NDArray[Any]) -> "Camera":
         """The camera whose pixels never show ground where `mask` (H, W) is 0, as behind landing
         gear or text in the picture. A mask of another size is scaled."""
-        shown = np.asarray(np.where(np.asarray(mask) > 0, 255, 0), np.uint8)
-        if shown.ndim != 2 or not shown.any():
-            raise CameraError(
-                f"mask must be (H, W) grey, 0 where no ground is seen, got {shown.shape}, "
-                f"{np.count_nonzero(shown)} pixels above 0"
-            )
-        fitted = self.fitted(shown.shape[1], shown.shape[0])
-        made = replace(fitted, mask=shown)
-        return made.resized(self.width_px, self.height_px)
+        if mask.ndim != 2:
+            raise CameraError(f"mask must be grey (H, W), got {mask.shape}")
+        fitted = replace(self.fitted(mask.shape[1], mask.shape[0]), mask=mask)
+        return fitted.resized(self.width_px, self.height_px)
 
     def numbers(self) -> dict[str, Any]:
         """All but the mask, as in `flight.json`."""
@@ -177,7 +184,8 @@ class Camera:
         mask = self.mask
         if mask is not None and mask.shape != (height_px, width_px):
             size = width_px, height_px
-            mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_AREA), np.uint8)
+            scaled = cv2.resize(mask, size, interpolation=cv2.INTER_AREA)
+            mask = np.asarray(np.where(scaled == 255, 255, 0), np.uint8)  # wholly of ground
         return replace(
             self,
             mask=mask,

@@ -78,7 +78,10 @@ def masked(camera: Camera, path: Path) -> Camera:
 
     Raises `MissingFileError` or `CameraError`."""
     path = require_file(path, "mask of the camera")
-    mask = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        mask = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # an empty file
+        mask = None
     if mask is None:
         raise CameraError(f"mask cannot be decoded: {path}")
     try:

@@ -265,10 +265,10 @@ def downsampled(view: View, gsd_m: float) -> View:
     if factor < 2 or width < 8 or height < 8:
         return view
     # Whole multiples only: what is left over at the right and below is not worth a slower path.
-    whole = replace(camera, width_px=width * factor, height_px=height * factor)
-    if camera.mask is not None:
-        whole = replace(whole, mask=camera.mask[: whole.height_px, : whole.width_px])
-    used = view.grey[: whole.height_px, : whole.width_px]
+    rows, cols = height * factor, width * factor
+    mask = None if camera.mask is None else camera.mask[:rows, :cols]
+    whole = replace(camera, width_px=cols, height_px=rows, mask=mask)
+    used = view.grey[:rows, :cols]
     return replace(view, grey=_thinned(used, factor), camera=whole.resized(width, height))
 
 

@@ -147,7 +147,7 @@ class Search:
         self.budget = Budget(self.plan.budget_ms)
 
     def run(self) -> Place | NoFix:
-        """By both kinds of channels alone."""
+        """By the channels of the view alone; see `found_by`."""
         return self.outcome(self.best())
 
     def outcome(self, best: Place | None) -> Place | NoFix:
@@ -474,6 +474,11 @@ class Search:
         """The best place so far, not compared one level finer."""
         return self._finished(self.places) if self.places else None
 
+    def is_doubtful(self, best: Place) -> bool:
+        """Whether it is not recognized, and time is left."""
+        doubtful = self.sheet.confidence is not None and self.likelihood(best) < CONFIDENT
+        return doubtful and not self.budget.cut_short and self.budget.fits(self.costs.trial_ms)
+
     def likelihood(self, place: Place | None) -> float:
         """Probability that the place is right, 0 for none."""
         if place is None or self.sheet.confidence is None:
@@ -493,7 +498,7 @@ def found_by(search: Search) -> Found | NoFix:
     that is more likely right: other light (infrared, night, snow) changes grey levels more than
     edges."""
     best = search.best()
-    if best is not None and search.sheet.confidence and search.likelihood(best) < CONFIDENT:
+    if best is not None and search.is_doubtful(best):
         other = search.by_gradients()
         hopeful = other.likelihood(other.tentative()) > search.likelihood(best)
         found = other.concluded() if hopeful else None

@@ -41,7 +41,7 @@ _SAMPLE_STEP_PX = 8
 
 def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
     refused = check_telemetry(view.telemetry, view.camera, gsd_m, heading_known)
-    return refused or check_picture(view.grey)
+    return refused or check_picture(view.grey, view.camera.mask)
 
 
 def check_telemetry(
@@ -81,9 +81,13 @@ def footprint_side_m(telemetry: Telemetry, camera: Camera) -> float:
     return telemetry.agl_m * math.sqrt(across * along / max(tilt, MIN_TILT_COS) ** 3)
 
 
-def check_picture(grey: NDArray[np.uint8]) -> NoFix | None:
-    """Too dark, too bright, blank?"""
+def check_picture(grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> NoFix | None:
+    """Too dark, too bright, blank, where the mask of the camera shows ground?"""
     sample = grey[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX]
+    if mask is not None:
+        sample = sample[mask[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX] > 0]
+        if sample.size == 0:
+            return NoFix("blank", "the mask of the camera leaves too little of the view")
     counts = np.bincount(sample.reshape(-1), minlength=256)
     low, high = (_percentile(counts, percent) for percent in (1, 99))
     levels, size = np.arange(256), int(counts.sum())

@@ -48,7 +48,8 @@ def block_scores(
     else:
         count, side = BLOCKS * BLOCKS, 2 * reach_px + 1
         found, pixels = np.empty((count, side, side)), np.empty(count)
-        at, shares = (window.matrix(pose), pose.turn_rad), (GREY_SHARE, MIN_SEEN, MIN_ENERGY)
+        at = window.matrix(pose), pose.turn_rad
+        shares = GREY_SHARE * (template.weights[1] > 0), MIN_SEEN, MIN_ENERGY
         KERNEL.blocks(window.made, template.planes, *at, reach_px, shares, found, pixels)
     return BlockScores(found, pixels, _middles_px(rows, cols))
 
@@ -111,5 +112,6 @@ def _energies(template: Template, values: Array) -> tuple[Sums, Sums]:
     squares = np.moveaxis(np.square(values, dtype=np.float64), 2, 0)
     blocks = template.block_sums(squares)
     gradients, grey = float(blocks[:2].sum()), float(blocks[2].sum())
-    weights = np.array([1.0, 1.0, GREY_SHARE * gradients / grey if grey > 0 else 0.0, 0.0])
+    counts = grey > 0 and template.weights[1] > 0  # else the view is compared without grey
+    weights = np.array([1.0, 1.0, GREY_SHARE * gradients / grey if counts else 0.0, 0.0])
     return weights, weights @ blocks

@@ -17,7 +17,7 @@ CHANNELS = 4  # cosine and sine of the doubled edge direction, grey, valid
 GROUPS = (slice(0, 2), slice(2, 3))
 GREY_SHARE, SOUGHT_SHARE = 0.6, 0.3
 """Weight of grey beside gradients where places are compared, and where candidates are sought: less,
-for in other light (infrared, night, snow) grey levels mislead (docs/decisions/light.md)."""
+for in other light (infrared, night, snow) grey levels mislead (docs/decisions/evidence.md)."""
 
 
 @dataclass(frozen=True)

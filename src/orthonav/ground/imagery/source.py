@@ -191,11 +191,13 @@ def _inspect(
     system = _system(path, dataset, names)
     if dataset.transform.is_identity or dataset.transform.determinant == 0:
         raise ImageryError(f"orthophoto has no georeference (geotransform or world file): {path}")
-    indexed = bands is None and _is_indexed(dataset)
-    if bands is not None:
+    asked = bands is not None
+    if bands is None:
+        bands = _bands(dataset)
+    else:
         _check_bands(path, dataset, bands)
-    bands = bands or _bands(dataset)
-    if len(bands) == 1 and dataset.dtypes[bands[0] - 1] in HEIGHT_TYPES:
+    alone = dataset.count == 1 or not asked
+    if alone and len(bands) == 1 and dataset.dtypes[bands[0] - 1] in HEIGHT_TYPES:
         raise UnfitError(
             f"raster of one band of {dataset.dtypes[0]} may hold heights; an orthophoto has bands "
             f"of 8 or 16 bits without a sign: {path}"
@@ -215,7 +217,7 @@ def _inspect(
         outline_latlon_deg=outline,
         date=date_of(dataset.tags(), names),
         masks=_masks(path, dataset, bands),
-        is_indexed=indexed,
+        is_indexed=not asked and _is_indexed(dataset),
         folder=folder,
         stamp=_stamp(path, dataset),
         terms=_terms(dataset.tags()),
@@ -282,11 +284,13 @@ def _check_bands(path: Path, dataset: Any, bands: tuple[int, ...]) -> None:
     if len(bands) not in (1, 3):
         raise ImageryError(f"bands of an orthophoto are one or three, not {text}")
     if not all(1 <= band <= dataset.count for band in bands):
-        raise ImageryError(f"orthophoto has bands 1 to {dataset.count}, not {text}: {path}")
+        raise UnfitError(f"orthophoto has bands 1 to {dataset.count}, not {text}: {path}")
+    if _is_indexed(dataset):
+        raise ImageryError(f"band 1 holds numbers of colours: leave --bands out: {path}")
 
 
 def _is_indexed(dataset: Any) -> bool:
-    return bool(dataset.count == 1 and dataset.colorinterp[0] == ColorInterp.palette)
+    return bool(dataset.colorinterp[0] == ColorInterp.palette)
 
 
 def _bands(dataset: Any) -> tuple[int, ...]:

@@ -185,7 +185,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
         note=f"{path.name}: flight log {run!s:.40} of orthonav {version!s:.40}",
         expected=len(replayable),
         stream=lambda: (_view(each, content, camera, options) for each in replayable),
-        warnings=(*warnings, *_gaps(content.views, replayable)),
+        warnings=(*warnings, *_unmasked(content, options), *_gaps(content.views, replayable)),
         session=content.session,
         results=partial(_results, files),
         arrivals=lambda: (
@@ -194,6 +194,15 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
             if _has_image(each, content)
         ),
     )
+
+
+def _unmasked(content: LogContent, options: SourceOptions) -> list[str]:
+    """A warning where the flight hid a part of its pictures and this replay does not."""
+    flown = content.session.get("options")
+    mask = flown.get("mask") if isinstance(flown, dict) else None
+    if not mask or options.mask is not None:
+        return []
+    return [f"the flight was flown with --mask {mask!s:.200}: give it again to see the same ground"]
 
 
 def files_of_run(path: Path) -> list[Path]:
