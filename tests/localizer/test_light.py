@@ -74,6 +74,15 @@ def test_the_same_candidates_are_compared_again(localizer):
     assert 0 < search.sought.grey_share < search.view.templates.grey_share
 
 
+def test_near_a_prior_candidates_are_sought_as_they_are_compared(localizer):
+    lat, lon = localizer.sheet.frame.latlon_from_en(np.array(PLACES[1]))
+    seen = view(infrared, PLACES[1])
+    search = localizer.registration.search(seen, Prior(lat, lon, 20.0))
+    assert search.sought.grey_share == search.view.templates.grey_share > 0
+    fix = localizer.locate(seen, prior=Prior(lat, lon, 20.0))
+    assert fix.is_confident and fix.evidence["grey_correlation"] == 0
+
+
 def test_a_prior_beside_the_map_finds_nothing(localizer):
     lat, lon = localizer.sheet.frame.latlon_from_en(np.array([9000.0, 0.0]))
     search = localizer.registration.search(view(GROUND, PLACES[0]), Prior(lat, lon, 10.0))

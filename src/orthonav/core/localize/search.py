@@ -139,8 +139,9 @@ class Search:
         self.chances = sheet.confidence.chances if sheet.confidence else USUAL_CHANCES
         self.places: list[Place] = []
         self.direct: list[Place] = []
-        share = min(SOUGHT_SHARE, view.templates.grey_share)
-        self.sought = view.templates.weighing_grey(share)
+        # Near a prior few candidates are sought, and it costs little to seek them by gradients too.
+        share = SOUGHT_SHARE if prior is None else math.inf
+        self.sought = view.templates.weighing_grey(min(share, view.templates.grey_share))
         self.found: list[tuple[Step, list[Pose]]] = []
         self.candidates = 0
         self.last: Step | None = None
@@ -240,12 +241,17 @@ class Search:
         return [coarse, TileStep(self, level, tried, count, len(tried))]
 
     def _likeliest(self) -> Step:
-        """The first stage at the judged level, or the coarse one where that takes too long."""
+        """All directions at the judged level where that takes little, else the first stage of them,
+        or the coarse level where even that takes too long."""
         policy = self.policy
         rated = policy.directions(self.view.prior, policy.judged_steps)
-        some = [each for each, nats in rated if nats < policy.stages_nats[1]] or [rated[0][0]]
-        step = FftStep(self, self.levels.judged, some, policy.candidates, len(some))
-        return step if step.cost_ms <= policy.last_ms else self._coarse_steps()[0]
+        every = [each for each, _ in rated]
+        first = [each for each, nats in rated if nats < policy.stages_nats[1]] or every[:1]
+        for some, most_ms in ((every, policy.cheap_ms), (first, policy.last_ms)):
+            step = FftStep(self, self.levels.judged, some, policy.candidates, len(some))
+            if step.cost_ms <= most_ms:
+                return step
+        return self._coarse_steps()[0]
 
     def _likely_first(self, step: Step) -> Iterator[Step]:
         """Likely directions first; all at once where the heading is known."""
