@@ -83,8 +83,8 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
     text += "by 1.7 %% of the height a degree (docs/flights.md has that of each source; "
     text += f"default {UNSTATED.aided_deg:g}, as where it is not stated)"
     number("--tilt-std-deg", default=UNSTATED.aided_deg, help=text)
-    text = "light that the camera sees, if not that of the map's imagery: predicts fewer fixes; "
-    text += "other: drone against satellite (default colour)"
+    text = "camera, if not of the kind that took the map's imagery: predicts fewer fixes; other: "
+    text += "another sensor, such as a drone's over satellite imagery (default colour)"
     group.add_argument("--camera-kind", choices=CAMERA_KINDS, default="colour", help=text)
 
 
