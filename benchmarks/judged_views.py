@@ -181,20 +181,19 @@ def _placed(
 ) -> dict[str, Any]:
     """Evidence, error and verdict of a view; `evidence` None where it was refused."""
     prior = None if case.prior_px is None else view.telemetry.prior
-    search = localizer.search(view, prior, case.heading_known)
-    found = search if isinstance(search, NoFix) else search.run()
-    if isinstance(search, NoFix) or isinstance(found, NoFix):
+    found = localizer.found(view, prior, case.heading_known)
+    if isinstance(found, NoFix):
         return {"evidence": None, "right": False}
     gsd_m = localizer.grid.gsd_m
     assert localizer.confidence is not None
-    fix, frame = fix_of(search, found), localizer.sheet.frame
+    fix, frame = fix_of(*found), localizer.sheet.frame
     off_m = frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - frame.en_from_latlon(*truth)
     error_m = float(np.hypot(*off_m))
     far_m = far_m_of(gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
     far_m = max(far_m, RADIUS_SHARE * fix.agl_m)
     right = case.kind in ("found", "beside") and error_m <= far_m
     return {
-        "evidence": {name: float(f"{value:.5g}") for name, value in found.scores.items()},
+        "evidence": {name: float(f"{value:.5g}") for name, value in found.place.scores.items()},
         "chances": asdict(localizer.confidence.chances),
         "off_en_m": np.round(off_m, 3).tolist(),
         "cov_en_m2": [float(f"{each:.5g}") for each in fix.cov_en_m2[[0, 0, 1], [0, 1, 1]]],
