@@ -10,7 +10,8 @@
    and when it ends are numbers in `policy`.
 3. `place.Placer` refines candidates from coarse to fine and compares the best `Place` with its
    strongest rival; the search ends as soon as it stands out. On a map with a terrain the best are
-   orthorectified on it first (`ground`).
+   orthorectified on it first (`ground`). Where none is recognized, gradients alone decide
+   (`search.found_by`).
 4. `camera` fits position, height, heading, pitch and roll to the blocks of the view there, with the
    reported ones as a prior. That gives their covariance too.
 5. `fix` states what was found; `confidence` is the probability that the place is right, from its
