@@ -213,6 +213,14 @@ def test_images_are_converted(image):
     np.testing.assert_array_equal(found, GREY)
 
 
+def test_deep_colours_with_alpha_and_the_other_byte_order():
+    deep = GREY.astype(np.uint16) * 12
+    alpha = np.full_like(deep, 65535)
+    seen = View(np.dstack([deep, deep, deep, alpha]), CAMERA, NADIR).grey
+    np.testing.assert_allclose(seen, View(deep, CAMERA, NADIR).grey, atol=1)
+    np.testing.assert_array_equal(View(deep.astype(">u2"), CAMERA, NADIR).grey, seen)
+
+
 @pytest.mark.parametrize("first, step", [(7000, 3), (29_000, 8), (0, 16), (300, 31)])
 def test_a_small_part_of_16_bits_is_stretched(first, step):
     """Thermal cameras of 14 bits, temperatures in 0.01 K, and 12 bits in 16."""

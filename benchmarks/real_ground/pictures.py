@@ -26,12 +26,12 @@ def residuals(localizer: Localizer, view: View) -> NDArray[np.uint8] | None:
     """The picture (H, W, 3) of a view; None where it has no camera."""
     registration = localizer.registration
     assert registration is not None
-    search = registration.search(view)
-    if isinstance(search, NoFix):
+    found = registration.found(view)
+    if isinstance(found, NoFix):
         return None
-    place = search.run()
-    camera = None if isinstance(place, NoFix) else search.camera(place)
-    if isinstance(place, NoFix) or camera is None:
+    search, place = found
+    camera = search.camera(place)
+    if camera is None:
         return None
     level, pose = search.levels.final, place.fit.pose
     made = search.ground.templates_at(pose, level, camera.orientation)

@@ -251,6 +251,7 @@ def test_every_depth_and_kind_becomes_8_bit_grey(tmp_path):
         ("deep.png", deep, grey),
         ("thermal.png", grey.astype(np.uint16) * 4 + 7000, filled),
         ("celsius.tif", celsius, filled),
+        ("reflectance.tif", (grey / 2550.0).astype(np.float32), filled),
         ("clear.png", np.dstack([colours, np.full_like(grey, 7)]), colour),
         ("deep.tif", deep, grey),
         ("colour.TIFF", colours, colour),
@@ -260,6 +261,19 @@ def test_every_depth_and_kind_becomes_8_bit_grey(tmp_path):
         read = read_image(tmp_path / name)
         assert read.dtype == np.uint8 and read.shape == grey.shape, name
         assert np.abs(read.astype(int) - expected).max() <= (15 if "JPEG" in name else 1), name
+
+
+@pytest.mark.parametrize("unknown", [np.nan, -9999.0, 3.4e38])
+def test_unknown_temperatures_do_not_stretch_the_others(tmp_path, unknown):
+    celsius = (scene() / 12.0 - 5).astype(np.float32)
+    celsius[: len(celsius) // 3] = unknown
+    (tmp_path / "a.tif").write_bytes(encoded(".tif", celsius))
+    read = read_image(tmp_path / "a.tif")
+    assert set(np.unique(read[: len(read) // 3])) <= {127, 128}
+    known = read[len(read) // 3 :].astype(float).ravel()
+    assert (
+        np.corrcoef(known, scene()[len(read) // 3 :].ravel())[0, 1] > 0.99 and np.ptp(known) > 200
+    )
 
 
 @pytest.mark.parametrize("values", ["nan,2,3", "46,,3", "46,2,", "91,92,3", "46,361,3", "46,2,inf"])

@@ -16,8 +16,8 @@ from orthonav.core.localize.rectify import (
     orthorectified,
     rectify_footprint,
 )
-from orthonav.core.localize.view import check_picture
 from orthonav.core.records import Telemetry, View
+from orthonav.onboard.motion import PictureOdometry
 
 LENS = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 BARREL = replace(LENS, distortion=(-0.1, 0.01, 0.0, 0.0))
@@ -83,13 +83,22 @@ def test_masks_that_cannot_be(mask):
 
 
 def test_a_mask_of_truths_is_one():
-    assert set(np.unique(replace(LENS, mask=GEAR > 0).mask)) == {0, 255}
+    np.testing.assert_array_equal(LENS.masked(GEAR > 0).mask, GEAR)
 
 
-def test_what_is_behind_the_mask_is_not_too_bright():
-    white = np.where(GEAR > 0, 3, 255).astype(np.uint8)
-    assert check_picture(white, GEAR).reason == "too_dark"
-    assert check_picture(np.where(GEAR > 0, TEXTURE, 0).astype(np.uint8), GEAR) is None
+def test_specks_all_over_leave_nothing_of_a_smaller_picture():
+    specks = np.where(np.arange(480)[:, None] % 4, np.ones((1, 640)), 0)
+    seen = downsampled(View(TEXTURE, LENS.masked(specks), DOWN), 2.0)
+    assert not rectify_footprint(seen, gsd_m=2.0, multiple_px=1).valid.any()
+
+
+def test_odometry_takes_no_corner_behind_the_mask():
+    for camera, found in ((LENS, True), (LENS.masked(GEAR), False)):
+        odometry = PictureOdometry()
+        odometry.motion(TEXTURE, camera, 10**9)
+        x, y = odometry._corners.reshape(-1, 2).T * 640 / odometry._before.shape[1]
+        behind = (x > 200) & (x < 420) & (y > 300)
+        assert behind.any() == found and not behind.all()
 
 
 @pytest.mark.parametrize("content", ["", "no picture"])

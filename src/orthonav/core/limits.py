@@ -5,4 +5,4 @@ RISKS = (1e-6, 0.5)
 DEFAULT_RISK = 1e-3
 """Probability of an error beyond the protection level."""
 CAMERA_KINDS = "colour", "other", "near-infrared", "thermal"
-"""Light that a camera sees, beside a map of colour imagery; *other*: of another sensor."""
+"""Cameras over a map of colour imagery; *other*: a sensor of another kind."""

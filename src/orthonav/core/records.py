@@ -342,16 +342,17 @@ def grey_levels(image: Any) -> NDArray[np.uint8]:
     colour = array.ndim == 3 and array.shape[2] in (3, 4)
     if not (array.ndim == 2 or colour) or array.size == 0:
         raise FlightError(f"the image has the shape {array.shape}; {EXPECTED}")
-    levels = _levels(array)
     if not colour:
-        return levels
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(levels[:, :, :3]), cv2.COLOR_BGR2GRAY))
+        return _levels(array)
+    levels = np.ascontiguousarray(_levels(array[:, :, :3]))
+    return np.asarray(cv2.cvtColor(levels, cv2.COLOR_BGR2GRAY))
 
 
 def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
     if array.dtype == np.uint8:
         return array
-    if array.dtype == np.uint16:
+    if array.dtype.kind == "u" and array.dtype.itemsize == 2:
+        array = array.astype(np.uint16, copy=False)  # of either byte order
         narrow = stretched(array, LEAST_COUNTS, NARROW_COUNTS)
         return (array >> 8).astype(np.uint8) if narrow is None else narrow
     if array.dtype.kind not in "iuf":
@@ -365,7 +366,8 @@ def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
 
 STRETCHED_PERCENT = 0.5, 99.5  # as those of orthophotos
 SAMPLED_PX = 1_000_000
-NARROW_COUNTS, LEAST_COUNTS = 8192.0, 128.0
+NO_VALUE = 9999.0  # such values, and greater ones, stand for unknown ones in files
+NARROW_COUNTS, LEAST_COUNTS = 8192.0, 512.0
 """Values of 16 bits that span less than the first are stretched: 12 and 14 bits, temperatures. As
 if they spanned the second where they span less, so that noise does not look like ground."""
 

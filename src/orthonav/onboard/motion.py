@@ -77,7 +77,8 @@ class PictureOdometry:
         small = _evened(small)
         before, corners, start_ns = self._before, self._corners, self._arrived_ns
         self._before, self._arrived_ns = small, arrived_ns
-        self._corners = _corners(small)
+        fitted = camera.resized(size[0], size[1])
+        self._corners = _corners(small, fitted.mask)
         if before is None or corners is None or before.shape != small.shape:
             return None
         if not 0 < arrived_ns - start_ns <= LONGEST_S * 1e9:
@@ -85,7 +86,7 @@ class PictureOdometry:
         pairs = _tracked(before, small, corners)
         if pairs is None:
             return None
-        return _motion(*pairs, camera.resized(size[0], size[1]), start_ns, arrived_ns)
+        return _motion(*pairs, fitted, start_ns, arrived_ns)
 
 
 def _evened(grey: Grey) -> Grey:
@@ -97,8 +98,11 @@ def _evened(grey: Grey) -> Grey:
     return np.asarray(np.clip(scaled, 0, 255), np.uint8)
 
 
-def _corners(grey: Grey) -> Corners | None:
-    found: Any = cv2.goodFeaturesToTrack(grey, CORNERS, 0.02, SIDE_PX / 30, blockSize=5)
+def _corners(grey: Grey, mask: Grey | None) -> Corners | None:
+    """Where the mask of the camera shows ground; its rim is an edge that does not move."""
+    if mask is not None:
+        mask = np.asarray(cv2.erode(mask, np.ones((9, 9), np.uint8), borderValue=255), np.uint8)
+    found: Any = cv2.goodFeaturesToTrack(grey, CORNERS, 0.02, SIDE_PX / 30, mask=mask, blockSize=5)
     return None if found is None else np.asarray(found, np.float32)
 
 

@@ -20,6 +20,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import (
     LEAST_COUNTS,
+    NO_VALUE,
     Prior,
     Telemetry,
     grey_levels,
@@ -40,7 +41,9 @@ MAX_VIEWS = 1_000_000
 """Rows of a table of a flight: as many views as `simulate` makes, 55 hours at 5 Hz."""
 # The camera describes the sensor: an orientation tag must not rotate the image.
 _DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-LEAST_SPAN = 2.0  # of temperatures (deg C) or other real numbers, as if spread over so much
+LEAST_SPAN, LEAST_SHARE = 2.0, 0.05
+"""Temperatures (deg C) and other real numbers count as spread over so much at least, those from 0
+to 1, such as reflectances, over the second."""
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
@@ -147,7 +150,13 @@ def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
         raise FlightError(f"image of the flight cannot be decoded: {where}")
     if image.dtype in (np.uint8, np.uint16):
         return grey_levels(image)
-    made = stretched(image, LEAST_SPAN if image.dtype.kind == "f" else LEAST_COUNTS)
+    known = image[np.isfinite(image) & (np.abs(image.astype(np.float64)) < NO_VALUE)]
+    if image.dtype.kind != "f" or known.size == 0:
+        least = LEAST_COUNTS
+    else:
+        least = LEAST_SHARE if known.min() >= 0 and known.max() <= 1 else LEAST_SPAN
+        image = np.where(np.abs(image) < NO_VALUE, image, np.nan)
+    made = stretched(image, least)
     return np.zeros(image.shape, np.uint8) if made is None else made
 
 

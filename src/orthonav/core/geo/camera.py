@@ -84,15 +84,12 @@ class Camera:
             )
 
     def _check_mask(self) -> None:
-        if self.mask is None:
-            return
-        shown = np.asarray(np.where(self.mask > 0, 255, 0), np.uint8)
-        if shown.shape != (self.height_px, self.width_px) or not shown.any():
+        mask, shape = self.mask, (self.height_px, self.width_px)
+        if mask is not None and (mask.dtype != np.uint8 or mask.shape != shape):
             raise CameraError(
-                f"camera mask must be {self.width_px} x {self.height_px} px, 0 where no ground is "
-                f"seen, got {shown.shape[::-1]} with {np.count_nonzero(shown)} above 0"
+                f"camera mask must be uint8 of {self.width_px} x {self.height_px} px, as "
+                f"Camera.masked makes it, got {mask.dtype} of {mask.shape[::-1]}"
             )
-        object.__setattr__(self, "mask", shown)
 
     @classmethod
     def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
@@ -136,9 +133,13 @@ class Camera:
     def masked(self, mask: NDArray[Any]) -> "Camera":
         """The camera whose pixels never show ground where `mask` (H, W) is 0, as behind landing
         gear or text in the picture. A mask of another size is scaled."""
-        if mask.ndim != 2:
-            raise CameraError(f"mask must be grey (H, W), got {mask.shape}")
-        fitted = replace(self.fitted(mask.shape[1], mask.shape[0]), mask=mask)
+        shown = np.asarray(np.where(np.asarray(mask) > 0, 255, 0), np.uint8)
+        if shown.ndim != 2 or not shown.any():
+            raise CameraError(
+                f"mask must be grey (H, W), 0 where no ground is seen, got {shown.shape}, "
+                f"{np.count_nonzero(shown)} pixels above 0"
+            )
+        fitted = replace(self.fitted(shown.shape[1], shown.shape[0]), mask=shown)
         return fitted.resized(self.width_px, self.height_px)
 
     def numbers(self) -> dict[str, Any]:

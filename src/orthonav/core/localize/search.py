@@ -139,7 +139,7 @@ class Search:
         self.chances = sheet.confidence.chances if sheet.confidence else USUAL_CHANCES
         self.places: list[Place] = []
         self.direct: list[Place] = []
-        # Near a prior few candidates are sought, and it costs little to seek them by gradients too.
+        # With a prior few candidates are sought, by both kinds; `by_gradients` seeks the others.
         share = SOUGHT_SHARE if prior is None else math.inf
         self.sought = view.templates.weighing_grey(min(share, view.templates.grey_share))
         self.found: list[tuple[Step, list[Pose]]] = []
@@ -246,7 +246,7 @@ class Search:
         policy = self.policy
         rated = policy.directions(self.view.prior, policy.judged_steps)
         every = [each for each, _ in rated]
-        first = [each for each, nats in rated if nats < policy.stages_nats[1]] or every[:1]
+        first = [each for each, nats in rated if nats <= policy.stages_nats[1]] or every[:1]
         for some, most_ms in ((every, policy.cheap_ms), (first, policy.last_ms)):
             step = FftStep(self, self.levels.judged, some, policy.candidates, len(some))
             if step.cost_ms <= most_ms:
@@ -481,9 +481,10 @@ class Search:
         return self._finished(self.places) if self.places else None
 
     def is_doubtful(self, best: Place) -> bool:
-        """Whether it is not recognized, and time is left."""
+        """Whether it is not recognized, and there is time to compare all candidates again."""
         doubtful = self.sheet.confidence is not None and self.likelihood(best) < CONFIDENT
-        return doubtful and not self.budget.cut_short and self.budget.fits(self.costs.trial_ms)
+        again_ms = self.costs.trial_ms + self.costs.nearby_ms * self.candidates
+        return doubtful and not self.budget.cut_short and self.budget.allows(again_ms)
 
     def likelihood(self, place: Place | None) -> float:
         """Probability that the place is right, 0 for none."""
