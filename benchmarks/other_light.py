@@ -33,6 +33,7 @@ from benchmarks.scenes import (
     far_m,
     flight,
     gsd_of,
+    map_of,
     ortho,
 )
 from orthonav.core.files import replacing
@@ -42,7 +43,6 @@ from orthonav.core.localize.fix import fix_of
 from orthonav.core.localize.search import Search
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, View
-from orthonav.ground.build import BuildRequest, build_map
 
 NAME = "other_light"
 SEED, WIDTH_PX = 3, 256
@@ -258,11 +258,7 @@ def measure(options: argparse.Namespace) -> Section:
 
 def _localizer(name: str, work: Path) -> Localizer:
     """On a map of level land."""
-    path = ortho(name, work)
-    out = work / f"{path.parent.name}-{path.stem}-level.onav"
-    if not out.is_file():
-        build_map(BuildRequest([path], out, relief="level"))
-    return Localizer(open_map(out))
+    return Localizer(open_map(map_of(ortho(name, work), work, relief="level")))
 
 
 def measured(task: tuple[str, int, Path]) -> dict[str, Any]:

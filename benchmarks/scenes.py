@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations, zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
@@ -204,15 +205,18 @@ def map_of(
     bounds_deg: tuple[float, float, float, float] | None = None,
     overlap: float = 0.875,
     dem: Path | None = None,
+    relief: str | None = None,
 ) -> Path:
     """The map of an orthophoto as `orthonav build` makes it, built once; of a part within bounds
-    (west, south, east, north), with the terrain `dem`."""
+    (west, south, east, north), with the terrain `dem` or of land like `relief`."""
     part = "" if bounds_deg is None else "-part"
     part += "" if overlap == 0.875 else f"-{overlap:g}"
     part += "" if dem is None else f"-{dem.stem}"
+    part += "" if relief is None else f"-{relief}"
     out = work / f"{path.parent.name}-{path.stem}{part}.onav"
     if not out.is_file():
-        build_map(BuildRequest([path], out, bounds_deg=bounds_deg, overlap=overlap, dem=dem))
+        how: dict[str, Any] = {"bounds_deg": bounds_deg, "overlap": overlap}
+        build_map(BuildRequest([path], out, dem=dem, relief=relief, **how))
     return out
 
 

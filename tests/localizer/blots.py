@@ -16,8 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import Chances, RegisteredConfidence
 from orthonav.core.localize.policy import DEFAULT_PLAN
+from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import TerrainInfo
 from orthonav.core.records import Fix, Prior
 from orthonav.ground.build import BuildRequest, build_map
@@ -135,6 +137,17 @@ def known_map(made_once, make_ortho):
     folder = made_once("blots", make)
     ortho = folder / "2020-05.tif"
     return KnownMap(ortho, folder / "area.onav", _frame_of(ortho))
+
+
+@pytest.fixture(scope="module")
+def known_path(made_once, make_ortho):
+    """The map file of `known_map`."""
+    return known_map(made_once, make_ortho).path
+
+
+@pytest.fixture(scope="module")
+def known_localizer(made_once, make_ortho):
+    return Localizer(open_map(known_map(made_once, make_ortho).path))
 
 
 def _frame_of(ortho):

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import blots
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, Ground, error_m, known_map, planned, rendered
+from blots import AGL_M, CAMERA, GROUND, Ground, error_m, planned, rendered
 
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.search import Found, found_by
@@ -17,14 +18,7 @@ OTHER = Ground(seed=5)
 PLACES = [(-120.0, 95.0), (60.3, -110.7), (133.1, 140.2), (-30.0, 5.5), (10.0, -80.0)]
 
 
-@pytest.fixture(scope="module")
-def map_path(made_once, make_ortho):
-    return known_map(made_once, make_ortho).path
-
-
-@pytest.fixture(scope="module")
-def localizer(map_path):
-    return Localizer(open_map(map_path))
+map_path, localizer = blots.known_path, blots.known_localizer
 
 
 def infrared(east_m, north_m):

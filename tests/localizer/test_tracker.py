@@ -4,10 +4,11 @@ import copy
 import math
 from dataclasses import replace
 
+import blots
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, GROUND, Flat, Ground, known_map, place_of, rendered
+from blots import AGL_M, GROUND, Flat, Ground, place_of, rendered
 
 from orthonav.core.errors import CameraError, MapFileError
 from orthonav.core.geo.camera import Camera
@@ -24,14 +25,7 @@ SPEED_MPS = 14.0
 OTHER = Ground(seed=1)
 
 
-@pytest.fixture(scope="module")
-def map_path(made_once, make_ortho):
-    return known_map(made_once, make_ortho).path
-
-
-@pytest.fixture(scope="module")
-def localizer(map_path):
-    return Localizer(open_map(map_path))
+map_path, localizer = blots.known_path, blots.known_localizer
 
 
 def changed(grey, rng):

@@ -2,13 +2,12 @@
 
 import math
 
+import blots
 import numpy as np
 import pytest
-from blots import AGL_M, GROUND, known_map, rendered
+from blots import AGL_M, GROUND, rendered
 from test_tracker import SPEED_MPS, WIDE, changed, followed, legs, place_of
 
-from orthonav.core.localize import Localizer
-from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix, Telemetry, View
 from orthonav.core.track.tracker import UNAIDED_S, Tracker
 
@@ -19,9 +18,7 @@ WRONG_MPS, WRONG_S = 4.0, 10.0
 DATES_M = 2.0
 
 
-@pytest.fixture(scope="module")
-def localizer(made_once, make_ortho):
-    return Localizer(open_map(known_map(made_once, make_ortho).path))
+localizer = blots.known_localizer
 
 
 class OtherDate:

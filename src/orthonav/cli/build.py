@@ -37,16 +37,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     add_options(parser, "--json")
     imagery = parser.add_argument_group("imagery")
-    add_options(
-        imagery,
-        "--ortho",
-        "--dem",
-        "--surface",
-        "--true-ortho",
-        "--dem-datum",
-        "--relief",
-        "--bands",
-    )
+    add_options(imagery, "--ortho", "--bands", "--true-ortho")
+    add_options(imagery, "--dem", "--surface", "--dem-datum", "--relief")
     text = "orthophoto of the same area at another date, from which confidence and covariance are "
     text += "calibrated; it does not become part of the map; may be repeated"
     imagery.add_argument(

@@ -353,8 +353,10 @@ def _levels(array: NDArray[Any]) -> NDArray[np.uint8]:
         return array
     if array.dtype.kind == "u" and array.dtype.itemsize == 2:
         array = array.astype(np.uint16, copy=False)  # of either byte order
-        narrow = stretched(array, LEAST_COUNTS, NARROW_COUNTS)
-        return (array >> 8).astype(np.uint8) if narrow is None else narrow
+        low, high = spread(array)
+        if high - low < NARROW_COUNTS:
+            return stretched(array, (low, high), LEAST_COUNTS)
+        return (array >> 8).astype(np.uint8)
     if array.dtype.kind not in "iuf":
         raise FlightError(f"the image has values of type {array.dtype}; {EXPECTED}")
     low, high = float(array.min()), float(array.max())
@@ -372,20 +374,23 @@ NARROW_COUNTS, LEAST_COUNTS = 8192.0, 512.0
 if they spanned the second where they span less, so that noise does not look like ground."""
 
 
-def stretched(
-    array: NDArray[Any], least: float, most: float = math.inf
-) -> NDArray[np.uint8] | None:
-    """Grey levels of measured values, from dark to bright, as if they spanned at least `least`;
-    None where they span `most` or more. What is not finite counts as their middle."""
+def spread(array: NDArray[Any]) -> tuple[float, float]:
+    """Ends of measured values (H, W) or (H, W, C), but for a few; NaN where none is finite."""
     step = max(1, round(math.sqrt(array.size / SAMPLED_PX)))
     sample = array[::step, ::step]
     known = sample[np.isfinite(sample)]
     if known.size == 0:
+        return math.nan, math.nan
+    low, high = np.percentile(known, STRETCHED_PERCENT).tolist()
+    return low, high
+
+
+def stretched(array: NDArray[Any], ends: tuple[float, float], least: float) -> NDArray[np.uint8]:
+    """Grey levels of values, dark to bright between the ends of their `spread`, or as if they
+    spanned `least`. What is not finite counts as their middle; all is dark where nothing is."""
+    if math.isnan(ends[0]):
         return np.zeros(array.shape, np.uint8)
-    low, high = (float(each) for each in np.percentile(known, STRETCHED_PERCENT))
-    if high - low >= most:
-        return None
-    span, middle = max(high - low, least), (low + high) / 2
+    span, middle = max(ends[1] - ends[0], least), (ends[0] + ends[1]) / 2
     levels = (array.astype(np.float32) - np.float32(middle)) * np.float32(255 / span) + 127.5
     levels = np.nan_to_num(levels, nan=127.5, posinf=255.0, neginf=0.0)
     return np.asarray(np.rint(levels.clip(0, 255)), np.uint8)

@@ -24,6 +24,7 @@ from orthonav.core.records import (
     Prior,
     Telemetry,
     grey_levels,
+    spread,
     stretched,
 )
 from orthonav.core.tables import TableError, TableRows
@@ -150,14 +151,16 @@ def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
         raise FlightError(f"image of the flight cannot be decoded: {where}")
     if image.dtype in (np.uint8, np.uint16):
         return grey_levels(image)
-    known = image[np.isfinite(image) & (np.abs(image.astype(np.float64)) < NO_VALUE)]
-    if image.dtype.kind != "f" or known.size == 0:
-        least = LEAST_COUNTS
-    else:
-        least = LEAST_SHARE if known.min() >= 0 and known.max() <= 1 else LEAST_SPAN
-        image = np.where(np.abs(image) < NO_VALUE, image, np.nan)
-    made = stretched(image, least)
-    return np.zeros(image.shape, np.uint8) if made is None else made
+    return _measured(image)
+
+
+def _measured(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Grey levels of temperatures, reflectances and other numbers."""
+    if image.dtype.kind != "f":
+        return stretched(image, spread(image), LEAST_COUNTS)
+    known = np.where(np.abs(image) < NO_VALUE, image, np.nan)
+    is_share = ((known >= 0) & (known <= 1) | np.isnan(known)).all()
+    return stretched(known, spread(known), LEAST_SHARE if is_share else LEAST_SPAN)
 
 
 def _is_cut_jpeg(data: bytes) -> bool:

@@ -143,9 +143,11 @@ class Search:
         share = SOUGHT_SHARE if prior is None else math.inf
         self.sought = view.templates.weighing_grey(min(share, view.templates.grey_share))
         self.found: list[tuple[Step, list[Pose]]] = []
-        self.candidates = 0
-        self.last: Step | None = None
         self.budget = Budget(self.plan.budget_ms)
+
+    @property
+    def candidates(self) -> int:
+        return sum(len(poses) for _, poses in self.found)
 
     def run(self) -> Place | NoFix:
         """By the channels of the view alone; see `found_by`."""
@@ -389,8 +391,6 @@ class Search:
 
     def _judge(self, step: Step, found: list[Pose]) -> None:
         self.found.append((step, found))
-        self.candidates += len(found)
-        self.last = step
         if step.level < self.levels.judged:
             self.direct = self.placer.direct(found)
         else:
@@ -419,7 +419,7 @@ class Search:
         level finer. Where only a part of all places was compared, the best must stand out too. No
         trial before a step that costs less, except the final level, before which all directions
         were tried."""
-        policy, last, levels = self.policy, self.last, self.levels
+        policy, last, levels = self.policy, self.found[-1][0] if self.found else None, self.levels
         if last is None or self.sheet.confidence is None or levels.final == levels.judged:
             return None
         at_final, is_level = step.level < levels.judged, self.placer.is_level
@@ -473,8 +473,7 @@ class Search:
         )
 
     def _is_proven(self, best: Place, doubt: float) -> bool:
-        confidence = self.sheet.confidence
-        return confidence is not None and confidence(best.scores) > 1 - doubt
+        return self.likelihood(best) > 1 - doubt
 
     def tentative(self) -> Place | None:
         """The best place so far, not compared one level finer."""

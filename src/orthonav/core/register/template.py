@@ -260,6 +260,8 @@ class ViewTemplates:
 
     def weighing_grey(self, share: float) -> "ViewTemplates":
         """The same view with another weight of grey beside gradients."""
+        if share == self.grey_share:
+            return self
         made = ViewTemplates(*self._pictures[0], self.finest, share)
         made._pictures = self._pictures
         return made
