@@ -50,7 +50,8 @@ def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     text = "offset that is added to the times of images to get times of the log (default 0)"
     add("--time-offset-s", type=float, default=0.0, help=text)
     add_options(group, "--camera", "--mask", "--mount-deg")
-    text = "ROS topic for image, camera_info, attitude, velocity, position or height"
+    text = "source of image, camera_info, attitude, velocity, position or height: a ROS topic, or "
+    text += "an instance in a log, such as position=GPS[1]"
     names: dict[str, Any] = {"dest": "topics", "metavar": "ROLE=NAME"}
     add("--topic", type=topic, action="append", default=[], help=text, **names)
     text = "views per second taken from a recording: of a video (default 1)"
@@ -121,8 +122,8 @@ def open_source(
     given |= {"mount_deg": tuple(options.mount_deg), "topics": dict(options.topics)}
     source_options = SourceOptions(**given, over_terrain=over_terrain)
     recording = open_source(path, source_options)
-    for warning in recording.warnings:
-        log.warning("%s", warning)
+    for said in (*recording.choices, *recording.warnings):
+        log.warning("%s", said)
     return recording
 
 

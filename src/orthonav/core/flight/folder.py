@@ -323,10 +323,13 @@ class FlightWriter:
     Use it inside `orthonav.core.files.replacing_folder`, so that it is written whole or not at all.
     """
 
-    def __init__(self, folder: Path, camera: Camera, note: str) -> None:
+    def __init__(
+        self, folder: Path, camera: Camera, note: str, choices: Sequence[str] = ()
+    ) -> None:
         self._folder = Path(folder)
         self._camera = camera
         self._note = note
+        self._choices = choices
         self._rows: list[dict[str, Any]] = []
         self._truth: list[tuple[str, str, str]] = []
         (self._folder / "frames").mkdir()
@@ -369,7 +372,8 @@ class FlightWriter:
         _write_csv(self._folder / "telemetry.csv", columns, table)
         if self._truth:
             _write_csv(self._folder / "truth.csv", ("frame", "lat_deg", "lon_deg"), self._truth)
-        text = json.dumps({"camera": self._camera.numbers(), "note": self._note}, indent=1)
+        plain = {"camera": self._camera.numbers(), "note": self._note}
+        text = json.dumps(plain | ({"choices": self._choices} if self._choices else {}), indent=1)
         (self._folder / "flight.json").write_text(text + "\n", encoding="utf-8")
 
 

@@ -2,7 +2,7 @@
 
 import math
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -175,6 +175,7 @@ class RecordedTrack:
     """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
     origin_ns: int = 0  # time at which a recording without a clock begins
     warnings: tuple[str, ...] = ()  # doubts about the log, for people
+    choices: tuple[str, ...] = ()  # what was used where the log has several, by `chosen`
 
     @cached_property
     def altitude(self) -> TimeSeries | None:
@@ -282,6 +283,11 @@ def angles_at(attitude: TimeSeries | None, time_ns: int) -> tuple[float, float, 
 
 def _at(series: TimeSeries | None, time_ns: int, width: int) -> Array:
     return np.full(width, np.nan) if series is None else series.at(time_ns)
+
+
+def chosen(role: str, used: str, others: Iterable[str], why: str) -> str:
+    """Which of several sources is used for a role, and why not the others."""
+    return f"{role}: using {used}, not {', '.join(others)}: {why}"
 
 
 def measured(height_m: float) -> float:

@@ -181,7 +181,7 @@ def import_flight(
     views = truths = complete = broken = 0
     first_broken, yaw_deg, tilt_std_deg = "", [], []
     with replacing_folder(Path(out)) as folder:
-        writer = FlightWriter(folder, recording.camera, recording.note)
+        writer = FlightWriter(folder, recording.camera, recording.note, recording.choices)
         for view in recording.views:
             try:
                 frame, data = _encoded_image(view, recording, jpeg_quality)

@@ -215,7 +215,7 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     camera, note = _camera(photos[0], options)
     track = None
     if options.telemetry is not None:
-        track = read_log(options.telemetry, options.mount_deg)
+        track = read_log(options.telemetry, options.mount_deg, options.topics)
         check_overlap(track, _time_ns(photos[0]), _time_ns(photos[-1]), options.telemetry)
         warnings += warnings_of(track, options)
     else:
@@ -253,6 +253,7 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
         expected=len(photos),
         stream=views if track is None else lambda: with_mean_velocities(views(), track),
         warnings=tuple(filter(None, [*warnings, "" if options.fov_deg else note])),
+        choices=() if track is None else track.choices,
         take_off_latlon_deg=None if track is None else track.take_off_latlon_deg,
     )
 

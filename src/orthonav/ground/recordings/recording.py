@@ -48,7 +48,8 @@ class SourceOptions:
     time_offset_s: float = 0.0  # added to the times of images to get times of the log, seconds
     mount_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Yaw, pitch, roll of the camera in the body; 0, 0, 0 looks straight down, top forward."""
-    topics: Mapping[str, str] = field(default_factory=dict)  # ROS topics by role, one of `ROLES`
+    topics: Mapping[str, str] = field(default_factory=dict)
+    """Topics of ROS, or messages and instances of a log such as GPS[1], by role, one of `ROLES`."""
     prior_std_m: float | None = None
     """Use the recorded position as the prior, with this standard deviation per axis."""
     sensor_width_mm: float | None = None
@@ -120,6 +121,8 @@ class Recording:
     expected: int
     stream: Callable[[], Iterator[SourceView]]
     warnings: tuple[str, ...] = ()
+    choices: tuple[str, ...] = ()
+    """What was used where the source has several, by `orthonav.core.flight.chosen`."""
     take_off_latlon_deg: tuple[float, float] | None = None
     """First position of its track, where heights above take-off count from; None: unknown."""
 

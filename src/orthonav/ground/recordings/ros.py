@@ -433,7 +433,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
             _camera(reader, topics, path), *size, str(path)
         )
         if options.telemetry is not None:
-            track = read_log(options.telemetry, options.mount_deg)
+            track = read_log(options.telemetry, options.mount_deg, options.topics)
         else:
             track = read_track(reader, topics, options.mount_deg)
         warnings = [] if track.attitude else ["no topic has the attitude of the aircraft"]
@@ -449,6 +449,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         expected=image.msgcount,
         stream=lambda: with_mean_velocities(_views(path, image.topic, track, options), track),
         warnings=(*doubts, *warnings, *warnings_of(track, options)),
+        choices=track.choices,
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
 

@@ -61,6 +61,7 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
         stream=lambda: with_mean_velocities(_views(path, track, options), track),
         warnings=(*warnings, *warnings_of(track, options)),
+        choices=track.choices,
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
 
@@ -74,7 +75,7 @@ def _track(
         raise FlightError(
             f"no telemetry beside the video ({path.stem}.srt or .csv); give --telemetry: {path}"
         )
-    track = read_log(telemetry_path, options.mount_deg)
+    track = read_log(telemetry_path, options.mount_deg, options.topics)
     start_ns = track.origin_ns + options.time_offset_ns
     check_overlap(track, start_ns, start_ns + last_ns, telemetry_path)
     warnings: list[str] = []
