@@ -173,6 +173,7 @@ class RecordedTrack:
     """Source of the attitude, which says what was not reported."""
     prior: TimeSeries | None = None
     """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
+    zoomed: TimeSeries | None = None  # 1 at another zoom than most of the time, else 0
     origin_ns: int = 0  # time at which a recording without a clock begins
     warnings: tuple[str, ...] = ()  # doubts about the log, for people
     choices: tuple[str, ...] = ()  # what was used where the log has several, by `chosen`
@@ -193,6 +194,9 @@ class RecordedTrack:
         recorded = (self.attitude, *self.heights, self.home, self.position)
         series = next((one for one in recorded if one is not None), None)
         return None if series is None else (int(series.time_ns[0]), int(series.time_ns[-1]))
+
+    def is_zoomed(self, time_ns: int) -> bool:
+        return bool(_at(self.zoomed, time_ns, 1)[0] > 0)
 
     def telemetry(self, time_ns: int, ground_alt_m: float | None = None) -> Telemetry:
         """Telemetry at a time; `ground_alt_m` gives a height where only the altitude is known.

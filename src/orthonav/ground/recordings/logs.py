@@ -3,7 +3,8 @@
 import contextlib
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -314,6 +315,9 @@ _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
 _HOME = re.compile(r"\bHOME\s*\(")
 _HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
 _GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
+_DIGITAL_ZOOM = re.compile(rf"\bd(?:igital)?[_ ]?zoom[a-z_]*\s*:?\s*{_NUMBER}", re.IGNORECASE)
+_ZOOM_UNIT = 10_000  # of models that write a zoom of 1 as 10000
+SAME_ZOOM = 0.02  # zooms that differ by less, as a fraction, are one
 NEEDED = ("time_s", "pitch_deg", "roll_deg")
 _COLUMNS = {
     "height": ("agl_m",),
@@ -391,6 +395,8 @@ class SubtitleBlock(NamedTuple):
     yaw_deg: float  # yaw of the gimbal, as are pitch and roll
     pitch_deg: float
     roll_deg: float
+    zoom: tuple[float, float]
+    """Focal length, whose unit differs between models, and digital zoom, 1 where there is none."""
 
 
 def read_srt(path: Path) -> RecordedTrack:
@@ -401,7 +407,8 @@ def read_srt(path: Path) -> RecordedTrack:
     found = list(blocks(data))
     if not found:
         raise FlightError(f"subtitles hold no telemetry: {path}")
-    attitude, position, height = Samples(3), Samples(3), Samples(1)
+    attitude, position, height, zoomed = Samples(3), Samples(3), Samples(1), Samples(1)
+    focal, digital = (_usual(each) for each in zip(*(block.zoom for block in found), strict=True))
     unrecorded = not any(
         (each.yaw_deg, each.pitch_deg, each.roll_deg) != (0, 0, 0) for each in found
     )
@@ -410,16 +417,31 @@ def read_srt(path: Path) -> RecordedTrack:
         attitude.add(block.start_ns, *((math.nan, -90.0, 0.0) if unrecorded else gimbal))
         position.add(block.start_ns, block.lat_deg, block.lon_deg, block.alt_m)
         height.add(block.start_ns, block.height_m)
+        pairs = zip(block.zoom, (focal, digital), strict=True)
+        zoomed.add(block.start_ns, any(abs(now / usual - 1) > SAME_ZOOM for now, usual in pairs))
+    warnings = (UNCLEAR_ORDER,) * doubtful + (f"{UNRECORDED}: {path}",) * unrecorded
+    if digital > 1 + SAME_ZOOM:
+        warnings += (
+            f"most of the subtitles state a digital zoom of {digital:g}: --camera or --fov-deg "
+            f"must be that of this zoom: {path}",
+        )
     track = RecordedTrack(
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
         home=height.series(),
         position=position.positions(),
+        zoomed=zoomed.series(),
         tilt=ASSUMED if unrecorded else GIMBAL,
-        warnings=(UNCLEAR_ORDER,) * doubtful + (f"{UNRECORDED}: {path}",) * unrecorded,
+        warnings=warnings,
     )
     if track.attitude is None and track.position is None:
         raise FlightError(f"subtitles have neither position nor gimbal angles: {path}")
     return track
+
+
+def _usual(zooms: Sequence[float]) -> float:
+    """The most frequent value, of several the smallest; NaN where none is known."""
+    counted = Counter(each for each in zooms if each > 0)
+    return max(counted, key=lambda zoom: (counted[zoom], -zoom), default=math.nan)
 
 
 def end_ns(track: RecordedTrack) -> int:
@@ -490,7 +512,10 @@ def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> S
     if not (abs(lat) <= 90 and abs(lon) <= 360):
         lat = lon = math.nan
     height, altitude = measured(height), measured(altitude)
-    return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll)
+    digital = _first(_DIGITAL_ZOOM, text)
+    digital = 1.0 if not digital > 0 else digital / (_ZOOM_UNIT if digital >= _ZOOM_UNIT else 1)
+    zoom = fields.get("focal_len") or math.nan, digital
+    return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll, zoom)
 
 
 def _first(pattern: re.Pattern[str], text: str) -> float:
