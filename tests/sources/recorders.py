@@ -148,6 +148,7 @@ def hidden(path, begin_s, shown_s):
     ticks, *_ = struct.unpack_from(">I", data, data.index(b"mdhd") + 16)
     edit = round(shown_s * 1000), round(begin_s * ticks)
     struct.pack_into(">II", data, data.index(b"elst") + 12, *edit)
+    struct.pack_into(">I", data, data.index(b"mvhd") + 20, edit[0])
     path.write_bytes(data)
     return path
 
@@ -180,6 +181,8 @@ def late(path, by_s):
     at = data.index(b"elst")
     data[at + 11] = 2
     data[at + 12 : at + 12] = struct.pack(">Iii", round(by_s * 1000), -1, 65536)
+    (ticks,) = struct.unpack_from(">I", data, data.index(b"mvhd") + 20)
+    struct.pack_into(">I", data, data.index(b"mvhd") + 20, ticks + round(by_s * 1000))
     for kind in (b"moov", b"trak", b"edts", b"elst"):
         (size,) = struct.unpack_from(">I", data, data.index(kind) - 4)
         struct.pack_into(">I", data, data.index(kind) - 4, size + 12)

@@ -6,6 +6,7 @@ needed here.
 
 import math
 import re
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -20,7 +21,6 @@ from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight.telemetry_track import RecordedTrack, chosen
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.recordings.logs import end_ns, log_kind, read_log
-from orthonav.ground.recordings.movie import read_movie
 from orthonav.ground.recordings.recording import (
     Recording,
     SourceOptions,
@@ -39,16 +39,16 @@ MAX_ASPECT_ERROR = 0.02  # of pixels, as a fraction
 _SHORT_NS = 1_000_000_000
 _MISSING_FRAMES = 0.01
 SILENT = 0  # OpenCV's level of logging at which it writes nothing
-_HEAD_BYTES = 2_000_000
-_STREAMED = (b"\x47", b"\0\0\1\xba")  # MPEG: clocks begin anywhere
 _MATROSKA = b"\x1aE\xdf\xa3"  # lengths count from the time 0 of the clock
+_STREAMED = (b"\x47", b"\0\0\1\xba")  # MPEG: clocks begin anywhere
+MAX_BOXES, MAX_INDEX_BYTES = 1000, 50_000_000
 _UNREAD = {
-    rb"(?m)^(?:tx3g|text)$|S_TEXT/": "subtitles (ffmpeg -i VIDEO OUT.srt extracts them)",
-    rb"gpmd": "telemetry of GoPro (GPMF)",
-    rb"djmd": "telemetry of DJI (djmd; let the drone record captions)",
+    rb"(?s)stsd.{12}(?:tx3g|text)|S_TEXT/": "subtitles (ffmpeg -i VIDEO OUT.srt extracts them)",
+    rb"(?s)stsd.{12}gpmd": "telemetry of GoPro (GPMF)",
+    rb"(?s)stsd.{12}djmd": "telemetry of DJI (djmd; let the drone record captions)",
     rb"KLVA|\x06\x0e\x2b\x34\x02\x0b\x01\x01\x0e\x01\x03\x01\x01": "KLV (MISB ST 0601)",
 }
-"""What a video may hold, by its format or a part of its stream."""
+"""What a video may hold, by bytes of its index or its begin."""
 
 
 def open_video(path: Path, options: SourceOptions) -> Recording:
@@ -115,18 +115,42 @@ def _check_pixels(capture: cv2.VideoCapture, camera: Camera, path: Path) -> None
 def _extent(path: Path, capture: cv2.VideoCapture) -> tuple[int, int, float]:
     """When the last frame is shown, the least number of frames of a whole video (0 where either is
     not known), and where its clock begins; of a video whose first frame was grabbed."""
-    fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
-    movie, head = read_movie(path), _head(path)
-    begin_s = capture.get(cv2.CAP_PROP_PTS) / (fps or 1.0)
-    if head.startswith(_STREAMED) or not 0 < begin_s < MAX_BEGIN_S:
+    fps, counted = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    if not (fps > 0 and counted > 0):
+        return 0, 0, 0.0
+    index, whole, shown_s = _index(path)
+    begin_s = capture.get(cv2.CAP_PROP_PTS) / fps
+    if index.startswith(_STREAMED) or not 0 < begin_s < MAX_BEGIN_S:
         begin_s = 0.0
-    if movie is not None and movie.hides:
-        frames = movie.shown_s * fps
-    elif head.startswith(_MATROSKA):
-        frames -= begin_s * fps
-    last_ns = round((frames - 1) / fps * 1e9) if fps > 0 and frames > 0 else 0
-    uncounted = movie is not None and movie.hides and movie.whole
-    return last_ns, 0 if uncounted else round(frames), begin_s
+    if index.startswith(_MATROSKA):
+        shown_s = counted / fps
+    frames = min(counted, (shown_s - begin_s) * fps) if shown_s > begin_s else counted
+    hidden = whole and frames < counted - 1
+    return round((frames - 1) / fps * 1e9), 0 if hidden else round(frames), begin_s
+
+
+def _index(path: Path) -> tuple[bytes, bool, float]:
+    """The index of an MP4 or MOV, whether the file has all bytes that its boxes announce, and how
+    many seconds are shown, 0 where that is not stated (ISO/IEC 14496-12); of others the begin."""
+    start, end = 0, path.stat().st_size
+    with path.open("rb") as stream:
+        index = stream.read(MAX_INDEX_BYTES // 20)
+        for _ in range(MAX_BOXES):
+            stream.seek(start)
+            size, kind, long = struct.unpack(">I4sQ", stream.read(16).ljust(16, b"\0"))
+            size = long if size == 1 else size or end - start
+            if size < 8:
+                break
+            if kind == b"moov":
+                stream.seek(start)
+                index = stream.read(min(size, MAX_INDEX_BYTES))
+            start += size
+    at = index.find(b"mvhd") + 4
+    if index[4:8] != b"moov" or len(index) < at + 32:
+        return index, False, 0.0
+    late = index[at] == 1
+    scale, ticks = struct.unpack_from(">IQ" if late else ">II", index, at + (20 if late else 12))
+    return index, start == end, ticks / scale if scale else 0.0
 
 
 def _zoomed_s(track: RecordedTrack, last_ns: int, options: SourceOptions) -> list[float]:
@@ -137,11 +161,6 @@ def _zoomed_s(track: RecordedTrack, last_ns: int, options: SourceOptions) -> lis
     end_s = min(last_ns, int(track.zoomed.time_ns[-1]) - start_ns) / 1e9
     dues_s = np.arange(math.floor(end_s * options.rate_hz) + 1) / options.rate_hz
     return [due for due in dues_s.tolist() if track.is_zoomed(start_ns + round(due * 1e9))]
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(_HEAD_BYTES)
 
 
 def _track(
@@ -157,8 +176,7 @@ def _track(
         unused = [other.name for other in others]
         choices = [chosen("telemetry", telemetry_path.name, unused, why)] if others else []
     if telemetry_path is None:
-        movie = read_movie(path)
-        held = _head(path) if movie is None else movie.formats
+        held, _, _ = _index(path)
         unread = [f"{text}, not read; " for part, text in _UNREAD.items() if re.search(part, held)]
         raise FlightError(
             f"no telemetry beside the video ({path.stem}.srt or .csv); "
