@@ -182,17 +182,17 @@ def _of_plane(optics: Optics, width_px: int, height_px: int) -> FocalLength | No
 
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_XMP_TAG, _MAKE, _MODEL, _SOFTWARE = 700, 0x010F, 0x0110, 0x0131
+_XMP_TAG, _MAKE, _MODEL, _SOFTWARE, _ORIENTATION = 700, 0x010F, 0x0110, 0x0131, 0x0112
+MAX_POSITION_ERROR_M, MAX_DOP = 100.0, 20.0  # of positions that are no truth if they have more
 _TIME, _TIME_ORIGINAL, _MAKER_NOTE = 0x0132, 0x9003, 0x927C
 _OFFSET, _OFFSET_ORIGINAL = 0x9010, 0x9011
 _SUBSEC, _SUBSEC_ORIGINAL = 0x9290, 0x9291
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
 _ZOOM = 0xA404
-_QUARTER_HOUR = timedelta(minutes=15)
 _FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
 _BODY_YAW, _CAMERA_ANGLES = 7, (10, 9, 11)  # yaw, pitch, roll
 _VALUE = re.compile(
-    r"(?<![/\w-])(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
+    r"(?<![/\w-])(drone-dji|drone-parrot|drone|Camera|sensefly|skydio):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
     r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
 )
 _NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
@@ -201,6 +201,8 @@ _ANGLE_OR_PLACE = re.compile(
     r"Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat|Lon"
 )
 """Values that a view is worse off without."""
+_OTHER_ANGLE = re.compile(r"[\w-]+:\w*(?:Yaw|Heading)\w*(?=\s*(?:=\s*[\"']|>)\s*[-+\d])")
+_SKYDIO = re.compile(r"(?s)(drone-skydio:CameraOrientationNED\b)(?:[^<>]*/>|.{0,600}?</\1)")
 _EXPOSED = re.compile(
     r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
     r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"
@@ -218,6 +220,7 @@ class Photo:
     time_ns: int | None  # time of exposure, UTC
     zone_known: bool
     """Whether the time zone was known; otherwise the camera's clock is assumed to be UTC."""
+    gps_ns: int | None  # time of the GPS, which may be some seconds old
     latlon_deg: tuple[float, float] | None  # recorded position
     alt_m: float  # recorded altitude; its reference differs between makers
     gimbal_deg: tuple[float, float, float] | None
@@ -231,6 +234,7 @@ class Photo:
     vel_en_mps: tuple[float, float] | None  # velocity over ground, east and north
     optics: Optics  # camera and lens
     software: str  # programs that wrote the file; of a camera its firmware
+    turned: bool  # whether other programs show it turned, by the orientation of EXIF
     agl_m: float = math.nan  # height above ground, where a table states it
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
@@ -255,10 +259,10 @@ def read_photo(path: Path) -> Photo:
     make = _word(tags.get(_MAKE))
     notes = more.get(_MAKER_NOTE)
     gimbal, heading = read_maker_notes(notes if isinstance(notes, bytes) else b"", make)
-    time_ns, zone_known = xmp.time_ns, True
-    if time_ns is None:
-        time_ns, zone_known = _time(tags, more, gps)
-    latlon, alt, unsigned = _place(gps)
+    time_ns, zone_known = (xmp.time_ns, True) if xmp.time_ns else _time(tags, more)
+    if void := _void(gps):
+        gps = {}
+    latlon, alt, doubt = _place(gps)
     rtk = xmp.first("drone-dji:RtkFlag") > 0
     north, east = (
         xmp.first(f"drone-dji:Flight{axis}Speed", f"drone:Flight{axis}Speed") for axis in "XY"
@@ -266,19 +270,24 @@ def read_photo(path: Path) -> Photo:
     body_yaw = xmp.body_yaw_deg()
     if math.isnan(body_yaw) and not xmp.unread:
         body_yaw = heading
-    doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)]
-    if unsigned:
-        doubts.append("GPS position without N or S, or without E or W")
+    gimbal, rotation = xmp.gimbal_deg() or gimbal, xmp.rotation(make)
+    doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)] + list(
+        filter(None, (void, doubt))
+    )
+    if gimbal is None and rotation is None and math.isnan(body_yaw):
+        others = [*xmp.others, *(["GPSImgDirection"] if 17 in gps else [])]
+        doubts += [f"angles of {other}, which are not read" for other in others[:1]]
     return Photo(
         path=path,
         width_px=width,
         height_px=height,
         time_ns=time_ns,
         zone_known=zone_known,
-        latlon_deg=xmp.latlon_deg() or latlon,
+        gps_ns=_gps_time_ns(gps),
+        latlon_deg=None if void else xmp.latlon_deg() or latlon,
         alt_m=alt,
-        gimbal_deg=xmp.gimbal_deg() or gimbal,
-        rotation=xmp.rotation(make),
+        gimbal_deg=gimbal,
+        rotation=rotation,
         body_yaw_deg=body_yaw,
         home_m=measured(
             xmp.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
@@ -288,6 +297,7 @@ def read_photo(path: Path) -> Photo:
         vel_en_mps=(east, north) if math.isfinite(east + north) else None,
         optics=_optics(tags, more),
         software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
+        turned=tags.get(_ORIENTATION, 1) not in (0, 1),
         doubts=tuple(doubts),
     )
 
@@ -307,26 +317,19 @@ def _optics(tags: dict[int, Any], more: dict[int, Any]) -> Optics:
 
 
 def _word(value: Any) -> str:
-    return "" if value is None else str(value).strip("\0 ")
+    text = value.decode("latin-1") if isinstance(value, bytes) else value
+    return "" if value is None else str(text).strip("\0 ")
 
 
-def _time(
-    tags: dict[int, Any], more: dict[int, Any], gps: dict[int, Any]
-) -> tuple[int | None, bool]:
-    """UTC in ns, and whether the time zone was known.
-
-    The zone is that of `OffsetTimeOriginal`, else the difference between the camera's clock and
-    the time of the GPS, rounded to quarters of an hour.
-    """
+def _time(tags: dict[int, Any], more: dict[int, Any]) -> tuple[int | None, bool]:
+    """Time in ns by the camera's clock, and whether it is UTC, by `OffsetTimeOriginal`."""
     parts = (_TIME_ORIGINAL, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL)
     if not str(more.get(_TIME_ORIGINAL, "")).strip("\0 :"):
         more, parts = {**more, _TIME: tags.get(_TIME, "")}, (_TIME, _SUBSEC, _OFFSET)
     text, fraction, offset = (str(more.get(part, "")).strip("\0 ") for part in parts)
+    zone = _offset(offset)
     try:
         local = datetime.strptime(text, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-        zone = _offset(offset)
-        if zone is None and (utc := _gps_time(gps)) is not None:
-            zone = round((local - utc) / _QUARTER_HOUR) * _QUARTER_HOUR
         whole = local - (zone or timedelta())
     except (ValueError, OverflowError):  # the latter for the years 1 and 9999
         return None, False
@@ -341,31 +344,37 @@ def _offset(text: str) -> timedelta | None:
         return None
 
 
-def _gps_time(gps: dict[int, Any]) -> datetime | None:
+def _gps_time_ns(gps: dict[int, Any]) -> int | None:
     try:
         day = datetime.strptime(str(gps[29]).strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
         hours, minutes, seconds = (float(part) for part in gps[7])
-        return day + timedelta(hours=hours, minutes=minutes, seconds=seconds)
+        return round((day.timestamp() + hours * 3600 + minutes * 60 + seconds) * 1e9)
     except (KeyError, ValueError, TypeError, ZeroDivisionError, OverflowError):
         return None
 
 
-def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float, bool]:
-    """Latitude and longitude in degrees, altitude, and whether N, S, E or W is missing (tags 1 to
-    6)."""
-    alt = measured(_number(gps.get(6)) * (-1 if gps.get(5) in (1, b"\x01") else 1))
+def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float, str]:
+    """Latitude and longitude in degrees, altitude, and why there is none (tags 1 to 6)."""
+    alt = measured(_number(gps.get(6)) * (-1 if gps.get(5) in (1, 3, b"\x01", b"\x03") else 1))
     try:
         lat, lon = (sum(float(part) / 60**i for i, part in enumerate(gps[tag])) for tag in (2, 4))
     except (KeyError, ValueError, TypeError, ZeroDivisionError):
-        return None, alt, False
-    references = [gps.get(tag, "") for tag in (1, 3)]
-    texts = [one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in references]
-    north, east = (text.upper().strip("\0 ")[:1] for text in texts)
+        return None, alt, ""
+    north, east = (_word(gps.get(tag)).upper()[:1] for tag in (1, 3))
     if north not in tuple("NS") or east not in tuple("EW"):
-        return None, alt, True
+        return None, alt, "GPS position without N or S, or without E or W"
     lat, lon = -lat if north == "S" else lat, -lon if east == "W" else lon
     sound = abs(lat) <= 90 and abs(lon) <= 360 and (lat, lon) != (0.0, 0.0)
-    return ((lat, lon) if sound else None), alt, False
+    return ((lat, lon) if sound else None), alt, ""
+
+
+def _void(gps: dict[int, Any]) -> str:
+    """Why the receiver's values are not used, empty where they are."""
+    if _word(gps.get(9)).upper() == "V" or _word(gps.get(10)) == "0":
+        return "GPS position without a fix (GPSStatus, GPSMeasureMode)"
+    if _number(gps.get(31)) > MAX_POSITION_ERROR_M or _number(gps.get(11)) > MAX_DOP:
+        return "GPS position with a large error (GPSHPositioningError, GPSDOP)"
+    return ""
 
 
 def _number(value: Any) -> float:
@@ -409,11 +418,14 @@ class Xmp:
     writer: str  # program that wrote the packet, empty where it is not named
     unread: tuple[str, ...] = ()
     """Angles, heights and positions that are not numbers, as name and value."""
+    others: tuple[str, ...] = ()  # names of angles of other makers
 
     @classmethod
     def of(cls, packet: str | bytes) -> "Xmp":
         text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
-        texts = {f"{maker}:{name}": value for maker, name, value in _VALUE.findall(text)}
+        camera = _SKYDIO.search(text)  # its names are those of the aircraft's angles too
+        skydio = camera[0].replace("drone-skydio:", "skydio:") if camera else ""
+        texts = {f"{maker}:{name}": value for maker, name, value in _VALUE.findall(skydio + text)}
         found = {name: _stated(value) for name, value in texts.items()}
         values = {name: value for name, value in found.items() if math.isfinite(value)}
         unread = tuple(
@@ -422,7 +434,8 @@ class Xmp:
             if _ANGLE_OR_PLACE.match(name.partition(":")[2])
         )
         writer = _WRITER.search(text)
-        return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread)
+        others = tuple(name for name in _OTHER_ANGLE.findall(text) if name not in texts)
+        return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread, others)
 
     def first(self, *names: str) -> float:
         return next((self.values[name] for name in names if name in self.values), math.nan)
@@ -441,7 +454,8 @@ class Xmp:
 
     def gimbal_deg(self) -> tuple[float, float, float] | None:
         """Yaw, pitch and roll of the gimbal, of a camera that looks ahead at 0, 0, 0."""
-        return self._angles("drone-dji:Gimbal{}Degree") or self._angles("drone:Gimbal{}Degree")
+        forms = "drone-dji:Gimbal{}Degree", "drone:Gimbal{}Degree", "drone-parrot:Camera{}Degree"
+        return next(filter(None, map(self._angles, (*forms, "skydio:{}"))), None)
 
     def body_yaw_deg(self) -> float:
         """Heading of the aircraft; NaN where a gimbal has another one that cannot be read."""
@@ -457,7 +471,7 @@ class Xmp:
         if math.isfinite(heading + pitch + roll):  # of the body; the camera looks straight down
             return enu_from_camera(heading, pitch, roll)
         angles = self._angles("Camera:{}")
-        if angles is None:
+        if angles is None or not any(angles):  # 0, 0, 0 was not recorded
             return None
         # senseFly uses the names of Pix4D with the opposite sign of roll.
         yaw, pitch, roll = angles

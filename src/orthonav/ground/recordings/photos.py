@@ -4,6 +4,7 @@ import logging
 import math
 import os
 import re
+import statistics
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -48,8 +49,8 @@ from orthonav.ground.recordings.recording import (
 log = logging.getLogger(__name__)
 
 UNKNOWN_YAW_STD_DEG = 180.0  # standard deviation of a heading that may be off by any angle
-_TURNED_DEG = 5.0
-"""A gimbal follows the aircraft within a few degrees; at more it would not report 0."""
+HOUR_NS, CLOCK_STEP_NS, MAX_LAG_NS = 3600 * 10**9, 900 * 10**9, 20 * 10**9
+"""Zones differ by quarters of an hour; a clock that is off by more than the last is corrected."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _MAGICS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*")
 _EDITOR = re.compile(
@@ -145,9 +146,13 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
     without = [unrecorded[photo.optics.make, photo.optics.model] for photo in photos]
     poses = [_pose(*each) for each in zip(photos, without, strict=True)]
     warnings = []
-    if any(without):
+    lost = [(pose, photo) for pose, photo, gone in zip(poses, photos, without, strict=True) if gone]
+    if not any(photo.body_yaw_deg for _, photo in lost):
+        for pose, _ in lost:  # the heading of the aircraft was not recorded either
+            pose["yaw_deg"] = math.nan
+    if lost:
         warnings.append(
-            f"gimbal angles of {sum(without)} photographs are all 0, so they were not recorded: "
+            f"gimbal angles of {len(lost)} photographs are all 0, so they were not recorded: "
             "heading of the aircraft and a camera that looks straight down assumed"
         )
     edited = _edited(photos)
@@ -180,10 +185,8 @@ def _pose(photo: Photo, gimbal_unrecorded: bool) -> dict[str, Any]:
 
 
 def _is_unrecorded(photos: Sequence[Photo]) -> bool:
-    """Whether the gimbal reports 0, 0, 0 in all photographs while the aircraft is turned."""
-    if any(photo.gimbal_deg is None or any(photo.gimbal_deg) for photo in photos):
-        return False
-    return any(abs(math.remainder(photo.body_yaw_deg, 360)) > _TURNED_DEG for photo in photos)
+    """Whether the gimbal reports 0, 0, 0 in all photographs: it would look at the horizon."""
+    return all(photo.gimbal_deg is not None and not any(photo.gimbal_deg) for photo in photos)
 
 
 def _edited(photos: Sequence[Photo]) -> list[int]:
@@ -208,10 +211,9 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     if chosen.table is not None:
         options = replace(options, telemetry=None)
     photos, warnings = _taken(chosen, options)
-    if options.camera is None and options.fov_deg is None:
-        focal_px = [_focal_px(photo, options) for photo in photos]
-        photos, zoomed = _alike(photos, focal_px, "of another focal length than most", ROUNDED)
-        warnings += zoomed
+    focal_px = [_focal_px(photo, options) for photo in photos]
+    photos, zoomed = _alike(photos, focal_px, "of another focal length than most", ROUNDED)
+    warnings += zoomed
     camera, note = _camera(photos[0], options)
     track = None
     if options.telemetry is not None:
@@ -235,6 +237,12 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
         }
         if any(math.isnan(photo.agl_m) for photo in photos):
             warnings += height_warnings(options, heights)
+    if turned := [photo for photo in photos if photo.turned]:
+        warnings.append(
+            f"other programs show {len(turned)} of {len(photos)} photographs turned (orientation "
+            "of EXIF); here their pixels, and the top of the image, are as stored, the first: "
+            f"{turned[0].path.name}"
+        )
     doubted = [photo for photo in photos if photo.doubts]
     if doubted:
         warnings.append(
@@ -283,8 +291,9 @@ def _taken(chosen: ChosenPhotos, options: SourceOptions) -> tuple[list[Photo], l
     warnings += odd
     if photos:
         photos, lost = _with_rows(photos, chosen)
+        photos, wrong = _by_gps(photos)
         photos, untimed, undated = _in_time(photos, chosen, options)
-        warnings += lost + _left_out(paths, untimed, "no time in EXIF")
+        warnings += wrong + lost + _left_out(paths, untimed, "no time in EXIF")
     if not photos:
         raise FlightError(f"{'; '.join(warnings)}: {folder}")
     if undated and len(photos) > 1:
@@ -345,6 +354,31 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
     if lost:
         warnings.append(f"{lost} rows of the table have no photograph: {table.path}")
     return known, warnings
+
+
+def _by_gps(photos: list[Photo]) -> tuple[list[Photo], list[str]]:
+    """The photographs in UTC where they have times of the GPS, and a warning about a camera whose
+    clock is off; those with a time zone in EXIF and those without one are judged apart."""
+    warnings, shifts_ns = [], {}
+    for known in {each.zone_known for each in photos}:
+        alike = (each for each in photos if each.zone_known == known)
+        lags = [each.time_ns - each.gps_ns for each in alike if each.time_ns and each.gps_ns]
+        if lags:
+            lag_ns = round(statistics.median(lags))
+            zone_ns = 0 if known else round(lag_ns / CLOCK_STEP_NS) * CLOCK_STEP_NS
+            if abs(lag_ns - zone_ns) > MAX_LAG_NS or not -12 * HOUR_NS <= zone_ns <= 14 * HOUR_NS:
+                warnings.append(
+                    f"clock of the camera and time of its GPS differ by {lag_ns / 1e9:+.0f} s, "
+                    "which is no time zone: the time of the GPS is used"
+                )
+                zone_ns = lag_ns
+            shifts_ns[known] = zone_ns
+    return [
+        replace(each, time_ns=each.time_ns - shifts_ns[each.zone_known], zone_known=True)
+        if each.time_ns and each.zone_known in shifts_ns
+        else each
+        for each in photos
+    ], warnings
 
 
 def _in_time(

@@ -126,7 +126,7 @@ def _extent(path: Path, capture: cv2.VideoCapture) -> tuple[int, int, float]:
         shown_s = counted / fps
     frames = min(counted, (shown_s - begin_s) * fps) if shown_s > begin_s else counted
     hidden = whole and frames < counted - 1
-    return round((frames - 1) / fps * 1e9), 0 if hidden else round(frames), begin_s
+    return round(max(0.0, frames - 1) / fps * 1e9), 0 if hidden else round(frames), begin_s
 
 
 def _index(path: Path) -> tuple[bytes, bool, float]:
@@ -136,10 +136,10 @@ def _index(path: Path) -> tuple[bytes, bool, float]:
     with path.open("rb") as stream:
         index = stream.read(MAX_INDEX_BYTES // 20)
         for _ in range(MAX_BOXES):
-            stream.seek(start)
+            stream.seek(min(start, end))
             size, kind, long = struct.unpack(">I4sQ", stream.read(16).ljust(16, b"\0"))
             size = long if size == 1 else size or end - start
-            if size < 8:
+            if size < 8 or start >= end:
                 break
             if kind == b"moov":
                 stream.seek(start)
