@@ -530,6 +530,29 @@ def test_photographs_of_another_focal_length_are_left_out(tmp_path, other):
     assert recording.camera.fx_px == pytest.approx(math.hypot(64, 48) * 24 / math.hypot(36, 24))
 
 
+def test_as_many_photographs_of_several_cameras_are_not_guessed(tmp_path):
+    """As of a drone with several cameras that expose together."""
+    for number in range(2):
+        time = f"2023:11:14 22:13:2{number}"
+        photo(tmp_path / f"p/{number}_W.jpg", time, xmp=dji())
+        photo(tmp_path / f"p/{number}_T.jpg", time, width=32, height=24)
+        photo(tmp_path / f"q/{number}_W.jpg", time, xmp=dji())
+        photo(tmp_path / f"q/{number}_Z.jpg", time, {0xA405: 162, 0x920A: 30}, xmp=dji())
+    for folder, other in (("p", "T"), ("q", "Z")):
+        with pytest.raises(
+            FlightError, match=f"2 as ._{other}.jpg.*; give the files of one camera"
+        ):
+            open_source(tmp_path / folder)
+        found = open_source(sorted((tmp_path / folder).glob("*_W.jpg")))
+        assert found.expected == 2
+
+
+def test_a_table_comes_before_the_clock(tmp_path):
+    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5) | {29: "2023:11:14", 7: (20, 1, 2)})
+    (tmp_path / "p/t.csv").write_text("file,yaw,time\na.jpg,1,7\n")
+    assert next(open_source(tmp_path / "p").views).telemetry.time_ns == 7 * 10**9
+
+
 def test_photographs_of_another_focal_length_are_left_out_with_a_camera_file_too(tmp_path):
     for number in range(3):
         more = {0xA405: 48, 0x920A: 17.6} if number == 1 else {}

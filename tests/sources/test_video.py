@@ -234,10 +234,11 @@ def test_views_of_another_zoom_are_left_out(recorded):
         texts = [f"{dji_subtitle(n)} [{form.format(4 if n >= 20 else 1)}]" for n in range(30)]
         subtitles(recorded.with_suffix(".SRT"), texts)
         recording = open_source(recorded, options(recorded, rate_hz=2.0))
-        said = "2 of 6 views left out, of another zoom than most, the first at 2.0 s"
+        said = (
+            "10 of 30 subtitles state another zoom than most, the first at 2.0 s; views there are"
+        )
         assert any(said in each for each in recording.warnings)
         assert [view.telemetry.time_ns / 1e9 for view in recording.views] == [0, 0.5, 1, 1.5]
-        assert recording.expected == 4
 
 
 def test_views_of_another_focal_length_are_left_out(recorded):
@@ -285,24 +286,6 @@ def test_the_time_before_the_first_frame_holds_no_missing_frames(recorded):
     late_by_250_ms(recorded)
     recording = open_source(recorded, options(recorded))
     assert recording.expected == len(list(recording.views)) == 3
-
-
-def test_an_mp4_that_ends_early_is_named_even_if_edits_hide_frames(tmp_path):
-    path = hidden(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), begin_s=0.5, shown_s=1.5)
-    subtitles(tmp_path / "a.srt", [dji_subtitle(n) for n in range(15)])
-    camera_file(tmp_path / "camera.json")
-    data = path.read_bytes()
-    at = data.index(b"moov") - 4
-    start = data.index(b"mdat") - 4  # the index first, its offsets moved by its length
-    index = bytearray(data[at:])
-    (first,) = struct.unpack_from(">I", index, index.index(b"stco") + 12)
-    struct.pack_into(">I", index, index.index(b"stco") + 12, first + len(index))
-    whole = data[:start] + index + data[start:at]
-    path.write_bytes(whole)
-    assert len(list(open_source(path, options(path, rate_hz=2.0)).views)) == 3
-    path.write_bytes(whole[: len(whole) - (at - start) // 2])
-    with pytest.raises(FlightError, match=r"cut short: \d+ of 15 frames"):
-        list(open_source(path, options(path)).views)
 
 
 def test_pixels_that_are_not_square(recorded):

@@ -195,9 +195,6 @@ class RecordedTrack:
         series = next((one for one in recorded if one is not None), None)
         return None if series is None else (int(series.time_ns[0]), int(series.time_ns[-1]))
 
-    def is_zoomed(self, time_ns: int) -> bool:
-        return bool(_at(self.zoomed, time_ns, 1)[0] > 0)
-
     def telemetry(self, time_ns: int, ground_alt_m: float | None = None) -> Telemetry:
         """Telemetry at a time; `ground_alt_m` gives a height where only the altitude is known.
 

@@ -10,8 +10,8 @@ import re
 import struct
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
-from orthonav.core.flight.telemetry_track import measured
+from orthonav.core.flight.telemetry_track import LATEST_NS, measured
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
-from orthonav.ground.recordings.image_table import ImageRow
+from orthonav.ground.recordings.image_table import ImageRow, ns_of
 
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -165,20 +165,16 @@ def _of_plane(optics: Optics, width_px: int, height_px: int) -> FocalLength | No
     unit_mm = _MM_PER_UNIT.get(optics.plane_unit, math.nan)
     taken_px = optics.taken_px if optics.taken_px > 0 else float(width_px)
     thinned = width_px / taken_px
-    px = optics.focal_mm * optics.plane / unit_mm * thinned
+    px, longer_px = optics.focal_mm * optics.plane / unit_mm * thinned, max(width_px, height_px)
     if not px > 0:
         return None
-    source = "focal length and sensor resolution of EXIF"
-    found = FocalLength(px, _PLANE_STD, source)
-    if found.field_deg(max(width_px, height_px)) <= MAX_FIELD_DEG:
-        return found
-    as_width = FocalLength(
-        optics.focal_mm / (optics.plane * unit_mm) * width_px,
-        _PLANE_STD,
-        "EXIF, with the sensor's width instead of its resolution",
+    found = FocalLength(px, _PLANE_STD, "focal length and sensor resolution of EXIF")
+    px = optics.focal_mm / (optics.plane * unit_mm) * width_px
+    as_width = replace(
+        found, px=px, source="EXIF, with the sensor's width instead of its resolution"
     )
-    believed = as_width.field_deg(max(width_px, height_px)) <= MAX_FIELD_DEG
-    return as_width if believed else found
+    wide = found.field_deg(longer_px) > MAX_FIELD_DEG
+    return as_width if wide and as_width.field_deg(longer_px) <= MAX_FIELD_DEG else found
 
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
@@ -189,23 +185,24 @@ _OFFSET, _OFFSET_ORIGINAL = 0x9010, 0x9011
 _SUBSEC, _SUBSEC_ORIGINAL = 0x9290, 0x9291
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
 _ZOOM = 0xA404
+_ZONE = re.compile(r"Z|[+-]\d\d:?\d\d")
 _FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
 _BODY_YAW, _CAMERA_ANGLES = 7, (10, 9, 11)  # yaw, pitch, roll
 _VALUE = re.compile(
-    r"(?<![/\w-])(drone-dji|drone-parrot|drone|Camera|sensefly|skydio):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
+    r"(?<![/\w-])([A-Za-z][\w-]{0,20}:[A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
     r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
 )
 _NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
 """A number with a decimal point or comma, or a fraction."""
 _ANGLE_OR_PLACE = re.compile(
-    r"Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat|Lon"
+    r"(?:drone(?:-dji)?|Camera|sensefly):(?:Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat"
+    r"|Lon)"
 )
 """Values that a view is worse off without."""
-_OTHER_ANGLE = re.compile(r"[\w-]+:\w*(?:Yaw|Heading)\w*(?=\s*(?:=\s*[\"']|>)\s*[-+\d])")
 _SKYDIO = re.compile(r"(?s)(drone-skydio:CameraOrientationNED\b)(?:[^<>]*/>|.{0,600}?</\1)")
 _EXPOSED = re.compile(
     r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
-    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"
+    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)"
 )
 _WRITER = re.compile(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})")
 
@@ -271,11 +268,10 @@ def read_photo(path: Path) -> Photo:
     if math.isnan(body_yaw) and not xmp.unread:
         body_yaw = heading
     gimbal, rotation = xmp.gimbal_deg() or gimbal, xmp.rotation(make)
-    doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)] + list(
-        filter(None, (void, doubt))
-    )
+    doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)]
     if gimbal is None and rotation is None and math.isnan(body_yaw):
-        others = [*xmp.others, *(["GPSImgDirection"] if 17 in gps else [])]
+        others = [name for name in xmp.values if "Yaw" in name or "Heading" in name]
+        others += ["GPSImgDirection"] if 17 in gps else []
         doubts += [f"angles of {other}, which are not read" for other in others[:1]]
     return Photo(
         path=path,
@@ -298,7 +294,7 @@ def read_photo(path: Path) -> Photo:
         optics=_optics(tags, more),
         software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
         turned=tags.get(_ORIENTATION, 1) not in (0, 1),
-        doubts=tuple(doubts),
+        doubts=tuple(filter(None, (*doubts, void, doubt))),
     )
 
 
@@ -326,22 +322,15 @@ def _time(tags: dict[int, Any], more: dict[int, Any]) -> tuple[int | None, bool]
     parts = (_TIME_ORIGINAL, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL)
     if not str(more.get(_TIME_ORIGINAL, "")).strip("\0 :"):
         more, parts = {**more, _TIME: tags.get(_TIME, "")}, (_TIME, _SUBSEC, _OFFSET)
-    text, fraction, offset = (str(more.get(part, "")).strip("\0 ") for part in parts)
-    zone = _offset(offset)
-    try:
-        local = datetime.strptime(text, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-        whole = local - (zone or timedelta())
-    except (ValueError, OverflowError):  # the latter for the years 1 and 9999
-        return None, False
+    text, fraction, zone = (str(more.get(part, "")).strip("\0 ") for part in parts)
+    zone = zone if _ZONE.fullmatch(zone) else ""
     nanoseconds = int(fraction[:9].ljust(9, "0")) if fraction.isdecimal() else 0
-    return round(whole.timestamp()) * 10**9 + nanoseconds, zone is not None
-
-
-def _offset(text: str) -> timedelta | None:
     try:
-        return datetime.strptime(text, "%z").utcoffset()
+        moment = datetime.strptime(text + zone, "%Y:%m:%d %H:%M:%S" + "%z" * bool(zone))
     except ValueError:
-        return None
+        return None, False
+    time_ns = ns_of(moment) + nanoseconds
+    return (time_ns, bool(zone)) if abs(time_ns) < LATEST_NS else (None, False)
 
 
 def _gps_time_ns(gps: dict[int, Any]) -> int | None:
@@ -394,9 +383,8 @@ def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float]
     if make.upper() != "DJI":
         return None, math.nan
     values: dict[int, float] = {}
-    for (
-        order
-    ) in "<>":  # programs that rewrite EXIF may change its byte order, not that of the notes
+    # Programs that rewrite EXIF may change its byte order, not that of the notes.
+    for order in "<>":
         count = struct.unpack_from(f"{order}H", data.ljust(2, b"\0"))[0]
         if values or not 1 <= count <= _MAX_ENTRIES or len(data) < 2 + count * _ENTRY_BYTES:
             continue
@@ -418,24 +406,22 @@ class Xmp:
     writer: str  # program that wrote the packet, empty where it is not named
     unread: tuple[str, ...] = ()
     """Angles, heights and positions that are not numbers, as name and value."""
-    others: tuple[str, ...] = ()  # names of angles of other makers
 
     @classmethod
     def of(cls, packet: str | bytes) -> "Xmp":
         text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
         camera = _SKYDIO.search(text)  # its names are those of the aircraft's angles too
         skydio = camera[0].replace("drone-skydio:", "skydio:") if camera else ""
-        texts = {f"{maker}:{name}": value for maker, name, value in _VALUE.findall(skydio + text)}
+        texts = dict(_VALUE.findall(skydio + text))
         found = {name: _stated(value) for name, value in texts.items()}
         values = {name: value for name, value in found.items() if math.isfinite(value)}
         unread = tuple(
             f"{name}={texts[name]!r:.40}"
             for name in found.keys() - values.keys()
-            if _ANGLE_OR_PLACE.match(name.partition(":")[2])
+            if _ANGLE_OR_PLACE.match(name)
         )
         writer = _WRITER.search(text)
-        others = tuple(name for name in _OTHER_ANGLE.findall(text) if name not in texts)
-        return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread, others)
+        return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread)
 
     def first(self, *names: str) -> float:
         return next((self.values[name] for name in names if name in self.values), math.nan)
@@ -491,12 +477,9 @@ def _stated(text: str) -> float:
 
 
 def _exposed_ns(text: str) -> int | None:
-    found = _EXPOSED.search(text)
-    if found is None:
+    if (found := _EXPOSED.search(text)) is None:
         return None
     try:
-        whole = datetime.strptime(" ".join(found.groups()[:6]), "%Y %m %d %H %M %S")
+        return ns_of(datetime.fromisoformat("{}-{}-{}T{}".format(*found.groups())))
     except ValueError:
         return None
-    whole = whole.replace(tzinfo=UTC)
-    return round(whole.timestamp()) * 10**9 + int((found[7] or "0").ljust(9, "0"))

@@ -33,7 +33,6 @@ from orthonav.ground.recordings.recording import (
 )
 
 SIDECARS = (".srt", ".csv")
-MAX_LATE_S = 1.0  # clocks that begin later are named
 MAX_BEGIN_S = 86_400.0  # later is no time, but OpenCV's value for none
 MAX_ASPECT_ERROR = 0.02  # of pixels, as a fraction
 _SHORT_NS = 1_000_000_000
@@ -41,14 +40,14 @@ _MISSING_FRAMES = 0.01
 SILENT = 0  # OpenCV's level of logging at which it writes nothing
 _MATROSKA = b"\x1aE\xdf\xa3"  # lengths count from the time 0 of the clock
 _STREAMED = (b"\x47", b"\0\0\1\xba")  # MPEG: clocks begin anywhere
-MAX_BOXES, MAX_INDEX_BYTES = 1000, 50_000_000
+MAX_END_BYTES = 10_000_000
 _UNREAD = {
     rb"(?s)stsd.{12}(?:tx3g|text)|S_TEXT/": "subtitles (ffmpeg -i VIDEO OUT.srt extracts them)",
     rb"(?s)stsd.{12}gpmd": "telemetry of GoPro (GPMF)",
     rb"(?s)stsd.{12}djmd": "telemetry of DJI (djmd; let the drone record captions)",
     rb"KLVA|\x06\x0e\x2b\x34\x02\x0b\x01\x01\x0e\x01\x03\x01\x01": "KLV (MISB ST 0601)",
 }
-"""What a video may hold, by bytes of its index or its begin."""
+"""What a video may hold, by bytes of its begin or its end."""
 
 
 def open_video(path: Path, options: SourceOptions) -> Recording:
@@ -70,28 +69,19 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         last_ns, promised, begin_s = _extent(path, capture)
         turn_deg = capture.get(cv2.CAP_PROP_ORIENTATION_META)
     track, telemetry_path, choices, warnings = _track(path, last_ns, options)
-    if turn_deg:
-        warnings.append(
-            f"players show the video turned by {turn_deg:g} deg; its frames are used as stored"
-        )
-    if begin_s > MAX_LATE_S:
+    said = f"players show the video turned by {turn_deg:g} deg; its frames are used as stored"
+    warnings += [said] if turn_deg else []
+    if begin_s > 1:
         warnings.append(
             f"the clock of the video begins at {begin_s:.1f} s; time 0 is its first frame. If "
             f"telemetry counts by that clock, add {begin_s:.1f} to --time-offset-s"
-        )
-    count = math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0
-    zoomed_s = _zoomed_s(track, last_ns, options)
-    if zoomed_s:
-        warnings.append(
-            f"{len(zoomed_s)} of {count} views left out, of another zoom than most, the first at "
-            f"{zoomed_s[0]:.1f} s: {telemetry_path}"
         )
     return Recording(
         kind="video",
         path=path,
         camera=camera,
         note=f"video {path.name}, telemetry of {telemetry_path.name}",
-        expected=count - len(zoomed_s),
+        expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
         stream=lambda: with_mean_velocities(_views(path, promised, track, options), track),
         warnings=(*warnings, *warnings_of(track, options)),
         choices=(*choices, *track.choices),
@@ -100,8 +90,7 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
 
 
 def _check_pixels(capture: cv2.VideoCapture, camera: Camera, path: Path) -> None:
-    """Raises `CameraError` where pixels of the video are not square, and those of the camera are
-    not of their shape."""
+    """Raises `CameraError` where pixels are not square, and not of the shape of the camera's."""
     wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
     stated = wide / high if wide > 0 and high > 0 else 1.0
     of_camera = camera.fy_px / camera.fx_px
@@ -115,52 +104,28 @@ def _check_pixels(capture: cv2.VideoCapture, camera: Camera, path: Path) -> None
 def _extent(path: Path, capture: cv2.VideoCapture) -> tuple[int, int, float]:
     """When the last frame is shown, the least number of frames of a whole video (0 where either is
     not known), and where its clock begins; of a video whose first frame was grabbed."""
-    fps, counted = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
-    if not (fps > 0 and counted > 0):
+    fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    if not (fps > 0 and frames > 0):
         return 0, 0, 0.0
-    index, whole, shown_s = _index(path)
-    begin_s = capture.get(cv2.CAP_PROP_PTS) / fps
-    if index.startswith(_STREAMED) or not 0 < begin_s < MAX_BEGIN_S:
+    held, begin_s = _ends(path), capture.get(cv2.CAP_PROP_PTS) / fps
+    if held.startswith(_STREAMED) or not 0 < begin_s < MAX_BEGIN_S:
         begin_s = 0.0
-    if index.startswith(_MATROSKA):
-        shown_s = counted / fps
-    frames = min(counted, (shown_s - begin_s) * fps) if shown_s > begin_s else counted
-    hidden = whole and frames < counted - 1
-    return round(max(0.0, frames - 1) / fps * 1e9), 0 if hidden else round(frames), begin_s
+    matroska, shown_s = held.startswith(_MATROSKA), frames / fps
+    if header := re.search(rb"(?s)moov.{4}mvhd(.{32})", held):  # ISO/IEC 14496-12, 8.2.2
+        late = header[1][0] == 1
+        scale, ticks = struct.unpack_from(">IQ" if late else ">II", header[1], 20 if late else 12)
+        shown_s = ticks / (scale or 1) or shown_s
+    shown = min(frames, (shown_s - begin_s) * fps) if matroska or header else frames
+    countable = matroska or shown > frames - 1  # edits may hide any number of frames
+    return round(max(0.0, shown - 1) / fps * 1e9), round(shown) if countable else 0, begin_s
 
 
-def _index(path: Path) -> tuple[bytes, bool, float]:
-    """The index of an MP4 or MOV, whether the file has all bytes that its boxes announce, and how
-    many seconds are shown, 0 where that is not stated (ISO/IEC 14496-12); of others the begin."""
-    start, end = 0, path.stat().st_size
+def _ends(path: Path) -> bytes:
+    """The begin and the end of a file: one of them has the index of an MP4 or MOV."""
     with path.open("rb") as stream:
-        index = stream.read(MAX_INDEX_BYTES // 20)
-        for _ in range(MAX_BOXES):
-            stream.seek(min(start, end))
-            size, kind, long = struct.unpack(">I4sQ", stream.read(16).ljust(16, b"\0"))
-            size = long if size == 1 else size or end - start
-            if size < 8 or start >= end:
-                break
-            if kind == b"moov":
-                stream.seek(start)
-                index = stream.read(min(size, MAX_INDEX_BYTES))
-            start += size
-    at = index.find(b"mvhd") + 4
-    if index[4:8] != b"moov" or len(index) < at + 32:
-        return index, False, 0.0
-    late = index[at] == 1
-    scale, ticks = struct.unpack_from(">IQ" if late else ">II", index, at + (20 if late else 12))
-    return index, start == end, ticks / scale if scale else 0.0
-
-
-def _zoomed_s(track: RecordedTrack, last_ns: int, options: SourceOptions) -> list[float]:
-    """Times of the views that are left out for their zoom."""
-    if track.zoomed is None:
-        return []
-    start_ns = track.origin_ns + options.time_offset_ns
-    end_s = min(last_ns, int(track.zoomed.time_ns[-1]) - start_ns) / 1e9
-    dues_s = np.arange(math.floor(end_s * options.rate_hz) + 1) / options.rate_hz
-    return [due for due in dues_s.tolist() if track.is_zoomed(start_ns + round(due * 1e9))]
+        begin = stream.read(MAX_END_BYTES)
+        stream.seek(max(len(begin), path.stat().st_size - MAX_END_BYTES))
+        return begin + stream.read(MAX_END_BYTES)
 
 
 def _track(
@@ -169,19 +134,17 @@ def _track(
     """Telemetry, its file, choices and warnings."""
     named = sorted(each for each in path.parent.iterdir() if each.stem == path.stem)
     beside = [each for suffix in SIDECARS for each in named if each.suffix.lower() == suffix]
-    telemetry_path, choices = options.telemetry, list[str]()
-    if telemetry_path is None and beside:
-        telemetry_path, *others = beside
-        why = "subtitles come before tables; --telemetry selects another file"
-        unused = [other.name for other in others]
-        choices = [chosen("telemetry", telemetry_path.name, unused, why)] if others else []
+    telemetry_path = options.telemetry or next(iter(beside), None)
     if telemetry_path is None:
-        held, _, _ = _index(path)
+        held = _ends(path)
         unread = [f"{text}, not read; " for part, text in _UNREAD.items() if re.search(part, held)]
         raise FlightError(
             f"no telemetry beside the video ({path.stem}.srt or .csv); "
             f"{'it holds ' if unread else ''}{''.join(unread)}give --telemetry: {path}"
         )
+    why = "subtitles come before tables; --telemetry selects another file"
+    unused = [] if options.telemetry else [each.name for each in beside[1:]]
+    choices = [chosen("telemetry", telemetry_path.name, unused, why)] if unused else []
     track = read_log(telemetry_path, options.mount_deg, options.topics)
     start_ns = track.origin_ns + options.time_offset_ns
     check_overlap(track, start_ns, start_ns + last_ns, telemetry_path)
@@ -206,7 +169,7 @@ def _views(
             stuck += time_ns <= before_ns
             if time_ns > before_ns and time_ns >= due / options.rate_hz * 1e9 - 1:
                 due = math.floor(time_ns / 1e9 * options.rate_hz + 1e-6) + 1
-                if not track.is_zoomed(start_ns + time_ns):
+                if track.zoomed is None or not track.zoomed.at(start_ns + time_ns)[0] > 0:
                     known = known_at(track, start_ns + time_ns, options)
                     where, (found, frame) = f"frame {number} of {path}", capture.retrieve()
                     load = partial(_grey, np.asarray(frame) if found else None, where)
