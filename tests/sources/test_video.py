@@ -270,6 +270,19 @@ def test_frames_that_edits_hide_are_not_missing(tmp_path):
         assert np.abs(view.grey().astype(int) - picture(number)).mean() < 6
 
 
+def test_frames_that_are_missing_besides_the_hidden_ones_are_named(tmp_path):
+    path = hidden(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), begin_s=0.5, shown_s=1.5)
+    subtitles(tmp_path / "a.srt", [dji_subtitle(n) for n in range(15)])
+    camera_file(tmp_path / "camera.json")
+    data = bytearray(path.read_bytes())
+    end = data.index(b"moov") - 4
+    begin = (data.index(b"mdat") + end) // 2
+    data[begin:end] = bytes(end - begin)
+    path.write_bytes(data)
+    with pytest.raises(FlightError, match=r"cut short: \d of 8 frames"):
+        list(open_source(path, options(path)).views)
+
+
 def test_a_clock_that_begins_late_is_named(tmp_path):
     """Time 0 is the first frame."""
     path = late(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), by_s=2.5)

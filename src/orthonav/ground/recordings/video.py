@@ -116,8 +116,8 @@ def _extent(path: Path, capture: cv2.VideoCapture) -> tuple[int, int, float]:
         scale, ticks = struct.unpack_from(">IQ" if late else ">II", header[1], 20 if late else 12)
         shown_s = ticks / (scale or 1) or shown_s
     shown = min(frames, (shown_s - begin_s) * fps) if matroska or header else frames
-    countable = matroska or shown > frames - 1  # edits may hide any number of frames
-    return round(max(0.0, shown - 1) / fps * 1e9), round(shown) if countable else 0, begin_s
+    least = shown if matroska or shown > frames - 1 else shown / 2  # hidden ones of another rate
+    return round(max(0.0, shown - 1) / fps * 1e9), round(least), begin_s
 
 
 def _ends(path: Path) -> bytes:
