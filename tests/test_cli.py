@@ -14,6 +14,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from helpers import Done
 from orthonav import __version__
@@ -223,6 +224,25 @@ def test_locate_pixel(run, map_path, short_flight, out):
     assert text.code == 0 and "95 % ellipse" in text.out
     refused(run(*to[:2], "none.jpg", *to[3:]), "no view 'none.jpg'")
     refused(run(*to, "--map", map_path), "no terrain")
+
+
+def test_locate_pixel_counts_in_the_image_as_stored(run, map_path, short_flight, out):
+    """Also where the orientation of EXIF has other programs turn it; it says so."""
+    fixes, turned = out / "fixes.jsonl", out / "turned"
+    assert run("localize", map_path, short_flight, "--out", fixes).code == 0
+    shutil.copytree(short_flight, turned)
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    data, segment = (turned / "frames/0001.jpg").read_bytes(), exif.tobytes()
+    segment = b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment
+    (turned / "frames/0001.jpg").write_bytes(data[:2] + segment + data[2:])
+    found = []
+    for folder, said in ((short_flight, False), (turned, True)):
+        done = run("locate-pixel", fixes, "0001.jpg", 10, 20, "--flight", folder, "--json")
+        found.append(json.loads(done.out))
+        assert found[-1].pop("shown_turned") is said
+        assert ("X and Y count as stored" in done.err) == said
+    assert found[0] == found[1]
 
 
 @pytest.mark.long

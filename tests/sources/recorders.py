@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import struct
 from types import SimpleNamespace
 
@@ -138,6 +139,63 @@ def video(path, frames=30, fps=10.0, code="FFV1"):
     for number in range(frames):
         writer.write(cv2.cvtColor(picture(number), cv2.COLOR_GRAY2BGR))
     writer.release()
+    return path
+
+
+def hidden(path, begin_s, shown_s):
+    """An MP4 whose edits hide what is before and after, as cutting without encoding does."""
+    data = bytearray(path.read_bytes())
+    ticks, *_ = struct.unpack_from(">I", data, data.index(b"mdhd") + 16)
+    edit = round(shown_s * 1000), round(begin_s * ticks)
+    struct.pack_into(">II", data, data.index(b"elst") + 12, *edit)
+    struct.pack_into(">I", data, data.index(b"mvhd") + 20, edit[0])
+    path.write_bytes(data)
+    return path
+
+
+def turned(path):
+    """An MP4 that players show upside down, by the matrix of its track."""
+    data = bytearray(path.read_bytes())
+    struct.pack_into(">9i", data, data.index(b"tkhd") + 44, -65536, 0, 0, 0, -65536, 0, 0, 0, 2**30)
+    path.write_bytes(data)
+    return path
+
+
+def late_by_250_ms(path):
+    """A Matroska file whose clock begins later."""
+
+    def later(found):
+        time_ms = int.from_bytes(found[1]) + 250
+        return b"\xe7\x82" + time_ms.to_bytes(2) if len(found[1]) == 2 else b"\xe7\x81\xfa"
+
+    data = re.sub(rb"\xe7(?:\x81(?=\0\xa3)|\x82(?=..\xa3))(..?)(?=\xa3)", later, path.read_bytes())
+    at = data.index(b"\x44\x89\x88") + 3
+    (length,) = struct.unpack_from(">d", data, at)
+    path.write_bytes(data[:at] + struct.pack(">d", length + 250) + data[at + 8 :])
+    return path
+
+
+def late(path, by_s):
+    """An MP4 whose first edit shows nothing."""
+    data = bytearray(path.read_bytes())
+    at = data.index(b"elst")
+    data[at + 11] = 2
+    data[at + 12 : at + 12] = struct.pack(">Iii", round(by_s * 1000), -1, 65536)
+    (ticks,) = struct.unpack_from(">I", data, data.index(b"mvhd") + 20)
+    struct.pack_into(">I", data, data.index(b"mvhd") + 20, ticks + round(by_s * 1000))
+    for kind in (b"moov", b"trak", b"edts", b"elst"):
+        (size,) = struct.unpack_from(">I", data, data.index(kind) - 4)
+        struct.pack_into(">I", data, data.index(kind) - 4, size + 12)
+    path.write_bytes(data)
+    return path
+
+
+def twice_as_wide(path):
+    """A Matroska file whose pixels are twice as wide as high; taken from its empty space."""
+    data = path.read_bytes()
+    size = b"\x54\xb0\x81" + bytes([2 * WIDTH]) + b"\x54\xba\x81" + bytes([HEIGHT])
+    data = data.replace(b"\x54\xb2\x81\x04", size + b"\x54\xb2\x81\x03")
+    path.write_bytes(data.replace(b"\xec\x01" + bytes(6) + b"\2\0\0", b"\xec\x81\0", 1))
     return path
 
 

@@ -76,6 +76,61 @@ def test_columns_by_many_names(images, header):
 
 
 @pytest.mark.parametrize(
+    "header, row, expected",
+    [
+        ("yaw (rad),pitch [rad],agl", "1.5707963,0.1745329,120", (90, 10, 0, 120)),
+        ("yaw_rad,pitch_rad,agl_ft", "-0.5235988,0,1000", (330, 0, 0, 304.8)),
+        ("yaw,pitch,Height (ft AGL)", "20,1,1000", (20, 1, 0, 304.8)),
+        ("yaw,pitch,height (cm)", "20,1,12000", (20, 1, 0, 120)),
+    ],
+)
+def test_units_of_the_header(images, header, row, expected):
+    found = views_of(images, f"file,{header}\na.png,{row}\n")
+    assert angles(found.by["a.png"]) == pytest.approx(expected, abs=1e-5)
+
+
+def test_headings_that_seem_to_be_in_radians_are_named(images):
+    for name in "defg":
+        (images / f"{name}.png").write_bytes((images / "a.png").read_bytes())
+    rows = "".join(
+        f"{name}.png,{yaw},120\n" for name, yaw in {"a": -3, "d": -2, "e": 0, "f": 1}.items()
+    )
+    assert "as in radians" in views_of(images, f"file,yaw,agl\n{rows}").warnings
+
+
+def test_a_table_of_metashape(images):
+    table = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll\na.png,2.5,46.5,400,30,1,2\n"
+    found = views_of(images, table, SourceOptions(fov_deg=60.0, ground_alt_m=280.0))
+    assert angles(found.by["a.png"]) == (30, 1, 2, 120)
+    assert found.by["a.png"].truth_latlon_deg == (46.5, 2.5)
+
+
+def test_columns_of_angles_that_are_not_read_are_named(images):
+    found = views_of(images, "file,lat,lon,agl,Omega,phi,kappa\na.png,46.5,2.5,120,1,2,3\n")
+    assert "columns Omega, phi, kappa are not read" in found.warnings
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        (
+            "location.txt",
+            "#name latitude/Y longitude/X height/Z yaw pitch roll SAlt\nA.png 46.5 2.5 9 1 2 3 0\n",
+        ),
+        ("geo.csv", "a.png,46.5,2.5,400\n"),
+    ],
+)
+def test_files_that_name_photographs_and_are_not_read_are_named(tmp_path, caplog, name, text):
+    """Of Mission Planner, and of Pix4D without a header."""
+    photo(tmp_path / "p/a.png", gps=place(46.5, 2.5))
+    (tmp_path / "p/notes.txt").write_text("words of b.png and others")
+    (tmp_path / "p" / name).write_text(text)
+    assert len(list(open_source(tmp_path / "p").views)) == 1
+    assert "not read, for want of a header such as file,yaw" in caplog.text
+    assert name in caplog.text and "notes.txt" not in caplog.text
+
+
+@pytest.mark.parametrize(
     "column, text, seconds",
     [
         ("timestamp", "1714557601500", 1_714_557_601.5),

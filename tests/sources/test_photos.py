@@ -10,10 +10,12 @@ from recorders import (
     PIX4D,
     SENSEFLY,
     START_S,
+    camera_file,
     dji,
     maker_notes,
     packet,
     photo,
+    picture,
     place,
 )
 
@@ -91,14 +93,40 @@ def test_angles_as_pix4d_names_them(tmp_path, make, roll):
         ("2023:11:14 23:13:20", {OFFSET: "+01:00"}, {}, 0, True),
         ("2023:11:14 17:13:20", {OFFSET: "-05:00", SUBSEC: "5"}, {}, 0.5, True),
         ("2023:11:14 22:13:20", {OFFSET: None, SUBSEC: "007"}, {}, 0.007, False),
-        # Two hours and some seconds after the GPS: the zone is two hours, the rest a slow clock.
-        ("2023:11:15 00:13:20", {OFFSET: None}, {29: "2023:11:14", 7: (22, 13, 25.5)}, 0, True),
         ("2023:11:14 22:13:20", {OFFSET: None}, {29: "x", 7: ()}, 0, False),
     ],
 )
 def test_times(tmp_path, time, more, gps, seconds, known):
     read = read_photo(photo(tmp_path / "a.jpg", time, more=more, gps=gps))
     assert (read.time_ns - START_S * 10**9, read.zone_known) == (round(seconds * 1e9), known)
+
+
+@pytest.mark.parametrize(
+    "time, offset, utc, said",
+    [
+        # Two hours and some seconds after the GPS: the zone is two hours, the rest a slow clock.
+        ("2023:11:15 00:13:20", None, (22, 13, 20), None),
+        ("2023:11:15 03:58:20", None, (22, 13, 20), None),  # 5:45 h, Nepal
+        ("2023:11:14 22:50:32", None, (22, 13, 25.5), "+2226 s"),  # 37 minutes are no zone
+        ("2023:11:15 00:13:20", "+01:00", (22, 13, 25.5), "+3594 s"),
+        ("2023:11:13 09:13:20", None, (22, 13, 25.5), "-133206 s"),  # 37 hours neither
+    ],
+)
+def test_a_clock_that_differs_from_the_gps(tmp_path, time, offset, utc, said):
+    for number in range(3):
+        day = {29: "2023:11:14", 7: (*utc[:2], utc[2] + number)}
+        each = f"{time[:-1]}{int(time[-1]) + number}"
+        photo(tmp_path / f"p/{number}.jpg", each, {OFFSET: offset}, place(46.5, 2.5) | day)
+    photo(
+        tmp_path / "p/3.jpg", f"{time[:-1]}{int(time[-1]) + 3}", {OFFSET: offset}, place(46.5, 2.5)
+    )
+    recording = open_source(tmp_path / "p")
+    warned = [each for each in recording.warnings if "clock of the camera" in each]
+    assert len(warned) == bool(said) and (said or "") in "".join(warned)
+    assert not any("UTC assumed" in each for each in recording.warnings)
+    off_s = utc[2] - 20
+    times = [view.telemetry.time_ns / 1e9 - START_S - off_s for view in recording.views]
+    assert times == pytest.approx([0, 1, 2, 3], abs=1e-6)
 
 
 @pytest.mark.parametrize("maker", [DJI, AUTEL])
@@ -114,6 +142,75 @@ def test_position_and_time_of_xmp_are_the_better_ones(tmp_path, maker, name):
     xmp = packet(UTCAtExposure="2023-11-14T22:13:20.073960")
     read = read_photo(photo(tmp_path / "a.jpg", time, {OFFSET: None}, xmp=xmp))
     assert read.time_ns == START_S * 10**9 + 73_960_000 and read.zone_known
+
+
+@pytest.mark.parametrize(
+    "gps, said",
+    [({9: "V"}, "without a fix"), ({10: "0"}, "without a fix"), ({31: 900.0}, "a large error")],
+)
+def test_a_position_without_a_fix_is_no_truth(tmp_path, gps, said):
+    xmp = dji().replace("drone-dji:Flight", 'drone-dji:GpsLatitude="46.5" drone-dji:Flight', 1)
+    xmp = xmp.replace("drone-dji:Flight", 'drone-dji:GpsLongitude="2.5" drone-dji:Flight', 1)
+    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5) | gps, xmp=xmp)
+    recording = open_source(tmp_path / "p")
+    assert any(said in each for each in recording.warnings)
+    assert next(recording.views).truth_latlon_deg is None
+    photo(tmp_path / "q/a.jpg", gps=place(46.5, 2.5) | {9: "A", 10: "3", 31: 9.0, 11: 1.2}, xmp=xmp)
+    assert next(open_source(tmp_path / "q").views).truth_latlon_deg == (46.5, 2.5)
+
+
+@pytest.mark.parametrize("reference", [b"\1", b"\3"])
+def test_altitudes_below_the_sea(tmp_path, reference):
+    gps = place(46.5, 2.5, alt=12.0) | {5: reference}
+    assert read_photo(photo(tmp_path / "a.jpg", gps=gps)).alt_m == -12
+
+
+def test_a_photograph_that_programs_turn_is_used_as_stored(tmp_path):
+    for number, tag in enumerate((1, 3, 8)):
+        time = f"2023:11:14 22:13:2{number}"
+        photo(tmp_path / f"p/{number}.jpg", time, first={0x0112: tag}, xmp=dji(), seed=number)
+    recording = open_source(tmp_path / "p")
+    assert any("show 2 of 3 photographs turned" in each for each in recording.warnings)
+    stored = read_image(tmp_path / "p/1.jpg")
+    assert np.array_equal([*recording.views][1].grey(), stored)
+    assert np.abs(stored.astype(int) - picture(1)).mean() < 6
+
+
+PARROT = "drone-parrot", "http://www.parrot.com/drone-parrot/1.0/"
+SKYDIO = "drone-skydio", "http://www.skydio.com/drone-skydio/1.0/"
+
+
+@pytest.mark.parametrize("nested", [True, False])
+def test_parrot_and_skydio(tmp_path, nested):
+    """Their cameras look ahead at 0, 0, 0, as DJI's do."""
+    xmp = packet(PARROT, CameraYawDegree="30.5", CameraPitchDegree="-80", CameraRollDegree="0")
+    assert attitude(read_photo(photo(tmp_path / "a.jpg", xmp=xmp))) == pytest.approx((30.5, 10, 0))
+    names = {"Roll": "0", "Pitch": "-80.0", "Yaw": "30.5"}
+    attributes = " ".join(f'drone-skydio:{name}="{value}"' for name, value in names.items())
+    camera = f"<drone-skydio:CameraOrientationNED {attributes}/>"
+    if nested:
+        inner = "".join(f"<drone-skydio:{n}>{v}</drone-skydio:{n}>" for n, v in names.items())
+        camera = 'CameraOrientationNED rdf:parseType="Resource"'
+        camera = f"<drone-skydio:{camera}>{inner}</drone-skydio:CameraOrientationNED>"
+    body = camera.replace("Camera", "Vehicle").replace("30.5", "99").replace("-80.0", "1")
+    xmp = packet(SKYDIO).replace("</rdf:Description>", f"{camera}{body}</rdf:Description>")
+    assert attitude(read_photo(photo(tmp_path / "b.jpg", xmp=xmp))) == pytest.approx((30.5, 10, 0))
+
+
+@pytest.mark.parametrize(
+    "maker, gps, named",
+    [
+        (("Maker", "http://maker.com/"), {}, "Maker:MountYaw"),
+        (DJI, {16: "M", 17: 30.0}, "GPSImgDirection"),
+    ],
+)
+def test_angles_that_are_not_read_are_named(tmp_path, maker, gps, named):
+    xmp = packet(maker, **({"MountYaw": "30.5"} if maker[0] == "Maker" else {}))
+    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5) | gps, xmp=xmp)
+    recording = open_source(tmp_path / "p")
+    said = f"such as angles of {named}, which are not read"
+    assert any(said in each for each in recording.warnings)
+    assert "yaw_deg" in next(recording.views).telemetry.missing()
 
 
 def test_missing_metadata_stays_missing(tmp_path):
@@ -227,6 +324,17 @@ def test_a_gimbal_that_reports_zero_was_not_recorded(tmp_path):
     assert [each.yaw_deg for each in reported] == pytest.approx([152.0, 205.8, 0.0])
     assert all(each.pitch_deg == each.roll_deg == 0 for each in reported)
     assert {(each.tilt_std_deg, each.mount_std_deg) for each in reported} == {(6.0, None)}
+
+
+def test_angles_that_are_all_zero_were_not_recorded(tmp_path):
+    for second in range(2):
+        time = f"2023:11:14 22:13:2{second}"
+        photo(tmp_path / f"p/{second}.jpg", time, xmp=gimbal(0, 0, 0, 0))
+        photo(tmp_path / f"q/{second}.jpg", time, xmp=packet(PIX4D, Yaw="0", Pitch="0.0", Roll="0"))
+    assert "gimbal angles of 2 photographs are all 0" in open_source(tmp_path / "p").warnings[0]
+    for view in views_of(tmp_path / "p"):
+        assert view.telemetry.missing() == ["yaw_deg"]
+    assert "yaw_deg" in views_of(tmp_path / "q")[0].telemetry.missing()
 
 
 # Focal lengths.
@@ -420,6 +528,39 @@ def test_photographs_of_another_focal_length_are_left_out(tmp_path, other):
     )
     assert [view.frame for view in recording.views] == ["0.jpg", "1.jpg", "none.jpg"]
     assert recording.camera.fx_px == pytest.approx(math.hypot(64, 48) * 24 / math.hypot(36, 24))
+
+
+def test_as_many_photographs_of_several_cameras_are_not_guessed(tmp_path):
+    """As of a drone with several cameras that expose together."""
+    for number in range(2):
+        time = f"2023:11:14 22:13:2{number}"
+        photo(tmp_path / f"p/{number}_W.jpg", time, xmp=dji())
+        photo(tmp_path / f"p/{number}_T.jpg", time, width=32, height=24)
+        photo(tmp_path / f"q/{number}_W.jpg", time, xmp=dji())
+        photo(tmp_path / f"q/{number}_Z.jpg", time, {0xA405: 162, 0x920A: 30}, xmp=dji())
+    for folder, other in (("p", "T"), ("q", "Z")):
+        with pytest.raises(
+            FlightError, match=f"2 as ._{other}.jpg.*; give the files of one camera"
+        ):
+            open_source(tmp_path / folder)
+        found = open_source(sorted((tmp_path / folder).glob("*_W.jpg")))
+        assert found.expected == 2
+
+
+def test_a_table_comes_before_the_clock(tmp_path):
+    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5) | {29: "2023:11:14", 7: (20, 1, 2)})
+    (tmp_path / "p/t.csv").write_text("file,yaw,time\na.jpg,1,7\n")
+    assert next(open_source(tmp_path / "p").views).telemetry.time_ns == 7 * 10**9
+
+
+def test_photographs_of_another_focal_length_are_left_out_with_a_camera_file_too(tmp_path):
+    for number in range(3):
+        more = {0xA405: 48, 0x920A: 17.6} if number == 1 else {}
+        photo(tmp_path / f"p/{number}.jpg", f"2023:11:14 22:13:2{number}", more, xmp=dji())
+    camera = camera_file(tmp_path / "camera.json")
+    recording = open_source(tmp_path / "p", SourceOptions(camera=camera))
+    assert [view.frame for view in recording.views] == ["0.jpg", "2.jpg"]
+    assert "1 of 3 photographs left out, of another focal length" in recording.warnings[0]
 
 
 def test_focal_lengths_that_differ_by_rounding_are_one(tmp_path):

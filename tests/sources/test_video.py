@@ -1,12 +1,24 @@
 """Videos with subtitles or a table: times, dialects, and what is broken."""
 
 import math
+import struct
 
 import numpy as np
 import pytest
-from recorders import camera_file, dji_subtitle, picture, subtitles, video
+from recorders import (
+    camera_file,
+    dji_subtitle,
+    hidden,
+    late,
+    late_by_250_ms,
+    picture,
+    subtitles,
+    turned,
+    twice_as_wide,
+    video,
+)
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.logs import blocks
@@ -210,3 +222,129 @@ def test_views_after_the_end_of_the_subtitles_have_no_telemetry(recorded, tmp_pa
     done = import_flight(recording, tmp_path / "flight")
     assert (done.views, done.complete, done.with_truth) == (6, 3, 3)
     assert {lon for _, lon in read_truth(tmp_path / "flight/truth.csv").values()} == {2.5}
+
+
+# Zoom, edits, clocks, pixels.
+
+
+def test_views_of_another_zoom_are_left_out(recorded):
+    """Some models write a digital zoom of 1 as 10000."""
+    forms = "dzoom_ratio: {:.2f}", "dzoom_ratio: {:.0f}0000, delta:0", "digital zoom {}", "DZOOM {}"
+    for form in forms:
+        texts = [f"{dji_subtitle(n)} [{form.format(4 if n >= 20 else 1)}]" for n in range(30)]
+        subtitles(recorded.with_suffix(".SRT"), texts)
+        recording = open_source(recorded, options(recorded, rate_hz=2.0))
+        said = (
+            "10 of 30 subtitles state another zoom than most, the first at 2.0 s; views there are"
+        )
+        assert any(said in each for each in recording.warnings)
+        assert [view.telemetry.time_ns / 1e9 for view in recording.views] == [0, 0.5, 1, 1.5]
+
+
+def test_views_of_another_focal_length_are_left_out(recorded):
+    texts = [dji_subtitle(n).replace("24.00", "48.00" if n < 5 else "24.00") for n in range(30)]
+    subtitles(recorded.with_suffix(".SRT"), texts)
+    recording = open_source(recorded, options(recorded))
+    assert [view.telemetry.time_ns / 1e9 for view in recording.views] == [1, 2]
+
+
+def test_a_digital_zoom_of_the_whole_flight_is_named(recorded):
+    texts = [f"{dji_subtitle(n)} [dzoom_ratio: 20000, delta:0]" for n in range(30)]
+    subtitles(recorded.with_suffix(".SRT"), texts)
+    recording = open_source(recorded, options(recorded))
+    assert "state a digital zoom of 2: --camera" in recording.warnings[0]
+    assert len(list(recording.views)) == 3
+
+
+def test_frames_that_edits_hide_are_not_missing(tmp_path):
+    """As of a video that was cut without encoding it again; time 0 is the first frame shown."""
+    path = hidden(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), begin_s=0.5, shown_s=1.5)
+    subtitles(tmp_path / "a.srt", [dji_subtitle(n, yaw=n) for n in range(15)])
+    camera_file(tmp_path / "camera.json")
+    recording = open_source(path, options(path, rate_hz=2.0))
+    views = list(recording.views)
+    assert recording.expected == 3 and "ends" not in "".join(recording.warnings)
+    assert [view.telemetry.time_ns / 1e9 for view in views] == [0, 0.5, 1]
+    assert [view.telemetry.yaw_deg for view in views] == pytest.approx([0, 5, 10])
+    for view, number in zip(views, (5, 10, 15), strict=True):
+        assert np.abs(view.grey().astype(int) - picture(number)).mean() < 6
+
+
+def test_frames_that_are_missing_besides_the_hidden_ones_are_named(tmp_path):
+    path = hidden(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), begin_s=0.5, shown_s=1.5)
+    subtitles(tmp_path / "a.srt", [dji_subtitle(n) for n in range(15)])
+    camera_file(tmp_path / "camera.json")
+    data = bytearray(path.read_bytes())
+    end = data.index(b"moov") - 4
+    begin = (data.index(b"mdat") + end) // 2
+    data[begin:end] = bytes(end - begin)
+    path.write_bytes(data)
+    with pytest.raises(FlightError, match=r"cut short: \d of 8 frames"):
+        list(open_source(path, options(path)).views)
+
+
+def test_a_clock_that_begins_late_is_named(tmp_path):
+    """Time 0 is the first frame."""
+    path = late(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), by_s=2.5)
+    subtitles(tmp_path / "a.srt", [dji_subtitle(n, yaw=n) for n in range(20)])
+    camera_file(tmp_path / "camera.json")
+    recording = open_source(path, options(path))
+    assert "begins at 2.5 s; time 0 is its first frame" in recording.warnings[0]
+    views = list(recording.views)
+    assert recording.expected == len(views) == 2
+    assert [view.telemetry.yaw_deg for view in views] == pytest.approx([0, 10])
+
+
+def test_the_time_before_the_first_frame_holds_no_missing_frames(recorded):
+    late_by_250_ms(recorded)
+    recording = open_source(recorded, options(recorded))
+    assert recording.expected == len(list(recording.views)) == 3
+
+
+def test_pixels_that_are_not_square(recorded):
+    twice_as_wide(recorded)
+    with pytest.raises(
+        CameraError, match=r"2\.000 times as wide as high, those of the camera 1\.0"
+    ):
+        open_source(recorded, options(recorded))
+    camera_file(recorded.parent / "camera.json", fx_px=30.0)
+    assert open_source(recorded, options(recorded)).camera.fx_px == 30
+
+
+def test_a_video_that_players_turn_is_used_as_stored(tmp_path):
+    path = turned(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"))
+    subtitles(tmp_path / "a.srt", [dji_subtitle(n) for n in range(20)])
+    camera_file(tmp_path / "camera.json")
+    recording = open_source(path, options(path))
+    assert (
+        "players show the video turned by 180 deg; its frames are used as stored"
+        in recording.warnings[0]
+    )
+    assert np.abs(next(recording.views).grey().astype(int) - picture(0)).mean() < 6
+
+
+@pytest.mark.parametrize(
+    "format_, said",
+    [
+        (b"tx3g", "subtitles .ffmpeg -i"),
+        (b"gpmd", "telemetry of GoPro"),
+        (b"djmd", "telemetry of DJI"),
+    ],
+)
+def test_telemetry_in_the_video_itself_is_named(tmp_path, format_, said):
+    path = video(tmp_path / "a.mp4", 20, 10.0, "mp4v")
+    data = path.read_bytes()
+    at, end = data.index(b"moov") - 4, data.index(b"udta") - 4
+    track = data[data.index(b"trak") - 4 : end].replace(b"mp4v", format_).replace(b"vide", b"meta")
+    (size,) = struct.unpack_from(">I", data, at)
+    index = struct.pack(">I", size + len(track)) + data[at + 4 : end] + track + data[end:]
+    path.write_bytes(data[:at] + index)
+    with pytest.raises(FlightError, match=f"it holds {said}.*not read; give --telemetry"):
+        open_source(path, SourceOptions(fov_deg=60.0))
+
+
+def test_of_subtitles_and_a_table_the_subtitles_are_used_and_named(recorded):
+    recorded.with_suffix(".csv").write_text("time_s,pitch_deg,roll_deg\n0,0,0\n3,0,0\n")
+    recording = open_source(recorded, options(recorded))
+    assert recording.choices[0].startswith("telemetry: using DJI_0001.SRT, not DJI_0001.csv: ")
+    assert next(recording.views).telemetry.yaw_deg == pytest.approx(355)

@@ -1,6 +1,7 @@
 """`orthonav locate-pixel`: where on the ground a pixel of a placed view lies."""
 
 import argparse
+import contextlib
 import logging
 import math
 from pathlib import Path
@@ -26,8 +27,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "fixes, as written by `orthonav localize`"
     add("fixes", type=Path, metavar="fixes.jsonl", help=text)
     add("frame", metavar="FRAME", help="name of the view, as in the file")
-    add("x", type=float, metavar="X", help="pixels from the left border")
-    add("y", type=float, metavar="Y", help="pixels from the upper border")
+    add("x", type=float, metavar="X", help="pixels from the left border, as stored")
+    add("y", type=float, metavar="Y", help="pixels from the upper border, as stored")
     text = "flight folder that was localized, for camera, pitch and roll"
     add("--flight", type=Path, required=True, metavar="FLIGHT_DIR", help=text)
     text = "map of the flight, whose terrain is the ground (default: level ground)"
@@ -64,6 +65,7 @@ def run(options: argparse.Namespace) -> None:
     other = read_identity(options.fixes).differences(given, options.map, options.flight)
     if other:
         log.warning("fixes are of %s: %s", other, options.fixes)
+    turned = _is_turned(view.path)
     found = locate_pixel(_camera(flight, view), telemetry, fix, (options.x, options.y), terrain)
     height_m = found.height_m if _is_above_sea(terrain) else math.nan
     ellipse = ellipse_95(found.cov_en_m2)
@@ -75,6 +77,7 @@ def run(options: argparse.Namespace) -> None:
         "cov_en_m2": found.cov_en_m2.tolist(),
         "ellipse_95": ellipse,
         "confident": result.is_confident,
+        "shown_turned": turned,
     }
     if options.json:
         print_json(plain)
@@ -88,6 +91,18 @@ def run(options: argparse.Namespace) -> None:
     print(f"95 % ellipse {axes}; {found.range_m:.0f} m from the camera")
     if not result.is_confident:
         print("! the position of this view is a best guess")
+
+
+def _is_turned(path: Path) -> bool:
+    from orthonav.core.errors import OrthonavError
+    from orthonav.ground.recordings.exif import read_photo
+
+    turned = False
+    with contextlib.suppress(OrthonavError):
+        turned = read_photo(path).turned
+    if turned:
+        log.warning("X and Y count as stored; other programs show it turned, by EXIF: %s", path)
+    return turned
 
 
 def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":

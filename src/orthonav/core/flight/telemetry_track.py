@@ -173,6 +173,7 @@ class RecordedTrack:
     """Source of the attitude, which says what was not reported."""
     prior: TimeSeries | None = None
     """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
+    zoomed: TimeSeries | None = None  # 1 at another zoom than most of the time, else 0
     origin_ns: int = 0  # time at which a recording without a clock begins
     warnings: tuple[str, ...] = ()  # doubts about the log, for people
     choices: tuple[str, ...] = ()  # what was used where the log has several, by `chosen`

@@ -10,8 +10,8 @@ import re
 import struct
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
-from orthonav.core.flight.telemetry_track import measured
+from orthonav.core.flight.telemetry_track import LATEST_NS, measured
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
-from orthonav.ground.recordings.image_table import ImageRow
+from orthonav.ground.recordings.image_table import ImageRow, ns_of
 
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -165,45 +165,44 @@ def _of_plane(optics: Optics, width_px: int, height_px: int) -> FocalLength | No
     unit_mm = _MM_PER_UNIT.get(optics.plane_unit, math.nan)
     taken_px = optics.taken_px if optics.taken_px > 0 else float(width_px)
     thinned = width_px / taken_px
-    px = optics.focal_mm * optics.plane / unit_mm * thinned
+    px, longer_px = optics.focal_mm * optics.plane / unit_mm * thinned, max(width_px, height_px)
     if not px > 0:
         return None
-    source = "focal length and sensor resolution of EXIF"
-    found = FocalLength(px, _PLANE_STD, source)
-    if found.field_deg(max(width_px, height_px)) <= MAX_FIELD_DEG:
-        return found
-    as_width = FocalLength(
-        optics.focal_mm / (optics.plane * unit_mm) * width_px,
-        _PLANE_STD,
-        "EXIF, with the sensor's width instead of its resolution",
+    found = FocalLength(px, _PLANE_STD, "focal length and sensor resolution of EXIF")
+    px = optics.focal_mm / (optics.plane * unit_mm) * width_px
+    as_width = replace(
+        found, px=px, source="EXIF, with the sensor's width instead of its resolution"
     )
-    believed = as_width.field_deg(max(width_px, height_px)) <= MAX_FIELD_DEG
-    return as_width if believed else found
+    wide = found.field_deg(longer_px) > MAX_FIELD_DEG
+    return as_width if wide and as_width.field_deg(longer_px) <= MAX_FIELD_DEG else found
 
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_XMP_TAG, _MAKE, _MODEL, _SOFTWARE = 700, 0x010F, 0x0110, 0x0131
+_XMP_TAG, _MAKE, _MODEL, _SOFTWARE, _ORIENTATION = 700, 0x010F, 0x0110, 0x0131, 0x0112
+MAX_POSITION_ERROR_M, MAX_DOP = 100.0, 20.0  # of positions that are no truth if they have more
 _TIME, _TIME_ORIGINAL, _MAKER_NOTE = 0x0132, 0x9003, 0x927C
 _OFFSET, _OFFSET_ORIGINAL = 0x9010, 0x9011
 _SUBSEC, _SUBSEC_ORIGINAL = 0x9290, 0x9291
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
 _ZOOM = 0xA404
-_QUARTER_HOUR = timedelta(minutes=15)
+_ZONE = re.compile(r"Z|[+-]\d\d:?\d\d")
 _FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
 _BODY_YAW, _CAMERA_ANGLES = 7, (10, 9, 11)  # yaw, pitch, roll
 _VALUE = re.compile(
-    r"(?<![/\w-])(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
+    r"(?<![/\w-])([A-Za-z][\w-]{0,20}:[A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
     r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
 )
 _NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
 """A number with a decimal point or comma, or a fraction."""
 _ANGLE_OR_PLACE = re.compile(
-    r"Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat|Lon"
+    r"(?:drone(?:-dji)?|Camera|sensefly):(?:Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat"
+    r"|Lon)"
 )
 """Values that a view is worse off without."""
+_SKYDIO = re.compile(r"(?s)(drone-skydio:CameraOrientationNED\b)(?:[^<>]*/>|.{0,600}?</\1)")
 _EXPOSED = re.compile(
     r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
-    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"
+    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)"
 )
 _WRITER = re.compile(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})")
 
@@ -218,6 +217,7 @@ class Photo:
     time_ns: int | None  # time of exposure, UTC
     zone_known: bool
     """Whether the time zone was known; otherwise the camera's clock is assumed to be UTC."""
+    gps_ns: int | None  # time of the GPS, which may be some seconds old
     latlon_deg: tuple[float, float] | None  # recorded position
     alt_m: float  # recorded altitude; its reference differs between makers
     gimbal_deg: tuple[float, float, float] | None
@@ -231,6 +231,7 @@ class Photo:
     vel_en_mps: tuple[float, float] | None  # velocity over ground, east and north
     optics: Optics  # camera and lens
     software: str  # programs that wrote the file; of a camera its firmware
+    turned: bool  # whether other programs show it turned, by the orientation of EXIF
     agl_m: float = math.nan  # height above ground, where a table states it
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
@@ -255,10 +256,10 @@ def read_photo(path: Path) -> Photo:
     make = _word(tags.get(_MAKE))
     notes = more.get(_MAKER_NOTE)
     gimbal, heading = read_maker_notes(notes if isinstance(notes, bytes) else b"", make)
-    time_ns, zone_known = xmp.time_ns, True
-    if time_ns is None:
-        time_ns, zone_known = _time(tags, more, gps)
-    latlon, alt, unsigned = _place(gps)
+    time_ns, zone_known = (xmp.time_ns, True) if xmp.time_ns else _time(tags, more)
+    if void := _void(gps):
+        gps = {}
+    latlon, alt, doubt = _place(gps)
     rtk = xmp.first("drone-dji:RtkFlag") > 0
     north, east = (
         xmp.first(f"drone-dji:Flight{axis}Speed", f"drone:Flight{axis}Speed") for axis in "XY"
@@ -266,19 +267,23 @@ def read_photo(path: Path) -> Photo:
     body_yaw = xmp.body_yaw_deg()
     if math.isnan(body_yaw) and not xmp.unread:
         body_yaw = heading
+    gimbal, rotation = xmp.gimbal_deg() or gimbal, xmp.rotation(make)
     doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)]
-    if unsigned:
-        doubts.append("GPS position without N or S, or without E or W")
+    if gimbal is None and rotation is None and math.isnan(body_yaw):
+        others = [name for name in xmp.values if "Yaw" in name or "Heading" in name]
+        others += ["GPSImgDirection"] if 17 in gps else []
+        doubts += [f"angles of {other}, which are not read" for other in others[:1]]
     return Photo(
         path=path,
         width_px=width,
         height_px=height,
         time_ns=time_ns,
         zone_known=zone_known,
-        latlon_deg=xmp.latlon_deg() or latlon,
+        gps_ns=_gps_time_ns(gps),
+        latlon_deg=None if void else xmp.latlon_deg() or latlon,
         alt_m=alt,
-        gimbal_deg=xmp.gimbal_deg() or gimbal,
-        rotation=xmp.rotation(make),
+        gimbal_deg=gimbal,
+        rotation=rotation,
         body_yaw_deg=body_yaw,
         home_m=measured(
             xmp.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
@@ -288,7 +293,8 @@ def read_photo(path: Path) -> Photo:
         vel_en_mps=(east, north) if math.isfinite(east + north) else None,
         optics=_optics(tags, more),
         software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
-        doubts=tuple(doubts),
+        turned=tags.get(_ORIENTATION, 1) not in (0, 1),
+        doubts=tuple(filter(None, (*doubts, void, doubt))),
     )
 
 
@@ -307,65 +313,57 @@ def _optics(tags: dict[int, Any], more: dict[int, Any]) -> Optics:
 
 
 def _word(value: Any) -> str:
-    return "" if value is None else str(value).strip("\0 ")
+    text = value.decode("latin-1") if isinstance(value, bytes) else value
+    return "" if value is None else str(text).strip("\0 ")
 
 
-def _time(
-    tags: dict[int, Any], more: dict[int, Any], gps: dict[int, Any]
-) -> tuple[int | None, bool]:
-    """UTC in ns, and whether the time zone was known.
-
-    The zone is that of `OffsetTimeOriginal`, else the difference between the camera's clock and
-    the time of the GPS, rounded to quarters of an hour.
-    """
+def _time(tags: dict[int, Any], more: dict[int, Any]) -> tuple[int | None, bool]:
+    """Time in ns by the camera's clock, and whether it is UTC, by `OffsetTimeOriginal`."""
     parts = (_TIME_ORIGINAL, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL)
     if not str(more.get(_TIME_ORIGINAL, "")).strip("\0 :"):
         more, parts = {**more, _TIME: tags.get(_TIME, "")}, (_TIME, _SUBSEC, _OFFSET)
-    text, fraction, offset = (str(more.get(part, "")).strip("\0 ") for part in parts)
-    try:
-        local = datetime.strptime(text, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-        zone = _offset(offset)
-        if zone is None and (utc := _gps_time(gps)) is not None:
-            zone = round((local - utc) / _QUARTER_HOUR) * _QUARTER_HOUR
-        whole = local - (zone or timedelta())
-    except (ValueError, OverflowError):  # the latter for the years 1 and 9999
-        return None, False
+    text, fraction, zone = (str(more.get(part, "")).strip("\0 ") for part in parts)
+    zone = zone if _ZONE.fullmatch(zone) else ""
     nanoseconds = int(fraction[:9].ljust(9, "0")) if fraction.isdecimal() else 0
-    return round(whole.timestamp()) * 10**9 + nanoseconds, zone is not None
-
-
-def _offset(text: str) -> timedelta | None:
     try:
-        return datetime.strptime(text, "%z").utcoffset()
+        moment = datetime.strptime(text + zone, "%Y:%m:%d %H:%M:%S" + "%z" * bool(zone))
     except ValueError:
-        return None
+        return None, False
+    time_ns = ns_of(moment) + nanoseconds
+    return (time_ns, bool(zone)) if abs(time_ns) < LATEST_NS else (None, False)
 
 
-def _gps_time(gps: dict[int, Any]) -> datetime | None:
+def _gps_time_ns(gps: dict[int, Any]) -> int | None:
     try:
         day = datetime.strptime(str(gps[29]).strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
         hours, minutes, seconds = (float(part) for part in gps[7])
-        return day + timedelta(hours=hours, minutes=minutes, seconds=seconds)
+        return round((day.timestamp() + hours * 3600 + minutes * 60 + seconds) * 1e9)
     except (KeyError, ValueError, TypeError, ZeroDivisionError, OverflowError):
         return None
 
 
-def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float, bool]:
-    """Latitude and longitude in degrees, altitude, and whether N, S, E or W is missing (tags 1 to
-    6)."""
-    alt = measured(_number(gps.get(6)) * (-1 if gps.get(5) in (1, b"\x01") else 1))
+def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float, str]:
+    """Latitude and longitude in degrees, altitude, and why there is none (tags 1 to 6)."""
+    alt = measured(_number(gps.get(6)) * (-1 if gps.get(5) in (1, 3, b"\x01", b"\x03") else 1))
     try:
         lat, lon = (sum(float(part) / 60**i for i, part in enumerate(gps[tag])) for tag in (2, 4))
     except (KeyError, ValueError, TypeError, ZeroDivisionError):
-        return None, alt, False
-    references = [gps.get(tag, "") for tag in (1, 3)]
-    texts = [one.decode("latin-1") if isinstance(one, bytes) else str(one) for one in references]
-    north, east = (text.upper().strip("\0 ")[:1] for text in texts)
+        return None, alt, ""
+    north, east = (_word(gps.get(tag)).upper()[:1] for tag in (1, 3))
     if north not in tuple("NS") or east not in tuple("EW"):
-        return None, alt, True
+        return None, alt, "GPS position without N or S, or without E or W"
     lat, lon = -lat if north == "S" else lat, -lon if east == "W" else lon
     sound = abs(lat) <= 90 and abs(lon) <= 360 and (lat, lon) != (0.0, 0.0)
-    return ((lat, lon) if sound else None), alt, False
+    return ((lat, lon) if sound else None), alt, ""
+
+
+def _void(gps: dict[int, Any]) -> str:
+    """Why the receiver's values are not used, empty where they are."""
+    if _word(gps.get(9)).upper() == "V" or _word(gps.get(10)) == "0":
+        return "GPS position without a fix (GPSStatus, GPSMeasureMode)"
+    if _number(gps.get(31)) > MAX_POSITION_ERROR_M or _number(gps.get(11)) > MAX_DOP:
+        return "GPS position with a large error (GPSHPositioningError, GPSDOP)"
+    return ""
 
 
 def _number(value: Any) -> float:
@@ -385,9 +383,8 @@ def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float]
     if make.upper() != "DJI":
         return None, math.nan
     values: dict[int, float] = {}
-    for (
-        order
-    ) in "<>":  # programs that rewrite EXIF may change its byte order, not that of the notes
+    # Programs that rewrite EXIF may change its byte order, not that of the notes.
+    for order in "<>":
         count = struct.unpack_from(f"{order}H", data.ljust(2, b"\0"))[0]
         if values or not 1 <= count <= _MAX_ENTRIES or len(data) < 2 + count * _ENTRY_BYTES:
             continue
@@ -413,13 +410,15 @@ class Xmp:
     @classmethod
     def of(cls, packet: str | bytes) -> "Xmp":
         text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
-        texts = {f"{maker}:{name}": value for maker, name, value in _VALUE.findall(text)}
+        camera = _SKYDIO.search(text)  # its names are those of the aircraft's angles too
+        skydio = camera[0].replace("drone-skydio:", "skydio:") if camera else ""
+        texts = dict(_VALUE.findall(skydio + text))
         found = {name: _stated(value) for name, value in texts.items()}
         values = {name: value for name, value in found.items() if math.isfinite(value)}
         unread = tuple(
             f"{name}={texts[name]!r:.40}"
             for name in found.keys() - values.keys()
-            if _ANGLE_OR_PLACE.match(name.partition(":")[2])
+            if _ANGLE_OR_PLACE.match(name)
         )
         writer = _WRITER.search(text)
         return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread)
@@ -441,7 +440,8 @@ class Xmp:
 
     def gimbal_deg(self) -> tuple[float, float, float] | None:
         """Yaw, pitch and roll of the gimbal, of a camera that looks ahead at 0, 0, 0."""
-        return self._angles("drone-dji:Gimbal{}Degree") or self._angles("drone:Gimbal{}Degree")
+        forms = "drone-dji:Gimbal{}Degree", "drone:Gimbal{}Degree", "drone-parrot:Camera{}Degree"
+        return next(filter(None, map(self._angles, (*forms, "skydio:{}"))), None)
 
     def body_yaw_deg(self) -> float:
         """Heading of the aircraft; NaN where a gimbal has another one that cannot be read."""
@@ -457,7 +457,7 @@ class Xmp:
         if math.isfinite(heading + pitch + roll):  # of the body; the camera looks straight down
             return enu_from_camera(heading, pitch, roll)
         angles = self._angles("Camera:{}")
-        if angles is None:
+        if angles is None or not any(angles):  # 0, 0, 0 was not recorded
             return None
         # senseFly uses the names of Pix4D with the opposite sign of roll.
         yaw, pitch, roll = angles
@@ -477,12 +477,9 @@ def _stated(text: str) -> float:
 
 
 def _exposed_ns(text: str) -> int | None:
-    found = _EXPOSED.search(text)
-    if found is None:
+    if (found := _EXPOSED.search(text)) is None:
         return None
     try:
-        whole = datetime.strptime(" ".join(found.groups()[:6]), "%Y %m %d %H %M %S")
+        return ns_of(datetime.fromisoformat("{}-{}-{}T{}".format(*found.groups())))
     except ValueError:
         return None
-    whole = whole.replace(tzinfo=UTC)
-    return round(whole.timestamp()) * 10**9 + int((found[7] or "0").ljust(9, "0"))

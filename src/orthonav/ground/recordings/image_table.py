@@ -7,7 +7,7 @@ counts it, where -90 looks straight down; any other is in the convention of orth
 import math
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -22,12 +22,14 @@ from orthonav.core.flight.folder import check_latlon, number_of
 from orthonav.core.flight.telemetry_track import measured
 from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import attitude_of
+from orthonav.core.geo.headings import RADIANS, seem_radians
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
 from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED, UNSTATED
 
 MAX_BYTES = 100_000_000
+_SUFFIXES = (".csv", ".tsv", ".txt")
 _SYNONYMS = {
-    "file": ("file", "filename", "image", "sourcefile", "frame"),
+    "file": ("file", "filename", "image", "sourcefile", "frame", "imagename", "label", "photo"),
     "yaw": ("gimbalyaw", "yaw", "heading"),
     "body_yaw": ("yaw", "heading"),
     "pitch": ("gimbalpitch", "pitch"),
@@ -36,20 +38,24 @@ _SYNONYMS = {
     "home": ("home", "relativealtitude"),
     "amsl": ("amsl",),
     "hae": ("hae",),
-    "alt": ("altitude",),
-    "lat": ("lat", "latitude"),
-    "lon": ("lon", "longitude"),
+    "alt": ("altitude", "zaltitude"),
+    "lat": ("lat", "latitude", "ylatitude"),
+    "lon": ("lon", "longitude", "xlongitude"),
     "time": ("time", "timestamp", "datetimeoriginal"),
 }
 _BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]")
-_FEET = ("ft", "feet", "foot")
-_UNITS = ("deg", "degree", "degrees", "m", "meter", "meters", "metre", "metres", "s", *_FEET)
+_SCALES = dict.fromkeys(("ft", "feet", "foot"), 0.3048) | {"km": 1000.0, "cm": 0.01}
+_SCALES |= dict.fromkeys(("rad", "radian", "radians"), math.degrees(1.0))
+_UNITS = ("deg", "degree", "degrees", "m", "meter", "meters", "metre", "metres", "s", *_SCALES)
+_UNREAD = re.compile(r"omega|phi|kappa|q[wxyz]")
 _EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
 _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 _GIMBAL_DEG = -45.0
 """A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
 _DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")  # as EXIF writes it
 _LARGEST_S = 9e9
+Columns = Mapping[str, tuple[str, float]]  # name in the table and scale, by field
+_HEAD_BYTES = 100_000
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ class ImageTable:
 
 def is_image_table(path: Path) -> bool:
     """Whether a file is a CSV with a column of file names and others that a view needs."""
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt") or not path.is_file():
+    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
         return False
     with path.open("rb") as stream:
         header = stream.readline(MAX_LINE_CHARS).decode("utf-8-sig", errors="replace")
@@ -145,15 +151,8 @@ def read_image_table(path: Path) -> ImageTable:
             rows[name] = _row(order, values, time_ns, gimbal, unrecorded)
     if not rows:
         raise FlightError(f"table names no image: {path}")
-    warnings = _missing(columns, path)
-    if unrecorded:
-        warnings.append(f"{UNRECORDED}: {path}")
-    elif gimbal and "gimbal" not in columns["pitch"][0].lower():
-        warnings.append(
-            f"pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight "
-            f"down: {path}"
-        )
-    return ImageTable(path, rows, tuple(warnings))
+    doubts = _doubts(columns, table.columns, found, gimbal, unrecorded)
+    return ImageTable(path, rows, tuple(f"{doubt}: {path}" for doubt in doubts))
 
 
 def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
@@ -162,7 +161,7 @@ def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
     for field, synonyms in _SYNONYMS.items():
         name = next((spelt[each] for each in synonyms if each in spelt), None)
         if name is not None:
-            found[field] = name, 0.3048 if _unit(name) in _FEET else 1.0
+            found[field] = name, _scale(name)
     return found
 
 
@@ -173,21 +172,17 @@ def _plain(name: str) -> str:
     return "".join(words).removesuffix("degree")
 
 
-def _unit(name: str) -> str:
+def _scale(name: str) -> float:
     bracket = _BRACKETS.search(name.lower())
     words = re.findall(r"[a-z]+", bracket[1] if bracket else name.lower())
-    return words[-1] if words else ""
+    return next((_SCALES[word] for word in words if word in _SCALES), 1.0)
 
 
 def _numbers(
-    texts: Mapping[str, str],
-    columns: Mapping[str, tuple[str, float]],
-    line: int,
-    comma: bool,
-    path: Path,
+    texts: Mapping[str, str], columns: Columns, line: int, comma: bool, path: Path
 ) -> dict[str, float]:
     values = {}
-    for field, (name, metres) in columns.items():
+    for field, (name, scale) in columns.items():
         text = texts[field]
         if field in ("file", "time") or text.lower() in _EMPTY:
             continue
@@ -196,16 +191,14 @@ def _numbers(
         value = number_of(text)
         if not math.isfinite(value):
             raise FlightError(f"line {line}: {name} is not a number, got {text!r:.40}: {path}")
-        values[field] = measured(metres * value) if field in _HEIGHTS else value
+        values[field] = measured(scale * value) if field in _HEIGHTS else scale * value
     lat, lon = values.get("lat", math.nan), values.get("lon", math.nan)
     if not math.isnan(lat + lon):
         check_latlon(lat, lon, line, path)
     return values
 
 
-def _is_gimbal(
-    columns: Mapping[str, tuple[str, float]], rows: Sequence[Mapping[str, float]]
-) -> bool:
+def _is_gimbal(columns: Columns, rows: Sequence[Mapping[str, float]]) -> bool:
     if "pitch" not in columns:
         return False
     known = [values["pitch"] for values in rows if "pitch" in values]
@@ -273,12 +266,36 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
             f"line {line}: time must be seconds or a date such as 2024-05-01T10:00:00Z, got "
             f"{text!r:.40}: {path}"
         ) from error
+    return ns_of(moment)
+
+
+def ns_of(moment: datetime) -> int:
+    """Nanoseconds since 1970 of a time, UTC without a zone."""
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    whole = moment.replace(microsecond=0)
-    return round(whole.timestamp()) * 10**9 + moment.microsecond * 1000
+    return round(moment.replace(microsecond=0).timestamp()) * 10**9 + moment.microsecond * 1000
 
 
-def _missing(columns: Mapping[str, tuple[str, float]], path: Path) -> list[str]:
+def _doubts(
+    columns: Columns, held: list[str], rows: list[dict[str, float]], gimbal: bool, unrecorded: bool
+) -> Iterator[str]:
     lacks = [] if "yaw" in columns else ["heading (yaw or heading)"]
     lacks += [] if set(_HEIGHTS) & columns.keys() else ["height (agl or height)"]
-    return [f"table has no column of {' and of '.join(lacks)}: {path}"] if lacks else []
+    if lacks:
+        yield f"table has no column of {' and of '.join(lacks)}"
+    if unread := [name for name in held if _UNREAD.fullmatch(_plain(name))]:
+        yield f"columns {', '.join(unread)} are not read"
+    if seem_radians([values.get("yaw", math.nan) for values in rows]):
+        yield RADIANS
+    if unrecorded:
+        yield UNRECORDED
+    elif gimbal and "gimbal" not in columns["pitch"][0].lower():
+        yield "pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight down"
+
+
+def names_images(path: Path, names: Collection[str]) -> bool:
+    """Whether a text names some of these images, in lower case."""
+    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        text = stream.read(_HEAD_BYTES).decode("utf-8", errors="replace").lower()
+    return not set(re.split(r"[\s,;\"/\\]+", text)).isdisjoint(names)

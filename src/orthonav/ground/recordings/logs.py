@@ -3,7 +3,7 @@
 import contextlib
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -213,7 +213,7 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
                 local, [local["vy"], local["vx"]], shift_us, _flag(local, "v_xy_valid", 1) != 0
             ),
             origin_ns=int(attitude.time_ns[0]),
-            warnings=warnings,
+            warnings=tuple(warnings),
         )
 
 
@@ -314,6 +314,8 @@ _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
 _HOME = re.compile(r"\bHOME\s*\(")
 _HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
 _GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
+_DIGITAL_ZOOM = re.compile(rf"\bd(?:igital)?[_ ]?zoom[a-z_]*\s*:?\s*{_NUMBER}", re.IGNORECASE)
+SAME_ZOOM = 0.02  # zooms that differ by less, as a fraction, are one
 NEEDED = ("time_s", "pitch_deg", "roll_deg")
 _COLUMNS = {
     "height": ("agl_m",),
@@ -391,6 +393,7 @@ class SubtitleBlock(NamedTuple):
     yaw_deg: float  # yaw of the gimbal, as are pitch and roll
     pitch_deg: float
     roll_deg: float
+    zoom: tuple[float, float]  # focal length, in any unit, and digital zoom
 
 
 def read_srt(path: Path) -> RecordedTrack:
@@ -401,25 +404,51 @@ def read_srt(path: Path) -> RecordedTrack:
     found = list(blocks(data))
     if not found:
         raise FlightError(f"subtitles hold no telemetry: {path}")
-    attitude, position, height = Samples(3), Samples(3), Samples(1)
+    attitude, position, height, zoomed = Samples(3), Samples(3), Samples(1), Samples(1)
     unrecorded = not any(
         (each.yaw_deg, each.pitch_deg, each.roll_deg) != (0, 0, 0) for each in found
     )
-    for block in [*found, found[-1]._replace(start_ns=found[-1].end_ns)]:
+    odd = _zoomed(found)
+    ending = found[-1]._replace(start_ns=found[-1].end_ns)
+    for block, other in zip([*found, ending], [*odd, odd[-1]], strict=True):
         gimbal = block.yaw_deg, block.pitch_deg, block.roll_deg
         attitude.add(block.start_ns, *((math.nan, -90.0, 0.0) if unrecorded else gimbal))
         position.add(block.start_ns, block.lat_deg, block.lon_deg, block.alt_m)
         height.add(block.start_ns, block.height_m)
+        zoomed.add(block.start_ns, other)
+    warnings = [UNCLEAR_ORDER] * doubtful + [f"{UNRECORDED}: {path}"] * unrecorded
+    if any(odd):
+        warnings.append(
+            f"{sum(odd)} of {len(odd)} subtitles state another zoom than most, the first at "
+            f"{found[odd.index(True)].start_ns / 1e9:.1f} s; views there are left out: {path}"
+        )
+    most = (block.zoom[1] for block, other in zip(found, odd, strict=True) if not other)
+    if (digital := next(most, 1.0)) > 1 + SAME_ZOOM:
+        warnings.append(
+            f"most of the subtitles state a digital zoom of {digital:g}: --camera or --fov-deg "
+            f"must be that of this zoom: {path}"
+        )
     track = RecordedTrack(
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
         home=height.series(),
         position=position.positions(),
+        zoomed=zoomed.series(),
         tilt=ASSUMED if unrecorded else GIMBAL,
-        warnings=(UNCLEAR_ORDER,) * doubtful + (f"{UNRECORDED}: {path}",) * unrecorded,
+        warnings=tuple(warnings),
     )
     if track.attitude is None and track.position is None:
         raise FlightError(f"subtitles have neither position nor gimbal angles: {path}")
     return track
+
+
+def _zoomed(found: Sequence[SubtitleBlock]) -> list[bool]:
+    """Whether each states another focal length or digital zoom than most of them."""
+    odd = np.zeros(len(found), bool)
+    for zooms in np.array([each.zoom for each in found]).T:
+        values, counts = np.unique(zooms[zooms > 0], return_counts=True)
+        if len(values):
+            odd |= np.abs(zooms / values[counts.argmax()] - 1) > SAME_ZOOM
+    return list(map(bool, odd))
 
 
 def end_ns(track: RecordedTrack) -> int:
@@ -490,7 +519,10 @@ def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> S
     if not (abs(lat) <= 90 and abs(lon) <= 360):
         lat = lon = math.nan
     height, altitude = measured(height), measured(altitude)
-    return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll)
+    digital = _first(_DIGITAL_ZOOM, text)
+    digital = digital / 10_000 if digital >= 10_000 else digital  # some write 10000 for 1
+    zoom = fields.get("focal_len") or math.nan, digital if digital > 0 else 1.0
+    return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll, zoom)
 
 
 def _first(pattern: re.Pattern[str], text: str) -> float:

@@ -4,7 +4,8 @@ import logging
 import math
 import os
 import re
-from collections import Counter, defaultdict
+import statistics
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,16 +18,15 @@ from orthonav.core.errors import CameraError, FlightError, lfs_pointer
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_image
 from orthonav.core.flight.telemetry_track import RecordedTrack
-from orthonav.core.geo.attitude import (
-    enu_from_gimbal_camera,
-)
+from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
 from orthonav.core.tilt import ASSUMED, AUTOPILOT, GIMBAL, TiltSource
-from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, read_photo
+from orthonav.ground.recordings.exif import Photo, focal_length, read_photo
 from orthonav.ground.recordings.image_table import (
     ImageTable,
     is_image_table,
+    names_images,
     read_image_table,
 )
 from orthonav.ground.recordings.logs import read_log
@@ -48,8 +48,8 @@ from orthonav.ground.recordings.recording import (
 log = logging.getLogger(__name__)
 
 UNKNOWN_YAW_STD_DEG = 180.0  # standard deviation of a heading that may be off by any angle
-_TURNED_DEG = 5.0
-"""A gimbal follows the aircraft within a few degrees; at more it would not report 0."""
+ZONE_STEP_NS, MAX_LAG_NS = 900 * 10**9, 20 * 10**9
+"""Zones are quarters of an hour; a clock that is off by more than the latter is corrected."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _MAGICS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*")
 _EDITOR = re.compile(
@@ -97,15 +97,14 @@ def chosen_photos(sources: Sequence[Path], options: SourceOptions) -> ChosenPhot
     first, telemetry, table = sources[0], options.telemetry, None
     if telemetry is not None and is_image_table(require_file(telemetry, "telemetry log")):
         table = read_image_table(telemetry)
-    if len(sources) == 1 and first.is_dir():
-        paths = photo_paths(first)
-        if table is None and telemetry is None:
+    if len(sources) == 1 and (first.is_dir() or is_image_table(first)):
+        folder = first if first.is_dir() else first.parent
+        paths = photo_paths(folder)
+        if folder != first:
+            table = read_image_table(first)
+        elif telemetry is None:
             table = image_table_in(first, paths)
-        return ChosenPhotos(first, paths, table, table is not None)
-    if len(sources) == 1 and is_image_table(first):
-        return ChosenPhotos(
-            first.parent, photo_paths(first.parent), read_image_table(first), singly=True
-        )
+        return ChosenPhotos(folder, paths, table, table is not None)
     for path in sources:
         if not is_photo(require_file(path, "photograph")):
             raise FlightError(f"expected photographs, where several files are given: {path}")
@@ -117,12 +116,16 @@ def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
     """The table that lies in a folder and names some of these photographs below it."""
     names = [path.relative_to(folder).as_posix() for path in photos]
     found = []
-    for path in sorted(path for path in folder.iterdir() if is_image_table(path)):
-        table = read_image_table(path)
-        if any(table.row(name) for name in names):
-            found.append(table)
-        else:
-            log.warning("table that names none of the photographs is not used: %s", path)
+    ends = {path.name.lower() for path in photos}
+    for path in sorted(folder.iterdir()):
+        if is_image_table(path):
+            table = read_image_table(path)
+            if any(table.row(name) for name in names):
+                found.append(table)
+            else:
+                log.warning("table that names none of the photographs is not used: %s", path)
+        elif names_images(path, ends):
+            log.warning("not read, for want of a header such as file,yaw,pitch,roll,agl: %s", path)
     if len(found) > 1:
         several = ", ".join(table.path.name for table in found[:5])
         raise FlightError(
@@ -138,16 +141,16 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
     them, whatever the heading of the aircraft, was not recorded. The camera then looks straight
     down, with the heading of the aircraft. Where a table states the attitude, that one counts.
     """
-    cameras: defaultdict[tuple[str, str], list[Photo]] = defaultdict(list)
-    for photo in photos:
-        cameras[photo.optics.make, photo.optics.model].append(photo)
-    unrecorded = {key: _is_unrecorded(of_camera) for key, of_camera in cameras.items()}
-    without = [unrecorded[photo.optics.make, photo.optics.model] for photo in photos]
-    poses = [_pose(*each) for each in zip(photos, without, strict=True)]
+    turned = [photo for photo in photos if photo.gimbal_deg is None or any(photo.gimbal_deg)]
+    recorded = {photo.optics.model for photo in turned}
+    lost = [photo.optics.model not in recorded for photo in photos]
+    # A heading of the aircraft that is 0 in all of them was not recorded either.
+    turns = any(photo.body_yaw_deg for photo, gone in zip(photos, lost, strict=True) if gone)
+    poses = [_pose(photo, gone, turns) for photo, gone in zip(photos, lost, strict=True)]
     warnings = []
-    if any(without):
+    if any(lost):
         warnings.append(
-            f"gimbal angles of {sum(without)} photographs are all 0, so they were not recorded: "
+            f"gimbal angles of {sum(lost)} photographs are all 0, so they were not recorded: "
             "heading of the aircraft and a camera that looks straight down assumed"
         )
     edited = _edited(photos)
@@ -165,10 +168,10 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
     ], warnings
 
 
-def _pose(photo: Photo, gimbal_unrecorded: bool) -> dict[str, Any]:
+def _pose(photo: Photo, gimbal_unrecorded: bool, turns: bool) -> dict[str, Any]:
     source: TiltSource | None = None
     if gimbal_unrecorded:
-        angles, source = (photo.body_yaw_deg % 360, 0.0, 0.0), ASSUMED
+        angles, source = (photo.body_yaw_deg % 360 if turns else math.nan, 0.0, 0.0), ASSUMED
     elif photo.gimbal_deg is not None:
         angles, source = attitude_of(enu_from_gimbal_camera(photo.gimbal_deg)), GIMBAL
     elif photo.rotation is not None:
@@ -177,13 +180,6 @@ def _pose(photo: Photo, gimbal_unrecorded: bool) -> dict[str, Any]:
         angles = photo.body_yaw_deg % 360, math.nan, math.nan
     pose: dict[str, Any] = dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), angles, strict=True))
     return pose if source is None else pose | source.stated(aided=photo.latlon_deg is not None)
-
-
-def _is_unrecorded(photos: Sequence[Photo]) -> bool:
-    """Whether the gimbal reports 0, 0, 0 in all photographs while the aircraft is turned."""
-    if any(photo.gimbal_deg is None or any(photo.gimbal_deg) for photo in photos):
-        return False
-    return any(abs(math.remainder(photo.body_yaw_deg, 360)) > _TURNED_DEG for photo in photos)
 
 
 def _edited(photos: Sequence[Photo]) -> list[int]:
@@ -208,10 +204,9 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     if chosen.table is not None:
         options = replace(options, telemetry=None)
     photos, warnings = _taken(chosen, options)
-    if options.camera is None and options.fov_deg is None:
-        focal_px = [_focal_px(photo, options) for photo in photos]
-        photos, zoomed = _alike(photos, focal_px, "of another focal length than most", ROUNDED)
-        warnings += zoomed
+    focal_px = [_focal_px(photo, options) for photo in photos]
+    photos, zoomed = _alike(photos, focal_px, "of another focal length than most", ROUNDED)
+    warnings += zoomed
     camera, note = _camera(photos[0], options)
     track = None
     if options.telemetry is not None:
@@ -228,13 +223,15 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
                 f"pitch and roll of {level} of {len(photos)} photographs are not known: a camera "
                 "that looks straight down is assumed"
             )
-        heights = {
-            name
-            for name in ("home_m", "amsl_m", "hae_m", "alt_m")
-            if any(math.isfinite(getattr(photo, name)) for photo in photos)
-        }
+        names = ("home_m", "amsl_m", "hae_m", "alt_m")
+        heights = {each for each in names if not all(math.isnan(getattr(p, each)) for p in photos)}
         if any(math.isnan(photo.agl_m) for photo in photos):
             warnings += height_warnings(options, heights)
+    if turned := [photo.path.name for photo in photos if photo.turned]:
+        warnings.append(
+            f"other programs show {len(turned)} of {len(photos)} photographs turned (orientation "
+            f"of EXIF); here pixels and the top are as stored, the first: {turned[0]}"
+        )
     doubted = [photo for photo in photos if photo.doubts]
     if doubted:
         warnings.append(
@@ -282,9 +279,10 @@ def _taken(chosen: ChosenPhotos, options: SourceOptions) -> tuple[list[Photo], l
     photos, odd = _alike(photos, sizes, "of another size than most")
     warnings += odd
     if photos:
+        photos, wrong = _by_gps(photos)
         photos, lost = _with_rows(photos, chosen)
         photos, untimed, undated = _in_time(photos, chosen, options)
-        warnings += lost + _left_out(paths, untimed, "no time in EXIF")
+        warnings += wrong + lost + _left_out(paths, untimed, "no time in EXIF")
     if not photos:
         raise FlightError(f"{'; '.join(warnings)}: {folder}")
     if undated and len(photos) > 1:
@@ -313,6 +311,11 @@ def _alike(
     if not counted:
         return photos, []
     usual = max(counted, key=lambda key: (counted[key], key))
+    first = {key: photo.path.name for key, photo in zip(keys, photos, strict=True)}
+    rivals = [key for key in counted if counted[key] == counted[usual] > 1]
+    if len(rivals) > 1 and not np.allclose(rivals, usual, rtol=tolerance, atol=0.0):
+        several = ", ".join(f"{counted[key]} as {first[key]}" for key in rivals)
+        raise FlightError(f"photographs {reason}: {several}; give the files of one camera")
     fits = [key is None or np.allclose(key, usual, rtol=tolerance, atol=0.0) for key in keys]
     odd = [photo.path for photo, fit in zip(photos, fits, strict=True) if not fit]
     alike = [photo for photo, fit in zip(photos, fits, strict=True) if fit]
@@ -323,19 +326,16 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
     table = chosen.table
     if table is None:
         return photos, []
-    rows = [table.row(photo.path.relative_to(chosen.folder).as_posix()) for photo in photos]
-    known = [
-        replace(photo, row=row, **row.values)
-        for photo, row in zip(photos, rows, strict=True)
-        if row
-    ]
-    without = [photo.path for photo, row in zip(photos, rows, strict=True) if row is None]
+    names = [photo.path.relative_to(chosen.folder).as_posix() for photo in photos]
+    pairs = [(photo, table.row(name)) for photo, name in zip(photos, names, strict=True)]
+    known = [replace(photo, row=row, **row.values) for photo, row in pairs if row]
+    without = [photo.path for photo, row in pairs if row is None]
     if not known:
         raise FlightError(
             f"table names none of the {len(photos)} photographs, such as {without[0].name}; it "
             f"names {next(iter(table.rows))}: {table.path}"
         )
-    if len({row.order for row in rows if row}) < len(known):
+    if len({row.order for _, row in pairs if row}) < len(known):
         raise FlightError(
             "a row of the table names several photographs of one name; give their paths below "
             f"{chosen.folder}: {table.path}"
@@ -345,6 +345,32 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
     if lost:
         warnings.append(f"{lost} rows of the table have no photograph: {table.path}")
     return known, warnings
+
+
+def _by_gps(photos: list[Photo]) -> tuple[list[Photo], list[str]]:
+    """The photographs in UTC by the times of the GPS, and a warning about a clock that is off;
+    those with a time zone in EXIF and those without one are judged apart."""
+    warnings, shifts_ns = [], {}
+    for known in (True, False):
+        alike = (each for each in photos if each.zone_known == known)
+        lags = [each.time_ns - each.gps_ns for each in alike if each.time_ns and each.gps_ns]
+        if not lags:
+            continue
+        shifts_ns[known] = lag_ns = round(statistics.median(lags))
+        steps = 0 if known else round(lag_ns / ZONE_STEP_NS)
+        if abs(lag_ns - steps * ZONE_STEP_NS) <= MAX_LAG_NS and -48 <= steps <= 56:
+            shifts_ns[known] = steps * ZONE_STEP_NS
+        else:
+            warnings.append(
+                f"clock of the camera and time of its GPS differ by {lag_ns / 1e9:+.0f} s, which "
+                "is no time zone: the time of the GPS is used"
+            )
+    return [
+        replace(each, time_ns=each.time_ns - shifts_ns[each.zone_known], zone_known=True)
+        if each.time_ns and each.zone_known in shifts_ns
+        else each
+        for each in photos
+    ], warnings
 
 
 def _in_time(
@@ -380,14 +406,10 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def _focal_px(photo: Photo, options: SourceOptions) -> float | None:
     """The focal length, NaN for one that cannot be used, None for none."""
     try:
-        found = _focal_length(photo, options)
+        found = focal_length(photo.optics, photo.width_px, photo.height_px, options.sensor_width_mm)
     except CameraError:
         return math.nan
     return None if found is None else found.px
-
-
-def _focal_length(photo: Photo, options: SourceOptions) -> FocalLength | None:
-    return focal_length(photo.optics, photo.width_px, photo.height_px, options.sensor_width_mm)
 
 
 def _camera(photo: Photo, options: SourceOptions) -> tuple[Camera, str]:
@@ -396,7 +418,7 @@ def _camera(photo: Photo, options: SourceOptions) -> tuple[Camera, str]:
     if given is not None:
         return given, "" if options.camera else f"field of view {options.fov_deg:g} deg, as given"
     try:
-        focal = _focal_length(photo, options)
+        focal = focal_length(photo.optics, width, height, options.sensor_width_mm)
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
     if focal is None:

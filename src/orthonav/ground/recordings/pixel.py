@@ -59,7 +59,7 @@ def locate_pixel(
     px: tuple[float, float],
     terrain: TerrainHeights | None = None,
 ) -> GroundPoint:
-    """The ground at image coordinates `px` (x, y; 0, 0 is the corner) of a view with a fix.
+    """The ground at image coordinates `px` (x, y; 0, 0: the stored corner) of a view with a fix.
 
     `telemetry`: of the view; it gives pitch and roll where the fix does not. Without
     `terrain` the ground is level.
