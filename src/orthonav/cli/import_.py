@@ -47,8 +47,7 @@ def run(options: argparse.Namespace) -> None:
         log.warning("%s", RADIANS)
     if options.json:
         plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
-        plain |= {"choices": recording.choices}
-        print_json(plain | asdict(done))
+        print_json(plain | {"choices": recording.choices} | asdict(done))
     else:
         tilt = "not stated, 3 deg are assumed"
         if done.tilt_std_deg is not None:

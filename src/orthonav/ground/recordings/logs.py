@@ -364,8 +364,9 @@ def log_kind(path: Path) -> str:
 def read_log(
     path: Path, mount_deg: Angles, named: Mapping[str, str] | None = None
 ) -> RecordedTrack:
-    """The track of a log. `mount_deg` applies where the log holds the attitude of the body; `named`:
-    the source of a role, such as {"position": "GPS[1]"}, where the log has several.
+    """The track of a log. `mount_deg` applies where the log holds the attitude of the body.
+
+    `named`: the source of a role, such as {"position": "GPS[1]"}, where the log has several.
 
     Raises `FlightError` where it is damaged, of another kind, or without attitude.
     """
