@@ -141,9 +141,8 @@ def camera_of_info(message: Any, topic: str = "") -> Camera:
     roi = message.roi
     if message.binning_x > 1 or message.binning_y > 1 or roi.width or roi.height:
         raise CameraError("camera_info with binning or a region of interest; give --camera FILE")
-    return camera_from_numbers(
-        (message.width, message.height),
-        matrix[[0, columns + 1, 2, columns + 2]].tolist(),
-        [] if rectified else lens.tolist(),
-        "plumb_bob" if rectified else str(message.distortion_model),
-    )
+    numbers = matrix[[0, columns + 1, 2, columns + 2]].tolist()
+    size = message.width, message.height
+    if rectified:
+        return camera_from_numbers(size, numbers, [], "plumb_bob")
+    return camera_from_numbers(size, numbers, lens.tolist(), str(message.distortion_model))

@@ -306,9 +306,9 @@ class Sources:
         Raises `FlightError` where the named one is not among `names`.
         """
         held, named = list(names), self.named.get(role)
-        if named is not None and named not in held:
-            known = ", ".join(held) or "none"
-            raise FlightError(f"no {named} for {role}; available: {known}: {self.path}")
+        if named not in (None, *held):
+            known = f"available: {', '.join(held) or 'none'}"
+            raise FlightError(f"no {named} for {role}; {known}: {self.path}")
         values, faults = dict[str, Any](), dict.fromkeys(held, "")
         for name in held if named is None else [named]:
             values[name], fault = read(name)
@@ -327,13 +327,10 @@ class Sources:
     def best(self, role: str, series: Mapping[str, TimeSeries | None]) -> TimeSeries | None:
         """As `first`: a series with less than half the samples of another one has a fault."""
         held = {name: 0 if one is None else len(one.time_ns) for name, one in series.items()}
-        few = {
-            name: f"{n} valid messages" for name, n in held.items() if 2 * n < max(held.values())
-        }
-        found: TimeSeries | None = self.first(
-            role, series, lambda name: (series[name], few.get(name, ""))
-        )
-        return found
+        most = max(held.values(), default=0)
+        few = {name: f"{n} valid messages" for name, n in held.items() if 2 * n < most}
+        self.first(role, series, lambda name: (series[name], few.get(name, "")))
+        return series.get(self.used[role])
 
 
 def measured(height_m: float) -> float:

@@ -73,7 +73,7 @@ def _add(held: dict[str, Samples], name: str, sound: bool, time_ns: int, *values
 
 class _Collected:
     def __init__(self, mount_deg: Angles) -> None:
-        self.mount = mount_deg
+        self.mount, self.autopilot = mount_deg, mavlink.NO_AUTOPILOT
         self.attitude, self.velocity, self.above_home = Samples(3), Samples(2), Samples(1)
         self.fixes: dict[str, Samples] = {}
         """By receiver: latitude, longitude, altitude, height above the ellipsoid, velocity."""
@@ -91,9 +91,8 @@ class _Collected:
         if attitude is None:
             raise FlightError(f"{what} has no attitude other than 0: {sources.path}")
         fixes = {name: each.arrays() for name, each in self.fixes.items()}
-        position = sources.best(
-            "position", {name: position_series(t, fix[:, :3]) for name, (t, fix) in fixes.items()}
-        )
+        places = {name: position_series(time, fix[:, :3]) for name, (time, fix) in fixes.items()}
+        position = sources.best("position", places)
         times, fix = fixes.get(sources.used["position"], Samples(6).arrays())
         distances = {name: each.series() for name, each in self.distances.items()}
         distance = sources.best("height", distances)
@@ -161,39 +160,34 @@ def read_tlog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     """
     mavutil = needed("pymavlink.mavutil", "telemetry logs")
     parts: dict[str, _Collected] = {}
-    autopilots: dict[str, mavlink.Autopilot | None] = {}
     with reading("telemetry log", path, silent=True):
         log = mavutil.mavlogfile(str(path), robust_parsing=True)
         try:
             while (message := log.recv_match(type=_WANTED)) is not None:
                 name = f"ATTITUDE[{message.get_srcSystem()}:{message.get_srcComponent()}]"
-                if message.get_type() != "HEARTBEAT":
-                    part = parts.setdefault(name, _Collected(mount_deg))
-                    time_ns = round(message._timestamp * 1e6) * 1000
-                    _from_tlog(part, message, time_ns, autopilots.get(name))
-                elif mavlink.is_of_autopilot(message):
-                    autopilots[name] = mavlink.KINDS.get(message.autopilot)
+                part = parts.setdefault(name, _Collected(mount_deg))
+                _from_tlog(part, message, round(message._timestamp * 1e6) * 1000)
         finally:
             log.f.close()
     senders = [name for name, part in parts.items() if part.attitude.series()]
-    trusted = [name for name in senders if name in autopilots]
+    trusted = [name for name in senders if parts[name].autopilot != mavlink.NO_AUTOPILOT]
     trusted = trusted or [name for name in senders if name.endswith((":0]", ":1]"))]
     usable = [*trusted, sources.named.get("attitude")]
     used = sources.first("attitude", senders, lambda name: (name if name in usable else None, ""))
     if used is None:
-        known = "; ".join(("telemetry log has no attitude", *sources.choices))
-        raise FlightError(f"{known}: {path}")
+        why = "; ".join(("telemetry log has no attitude", *sources.choices))
+        raise FlightError(f"{why}: {path}")
     own = [name for name in trusted if name.partition(":")[0] == used.partition(":")[0]]
     body = parts[used if used in own or not own else own[0]]
     body.attitude = parts[used].attitude
     return body.track("telemetry log", sources)
 
 
-def _from_tlog(
-    collected: _Collected, message: Any, time_ns: int, autopilot: mavlink.Autopilot | None
-) -> None:
+def _from_tlog(collected: _Collected, message: Any, time_ns: int) -> None:
     kind = message.get_type()
-    if kind == "ATTITUDE":
+    if kind == "HEARTBEAT" and mavlink.is_of_autopilot(message):
+        collected.autopilot = message.autopilot
+    elif kind == "ATTITUDE":
         angles = map(math.degrees, (message.yaw, message.pitch, message.roll))
         collected.add_attitude(time_ns, *angles)
     elif kind == "ATTITUDE_QUATERNION":
@@ -202,19 +196,19 @@ def _from_tlog(
             # A camera that looks straight down has the angles of the body.
             collected.add_attitude(time_ns, *attitude_of(enu_from_body_camera(turn)))
     elif kind == "GLOBAL_POSITION_INT":
-        if autopilot is mavlink.Autopilot.ARDUPILOT or not mavlink.repeats_height(message):
+        kind_of = mavlink.KINDS.get(collected.autopilot)
+        if kind_of is mavlink.Autopilot.ARDUPILOT or not mavlink.repeats_height(message):
             collected.above_home.add(time_ns, message.relative_alt * 1e-3)
         collected.velocity.add(time_ns, message.vy * 1e-2, message.vx * 1e-2)
     elif kind in ("GPS_RAW_INT", "GPS2_RAW"):
-        place = message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3
         hae_m = message.alt_ellipsoid * 1e-3 or math.nan  # 0 without this extension
-        values = *place, hae_m, math.nan, math.nan
-        _add(collected.fixes, kind, message.fix_type >= 3, time_ns, *values)
+        place = message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3, hae_m
+        _add(collected.fixes, kind, message.fix_type >= 3, time_ns, *place, math.nan, math.nan)
     elif kind == "DISTANCE_SENSOR":
         name, distance_m = f"{kind}[{message.id}]", message.current_distance * 1e-2
         _add(collected.distances, name, mavlink.is_height(message), time_ns, distance_m)
         collected.distances.pop("RANGEFINDER", None)  # the same without its limits
-    elif not any(name.startswith("DISTANCE") for name in collected.distances):
+    elif kind == "RANGEFINDER" and collected.distances.keys() <= {kind}:
         _add(collected.distances, kind, message.distance > 0, time_ns, message.distance)
 
 
@@ -238,9 +232,8 @@ def read_ulog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
         def series(name: str, of: Callable[[Columns], Any]) -> dict[str, TimeSeries | None]:
             return {key: of(columns) for key, columns in topics[name].items()}
 
-        attitude = sources.best(
-            "attitude", series("vehicle_attitude", partial(_attitude, mount_deg))
-        )
+        attitudes = series("vehicle_attitude", partial(_attitude, mount_deg))
+        attitude = sources.best("attitude", attitudes)
         if attitude is None:
             damaged = ", and is damaged" if log.file_corruption else ""
             raise FlightError(f"PX4 log has no attitude (vehicle_attitude){damaged}: {path}")

@@ -36,7 +36,6 @@ from orthonav.core.flight.telemetry_track import (
     RecordedTrack,
     Samples,
     Sources,
-    TimeSeries,
     altitude_series,
     attitude_series,
 )
@@ -366,16 +365,16 @@ def find_topics(reader: Any, sources: Sources) -> Topics:
     counted = {one.topic: one for one in reader.connections if one.msgcount}
     found: dict[str, dict[str, Any]] = {}
     for role, types in TYPES.items():
-        of_type = [one for one in counted.values() if one.msgtype in types]
-        if role not in sources.named:
-            of_type = [one for one in of_type if _is_candidate(one)]
+        named = role in sources.named
+        of_type = [
+            one for one in counted.values() if one.msgtype in types and (named or _fits(one))
+        ]
         of_type.sort(key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic))
         found[role] = {one.topic: one for one in of_type}
     images, infos = found["image"], found["camera_info"]
     if len(images) != 1 and "image" not in sources.named:
-        names = (
-            ", ".join(sorted(images)) or f"none among {', '.join(sorted(counted)) or 'no topic'}"
-        )
+        known = ", ".join(sorted(counted)) or "no topic"
+        names = ", ".join(sorted(images)) or f"none among {known}"
         raise FlightError(
             f"expected one topic of images, found {names}; give --topic: {sources.path}"
         )
@@ -389,7 +388,7 @@ def find_topics(reader: Any, sources: Sources) -> Topics:
     return found
 
 
-def _is_candidate(connection: Any) -> bool:
+def _fits(connection: Any) -> bool:
     is_height = _last_name(connection) in _HEIGHT_NAMES or connection.msgtype not in _PLAIN_NUMBERS
     return is_height and not connection.topic.endswith(_IGNORED)
 
@@ -502,10 +501,8 @@ def read_track(reader: Any, topics: Topics, sources: Sources, mount_deg: Angles)
     attitude, horizon = first("attitude", partial(_attitude, mount_deg)) or (None, None)
     agl, home, amsl = first("height", _heights) or (None, None, None)
     receivers = topics["position"].items()
-    places = sources.best(
-        "position",
-        {name: _samples(reader, one, _position, 3).positions() for name, one in receivers},
-    )
+    fixes = {name: _samples(reader, one, _position, 3).positions() for name, one in receivers}
+    places = sources.best("position", fixes)
     return RecordedTrack(
         attitude=attitude,
         heights=() if agl is None else (agl,),
@@ -513,16 +510,17 @@ def read_track(reader: Any, topics: Topics, sources: Sources, mount_deg: Angles)
         amsl=amsl,
         hae=altitude_series(places),  # sensor_msgs/NavSatFix
         position=places,
-        velocity=first("velocity", _velocities),
+        velocity=first(
+            "velocity", lambda bag, one: (_samples(bag, one, _velocity, 2).series(), "")
+        ),
         horizon_std=horizon,
         origin_ns=0 if attitude is None else int(attitude.time_ns[0]),
         choices=sources.choices,
     )
 
 
-def _attitude(
-    mount_deg: Angles, reader: Any, connection: Any
-) -> tuple[tuple[TimeSeries, TimeSeries | None] | None, str]:
+def _attitude(mount_deg: Angles, reader: Any, connection: Any) -> tuple[Any, str]:
+    """The series of attitudes and, where it is stated, of the horizon's deviation."""
     times, wxyz = _samples(reader, connection, attitude_of_message, 4).arrays()
     enu_from_flu, sound = rotations_of_wxyz(wxyz)
     attitude = attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
@@ -531,10 +529,6 @@ def _attitude(
     changes = np.ptp(wxyz[sound], axis=0).any()
     horizon = _samples(reader, connection, horizon_std_of_message, 1).series()
     return (attitude, horizon), "" if changes else "its orientation never changes"
-
-
-def _velocities(reader: Any, connection: Any) -> tuple[TimeSeries | None, str]:
-    return _samples(reader, connection, _velocity, 2).series(), ""
 
 
 def _messages(reader: Any, connection: Any) -> Iterator[tuple[int, Any]]:
@@ -554,7 +548,7 @@ def _samples(reader: Any, connection: Any, values_of: Callable[[Any], Any], widt
     return samples
 
 
-def _heights(reader: Any, connection: Any) -> tuple[tuple[TimeSeries | None, ...] | None, str]:
+def _heights(reader: Any, connection: Any) -> tuple[Any, str]:
     agl, home, amsl = (Samples(1) for _ in range(3))
     for time_ns, message in _messages(reader, connection):
         if hasattr(message, "bottom_clearance"):

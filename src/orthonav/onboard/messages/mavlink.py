@@ -344,10 +344,8 @@ class Autopilot(Enum):
 
 
 KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
-NO_AUTOPILOT, _GIMBAL, _CAMERA = 8, 26, 30
-DOWNWARD = 25
-_INVALID_SIGNAL = 1
-_SAME_MM = 50
+NO_AUTOPILOT, DOWNWARD = 8, 25
+_GIMBAL, _CAMERA, _INVALID_SIGNAL, _SAME_MM = 26, 30, 1, 50
 
 
 def is_of_autopilot(heartbeat: Message) -> bool:
