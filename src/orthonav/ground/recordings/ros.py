@@ -81,8 +81,8 @@ TYPES: dict[str, tuple[str, ...]] = {
     "height": ("sensor_msgs/msg/Range", "mavros_msgs/msg/Altitude", *_PLAIN_NUMBERS),
 }
 _ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
-_HOME_NAMES = ("rel_alt", "relative_altitude")
-_HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
+_HOME_NAMES = ("/rel_alt", "/relative_altitude")
+_HEIGHT_NAMES = (*_HOME_NAMES, "/agl", "/height_above_ground")
 _IGNORED = ("/orthonav/fix", "/global_position/local")
 """Its own results; odometry of MAVROS whose velocity is not in the frame of the body."""
 Topics = Mapping[str, Mapping[str, Any]]  # connections of a role by topic, the preferred first
@@ -389,12 +389,8 @@ def find_topics(reader: Any, sources: Sources) -> Topics:
 
 
 def _fits(connection: Any) -> bool:
-    is_height = _last_name(connection) in _HEIGHT_NAMES or connection.msgtype not in _PLAIN_NUMBERS
-    return is_height and not connection.topic.endswith(_IGNORED)
-
-
-def _last_name(connection: Any) -> str:
-    return str(connection.topic.rpartition("/")[2])
+    number, topic = connection.msgtype in _PLAIN_NUMBERS, connection.topic
+    return topic.endswith(_HEIGHT_NAMES) if number else not topic.endswith(_IGNORED)
 
 
 def open_ros(path: Path, options: SourceOptions) -> Recording:
@@ -556,8 +552,7 @@ def _heights(reader: Any, connection: Any) -> tuple[Any, str]:
             home.add(time_ns, message.relative)
             amsl.add(time_ns, message.amsl)
         elif (height := height_of_message(message)) is not None:
-            above_home = _last_name(connection) in _HOME_NAMES
-            (home if above_home else agl).add(time_ns, height)
+            (home if connection.topic.endswith(_HOME_NAMES) else agl).add(time_ns, height)
     found = agl.series(), home.series(), amsl.series()
     return found if any(found) else None, ""
 
