@@ -94,9 +94,8 @@ class _Collected:
         places = {name: position_series(time, fix[:, :3]) for name, (time, fix) in fixes.items()}
         position = sources.best("position", places)
         times, fix = fixes.get(sources.used["position"], Samples(6).arrays())
-        distance = sources.best(
-            "height", {key: one.series() for key, one in self.distances.items()}
-        )
+        distances = {name: each.series() for name, each in self.distances.items()}
+        distance = sources.best("height", distances)
         return RecordedTrack(
             attitude=attitude,
             heights=() if distance is None else (distance,),

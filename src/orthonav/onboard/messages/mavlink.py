@@ -344,8 +344,7 @@ class Autopilot(Enum):
 
 
 KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
-NO_AUTOPILOT, DOWNWARD = 8, 25
-_GIMBAL, _CAMERA, _INVALID_SIGNAL, _SAME_MM = 26, 30, 1, 50
+NO_AUTOPILOT, DOWNWARD, _GIMBAL, _CAMERA, _INVALID_SIGNAL, _SAME_MM = 8, 25, 26, 30, 1, 50
 
 
 def is_of_autopilot(heartbeat: Message) -> bool:
