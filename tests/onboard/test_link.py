@@ -52,8 +52,9 @@ def test_the_first_autopilot_heard_is_the_target():
     flying = Flying()
     station = Autopilot(255, 190).heartbeat(kind=8)
     gimbal = Autopilot(1, 154).heartbeat(kind=8)
+    as_autopilot = Autopilot(1, 171).say("heartbeat", 26, 0, 0, 0, 4, 3)
     other = Autopilot(9).attitude(5 * S)
-    assert flying.hear(station, gimbal, other) == 0 and flying.link.target is None
+    assert flying.hear(station, gimbal, as_autopilot, other) == 0 and flying.link.target is None
     assert flying.hear(flying.autopilot.heartbeat(kind=3)) == 1
     assert (flying.link.target, flying.link.kind) == (Target(1, 1), Kind.ARDUPILOT)
     assert flying.hear(Autopilot(9).heartbeat(), other, Autopilot(1, 2).attitude(5 * S)) == 0
@@ -142,11 +143,17 @@ def test_heights_of_every_message(flying):
     # stamped since 1970, as some autopilots do
     since_1970 = say("altitude", (UTC_NS + now) // 1000, 0, 0, 0, 55.0, 42.0, 0)
     assert height(since_1970) == 42.0
-    ahead = flying.autopilot.distance(flying.boot_ns(), 7.0, orientation=0)
-    too_far = say("distance_sensor", now // MS, 20, 5000, 5000, 0, 0, 25, 255)
-    assert height(ahead, too_far) == 42.0
     down = math.cos(math.radians(10))
     assert height(say("rangefinder", 50.0, 1.0)) == round(50 * down, 2)
+    flying.time.go(2.0)
+    flying.hear(flying.autopilot.attitude(flying.boot_ns(), roll_deg=10.0))
+    assert height(say("altitude", flying.boot_ns() // 1000, 0, 0, 0, 55.0, 42.0, 0)) == 42.0
+    ahead = flying.autopilot.distance(flying.boot_ns(), 7.0, orientation=0)
+    ms = flying.boot_ns() // MS
+    too_far = say("distance_sensor", ms, 20, 5000, 5000, 0, 0, 25, 255)
+    invalid = say("distance_sensor", ms, 20, 5000, 700, 0, 0, 25, 255, 0, 0, [0] * 4, 1)
+    no_limits = say("rangefinder", 50.0, 1.0)  # of the sensor that is out of its limits
+    assert height(ahead, too_far, invalid, no_limits) == 42.0
     flying.time.go(0.02)
     telemetry = flying.autopilot.distance(flying.boot_ns(), 40.0)
     assert height(telemetry) == round(40 * down, 2)

@@ -294,6 +294,51 @@ def test_an_imu_without_orientation_is_no_attitude(peer, reading):
 
 
 @pytest.mark.parametrize(
+    ("frame", "wxyz", "said"),
+    [
+        ("livox_frame", (1.0, 0.0, 0.0, 0.0), "imu is not used: it has no orientation"),
+        ("imu", (0.0, 0.0, 0.0, 0.0), "imu is not used: it has no orientation"),
+        ("camera_imu", (0.6, 0.0, 0.0, 0.8), "imu is not used: its frame is named 'camera'"),
+        ("imu_ned", (0.6, 0.0, 0.0, 0.8), "imu is not used: its frame is named 'ned'"),
+    ],
+)
+def test_an_imu_that_is_not_of_the_body_is_named_once(peer, reading, caplog, frame, wxyz, said):
+    flying = joined(peer, reading, *SEEN)
+    now_ns = time.time_ns()
+    w, x, y, z = wxyz
+    for offset_ns in (0, 1):
+        message = imu(now_ns + offset_ns)
+        message.header.frame_id, message.orientation = frame, ros.Quaternion(x, y, z, w)
+        peer.write("/imu/data", message)
+    peer.write("/cam/image_raw", image(now_ns))
+    assert math.isnan(flying.read().telemetry.yaw_deg) and caplog.text.count(said) == 1
+
+
+def test_a_range_ahead_is_no_height(peer, reading, caplog):
+    flying = joined(peer, reading, *SEEN)
+    now_ns = time.time_ns()
+    ahead = ranged(now_ns, 3.0)
+    ahead.header.frame_id = "sonar_front"
+    peer.write("/imu/data", imu(now_ns))
+    peer.write("/range", ahead)
+    peer.write("/cam/image_raw", image(now_ns))
+    assert math.isnan(flying.read().telemetry.agl_m)
+    assert "distance is not used: its frame is named 'front'" in caplog.text
+
+
+def test_rectified_images_have_the_camera_p(peer, reading, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "REMAPPED", ["-r", "image:=/cam/image_rect"])
+    messages = Messages()
+    matrix = np.array([50.0, 0, 30.5, 0, 0, 50.0, 22.5, 0, 0, 0, 1, 0])
+    sent = messages.camera_info(lens=(-0.2, 0.1, 0.0, 0.0, 0.0), p=matrix)
+    flying = joined(peer, reading, "/cam/camera_info")
+    peer.write("/cam/camera_info", ros.native(sent, ros.CameraInfo))
+    flying.deadline = time.monotonic() + 60
+    camera = flying.reader.wait_for_camera()
+    assert (camera.fx_px, camera.cx_px, camera.distortion) == (50, 31, ())
+
+
+@pytest.mark.parametrize(
     ("std_deg", "expected"),
     [(0.0, 3.0), (0.1, 0.3), (5.0, 5.0), (57.3, 3.0), (math.nan, 3.0)],  # MAVROS: 1 rad
 )

@@ -241,12 +241,14 @@ def quaternion_wxyz(yaw, pitch, roll):
 
 
 def ulog(path, topics):
-    """A ULog by pyulog's own writer. `topics`: name -> (fields as its format has them, rows)."""
+    """A ULog by pyulog's own writer. `topics`: name, or name:instance -> (fields as its format has
+    them, rows)."""
     from pyulog.core import ULog
 
     log = ULog(None)
     codes = ULog._UNPACK_TYPES
-    for number, (name, (text, rows)) in enumerate(topics.items()):
+    for number, (topic, (text, rows)) in enumerate(topics.items()):
+        name, _, instance = topic.partition(":")
         log._message_formats[name] = ULog.MessageFormat(f"{name}:{text};".encode(), None)
         flat = {}
         for part in text.split(";"):
@@ -256,7 +258,7 @@ def ulog(path, topics):
             flat.update(dict.fromkeys(names, base))
         dtype = np.dtype([(field, codes[kind][2]) for field, kind in flat.items()])
         message = SimpleNamespace(
-            multi_id=0,
+            multi_id=int(instance or 0),
             msg_id=number,
             message_name=name,
             field_data=[SimpleNamespace(field_name=f, type_str=k) for f, k in flat.items()],
@@ -321,6 +323,11 @@ def record(name, *values):
     return b"\xa3\x95" + bytes([number]) + packed
 
 
+def rangefinder(us, t):
+    """Fields of RFND: 95.5 m downward, which is valid for 5 s."""
+    return us, 0, 9_550, 4 if t < 5 else 1, 25
+
+
 def dataflash(path, seconds=10, boot_us=3_000_000, attitude=True, gps=True):
     """A DataFlash log with the FMT records that ArduPilot writes."""
     data = b""
@@ -340,7 +347,7 @@ def dataflash(path, seconds=10, boot_us=3_000_000, attitude=True, gps=True):
             angles = (round(100 * a) for a in (roll, roll, pitch, pitch, yaw, yaw))
             data += record("ATT", us, *angles)
         data += record("POS", us, 465_000_000, 25_000_000, 400.0, 110.0 + t, 110.0)
-        data += record("RFND", us, 0, 9_550, 4 if t < 5 else 1, 25)
+        data += record("RFND", *rangefinder(us, t))
     path.write_bytes(data)
     return path
 
@@ -353,7 +360,7 @@ def tlog(path, seconds=10, attitude=True):
     other = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
     data = b""
     for t, yaw, pitch, roll in flown(seconds):
-        angles = (math.radians(a) for a in (roll, pitch, yaw))
+        angles = [math.radians(a) for a in (roll, pitch, yaw)]
         ms = round(t * 1000)
         messages = [
             (other, dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)),

@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+import recorders
 from recorders import (
     START_S,
     camera_file,
@@ -13,6 +14,7 @@ from recorders import (
     photo,
     px4_topics,
     quaternion_wxyz,
+    record,
     tlog,
     ulog,
     video,
@@ -136,6 +138,166 @@ def test_a_log_that_was_cut_tells_what_came_before(kind, log):
         log.write_bytes(data[: len(data) // 2] + bytes(len(data) // 2))
         (warning,) = read_log(log, DOWN).warnings
         assert warning.startswith("log is damaged: views from ")
+
+
+def appended(path, sender, *messages, t=0.0):
+    """Messages of a sender (system, component) at the end of a telemetry log."""
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    packer = dialect.MAVLink(None, srcSystem=sender[0], srcComponent=sender[1])
+    stamp = struct.pack(">Q", START_S * 10**6 + round(t * 1e6))
+    packed = (getattr(dialect, f"MAVLink_{name}_message")(*of) for name, *of in messages)
+    with path.open("ab") as stream:
+        stream.writelines(stamp + message.pack(packer) for message in packed)
+    return path
+
+
+GIMBAL = 1, 154
+
+
+@pytest.mark.parametrize("heartbeats", [False, True])
+def test_a_gimbal_in_a_tlog_is_not_the_aircraft(tmp_path, heartbeats):
+    path = tlog(tmp_path / "a.tlog")
+    alone = read_log(path, DOWN).attitude
+    if heartbeats:
+        appended(path, (1, 1), ("heartbeat", 2, 3, 0, 0, 4, 3))
+        appended(path, GIMBAL, ("heartbeat", 26, 0, 0, 0, 4, 3))  # as if an autopilot
+    for step in range(40):
+        t = step / 10 + 0.03
+        appended(path, GIMBAL, ("attitude", round(t * 1000), 0.0, -1.5, 1.0, 0, 0, 0), t=t)
+    track = read_log(path, DOWN)
+    assert np.array_equal(track.attitude.values, alone.values)
+    assert "attitude: using ATTITUDE[1:1], not ATTITUDE[1:154]: first" in track.choices[0]
+    track = read_log(path, DOWN, {"attitude": "ATTITUDE[1:154]"})
+    assert len(track.attitude.time_ns) == 40 and track.choices == ()
+    assert track.latlon_deg((START_S + 3) * 10**9) is not None  # of the autopilot
+    with pytest.raises(FlightError, match=r"no GPS for position; available: GPS_RAW_INT: "):
+        read_log(path, DOWN, {"position": "GPS"})
+    only = appended(tmp_path / "b.tlog", GIMBAL, ("attitude", 0, 0.0, -1.5, 1.0, 0, 0, 0))
+    with pytest.raises(FlightError, match=r"no attitude; .* not ATTITUDE\[1:154\]"):
+        read_log(only, DOWN)
+
+
+@pytest.mark.parametrize("autopilot, home_m", [(12, None), (3, 12.0)])
+def test_a_height_in_a_tlog_that_repeats_that_above_the_sea(tmp_path, autopilot, home_m):
+    """PX4 without a home sends it as the height above home."""
+    path = tmp_path / "a.tlog"
+    for t in (0.0, 0.5):
+        appended(
+            path,
+            (1, 1),
+            ("heartbeat", 2, autopilot, 0, 0, 4, 3),
+            ("attitude", 0, 0.1, 0.0, 1.0, 0, 0, 0),
+            ("global_position_int", 0, 465_000_000, 25_000_000, 12_000, 12_000, 0, 0, 0, 0),
+            t=t,
+        )
+    assert read_log(path, DOWN).telemetry(START_S * 10**9).home_m == home_m
+
+
+def test_distances_in_a_tlog(tmp_path):
+    """Ahead, with a bad signal, and RANGEFINDER beside them, which knows no limits."""
+    path = tlog(tmp_path / "a.tlog")
+    for t in range(10):
+        common = 0, 20, 12_000
+        appended(
+            path,
+            (1, 1),
+            ("rangefinder", 120.0, 1.0),
+            ("distance_sensor", *common, 300, 0, 1, 0, 255),
+            ("distance_sensor", *common, 300, 0, 2, 25, 255, 0, 0, [0] * 4, 1),
+            ("distance_sensor", *common, 9000 if t < 5 else 12_000, 0, 3, 25, 255),
+            ("rangefinder", 120.0, 1.0),
+            t=float(t),
+        )
+    track = read_log(path, DOWN)
+    assert track.telemetry((START_S + 3) * 10**9).agl_m == 90
+    assert track.telemetry((START_S + 9) * 10**9).agl_m == 114  # above home
+    assert "height: using DISTANCE_SENSOR[3], not DISTANCE_SENSOR[1] (0 valid" in track.choices[0]
+
+
+def gps(us, fix_type, lat_e7, instance=0):
+    place = lat_e7, 25_000_000, 40_000
+    return us, instance, fix_type, 252_818_000, 2288, 12, 80, *place, 5.0, 90.0, 0.0, 0.0, 1
+
+
+def test_the_receiver_with_a_fix_in_a_dataflash_log(tmp_path):
+    path = dataflash(tmp_path / "a.bin", gps=False)
+    times = range(3_000_000, 13_000_000, 200_000)
+    first, second = (
+        b"".join(record("GPS", *gps(us, *fix)) for us in times)
+        for fix in ((1, 0, 0), (3, 465_000_000, 1))
+    )
+    path.write_bytes(path.read_bytes() + first + second)
+    track = read_log(path, DOWN)
+    at = int(track.attitude.time_ns[10])
+    assert track.latlon_deg(at) == (46.5, 2.5) and track.telemetry(at).vel_en_mps is not None
+    assert "position: using GPS[1], not GPS[0] (0 valid messages): first" in track.choices[0]
+    assert read_log(path, DOWN, {"position": "GPS[0]"}).position is None
+    with pytest.raises(FlightError, match=r"no GPS\[2\] .*available: GPS\[0\], GPS\[1\]: "):
+        read_log(path, DOWN, {"position": "GPS[2]"})
+    with pytest.raises(FlightError, match="logs have no sources of velocity: "):
+        read_log(path, DOWN, {"velocity": "GPS[1]"})
+
+
+def test_rangefinders_of_ardupilot_3_6(tmp_path, monkeypatch):
+    old = 132, "QCBCB", "TimeUS,Dist1,Orient1,Dist2,Orient2"
+    monkeypatch.setitem(recorders.DATAFLASH, "RFND", old)
+    monkeypatch.setattr(recorders, "rangefinder", lambda us, t: (us, 300, 0, 9_550, 25))
+    track = read_log(dataflash(tmp_path / "a.bin"), DOWN)
+    assert track.telemetry((START_S + 3) * 10**9).agl_m == 95.5
+    assert "height: using RFND[1], not RFND[0] (0 valid messages)" in track.choices[0]
+
+
+@pytest.mark.parametrize("write", [dataflash, tlog])
+def test_an_attitude_of_zeros_is_none(tmp_path, monkeypatch, write):
+    monkeypatch.setattr(recorders, "flown", lambda seconds: [(t, 0, 0, 0) for t in range(9)])
+    with pytest.raises(FlightError, match="has no attitude"):
+        read_log(write(tmp_path / "a.log"), DOWN)
+
+
+def test_instances_of_a_ulog(tmp_path):
+    """A second receiver has the fix, a second sensor looks down; an identity is no attitude."""
+    topics = px4_topics(sensor=False)
+    fields, fixes = topics.pop("vehicle_gps_position")
+    topics["sensor_gps"] = fields, [(*row[:2], 10_000_000, 10_000_000, 0, 1) for row in fixes]
+    topics["sensor_gps:1"] = fields, fixes
+    sensor = "uint64_t timestamp;float current_distance;uint8_t orientation;int8_t signal_quality"
+    times = [row[0] for row in fixes]
+    topics["distance_sensor"] = sensor, [(t, 3.0, 0, -1) for t in times]
+    topics["distance_sensor:1"] = sensor, [(t, 70.0, 25, 0) for t in times]
+    topics["distance_sensor:2"] = sensor, [(t, 80.0, 25, -1) for t in times]
+    fields, attitudes = topics["vehicle_attitude"]
+    topics["vehicle_attitude"] = fields, [(row[0], 1.0, 0.0, 0.0, 0.0) for row in attitudes]
+    topics["vehicle_attitude:1"] = fields, attitudes
+    path = ulog(tmp_path / "a.ulg", topics)
+    track, at = read_log(path, DOWN), (START_S + 3) * 10**9
+    assert track.latlon_deg(at) == (46.5, 2.5) and track.telemetry(at).agl_m == 80
+    assert turned(angles_at(track.attitude, at)[0], 350 + 12) == pytest.approx(0, abs=0.02)
+    for role, used in (
+        ("attitude", "vehicle_attitude[1], not vehicle_attitude[0] (0 valid messages)"),
+        ("position", "sensor_gps[1], not sensor_gps[0] (0 valid messages)"),
+        ("height", "distance_sensor[2], not distance_sensor[0] (0 valid messages), distance_"),
+    ):
+        assert any(line.startswith(f"{role}: using {used}") for line in track.choices)
+    named = read_log(path, DOWN, {"height": "distance_sensor[1]"})
+    assert named.telemetry(at).agl_m != 80
+
+
+def test_positions_of_px4_without_a_receiver_are_called_an_estimate(tmp_path):
+    del (topics := px4_topics())["vehicle_gps_position"]
+    track = read_log(ulog(tmp_path / "a.ulg", topics), DOWN)
+    assert track.warnings == ("positions are an estimate: the log has no receiver",)
+
+
+def test_a_log_behind_a_ulog_is_not_read(tmp_path):
+    path = ulog(tmp_path / "a.ulg", px4_topics(seconds=5))
+    first = path.read_bytes()
+    later = ulog(tmp_path / "b.ulg", px4_topics(seconds=9, boot_us=10**9)).read_bytes()
+    path.write_bytes(first + later)
+    track = read_log(path, DOWN)
+    assert len(track.attitude.time_ns) == 51
+    (warning,) = track.warnings
+    assert f"followed by another one from byte {len(first)} on: views from 5.0 s on" in warning
 
 
 @pytest.fixture

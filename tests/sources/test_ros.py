@@ -162,7 +162,7 @@ def test_cameras(messages):
     [
         ("rational_polynomial", (0.1, 0, 0, 0, 0, 0.2, 0, 0), {}, "more than k1"),
         ("thin_prism", (), {}, "not supported"),
-        ("plumb_bob", (), {"k": np.zeros(9)}, "not calibrated"),
+        ("plumb_bob", (), {"k": np.zeros(9)}, "not calibrated: no matrix K"),
         ("plumb_bob", (), {"binning_x": 2}, "binning"),
     ],
 )
@@ -183,11 +183,12 @@ def test_a_raw_imu_is_passed_over(tmp_path, messages, topics):
 
 def test_the_horizon_is_as_good_as_an_imu_states(tmp_path, messages, topics):
     """Or as good as an autopilot's that GNSS aids, or not."""
-    turn = messages.turn(100)
-    times = [time_ns for time_ns, _ in topics["/imu/data"]]
+    before = topics["/imu/data"]
 
     def horizon_deg(name, std_deg):
-        topics["/imu/data"] = [(t, messages.imu(t, turn, std_deg=std_deg)) for t in times]
+        topics["/imu/data"] = [
+            (t, messages.imu(t, message.orientation, std_deg=std_deg)) for t, message in before
+        ]
         views = list(open_source(record(tmp_path / name, topics, messages)).views)
         assert {view.telemetry.mount_std_deg for view in views} == {2.5}
         return [round(view.telemetry.horizon_std_deg, 6) for view in views]
@@ -198,11 +199,98 @@ def test_the_horizon_is_as_good_as_an_imu_states(tmp_path, messages, topics):
     assert set(horizon_deg("without", 0.0)) == {3.0}
 
 
+def named(messages, frame, what):
+    """The same message in a frame of that name."""
+    what.header.frame_id = frame
+    return what
+
+
+def test_an_orientation_that_never_changes_is_none(tmp_path, messages, topics):
+    """Lidars send 0 0 0 1, or where they are mounted, with the most messages."""
+    recorded = topics["/imu/data"]
+    for name, turn in ("/livox/imu", messages.turn(0)), ("/mounted/imu", messages.turn(30)):
+        topics[name] = [(t + i, messages.imu(t, turn)) for t, _ in recorded for i in (0, 9)]
+    path = record(tmp_path / "flight", topics, messages)
+    recording = open_source(path)
+    assert [view.telemetry.yaw_deg for view in recording.views] == pytest.approx([355, 5, 15, 25])
+    assert recording.choices == (
+        "attitude: using /imu/data, not /livox/imu (no valid message), /mounted/imu (its "
+        "orientation never changes), /odom: first that fits; --topic attitude=NAME selects another",
+    )
+    named = open_source(path, SourceOptions(topics={"attitude": "/mounted/imu"}))
+    assert next(named.views).telemetry.yaw_deg == pytest.approx(60)
+
+
+def test_frames_that_are_not_of_the_body(tmp_path, messages, topics):
+    topics["/imu/data"] = [
+        (t, named(messages, "imu_link_ned", one)) for t, one in topics["/imu/data"]
+    ]
+    for _, odometry in topics["/odom"]:
+        odometry.child_frame_id = "camera_pose_frame"
+    recording = open_source(record(tmp_path / "flight", topics, messages))
+    assert "no topic has the attitude of the aircraft" in recording.warnings
+    assert "using none, not /imu/data (named 'ned'), /odom (named 'camera')" in recording.choices[0]
+    assert next(recording.views).telemetry.vel_en_mps is None
+
+
+def test_the_receiver_that_has_a_fix(tmp_path, messages, topics):
+    """And never orthonav's own fixes, which would be their own truth."""
+    fixes = topics.pop("/fix")
+    topics["/a/fix"] = [(t, messages.fix(t, 1.0, 1.0, status=-1)) for t, _ in fixes]
+    topics["/b/fix"] = fixes
+    topics["/orthonav/fix"] = [(t, messages.fix(t, 2.0, 2.0)) for t, _ in fixes]
+    recording = open_source(record(tmp_path / "flight", topics, messages))
+    assert "position: using /b/fix, not /a/fix (0 valid messages): first" in recording.choices[1]
+    assert next(recording.views).truth_latlon_deg == pytest.approx((46.5005, 2.5))
+
+
+def test_ranges_that_are_no_heights(tmp_path, messages, topics):
+    """Ahead by the name of the topic or frame; at the limits, or infinite, of the sensor."""
+    down = topics.pop("/range")
+    topics["/a_front"] = [(t, messages.range(t, 3.0)) for t, _ in down]
+    topics["/a"] = [(t, named(messages, "sonar_left", messages.range(t, 3.0))) for t, _ in down]
+    topics["/b"] = [(t, messages.range(t, (120.0, math.inf)[t % 2])) for t, _ in down]
+    topics["/down"] = down
+    recording = open_source(record(tmp_path / "flight", topics, messages))
+    assert [view.telemetry.agl_m for view in recording.views] == [85, 95, 105, 115]
+    assert recording.choices[1].startswith(
+        "height: using /down, not /a (named 'left'), /a_front (named 'front'), /b (no valid message"
+    )
+
+
+def test_odometry_of_mavros_in_the_global_frame_has_no_velocity_of_the_body(
+    tmp_path, messages, topics
+):
+    topics["/mavros/global_position/local"] = topics.pop("/odom")
+    recording = open_source(record(tmp_path / "flight", topics, messages))
+    assert next(recording.views).telemetry.vel_en_mps is None
+
+
+def test_rectified_images_have_the_camera_p(tmp_path, messages, topics):
+    matrix = np.array([50.0, 0, 30.5, 0, 0, 50.0, 22.5, 0, 0, 0, 1, 0])
+    info = messages.camera_info(lens=(-0.2, 0.1, 0.0, 0.0, 0.0), p=matrix)
+    topics |= {"/cam/camera_info": [(START_S * 10**9, info)]}
+    raw = open_source(record(tmp_path / "raw", topics, messages)).camera
+    topics["/cam/image_rect/compressed"] = [
+        (t, messages.compressed(t, picture())) for t, _ in topics.pop("/cam/image_raw")
+    ]
+    camera = open_source(record(tmp_path / "rectified", topics, messages)).camera
+    assert (raw.fx_px, raw.cx_px, raw.distortion[0]) == (60, 32, -0.2)
+    assert (camera.fx_px, camera.cx_px, camera.cy_px, camera.distortion) == (50, 31, 23, ())
+
+
+def test_the_camera_info_of_the_nearest_namespace(tmp_path, messages, topics):
+    other = messages.camera_info(k=np.array([90.0, 0, 31.5, 0, 90.0, 23.5, 0, 0, 1]))
+    topics["/camera_info"] = [(t, other) for t, _ in topics["/imu/data"]]
+    assert open_source(record(tmp_path / "flight", topics, messages)).camera.fx_px == 60
+
+
 def test_heights_of_mavros(tmp_path, messages, topics):
     del topics["/range"]
     times = [time_ns for time_ns, _ in topics["/imu/data"]]
     topics["/mavros/altitude"] = [
-        (t, messages.altitude(t, 110.0, math.nan if i < 20 else 90.0)) for i, t in enumerate(times)
+        (t, messages.altitude(t, 110.0, (math.nan, -1.0)[i // 10] if i < 20 else 90.0))
+        for i, t in enumerate(times)
     ]
     views = list(open_source(record(tmp_path / "a", topics, messages)).views)
     assert [view.telemetry.agl_m for view in views] == [110, 110, 90, 90]
@@ -222,11 +310,11 @@ def test_topics_as_requested(tmp_path, messages, topics):
     recording = open_source(path, telemetry)
     assert "attitude /odom" in recording.note and len(list(recording.views)) == 4
     for role, name, error in (
-        ("image", "/none", "no messages on /none; available: /cam/camera_info"),
-        ("image", "/imu/data", "carries sensor_msgs/msg/Imu; image is one of"),
+        ("image", "/none", "no /none for image; available: /cam/image_raw, /other/image_raw: "),
+        ("position", "/imu/data", "no /imu/data for position; available: /fix: "),
     ):
         with pytest.raises(FlightError, match=error):
-            open_source(path, SourceOptions(topics={role: name}))
+            open_source(path, SourceOptions(topics=telemetry.topics | {role: name}))
 
 
 def test_without_attitude_and_fix_nothing_is_made_up(tmp_path, messages, topics):

@@ -14,6 +14,8 @@ from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.onboard.messages.estimate import Clock, EstimateError
 from orthonav.onboard.messages.mavlink import (
+    KINDS,
+    NO_AUTOPILOT,
     Autopilot,
     Message,
     Origin,
@@ -21,6 +23,9 @@ from orthonav.onboard.messages.mavlink import (
     Signing,
     Target,
     dialect,
+    is_height,
+    is_of_autopilot,
+    repeats_height,
     signing_timestamp,
 )
 from orthonav.onboard.ports import Transport
@@ -41,13 +46,9 @@ RESIGN_NS = 10 * 10**9
 """Interval at which signature timestamps are set to the current time."""
 _MOST_READS = 200
 _MOST_OTHERS = 10
-_BOARD, _NO_AUTOPILOT, _AUTOPILOT_COMPONENT = 18, 8, 1
-_KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
-_DOWNWARD = 25
+_BOARD, _AUTOPILOT_COMPONENT = 18, 1
 _FAR_NS = 60 * 10**9
 _ARMED = 128
-_SAME_M = 0.05
-"""Heights above home and above sea level that are the same within this are one height, twice."""
 _LATE_NS = 2 * 10**9
 """Timestamps of GNSS solutions that differ more from their arrival are of another clock."""
 _UNKNOWN_16 = 65535
@@ -247,7 +248,7 @@ class AutopilotLink:
         system_id, component_id = message.get_srcSystem(), message.get_srcComponent()
         if self.target is not None and system_id == self.target.system_id:
             return bool(component_id == self.target.component_id)
-        heartbeat = message.get_type() == "HEARTBEAT" and message.autopilot != _NO_AUTOPILOT
+        heartbeat = message.get_type() == "HEARTBEAT" and is_of_autopilot(message)
         if not heartbeat or system_id == 0:
             return False
         heard = Target(system_id, component_id or _AUTOPILOT_COMPONENT)
@@ -278,7 +279,7 @@ class AutopilotLink:
         self.origin = None
 
     def _heartbeat(self, message: Message, now_ns: int) -> None:
-        self.kind = _KINDS.get(message.autopilot, self.kind)
+        self.kind = KINDS.get(message.autopilot, self.kind)
         self.armed = bool(message.base_mode & _ARMED)
 
     def _attitude(self, message: Message, now_ns: int) -> None:
@@ -296,9 +297,7 @@ class AutopilotLink:
     def _global_position(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
         home_m, amsl_m = message.relative_alt * 1e-3, message.alt * 1e-3
-        # PX4 without a home repeats the height above the sea, and ArduPilot without an altitude by
-        # GNSS counts that from its start.
-        same = abs(home_m - amsl_m) <= _SAME_M
+        same = repeats_height(message)
         if not same or self.kind is Autopilot.ARDUPILOT:
             self.buffer.add_height("home", time_ns, home_m)
         # 0 where the autopilot has no position
@@ -327,14 +326,14 @@ class AutopilotLink:
             self.buffer.add_height("altitude", time_ns, message.altitude_amsl)
 
     def _distance(self, message: Message, now_ns: int) -> None:
-        within = message.min_distance < message.current_distance < message.max_distance
-        if message.orientation == _DOWNWARD and within:
+        if is_height(message):
             time_ns = self._timed(message.time_boot_ms, now_ns)
             self.buffer.add_distance(time_ns, message.current_distance * 1e-2)
 
     def _rangefinder(self, message: Message, now_ns: int) -> None:
         arrived_ns = self.sync.boot_ns(now_ns)
-        if arrived_ns is not None and message.distance > 0:
+        limited = self.counts["DISTANCE_SENSOR"] > 0  # the same, with its limits
+        if arrived_ns is not None and message.distance > 0 and not limited:
             self.buffer.add_distance(arrived_ns, message.distance)
 
     def _system_time(self, message: Message, now_ns: int) -> None:
@@ -379,7 +378,7 @@ class AutopilotLink:
                 self._due["heartbeat"] = now_ns + HEARTBEAT_NS
                 self.send(
                     dialect().MAVLink_heartbeat_message(
-                        _BOARD, _NO_AUTOPILOT, 0, 0, self.system_status, 3
+                        _BOARD, NO_AUTOPILOT, 0, 0, self.system_status, 3
                     )
                 )
             if now_ns >= self._due["timesync"] and self.target is not None:

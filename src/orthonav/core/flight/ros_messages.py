@@ -1,6 +1,6 @@
 """Images, cameras, attitudes and heights of ROS messages; axes: REP 103 and REP 105."""
 
-import math
+import re
 from typing import Any
 
 import cv2
@@ -14,6 +14,9 @@ from orthonav.core.geo.camera_files import camera_from_numbers
 from orthonav.core.records import grey_levels
 from orthonav.core.tilt import stated_deg
 
+_NOT_BODY = ("camera", "optical", "gimbal", "lidar", "laser", "ned", "frd")
+_NOT_DOWN = ("front", "forward", "rear", "back", "backward", "left", "right", "up", "upward")
+
 
 def stamp_ns(message: Any, recorded_ns: int) -> int:
     """Time stamp of a message, or the time of its recording where it has none."""
@@ -26,7 +29,7 @@ def attitude_of_message(message: Any) -> tuple[float, float, float, float] | Non
     """The orientation w, x, y, z in a `sensor_msgs/Imu`, `nav_msgs/Odometry` or
     `geometry_msgs/PoseStamped`: from forward-left-up to east-north-up (REP 103).
 
-    None for an `Imu` that says it has none.
+    None without one: an `Imu` says so, and others send zeros or 0 0 0 1.
     """
     if hasattr(message, "orientation_covariance"):
         if message.orientation_covariance[0] == -1:
@@ -36,7 +39,18 @@ def attitude_of_message(message: Any) -> tuple[float, float, float, float] | Non
         turn = message.pose.pose.orientation
     else:
         turn = message.pose.orientation
+    if not (turn.x or turn.y or turn.z):
+        return None
     return float(turn.w), float(turn.x), float(turn.y), float(turn.z)
+
+
+def odd_word(message: Any, topic: str = "") -> str:
+    """The word in the name of a frame, or of the topic of a `Range`, by which it does not look down
+    or another message is not of the body; "" without one."""
+    ranges, header = hasattr(message, "max_range"), getattr(message, "header", None)
+    frames = getattr(header, "frame_id", ""), getattr(message, "child_frame_id", "")
+    words = re.findall("[a-z]+", " ".join((topic * ranges, *frames)).lower())
+    return next((word for word in words if word in (_NOT_DOWN if ranges else _NOT_BODY)), "")
 
 
 def horizon_std_of_message(message: Any) -> float | None:
@@ -47,16 +61,13 @@ def horizon_std_of_message(message: Any) -> float | None:
 
 
 def height_of_message(message: Any) -> float | None:
-    """Metres above ground of a `sensor_msgs/Range`, `mavros_msgs/Altitude` or a plain number.
+    """Metres above ground of a `sensor_msgs/Range` or a plain number.
 
-    None for a range outside the limits of its sensor.
+    None for a range that is not within the limits of its sensor: infinite ones show no distance.
     """
     if hasattr(message, "range"):
-        sound = message.min_range <= message.range <= message.max_range
+        sound = message.min_range < message.range < message.max_range
         return float(message.range) if sound else None
-    if hasattr(message, "bottom_clearance"):
-        clearance = message.bottom_clearance
-        return float(clearance if math.isfinite(clearance) else message.relative)
     return float(message.data)
 
 
@@ -114,21 +125,24 @@ def grey_of_image(message: Any, where: str) -> Grey:
     return grey_levels(pixels.astype(pixels.dtype.newbyteorder("="), copy=False))
 
 
-def camera_of_info(message: Any) -> Camera:
-    """The camera of a `sensor_msgs/CameraInfo` (matrix K, not the rectified P).
+def camera_of_info(message: Any, topic: str = "") -> Camera:
+    """The camera of a `sensor_msgs/CameraInfo` for images of a topic: matrix P without distortion
+    where it is named as rectified, such as `image_rect`, else K.
 
     Raises `CameraError` where it is not calibrated, or has an unsupported model.
     """
-    matrix = np.asarray(getattr(message, "K", getattr(message, "k", None)), dtype=np.float64)
-    lens = np.asarray(getattr(message, "D", getattr(message, "d", None)), dtype=np.float64)
-    if matrix.size != 9 or matrix[0] <= 0:
-        raise CameraError("camera_info is not calibrated; give --camera FILE")
+    rectified = re.search("(^|[/_])rect", topic) is not None
+    name = "P" if rectified else "K"
+    matrix = np.ravel(getattr(message, name, getattr(message, name.lower(), [])))
+    lens = np.ravel(getattr(message, "D", getattr(message, "d", [])))
+    columns = 4 if rectified else 3
+    if matrix.size != 3 * columns or matrix[0] <= 0:
+        raise CameraError(f"camera_info is not calibrated: no matrix {name}; give --camera FILE")
     roi = message.roi
     if message.binning_x > 1 or message.binning_y > 1 or roi.width or roi.height:
         raise CameraError("camera_info with binning or a region of interest; give --camera FILE")
-    return camera_from_numbers(
-        (message.width, message.height),
-        matrix[[0, 4, 2, 5]].tolist(),
-        lens.ravel().tolist(),
-        str(message.distortion_model),
-    )
+    numbers = matrix[[0, columns + 1, 2, columns + 2]].tolist()
+    size = message.width, message.height
+    if rectified:
+        return camera_from_numbers(size, numbers, [], "plumb_bob")
+    return camera_from_numbers(size, numbers, lens.tolist(), str(message.distortion_model))

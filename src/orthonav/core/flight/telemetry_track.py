@@ -2,14 +2,16 @@
 
 import math
 from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.core.errors import FlightError
 from orthonav.core.geo.attitude import matrices_of_wxyz, slerp, wxyz_of_matrices
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.records import Prior, Telemetry
@@ -289,6 +291,47 @@ def _at(series: TimeSeries | None, time_ns: int, width: int) -> Array:
 def chosen(role: str, used: str, others: Iterable[str], why: str) -> str:
     """Which of several sources is used for a role, and why not the others."""
     return f"{role}: using {used}, not {', '.join(others)}: {why}"
+
+
+class Sources:
+    """The source of each role: as named, else the first without a fault, else with a value."""
+
+    def __init__(self, named: Mapping[str, str], path: Path) -> None:
+        self.named, self.path = named, path
+        self.used: dict[str, str] = {}
+        self.choices: tuple[str, ...] = ()  # by `chosen`
+
+    def first(self, role: str, names: Iterable[str], read: Callable[[str], tuple[Any, str]]) -> Any:
+        """The value of the source of a role; `read` gives the value and the fault of one.
+
+        Raises `FlightError` where the named one is not among `names`.
+        """
+        held, named = list(names), self.named.get(role)
+        if named not in (None, *held):
+            known = f"available: {', '.join(held) or 'none'}"
+            raise FlightError(f"no {named} for {role}; {known}: {self.path}")
+        values, faults = dict[str, Any](), dict.fromkeys(held, "")
+        for name in held if named is None else [named]:
+            values[name], fault = read(name)
+            faults[name] = fault if fault or values[name] is not None else "no valid message"
+            if not faults[name]:
+                break
+        fit = [name for name, value in values.items() if value is not None]
+        used = self.used[role] = min(fit, key=lambda name: faults[name] != "", default="none")
+        faults.pop(used, None)
+        others = [f"{name} ({fault})" if fault else name for name, fault in faults.items()]
+        if others and named is None:
+            why = f"first that fits; --topic {role}=NAME selects another"
+            self.choices += (chosen(role, used, others, why),)
+        return values.get(used)
+
+    def best(self, role: str, series: Mapping[str, TimeSeries | None]) -> TimeSeries | None:
+        """As `first`: a series with less than half the samples of another one has a fault."""
+        held = {name: 0 if one is None else len(one.time_ns) for name, one in series.items()}
+        most = max(held.values(), default=0)
+        few = {name: f"{n} valid messages" for name, n in held.items() if 2 * n < most}
+        self.first(role, series, lambda name: (series[name], few.get(name, "")))
+        return series.get(self.used[role])
 
 
 def measured(height_m: float) -> float:

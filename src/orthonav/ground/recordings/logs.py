@@ -3,9 +3,11 @@
 import contextlib
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +19,7 @@ from orthonav.core.flight.folder import number_of, time_ns_of
 from orthonav.core.flight.telemetry_track import (
     RecordedTrack,
     Samples,
+    Sources,
     TimeSeries,
     altitude_series,
     attitude_of_angles,
@@ -45,60 +48,69 @@ from orthonav.core.tilt import (
     UNSTATED,
     TiltSource,
 )
+from orthonav.onboard.messages import mavlink
 
 DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats
 MAVLINK_MAGICS = (0xFE, 0xFD)
-_DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _RANGE_IS_GOOD = 4
 _WANTED = {
-    "ATTITUDE",
-    "ATTITUDE_QUATERNION",
-    "GLOBAL_POSITION_INT",
-    "GPS_RAW_INT",
-    "DISTANCE_SENSOR",
-    "RANGEFINDER",
+    *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
+    *("GPS2_RAW", "DISTANCE_SENSOR", "RANGEFINDER"),
 }
 ULOG_MAGIC = b"ULog\x01\x12\x35"
 _TOPICS = [
-    "vehicle_attitude",
-    "vehicle_local_position",
-    "vehicle_global_position",
-    "vehicle_gps_position",
-    "sensor_gps",
-    "distance_sensor",
-    "home_position",
+    *("vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "home_position"),
+    *("vehicle_gps_position", "sensor_gps", "distance_sensor"),
 ]
 Columns = dict[str, NDArray[Any]]
 
 
+def _add(held: dict[str, Samples], name: str, sound: bool, time_ns: int, *values: float) -> None:
+    samples = held.setdefault(name, Samples(len(values)))
+    if sound:
+        samples.add(time_ns, *values)
+
+
 class _Collected:
     def __init__(self, mount_deg: Angles) -> None:
-        self.mount = mount_deg
-        self.attitude, self.velocity, self.position = Samples(3), Samples(2), Samples(3)
-        self.distance, self.above_home, self.hae = Samples(1), Samples(1), Samples(1)
+        self.mount, self.autopilot = mount_deg, mavlink.NO_AUTOPILOT
+        self.attitude, self.velocity, self.above_home = Samples(3), Samples(2), Samples(1)
+        self.fixes: dict[str, Samples] = {}
+        """By receiver: latitude, longitude, altitude, height above the ellipsoid, velocity."""
+        self.distances: dict[str, Samples] = {}
 
-    def track(self, what: str, path: Path, tilt: TiltSource = AUTOPILOT) -> RecordedTrack:
+    def add_attitude(self, time_ns: int, yaw: float, pitch: float, roll: float) -> None:
+        if yaw or pitch or roll:  # all are 0 where none is known
+            self.attitude.add(time_ns, yaw, pitch, roll)
+
+    def track(self, what: str, sources: Sources, tilt: TiltSource = AUTOPILOT) -> RecordedTrack:
         """The track of all samples; raises `FlightError` without attitude."""
         attitude = attitude_of_angles(
             self.attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles), self.mount)
         )
         if attitude is None:
-            raise FlightError(f"{what} has no attitude: {path}")
-        distance, position = self.distance.series(), self.position.positions()
+            raise FlightError(f"{what} has no attitude other than 0: {sources.path}")
+        fixes = {name: each.arrays() for name, each in self.fixes.items()}
+        places = {name: position_series(time, fix[:, :3]) for name, (time, fix) in fixes.items()}
+        position = sources.best("position", places)
+        times, fix = fixes.get(sources.used["position"], Samples(6).arrays())
+        distances = {name: each.series() for name, each in self.distances.items()}
+        distance = sources.best("height", distances)
         return RecordedTrack(
             attitude=attitude,
             heights=() if distance is None else (distance,),
             home=self.above_home.series(),
             amsl=altitude_series(position),
-            hae=self.hae.series(),
+            hae=series_of(times, fix[:, 3:4]),
             position=position,
-            velocity=self.velocity.series(),
+            velocity=self.velocity.series() or series_of(times, fix[:, 4:]),
             tilt=tilt,
             origin_ns=int(attitude.time_ns[0]),
+            choices=sources.choices,
         )
 
 
-def read_dataflash(path: Path, mount_deg: Angles) -> RecordedTrack:
+def read_dataflash(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     """The track of a DataFlash log; times are UTC where it has a GPS fix, else since boot."""
     reader = needed("pymavlink.DFReader", "ArduPilot logs")
     collected = _Collected(mount_deg)
@@ -107,113 +119,154 @@ def read_dataflash(path: Path, mount_deg: Angles) -> RecordedTrack:
         try:
             log.__init__(str(path))  # separately, so that its file is closed where this fails
             base_ns = round(getattr(log.clock, "timebase", 0.0) * 1e6) * 1000
-            while (message := log.recv_match(type=["ATT", "GPS", "POS", "RFND"])) is not None:
-                if hasattr(message, "TimeUS"):
+            kinds = ["ATT", "GPS", "GPS2", "POS", "RFND"]
+            while (message := log.recv_match(type=kinds)) is not None:
+                with contextlib.suppress(AttributeError):  # of a damaged or unknown layout
                     _from_dataflash(collected, message, base_ns + int(message.TimeUS) * 1000)
         finally:
             with contextlib.suppress(AttributeError, BufferError):
                 log.filehandle.close()
                 log.data_map.close()
-    return collected.track("ArduPilot log", path, ARDUPILOT)
+    sources.first("attitude", ["ATT"], lambda name: (name, ""))
+    return collected.track("ArduPilot log", sources, ARDUPILOT)
 
 
 def _from_dataflash(collected: _Collected, message: Any, time_ns: int) -> None:
     kind = message.get_type()
     if kind == "ATT":
-        collected.attitude.add(time_ns, message.Yaw, message.Pitch, message.Roll)
-    elif kind == "GPS" and message.Status >= 3 and getattr(message, "I", 0) == 0:
-        collected.position.add(time_ns, message.Lat, message.Lng, message.Alt)
-        course = math.radians(message.GCrs)
-        east, north = math.sin(course) * message.Spd, math.cos(course) * message.Spd
-        collected.velocity.add(time_ns, east, north)
+        collected.add_attitude(time_ns, message.Yaw, message.Pitch, message.Roll)
     elif kind == "POS":
         collected.above_home.add(time_ns, message.RelHomeAlt)
-    elif kind == "RFND" and message.Dist > 0:
+    elif kind == "RFND":
         good = getattr(message, "Stat", _RANGE_IS_GOOD) == _RANGE_IS_GOOD
-        if good and getattr(message, "Orient", _DOWNWARD) == _DOWNWARD:
-            collected.distance.add(time_ns, message.Dist)
+        for number in ("", "1", "2"):  # numbered up to ArduPilot 3.6
+            if (distance_m := getattr(message, f"Dist{number}", None)) is not None:
+                instance = int(number) - 1 if number else getattr(message, "Instance", 0)
+                down = getattr(message, f"Orient{number}", mavlink.DOWNWARD) == mavlink.DOWNWARD
+                sound = good and down and distance_m > 0
+                _add(collected.distances, f"RFND[{instance}]", sound, time_ns, distance_m)
+    else:
+        receiver = f"GPS[{message.I}]" if hasattr(message, "I") else kind
+        course = math.radians(message.GCrs)
+        velocity = math.sin(course) * message.Spd, math.cos(course) * message.Spd
+        place = message.Lat, message.Lng, message.Alt, math.nan
+        _add(collected.fixes, receiver, message.Status >= 3, time_ns, *place, *velocity)
 
 
-def read_tlog(path: Path, mount_deg: Angles) -> RecordedTrack:
+def read_tlog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     """The track of a telemetry log; times are UTC of the ground station at reception.
 
-    Only the first vehicle that sends its attitude is read.
+    Its first autopilot is read: gimbals and other vehicles send attitudes too.
     """
     mavutil = needed("pymavlink.mavutil", "telemetry logs")
-    collected = _Collected(mount_deg)
-    vehicle = None
+    parts: dict[str, _Collected] = {}
     with reading("telemetry log", path, silent=True):
         log = mavutil.mavlogfile(str(path), robust_parsing=True)
         try:
             while (message := log.recv_match(type=_WANTED)) is not None:
-                if vehicle is None and message.get_type().startswith("ATTITUDE"):
-                    vehicle = message.get_srcSystem()
-                if message.get_srcSystem() == vehicle:
-                    _from_tlog(collected, message, round(message._timestamp * 1e6) * 1000)
+                name = f"ATTITUDE[{message.get_srcSystem()}:{message.get_srcComponent()}]"
+                part = parts.setdefault(name, _Collected(mount_deg))
+                _from_tlog(part, message, round(message._timestamp * 1e6) * 1000)
         finally:
             log.f.close()
-    return collected.track("telemetry log", path)
+    senders = [name for name, part in parts.items() if part.attitude.series()]
+    trusted = [name for name in senders if parts[name].autopilot != mavlink.NO_AUTOPILOT]
+    trusted = trusted or [name for name in senders if name.endswith((":0]", ":1]"))]
+    usable = [*trusted, sources.named.get("attitude")]
+    used = sources.first("attitude", senders, lambda name: (name if name in usable else None, ""))
+    if used is None:
+        why = "; ".join(("telemetry log has no attitude", *sources.choices))
+        raise FlightError(f"{why}: {path}")
+    own = [name for name in trusted if name.partition(":")[0] == used.partition(":")[0]]
+    body = parts[used if used in own or not own else own[0]]
+    body.attitude = parts[used].attitude
+    return body.track("telemetry log", sources)
 
 
 def _from_tlog(collected: _Collected, message: Any, time_ns: int) -> None:
     kind = message.get_type()
-    if kind == "ATTITUDE":
+    if kind == "HEARTBEAT" and mavlink.is_of_autopilot(message):
+        collected.autopilot = message.autopilot
+    elif kind == "ATTITUDE":
         angles = map(math.degrees, (message.yaw, message.pitch, message.roll))
-        collected.attitude.add(time_ns, *angles)
+        collected.add_attitude(time_ns, *angles)
     elif kind == "ATTITUDE_QUATERNION":
         wxyz = np.array([[message.q1, message.q2, message.q3, message.q4]])
         for turn in rotations_of_wxyz(wxyz)[0]:
             # A camera that looks straight down has the angles of the body.
-            collected.attitude.add(time_ns, *attitude_of(enu_from_body_camera(turn)))
+            collected.add_attitude(time_ns, *attitude_of(enu_from_body_camera(turn)))
     elif kind == "GLOBAL_POSITION_INT":
-        collected.above_home.add(time_ns, message.relative_alt * 1e-3)
+        kind_of = mavlink.KINDS.get(collected.autopilot)
+        if kind_of is mavlink.Autopilot.ARDUPILOT or not mavlink.repeats_height(message):
+            collected.above_home.add(time_ns, message.relative_alt * 1e-3)
         collected.velocity.add(time_ns, message.vy * 1e-2, message.vx * 1e-2)
-    elif kind == "GPS_RAW_INT" and message.fix_type >= 3:
-        place = message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3
-        collected.position.add(time_ns, *place)
-        if message.alt_ellipsoid:  # 0 without this extension
-            collected.hae.add(time_ns, message.alt_ellipsoid * 1e-3)
-    elif kind == "DISTANCE_SENSOR" and message.orientation == _DOWNWARD:
-        if message.min_distance < message.current_distance < message.max_distance:
-            collected.distance.add(time_ns, message.current_distance * 1e-2)
-    elif kind == "RANGEFINDER" and message.distance > 0:
-        collected.distance.add(time_ns, message.distance)
+    elif kind in ("GPS_RAW_INT", "GPS2_RAW"):
+        hae_m = message.alt_ellipsoid * 1e-3 or math.nan  # 0 without this extension
+        place = message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3, hae_m
+        _add(collected.fixes, kind, message.fix_type >= 3, time_ns, *place, math.nan, math.nan)
+    elif kind == "DISTANCE_SENSOR":
+        name, distance_m = f"{kind}[{message.id}]", message.current_distance * 1e-2
+        _add(collected.distances, name, mavlink.is_height(message), time_ns, distance_m)
+        collected.distances.pop("RANGEFINDER", None)  # the same without its limits
+    elif kind == "RANGEFINDER" and collected.distances.keys() <= {kind}:
+        _add(collected.distances, kind, message.distance > 0, time_ns, message.distance)
 
 
-def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
+def read_ulog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     """The track of a ULog; times are UTC where the log has a GPS fix, else since boot."""
     core = needed("pyulog.core", "PX4 logs")
-    with reading("PX4 log", path, silent=True), path.open("rb") as stream:
+    with reading("PX4 log", path, silent=True), path.open("rb") as whole, TemporaryFile() as first:
+        data = whole.read()
+        end = data.find(ULOG_MAGIC, 1)  # of a log behind it, on a card that was not erased
+        first.write(data[: max(0, end)])
+        (stream := whole if end < 0 else first).seek(0)
         log = core.ULog(stream, _TOPICS)
-        topics: dict[str, Columns] = {one.name: one.data for one in reversed(log.data_list)}
-        gps = topics.get("vehicle_gps_position") or topics.get("sensor_gps") or {}
-        shift_us = _utc_shift_us(gps)
-        attitude = _attitude(topics.get("vehicle_attitude", {}), shift_us, mount_deg)
+        topics: dict[str, dict[str, Columns]] = {name: {} for name in _TOPICS}
+        for one in log.data_list:
+            topics[one.name][f"{one.name}[{one.multi_id}]"] = one.data
+        gps = topics["vehicle_gps_position"] | topics["sensor_gps"]
+        shift_us = next(filter(None, map(_utc_shift_us, gps.values())), 0)
+        for one in log.data_list:
+            one.data["time_ns"] = (one.data["timestamp"].astype(np.int64) + shift_us) * 1000
+
+        def series(name: str, of: Callable[[Columns], Any]) -> dict[str, TimeSeries | None]:
+            return {key: of(columns) for key, columns in topics[name].items()}
+
+        attitudes = series("vehicle_attitude", partial(_attitude, mount_deg))
+        attitude = sources.best("attitude", attitudes)
         if attitude is None:
             damaged = ", and is damaged" if log.file_corruption else ""
             raise FlightError(f"PX4 log has no attitude (vehicle_attitude){damaged}: {path}")
         warnings: tuple[str, ...] = ()
-        if log.file_corruption:
+        if log.file_corruption or end > 0:
             read_s = float(attitude.time_ns[-1] - attitude.time_ns[0]) / 1e9
+            why = "damaged" if end < 0 else f"followed by another one from byte {end} on"
             warnings = (
-                f"log is damaged: views from {read_s:.1f} s on, or in gaps, may lack telemetry",
+                f"log is {why}: views from {read_s:.1f} s on, or in gaps, may lack telemetry",
             )
-        position, local = _position(gps, topics, shift_us), topics.get("vehicle_local_position", {})
+        positions = series("vehicle_gps_position", _position)
+        if "position" in sources.named or not any(positions.values()):  # else made of the others
+            positions |= series("sensor_gps", _position)
+        if not gps and (positions := series("vehicle_global_position", _position)):
+            warnings += ("positions are an estimate: the log has no receiver",)
+        position = sources.best("position", positions)
+        distance = sources.best("height", series("distance_sensor", _distance))
+        single = {name: next(iter(each.values()), {}) for name, each in topics.items()}
+        local = single["vehicle_local_position"]
+        bottom = _bottom(local, len(topics["distance_sensor"]))
+        heights = (distance,) if "height" in sources.named else (bottom, distance)
         return RecordedTrack(
             attitude=attitude,
-            heights=_heights(local, topics.get("distance_sensor", {}), shift_us),
-            home=_home(local, topics, shift_us),
+            heights=tuple(filter(None, heights)),
+            home=_home(local, single),
             amsl=altitude_series(position),
-            hae=_hae(gps, shift_us),
+            hae=_hae(gps.get(sources.used["position"], {})),
             position=position,
             tilt=AUTOPILOT if gps else replace(AUTOPILOT, aided_deg=AUTOPILOT.unaided_deg),
-            velocity=None
-            if "vx" not in local
-            else _series(
-                local, [local["vy"], local["vx"]], shift_us, _flag(local, "v_xy_valid", 1) != 0
-            ),
+            velocity=_series(local, ("vy", "vx"), _flag(local, "v_xy_valid", 1) != 0),
             origin_ns=int(attitude.time_ns[0]),
-            warnings=tuple(warnings),
+            warnings=warnings,
+            choices=sources.choices,
         )
 
 
@@ -221,83 +274,77 @@ def _utc_shift_us(gps: Columns) -> int:
     if "time_utc_usec" not in gps:
         return 0
     utc, own = gps["time_utc_usec"].astype(np.int64), gps["timestamp"].astype(np.int64)
-    sound = utc > 0
+    sound = (utc > 0) & (_flag(gps, "fix_type", 3) >= 3)
     return int(np.median((utc - own)[sound])) if sound.any() else 0
 
 
-def _time_ns(columns: Columns, shift_us: int) -> NDArray[np.int64]:
-    return np.asarray((columns["timestamp"].astype(np.int64) + shift_us) * 1000)
-
-
-def _attitude(columns: Columns, shift_us: int, mount_deg: Angles) -> TimeSeries | None:
+def _attitude(mount_deg: Angles, columns: Columns) -> TimeSeries | None:
     if "q[3]" not in columns:
         return None
     wxyz = np.stack([columns[f"q[{i}]"] for i in range(4)], axis=1).astype(np.float64)
+    wxyz[~wxyz[:, 1:].any(axis=1)] = math.nan  # 1 0 0 0 where none is known
     ned_from_frd, sound = rotations_of_wxyz(wxyz)
     rotations = enu_from_body_camera(ned_from_frd, mount_deg)
-    return attitude_series(_time_ns(columns, shift_us)[sound], rotations)
+    return attitude_series(columns["time_ns"][sound], rotations)
 
 
 def _series(
-    columns: Columns, values: list[NDArray[Any]], shift_us: int, sound: NDArray[Any] | None = None
+    columns: Columns, names: tuple[str, ...], sound: NDArray[Any], scale: float = 1.0
 ) -> TimeSeries | None:
-    table, times = np.stack(values, axis=1).astype(np.float64), _time_ns(columns, shift_us)
-    return series_of(times, table) if sound is None else series_of(times[sound], table[sound])
+    if names[0] not in columns:
+        return None
+    table = np.stack([columns[name] for name in names], axis=1).astype(np.float64) * scale
+    return series_of(columns["time_ns"][sound], table[sound])
 
 
 def _flag(columns: Columns, name: str, otherwise: float) -> NDArray[Any]:
     """A column, or one value everywhere where it was not logged."""
-    return np.asarray(columns.get(name, np.full(len(columns["timestamp"]), otherwise)))
+    return np.asarray(columns.get(name, np.full(len(columns.get("timestamp", ())), otherwise)))
 
 
-def _heights(local: Columns, sensor: Columns, shift_us: int) -> tuple[TimeSeries, ...]:
-    """Heights above ground by distance sensor: the estimator's, then the raw one."""
-    found = []
-    if "dist_bottom" in local:
-        # Without a sensor the estimator guesses, and calls its guess valid.
-        sound = _flag(local, "dist_bottom_sensor_bitfield", len(sensor)) != 0
-        sound &= _flag(local, "dist_bottom_valid", 1) != 0
-        found.append(_series(local, [local["dist_bottom"]], shift_us, sound))
-    if "current_distance" in sensor:
-        distance = sensor["current_distance"]
-        sound = _flag(sensor, "orientation", _DOWNWARD) == _DOWNWARD
-        sound &= distance > _flag(sensor, "min_distance", 0)
-        sound &= distance < _flag(sensor, "max_distance", np.inf)
-        found.append(_series(sensor, [distance], shift_us, sound))
-    return tuple(series for series in found if series is not None)
+def _bottom(local: Columns, sensors: int) -> TimeSeries | None:
+    """Height above ground by the estimator, from distance sensors."""
+    # Without a sensor the estimator guesses, and calls its guess valid.
+    sound = _flag(local, "dist_bottom_sensor_bitfield", sensors) != 0
+    sound &= _flag(local, "dist_bottom_valid", 1) != 0
+    return _series(local, ("dist_bottom",), sound)
 
 
-def _home(local: Columns, topics: dict[str, Columns], shift_us: int) -> TimeSeries | None:
+def _distance(sensor: Columns) -> TimeSeries | None:
+    distance = _flag(sensor, "current_distance", math.nan)
+    sound = _flag(sensor, "orientation", mavlink.DOWNWARD) == mavlink.DOWNWARD
+    sound &= _flag(sensor, "signal_quality", -1) != 0
+    sound &= distance > _flag(sensor, "min_distance", 0)
+    sound &= distance < _flag(sensor, "max_distance", np.inf)
+    return _series(sensor, ("current_distance",), sound)
+
+
+def _home(local: Columns, single: dict[str, Columns]) -> TimeSeries | None:
     """Height above home, or above the origin of the local frame, which is where PX4 started."""
-    place, home = topics.get("vehicle_global_position", {}), topics.get("home_position", {})
+    place, home = single["vehicle_global_position"], single["home_position"]
     if "alt" in place and "alt" in home:
         above = place["alt"].astype(np.float64) - float(home["alt"][-1])
-        return _series(place, [above], shift_us)
-    if "z" not in local:
-        return None
-    return _series(local, [-local["z"]], shift_us, _flag(local, "z_valid", 1) != 0)
+        return series_of(place["time_ns"], above[:, None])
+    return _series(local, ("z",), _flag(local, "z_valid", 1) != 0, -1)
 
 
-def _hae(gps: Columns, shift_us: int) -> TimeSeries | None:
-    for name, metres in (("altitude_ellipsoid_m", 1), ("alt_ellipsoid", 1e-3)):  # since PX4 1.14
-        if name in gps:
-            return _series(gps, [gps[name] * metres], shift_us, _flag(gps, "fix_type", 3) >= 3)
-    return None
+def _hae(gps: Columns) -> TimeSeries | None:
+    sound = _flag(gps, "fix_type", 3) >= 3
+    since_1_14 = _series(gps, ("altitude_ellipsoid_m",), sound)
+    return since_1_14 or _series(gps, ("alt_ellipsoid",), sound, 1e-3)
 
 
-def _position(gps: Columns, topics: dict[str, Columns], shift_us: int) -> TimeSeries | None:
-    """Position of the GPS receiver, or of the estimator where the log has no receiver."""
-    if "latitude_deg" in gps:  # since PX4 1.14
-        parts = gps["latitude_deg"], gps["longitude_deg"], gps["altitude_msl_m"]
-    elif "lat" in gps:
-        parts = gps["lat"] * 1e-7, gps["lon"] * 1e-7, gps["alt"] * 1e-3
+def _position(columns: Columns) -> TimeSeries | None:
+    """Positions of a receiver, or of the estimator."""
+    if "latitude_deg" in columns:  # since PX4 1.14
+        parts = columns["latitude_deg"], columns["longitude_deg"], columns["altitude_msl_m"]
+    elif "fix_type" in columns:
+        parts = columns["lat"] * 1e-7, columns["lon"] * 1e-7, columns["alt"] * 1e-3
     else:
-        gps = topics.get("vehicle_global_position", {})
-        if "lat" not in gps:
-            return None
-        parts = gps["lat"], gps["lon"], gps["alt"]
-    place, sound = np.stack(parts, axis=1).astype(np.float64), _flag(gps, "fix_type", 3) >= 3
-    return position_series(_time_ns(gps, shift_us)[sound], place[sound])
+        parts = columns["lat"], columns["lon"], columns["alt"]
+    place, sound = np.stack(parts, axis=1).astype(np.float64), _flag(columns, "fix_type", 3) >= 3
+    sound &= _flag(columns, "lat_lon_valid", 1) != 0
+    return position_series(columns["time_ns"][sound], place[sound])
 
 
 _SRT = re.compile(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->")
@@ -370,15 +417,17 @@ def read_log(
 
     Raises `FlightError` where it is damaged, of another kind, or without attitude.
     """
-    kind = log_kind(path)
+    kind, sources = log_kind(path), Sources(named or {}, path)
+    if unknown := sources.named.keys() - {"image", "camera_info", "attitude", "position", "height"}:
+        raise FlightError(f"logs have no sources of {', '.join(unknown)}: {path}")
     if kind in ("srt", "table") and path.stat().st_size > MAX_BYTES:
         raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
     if kind == "ulog":
-        return read_ulog(path, mount_deg)
+        return read_ulog(path, mount_deg, sources)
     if kind == "dataflash":
-        return read_dataflash(path, mount_deg)
+        return read_dataflash(path, mount_deg, sources)
     if kind == "tlog":
-        return read_tlog(path, mount_deg)
+        return read_tlog(path, mount_deg, sources)
     return read_srt(path) if kind == "srt" else read_table(path)
 
 

@@ -7,13 +7,14 @@ import bz2
 import contextlib
 import io
 import logging
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,13 @@ from orthonav.core.flight.ros_messages import (
     grey_of_message,
     height_of_message,
     horizon_std_of_message,
+    odd_word,
     stamp_ns,
 )
 from orthonav.core.flight.telemetry_track import (
     RecordedTrack,
     Samples,
-    TimeSeries,
+    Sources,
     altitude_series,
     attitude_series,
 )
@@ -48,6 +50,7 @@ from orthonav.ground.recordings.mcap_files import (
     partial_records,
 )
 from orthonav.ground.recordings.recording import (
+    ROLES,
     Recording,
     SourceOptions,
     SourceView,
@@ -67,28 +70,22 @@ _SPLIT = re.compile(r"(.+)_(\d{1,9})")
 _END = b"\x0f" + (4).to_bytes(8, "little") + bytes(4)  # data end
 _END += b"\x02" + (20).to_bytes(8, "little") + bytes(20) + MAGIC  # footer without a summary
 
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
 TYPES: dict[str, tuple[str, ...]] = {
-    "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    "image": ("sensor_msgs/msg/Image", _COMPRESSED),
     "camera_info": ("sensor_msgs/msg/CameraInfo",),
-    "attitude": (
-        "sensor_msgs/msg/Imu",
-        "nav_msgs/msg/Odometry",
-        "geometry_msgs/msg/PoseStamped",
-    ),
+    "attitude": ("sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"),
     "velocity": ("nav_msgs/msg/Odometry",),
     "position": ("sensor_msgs/msg/NavSatFix",),
-    "height": (
-        "sensor_msgs/msg/Range",
-        "mavros_msgs/msg/Altitude",
-        "std_msgs/msg/Float64",
-        "std_msgs/msg/Float32",
-    ),
+    "height": ("sensor_msgs/msg/Range", "mavros_msgs/msg/Altitude", *_PLAIN_NUMBERS),
 }
-_COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
-_PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
-_HOME_NAMES = ("rel_alt", "relative_altitude")
-_HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
+_HOME_NAMES = ("/rel_alt", "/relative_altitude")
+_HEIGHT_NAMES = (*_HOME_NAMES, "/agl", "/height_above_ground")
+_IGNORED = ("/orthonav/fix", "/global_position/local")
+"""Its own results; odometry of MAVROS whose velocity is not in the frame of the body."""
+Topics = Mapping[str, Mapping[str, Any]]  # connections of a role by topic, the preferred first
 log = logging.getLogger(__name__)
 
 
@@ -359,65 +356,41 @@ def _require(size: int) -> None:
         raise ValueError(f"a chunk states {size} bytes, more than {MAX_CHUNK_BYTES}")
 
 
-class Topics(NamedTuple):
-    """The connection of each role that was found, and all candidates for attitude."""
-
-    roles: Mapping[str, Any]  # "image" first
-    attitudes: Sequence[Any]
-
-
 def all_on(reader: Any, connection: Any) -> list[Any]:
     """All connections on the topic of one (bags split or appended have several)."""
     return [one for one in reader.connections if one.topic == connection.topic]
 
 
-def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
+def find_topics(reader: Any, sources: Sources) -> Topics:
     counted = {one.topic: one for one in reader.connections if one.msgcount}
-    found: dict[str, list[Any]] = {}
+    found: dict[str, dict[str, Any]] = {}
     for role, types in TYPES.items():
-        if role in asked:
-            found[role] = [_asked(role, asked[role], counted, path)]
-            continue
+        named = role in sources.named
         of_type = [
-            one
-            for one in counted.values()
-            if one.msgtype in types
-            and (one.msgtype not in _PLAIN_NUMBERS or _last_name(one) in _HEIGHT_NAMES)
+            one for one in counted.values() if one.msgtype in types and (named or _fits(one))
         ]
-        found[role] = sorted(
-            of_type, key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic)
-        )
-    images = found["image"]
-    if len(images) != 1:
-        found_names = ", ".join(sorted(one.topic for one in images))
-        if not images:
-            found_names = f"none among {', '.join(sorted(counted)) or 'no topic'}"
+        of_type.sort(key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic))
+        found[role] = {one.topic: one for one in of_type}
+    images, infos = found["image"], found["camera_info"]
+    if len(images) != 1 and "image" not in sources.named:
+        known = ", ".join(sorted(counted)) or "no topic"
+        names = ", ".join(sorted(images)) or f"none among {known}"
         raise FlightError(
-            f"expected one topic of images, found {found_names}; give --topic: {path}"
+            f"expected one topic of images, found {names}; give --topic: {sources.path}"
         )
-    infos = found["camera_info"]
-    # In the namespace of the image (image_raw/compressed too).
-    near = [one for one in infos if images[0].topic.startswith(one.topic.rpartition("/")[0] + "/")]
-    found["camera_info"] = near or (infos if len(infos) == 1 else [])
-    roles = {role: ones[0] for role, ones in found.items() if ones}
-    return Topics(roles, found["attitude"])
+    image = sources.first("image", images, lambda name: (name, ""))
+    if "camera_info" not in sources.named:
+        # In the namespace of the image (image_raw/compressed too).
+        near = [name for name in infos if image.startswith(name.rpartition("/")[0] + "/")]
+        near.sort(key=lambda name: -name.count("/"))
+        infos = dict.fromkeys(near or list(infos)[: len(infos) == 1])
+    sources.first("camera_info", infos, lambda name: (name, ""))
+    return found
 
 
-def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
-    if name not in counted:
-        raise FlightError(
-            f"no messages on {name}; available: {', '.join(sorted(counted)) or 'none'}: {path}"
-        )
-    if counted[name].msgtype not in TYPES[role]:
-        raise FlightError(
-            f"{name} carries {counted[name].msgtype}; {role} is one of "
-            f"{', '.join(TYPES[role])}: {path}"
-        )
-    return counted[name]
-
-
-def _last_name(connection: Any) -> str:
-    return str(connection.topic.rpartition("/")[2])
+def _fits(connection: Any) -> bool:
+    number, topic = connection.msgtype in _PLAIN_NUMBERS, connection.topic
+    return topic.endswith(_HEIGHT_NAMES) if number else not topic.endswith(_IGNORED)
 
 
 def open_ros(path: Path, options: SourceOptions) -> Recording:
@@ -426,37 +399,40 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
     Telemetry is read first, in one pass over its topics; images are read on request.
     """
     with opened(path) as (reader, doubts):
-        topics = find_topics(reader, options.topics, path)
-        image = topics.roles["image"]
-        size, first_ns, last_ns = _first_image(reader, topics, path)
+        own = ROLES if options.telemetry is None else ("image", "camera_info")  # else of the log
+        asked = {role: name for role, name in options.topics.items() if role in own}
+        sources = Sources(asked, path)
+        topics = find_topics(reader, sources)
+        image = topics["image"][sources.used["image"]]
+        size, first_ns, last_ns = _first_image(reader, image, path)
         camera = given_camera(options, *size, str(path)) or fitted(
-            _camera(reader, topics, path), *size, str(path)
+            _camera(reader, topics, sources), *size, str(path)
         )
         if options.telemetry is not None:
             track = read_log(options.telemetry, options.mount_deg, options.topics)
         else:
-            track = read_track(reader, topics, options.mount_deg)
+            track = read_track(reader, topics, sources, options.mount_deg)
         warnings = [] if track.attitude else ["no topic has the attitude of the aircraft"]
         if track.span_ns() is not None or options.telemetry is not None:
             offset = options.time_offset_ns
             check_overlap(track, first_ns + offset, last_ns + offset, options.telemetry or path)
-    used = ", ".join(f"{role} {one.topic}" for role, one in topics.roles.items())
+    used = [f"{role} {name}" for role, name in sources.used.items() if name != "none"]
     return Recording(
         kind="ros",
         path=path,
         camera=camera,
-        note=f"{path.name}: {used}",
+        note=f"{path.name}: {', '.join(used)}",
         expected=image.msgcount,
         stream=lambda: with_mean_velocities(_views(path, image.topic, track, options), track),
         warnings=(*doubts, *warnings, *warnings_of(track, options)),
-        choices=track.choices,
+        choices=tuple(dict.fromkeys(sources.choices + track.choices)),
         take_off_latlon_deg=track.take_off_latlon_deg,
     )
 
 
-def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, int], int, int]:
+def _first_image(reader: Any, image: Any, path: Path) -> tuple[tuple[int, int], int, int]:
     """Width and height of the first image that can be read, and times of the first and the last."""
-    reason, image = "there is none", topics.roles["image"]
+    reason = "there is none"
     for _, time_ns, raw in reader.messages(connections=all_on(reader, image)):
         try:
             message = reader.deserialize(raw, image.msgtype)
@@ -470,16 +446,15 @@ def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, in
     raise FlightError(f"no image of {image.topic} can be read ({reason}): {path}")
 
 
-def _camera(reader: Any, topics: Topics, path: Path) -> Camera:
-    info = topics.roles.get("camera_info")
-    if info is None:
-        raise CameraError(f"no camera_info for the images; give --camera FILE: {path}")
-    for _, _, raw in reader.messages(connections=all_on(reader, info)):
-        try:
-            return camera_of_info(reader.deserialize(raw, info.msgtype))
-        except CameraError as error:
-            raise CameraError(f"{error}: {path}") from error
-    raise CameraError(f"no message on {info.topic}; give --camera FILE: {path}")
+def _camera(reader: Any, topics: Topics, sources: Sources) -> Camera:
+    info = topics["camera_info"].get(sources.used["camera_info"])
+    found = next(_messages(reader, info), None) if info else None
+    if found is None:
+        raise CameraError(f"no camera_info for the images; give --camera FILE: {sources.path}")
+    try:
+        return camera_of_info(found[1], sources.used["image"])
+    except CameraError as error:
+        raise CameraError(f"{error}: {sources.path}") from error
 
 
 def _views(
@@ -509,23 +484,21 @@ def _broken(reason: str, where: str) -> NDArray[np.uint8]:
     raise FlightError(f"image message cannot be read ({reason}): {where}")
 
 
-def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
-    """The track of the selected topics.
+def read_track(reader: Any, topics: Topics, sources: Sources, mount_deg: Angles) -> RecordedTrack:
+    def first(role: str, read: Callable[[Any, Any], tuple[Any, str]]) -> Any:
+        def value(name: str) -> tuple[Any, str]:
+            one = topics[role][name]
+            word = odd_word(next((each for _, each in _messages(reader, one)), None), name)
+            odd = word and role not in sources.named
+            return (None, f"named '{word}'") if odd else read(reader, one)
 
-    The attitude is that of the first topic that has one (raw IMUs do not).
-    """
-    attitude: TimeSeries | None = None
-    horizon: TimeSeries | None = None
-    for connection in topics.attitudes:
-        times, wxyz = _samples(reader, connection, 4, attitude_of_message).arrays()
-        enu_from_flu, sound = rotations_of_wxyz(wxyz)
-        attitude = attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
-        if attitude is not None:
-            horizon = _samples(reader, connection, 1, _horizon_std).series()
-            break
-    agl, home, amsl = _heights(reader, topics)
-    places = _samples(reader, topics.roles.get("position"), 3, _position).positions()
-    velocity = _samples(reader, topics.roles.get("velocity"), 2, _velocity)
+        return sources.first(role, topics[role], value)
+
+    attitude, horizon = first("attitude", partial(_attitude, mount_deg)) or (None, None)
+    agl, home, amsl = first("height", _heights) or (None, None, None)
+    receivers = topics["position"].items()
+    fixes = {name: _samples(reader, one, _position, 3).positions() for name, one in receivers}
+    places = sources.best("position", fixes)
     return RecordedTrack(
         attitude=attitude,
         heights=() if agl is None else (agl,),
@@ -533,15 +506,28 @@ def read_track(reader: Any, topics: Topics, mount_deg: Angles) -> RecordedTrack:
         amsl=amsl,
         hae=altitude_series(places),  # sensor_msgs/NavSatFix
         position=places,
-        velocity=velocity.series(),
+        velocity=first(
+            "velocity", lambda bag, one: (_samples(bag, one, _velocity, 2).series(), "")
+        ),
         horizon_std=horizon,
         origin_ns=0 if attitude is None else int(attitude.time_ns[0]),
+        choices=sources.choices,
     )
 
 
+def _attitude(mount_deg: Angles, reader: Any, connection: Any) -> tuple[Any, str]:
+    """The series of attitudes and, where it is stated, of the horizon's deviation."""
+    times, wxyz = _samples(reader, connection, attitude_of_message, 4).arrays()
+    enu_from_flu, sound = rotations_of_wxyz(wxyz)
+    attitude = attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
+    if attitude is None:
+        return None, ""
+    changes = np.ptp(wxyz[sound], axis=0).any()
+    horizon = _samples(reader, connection, horizon_std_of_message, 1).series()
+    return (attitude, horizon), "" if changes else "its orientation never changes"
+
+
 def _messages(reader: Any, connection: Any) -> Iterator[tuple[int, Any]]:
-    if connection is None:
-        return
     for one, recorded_ns, raw in reader.messages(connections=all_on(reader, connection)):
         try:
             message = reader.deserialize(raw, one.msgtype)
@@ -550,44 +536,33 @@ def _messages(reader: Any, connection: Any) -> Iterator[tuple[int, Any]]:
         yield stamp_ns(message, recorded_ns), message
 
 
-def _samples(
-    reader: Any,
-    connection: Any,
-    width: int,
-    values_of: Callable[[Any], tuple[float, ...] | None],
-) -> Samples:
+def _samples(reader: Any, connection: Any, values_of: Callable[[Any], Any], width: int) -> Samples:
     samples = Samples(width)
     for time_ns, message in _messages(reader, connection):
         if (values := values_of(message)) is not None:
-            samples.add(time_ns, *values)
+            samples.add(time_ns, *np.atleast_1d(values))
     return samples
 
 
-def _heights(reader: Any, topics: Topics) -> tuple[TimeSeries | None, ...]:
+def _heights(reader: Any, connection: Any) -> tuple[Any, str]:
     agl, home, amsl = (Samples(1) for _ in range(3))
-    connection: Any = topics.roles.get("height")
     for time_ns, message in _messages(reader, connection):
         if hasattr(message, "bottom_clearance"):
-            agl.add(time_ns, message.bottom_clearance)
+            agl.add(time_ns, message.bottom_clearance if message.bottom_clearance > 0 else math.nan)
             home.add(time_ns, message.relative)
             amsl.add(time_ns, message.amsl)
         elif (height := height_of_message(message)) is not None:
-            above_home = _last_name(connection) in _HOME_NAMES
-            (home if above_home else agl).add(time_ns, height)
-    return agl.series(), home.series(), amsl.series()
+            (home if connection.topic.endswith(_HOME_NAMES) else agl).add(time_ns, height)
+    found = agl.series(), home.series(), amsl.series()
+    return found if any(found) else None, ""
 
 
 def _velocity(message: Any) -> tuple[float, ...] | None:
-    turn, twist = message.pose.pose.orientation, message.twist.twist.linear
-    for enu_from_flu in rotations_of_wxyz(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]:
+    twist, wxyz = message.twist.twist.linear, attitude_of_message(message)
+    for enu_from_flu in rotations_of_wxyz(np.array([wxyz or (0.0,) * 4]))[0]:
         east, north, _ = enu_from_flu @ [twist.x, twist.y, twist.z]
         return float(east), float(north)
     return None
-
-
-def _horizon_std(message: Any) -> tuple[float, ...] | None:
-    std_deg = horizon_std_of_message(message)
-    return None if std_deg is None else (std_deg,)
 
 
 def _position(message: Any) -> tuple[float, ...] | None:

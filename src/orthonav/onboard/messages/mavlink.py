@@ -343,6 +343,28 @@ class Autopilot(Enum):
     ARDUPILOT = "ardupilot"
 
 
+KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
+NO_AUTOPILOT, DOWNWARD, _GIMBAL, _CAMERA, _INVALID_SIGNAL, _SAME_MM = 8, 25, 26, 30, 1, 50
+
+
+def is_of_autopilot(heartbeat: Message) -> bool:
+    """Whether an autopilot sends it; some gimbals and cameras name one as theirs."""
+    return heartbeat.autopilot != NO_AUTOPILOT and heartbeat.type not in (_GIMBAL, _CAMERA)
+
+
+def is_height(sensor: Message) -> bool:
+    """Whether a DISTANCE_SENSOR measures downward, within its limits."""
+    within = sensor.min_distance < sensor.current_distance < sensor.max_distance
+    valid = within and getattr(sensor, "signal_quality", 0) != _INVALID_SIGNAL
+    return bool(valid and sensor.orientation == DOWNWARD)
+
+
+def repeats_height(position: Message) -> bool:
+    """Whether both heights of GLOBAL_POSITION_INT are one: PX4 without a home repeats that above
+    the sea, ArduPilot without an altitude by GNSS counts that from its start."""
+    return bool(abs(position.relative_alt - position.alt) <= _SAME_MM)
+
+
 @dataclass(frozen=True)
 class Origin:
     """Origin of an autopilot's local frame (WGS84, m above mean sea level)."""

@@ -22,6 +22,7 @@ from orthonav.core.flight.ros_messages import (
     grey_of_message,
     height_of_message,
     horizon_std_of_message,
+    odd_word,
     stamp_ns,
 )
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, ned_wxyz_from_ros
@@ -220,13 +221,13 @@ class Ros2Reader:
         self._info_stamps.append(stamp_ns(message, 0))
         if self._camera is None:
             try:
-                self._camera = camera_of_info(message)
+                self._camera = camera_of_info(message, self._image_topic)
             except CameraError as error:
                 self._camera_error = error
 
     def _take_attitude(self, message: Any, cdr: bytes) -> None:
         time_ns, wxyz = self._stamp(message), attitude_of_message(message)
-        if time_ns is None or wxyz is None:
+        if self._is_odd("imu", message, missing=wxyz is None) or time_ns is None or wxyz is None:
             return
         if time_ns < self._attitude_ns - JUMP_NS:
             self._restart("imu", self._attitude_ns - time_ns)
@@ -236,9 +237,16 @@ class Ros2Reader:
         if turned is not None:
             self._buffer.add_attitude(time_ns, turned.tolist())
 
+    def _is_odd(self, what: str, message: Any, *, missing: bool = False) -> bool:
+        word = odd_word(message)
+        if word or missing:
+            why = f"its frame is named '{word}'" if word else "it has no orientation"
+            self._say_once(f"{what} is not used: {why}")
+        return bool(word)
+
     def _take_height(self, source: str, message: Any, cdr: bytes) -> None:
         time_ns, height = self._stamp(message), height_of_message(message)
-        if time_ns is None or height is None:
+        if self._is_odd(source, message) or time_ns is None or height is None:
             return
         if source == "distance":
             self._buffer.add_distance(time_ns, height)
