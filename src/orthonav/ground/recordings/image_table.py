@@ -232,8 +232,8 @@ def _row(
         found |= {"time_ns": time_ns, "zone_known": True}
     if "lat" in values and "lon" in values and (values["lat"] or values["lon"]):
         found["latlon_deg"] = values["lat"], values["lon"]
-    if any(math.isfinite(values.get(name, math.nan)) for name in _HEIGHTS):
-        found |= {f"{name}_m": values.get(name, math.nan) for name in _HEIGHTS}
+    stated = [name for name in _HEIGHTS if math.isfinite(values.get(name, math.nan))]
+    found |= {f"{name}_m": values[name] for name in stated}
     yaw, pitch = values.get("yaw", math.nan), values.get("pitch", math.nan)
     roll = values.get("roll", 0.0)
     if gimbal and math.isfinite(pitch) and not unrecorded:
