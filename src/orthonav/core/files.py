@@ -11,6 +11,7 @@ from pathlib import Path
 
 from orthonav.core.errors import MissingFileError, OutputError, lfs_pointer
 
+StrPath = str | os.PathLike[str]
 Progress = Callable[[str, float], None]
 """Receives the stage of a long task and the fraction of it that is done, 0 to 1."""
 

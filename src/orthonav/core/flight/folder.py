@@ -236,6 +236,7 @@ def camera_from_plain(raw: Any) -> Camera:
         distortion=tuple(float(value) for value in distortion),
         model=str(raw.get("model", "brown")),
         focal_std=float(raw.get("focal_std", 0.0)),
+        unusual=raw.get("unusual") is True,
     )
 
 

@@ -128,7 +128,7 @@ def camera_of_info(message: Any) -> Camera:
         raise CameraError("camera_info with binning or a region of interest; give --camera FILE")
     return camera_from_numbers(
         (message.width, message.height),
-        matrix[[0, 4, 2, 5]].tolist(),
+        matrix.tolist(),
         lens.ravel().tolist(),
         str(message.distortion_model),
     )

@@ -22,11 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
+from orthonav.core.files import StrPath
 
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
 MAX_FOCAL_STD = 0.5
 FOV_STD = 0.05  # of the focal length by a stated field of view, relative
+MAX_OFF_MIDDLE = 0.1  # of the principal point, as a share of a side
+MAX_SKEW = 1e-3  # of the focal length
+MIN_FOCAL, MAX_FOCAL = 0.3, 20.0  # over a side
+MIN_FOV_DEG = 2.9  # that of 20 widths; 2.9 radians are 166 deg
+MAX_OBLONG = 0.05  # of pixels
 _STEPS = 50
 _CLOSE = 1e-9
 _EXACT = 1e-14
@@ -44,8 +50,10 @@ class Camera:
     (pixel-is-area: its centre is 0.5, 0.5). With `model` "brown", `distortion` is empty or
     k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
     OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
-    for a calibrated camera. `mask` (H, W), see `masked`, is no part of comparisons. Raises
-    `CameraError` on values no camera has."""
+    for a calibrated camera. `mask` (H, W), see `masked`, is no part of comparisons. `unusual`: a
+    principal point more than a tenth of a side from the middle (a crop, a shifted lens) or pixels
+    that are not square are meant; without it they are refused. Raises `CameraError` on values no
+    camera has."""
 
     width_px: int
     height_px: int
@@ -57,13 +65,16 @@ class Camera:
     model: str = "brown"
     focal_std: float = 0.0
     mask: NDArray[np.uint8] | None = field(default=None, compare=False, repr=False)
+    unusual: bool = False
 
     def __post_init__(self) -> None:
         if self.distortion and not any(self.distortion):
             object.__setattr__(self, "distortion", ())  # none at all, and faster
         for name in ("width_px", "height_px"):
-            if not 1 <= getattr(self, name) <= MAX_DIMENSION_PX:
-                raise CameraError(f"camera {name} must be 1 to {MAX_DIMENSION_PX}: {self}")
+            side = getattr(self, name)
+            if not (1 <= side <= MAX_DIMENSION_PX and side == int(side)):
+                raise CameraError(f"camera {name} must be 1 to {MAX_DIMENSION_PX}, whole: {self}")
+            object.__setattr__(self, name, int(side))
         self._check_mask()
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
         if not all(math.isfinite(number) for number in numbers):
@@ -82,6 +93,31 @@ class Camera:
                 f"camera distortion of a {self.model} lens must be empty or {names}, "
                 f"got {self.distortion}"
             )
+        self._check_plausible()
+
+    def _check_plausible(self) -> None:
+        """By shares of sides, which remain where a picture is scaled."""
+        (fx, fy), (wide, high) = (self.fx_px, self.fy_px), (self.width_px, self.height_px)
+        off = max(abs(self.cx_px / wide - 0.5), abs(self.cy_px / high - 0.5))
+        apart, wrong = abs(fx / fy - 1), ""
+        if max(fx / wide, fy / high) < MIN_FOCAL or min(fx / wide, fy / high) > MAX_FOCAL:
+            wrong = (
+                f"focal length of {fx:g} px is {fx / wide:.2g} widths, expected {MIN_FOCAL:g} to "
+                f"{MAX_FOCAL:g}; it is in pixels of this picture"
+            )
+        elif off > MAX_OFF_MIDDLE and not self.unusual:
+            wrong = (
+                f"principal point {self.cx_px:g}, {self.cy_px:g} px is {off:.0%} of a side from "
+                "the middle: is it of another size, or the matrix transposed? State that of a "
+                'crop or a shifted lens by "unusual": true'
+            )
+        elif apart > MAX_OBLONG + 2 / min(wide, high) and not self.unusual:  # sides are rounded
+            wrong = (
+                f"focal lengths of {fx:g} and {fy:g} px differ by {apart:.0%}; state pixels that "
+                'are not square by "unusual": true'
+            )
+        if wrong:
+            raise CameraError(f"camera of {wide} x {high} px: {wrong}")
 
     def _check_mask(self) -> None:
         mask, shape = self.mask, (self.height_px, self.width_px)
@@ -92,13 +128,23 @@ class Camera:
             )
 
     @classmethod
-    def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
-        """A camera without distortion by its horizontal field of view, above 0 and below 180 deg.
+    def from_fov(
+        cls, fov_deg: float, width_px: int, height_px: int, *, diagonal: bool = False
+    ) -> "Camera":
+        """A camera without distortion by its field of view in degrees, 2.9 to about 125.
 
-        Stated fields of view are often those of the lens or of another mode: good to 5 %."""
+        It is that across the width of the picture; with `diagonal` that from corner to corner, as
+        makers of cameras often state it. Stated fields of view are often those of the lens or of
+        another mode: good to 5 %. Raises `CameraError`."""
         if not 0 < fov_deg < 180:
             raise CameraError(f"field of view must be above 0 and below 180 deg, got {fov_deg:g}")
-        focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
+        if fov_deg < MIN_FOV_DEG:
+            raise CameraError(
+                f"field of view of {fov_deg:g} deg is less than {MIN_FOV_DEG} deg; if these are "
+                f"radians, give {math.degrees(fov_deg):.1f}"
+            )
+        across_px = math.hypot(width_px, height_px) if diagonal else width_px
+        focal_px = across_px / 2 / math.tan(math.radians(fov_deg) / 2)
         middle_px = width_px / 2, height_px / 2
         return cls(width_px, height_px, focal_px, focal_px, *middle_px, focal_std=FOV_STD)
 
@@ -109,21 +155,37 @@ class Camera:
         distortion: Sequence[float] | None,
         size_px: tuple[int, int],
         model: str = "brown",
+        *,
+        unusual: bool = False,
     ) -> "Camera":
-        """A camera by the matrix (3, 3) and the distortion of OpenCV's calibration.
+        """A camera by the matrix (3, 3) in pixels and the distortion of OpenCV's calibration.
 
-        `size_px`: width and height of the images that it was calibrated with."""
+        OpenCV counts cx and cy from the centre of the first pixel; 0.5 is added, because `cx_px`
+        and `cy_px` count from its corner. `distortion`: k1, k2, p1, p2[, k3], of a "fisheye"
+        `model` k1 to k4; None: none. `size_px`: width and height of the images that it was
+        calibrated with. `unusual`: see `Camera`. Raises `CameraError`."""
         k = np.asarray(matrix, np.float64)
         if k.shape != (3, 3):
             raise CameraError(f"camera matrix must be (3, 3), got {k.shape}")
+        if k[0, 2] == k[1, 2] == 0 and k[2, :2].any():
+            raise CameraError(
+                "camera matrix is transposed (its last row is "
+                f"{k[2, 0]:g}, {k[2, 1]:g}, {k[2, 2]:g}), as MATLAB writes it; transpose it, and "
+                "subtract 1 from cx and cy if they are MATLAB's, which counts pixels from 1"
+            )
+        if abs(k[0, 1]) > MAX_SKEW * abs(k[0, 0]) or k[1, 0] or k[2].tolist() != [0, 0, 1]:
+            raise CameraError(
+                f"camera matrix must be fx 0 cx, 0 fy cy, 0 0 1, without skew, got {k.tolist()}"
+            )
         # OpenCV counts from the centre of the first pixel.
         numbers = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
         more = () if distortion is None else np.ravel(np.asarray(distortion, np.float64)).tolist()
-        return cls(*size_px, *numbers, tuple(more), model)
+        return cls(*size_px, *numbers, tuple(more), model, unusual=unusual)
 
     @classmethod
-    def from_file(cls, path: Path | str) -> "Camera":
-        """The camera of a `flight.json`, or of a calibration of OpenCV, ROS or Kalibr.
+    def from_file(cls, path: StrPath) -> "Camera":
+        """The camera of a `flight.json`, or of a calibration of OpenCV (YAML, XML, JSON), ROS or
+        Kalibr (YAML; `FILE#cam1` is one of several).
 
         Raises `MissingFileError`, `CameraError` or `MissingExtraError`."""
         from orthonav.core.geo.camera_files import read_camera_file  # the readers make cameras
@@ -144,7 +206,8 @@ class Camera:
 
     def numbers(self) -> dict[str, Any]:
         """All but the mask, as in `flight.json`."""
-        return {name: each for name, each in vars(self).items() if name != "mask"}
+        known = {name: each for name, each in vars(self).items() if name != "mask"}
+        return known if known.pop("unusual") is False else known | {"unusual": True}
 
     @property
     def is_pinhole(self) -> bool:
