@@ -12,7 +12,7 @@ import numpy as np
 
 from orthonav.core.errors import CameraError, MissingExtraError
 from orthonav.core.files import require_file
-from orthonav.core.flight import read_camera
+from orthonav.core.flight.folder import camera_from_plain
 from orthonav.core.geo.camera import Camera
 from orthonav.core.guard import needed
 
@@ -75,7 +75,7 @@ def read_camera_file(path: Path) -> Camera:
             return camera
         if text.lstrip().startswith("{"):
             plain = json.loads(text)
-            return read_camera(path)[0] if "camera" in plain else _plain(plain)
+            return camera_from_plain(plain["camera"]) if "camera" in plain else _plain(plain)
         return _plain(_yaml(text.removeprefix(_OPENCV_HEADER)), name)
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
