@@ -10,22 +10,23 @@ nine decimals, so that nanoseconds since 1970 are exact, which a float64 of seco
 import hashlib
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from decimal import Decimal
+from importlib import import_module
 from itertools import chain, repeat
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError
-from orthonav.core.files import require_file, write_lines
+from orthonav.core.errors import FlightError, MissingExtraError
+from orthonav.core.files import StrPath, require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.limits import DEFAULT_RISK
-from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.core.records import Fix, NoFix, ReadOnly, ViewResult
 
 KEYS = (
     "frame",  # name of the image in the flight folder
@@ -149,27 +150,36 @@ UNKNOWN = Identity()  # of a run whose map and flight are not stated
 
 def result_to_json(result: ViewResult) -> str:
     """One line of `fixes.jsonl`, without the line end: strict JSON in ASCII, keys as in `KEYS`."""
-    values: dict[str, Any] = {
+    plain = result_to_plain(result)
+    texts = {key: json.dumps(value, allow_nan=False) for key, value in plain.items()}
+    texts["time_s"] = _seconds(result.time_ns)
+    return "{" + ", ".join(f'"{key}": {text}' for key, text in texts.items()) + "}"
+
+
+def result_to_plain(result: ViewResult) -> dict[str, Any]:
+    """Plain values of a line by their keys, in the order of the file."""
+    outcome = outcome_to_plain(result.outcome, result.risk)
+    if isinstance(result.outcome, Fix):
+        outcome["confident"] = result.is_confident
+    own = {
         "frame": result.frame,
-        **_outcome_values(result.outcome),
-        "evidence": {str(k): _or_none(v) for k, v in result.outcome.evidence.items()},
+        "time_s": result.time_ns / 1e9,
         "latency_ms": _or_none(result.latency_ms),
     }
-    if isinstance(result.outcome, Fix):
-        fix, risk = result.outcome, result.risk
-        values["confident"] = result.is_confident
-        stated = fix.place_probability, fix.protection_level_m(risk), risk
-        values |= zip(INTEGRITY_KEYS, map(_or_none, stated), strict=True)
-    texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
-    texts["time_s"] = _seconds(result.time_ns)
-    keys: tuple[str, ...] = KEYS
-    for more in (INTEGRITY_KEYS, GROUND_KEYS, POSE_KEYS):
-        if more[0] in values:
-            keys += more
-    if result.state is not None:
-        keys += TRACK_KEYS
-        texts |= {"tracked": "true", "state": json.dumps(result.state)}
-    return "{" + ", ".join(f'"{key}": {texts[key]}' for key in keys) + "}"
+    track = {} if result.state is None else {"tracked": True, "state": result.state}
+    values = own | outcome | track
+    return {key: values.pop(key) for key in KEYS} | values
+
+
+def outcome_to_plain(outcome: Fix | NoFix, risk: float = DEFAULT_RISK) -> dict[str, Any]:
+    """As `result_to_plain`, without what belongs to the flight."""
+    values = _outcome_values(outcome)
+    values["evidence"] = {str(k): _or_none(v) for k, v in outcome.evidence.items()}
+    known = {key: values.pop(key) for key in KEYS if key in values}
+    if isinstance(outcome, Fix):
+        stated = outcome.place_probability, outcome.protection_level_m(risk), risk
+        known |= zip(INTEGRITY_KEYS, map(_or_none, stated), strict=True)
+    return known | values
 
 
 def result_from_json(line: str) -> ViewResult:
@@ -217,7 +227,7 @@ def is_health(line: str) -> bool:
     return line.startswith('{"health"')
 
 
-def read_results(path: Path) -> list[ViewResult]:
+def read_results(path: StrPath) -> list[ViewResult]:
     """All results in `path`, in its order; empty lines and those of health are skipped.
 
     Raises `MissingFileError` where there is no such file, and `FlightError` with the number of the
@@ -243,12 +253,58 @@ def read_results(path: Path) -> list[ViewResult]:
     return results
 
 
+def to_dataframe(fixes: StrPath | Iterable[Fix | NoFix | ViewResult]) -> Any:
+    """A pandas table with one row for each of these, or for each line of a file of fixes.
+
+    Columns are the keys of `fixes.jsonl`, numbers of the evidence as `evidence.NAME`. Raises
+    `MissingExtraError` without pandas, and as `read_results`."""
+    try:
+        pandas: Any = import_module("pandas")
+    except ImportError as error:
+        raise MissingExtraError("a table of fixes needs pandas: pip install pandas") from error
+    return pandas.json_normalize([each.to_dict() for each in _all(fixes)])
+
+
+def to_geojson(fixes: StrPath | Iterable[Fix | NoFix | ViewResult]) -> dict[str, Any]:
+    """A FeatureCollection (RFC 7946) with a point for each fix among these, or in a file of fixes;
+    `json.dumps` makes text of it, GeoPandas' `from_features` a table. Raises as `read_results`."""
+    views = (
+        x if isinstance(x, ViewResult) else ViewResult("", 0, x, math.nan) for x in _all(fixes)
+    )
+    return feature_collection(
+        feature(x.frame, x.outcome, x.outcome.std_m) for x in views if isinstance(x.outcome, Fix)
+    )
+
+
+def feature_collection(features: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    return {"type": "FeatureCollection", "features": list(features)}
+
+
+def feature(frame: str, fix: Fix, std_m: float, height_m: float = math.nan) -> dict[str, Any]:
+    """Of GeoJSON; `height_m`: above mean sea level, NaN: unknown."""
+    numbers = {"agl_m": fix.agl_m, "heading_deg": fix.heading_deg, "std_m": std_m}
+    numbers["confidence"] = fix.confidence
+    known = {name: None if math.isnan(x) else round(x, 4) for name, x in numbers.items()}
+    place = fix.lon_deg, fix.lat_deg, height_m
+    point = [round(value, 8) for value in place if math.isfinite(value)]
+    return {
+        "type": "Feature",
+        "geometry": {"type": "Point", "coordinates": point},
+        "properties": {"frame": frame, **known},
+    }
+
+
+def _all(fixes: StrPath | Iterable[Any]) -> Iterable[Any]:
+    return read_results(fixes) if isinstance(fixes, str | os.PathLike) else fixes
+
+
 def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
     if isinstance(outcome, NoFix):
         no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
         return {**no_fix, **_NULL_IN_NO_FIX}
     return {
         "status": "fix",
+        "confident": outcome.is_confident,
         "lat_deg": _or_none(outcome.lat_deg),
         "lon_deg": _or_none(outcome.lon_deg),
         "cov_en_m2": _rows(outcome.cov_en_m2),
@@ -288,7 +344,7 @@ def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
 def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
     status, evidence = values["status"], values["evidence"]
     _checked(values, "evidence", "an object", isinstance(evidence, dict))
-    evidence = MappingProxyType(
+    evidence = ReadOnly(
         {key: _as_float(value, f"evidence {key!r:.40}") for key, value in evidence.items()}
     )
     if status == "no_fix":

@@ -20,6 +20,7 @@ from orthonav.core.records import (
     DEFAULT_AGL_STD,
     DEFAULT_YAW_STD_DEG,
     MIN_YAW_STD_DEG,
+    Fix,
     NoFix,
     Telemetry,
     View,
@@ -37,6 +38,13 @@ DARK_LEVEL = 16.0
 BRIGHT_LEVEL = 250.0
 MIN_STD = 3.0
 _SAMPLE_STEP_PX = 8
+
+
+def named(found: Fix | NoFix) -> Fix | NoFix:
+    """With the name that the heading has as an argument."""
+    if isinstance(found, NoFix) and found.reason == "missing_telemetry":
+        return replace(found, detail=found.detail.replace("yaw_deg", "heading_deg"))
+    return found
 
 
 def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
@@ -94,9 +102,9 @@ def check_picture(grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None
     mean = float(counts @ levels) / size
     std = math.sqrt(max(float(counts @ levels**2) / size - mean**2, 0.0))
     if high < DARK_LEVEL:
-        return NoFix("too_dark", f"99 % of the view is darker than {high:.0f} of 255")
+        return NoFix("too_dark", f"99 % of the view is {high:.0f} of 255 or darker")
     if low > BRIGHT_LEVEL:
-        return NoFix("too_bright", f"99 % of the view is brighter than {low:.0f} of 255")
+        return NoFix("too_bright", f"99 % of the view is {low:.0f} of 255 or brighter")
     if std < MIN_STD:
         return NoFix("blank", f"grey levels differ by {std:.1f} of 255 only (standard deviation)")
     return None

@@ -24,7 +24,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from orthonav.core.errors import MapChangedError, MapFileError, MissingFileError, OutputError
-from orthonav.core.files import replacing, require_file
+from orthonav.core.files import StrPath, replacing, require_file
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile.manifest import Manifest
 
 MAX_HEADER_BYTES = 16 * 2**20
@@ -126,7 +127,8 @@ class MapParts(Mapping[str, NDArray[Any]]):
 class MapFile:
     """An opened map, or one that was built and not yet written.
 
-    `arrays`: its parts, read-only; those of an opened map are read when asked for."""
+    `arrays`: its parts by name, read-only; those of an opened map are read when asked for. Frame,
+    resolution, coordinate system, bounds and `contains` are those of its first sheet."""
 
     path: Path
     size_bytes: int
@@ -134,8 +136,31 @@ class MapFile:
     arrays: Mapping[str, NDArray[Any]]
 
     def __repr__(self) -> str:
-        area_km2, gsd_m = self.manifest.area_km2, self.manifest.sheets[0].grid.gsd_m
-        return f"MapFile({self.path}, {area_km2:.2f} km2, {gsd_m:g} m per pixel)"
+        return f"MapFile({self.path}, {self.manifest.area_km2:.2f} km2, {self.gsd_m:g} m per pixel)"
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The plane of the map: `en_from_latlon(lat_deg, lon_deg)` gives metres east and north of
+        its centre (.., 2), `latlon_from_en` the inverse."""
+        return self.manifest.sheets[0].frame
+
+    @property
+    def gsd_m(self) -> float:
+        """Metres on the ground per pixel."""
+        return self.manifest.sheets[0].grid.gsd_m
+
+    @property
+    def crs(self) -> str:
+        """The coordinate system of `frame`, for PROJ."""
+        return self.frame.proj4
+
+    @property
+    def dates(self) -> tuple[str, ...]:
+        """First and last date of its imagery as ISO 8601, as far as they are known."""
+        ends = ("date_from", "date")
+        return tuple(
+            sorted({str(x[end]) for x in self.manifest.imagery for end in ends if x.get(end)})
+        )
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:
@@ -240,7 +265,7 @@ class _OpenFile:
         return b"".join(pieces)
 
 
-def open_map(path: Path, manifest_sha256: str | None = None) -> MapFile:
+def open_map(path: StrPath, manifest_sha256: str | None = None) -> MapFile:
     """Open a map and verify every checksum in it.
 
     `manifest_sha256`: of a signature; another map is refused, also one swapped after its check.
