@@ -107,12 +107,22 @@ def test_types_of_the_examples_are_accepted(tmp_path):
     readme = (EXAMPLES.parent / "README.md").read_text("utf-8")
     notebook = json.loads((EXAMPLES / "first_steps.ipynb").read_text("utf-8"))
     cells = ["".join(x["source"]) for x in notebook["cells"] if x["cell_type"] == "code"]
-    texts = {"readme.py": readme.split("```python\n")[1].split("```")[0], "steps.py": "\n".join(cells)}
+    texts = {
+        "readme.py": readme.split("```python\n")[1].split("```")[0],
+        "steps.py": "\n".join(cells),
+    }
     for name in ("build_map.py", "follow_flight.py", "one_image.py"):
         texts[name] = (EXAMPLES / name).read_text("utf-8")
     for name, text in texts.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "mypy", "--strict", "--ignore-missing-imports", "--config-file="]
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--ignore-missing-imports",
+        "--config-file=",
+    ]
     done = subprocess.run([*command, "--follow-imports=silent", *(tmp_path / name for name in texts)],
                           capture_output=True, text=True, timeout=300, env={**os.environ,
                           "MYPYPATH": str(EXAMPLES.parent / "src")})  # fmt: skip
