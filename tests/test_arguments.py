@@ -142,7 +142,7 @@ def test_a_prior_of_another_type_is_named(map_path, area):
     with pytest.raises(ArgumentError, match="prior must be an orthonav"):
         localizer.localize(grey, area.camera, agl_m=300.0, prior=(48.8, 2.3))
     found = localizer.localize(grey, area.camera, agl_m=300.0, heading_deg=math.nan)
-    assert found.detail == "not a number: heading_deg"
+    assert found.detail == "not a number: heading_deg (yaw_deg)"
     assert "0 of 255 or darker" in localizer.localize(grey, area.camera, agl_m=300.0).detail
 
 

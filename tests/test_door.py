@@ -115,17 +115,10 @@ def test_types_of_the_examples_are_accepted(tmp_path):
         texts[name] = (EXAMPLES / name).read_text("utf-8")
     for name, text in texts.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
-    command = [
-        sys.executable,
-        "-m",
-        "mypy",
-        "--strict",
-        "--ignore-missing-imports",
-        "--config-file=",
-    ]
-    done = subprocess.run([*command, "--follow-imports=silent", *(tmp_path / name for name in texts)],
-                          capture_output=True, text=True, timeout=300, env={**os.environ,
-                          "MYPYPATH": str(EXAMPLES.parent / "src")})  # fmt: skip
+    options = ("--strict", "--ignore-missing-imports", "--config-file=", "--follow-imports=silent")
+    command = [sys.executable, "-m", "mypy", *options, *(tmp_path / name for name in texts)]
+    env = {**os.environ, "MYPYPATH": str(EXAMPLES.parent / "src")}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=env)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

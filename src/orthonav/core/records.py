@@ -32,8 +32,6 @@ MAX_TIME_S = 1e11  # the year 5138; since 1970 there were more milliseconds
 
 Evidence = Mapping[str, float]
 """Named numbers behind the confidence of a fix; see `docs/reference/formats.md`."""
-Image = NDArray[Any] | None
-"""None, as OpenCV gives for a file that it cannot read, is refused by name."""
 
 
 def has_type(name: str, value: Any, expected: type, how: str) -> None:
@@ -75,10 +73,8 @@ class ByValue:
     def _key(self) -> tuple[Any, ...]:
         return tuple(_comparable(getattr(self, each.name)) for each in fields(self))
 
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, ByValue) and type(other) is type(self) and other._key() == self._key()
-        )
+    def __eq__(self, other: Any) -> bool:
+        return type(other) is type(self) and bool(other._key() == self._key())
 
     def __hash__(self) -> int:
         return hash(self._key())
@@ -161,23 +157,13 @@ class Telemetry(ByValue):
     below: Ground | None = None
 
     def __post_init__(self) -> None:
-        prior, below = self.prior, self.below
-        optional: dict[str, tuple[float | None, ...]] = {
-            "yaw_std_deg": (self.yaw_std_deg,),
-            "agl_std_m": (self.agl_std_m,),
-            "prior": () if prior is None else (prior.std_m,),
-            "vel_en_mps": () if self.vel_en_mps is None else self.vel_en_mps,
-            "tilt_std_deg": (self.tilt_std_deg,),
-            "mount_std_deg": (self.mount_std_deg,),
-            "vel_std_mps": (self.vel_std_mps,),
-            "home_m": (self.home_m,),
-            "amsl_m": (self.amsl_m,),
-            "hae_m": (self.hae_m,),
-            "below": () if below is None else (below.height_m, below.std_m, below.known),
-        }
-        for name, values in optional.items():
-            is_std, known = "_std_" in name, [each for each in values if each is not None]
-            if not all(math.isfinite(each) and not (is_std and each < 0) for each in known):
+        for name in _OPTIONAL:
+            value: Any = getattr(self, name)
+            if isinstance(value, Prior | Ground):
+                value = vars(value).values()
+            parts = value if hasattr(value, "__iter__") else () if value is None else (value,)
+            least = 0.0 if "_std_" in name else -math.inf
+            if not all(math.isfinite(each) and each >= least for each in parts):
                 object.__setattr__(self, name, None)
 
     @property
@@ -189,13 +175,11 @@ class Telemetry(ByValue):
 
     def missing(self) -> list[str]:
         """Names of the fields without which a view cannot be rectified, empty if all are there."""
-        named = {
-            "yaw_deg": self.yaw_deg,
-            "pitch_deg": self.pitch_deg,
-            "roll_deg": self.roll_deg,
-            "agl_m": self.agl_m,
-        }
-        return [name for name, value in named.items() if not math.isfinite(value)]
+        needed = "yaw_deg", "pitch_deg", "roll_deg", "agl_m"
+        return [name for name in needed if not math.isfinite(getattr(self, name))]
+
+
+_OPTIONAL = tuple(each.name for each in fields(Telemetry))[5:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +206,7 @@ class View(ByValue):
     @classmethod
     def of(
         cls,
-        image: Image,
+        image: NDArray[Any] | None,
         camera: Camera,
         *,
         agl_m: float,
@@ -238,32 +222,27 @@ class View(ByValue):
     ) -> "View":
         """A view of an image and of what was reported at its exposure.
 
-        - `image`: (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA; uint8, uint16 (white is 65535) or
-          floating point (0 to 1, or 0 to 255). `camera`: of that size or of its proportions.
-        - `agl_m`: height above ground, m.
-        - `heading_deg`: of the top of the image, clockwise from true north; None: unknown.
-        - `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down; ahead and left positive.
-        - `time_s`: of the exposure, seconds of any clock.
-        - `prior`: position known before, used by a `Tracker`; None: none.
-        - `heading_std_deg`, `agl_std_m`, `tilt_std_deg`: standard deviations, 0 or more, of heading
-          (None: 7 deg), height (None: 8 % of it), and of pitch and of roll by their source
-          (docs/flights.md; None: 3 deg). On a map without terrain 3 deg place the camera to 3 % of
-          the height, 1 deg to 1.6 %.
-        - `vel_en_mps`: velocity over ground since the view before, east and north, m/s; None:
-          unknown.
+        `image`: (H, W) grey, (H, W, 3) BGR, (H, W, 4) BGRA; uint8, uint16 (white is 65535) or
+        floating point (0 to 1, or 0 to 255). `camera`: of its size or proportions. `agl_m`: height
+        above ground, m. `heading_deg`: of the top of the image, clockwise from true north; None:
+        unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down, positive ahead
+        and left. `time_s`: of the exposure, seconds of any clock. `prior`: used by a `Tracker`;
+        None: none. `vel_en_mps`: velocity over ground since the view before, east and north, m/s.
+
+        Standard deviations, 0 or more, of heading (None: 7 deg), height (None: 8 % of it), and of
+        pitch and of roll, by their source (docs/flights.md; None: 3 deg): on a map without terrain
+        3 deg place the camera to 3 % of the height, 1 deg to 1.6 %.
 
         Raises `ArgumentError`, `FlightError` for what is no image, `CameraError` where image and
         camera have different proportions."""
-        stds = {"heading_std_deg": heading_std_deg, "agl_std_m": agl_std_m}
-        for name, std in (stds | {"tilt_std_deg": tilt_std_deg}).items():
-            if std is not None:
-                number(name, std, "0 or more; None: unknown", 0)
+        stds = heading_std_deg, agl_std_m, tilt_std_deg
+        for name, std in zip(("heading_std_deg", "agl_std_m", "tilt_std_deg"), stds, strict=True):
+            number(name, std or 0, "0 or more; None: unknown", 0)
         if prior is not None:
             has_type("prior", prior, Prior, PRIOR)
+        number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S)
         telemetry = Telemetry(
-            round(
-                number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S) * 1e9
-            ),
+            round(time_s * 1e9),
             math.nan if heading_deg is None else number("heading_deg", heading_deg),
             number("pitch_deg", pitch_deg),
             number("roll_deg", roll_deg),
@@ -284,16 +263,22 @@ class View(ByValue):
         )
 
 
-class Outcome(ByValue):
-    """What came of a view."""
-
+class Result(ByValue):
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON by the keys of `fixes.jsonl` (docs/reference/formats.md), without
-        those of a flight: name, time, latency, state. Unknown numbers are None."""
-        from orthonav.core.flight.fixes import outcome_to_plain  # it reads and makes records
+        """Plain values for JSON by the keys of `fixes.jsonl` (docs/reference/formats.md), of a
+        `Fix` or `NoFix` without those of the flight (name, time, ..); None: unknown."""
+        from orthonav.core.flight.fixes import to_plain  # it reads and makes records
 
-        assert isinstance(self, Fix | NoFix)
-        return outcome_to_plain(self)
+        return to_plain(self)
+
+
+class Outcome(Result):
+    """Its `evidence` is read-only."""
+
+    evidence: Evidence
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "evidence", ReadOnly(self.evidence))
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,7 +308,7 @@ class Fix(Outcome):
     radius_m: float
     heading_deg: float
     agl_m: float
-    evidence: Evidence = field(default_factory=ReadOnly)
+    evidence: Evidence = field(default_factory=dict)
     ground_latlon_deg: tuple[float, float] | None = None
     ground_cov_en_m2: NDArray[np.float64] | None = None
     pitch_deg: float = math.nan
@@ -396,7 +381,7 @@ class NoFix(Outcome):
 
     reason: str
     detail: str
-    evidence: Evidence = field(default_factory=ReadOnly)
+    evidence: Evidence = field(default_factory=dict)
 
     @property
     def is_confident(self) -> Literal[False]:
@@ -407,7 +392,7 @@ class NoFix(Outcome):
 
 
 @dataclass(frozen=True, eq=False)
-class ViewResult(ByValue):
+class ViewResult(Result):
     """The result for one view of a flight: a line of `fixes.jsonl`.
 
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
@@ -435,12 +420,6 @@ class ViewResult(ByValue):
     def is_recognized(self) -> bool:
         """Whether it is confident, and not of a track that searches, coasts or is lost."""
         return self.is_confident and self.state in (None, "tracking")
-
-    def to_dict(self) -> dict[str, Any]:
-        """As that of a fix, with `frame`, `time_s`, `latency_ms` and, of a track, `state`."""
-        from orthonav.core.flight.fixes import result_to_plain
-
-        return result_to_plain(self)
 
 
 EXPECTED = (

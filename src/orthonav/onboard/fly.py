@@ -29,16 +29,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.localize.view import check_picture
-from orthonav.core.records import (
-    CONFIDENT,
-    Fix,
-    NoFix,
-    Prior,
-    ReadOnly,
-    Telemetry,
-    View,
-    ViewResult,
-)
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, FrozenCheck, NewestImage
 from orthonav.onboard.gnss.watch import GnssWatch
@@ -598,7 +589,7 @@ def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> 
     own, names = fix.evidence, ("vel_east_mps", "vel_north_mps")
     moved = zip(names, reported, mean, strict=True)
     at_exposure = {key: own[key] + now - over for key, now, over in moved if key in own}
-    return replace(fix, evidence=ReadOnly({**own, **at_exposure}))
+    return replace(fix, evidence={**own, **at_exposure})
 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:

@@ -26,7 +26,7 @@ from orthonav.core.errors import FlightError, MissingExtraError
 from orthonav.core.files import StrPath, require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.limits import DEFAULT_RISK
-from orthonav.core.records import Fix, NoFix, ReadOnly, ViewResult
+from orthonav.core.records import Fix, NoFix, ViewResult
 
 KEYS = (
     "frame",  # name of the image in the flight folder
@@ -150,36 +150,31 @@ UNKNOWN = Identity()  # of a run whose map and flight are not stated
 
 def result_to_json(result: ViewResult) -> str:
     """One line of `fixes.jsonl`, without the line end: strict JSON in ASCII, keys as in `KEYS`."""
-    plain = result_to_plain(result)
-    texts = {key: json.dumps(value, allow_nan=False) for key, value in plain.items()}
+    plain = to_plain(result).items()
+    texts = {key: json.dumps(value, allow_nan=False) for key, value in plain}
     texts["time_s"] = _seconds(result.time_ns)
     return "{" + ", ".join(f'"{key}": {text}' for key, text in texts.items()) + "}"
 
 
-def result_to_plain(result: ViewResult) -> dict[str, Any]:
-    """Plain values of a line by their keys, in the order of the file."""
-    outcome = outcome_to_plain(result.outcome, result.risk)
-    if isinstance(result.outcome, Fix):
-        outcome["confident"] = result.is_confident
-    own = {
-        "frame": result.frame,
-        "time_s": result.time_ns / 1e9,
-        "latency_ms": _or_none(result.latency_ms),
-    }
-    track = {} if result.state is None else {"tracked": True, "state": result.state}
-    values = own | outcome | track
-    return {key: values.pop(key) for key in KEYS} | values
-
-
-def outcome_to_plain(outcome: Fix | NoFix, risk: float = DEFAULT_RISK) -> dict[str, Any]:
-    """As `result_to_plain`, without what belongs to the flight."""
-    values = _outcome_values(outcome)
-    values["evidence"] = {str(k): _or_none(v) for k, v in outcome.evidence.items()}
-    known = {key: values.pop(key) for key in KEYS if key in values}
-    if isinstance(outcome, Fix):
-        stated = outcome.place_probability, outcome.protection_level_m(risk), risk
-        known |= zip(INTEGRITY_KEYS, map(_or_none, stated), strict=True)
-    return known | values
+def to_plain(record: Any, risk: float = DEFAULT_RISK) -> dict[str, Any]:
+    """Plain values of a `ViewResult` by the keys of a line, in their order; those of a fix or of
+    none, with protection levels of this risk, lack what belongs to the flight."""
+    if isinstance(record, ViewResult):
+        values = to_plain(record.outcome, record.risk)
+        values |= {"frame": record.frame, "time_s": record.time_ns / 1e9}
+        values["latency_ms"] = _or_none(record.latency_ms)
+        if isinstance(record.outcome, Fix):
+            values["confident"] = record.is_confident
+        if record.state is not None:
+            values |= zip(TRACK_KEYS, (True, record.state), strict=True)
+    else:
+        values = _outcome_values(record)
+        values["evidence"] = {str(k): _or_none(v) for k, v in record.evidence.items()}
+        if isinstance(record, Fix):
+            stated = record.place_probability, record.protection_level_m(risk), risk
+            values |= zip(INTEGRITY_KEYS, map(_or_none, stated), strict=True)
+    keys = (*KEYS, *INTEGRITY_KEYS, *GROUND_KEYS, *POSE_KEYS, *TRACK_KEYS)
+    return {key: values[key] for key in keys if key in values}
 
 
 def result_from_json(line: str) -> ViewResult:
@@ -268,30 +263,22 @@ def to_dataframe(fixes: StrPath | Iterable[Fix | NoFix | ViewResult]) -> Any:
 def to_geojson(fixes: StrPath | Iterable[Fix | NoFix | ViewResult]) -> dict[str, Any]:
     """A FeatureCollection (RFC 7946) with a point for each fix among these, or in a file of fixes;
     `json.dumps` makes text of it, GeoPandas' `from_features` a table. Raises as `read_results`."""
-    views = (
-        x if isinstance(x, ViewResult) else ViewResult("", 0, x, math.nan) for x in _all(fixes)
-    )
-    return feature_collection(
-        feature(x.frame, x.outcome, x.outcome.std_m) for x in views if isinstance(x.outcome, Fix)
-    )
+    pairs = [(getattr(x, "frame", None), getattr(x, "outcome", x)) for x in _all(fixes)]
+    shown = [feature(frame, fix, fix.std_m) for frame, fix in pairs if isinstance(fix, Fix)]
+    return {"type": "FeatureCollection", "features": shown}
 
 
-def feature_collection(features: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    return {"type": "FeatureCollection", "features": list(features)}
-
-
-def feature(frame: str, fix: Fix, std_m: float, height_m: float = math.nan) -> dict[str, Any]:
+def feature(
+    frame: str | None, fix: Fix, std_m: float, height_m: float = math.nan
+) -> dict[str, Any]:
     """Of GeoJSON; `height_m`: above mean sea level, NaN: unknown."""
-    numbers = {"agl_m": fix.agl_m, "heading_deg": fix.heading_deg, "std_m": std_m}
-    numbers["confidence"] = fix.confidence
-    known = {name: None if math.isnan(x) else round(x, 4) for name, x in numbers.items()}
+    about = {"agl_m": fix.agl_m, "heading_deg": fix.heading_deg, "std_m": std_m}
+    about["confidence"] = fix.confidence
+    known = {name: None if math.isnan(x) else round(x, 4) for name, x in about.items()}
     place = fix.lon_deg, fix.lat_deg, height_m
     point = [round(value, 8) for value in place if math.isfinite(value)]
-    return {
-        "type": "Feature",
-        "geometry": {"type": "Point", "coordinates": point},
-        "properties": {"frame": frame, **known},
-    }
+    geometry = {"type": "Point", "coordinates": point}
+    return {"type": "Feature", "geometry": geometry, "properties": {"frame": frame, **known}}
 
 
 def _all(fixes: StrPath | Iterable[Any]) -> Iterable[Any]:
@@ -344,9 +331,7 @@ def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
 def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
     status, evidence = values["status"], values["evidence"]
     _checked(values, "evidence", "an object", isinstance(evidence, dict))
-    evidence = ReadOnly(
-        {key: _as_float(value, f"evidence {key!r:.40}") for key, value in evidence.items()}
-    )
+    evidence = {key: _as_float(each, f"evidence {key!r:.40}") for key, each in evidence.items()}
     if status == "no_fix":
         reason = _checked(values, "reason", "text", isinstance(values["reason"], str))
         return NoFix(reason=reason, detail=str(values.get("detail") or ""), evidence=evidence)

@@ -70,62 +70,45 @@ class Camera:
     def __post_init__(self) -> None:
         if self.distortion and not any(self.distortion):
             object.__setattr__(self, "distortion", ())  # none at all, and faster
+        if wrong := self._impossible() or self._implausible():
+            raise CameraError(f"camera {wrong}: {self}")
         for name in ("width_px", "height_px"):
-            side = getattr(self, name)
-            if not (1 <= side <= MAX_DIMENSION_PX and side == int(side)):
-                raise CameraError(f"camera {name} must be 1 to {MAX_DIMENSION_PX}, whole: {self}")
-            object.__setattr__(self, name, int(side))
-        self._check_mask()
+            object.__setattr__(self, name, int(getattr(self, name)))
+
+    def _impossible(self) -> str:
+        mask, size = self.mask, (self.width_px, self.height_px)
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
-        if not all(math.isfinite(number) for number in numbers):
-            raise CameraError(f"camera has a value that is not finite: {self}")
-        if self.fx_px <= 0 or self.fy_px <= 0:
-            raise CameraError(f"camera focal length must be above 0 px: {self}")
-        if not 0 <= self.focal_std <= MAX_FOCAL_STD:
-            raise CameraError(
-                f"camera focal_std must be a fraction, 0 to {MAX_FOCAL_STD}, got {self.focal_std}"
-            )
-        if self.model not in ("brown", "fisheye"):
-            raise CameraError(f"camera model must be brown or fisheye, got '{self.model}'")
         allowed, names = ((0, 4), "k1,k2,k3,k4") if self.model == "fisheye" else _BROWN
-        if len(self.distortion) not in allowed:
-            raise CameraError(
-                f"camera distortion of a {self.model} lens must be empty or {names}, "
-                f"got {self.distortion}"
-            )
-        self._check_plausible()
+        if not all(1 <= side <= MAX_DIMENSION_PX and side == int(side) for side in size):
+            return f"width_px and height_px must be whole, 1 to {MAX_DIMENSION_PX}"
+        if mask is not None and (mask.dtype != np.uint8 or mask.shape != size[::-1]):
+            got = f"got {mask.dtype} of {mask.shape[::-1]}"
+            return f"mask must be uint8 of {size}, as Camera.masked makes it, {got}"
+        if not all(math.isfinite(number) for number in numbers):
+            return "has a value that is not finite"
+        if self.fx_px <= 0 or self.fy_px <= 0:
+            return "focal length must be above 0 px"
+        if not 0 <= self.focal_std <= MAX_FOCAL_STD:
+            return f"focal_std must be a fraction, 0 to {MAX_FOCAL_STD}"
+        if self.model not in ("brown", "fisheye"):
+            return f"model must be brown or fisheye, got '{self.model}'"
+        known = len(self.distortion) in allowed
+        return "" if known else f"distortion of a {self.model} lens must be empty or {names}"
 
-    def _check_plausible(self) -> None:
+    def _implausible(self) -> str:
         """By shares of sides, which remain where a picture is scaled."""
-        (fx, fy), (wide, high) = (self.fx_px, self.fy_px), (self.width_px, self.height_px)
+        fx, fy, wide, high = self.fx_px, self.fy_px, self.width_px, self.height_px
         off = max(abs(self.cx_px / wide - 0.5), abs(self.cy_px / high - 0.5))
-        apart, wrong = abs(fx / fy - 1), ""
+        apart = abs(fx / fy - 1)
         if max(fx / wide, fy / high) < MIN_FOCAL or min(fx / wide, fy / high) > MAX_FOCAL:
-            wrong = (
-                f"focal length of {fx:g} px is {fx / wide:.2g} widths, expected {MIN_FOCAL:g} to "
-                f"{MAX_FOCAL:g}; it is in pixels of this picture"
-            )
-        elif off > MAX_OFF_MIDDLE and not self.unusual:
-            wrong = (
-                f"principal point {self.cx_px:g}, {self.cy_px:g} px is {off:.0%} of a side from "
-                "the middle: is it of another size, or the matrix transposed? State that of a "
-                'crop or a shifted lens by "unusual": true'
-            )
-        elif apart > MAX_OBLONG + 2 / min(wide, high) and not self.unusual:  # sides are rounded
-            wrong = (
-                f"focal lengths of {fx:g} and {fy:g} px differ by {apart:.0%}; state pixels that "
-                'are not square by "unusual": true'
-            )
-        if wrong:
-            raise CameraError(f"camera of {wide} x {high} px: {wrong}")
-
-    def _check_mask(self) -> None:
-        mask, shape = self.mask, (self.height_px, self.width_px)
-        if mask is not None and (mask.dtype != np.uint8 or mask.shape != shape):
-            raise CameraError(
-                f"camera mask must be uint8 of {self.width_px} x {self.height_px} px, as "
-                f"Camera.masked makes it, got {mask.dtype} of {mask.shape[::-1]}"
-            )
+            return f"focal length {fx:g} px is {fx / wide:.2g} widths, expected 0.3 to 20"
+        if off > MAX_OFF_MIDDLE and not self.unusual:
+            middle = f"principal point {self.cx_px:g}, {self.cy_px:g} px is {off:.0%} of a side "
+            return middle + 'from the middle ("unusual": true states a crop or a shifted lens)'
+        if apart > MAX_OBLONG + 2 / min(wide, high) and not self.unusual:  # sides are rounded
+            differ = f"focal lengths {fx:g} and {fy:g} px differ by {apart:.0%} "
+            return differ + '("unusual": true states pixels that are not square)'
+        return ""
 
     @classmethod
     def from_fov(
@@ -136,12 +119,10 @@ class Camera:
         It is that across the width of the picture; with `diagonal` that from corner to corner, as
         makers of cameras often state it. Stated fields of view are often those of the lens or of
         another mode: good to 5 %. Raises `CameraError`."""
-        if not 0 < fov_deg < 180:
-            raise CameraError(f"field of view must be above 0 and below 180 deg, got {fov_deg:g}")
-        if fov_deg < MIN_FOV_DEG:
+        if not MIN_FOV_DEG <= fov_deg < 180:
+            turned = f"; {math.degrees(fov_deg):.1f} if these are radians" if fov_deg > 0 else ""
             raise CameraError(
-                f"field of view of {fov_deg:g} deg is less than {MIN_FOV_DEG} deg; if these are "
-                f"radians, give {math.degrees(fov_deg):.1f}"
+                f"field of view must be {MIN_FOV_DEG} to 180 deg, got {fov_deg:g}{turned}"
             )
         across_px = math.hypot(width_px, height_px) if diagonal else width_px
         focal_px = across_px / 2 / math.tan(math.radians(fov_deg) / 2)
@@ -206,8 +187,8 @@ class Camera:
 
     def numbers(self) -> dict[str, Any]:
         """All but the mask, as in `flight.json`."""
-        known = {name: each for name, each in vars(self).items() if name != "mask"}
-        return known if known.pop("unusual") is False else known | {"unusual": True}
+        left_out = ("mask",) if self.unusual else ("mask", "unusual")
+        return {name: each for name, each in vars(self).items() if name not in left_out}
 
     @property
     def is_pinhole(self) -> bool:

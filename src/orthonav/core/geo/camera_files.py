@@ -3,7 +3,7 @@
 import contextlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +30,7 @@ _READ = (
     "JSON), ROS (camera_matrix, distortion_coefficients, ..) or Kalibr (intrinsics, resolution, ..)"
 )
 _UNREAD = {  # programs by what their files hold
-    "COLMAP": re.compile(
-        r"^\s*\d+ (SIMPLE_\w+|PINHOLE|RADIAL|OPENCV\w*|FULL_OPENCV|FOV)( [\d.e+-]+)+\s*$", re.M
-    ),
+    "COLMAP": re.compile(r"^\s*\d+ [A-Z_]+ \d+ \d+( [\d.e+-]+)+\s*$", re.M),
     "Metashape": re.compile(r"<(calibration|document)\b"),
 }
 _BROKEN = (
@@ -71,8 +69,7 @@ def read_camera_file(path: Path) -> Camera:
         if name is not None and not chain:
             raise CameraError(f"file is not a Kalibr chain; give it without #{name:.60}")
         if not chain and (text.startswith(_OPENCV_HEADER) or "opencv-matrix" in text):
-            camera: Camera = _opencv(text, _stored)
-            return camera
+            return _plain(_opencv(text))
         if text.lstrip().startswith("{"):
             plain = json.loads(text)
             return camera_from_plain(plain["camera"]) if "camera" in plain else _plain(plain)
@@ -102,11 +99,7 @@ def masked(camera: Camera, path: Path) -> Camera:
 
 
 def camera_from_numbers(
-    size_px: Sequence[int],
-    matrix: Sequence[float],
-    distortion: Sequence[float],
-    model: str,
-    unusual: bool = False,
+    size_px: Sequence[int], matrix: Any, distortion: Any, model: str, unusual: bool = False
 ) -> Camera:
     """`matrix`: 9 numbers, row by row."""
     numbers = tuple(float(number) for number in distortion)
@@ -121,9 +114,8 @@ def camera_from_numbers(
         numbers = (*numbers, *(0.0,) * (4 - len(numbers))) if 0 < len(numbers) < 4 else numbers[:5]
     else:
         raise CameraError(f"distortion model '{model}' is not supported; brown and equidistant are")
-    size = int(size_px[0]), int(size_px[1])
-    k = np.reshape(_numbers(matrix, 9), (3, 3))
-    return Camera.from_matrix(k, numbers, size, ours, unusual=unusual)
+    k, (width, height) = _numbers(matrix, 9).reshape(3, 3), map(int, size_px)
+    return Camera.from_matrix(k, numbers, (width, height), ours, unusual=unusual)
 
 
 def _yaml(text: str) -> Any:
@@ -131,7 +123,7 @@ def _yaml(text: str) -> Any:
         yaml = needed("yaml", "camera files in YAML")
     except MissingExtraError:
         with contextlib.suppress(CameraError):  # OpenCV reads most of what ROS and Kalibr write
-            return _opencv(f"{_OPENCV_HEADER}\n---\n{text}", lambda each: _value(each.root()))
+            return _opencv(f"{_OPENCV_HEADER}\n---\n{text}")
         raise
     try:
         _check_events(yaml, text)
@@ -176,12 +168,13 @@ def _plain(plain: Any, name: str | None = None) -> Camera:
         return _kalibr(plain[name or cameras[0]])
     if "intrinsics" in plain:
         return _kalibr(plain)
-    matrix = plain["camera_matrix"]["data"]
+    lens = "distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "D1"
+    fisheye = plain.get("fisheye_model") or plain.get("fisheye")
     return camera_from_numbers(
-        (plain["image_width"], plain["image_height"]),
-        matrix,
-        plain["distortion_coefficients"]["data"],
-        str(plain.get("distortion_model", "plumb_bob")),
+        [_first(plain, f"image_{side}", f"image_{side.title()}") for side in ("width", "height")],
+        _first(plain, "camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")["data"],
+        _first(plain, *lens)["data"],
+        "fisheye" if fisheye else str(plain.get("distortion_model", "plumb_bob")),
         bool(plain.get("unusual")),
     )
 
@@ -199,14 +192,14 @@ def _kalibr(plain: Mapping[str, Any]) -> Camera:
     )
 
 
-def _opencv(text: str, read: Callable[[cv2.FileStorage], Any]) -> Any:
+def _opencv(text: str) -> Any:
     # OpenCV crashes where nesting is deeper than the stack.
     if sum(1 for _ in _OPENING.finditer(text)) > MAX_OPENINGS:
         raise CameraError(f"camera file has more than {MAX_OPENINGS} parts")
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
         try:
-            return read(storage)
+            return _value(storage.root())
         finally:
             storage.release()
     except (cv2.error, SystemError) as error:
@@ -222,37 +215,8 @@ def _value(node: cv2.FileNode) -> Any:
     return node.string() if node.isString() else node.real()
 
 
-def _stored(storage: cv2.FileStorage) -> Camera:
-    matrix = _matrix(storage, "camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")
-    lens = _matrix(
-        storage, "distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "D1"
-    )
-    sides = [_whole(storage, f"image_{side}") for side in ("width", "height")]
-    if 0 in sides:
-        sides = [_whole(storage, f"image_{side}") for side in ("Width", "Height")]
-    if matrix is None or matrix.size != 9 or 0 in sides:
-        raise CameraError("file lacks camera_matrix, image_width or image_height")
-    fisheye = _whole(storage, "fisheye_model") or _whole(storage, "fisheye")
-    return camera_from_numbers(
-        sides,
-        matrix.ravel().tolist(),
-        [] if lens is None else lens.ravel().tolist(),
-        "fisheye" if fisheye else "brown",
-        bool(_whole(storage, "unusual")),
-    )
-
-
-def _matrix(storage: cv2.FileStorage, *names: str) -> Any:
-    for name in names:
-        node = storage.getNode(name)
-        if not node.empty() and (matrix := node.mat()) is not None:
-            return np.asarray(matrix, dtype=np.float64)
-    return None
-
-
-def _whole(storage: cv2.FileStorage, name: str) -> int:
-    node = storage.getNode(name)
-    return int(node.real()) if not node.empty() and (node.isInt() or node.isReal()) else 0
+def _first(plain: Mapping[str, Any], *names: str) -> Any:
+    return plain[next((name for name in names if name in plain), names[0])]
 
 
 def _numbers(values: Any, count: int) -> Any:

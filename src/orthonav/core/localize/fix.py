@@ -13,7 +13,7 @@ from orthonav.core.localize.place import Place
 from orthonav.core.localize.rectify import off_nadir_deg
 from orthonav.core.localize.search import Search
 from orthonav.core.localize.view import PreparedView
-from orthonav.core.records import RADIUS_SHARE, Fix, ReadOnly
+from orthonav.core.records import RADIUS_SHARE, Fix
 
 
 def fix_of(search: Search, best: Place) -> Fix:
@@ -53,7 +53,7 @@ def fix_of(search: Search, best: Place) -> Fix:
         radius_m=radius_m,
         heading_deg=heading_deg % 360,
         agl_m=found.agl_m,
-        evidence=ReadOnly(evidence),
+        evidence=evidence,
         ground_latlon_deg=middle,
         ground_cov_en_m2=None if middle is None else found.middle_cov_en_m2,
         pitch_deg=pitch_deg,

@@ -2,7 +2,9 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
+from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError, VariantError
 from orthonav.core.geo.camera import Camera
@@ -14,12 +16,12 @@ from orthonav.core.localize.ground import SearchedSheet
 from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
 from orthonav.core.localize.search import Found, Search, found_by
 from orthonav.core.localize.tiles import TileLocalizer, TileProposer
-from orthonav.core.localize.view import PreparedView, check_view, named, prepare
+from orthonav.core.localize.view import PreparedView, check_view, prepare
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
-from orthonav.core.records import PRIOR, Fix, Image, NoFix, Prior, View, has_type
+from orthonav.core.records import PRIOR, Fix, NoFix, Prior, View, has_type
 from orthonav.core.tiles.position import PositionRule
 
 WIDEST_M = 2e7  # half the Earth's circumference
@@ -100,7 +102,7 @@ class Localizer:
 
     def localize(
         self,
-        image: Image,
+        image: NDArray[Any] | None,
         camera: Camera,
         *,
         agl_m: float,
@@ -112,20 +114,13 @@ class Localizer:
         agl_std_m: float | None = None,
         tilt_std_deg: float | None = None,
     ) -> Fix | NoFix:
-        """The position from which an image was taken.
+        """The position from which an image was taken; arguments and errors are those of `View.of`.
 
-        - `image`: (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA; `camera`: of its proportions.
-        - `agl_m`: height above ground, m. `agl_std_m`: its standard deviation; None: 8 % of it.
-        - `heading_deg`: of the top of the image, clockwise from true north; None: all headings are
-          tried. `heading_std_deg`: its standard deviation; None: 7 deg.
-        - `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down.
-        - `tilt_std_deg`: standard deviation of each of the two. None: 3 deg are assumed, and tilt
-          and position are estimated together: on a map without terrain the camera is placed to 3 %
-          of the height, with 1 deg to 1.6 %, with 0 (exact, as for crops of an orthophoto) to that
-          of the registration.
-        - `prior`: searched within three of its standard deviations; None: on the whole map.
-
-        Raises as `View.of`."""
+        `heading_deg` None: all headings are tried. `prior`: searched within three of its standard
+        deviations; None: on the whole map. `tilt_std_deg`: how good pitch and roll are. None: 3 deg
+        are assumed, and the tilt is estimated with the position, which costs accuracy: on a map
+        without terrain the camera is placed to 3 % of the height, with 1 deg to 1.6 %. Crops of
+        an orthophoto have none: 0."""
         view = View.of(
             image,
             camera,
@@ -137,7 +132,7 @@ class Localizer:
             agl_std_m=agl_std_m,
             tilt_std_deg=tilt_std_deg,
         )
-        return named(self.locate(view, prior=prior, heading_known=heading_deg is not None))
+        return self.locate(view, prior=prior, heading_known=heading_deg is not None)
 
 
 class RegistrationLocalizer(SearchedSheet):

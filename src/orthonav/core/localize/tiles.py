@@ -15,16 +15,7 @@ from orthonav.core.localize.confidence import LogisticConfidence
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
 from orthonav.core.localize.view import check_rectified
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.records import (
-    PRIOR_SIGMAS,
-    TILE_YAW_STD_DEG,
-    Fix,
-    NoFix,
-    Prior,
-    ReadOnly,
-    Telemetry,
-    View,
-)
+from orthonav.core.records import PRIOR_SIGMAS, TILE_YAW_STD_DEG, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import Peak
 from orthonav.core.tiles import represent
@@ -355,5 +346,5 @@ class TileLocalizer:
             radius_m=self.radius_m,
             heading_deg=heading_deg % 360,
             agl_m=telemetry.agl_m,
-            evidence=ReadOnly(evidence),
+            evidence=evidence,
         )

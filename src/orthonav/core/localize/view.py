@@ -20,7 +20,6 @@ from orthonav.core.records import (
     DEFAULT_AGL_STD,
     DEFAULT_YAW_STD_DEG,
     MIN_YAW_STD_DEG,
-    Fix,
     NoFix,
     Telemetry,
     View,
@@ -40,13 +39,6 @@ MIN_STD = 3.0
 _SAMPLE_STEP_PX = 8
 
 
-def named(found: Fix | NoFix) -> Fix | NoFix:
-    """With the name that the heading has as an argument."""
-    if isinstance(found, NoFix) and found.reason == "missing_telemetry":
-        return replace(found, detail=found.detail.replace("yaw_deg", "heading_deg"))
-    return found
-
-
 def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
     refused = check_telemetry(view.telemetry, view.camera, gsd_m, heading_known)
     return refused or check_picture(view.grey, view.camera.mask)
@@ -58,7 +50,8 @@ def check_telemetry(
     """Without `gsd_m` its size beside a map is not checked."""
     missing = [name for name in telemetry.missing() if heading_known or name != "yaw_deg"]
     if missing:
-        return NoFix("missing_telemetry", f"not a number: {', '.join(missing)}")
+        names = ", ".join(missing).replace("yaw_deg", "heading_deg (yaw_deg)")
+        return NoFix("missing_telemetry", f"not a number: {names}")
     if telemetry.agl_m <= 0:
         return NoFix("bad_height", f"height above ground is {telemetry.agl_m:.1f} m")
     tilt_deg = off_nadir_deg(telemetry)

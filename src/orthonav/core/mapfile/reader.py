@@ -157,25 +157,22 @@ class MapFile:
     @property
     def dates(self) -> tuple[str, ...]:
         """First and last date of its imagery as ISO 8601, as far as they are known."""
-        ends = ("date_from", "date")
-        return tuple(
-            sorted({str(x[end]) for x in self.manifest.imagery for end in ends if x.get(end)})
-        )
+        sources = self.manifest.imagery
+        found = {str(x[end]) for x in sources for end in ("date_from", "date") if x.get(end)}
+        return tuple(sorted(found))
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:
         """West, south, east and north of the first sheet, degrees."""
-        sheet = self.manifest.sheets[0]
-        west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
+        west_m, south_m, east_m, north_m = self.manifest.sheets[0].grid.extent_en_m
         corners_en_m = [(x, y) for x in (west_m, east_m) for y in (south_m, north_m)]
-        lat, lon = sheet.frame.latlon_from_en(corners_en_m)
+        lat, lon = self.frame.latlon_from_en(corners_en_m)
         return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
 
     def contains(self, lat_deg: float, lon_deg: float) -> bool:
         """Whether a position is on the first sheet."""
-        sheet = self.manifest.sheets[0]
-        x_m, y_m = sheet.frame.en_from_latlon(lat_deg, lon_deg).tolist()
-        west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
+        x_m, y_m = self.frame.en_from_latlon(lat_deg, lon_deg).tolist()
+        west_m, south_m, east_m, north_m = self.manifest.sheets[0].grid.extent_en_m
         return bool(west_m <= x_m <= east_m and south_m <= y_m <= north_m)
 
     def array(self, name: str, dtype: type[np.generic], ndim: int) -> NDArray[Any]:

@@ -6,7 +6,7 @@ plausible places go to the mixture with their odds. Overlapping views are regist
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,19 +27,9 @@ from orthonav.core.localize.odometry import (
 )
 from orthonav.core.localize.search import Found, found_by
 from orthonav.core.localize.sighting import Sighting, sightings
-from orthonav.core.localize.view import check_view, named
+from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.records import (
-    PRIOR_SIGMAS,
-    RADIUS_SHARE,
-    Fix,
-    Image,
-    NoFix,
-    Prior,
-    ReadOnly,
-    Telemetry,
-    View,
-)
+from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
 from orthonav.core.track import (
     Estimate,
@@ -173,7 +163,7 @@ class Tracker:
 
     def update(
         self,
-        image: Image,
+        image: NDArray[Any] | None,
         camera: Camera,
         *,
         time_s: float,
@@ -214,7 +204,7 @@ class Tracker:
                     f"time_s must grow, by at most {LONGEST_GAP_S:g} s, got {step_s:+g} s; it is "
                     "in seconds, not ms or ns; after a pause use another Tracker"
                 )
-        return named(self.locate(view))
+        return self.locate(view)
 
     def __repr__(self) -> str:
         return f"Tracker({self._localizer.opened.path}, {self.state.value})"
@@ -570,7 +560,7 @@ class Tracker:
             radius_m=radius_m,
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
-            evidence=ReadOnly(evidence),
+            evidence=evidence,
             pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
             roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
         )

@@ -18,7 +18,7 @@ import numpy as np
 
 from orthonav.core.errors import VariantError
 from orthonav.core.files import write_text
-from orthonav.core.flight.fixes import feature, feature_collection
+from orthonav.core.flight.fixes import feature
 from orthonav.core.geo.attitude import wxyz_of_matrices
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.geo.frames import LocalFrame
@@ -135,8 +135,8 @@ def _csv(positions: Positions) -> list[str]:
 
 
 def _geojson(positions: Positions) -> list[str]:
-    features = (feature(x.view.frame, x.fix, x.std_m, x.height_m) for x in positions)
-    return [json.dumps(feature_collection(features), allow_nan=False)]
+    features = [feature(x.view.frame, x.fix, x.std_m, x.height_m) for x in positions]
+    return [json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False)]
 
 
 def _exif(positions: Positions) -> list[str]:

@@ -17,7 +17,7 @@ import numpy as np
 from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ReadOnly, ViewResult
+from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult
 from orthonav.onboard.gnss.biases import (
     NANOSECONDS,
     Array,
@@ -113,7 +113,7 @@ class GnssWatch:
                 monitor.position(position)
         if isinstance(fix, Fix):
             fix = self._corrected(fix)
-        evidence = ReadOnly({**fix.evidence, **self._evidence(now_ns)})
+        evidence = {**fix.evidence, **self._evidence(now_ns)}
         return replace(result, outcome=replace(fix, evidence=evidence))
 
     def _corrected(self, fix: Fix) -> Fix:
