@@ -132,7 +132,7 @@ def test_every_kind_of_path(map_path, flight_path, tmp_path, kind):
 
 def test_what_is_no_map_is_named(map_path):
     for make in (Localizer, Tracker):
-        with pytest.raises(ArgumentError, match=r"map must be an opened map, orthonav.open_map\("):
+        with pytest.raises(ArgumentError, match=r"map must be .*open_map\(path\), got str"):
             make(str(map_path))
 
 

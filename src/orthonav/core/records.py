@@ -27,17 +27,17 @@ DEFAULT_AGL_STD = 0.08  # over the height
 DEFAULT_TILT_STD_DEG = UNSTATED.aided_deg
 RADIUS_SHARE = 0.025  # least radius of the confidence over the height: an error of 1.4 deg of tilt
 MAP_STD_M = 3.0  # per axis, of a displacement of the map as a whole: it never averages out
-PRIOR = "an orthonav.Prior(lat_deg, lon_deg, std_m)"
 MAX_TIME_S = 1e11  # the year 5138; since 1970 there were more milliseconds
 
 Evidence = Mapping[str, float]
 """Named numbers behind the confidence of a fix; see `docs/reference/formats.md`."""
 
 
-def has_type(name: str, value: Any, expected: type, how: str) -> None:
+def has_type(name: str, value: Any, expected: type, how: str = "") -> None:
     """Raise `ArgumentError` that names the argument unless it has the type, made by `how`."""
     if not isinstance(value, expected):
-        raise ArgumentError(f"{name} must be {how}, got {type(value).__name__}")
+        kind = f"an orthonav.{expected.__name__}{how}"
+        raise ArgumentError(f"{name} must be {kind}, got {type(value).__name__}")
 
 
 def number(
@@ -198,7 +198,7 @@ class View(ByValue):
     telemetry: Telemetry
 
     def __post_init__(self) -> None:
-        has_type("camera", self.camera, Camera, "an orthonav.Camera, as of Camera.from_matrix(..)")
+        has_type("camera", self.camera, Camera, ", as of Camera.from_matrix(..)")
         grey = np.ascontiguousarray(grey_levels(self.grey))  # a flipped picture is a view of it
         object.__setattr__(self, "grey", grey)
         object.__setattr__(self, "camera", self.camera.fitted(grey.shape[1], grey.shape[0]))
@@ -239,7 +239,7 @@ class View(ByValue):
         for name, std in zip(("heading_std_deg", "agl_std_m", "tilt_std_deg"), stds, strict=True):
             number(name, std or 0, "0 or more; None: unknown", 0)
         if prior is not None:
-            has_type("prior", prior, Prior, PRIOR)
+            has_type("prior", prior, Prior, "(lat_deg, lon_deg, std_m)")
         number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S)
         telemetry = Telemetry(
             round(time_s * 1e9),

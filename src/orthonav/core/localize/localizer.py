@@ -21,7 +21,7 @@ from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
-from orthonav.core.records import PRIOR, Fix, NoFix, Prior, View, has_type
+from orthonav.core.records import Fix, NoFix, Prior, View, has_type
 from orthonav.core.tiles.position import PositionRule
 
 WIDEST_M = 2e7  # half the Earth's circumference
@@ -51,7 +51,7 @@ class Localizer:
         Without `flying`, representations too slow to fly are accepted: only for maps of one's own,
         because networks are loaded from this machine. `level_ground`: for simulated views of
         level ground, as well known as the map's terrain."""
-        has_type("map", map, MapFile, "an opened map, orthonav.open_map(path)")
+        has_type("map", map, MapFile, ", as of orthonav.open_map(path)")
         if len(map.manifest.sheets) != 1:
             raise MapFileError(f"this program flies maps of one sheet: {map.path}")
         self.opened = map
@@ -88,7 +88,7 @@ class Localizer:
         false all headings are tried and the reported heading may be NaN. Any fault of a view makes
         a `NoFix`."""
         if prior is not None:
-            has_type("prior", prior, Prior, PRIOR)
+            has_type("prior", prior, Prior, "(lat_deg, lon_deg, std_m)")
         refused = check_view(view, self.grid.gsd_m, heading_known)
         if refused is not None:
             return refused

@@ -140,8 +140,7 @@ class MapFile:
 
     @property
     def frame(self) -> LocalFrame:
-        """The plane of the map: `en_from_latlon(lat_deg, lon_deg)` gives metres east and north of
-        its centre (.., 2), `latlon_from_en` the inverse."""
+        """Its `en_from_latlon(lat_deg, lon_deg)` gives metres east and north of the centre."""
         return self.manifest.sheets[0].frame
 
     @property
