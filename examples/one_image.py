@@ -11,6 +11,8 @@ import orthonav
 map_path, image_path, agl_m = sys.argv[1:4]
 fov_deg = float(sys.argv[4]) if len(sys.argv) > 4 else 65.0
 image = cv2.imread(image_path)
+if image is None:
+    sys.exit(f"image cannot be read: {image_path}")
 camera = orthonav.Camera.from_fov(fov_deg, image.shape[1], image.shape[0])
 localizer = orthonav.Localizer(orthonav.open_map(map_path))
 fix = localizer.localize(
@@ -22,7 +24,7 @@ fix = localizer.localize(
     roll_deg=0.0,
     tilt_std_deg=1.0,
 )
-if fix.is_confident:
+if isinstance(fix, orthonav.Fix) and fix.is_confident:
     print(f"{fix.lat_deg:.6f}, {fix.lon_deg:.6f}, {fix.std_m:.1f} m, {fix.heading_deg:.1f} deg")
 else:
     print(fix)

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -97,6 +98,28 @@ def test_examples_run(map_path, area, flight_path, tmp_path):
     assert " deg" in run_example("one_image.py", map_path, image, area.agl_m, fov_deg)
     assert "Fix(" in run_example("follow_flight.py", map_path, flight_path)
     assert "MapFile(" in run_example("build_map.py", area.past, tmp_path / "a.onav", 2.5)
+
+
+@pytest.mark.long
+def test_types_of_the_examples_are_accepted(tmp_path):
+    """By mypy, as strict as this project; programs in README and notebook too."""
+    pytest.importorskip("mypy")
+    readme = (EXAMPLES.parent / "README.md").read_text("utf-8")
+    notebook = json.loads((EXAMPLES / "first_steps.ipynb").read_text("utf-8"))
+    cells = ["".join(x["source"]) for x in notebook["cells"] if x["cell_type"] == "code"]
+    texts = {
+        "readme.py": readme.split("```python\n")[1].split("```")[0],
+        "steps.py": "\n".join(cells),
+    }
+    for name in ("build_map.py", "follow_flight.py", "one_image.py"):
+        texts[name] = (EXAMPLES / name).read_text("utf-8")
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    options = ("--strict", "--ignore-missing-imports", "--config-file=", "--follow-imports=silent")
+    command = [sys.executable, "-m", "mypy", *options, *(tmp_path / name for name in texts)]
+    env = {**os.environ, "MYPYPATH": str(EXAMPLES.parent / "src")}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=env)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_fixes_are_evaluated_and_a_check_is_refused(map_path, flight_path, tmp_path):

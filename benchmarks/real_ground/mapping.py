@@ -147,7 +147,8 @@ class Windows:
     ) -> Seen | None:
         """A window by its first column and row; None where it leaves the imagery of the map."""
         high, wide = photograph.grey.shape
-        camera = Camera(WINDOW_PX, WINDOW_PX, FOCAL_PX, FOCAL_PX, wide / 2 - col, high / 2 - row)
+        middle = wide / 2 - col, high / 2 - row
+        camera = Camera(WINDOW_PX, WINDOW_PX, FOCAL_PX, FOCAL_PX, *middle, unusual=True)
         ray = np.array([WINDOW_PX / 2 - camera.cx_px, WINDOW_PX / 2 - camera.cy_px, FOCAL_PX])
         rays = (photograph.grid_from_camera @ ray)[None, None]
         middle = met(heights, rays, photograph.position_m)[0, 0]

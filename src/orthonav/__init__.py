@@ -5,7 +5,7 @@
     localizer = orthonav.Localizer(orthonav.open_map("area.onav"))
     camera = orthonav.Camera.from_fov(65, 1280, 960)
     fix = localizer.localize(cv2.imread("0100.jpg"), camera, agl_m=270, heading_deg=None)
-    if fix.is_confident:
+    if isinstance(fix, orthonav.Fix) and fix.is_confident:
         print(fix.lat_deg, fix.lon_deg, fix.std_m, fix.heading_deg)
 
 `build_map` makes a map from orthophotos, `Tracker` follows a flight, `evaluate` compares fixes with
@@ -41,6 +41,8 @@ __all__ = [
     "read_results",
     "read_truth",
     "simulate_flight",
+    "to_dataframe",
+    "to_geojson",
 ]
 _HOMES = {
     **dict.fromkeys(("BuildRequest", "build_map"), "ground.build"),
@@ -55,7 +57,7 @@ _HOMES = {
     "check": "ground.check.run",
     "evaluate": "ground.evaluate.metrics",
     "OrthonavError": "core.errors",
-    "read_results": "core.flight.fixes",
+    **dict.fromkeys(("read_results", "to_dataframe", "to_geojson"), "core.flight.fixes"),
 }
 
 

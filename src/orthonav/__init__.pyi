@@ -3,6 +3,8 @@ from orthonav.core.flight import FlightFolder as FlightFolder
 from orthonav.core.flight import open_flight as open_flight
 from orthonav.core.flight import read_truth as read_truth
 from orthonav.core.flight.fixes import read_results as read_results
+from orthonav.core.flight.fixes import to_dataframe as to_dataframe
+from orthonav.core.flight.fixes import to_geojson as to_geojson
 from orthonav.core.geo.camera import Camera as Camera
 from orthonav.core.localize import Localizer as Localizer
 from orthonav.core.mapfile import MapFile as MapFile

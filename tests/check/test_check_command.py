@@ -213,10 +213,10 @@ def test_odd_routes(checked, frame, points, changed):
 def test_views_that_fit_on_no_map(checked, frame):
     with pytest.raises(AreaError, match="do not fit on the map"):
         checked(agl_m=50_000.0)
-    wide = checked(agl_m=None, camera=Camera(65_535, 65_535, 500.0, 500.0, 1.0, 1.0))
-    assert wide.conditions.width_m == pytest.approx(128.0)
+    wide = Camera(65_535, 65_535, 20_000.0, 20_000.0, 1.0, 1.0, unusual=True)
+    assert checked(agl_m=None, camera=wide).conditions.width_m == pytest.approx(128.0)
     with pytest.raises(CameraError, match="long as wide"):
-        checked(camera=Camera(65_535, 1, 1000.0, 1000.0, 1.0, 1.0))
+        checked(camera=Camera(65_535, 1, 1000.0, 1000.0, 32_767.5, 0.5))
     many = checked(camera=Camera(65_535, 49_151, 51_200.0, 51_200.0, 32_768.0, 24_576.0))
     assert many.conditions.width_m == pytest.approx(166.4, abs=0.1)
 

@@ -1,5 +1,6 @@
 """The camera: conventions by hand, projection against OpenCV, the homography against rays."""
 
+import json
 import math
 
 import cv2
@@ -94,9 +95,9 @@ GOOD = {"width_px": 640, "height_px": 480, "fx_px": 500, "fy_px": 500, "cx_px": 
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"width_px": 0}, "width_px must be"),
+        ({"width_px": 0}, "width_px and height_px must be"),
         ({"height_px": 65_536}, "height_px must be"),
-        ({"width_px": math.nan}, "width_px must be"),
+        ({"width_px": math.nan}, "width_px and height_px must be"),
         ({"fx_px": 0}, "focal length"),
         ({"fy_px": -500}, "focal length"),
         ({"fx_px": math.inf}, "not finite"),
@@ -104,11 +105,57 @@ GOOD = {"width_px": 640, "height_px": 480, "fx_px": 500, "fy_px": 500, "cx_px": 
         ({"distortion": (0.1, math.nan, 0, 0)}, "not finite"),
         ({"distortion": (0.1,)}, "k1,k2,p1,p2"),
         ({"distortion": (0.1,) * 8}, "k1,k2,p1,p2"),
+        ({"width_px": 640.5}, "width_px and height_px must be whole"),
+        ({"fx_px": 8.8, "fy_px": 8.8}, "focal length 8.8 px is 0.014 widths"),
+        ({"fx_px": 64_899, "fy_px": 64_899}, "focal length 64899 px"),
+        ({"cx_px": 0.5, "cy_px": 0.5}, "principal point 0.5, 0.5 px is 50% of a side"),
+        ({"fx_px": 5000, "fy_px": 5000, "cx_px": 11_448}, "principal point 11448, 240 px"),
+        ({"cx_px": 480, "cy_px": 320}, "principal point"),
+        ({"fy_px": 650}, "500 and 650 px differ by 23%"),
     ],
 )
 def test_impossible_cameras_are_refused(change, message):
     with pytest.raises(CameraError, match=message):
         Camera(**(GOOD | change))
+
+
+@pytest.mark.parametrize("change", [{"cx_px": 0.5}, {"fy_px": 650}])
+def test_unusual_cameras_are_stated(change, tmp_path):
+    """A crop, a shifted lens, pixels that are not square; remembered in files and other sizes."""
+    with pytest.raises(CameraError, match='"unusual": true'):
+        Camera(**(GOOD | change))
+    camera = Camera(**(GOOD | change), unusual=True)
+    plain = {"camera": json.loads(json.dumps(camera.numbers()))}
+    (tmp_path / "flight.json").write_text(json.dumps(plain))
+    assert Camera.from_file(tmp_path / "flight.json") == camera
+    assert camera.fitted(320, 240).unusual and "unusual" not in Camera(**GOOD).numbers()
+
+
+def test_every_size_of_a_picture_has_a_camera():
+    camera = Camera(4000, 3000, 0.3001 * 4000, 0.3001 * 4000, 2395, 1795)
+    for width in (4000, 1333, 333, 64, 31):
+        assert camera.resized(width, round(width * 0.75)).width_px == width
+
+
+def test_fields_of_view():
+    across = Camera.from_fov(84, 1280, 960, diagonal=True)
+    assert across.fx_px == pytest.approx(math.hypot(1280, 960) / 2 / math.tan(math.radians(42)))
+    with pytest.raises(CameraError, match=r"64\.7 if these are radians"):
+        Camera.from_fov(1.13, 1280, 960)
+    whole = Camera.from_fov(65, 1280.0, 960.0)
+    assert type(whole.width_px) is int and whole == Camera.from_fov(65, 1280, 960)
+
+
+def test_matrices_that_are_not_those_of_opencv():
+    matrix = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
+    assert Camera.from_matrix(matrix, None, (640, 480)).cx_px == 320.0
+    with pytest.raises(CameraError, match=r"transposed \(its last row is 319.5, 239.5, 1\)"):
+        Camera.from_matrix(matrix.T, None, (640, 480))
+    for row, col in ((0, 1), (1, 0), (2, 0)):
+        other = matrix.copy()
+        other[row, col] = 3.0
+        with pytest.raises(CameraError, match="without skew"):
+            Camera.from_matrix(other, None, (640, 480))
 
 
 @given(yaws, tilts, tilts, st.floats(30, 500), st.just(()) | coefficients)

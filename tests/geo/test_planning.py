@@ -47,7 +47,9 @@ def test_the_view_is_the_footprint():
 
 @given(st.floats(1, 50_000), st.integers(64, 6000), st.integers(64, 6000), st.floats(0.3, 5))
 def test_the_map_that_is_advised_is_good_for_the_view(agl_m, width_px, height_px, focal):
-    camera = Camera(width_px, height_px, focal * width_px, focal * width_px, 10.0, 10.0)
+    camera = Camera(
+        width_px, height_px, focal * width_px, focal * width_px, 10.0, 10.0, unusual=True
+    )
     view = ViewPlan.of(camera, agl_m)
     gsd_m, tile_px = suited_map(view)
     assert gsd_m >= 0.995 * max(FINEST_IMAGERY_M, view.gsd_m)

@@ -340,12 +340,11 @@ def test_a_damaged_layer_gives_no_fix(map_path, tmp_path, plain, caplog):
     assert [record.exc_info for record in caplog.records] == [None]  # a line, no traceback
 
 
-@pytest.mark.parametrize(
-    "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.5, 3.0, math.nan)]
-)
-def test_a_nan_prior_is_outside_the_map(localizer, plain, prior):
-    outcome = localizer.locate(View(plain[0], CAMERA, plain[1]), prior=prior)
+def test_a_swapped_prior_is_named(localizer, plain):
+    lat_deg, lon_deg = localizer.opened.frame.latlon_from_en([0.0, 0.0])
+    outcome = localizer.locate(View(plain[0], CAMERA, plain[1]), prior=Prior(lon_deg, lat_deg, 50))
     assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
+    assert "seem to be swapped" in outcome.detail
 
 
 ODD = {

@@ -380,4 +380,4 @@ def test_a_place_that_contradicts_the_start_is_found_and_not_believed_at_once(lo
 def test_a_wrong_camera_is_refused(localizer):
     grey, telemetry, _ = next(iter(views(1)))
     with pytest.raises(CameraError, match="320 x 240"):
-        Tracker(localizer).locate(View(grey, replace(WIDE, width_px=640), telemetry))
+        Tracker(localizer).locate(View(grey, replace(WIDE, width_px=640, cx_px=320.0), telemetry))

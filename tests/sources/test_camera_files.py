@@ -1,6 +1,7 @@
 """Camera files of other programs, as those programs write them."""
 
 import json
+import sys
 from copy import deepcopy
 
 import cv2
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from orthonav.core.errors import CameraError
+from orthonav.core.errors import CameraError, MissingExtraError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
 
@@ -82,6 +83,26 @@ def test_opencv(tmp_path, name):
     assert read_camera_file(long) == expected(BROWN)
 
 
+def test_opencv_as_xml(tmp_path):
+    """As Metashape exports it."""
+    names = "Camera_Matrix", "Distortion_Coefficients"
+    text = opencv(tmp_path / "camera.xml", BROWN, names).read_text()
+    (tmp_path / "camera.xml").write_text(text.replace("image_w", "image_W").replace("_h", "_H"))
+    assert read_camera_file(tmp_path / "camera.xml") == expected(BROWN)
+
+
+@pytest.mark.parametrize("write", [ros, kalibr])
+def test_without_pyyaml_opencv_reads(tmp_path, monkeypatch, write):
+    path = write(tmp_path / "a.yaml")
+    plain = yaml.safe_load(path.read_text())
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(MissingExtraError, match="PyYAML"):  # sequences that are not indented
+        read_camera_file(path)
+    indented = "\n".join(f"{name}: {json.dumps(each)}" for name, each in plain.items())
+    path.write_text(indented.replace('"', ""))
+    assert read_camera_file(path).distortion == tuple(BROWN[: 5 if write is ros else 4])
+
+
 @pytest.mark.parametrize(
     "write, model, given, expects",
     [
@@ -104,10 +125,10 @@ def test_a_chain_of_kalibr_with_the_header_of_opencv(tmp_path):
     path = kalibr(tmp_path / "a.yaml", names=("cam0", "cam1"))
     chain = path.read_text()
     second = chain.index("cam1:")
-    chain = chain[:second] + chain[second:].replace("500.25", "600.25")
+    chain = chain[:second] + chain[second:].replace("500.25", "501.25")
     path.write_text("%YAML:1.0\n\n" + chain)
     assert read_camera_file(tmp_path / "a.yaml#cam0") == expected(BROWN[:4])
-    assert read_camera_file(tmp_path / "a.yaml#cam1").fx_px == 600.25
+    assert read_camera_file(tmp_path / "a.yaml#cam1").fx_px == 501.25
     with pytest.raises(CameraError, match="holds cam0, cam1; select one as FILE#cam0"):
         read_camera_file(path)
     with pytest.raises(CameraError, match="no camera 'cam7', it holds cam0, cam1"):
@@ -128,15 +149,32 @@ REFUSED = {
     "omni": (lambda p: kalibr(p, camera_model="omni"), "'omni' is not supported"),
     "two cameras": (lambda p: kalibr(p, names=("cam0", "cam1")), "holds cam0, cam1"),
     "short matrix": (lambda p: ros(p, camera_matrix={"data": [1, 2]}), "9 numbers"),
-    "no size": (written("%YAML:1.0\n---\nfx: 1\n"), "lacks camera_matrix"),
+    "no size": (written("%YAML:1.0\n---\nfx: 1\n"), "key .image_width. is missing"),
     "not YAML": (written("a: [1, 2"), "not YAML"),
     "code": (written("!!python/object/apply:os.system ['true']"), "not YAML"),
     "a list": (written("- 1\n- 2\n"), "mapping was expected"),
     "nothing": (written(""), "mapping was expected"),
-    "other JSON": (written(json.dumps({"a": 1})), "key .camera_matrix. is missing"),
+    "other JSON": (written(json.dumps({"a": 1})), "key .image_width. is missing"),
     "bytes": (written(b"\xff\xfe\x00\x80"), "not UTF-8 text"),
     "broken OpenCV": (written("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: x"), "."),
     "negative": (lambda p: kalibr(p, intrinsics=[-1, 1, 1, 1]), "focal length"),
+}
+
+
+REFUSED |= {
+    "transposed": (
+        lambda p: ros(p, camera_matrix={"data": MATRIX.T.ravel().tolist()}),
+        "transposed .its last row is 319.5, 239.5, 1., as MATLAB",
+    ),
+    "no centre": (lambda p: kalibr(p, intrinsics=[500, 500, 0, 0]), "principal point 0.5, 0.5 px"),
+    "COLMAP": (
+        written("# Camera list\n1 SIMPLE_RADIAL 640 480 500.2 320 240 -0.01\n"),
+        "of COLMAP are not read; expected flight.json, or",
+    ),
+    "Metashape": (
+        written('<?xml version="1.0"?>\n<calibration><f>500</f></calibration>\n'),
+        "of Metashape are not read",
+    ),
 }
 
 

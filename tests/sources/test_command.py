@@ -229,7 +229,7 @@ def test_one_photograph_is_placed_and_printed(run, tmp_path):
     (line,) = map(json.loads, out.splitlines())
     assert code == 0 and line["frame"] == "photo.png" and "1 view: " in err
     unknown = run(*one)
-    assert "none: not a number: yaw_deg (missing_telemetry); give --heading unknown" in unknown.out
+    assert "heading_deg (yaw_deg) (missing_telemetry); give --heading unknown" in unknown.out
     plain = json.loads(run(*one, "--heading", "unknown", "--json").out)
     assert plain["fixes"] is None and plain["positions"][0]["lat_deg"] == pytest.approx(lat)
     both = run(*one, "--dem", path)

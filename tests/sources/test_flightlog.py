@@ -213,7 +213,7 @@ OPTIONAL = [each.name for each in fields(Telemetry) if each.name not in NAMED]
 )
 def test_telemetry_comes_back_exactly(time_ns, four, others, prior, velocity, below):
     """All fields that there are, also those that come later."""
-    prior = prior and Prior(*prior)
+    prior = prior and Prior.known(*prior)
     before = Telemetry(time_ns, *four, prior=prior, vel_en_mps=velocity, below=below, **others)
     after = view_of(telemetry_message(LoggedView(3, 5, "ä/b.png", before, "full")))
     assert (after.index, after.number, after.frame, after.picture) == (3, 5, "ä/b.png", "full")

@@ -351,7 +351,7 @@ def test_a_camera_file_and_a_log_may_stand_in(tmp_path, messages, topics):
     with pytest.raises(CameraError, match="no camera_info"):
         open_source(path)
     log = ulog(tmp_path / "a.ulg", px4_topics())
-    camera = camera_file(tmp_path / "camera.json", width_px=128, height_px=96)
+    camera = camera_file(tmp_path / "camera.json", width_px=128, height_px=96, cx_px=64, cy_px=48)
     recording = open_source(path, SourceOptions(camera=camera, telemetry=log))
     assert recording.camera.width_px == 64
     telemetry = next(recording.views).telemetry
@@ -464,7 +464,7 @@ def test_pictures_are_not_held(tmp_path, messages):
     stamps = [START_S * 10**9 + step * 10**8 for step in range(60)]
     topics = {
         "/cam/image_raw": [(t, messages.image(t, image)) for t in stamps],
-        "/cam/camera_info": [(stamps[0], messages.camera_info(width=640, height=480))],
+        "/cam/camera_info": [(stamps[0], messages.camera_info())],
     }
     path = record(tmp_path / "flight", topics, messages)
     del topics

@@ -218,7 +218,7 @@ UNKNOWN = {
         )
     },
     "vel_en_mps": ((math.nan, 2.0), (2.0, math.nan)),
-    "prior": tuple(Prior(*(math.nan if n == at else 48.0 for n in range(3))) for at in range(3)),
+    "prior": (Prior(48.0, 48.0, math.inf),),
     "below": (Ground(math.nan, 1.0, 1.0), Ground(30.0, math.nan, 1.0)),
 }
 VALUES = [(name, value) for name, values in UNKNOWN.items() for value in values]

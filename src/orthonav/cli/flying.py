@@ -501,9 +501,8 @@ def start_of(
 def given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | None:
     if not options.start:
         return None
-    start = Prior(*options.start)
-    place = start.lat_deg, start.lon_deg
-    if not (abs(place[0]) <= 90 and abs(place[1]) <= 180 and start.std_m > 0):
+    start, place = Prior.known(*options.start), options.start[:2]
+    if start is None or abs(start.lon_deg) > 180 or start.std_m == 0:
         raise UsageError(
             "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a standard "
             f"deviation above 0 m, got {','.join(f'{value:g}' for value in options.start)}"

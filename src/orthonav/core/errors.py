@@ -15,6 +15,10 @@ class MissingFileError(OrthonavError, FileNotFoundError):
     """A file or folder that was named does not exist or cannot be read."""
 
 
+class ArgumentError(OrthonavError, TypeError, ValueError):
+    """An argument of another type, or a number out of range, was given to a function."""
+
+
 class ImageryError(OrthonavError, ValueError):
     """An orthophoto cannot be used: no georeference, no valid pixels, unreadable, wrong bands."""
 

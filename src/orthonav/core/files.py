@@ -8,9 +8,13 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from orthonav.core.errors import MissingFileError, OutputError, lfs_pointer
 
+StrPath = str | os.PathLike[str]
+GivenPath: TypeAlias = Any
+"""A `StrPath` when a record is made, which holds a `Path`: no type is both."""
 Progress = Callable[[str, float], None]
 """Receives the stage of a long task and the fraction of it that is done, 0 to 1."""
 
@@ -147,13 +151,13 @@ def with_paths(record: object, *names: str) -> None:
     """Turn text fields of a frozen record into paths; None stays."""
     for name in names:
         value = getattr(record, name)
-        if isinstance(value, str):
+        if isinstance(value, str | os.PathLike):
             object.__setattr__(record, name, Path(value))
-        elif value is not None and not isinstance(value, Path):
+        elif value is not None:
             object.__setattr__(record, name, tuple(Path(each) for each in value))
 
 
-def require_file(path: Path, what: str) -> Path:
+def require_file(path: StrPath, what: str) -> Path:
     """`path` if it is a file and no pointer of Git LFS, else `MissingFileError` naming `what`."""
     path = Path(path)
     if not path.is_file():

@@ -1,16 +1,16 @@
 """Telemetry, view, prior, fix, no fix."""
 
 import math
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from types import MappingProxyType
-from typing import Any
+from dataclasses import Field, dataclass, field, fields, replace
+from typing import Any, ClassVar, Literal, NoReturn
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import ArgumentError, FlightError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.integrity import probability_within, protection_level_m
@@ -27,73 +27,143 @@ DEFAULT_AGL_STD = 0.08  # over the height
 DEFAULT_TILT_STD_DEG = UNSTATED.aided_deg
 RADIUS_SHARE = 0.025  # least radius of the confidence over the height: an error of 1.4 deg of tilt
 MAP_STD_M = 3.0  # per axis, of a displacement of the map as a whole: it never averages out
+MAX_TIME_S = 1e11  # the year 5138; since 1970 there were more milliseconds
 
 Evidence = Mapping[str, float]
 """Named numbers behind the confidence of a fix; see `docs/reference/formats.md`."""
+
+
+def has_type(name: str, value: Any, expected: type, how: str = "") -> None:
+    """Raise `ArgumentError` that names the argument unless it has the type, made by `how`."""
+    if not isinstance(value, expected):
+        kind = f"an orthonav.{expected.__name__}{how}"
+        raise ArgumentError(f"{name} must be {kind}, got {type(value).__name__}")
+
+
+def number(
+    name: str, value: Any, how: str = "a number", least: float = math.nan, most: float = math.inf
+) -> float:
+    """Raise `ArgumentError` that names the argument unless it is a number, from `least` (NaN: of
+    any value, NaN too) to `most`."""
+    try:
+        found = None if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError):
+        found = None
+    if found is None or not (math.isnan(least) or least <= found <= most):
+        raise ArgumentError(f"{name} must be {how}, got {value!r:.40}")
+    return found
+
+
+class ReadOnly(dict[str, float]):
+    """Unlike a mapping proxy it can be pickled and copied."""
+
+    def __setitem__(self, *_: Any) -> NoReturn:
+        raise TypeError("values of a record are read-only")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return ReadOnly, (dict(self),)
+
+
+class ByValue:
+    """Compared by fields: arrays by shape and values, NaN equal to NaN."""
+
+    __slots__ = ()
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def _key(self) -> tuple[Any, ...]:
+        return tuple(_comparable(getattr(self, each.name)) for each in fields(self))
+
+    def __eq__(self, other: Any) -> bool:
+        return type(other) is type(self) and bool(other._key() == self._key())
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+
+def _comparable(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    if isinstance(value, Mapping):
+        return frozenset((name, _comparable(each)) for name, each in value.items())
+    if isinstance(value, tuple):
+        return tuple(map(_comparable, value))
+    return "nan" if value != value else value
 
 
 @dataclass(frozen=True)
 class Prior:
     """The position expected before a search: a round Gaussian.
 
-    `lat_deg`, `lon_deg`: its mean, WGS 84. `std_m`: standard deviation per axis, m, 0 or more; the
-    search ends at `PRIOR_SIGMAS` of them."""
+    `lat_deg` (-90 to 90), `lon_deg` (-360 to 360): its mean, WGS 84. `std_m`: standard deviation
+    per axis, m, 0 or more; the search ends at three of them. Raises `ArgumentError`."""
 
     lat_deg: float
     lon_deg: float
     std_m: float
 
+    def __post_init__(self) -> None:
+        number("lat_deg", self.lat_deg, "-90 to 90, before the longitude", -90, 90)
+        number("lon_deg", self.lon_deg, "-360 to 360", -360, 360)
+        number("std_m", self.std_m, "metres, 0 or more", 0)
 
-@dataclass(frozen=True, slots=True)
-class Telemetry:
-    """What the autopilot reported for the exposure of one view. NaN and None stand for unknown: an
-    optional field that is not finite becomes None."""
+    @classmethod
+    def known(cls, *values: float) -> "Prior | None":
+        """None where a value is unknown or impossible."""
+        try:
+            return cls(*values)
+        except ArgumentError:
+            return None
 
-    time_ns: int  # time of exposure, ns
-    yaw_deg: float  # heading of the top of the picture, clockwise from true north
-    pitch_deg: float  # 0 where the optical axis points straight down; positive looks ahead
-    roll_deg: float  # 0 where the optical axis points straight down; positive looks left
-    agl_m: float  # height above ground, above 0
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Telemetry(ByValue):
+    """What the autopilot reported for the exposure of one view.
+
+    NaN and None stand for unknown: an optional field that is not finite becomes None. Angles are
+    degrees. A view without heading, pitch, roll or height gives a `NoFix`.
+
+    - `time_ns`: of the exposure, whole nanoseconds of any clock. `agl_m`: height above ground, m.
+    - `yaw_deg`: heading of the top of the picture, clockwise from true north: `heading_deg` of
+      `View.of`, which makes records of the arguments that most programs have.
+    - `pitch_deg`, `roll_deg`: 0 where the camera looks straight down; ahead and left are positive.
+    - `yaw_std_deg`, `agl_std_m`: standard deviations from view to view; None: 7 deg, 8 % of the
+      height.
+    - `prior`: expected position; None: none. `vel_en_mps`: velocity over ground since the view
+      before, true east and north, m/s; `vel_std_mps`: its standard deviation per axis; None: by
+      the speed.
+    - `tilt_std_deg`: standard deviation of the error of pitch and of roll, mount included; 0: they
+      are exact; None: 3 deg. `mount_std_deg`: its constant part, of a mount that was never
+      calibrated; None: unknown.
+    - `home_m`, `amsl_m`, `hae_m`: height above take-off, mean sea level and the ellipsoid, m, as
+      recorded; used with a terrain only, never in place of `agl_m`.
+    - `below`: the ground from which `agl_m` was computed by a height above sea, its deviation being
+      part of `agl_std_m`; None: `agl_m` was measured."""
+
+    time_ns: int
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+    agl_m: float
     yaw_std_deg: float | None = None
-    """Standard deviation of the heading from view to view; `DEFAULT_YAW_STD_DEG` where None."""
     agl_std_m: float | None = None
-    """The same of the height; `DEFAULT_AGL_STD` of the height where None."""
-    prior: Prior | None = None  # expected position
+    prior: Prior | None = None
     vel_en_mps: tuple[float, float] | None = None
-    """Velocity over ground since the view before, true east and north."""
     tilt_std_deg: float | None = None
-    """Standard deviation of the error of pitch and of roll, mount included; 0: they are exact.
-    `DEFAULT_TILT_STD_DEG` where None."""
     mount_std_deg: float | None = None
-    """Its part that is constant: of a mount that was never calibrated; None: not known."""
     vel_std_mps: float | None = None
-    """Standard deviation of the velocity per axis; see `orthonav.core.track.tracker`."""
     home_m: float | None = None
-    """Height above the place of take-off, as recorded; it is not used in place of `agl_m`."""
-    amsl_m: float | None = None  # height above mean sea level, as recorded
-    hae_m: float | None = None  # height above the ellipsoid of WGS 84, as recorded
+    amsl_m: float | None = None
+    hae_m: float | None = None
     below: Ground | None = None
-    """The ground from which `agl_m` was computed by a height above sea; None where it was measured.
-    Its deviation is part of `agl_std_m`."""
 
     def __post_init__(self) -> None:
-        prior, below = self.prior, self.below
-        optional: dict[str, tuple[float | None, ...]] = {
-            "yaw_std_deg": (self.yaw_std_deg,),
-            "agl_std_m": (self.agl_std_m,),
-            "prior": () if prior is None else (prior.lat_deg, prior.lon_deg, prior.std_m),
-            "vel_en_mps": () if self.vel_en_mps is None else self.vel_en_mps,
-            "tilt_std_deg": (self.tilt_std_deg,),
-            "mount_std_deg": (self.mount_std_deg,),
-            "vel_std_mps": (self.vel_std_mps,),
-            "home_m": (self.home_m,),
-            "amsl_m": (self.amsl_m,),
-            "hae_m": (self.hae_m,),
-            "below": () if below is None else (below.height_m, below.std_m, below.known),
-        }
-        for name, values in optional.items():
-            is_std, known = "_std_" in name, [each for each in values if each is not None]
-            if not all(math.isfinite(each) and not (is_std and each < 0) for each in known):
+        for name in _OPTIONAL:
+            value: Any = getattr(self, name)
+            if isinstance(value, Prior | Ground):
+                value = vars(value).values()
+            parts = value if hasattr(value, "__iter__") else () if value is None else (value,)
+            least = 0.0 if "_std_" in name else -math.inf
+            if not all(math.isfinite(each) and each >= least for each in parts):
                 object.__setattr__(self, name, None)
 
     @property
@@ -105,17 +175,15 @@ class Telemetry:
 
     def missing(self) -> list[str]:
         """Names of the fields without which a view cannot be rectified, empty if all are there."""
-        named = {
-            "yaw_deg": self.yaw_deg,
-            "pitch_deg": self.pitch_deg,
-            "roll_deg": self.roll_deg,
-            "agl_m": self.agl_m,
-        }
-        return [name for name, value in named.items() if not math.isfinite(value)]
+        needed = "yaw_deg", "pitch_deg", "roll_deg", "agl_m"
+        return [name for name in needed if not math.isfinite(getattr(self, name))]
+
+
+_OPTIONAL = tuple(each.name for each in fields(Telemetry))[5:]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class View(ByValue):
     """What the camera saw at one exposure, and the telemetry of that time.
 
     `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified. Images of other
@@ -130,6 +198,7 @@ class View:
     telemetry: Telemetry
 
     def __post_init__(self) -> None:
+        has_type("camera", self.camera, Camera, ", as of Camera.from_matrix(..)")
         grey = np.ascontiguousarray(grey_levels(self.grey))  # a flipped picture is a view of it
         object.__setattr__(self, "grey", grey)
         object.__setattr__(self, "camera", self.camera.fitted(grey.shape[1], grey.shape[0]))
@@ -137,7 +206,7 @@ class View:
     @classmethod
     def of(
         cls,
-        image: NDArray[Any],
+        image: NDArray[Any] | None,
         camera: Camera,
         *,
         agl_m: float,
@@ -151,31 +220,40 @@ class View:
         tilt_std_deg: float | None = None,
         vel_en_mps: tuple[float, float] | None = None,
     ) -> "View":
-        """A view of an image (H, W), (H, W, 3) BGR or (H, W, 4), see
-        `orthonav.core.records.grey_levels`.
+        """A view of an image and of what was reported at its exposure.
 
-        `agl_m`: height above ground. `heading_deg`: of the top of the image, clockwise from true
-        north; None: unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down.
-        `tilt_std_deg`: their standard deviation, by the source (docs/flights.md); None: 3 deg,
-        which on a map without terrain places the camera to 3 % of the height, 1 deg to 1.6 %.
-        `time_s`: of the exposure. The standard deviations are those of `Telemetry`."""
-        heading = math.nan if heading_deg is None else float(heading_deg)
-        return cls(
-            image,
-            camera,
-            Telemetry(
-                round(time_s * 1e9),
-                heading,
-                float(pitch_deg),
-                float(roll_deg),
-                float(agl_m),
-                yaw_std_deg=heading_std_deg,
-                agl_std_m=agl_std_m,
-                prior=prior,
-                vel_en_mps=vel_en_mps,
-                tilt_std_deg=tilt_std_deg,
-            ),
+        `image`: (H, W) grey, (H, W, 3) BGR, (H, W, 4) BGRA; uint8, uint16 (white is 65535) or
+        floating point (0 to 1, or 0 to 255). `camera`: of its size or proportions. `agl_m`: height
+        above ground, m. `heading_deg`: of the top of the image, clockwise from true north; None:
+        unknown. `pitch_deg`, `roll_deg`: 0 for a camera that looks straight down, positive ahead
+        and left. `time_s`: of the exposure, seconds of any clock. `prior`: used by a `Tracker`;
+        None: none. `vel_en_mps`: velocity over ground since the view before, east and north, m/s.
+
+        Standard deviations, 0 or more, of heading (None: 7 deg), height (None: 8 % of it), and of
+        pitch and of roll, by their source (docs/flights.md; None: 3 deg): on a map without terrain
+        3 deg place the camera to 3 % of the height, 1 deg to 1.6 %.
+
+        Raises `ArgumentError`, `FlightError` for what is no image, `CameraError` where image and
+        camera have different proportions."""
+        stds = heading_std_deg, agl_std_m, tilt_std_deg
+        for name, std in zip(("heading_std_deg", "agl_std_m", "tilt_std_deg"), stds, strict=True):
+            number(name, std or 0, "0 or more; None: unknown", 0)
+        if prior is not None:
+            has_type("prior", prior, Prior, "(lat_deg, lon_deg, std_m)")
+        number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S)
+        telemetry = Telemetry(
+            round(time_s * 1e9),
+            math.nan if heading_deg is None else number("heading_deg", heading_deg),
+            number("pitch_deg", pitch_deg),
+            number("roll_deg", roll_deg),
+            number("agl_m", agl_m),
+            yaw_std_deg=heading_std_deg,
+            agl_std_m=agl_std_m,
+            prior=prior,
+            vel_en_mps=vel_en_mps,
+            tilt_std_deg=tilt_std_deg,
         )
+        return cls(grey_levels(image), camera, telemetry)
 
     def __repr__(self) -> str:
         reported = self.telemetry
@@ -185,14 +263,43 @@ class View:
         )
 
 
+class Result(ByValue):
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON by the keys of `fixes.jsonl` (docs/reference/formats.md), of a
+        `Fix` or `NoFix` without those of the flight (name, time, ..); None: unknown."""
+        from orthonav.core.flight.fixes import to_plain  # it reads and makes records
+
+        return to_plain(self)
+
+
+class Outcome(Result):
+    """Its `evidence` is read-only."""
+
+    evidence: Evidence
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "evidence", ReadOnly(self.evidence))
+
+
 @dataclass(frozen=True, eq=False)
-class Fix:
+class Fix(Outcome):
     """The position from which a view was taken, with its uncertainty.
 
-    `lat_deg`, `lon_deg`: WGS 84. `cov_en_m2` (2, 2): covariance of east and north, m2, of a correct
-    fix. `confidence`: probability that the error is below `radius_m`, 0..1, NaN where the map was
-    not calibrated. `heading_deg` (0..360) and `agl_m`: estimated, or as reported where the method
-    does not estimate them. `evidence`: the numbers behind the confidence."""
+    - `lat_deg`, `lon_deg`: WGS 84. `cov_en_m2` (2, 2): covariance of east and north, m2, of a
+      correct fix.
+    - `confidence`: probability that the error is below `radius_m`, 0..1; NaN where the map was not
+      calibrated.
+    - `heading_deg` (0..360, of the top of the image) and `agl_m` (m): estimated, or as reported
+      where the method does not estimate them.
+    - `evidence`: the numbers behind the confidence, such as `score` and `strength` of a
+      registration, `heading_std_deg`, `pitch_bias_deg`; all keys are in docs/reference/formats.md.
+    - `ground_latlon_deg`: latitude and longitude of the ground that the middle of the picture
+      shows; `ground_cov_en_m2` (2, 2): covariance of its east and north, m2; None: unknown.
+    - `pitch_deg`, `roll_deg`: of the camera, estimated; as reported where `pose_cov` is None.
+    - `pose_cov` (6, 6): covariance of metres east, north and up and degrees of heading, pitch and
+      roll; None where the six were not estimated together.
+    - `place_probability`: that the place is right, 0..1, whatever the error there; NaN where the
+      method states only a confidence, which is then used for it."""
 
     lat_deg: float
     lon_deg: float
@@ -201,20 +308,13 @@ class Fix:
     radius_m: float
     heading_deg: float
     agl_m: float
-    evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
+    evidence: Evidence = field(default_factory=dict)
     ground_latlon_deg: tuple[float, float] | None = None
-    """Ground that the middle of the picture shows."""
     ground_cov_en_m2: NDArray[np.float64] | None = None
-    """Covariance (2, 2) of its east and north, m2."""
     pitch_deg: float = math.nan
-    """Pitch and roll of the camera, estimated; as reported where `pose_cov` is None."""
     roll_deg: float = math.nan
     pose_cov: NDArray[np.float64] | None = None
-    """Covariance (6, 6) of metres east, north and up and degrees of heading, pitch and roll; None
-    where the six were not estimated together."""
     place_probability: float = math.nan
-    """Probability that the place is right, whatever the error there; NaN where the method states
-    only a confidence, which is then used for it."""
 
     @property
     def is_confident(self) -> bool:
@@ -273,7 +373,7 @@ def _finite(value: float | None) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class NoFix:
+class NoFix(Outcome):
     """No position, and why. A value, not an exception.
 
     `reason` is a short stable word for programs (such as `blank`, `too_dark`, `outside_map`),
@@ -281,16 +381,18 @@ class NoFix:
 
     reason: str
     detail: str
-    evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
+    evidence: Evidence = field(default_factory=dict)
 
-    is_confident = False
+    @property
+    def is_confident(self) -> Literal[False]:
+        return False
 
     def __repr__(self) -> str:
         return f"NoFix({self.reason}: {self.detail})"
 
 
 @dataclass(frozen=True, eq=False)
-class ViewResult:
+class ViewResult(Result):
     """The result for one view of a flight: a line of `fixes.jsonl`.
 
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
@@ -334,6 +436,8 @@ def grey_levels(image: Any) -> NDArray[np.uint8]:
     `FlightError`."""
     if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.ndim == 2 and image.size:
         return image
+    if isinstance(image, str | os.PathLike):
+        raise FlightError(f"the image is a path, read it first, as by cv2.imread; {EXPECTED}")
     if image is None:
         raise FlightError(f"the image is None, as of a file that could not be read; {EXPECTED}")
     array = np.asarray(image)

@@ -589,7 +589,7 @@ def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> 
     own, names = fix.evidence, ("vel_east_mps", "vel_north_mps")
     moved = zip(names, reported, mean, strict=True)
     at_exposure = {key: own[key] + now - over for key, now, over in moved if key in own}
-    return replace(fix, evidence=MappingProxyType({**own, **at_exposure}))
+    return replace(fix, evidence={**own, **at_exposure})
 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:

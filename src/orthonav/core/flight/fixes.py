@@ -10,19 +10,20 @@ nine decimals, so that nanoseconds since 1970 are exact, which a float64 of seco
 import hashlib
 import json
 import math
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from decimal import Decimal
+from importlib import import_module
 from itertools import chain, repeat
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError
-from orthonav.core.files import require_file, write_lines
+from orthonav.core.errors import FlightError, MissingExtraError
+from orthonav.core.files import StrPath, require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.records import Fix, NoFix, ViewResult
@@ -149,27 +150,31 @@ UNKNOWN = Identity()  # of a run whose map and flight are not stated
 
 def result_to_json(result: ViewResult) -> str:
     """One line of `fixes.jsonl`, without the line end: strict JSON in ASCII, keys as in `KEYS`."""
-    values: dict[str, Any] = {
-        "frame": result.frame,
-        **_outcome_values(result.outcome),
-        "evidence": {str(k): _or_none(v) for k, v in result.outcome.evidence.items()},
-        "latency_ms": _or_none(result.latency_ms),
-    }
-    if isinstance(result.outcome, Fix):
-        fix, risk = result.outcome, result.risk
-        values["confident"] = result.is_confident
-        stated = fix.place_probability, fix.protection_level_m(risk), risk
-        values |= zip(INTEGRITY_KEYS, map(_or_none, stated), strict=True)
-    texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
+    plain = to_plain(result).items()
+    texts = {key: json.dumps(value, allow_nan=False) for key, value in plain}
     texts["time_s"] = _seconds(result.time_ns)
-    keys: tuple[str, ...] = KEYS
-    for more in (INTEGRITY_KEYS, GROUND_KEYS, POSE_KEYS):
-        if more[0] in values:
-            keys += more
-    if result.state is not None:
-        keys += TRACK_KEYS
-        texts |= {"tracked": "true", "state": json.dumps(result.state)}
-    return "{" + ", ".join(f'"{key}": {texts[key]}' for key in keys) + "}"
+    return "{" + ", ".join(f'"{key}": {text}' for key, text in texts.items()) + "}"
+
+
+def to_plain(record: Any, risk: float = DEFAULT_RISK) -> dict[str, Any]:
+    """Plain values of a `ViewResult` by the keys of a line, in their order; those of a fix or of
+    none, with protection levels of this risk, lack what belongs to the flight."""
+    if isinstance(record, ViewResult):
+        values = to_plain(record.outcome, record.risk)
+        values |= {"frame": record.frame, "time_s": record.time_ns / 1e9}
+        values["latency_ms"] = _or_none(record.latency_ms)
+        if isinstance(record.outcome, Fix):
+            values["confident"] = record.is_confident
+        if record.state is not None:
+            values |= zip(TRACK_KEYS, (True, record.state), strict=True)
+    else:
+        values = _outcome_values(record)
+        values["evidence"] = {str(k): _or_none(v) for k, v in record.evidence.items()}
+        if isinstance(record, Fix):
+            stated = record.place_probability, record.protection_level_m(risk), risk
+            values |= zip(INTEGRITY_KEYS, map(_or_none, stated), strict=True)
+    keys = (*KEYS, *INTEGRITY_KEYS, *GROUND_KEYS, *POSE_KEYS, *TRACK_KEYS)
+    return {key: values[key] for key in keys if key in values}
 
 
 def result_from_json(line: str) -> ViewResult:
@@ -217,7 +222,7 @@ def is_health(line: str) -> bool:
     return line.startswith('{"health"')
 
 
-def read_results(path: Path) -> list[ViewResult]:
+def read_results(path: StrPath) -> list[ViewResult]:
     """All results in `path`, in its order; empty lines and those of health are skipped.
 
     Raises `MissingFileError` where there is no such file, and `FlightError` with the number of the
@@ -243,19 +248,52 @@ def read_results(path: Path) -> list[ViewResult]:
     return results
 
 
+def to_dataframe(fixes: StrPath | Iterable[Fix | NoFix | ViewResult]) -> Any:
+    """A pandas table with one row for each of these, or for each line of a file of fixes.
+
+    Columns are the keys of `fixes.jsonl`, numbers of the evidence as `evidence.NAME`. Raises
+    `MissingExtraError` without pandas, and as `read_results`."""
+    try:
+        pandas: Any = import_module("pandas")
+    except ImportError as error:
+        raise MissingExtraError("a table of fixes needs pandas: pip install pandas") from error
+    return pandas.json_normalize([each.to_dict() for each in _all(fixes)])
+
+
+def to_geojson(fixes: StrPath | Iterable[Fix | NoFix | ViewResult]) -> dict[str, Any]:
+    """A FeatureCollection (RFC 7946) with a point for each fix among these, or in a file of fixes;
+    `json.dumps` makes text of it, GeoPandas' `from_features` a table. Raises as `read_results`."""
+    pairs = [(getattr(x, "frame", None), getattr(x, "outcome", x)) for x in _all(fixes)]
+    shown = [feature(frame, fix, fix.std_m) for frame, fix in pairs if isinstance(fix, Fix)]
+    return {"type": "FeatureCollection", "features": shown}
+
+
+def feature(
+    frame: str | None, fix: Fix, std_m: float, height_m: float = math.nan
+) -> dict[str, Any]:
+    """Of GeoJSON; `height_m`: above mean sea level, NaN: unknown."""
+    about = {"agl_m": fix.agl_m, "heading_deg": fix.heading_deg, "std_m": std_m}
+    about["confidence"] = fix.confidence
+    known = {name: None if math.isnan(x) else round(x, 4) for name, x in about.items()}
+    place = fix.lon_deg, fix.lat_deg, height_m
+    point = [round(value, 8) for value in place if math.isfinite(value)]
+    geometry = {"type": "Point", "coordinates": point}
+    return {"type": "Feature", "geometry": geometry, "properties": {"frame": frame, **known}}
+
+
+def _all(fixes: StrPath | Iterable[Any]) -> Iterable[Any]:
+    return read_results(fixes) if isinstance(fixes, str | os.PathLike) else fixes
+
+
 def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
     if isinstance(outcome, NoFix):
         no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
         return {**no_fix, **_NULL_IN_NO_FIX}
     return {
         "status": "fix",
-        "lat_deg": _or_none(outcome.lat_deg),
-        "lon_deg": _or_none(outcome.lon_deg),
+        "confident": outcome.is_confident,
+        **{key: _or_none(getattr(outcome, key)) for key in (*KEYS[4:6], *KEYS[7:11])},
         "cov_en_m2": _rows(outcome.cov_en_m2),
-        "confidence": _or_none(outcome.confidence),
-        "radius_m": _or_none(outcome.radius_m),
-        "heading_deg": _or_none(outcome.heading_deg),
-        "agl_m": _or_none(outcome.agl_m),
         **_NULL_IN_FIX,
         **_ground_values(outcome),
         **_pose_values(outcome),
@@ -288,9 +326,7 @@ def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
 def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
     status, evidence = values["status"], values["evidence"]
     _checked(values, "evidence", "an object", isinstance(evidence, dict))
-    evidence = MappingProxyType(
-        {key: _as_float(value, f"evidence {key!r:.40}") for key, value in evidence.items()}
-    )
+    evidence = {key: _as_float(each, f"evidence {key!r:.40}") for key, each in evidence.items()}
     if status == "no_fix":
         reason = _checked(values, "reason", "text", isinstance(values["reason"], str))
         return NoFix(reason=reason, detail=str(values.get("detail") or ""), evidence=evidence)

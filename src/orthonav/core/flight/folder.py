@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError, MissingFileError, OutputError
-from orthonav.core.files import require_file
+from orthonav.core.files import StrPath, require_file
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import (
@@ -87,7 +87,7 @@ class FlightFolder:
         return len(self.views)
 
 
-def open_flight(path: Path, *, images_needed: bool = True) -> FlightFolder:
+def open_flight(path: StrPath, *, images_needed: bool = True) -> FlightFolder:
     """Open a flight folder and, if `images_needed`, check that every image named is there.
 
     The camera is scaled to the size of the first image that can be decoded. Raises
@@ -180,7 +180,7 @@ def _is_cut_jpeg(data: bytes) -> bool:
     return data.find(_JPEG_END, at) < 0
 
 
-def read_truth(path: Path) -> dict[str, tuple[float, float]]:
+def read_truth(path: StrPath) -> dict[str, tuple[float, float]]:
     """True positions by frame, (lat_deg, lon_deg), from `truth.csv`.
 
     Raises `MissingFileError` or `FlightError`, naming the line.
@@ -236,6 +236,7 @@ def camera_from_plain(raw: Any) -> Camera:
         distortion=tuple(float(value) for value in distortion),
         model=str(raw.get("model", "brown")),
         focal_std=float(raw.get("focal_std", 0.0)),
+        unusual=raw.get("unusual") is True,
     )
 
 
@@ -269,7 +270,7 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
     east, north = (_optional(row, f"vel_{name}_mps") for name in ("east", "north"))
     prior = None
     if lat is not None and lon is not None and std_m is not None:
-        prior = Prior(lat, lon, std_m) if abs(lat) <= 90 and abs(lon) <= 360 else None
+        prior = Prior.known(lat, lon, std_m)
     values: dict[str, Any] = {name: number_of(row[name]) for name in TELEMETRY_COLUMNS[2:]}
     values |= {name: _optional(row, name) for name in _OPTIONAL_FIELDS}
     velocity = None if east is None or north is None else (east, north)

@@ -141,7 +141,7 @@ def camera_of_info(message: Any, topic: str = "") -> Camera:
     roi = message.roi
     if message.binning_x > 1 or message.binning_y > 1 or roi.width or roi.height:
         raise CameraError("camera_info with binning or a region of interest; give --camera FILE")
-    numbers = matrix[[0, columns + 1, 2, columns + 2]].tolist()
+    numbers = matrix.reshape(3, columns)[:, :3].ravel().tolist()
     size = message.width, message.height
     if rectified:
         return camera_from_numbers(size, numbers, [], "plumb_bob")

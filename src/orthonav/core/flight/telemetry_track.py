@@ -214,7 +214,7 @@ class RecordedTrack:
             yaw_std_deg=_number(_at(self.yaw_std, time_ns, 1)[0]),
             agl_std_m=_number(_at(self.agl_std, time_ns, 1)[0]),
             **(self._tilt_stds(time_ns) if math.isfinite(pitch + roll) else {}),
-            prior=Prior(*map(float, prior)) if np.isfinite(prior).all() else None,
+            prior=Prior.known(*map(float, prior)),
             vel_en_mps=(float(velocity[0]), float(velocity[1]))
             if np.isfinite(velocity).all()
             else None,

@@ -22,11 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
+from orthonav.core.files import StrPath
 
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
 MAX_FOCAL_STD = 0.5
 FOV_STD = 0.05  # of the focal length by a stated field of view, relative
+MAX_OFF_MIDDLE = 0.1  # of the principal point, as a share of a side
+MAX_SKEW = 1e-3  # of the focal length
+MIN_FOCAL, MAX_FOCAL = 0.3, 20.0  # over a side
+MIN_FOV_DEG = 2.9  # that of 20 widths; 2.9 radians are 166 deg
+MAX_OBLONG = 0.05  # of pixels
 _STEPS = 50
 _CLOSE = 1e-9
 _EXACT = 1e-14
@@ -44,8 +50,10 @@ class Camera:
     (pixel-is-area: its centre is 0.5, 0.5). With `model` "brown", `distortion` is empty or
     k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
     OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
-    for a calibrated camera. `mask` (H, W), see `masked`, is no part of comparisons. Raises
-    `CameraError` on values no camera has."""
+    for a calibrated camera. `mask` (H, W), see `masked`, is no part of comparisons. `unusual`: a
+    principal point more than a tenth of a side from the middle (a crop, a shifted lens) or pixels
+    that are not square are meant; without it they are refused. Raises `CameraError` on values no
+    camera has."""
 
     width_px: int
     height_px: int
@@ -57,48 +65,67 @@ class Camera:
     model: str = "brown"
     focal_std: float = 0.0
     mask: NDArray[np.uint8] | None = field(default=None, compare=False, repr=False)
+    unusual: bool = False
 
     def __post_init__(self) -> None:
         if self.distortion and not any(self.distortion):
             object.__setattr__(self, "distortion", ())  # none at all, and faster
+        if wrong := self._impossible() or self._implausible():
+            raise CameraError(f"camera {wrong}: {self}")
         for name in ("width_px", "height_px"):
-            if not 1 <= getattr(self, name) <= MAX_DIMENSION_PX:
-                raise CameraError(f"camera {name} must be 1 to {MAX_DIMENSION_PX}: {self}")
-        self._check_mask()
-        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
-        if not all(math.isfinite(number) for number in numbers):
-            raise CameraError(f"camera has a value that is not finite: {self}")
-        if self.fx_px <= 0 or self.fy_px <= 0:
-            raise CameraError(f"camera focal length must be above 0 px: {self}")
-        if not 0 <= self.focal_std <= MAX_FOCAL_STD:
-            raise CameraError(
-                f"camera focal_std must be a fraction, 0 to {MAX_FOCAL_STD}, got {self.focal_std}"
-            )
-        if self.model not in ("brown", "fisheye"):
-            raise CameraError(f"camera model must be brown or fisheye, got '{self.model}'")
-        allowed, names = ((0, 4), "k1,k2,k3,k4") if self.model == "fisheye" else _BROWN
-        if len(self.distortion) not in allowed:
-            raise CameraError(
-                f"camera distortion of a {self.model} lens must be empty or {names}, "
-                f"got {self.distortion}"
-            )
+            object.__setattr__(self, name, int(getattr(self, name)))
 
-    def _check_mask(self) -> None:
-        mask, shape = self.mask, (self.height_px, self.width_px)
-        if mask is not None and (mask.dtype != np.uint8 or mask.shape != shape):
-            raise CameraError(
-                f"camera mask must be uint8 of {self.width_px} x {self.height_px} px, as "
-                f"Camera.masked makes it, got {mask.dtype} of {mask.shape[::-1]}"
-            )
+    def _impossible(self) -> str:
+        mask, size = self.mask, (self.width_px, self.height_px)
+        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
+        allowed, names = ((0, 4), "k1,k2,k3,k4") if self.model == "fisheye" else _BROWN
+        if not all(1 <= side <= MAX_DIMENSION_PX and side == int(side) for side in size):
+            return f"width_px and height_px must be whole, 1 to {MAX_DIMENSION_PX}"
+        if mask is not None and (mask.dtype != np.uint8 or mask.shape != size[::-1]):
+            got = f"got {mask.dtype} of {mask.shape[::-1]}"
+            return f"mask must be uint8 of {size}, as Camera.masked makes it, {got}"
+        if not all(math.isfinite(number) for number in numbers):
+            return "has a value that is not finite"
+        if self.fx_px <= 0 or self.fy_px <= 0:
+            return "focal length must be above 0 px"
+        if not 0 <= self.focal_std <= MAX_FOCAL_STD:
+            return f"focal_std must be a fraction, 0 to {MAX_FOCAL_STD}"
+        if self.model not in ("brown", "fisheye"):
+            return f"model must be brown or fisheye, got '{self.model}'"
+        known = len(self.distortion) in allowed
+        return "" if known else f"distortion of a {self.model} lens must be empty or {names}"
+
+    def _implausible(self) -> str:
+        """By shares of sides, which remain where a picture is scaled."""
+        fx, fy, wide, high = self.fx_px, self.fy_px, self.width_px, self.height_px
+        off = max(abs(self.cx_px / wide - 0.5), abs(self.cy_px / high - 0.5))
+        apart = abs(fx / fy - 1)
+        if max(fx / wide, fy / high) < MIN_FOCAL or min(fx / wide, fy / high) > MAX_FOCAL:
+            return f"focal length {fx:g} px is {fx / wide:.2g} widths, expected 0.3 to 20"
+        if off > MAX_OFF_MIDDLE and not self.unusual:
+            middle = f"principal point {self.cx_px:g}, {self.cy_px:g} px is {off:.0%} of a side "
+            return middle + 'from the middle ("unusual": true states a crop or a shifted lens)'
+        if apart > MAX_OBLONG + 2 / min(wide, high) and not self.unusual:  # sides are rounded
+            differ = f"focal lengths {fx:g} and {fy:g} px differ by {apart:.0%} "
+            return differ + '("unusual": true states pixels that are not square)'
+        return ""
 
     @classmethod
-    def from_fov(cls, fov_deg: float, width_px: int, height_px: int) -> "Camera":
-        """A camera without distortion by its horizontal field of view, above 0 and below 180 deg.
+    def from_fov(
+        cls, fov_deg: float, width_px: int, height_px: int, *, diagonal: bool = False
+    ) -> "Camera":
+        """A camera without distortion by its field of view in degrees, 2.9 to about 125.
 
-        Stated fields of view are often those of the lens or of another mode: good to 5 %."""
-        if not 0 < fov_deg < 180:
-            raise CameraError(f"field of view must be above 0 and below 180 deg, got {fov_deg:g}")
-        focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
+        It is that across the width of the picture; with `diagonal` that from corner to corner, as
+        makers of cameras often state it. Stated fields of view are often those of the lens or of
+        another mode: good to 5 %. Raises `CameraError`."""
+        if not MIN_FOV_DEG <= fov_deg < 180:
+            turned = f"; {math.degrees(fov_deg):.1f} if these are radians" if fov_deg > 0 else ""
+            raise CameraError(
+                f"field of view must be {MIN_FOV_DEG} to 180 deg, got {fov_deg:g}{turned}"
+            )
+        across_px = math.hypot(width_px, height_px) if diagonal else width_px
+        focal_px = across_px / 2 / math.tan(math.radians(fov_deg) / 2)
         middle_px = width_px / 2, height_px / 2
         return cls(width_px, height_px, focal_px, focal_px, *middle_px, focal_std=FOV_STD)
 
@@ -109,21 +136,37 @@ class Camera:
         distortion: Sequence[float] | None,
         size_px: tuple[int, int],
         model: str = "brown",
+        *,
+        unusual: bool = False,
     ) -> "Camera":
-        """A camera by the matrix (3, 3) and the distortion of OpenCV's calibration.
+        """A camera by the matrix (3, 3) in pixels and the distortion of OpenCV's calibration.
 
-        `size_px`: width and height of the images that it was calibrated with."""
+        OpenCV counts cx and cy from the centre of the first pixel; 0.5 is added, because `cx_px`
+        and `cy_px` count from its corner. `distortion`: k1, k2, p1, p2[, k3], of a "fisheye"
+        `model` k1 to k4; None: none. `size_px`: width and height of the images that it was
+        calibrated with. `unusual`: see `Camera`. Raises `CameraError`."""
         k = np.asarray(matrix, np.float64)
         if k.shape != (3, 3):
             raise CameraError(f"camera matrix must be (3, 3), got {k.shape}")
+        if k[0, 2] == k[1, 2] == 0 and k[2, :2].any():
+            raise CameraError(
+                "camera matrix is transposed (its last row is "
+                f"{k[2, 0]:g}, {k[2, 1]:g}, {k[2, 2]:g}), as MATLAB writes it; transpose it, and "
+                "subtract 1 from cx and cy if they are MATLAB's, which counts pixels from 1"
+            )
+        if abs(k[0, 1]) > MAX_SKEW * abs(k[0, 0]) or k[1, 0] or k[2].tolist() != [0, 0, 1]:
+            raise CameraError(
+                f"camera matrix must be fx 0 cx, 0 fy cy, 0 0 1, without skew, got {k.tolist()}"
+            )
         # OpenCV counts from the centre of the first pixel.
         numbers = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
         more = () if distortion is None else np.ravel(np.asarray(distortion, np.float64)).tolist()
-        return cls(*size_px, *numbers, tuple(more), model)
+        return cls(*size_px, *numbers, tuple(more), model, unusual=unusual)
 
     @classmethod
-    def from_file(cls, path: Path | str) -> "Camera":
-        """The camera of a `flight.json`, or of a calibration of OpenCV, ROS or Kalibr.
+    def from_file(cls, path: StrPath) -> "Camera":
+        """The camera of a `flight.json`, or of a calibration of OpenCV (YAML, XML, JSON), ROS or
+        Kalibr (YAML; `FILE#cam1` is one of several).
 
         Raises `MissingFileError`, `CameraError` or `MissingExtraError`."""
         from orthonav.core.geo.camera_files import read_camera_file  # the readers make cameras
@@ -144,7 +187,8 @@ class Camera:
 
     def numbers(self) -> dict[str, Any]:
         """All but the mask, as in `flight.json`."""
-        return {name: each for name, each in vars(self).items() if name != "mask"}
+        left_out = ("mask",) if self.unusual else ("mask", "unusual")
+        return {name: each for name, each in vars(self).items() if name not in left_out}
 
     @property
     def is_pinhole(self) -> bool:

@@ -1,5 +1,6 @@
 """Camera files of other programs: OpenCV, ROS and Kalibr count from the first pixel's centre."""
 
+import contextlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -9,9 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from orthonav.core.errors import CameraError
+from orthonav.core.errors import CameraError, MissingExtraError
 from orthonav.core.files import require_file
-from orthonav.core.flight import read_camera
+from orthonav.core.flight.folder import camera_from_plain
 from orthonav.core.geo.camera import Camera
 from orthonav.core.guard import needed
 
@@ -24,6 +25,14 @@ _OPENCV_HEADER = "%YAML:1.0"
 _CHAIN = re.compile(r"^cam\d+\s*:", re.MULTILINE)
 _BROWN = ("", "brown", "plumb_bob", "rational_polynomial", "radtan", "none")
 _FISHEYE = ("equidistant", "fisheye")
+_READ = (
+    "expected flight.json, or a camera of OpenCV (camera_matrix, image_width, .. as YAML, XML or "
+    "JSON), ROS (camera_matrix, distortion_coefficients, ..) or Kalibr (intrinsics, resolution, ..)"
+)
+_UNREAD = {  # programs by what their files hold
+    "COLMAP": re.compile(r"^\s*\d+ [A-Z_]+ \d+ \d+( [\d.e+-]+)+\s*$", re.M),
+    "Metashape": re.compile(r"<(calibration|document)\b"),
+}
 _BROKEN = (
     ValueError,
     KeyError,
@@ -51,26 +60,25 @@ def read_camera_file(path: Path) -> Camera:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise CameraError(f"camera file is not UTF-8 text: {path}") from error
+    for program, mark in _UNREAD.items():
+        if mark.search(text):
+            raise CameraError(f"camera files of {program} are not read; {_READ}: {path}")
     try:
         # Kalibr chains may begin with OpenCV's header, which is not YAML.
         chain = _CHAIN.search(text) is not None
         if name is not None and not chain:
             raise CameraError(f"file is not a Kalibr chain; give it without #{name:.60}")
         if not chain and (text.startswith(_OPENCV_HEADER) or "opencv-matrix" in text):
-            return _opencv(text)
+            return _plain(_opencv(text))
         if text.lstrip().startswith("{"):
             plain = json.loads(text)
-            return read_camera(path)[0] if "camera" in plain else _plain(plain)
+            return camera_from_plain(plain["camera"]) if "camera" in plain else _plain(plain)
         return _plain(_yaml(text.removeprefix(_OPENCV_HEADER)), name)
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
     except _BROKEN as error:
         found = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
-        raise CameraError(
-            "expected flight.json, or a camera of OpenCV (camera_matrix, image_width, ..), ROS "
-            "(camera_matrix, distortion_coefficients, ..) or Kalibr (intrinsics, resolution, ..); "
-            f"{found}: {path}"
-        ) from error
+        raise CameraError(f"{_READ}; {found}: {path}") from error
 
 
 def masked(camera: Camera, path: Path) -> Camera:
@@ -91,9 +99,9 @@ def masked(camera: Camera, path: Path) -> Camera:
 
 
 def camera_from_numbers(
-    size_px: Sequence[int], matrix: Sequence[float], distortion: Sequence[float], model: str
+    size_px: Sequence[int], matrix: Any, distortion: Any, model: str, unusual: bool = False
 ) -> Camera:
-    fx, fy, cx, cy = (float(number) for number in matrix)
+    """`matrix`: 9 numbers, row by row."""
     numbers = tuple(float(number) for number in distortion)
     if model in _FISHEYE:
         ours = "fisheye"
@@ -106,11 +114,17 @@ def camera_from_numbers(
         numbers = (*numbers, *(0.0,) * (4 - len(numbers))) if 0 < len(numbers) < 4 else numbers[:5]
     else:
         raise CameraError(f"distortion model '{model}' is not supported; brown and equidistant are")
-    return Camera(int(size_px[0]), int(size_px[1]), fx, fy, cx + 0.5, cy + 0.5, numbers, model=ours)
+    k, (width, height) = _numbers(matrix, 9).reshape(3, 3), map(int, size_px)
+    return Camera.from_matrix(k, numbers, (width, height), ours, unusual=unusual)
 
 
 def _yaml(text: str) -> Any:
-    yaml = needed("yaml", "camera files in YAML")
+    try:
+        yaml = needed("yaml", "camera files in YAML")
+    except MissingExtraError:
+        with contextlib.suppress(CameraError):  # OpenCV reads most of what ROS and Kalibr write
+            return _opencv(f"{_OPENCV_HEADER}\n---\n{text}")
+        raise
     try:
         _check_events(yaml, text)
         return yaml.safe_load(text)
@@ -154,70 +168,55 @@ def _plain(plain: Any, name: str | None = None) -> Camera:
         return _kalibr(plain[name or cameras[0]])
     if "intrinsics" in plain:
         return _kalibr(plain)
-    matrix = _numbers(plain["camera_matrix"]["data"], 9)
+    lens = "distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "D1"
+    fisheye = plain.get("fisheye_model") or plain.get("fisheye")
     return camera_from_numbers(
-        (plain["image_width"], plain["image_height"]),
-        matrix[[0, 4, 2, 5]].tolist(),
-        plain["distortion_coefficients"]["data"],
-        str(plain.get("distortion_model", "plumb_bob")),
+        [_first(plain, f"image_{side}", f"image_{side.title()}") for side in ("width", "height")],
+        _first(plain, "camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")["data"],
+        _first(plain, *lens)["data"],
+        "fisheye" if fisheye else str(plain.get("distortion_model", "plumb_bob")),
+        bool(plain.get("unusual")),
     )
 
 
 def _kalibr(plain: Mapping[str, Any]) -> Camera:
     if plain["camera_model"] != "pinhole":
         raise CameraError(f"camera model '{plain['camera_model']}' is not supported; pinhole is")
+    fx, fy, cx, cy = plain["intrinsics"]
     return camera_from_numbers(
         plain["resolution"],
-        plain["intrinsics"],
+        (fx, 0, cx, 0, fy, cy, 0, 0, 1),
         plain.get("distortion_coeffs", []),
         str(plain.get("distortion_model", "none")),
+        bool(plain.get("unusual")),
     )
 
 
-def _opencv(text: str) -> Camera:
+def _opencv(text: str) -> Any:
     # OpenCV crashes where nesting is deeper than the stack.
     if sum(1 for _ in _OPENING.finditer(text)) > MAX_OPENINGS:
         raise CameraError(f"camera file has more than {MAX_OPENINGS} parts")
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
         try:
-            return _stored(storage)
+            return _value(storage.root())
         finally:
             storage.release()
     except (cv2.error, SystemError) as error:
         raise CameraError("camera file cannot be read by OpenCV") from error
 
 
-def _stored(storage: cv2.FileStorage) -> Camera:
-    matrix = _matrix(storage, "camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")
-    lens = _matrix(
-        storage, "distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "D1"
-    )
-    sides = [_whole(storage, f"image_{side}") for side in ("width", "height")]
-    if 0 in sides:
-        sides = [_whole(storage, f"image_{side}") for side in ("Width", "Height")]
-    if matrix is None or matrix.size != 9 or 0 in sides:
-        raise CameraError("file lacks camera_matrix, image_width or image_height")
-    fisheye = _whole(storage, "fisheye_model") or _whole(storage, "fisheye")
-    return camera_from_numbers(
-        sides,
-        matrix.ravel()[[0, 4, 2, 5]].tolist(),
-        [] if lens is None else lens.ravel().tolist(),
-        "fisheye" if fisheye else "brown",
-    )
+def _value(node: cv2.FileNode) -> Any:
+    if node.isMap():
+        names = node.keys()
+        return {name: _value(node.getNode(name)) for name in names}
+    if node.isSeq():
+        return [_value(node.at(number)) for number in range(node.size())]
+    return node.string() if node.isString() else node.real()
 
 
-def _matrix(storage: cv2.FileStorage, *names: str) -> Any:
-    for name in names:
-        node = storage.getNode(name)
-        if not node.empty() and (matrix := node.mat()) is not None:
-            return np.asarray(matrix, dtype=np.float64)
-    return None
-
-
-def _whole(storage: cv2.FileStorage, name: str) -> int:
-    node = storage.getNode(name)
-    return int(node.real()) if not node.empty() and (node.isInt() or node.isReal()) else 0
+def _first(plain: Mapping[str, Any], *names: str) -> Any:
+    return plain[next((name for name in names if name in plain), names[0])]
 
 
 def _numbers(values: Any, count: int) -> Any:

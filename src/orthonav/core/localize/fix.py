@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +53,7 @@ def fix_of(search: Search, best: Place) -> Fix:
         radius_m=radius_m,
         heading_deg=heading_deg % 360,
         agl_m=found.agl_m,
-        evidence=MappingProxyType(evidence),
+        evidence=evidence,
         ground_latlon_deg=middle,
         ground_cov_en_m2=None if middle is None else found.middle_cov_en_m2,
         pitch_deg=pitch_deg,

@@ -5,7 +5,6 @@ for candidates only (`TileProposer`)."""
 
 import math
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -347,5 +346,5 @@ class TileLocalizer:
             radius_m=self.radius_m,
             heading_deg=heading_deg % 360,
             agl_m=telemetry.agl_m,
-            evidence=MappingProxyType(evidence),
+            evidence=evidence,
         )

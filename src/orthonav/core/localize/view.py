@@ -50,7 +50,8 @@ def check_telemetry(
     """Without `gsd_m` its size beside a map is not checked."""
     missing = [name for name in telemetry.missing() if heading_known or name != "yaw_deg"]
     if missing:
-        return NoFix("missing_telemetry", f"not a number: {', '.join(missing)}")
+        names = ", ".join(missing).replace("yaw_deg", "heading_deg (yaw_deg)")
+        return NoFix("missing_telemetry", f"not a number: {names}")
     if telemetry.agl_m <= 0:
         return NoFix("bad_height", f"height above ground is {telemetry.agl_m:.1f} m")
     tilt_deg = off_nadir_deg(telemetry)
@@ -94,9 +95,9 @@ def check_picture(grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None
     mean = float(counts @ levels) / size
     std = math.sqrt(max(float(counts @ levels**2) / size - mean**2, 0.0))
     if high < DARK_LEVEL:
-        return NoFix("too_dark", f"99 % of the view is darker than {high:.0f} of 255")
+        return NoFix("too_dark", f"99 % of the view is {high:.0f} of 255 or darker")
     if low > BRIGHT_LEVEL:
-        return NoFix("too_bright", f"99 % of the view is brighter than {low:.0f} of 255")
+        return NoFix("too_bright", f"99 % of the view is {low:.0f} of 255 or brighter")
     if std < MIN_STD:
         return NoFix("blank", f"grey levels differ by {std:.1f} of 255 only (standard deviation)")
     return None

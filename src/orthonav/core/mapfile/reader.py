@@ -24,7 +24,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from orthonav.core.errors import MapChangedError, MapFileError, MissingFileError, OutputError
-from orthonav.core.files import replacing, require_file
+from orthonav.core.files import StrPath, replacing, require_file
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile.manifest import Manifest
 
 MAX_HEADER_BYTES = 16 * 2**20
@@ -126,7 +127,8 @@ class MapParts(Mapping[str, NDArray[Any]]):
 class MapFile:
     """An opened map, or one that was built and not yet written.
 
-    `arrays`: its parts, read-only; those of an opened map are read when asked for."""
+    `arrays`: its parts by name, read-only; those of an opened map are read when asked for. Frame,
+    resolution, coordinate system, bounds and `contains` are those of its first sheet."""
 
     path: Path
     size_bytes: int
@@ -134,23 +136,42 @@ class MapFile:
     arrays: Mapping[str, NDArray[Any]]
 
     def __repr__(self) -> str:
-        area_km2, gsd_m = self.manifest.area_km2, self.manifest.sheets[0].grid.gsd_m
-        return f"MapFile({self.path}, {area_km2:.2f} km2, {gsd_m:g} m per pixel)"
+        return f"MapFile({self.path}, {self.manifest.area_km2:.2f} km2, {self.gsd_m:g} m per pixel)"
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Its `en_from_latlon(lat_deg, lon_deg)` gives metres east and north of the centre."""
+        return self.manifest.sheets[0].frame
+
+    @property
+    def gsd_m(self) -> float:
+        """Metres on the ground per pixel."""
+        return self.manifest.sheets[0].grid.gsd_m
+
+    @property
+    def crs(self) -> str:
+        """The coordinate system of `frame`, for PROJ."""
+        return self.frame.proj4
+
+    @property
+    def dates(self) -> tuple[str, ...]:
+        """First and last date of its imagery as ISO 8601, as far as they are known."""
+        sources = self.manifest.imagery
+        found = {str(x[end]) for x in sources for end in ("date_from", "date") if x.get(end)}
+        return tuple(sorted(found))
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:
         """West, south, east and north of the first sheet, degrees."""
-        sheet = self.manifest.sheets[0]
-        west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
+        west_m, south_m, east_m, north_m = self.manifest.sheets[0].grid.extent_en_m
         corners_en_m = [(x, y) for x in (west_m, east_m) for y in (south_m, north_m)]
-        lat, lon = sheet.frame.latlon_from_en(corners_en_m)
+        lat, lon = self.frame.latlon_from_en(corners_en_m)
         return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
 
     def contains(self, lat_deg: float, lon_deg: float) -> bool:
         """Whether a position is on the first sheet."""
-        sheet = self.manifest.sheets[0]
-        x_m, y_m = sheet.frame.en_from_latlon(lat_deg, lon_deg).tolist()
-        west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
+        x_m, y_m = self.frame.en_from_latlon(lat_deg, lon_deg).tolist()
+        west_m, south_m, east_m, north_m = self.manifest.sheets[0].grid.extent_en_m
         return bool(west_m <= x_m <= east_m and south_m <= y_m <= north_m)
 
     def array(self, name: str, dtype: type[np.generic], ndim: int) -> NDArray[Any]:
@@ -240,7 +261,7 @@ class _OpenFile:
         return b"".join(pieces)
 
 
-def open_map(path: Path, manifest_sha256: str | None = None) -> MapFile:
+def open_map(path: StrPath, manifest_sha256: str | None = None) -> MapFile:
     """Open a map and verify every checksum in it.
 
     `manifest_sha256`: of a signature; another map is refused, also one swapped after its check.

@@ -6,13 +6,12 @@ plausible places go to the mixture with their odds. Overlapping views are regist
 
 import math
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import MapFileError
+from orthonav.core.errors import ArgumentError, MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.integrity import probability_within
@@ -99,14 +98,15 @@ class Tracker:
         smooth: bool = False,
         lag: int | None = None,
     ) -> None:
-        """`model`: None: the usual one, with a mount as good as the height asks for.
+        """`localizer`: or an opened map. `model`: None: the usual one, with a mount as good as the
+        height asks for.
 
         With `use_prior` the track starts at the first view's prior; with `every_prior` all priors
         are position measurements, such as GNSS. `smooth` records the history for `smoothed_track`;
         with `lag` each view is smoothed over those before it and so many after it.
 
         Raises `MapFileError` where the map has no registration layer or no confidence."""
-        if isinstance(localizer, MapFile):
+        if not isinstance(localizer, Localizer):
             localizer = Localizer(localizer)
         self._heading_known = heading_known
         self.model, self._usual_model = model or Model(), model is None
@@ -163,7 +163,7 @@ class Tracker:
 
     def update(
         self,
-        image: NDArray[Any],
+        image: NDArray[Any] | None,
         camera: Camera,
         *,
         time_s: float,
@@ -179,9 +179,10 @@ class Tracker:
     ) -> Fix | NoFix:
         """The position of the aircraft by this image and all before it; arguments as of `View.of`.
 
-        `heading_deg` may be None in a tracker made with `heading_known=False`. `vel_en_mps`:
-        reported velocity over ground. `tilt_std_deg`: of `pitch_deg` and `roll_deg`, without the
-        constant error of the mount, which is estimated. Raises as `View.of`."""
+        `time_s`: seconds, greater than that of the image before, by at most 600. `heading_deg` may
+        be None in a tracker made with `heading_known=False`. Standard deviations are those from
+        view to view, without constant errors, which are estimated; None: `heading_std_deg` 2 deg,
+        `agl_std_m` 2 % of the height, `tilt_std_deg` 2 deg. Raises as `View.of`."""
         view = View.of(
             image,
             camera,
@@ -196,10 +197,14 @@ class Tracker:
             tilt_std_deg=tilt_std_deg,
             vel_en_mps=vel_en_mps,
         )
-        found = self.locate(view)
-        if isinstance(found, NoFix) and found.reason == "missing_telemetry":
-            return replace(found, detail=found.detail.replace("yaw_deg", "heading_deg"))
-        return found
+        if self._time_ns is not None:
+            step_s = (view.telemetry.time_ns - self._time_ns) / 1e9
+            if not 0 < step_s <= LONGEST_GAP_S:
+                raise ArgumentError(
+                    f"time_s must grow, by at most {LONGEST_GAP_S:g} s, got {step_s:+g} s; it is "
+                    "in seconds, not ms or ns; after a pause use another Tracker"
+                )
+        return self.locate(view)
 
     def __repr__(self) -> str:
         return f"Tracker({self._localizer.opened.path}, {self.state.value})"
@@ -555,7 +560,7 @@ class Tracker:
             radius_m=radius_m,
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
-            evidence=MappingProxyType(evidence),
+            evidence=evidence,
             pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
             roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
         )

@@ -5,6 +5,7 @@ and 256 px tiles) and the compressed registration layer (0.15 to 0.35 MB per km2
 """
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.core.errors import AreaError, OutputError, VariantError
-from orthonav.core.files import Progress, no_progress, with_paths
+from orthonav.core.files import GivenPath, Progress, no_progress, with_paths
 from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import USUAL_TILES
@@ -98,8 +99,8 @@ class BuildRequest:
       imagery, for sheets of an atlas; method gradient only.
     """
 
-    orthos: Sequence[Path]
-    out: Path
+    orthos: Sequence[GivenPath]
+    out: GivenPath
     bounds_deg: Extent | None = None
     route: Route | None = None
     band_m: float | None = None
@@ -110,12 +111,12 @@ class BuildRequest:
     edges: str | None = None
     seed: int = 0
     registration: bool = True
-    other_dates: Sequence[Path] = ()
+    other_dates: Sequence[GivenPath] = ()
     calibration_views: int = 24
-    work: Path | None = None
+    work: GivenPath | None = None
     workers: int | None = None
-    dem: Path | None = None
-    surface: Sequence[Path] = ()
+    dem: GivenPath | None = None
+    surface: Sequence[GivenPath] = ()
     true_ortho: bool = False
     bands: tuple[int, ...] | None = None
     dem_datum: str | None = None
@@ -126,7 +127,7 @@ class BuildRequest:
     cells: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.orthos, str | Path):
+        if isinstance(self.orthos, str | os.PathLike):
             object.__setattr__(self, "orthos", (self.orthos,))
         with_paths(self, "orthos", "out", "other_dates", "work", "dem", "surface")
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.cores import usable_cores
 from orthonav.core.errors import AreaError, CameraError, MapFileError
-from orthonav.core.files import Progress, no_progress
+from orthonav.core.files import Progress, StrPath, no_progress
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.ground import MIN_KNOWN
@@ -90,7 +90,7 @@ def check_map(
     return _Check(request, opened, progress).result(), opened
 
 
-def check(map_path: Path | str, *, progress: Progress = no_progress, **asked: Any) -> CheckResult:
+def check(map_path: StrPath, *, progress: Progress = no_progress, **asked: Any) -> CheckResult:
     """Predict where on a map views can be localized.
 
     `asked`: fields of `CheckRequest`, such as `route`, `agl_m`, `camera`, `prior_std_m`. It starts

@@ -18,6 +18,7 @@ import numpy as np
 
 from orthonav.core import integrity
 from orthonav.core.errors import FlightError
+from orthonav.core.files import StrPath
 from orthonav.core.flight import FlightFolder, read_truth
 from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
 from orthonav.core.geo.frames import LocalFrame, distances_m
@@ -226,8 +227,8 @@ def radius_key(radius_m: float) -> str:
 
 
 def evaluate(
-    fixes: Path | str,
-    truth: Path | str,
+    fixes: StrPath,
+    truth: StrPath,
     radius_m: float = 15.0,
     alert_limit_m: float = math.nan,
     risk: float = DEFAULT_RISK,

@@ -18,6 +18,7 @@ import numpy as np
 
 from orthonav.core.errors import VariantError
 from orthonav.core.files import write_text
+from orthonav.core.flight.fixes import feature
 from orthonav.core.geo.attitude import wxyz_of_matrices
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.geo.frames import LocalFrame
@@ -134,20 +135,7 @@ def _csv(positions: Positions) -> list[str]:
 
 
 def _geojson(positions: Positions) -> list[str]:
-    features = []
-    for each in positions:
-        place = each.fix.lon_deg, each.fix.lat_deg, each.height_m
-        numbers = {
-            "agl_m": each.fix.agl_m,
-            "heading_deg": each.fix.heading_deg,
-            "std_m": each.std_m,
-            "confidence": each.fix.confidence,
-        }
-        known = {name: None if math.isnan(x) else round(x, 4) for name, x in numbers.items()}
-        point = [round(value, 8) for value in place if math.isfinite(value)]
-        geometry = {"type": "Point", "coordinates": point}
-        about = {"frame": each.view.frame, **known}
-        features.append({"type": "Feature", "geometry": geometry, "properties": about})
+    features = [feature(x.view.frame, x.fix, x.std_m, x.height_m) for x in positions]
     return [json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False)]
 
 

@@ -4,15 +4,15 @@ Positions are arbitrary, never on a tile grid. Images are rendered with the true
 height; the telemetry differs from these by the requested errors."""
 
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError, CameraError, FlightError
-from orthonav.core.files import replacing_folder, with_paths
+from orthonav.core.files import GivenPath, replacing_folder, with_paths
 from orthonav.core.flight.folder import FlightWriter
 from orthonav.core.flight.gnss import FILE as GNSS_FILE
 from orthonav.core.flight.gnss import write_gnss
@@ -134,8 +134,8 @@ class SimulateRequest:
     `camera_pitch_deg`: angle by which the camera looks ahead of straight down, 0..65; reported.
     """
 
-    orthos: Sequence[Path]  # orthophotos to fly over; earlier ones take precedence
-    out: Path  # flight folder to write
+    orthos: Sequence[GivenPath]  # orthophotos to fly over; earlier ones take precedence
+    out: GivenPath  # flight folder to write
     route: Route | None = None
     random: int | None = None
     agl_m: float | None = None
@@ -154,7 +154,7 @@ class SimulateRequest:
     gnss: Good | None = None  # receiver whose solutions are written to `gnss.csv`; only on a route
 
     def __post_init__(self) -> None:
-        if isinstance(self.orthos, str | Path):
+        if isinstance(self.orthos, str | os.PathLike):
             object.__setattr__(self, "orthos", (self.orthos,))
         with_paths(self, "orthos", "out")
 

@@ -113,7 +113,7 @@ class GnssWatch:
                 monitor.position(position)
         if isinstance(fix, Fix):
             fix = self._corrected(fix)
-        evidence = MappingProxyType({**fix.evidence, **self._evidence(now_ns)})
+        evidence = {**fix.evidence, **self._evidence(now_ns)}
         return replace(result, outcome=replace(fix, evidence=evidence))
 
     def _corrected(self, fix: Fix) -> Fix:

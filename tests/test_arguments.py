@@ -1,0 +1,156 @@
+"""Arguments that a caller may get wrong are named; records are values."""
+
+import copy
+import dataclasses
+import json
+import math
+import os
+import pickle
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import orthonav
+from orthonav import Camera, Fix, Localizer, NoFix, Prior, Telemetry, Tracker, View, ViewResult
+from orthonav.core.errors import ArgumentError, FlightError, MissingExtraError
+from orthonav.core.flight.fixes import result_to_json, write_results
+
+CAMERA = Camera.from_fov(65, 64, 48)
+GREY = np.arange(64 * 48, dtype=np.uint8).reshape(48, 64)
+COV = np.array([[4.0, 1.0], [1.0, 9.0]])
+FIX = Fix(48.0, 2.0, COV, 0.95, 35.0, 10.0, 100.0, pose_cov=np.eye(6), ground_latlon_deg=(48, 2.1))
+NO_FIX = NoFix("blank", "nothing to see", {"share": math.nan})
+TELEMETRY = Telemetry(5, math.nan, 0.0, 1.0, 100.0, prior=Prior(48.0, 2.0, 30.0))
+RECORDS = [FIX, NO_FIX, TELEMETRY, View(GREY, CAMERA, TELEMETRY), CAMERA, Prior(1, 2, 3),
+           ViewResult("a.jpg", 10**9 + 1, FIX, 7.0, "tracking")]  # fmt: skip
+
+
+@pytest.mark.parametrize("record", RECORDS, ids=lambda each: type(each).__name__)
+def test_records_are_values(record):
+    for other in (pickle.loads(pickle.dumps(record)), copy.deepcopy(record)):
+        assert other == record and hash(other) == hash(record)
+    assert record != "another type" and dataclasses.asdict(record)
+
+
+def test_records_with_other_values_differ():
+    assert dataclasses.replace(FIX, cov_en_m2=COV + 1e-9) != FIX
+    assert dataclasses.replace(FIX, evidence={"score": 0.5}) != FIX
+    assert NoFix("blank", "") != NoFix("dark", "")
+    assert View(GREY + 1, CAMERA, TELEMETRY) != View(GREY, CAMERA, TELEMETRY)
+
+
+def test_plain_values_are_those_of_the_file(tmp_path):
+    for result in (ViewResult("a.jpg", 10**9, FIX, 7.0, "tracking"), ViewResult("b", 0, NO_FIX, 1)):
+        assert json.loads(json.dumps(result.to_dict())) == json.loads(result_to_json(result))
+        own = result.outcome.to_dict()
+        assert own.items() <= result.to_dict().items() and "frame" not in own
+    results = [ViewResult("a.jpg", 10**9, FIX, 7.0), ViewResult("b", 0, NO_FIX, 1.0)]
+    write_results(tmp_path / "fixes.jsonl", results)
+    shown = orthonav.to_geojson(str(tmp_path / "fixes.jsonl"))
+    (feature,) = shown["features"]
+    assert feature["geometry"] == {"type": "Point", "coordinates": [2.0, 48.0]}
+    assert feature["properties"]["frame"] == "a.jpg" and shown["type"] == "FeatureCollection"
+    assert feature["properties"]["std_m"] == pytest.approx(FIX.std_m, abs=1e-4)
+    assert len(orthonav.to_geojson([FIX, NO_FIX])["features"]) == 1
+
+
+def test_a_table_of_fixes(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingExtraError, match="pip install pandas"):
+        orthonav.to_dataframe([FIX])
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(json_normalize=lambda rows: rows))
+    assert orthonav.to_dataframe([FIX, NO_FIX]) == [FIX.to_dict(), NO_FIX.to_dict()]
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        ((48.0, 2.0, -5), "std_m must be metres, 0 or more, got -5"),
+        ((math.nan, 2.0, 5), "lat_deg must be -90 to 90"),
+        ((200, 2.0, 5), "lat_deg must be -90 to 90, before the longitude, got 200"),
+        ((2.0, math.inf, 5), "lon_deg must be"),
+        (("48", 2.0, 5), "lat_deg must be .* got '48'"),
+    ],
+)
+def test_impossible_priors(values, message):
+    with pytest.raises(ArgumentError, match=message):
+        Prior(*values)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"heading_std_deg": -1}, "heading_std_deg must be 0 or more"),
+        ({"agl_std_m": math.nan}, "agl_std_m must be 0 or more"),
+        ({"tilt_std_deg": "1"}, "tilt_std_deg must be 0 or more"),
+        ({"agl_m": "270"}, "agl_m must be a number, got '270'"),
+        ({"agl_m": None}, "agl_m must be a number, got None"),
+        ({"pitch_deg": None}, "pitch_deg must be a number"),
+        ({"heading_deg": "N"}, "heading_deg must be a number"),
+        ({"prior": (48.8, 2.3)}, r"prior must be an orthonav.Prior\(lat_deg.*, got tuple"),
+        ({"time_s": math.nan}, "time_s must be in seconds"),
+        ({"time_s": 1.7e12}, "time_s must be in seconds, not ms or ns, got 17"),
+        ({"camera": None}, "camera must be an orthonav.Camera, .* got NoneType"),
+        ({"camera": np.eye(3)}, "camera must be an orthonav.Camera, .* got ndarray"),
+    ],
+)
+def test_arguments_of_a_view(change, message):
+    with pytest.raises(ArgumentError, match=message):
+        View.of(**({"image": GREY, "camera": CAMERA, "agl_m": 100.0} | change))
+    assert isinstance(ArgumentError(""), TypeError | ValueError)
+
+
+def test_a_path_is_no_image(tmp_path):
+    for path in ("a.jpg", tmp_path / "a.jpg"):
+        with pytest.raises(FlightError, match="image is a path, read it first"):
+            View.of(path, CAMERA, agl_m=100.0)
+
+
+class OtherPath(os.PathLike):
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __fspath__(self):
+        return self.path
+
+
+@pytest.mark.parametrize("kind", [str, OtherPath])
+def test_every_kind_of_path(map_path, flight_path, tmp_path, kind):
+    map_ = orthonav.open_map(kind(map_path))
+    assert orthonav.read_truth(kind(flight_path / "truth.csv"))
+    assert orthonav.open_flight(kind(flight_path)).views
+    assert Camera.from_file(kind(flight_path / "flight.json")).width_px
+    request = orthonav.BuildRequest(kind("a.tif"), kind(tmp_path / "a.onav"))
+    assert request.out == tmp_path / "a.onav" and len(request.orthos) == 1
+    assert map_.gsd_m == map_.manifest.sheets[0].grid.gsd_m and "+proj=aeqd" in map_.crs
+    assert map_.frame.en_from_latlon(map_.frame.lat_deg, map_.frame.lon_deg).tolist() == [0, 0]
+    known = {each["date"] for each in map_.manifest.imagery if "date" in each}
+    assert set(map_.dates) >= known and list(map_.dates) == sorted(map_.dates)
+
+
+def test_what_is_no_map_is_named(map_path):
+    for make in (Localizer, Tracker):
+        with pytest.raises(ArgumentError, match=r"map must be .*open_map\(path\), got str"):
+            make(str(map_path))
+
+
+def test_a_prior_of_another_type_is_named(map_path, area):
+    localizer = Localizer(map=orthonav.open_map(map_path))
+    grey = np.zeros((240, 320), np.uint8)
+    with pytest.raises(ArgumentError, match="prior must be an orthonav"):
+        localizer.localize(grey, area.camera, agl_m=300.0, prior=(48.8, 2.3))
+    found = localizer.localize(grey, area.camera, agl_m=300.0, heading_deg=math.nan)
+    assert found.detail == "not a number: heading_deg (yaw_deg)"
+    assert "0 of 255 or darker" in localizer.localize(grey, area.camera, agl_m=300.0).detail
+
+
+@pytest.mark.parametrize("step_s", [0.0, -1.0, 500_000.0, 5e8])
+def test_times_of_a_track_grow(map_path, area, step_s):
+    tracker = Tracker(orthonav.open_map(map_path), heading_known=False)
+    grey = np.zeros((240, 320), np.uint8)
+    tracker.update(grey, area.camera, time_s=1000.0, agl_m=300.0)
+    with pytest.raises(ArgumentError, match="time_s must grow, by at most 600 s"):
+        tracker.update(grey, area.camera, time_s=1000.0 + step_s, agl_m=300.0)
+    tracker.update(grey, area.camera, time_s=1000.5, agl_m=300.0)
