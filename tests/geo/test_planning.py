@@ -140,7 +140,7 @@ def test_unknown_heights_are_refused():
     ellipsoid = Route(PLACES, tuple(Height(400.0, "hae") for _ in PLACES))
     with pytest.raises(RouteError, match=r"or it is above the ellipsoid; .*--agl-m"):
         profile(ellipsoid, (1.0, 1.0), None, 10.0, slope)
-    with pytest.raises(RouteError, match="does not cover leg 1"):
+    with pytest.raises(RouteError, match="no height for 100% of leg 1"):
         profile(Route(PLACES), (1.0, 1.0), 100, 10.0, lambda lat, lon: np.full(lat.shape, np.nan))
 
 

@@ -129,6 +129,9 @@ def run(options: argparse.Namespace) -> None:
             "be used; --dem-datum, and a geoid grid for heights above the ellipsoid, add heights "
             "above the sea"
         )
+    accuracies = {(each["crs"], each.get("crs_accuracy_m")) for each in result.manifest.imagery}
+    for crs, accuracy_m in sorted(pair for pair in accuracies if pair[1]):
+        print(f"{crs:.60} is converted to WGS 84 to {accuracy_m:g} m, as PROJ states")
     for each in plates:
         print(
             f"{each['crs']:.60} is taken as WGS 84, from which its tectonic plate has moved it by "
@@ -138,7 +141,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _plates(manifest: "Manifest") -> list[dict[str, Any]]:
     """Systems that their tectonic plate has moved away from WGS 84 by now."""
-    from orthonav.ground.imagery.plates import plate_shift_m
+    from orthonav.ground.imagery.systems import plate_shift_m
 
     now = time.gmtime()
     year = round(now.tm_year + now.tm_yday / 366, 1)

@@ -262,6 +262,8 @@ LOW_PERCENT, OFFSET_SAMPLES, MOST_OFF_M = 5, 256, 10.0
 largest height above a terrain of the same datum."""
 MAX_SURFACE_M = 3.0
 """Coarsest surface model: wider samples do not show houses."""
+MAX_UNDULATION_M = 120.0
+"""Height of one vertical datum above another."""
 ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
 """Squares per side of the area in which roughness is measured, their width in postings, and the
 most samples of the source across a posting."""
@@ -339,7 +341,7 @@ class Surface:
 
     def above_m(self, dem: Dem) -> float:
         """Height of bare ground above that of a terrain model, where the datum of either is not
-        known. Raises `ImageryError` where they are known and differ by more than `MOST_OFF_M`."""
+        known. Raises `ImageryError` for more than can be, as with other units."""
         known = all(each.datum.is_known for each in (dem, *self.models))
         west, south, east, north = self.area.extent_en_m
         posting_m = max(east - west, north - south) / OFFSET_SAMPLES
@@ -349,7 +351,7 @@ class Surface:
         if not np.isfinite(off_m).any():
             return 0.0
         low_m = float(np.nanpercentile(off_m, LOW_PERCENT))
-        if known and abs(low_m) > MOST_OFF_M:
+        if abs(low_m) > (MOST_OFF_M if known else MAX_UNDULATION_M):
             raise ImageryError(
                 f"bare ground of the surface lies {low_m:.0f} m above the terrain: check unit and "
                 f"vertical datum of {self.name} and {dem.path.name}"
@@ -571,18 +573,8 @@ def terrain_parts(
     known = sum(int(np.isfinite(each).sum()) for each in found.values())
     high_m = round(high_m, 3)
     info = TerrainInfo(
-        west_m,
-        north_m,
-        posting_m,
-        rows,
-        cols,
-        TERRAIN_CHUNK_PX,
-        low_m,
-        high_m,
-        unit_m,
-        known,
-        name,
-        datum,
+        *(west_m, north_m, posting_m, rows, cols, TERRAIN_CHUNK_PX),
+        *(low_m, high_m, unit_m, known, name, datum),
     )
     blobs = [
         encode_terrain(found[number], info) if number in found else b""

@@ -31,8 +31,9 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import ImageryError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.imagery.plates import at_epoch
 from orthonav.ground.imagery.source import Source, open_sources, quiet, sources_in, unreadable
+from orthonav.ground.imagery.systems import at_epoch
+from orthonav.ground.planning.area import outline
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
 WHOLLY_VALID = 250
@@ -172,7 +173,9 @@ def _values(source: Source, place: str, band: int) -> str:
 def _mask(source: Source, place: str) -> str:
     """255 everywhere, or the union of the masks of a file."""
     everywhere = "<ScaleOffset>255</ScaleOffset><ScaleRatio>0</ScaleRatio>"
-    valid = [(mask, "<NODATA>0</NODATA>") for mask in source.masks]
+    opaque = "<ColorTableComponent>4</ColorTableComponent>"
+    zero = opaque if source.is_indexed and source.masks == ("1",) else "<NODATA>0</NODATA>"
+    valid = [(mask, zero) for mask in source.masks]
     return "".join(
         f"<ComplexSource>{place}<SourceBand>{band}</SourceBand>{more}</ComplexSource>"
         for band, more in valid or [(str(source.bands[0]), everywhere)]
@@ -441,16 +444,9 @@ class SheetRaster:
             members = np.array(lattice.members)
             boxes = self._boxes_px[members[near[members]]]
             if len(boxes):
-                low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
-                yield (
-                    lattice,
-                    (
-                        max(left, int(low[0])),
-                        max(top, int(low[1])),
-                        min(right, int(high[0])),
-                        min(bottom, int(high[1])),
-                    ),
-                )
+                low = np.maximum(boxes[:, :2].min(axis=0), [left, top]).tolist()
+                high = np.minimum(boxes[:, 2:].max(axis=0), [right, bottom]).tolist()
+                yield lattice, (low[0], low[1], high[0], high[1])
 
     def _near(self, left: int, top: int, right: int, bottom: int) -> NDArray[np.bool_]:
         boxes = self._boxes_px
@@ -520,11 +516,7 @@ class SheetRaster:
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]
     ) -> Window | None:
         """Pixels of a lattice that a window needs; None for none."""
-        share = np.linspace(0, 1, 9)
-        zero, one = np.zeros(9), np.ones(9)
-        cols = np.concatenate([share, share, zero, one]) * shape[1]
-        rows = np.concatenate([zero, one, share, share]) * shape[0]
-        east, north = target * (cols, rows)
+        east, north = target * outline((0, 0, shape[1], shape[0]), 8).T
         lat, lon = self._frame.latlon_from_en(np.stack([east, north], axis=1))
         x, y = transform_coordinates("EPSG:4326", lattice.first.system, lon, lat)[:2]
         col, row = ~lattice.transform * (np.asarray(x), np.asarray(y))

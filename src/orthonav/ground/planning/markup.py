@@ -6,6 +6,7 @@ Files are of unknown origin: no DTD is read, hence no entities and no external f
 gpxpy are not used: neither limits the number and depth of elements, and 20 MB of empty elements
 would take gigabytes."""
 
+import logging
 import re
 import struct
 import zipfile
@@ -16,6 +17,7 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 from orthonav.core.errors import RouteError
+from orthonav.core.flight.telemetry_track import chosen
 from orthonav.ground.planning.record import (
     Height,
     HeightFrame,
@@ -37,6 +39,7 @@ _WPML_FRAMES: dict[str, HeightFrame] = {  # by `executeHeightMode`
     "realTimeFollowSurface": "agl",
 }
 _Place = tuple[float, float, Height | None]
+log = logging.getLogger(__name__)
 
 
 def read_markup(data: bytes, kind: str, root: str) -> Element:
@@ -95,11 +98,11 @@ def read_gpx(data: bytes) -> list[Route]:
     mean sea level."""
     root = read_markup(data, "GPX", "gpx")
     planned = [_gpx_route(each, "rtept") for each in root.iterfind("rte[rtept]")]
-    found = planned or [
-        _gpx_route(each, "trkseg/trkpt")
-        for each in root.iterfind("trk")
-        if each.find("trkseg/trkpt") is not None
-    ]
+    flown = [each for each in root.iterfind("trk") if each.find("trkseg/trkpt") is not None]
+    if planned and flown:
+        tracks = [text_of(each, "name") or "(no name)" for each in flown]
+        log.warning("%s", chosen("route", "rte", tracks, "routes come before tracks (trk)"))
+    found = planned or [_gpx_route(each, "trkseg/trkpt") for each in flown]
     if not found:
         raise RouteError("GPX holds no route (rte) and no track (trk) with positions")
     return found
@@ -146,10 +149,14 @@ def _chosen_members(members: list[str]) -> list[str]:
 def read_kml(data: bytes) -> list[Route]:
     root = read_markup(data, "KML", "kml")
     found = [route for mark in root.iter("Placemark") for route in _kml_routes(mark)]
+    links = [each.findtext(".//href") or "?" for each in root.iter("NetworkLink")]
+    linked = f"; files that it links to are not read: {', '.join(links)}" if links else ""
+    if found and linked:
+        log.warning("lines of the KML are its own%s", linked)
     if not found:
         dji = "; it is the template of a DJI mission: give its waylines.wpml, or the whole KMZ"
         hint = dji if root.find(".//missionConfig") is not None else ""
-        raise RouteError(f"KML holds no LineString and no gx:Track{hint}")
+        raise RouteError(f"KML holds no LineString and no gx:Track{hint}{linked}")
     return found
 
 
