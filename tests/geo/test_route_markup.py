@@ -90,6 +90,16 @@ def test_lines_of_one_placemark_are_joined_and_placemarks_picked_by_name(read):
         read(text, "a.kml")
 
 
+def test_files_that_a_kml_links_to_are_named(read, caplog):
+    link = "</Folder><NetworkLink><Link><href>files/way.kml</href></Link></NetworkLink></Document>"
+    text = kml_of().replace("</Folder></Document>", link)
+    with pytest.raises(RouteError, match=r"no LineString .* not read: files/way\.kml"):
+        read(archive(("doc.kml", text)), "a.kmz")
+    text = kml_of(("way", line())).replace("</Folder></Document>", link)
+    assert read(text, "a.kml").waypoints == PLACES
+    assert "files that it links to are not read: files/way.kml" in caplog.text
+
+
 def test_kmz_is_kml_in_an_archive(read):
     text = kml_of(("way", line()))
     assert read(archive(("doc.kml", text), ("files/b.kml", "<x/>")), "a.kmz").waypoints == PLACES
@@ -176,8 +186,9 @@ def test_routes_and_tracks_of_gpx(read, inner, name, version):
     assert route.heights == (Height(120, "amsl"), None, None)
 
 
-def test_a_route_comes_before_a_track_and_names_choose(read):
+def test_a_route_comes_before_a_track_and_names_choose(read, caplog):
     assert read(GPX.format(SEGMENTS + ROUTE), "a.gpx").name == "planned"
+    assert "route: using rte, not flown: routes come before tracks" in caplog.text
     two = GPX.format(ROUTE + ROUTE.replace("planned", "other"))
     assert read(two, "a.gpx#other").name == "other"
     with pytest.raises(RouteError, match="1 'planned', 2 'other'"):

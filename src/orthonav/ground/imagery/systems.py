@@ -89,21 +89,14 @@ def _accuracy(wkt: str, lat_deg: float, lon_deg: float) -> tuple[float | None, s
 
 
 def _better(group: TransformerGroup, accuracy_m: float) -> str:
-    """How to install the grid of a more accurate operation; empty where there is none."""
-    missing = [
-        each
-        for each in group.unavailable_operations
-        if each.grids and 0 <= each.accuracy < accuracy_m
-    ]
-    if not missing:
-        return ""
-    best = min(missing, key=lambda each: each.accuracy)
+    """How to install what the best operation lacks; empty where none would be more accurate."""
     folder = Path(rasterio.__file__).with_name("proj_data")  # of wheels
     target = f" --target-directory {folder}" if folder.is_dir() else ""
-    return (
-        f"install the grid of {best.accuracy:g} m: pyproj sync --file {best.grids[0].short_name}"
-        f"{target}"
-    )
+    for each in group.unavailable_operations:
+        if each.grids and 0 <= each.accuracy < accuracy_m:
+            calls = [f"pyproj sync --file {grid.short_name}{target}" for grid in each.grids]
+            return f"install the grid of {each.accuracy:g} m: {' && '.join(calls)}"
+    return ""
 
 
 def plate_shift_deg(
