@@ -288,7 +288,7 @@ def _require_picture(path: Path, dataset: Any) -> None:
         )
     if dataset.count > 1 or _is_indexed(dataset):
         return
-    values = np.unique(_sampled(dataset, 1).compressed())
+    values = np.unique(_sampled(dataset, 1, valid=True))
     if 0 < len(values) < MIN_VALUES:  # all windows may lie on water
         shape = min(dataset.height, OVERVIEW_PX), min(dataset.width, OVERVIEW_PX)
         values = np.unique(dataset.read(1, out_shape=shape, masked=True).compressed())
@@ -395,8 +395,8 @@ def _masks(path: Path, dataset: Any, bands: tuple[int, ...]) -> tuple[str, ...]:
     return tuple(f"mask,{band}" for band in bands)
 
 
-def _sampled(dataset: Any, band: int) -> Any:
-    """Values in windows all over a file, masked: decimated reads may decode the whole file."""
+def _sampled(dataset: Any, band: int, *, valid: bool = False) -> NDArray[Any]:
+    """Values in windows all over a file: decimated reads may decode the whole file."""
     side = ALPHA_SAMPLE_PX
     cols = np.linspace(0, max(0, dataset.width - side), 4).astype(int).tolist()
     rows = np.linspace(0, max(0, dataset.height - side), 4).astype(int).tolist()
@@ -405,13 +405,13 @@ def _sampled(dataset: Any, band: int) -> Any:
         for row in rows
         for col in cols
     ]
-    parts = [dataset.read(band, window=each, masked=True).ravel() for each in windows]
-    return np.ma.concatenate(parts)
+    parts = (dataset.read(band, window=each, masked=valid) for each in windows)
+    return np.concatenate([each.compressed() if valid else each.ravel() for each in parts])
 
 
 def _is_mask(path: Path, dataset: Any) -> bool:
     """GDAL marks the fourth of four bands by default; a mask has few values between its ends."""
-    values = _sampled(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1).data
+    values = _sampled(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1)
     partly = float(((values != 0) & (values != values.max())).mean())
     if partly <= MAX_PARTLY_CLEAR:
         return True

@@ -61,14 +61,18 @@ def _accuracy(wkt: str, lat_deg: float, lon_deg: float) -> tuple[float | None, s
     if _plate_frame(wkt) is not None:
         return None, ""
     system = pyproj.CRS.from_wkt(wkt).to_2d()
-    box = AreaOfInterest(lon_deg - 0.1, lat_deg - 0.1, lon_deg + 0.1, lat_deg + 0.1)
-    group = TransformerGroup(system, "EPSG:4326", always_xy=True, area_of_interest=box)
     # rasterio has a PROJ of its own, with other grids: which operation gives what it gives?
     x, y = transform_coordinates("EPSG:4326", CRS.from_wkt(wkt), [lon_deg], [lat_deg])[:2]
-    turned = [each.transform(x[0], y[0])[::-1] for each in group.transformers]
-    off_m = np.nan_to_num(distances_m(np.array([lat_deg, lon_deg]), np.array(turned)), nan=math.inf)
+    box: Any = AreaOfInterest(lon_deg - 0.1, lat_deg - 0.1, lon_deg + 0.1, lat_deg + 0.1)
+    for area in (box, None):  # None: it uses some beyond their area of use
+        group = TransformerGroup(system, "EPSG:4326", always_xy=True, area_of_interest=area)
+        places = np.array([each.transform(x[0], y[0])[::-1] for each in group.transformers])
+        off_m = np.nan_to_num(distances_m([lat_deg, lon_deg], places), nan=math.inf)
+        if off_m.min() < 1:
+            break
     used, named = group.transformers[int(off_m.argmin())], f"'{system.name:.60}'"
-    zeros = system.is_bound and not any(system.coordinate_operation.towgs84 or [1])
+    stated = system.coordinate_operation
+    zeros = stated is not None and not any(stated.towgs84 or [1])
     if "Ballpark" in used.description or zeros:
         if system.ellipsoid and system.ellipsoid.semi_major_metre == WGS84_A_M:  # GRS 80 too
             return None, f"{named} is taken as WGS 84, from which it may differ by 1 to 2 m"
