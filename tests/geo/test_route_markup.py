@@ -157,7 +157,11 @@ def test_several_waylines_are_picked_by_identifier_or_number(read):
         (wpml_of(), "a.wpml", "no wayline with waypoints"),
         (wpml_of(wayline("aboveTheMoon")), "a.wpml", "executeHeightMode must be relative"),
         (wpml_of(wayline()).replace("<wpml:index>1", "<wpml:index>x"), "a.wpml", "WPML index"),
-        (wpml_of(wayline()).replace("2.5,46.5,0", "2.5"), "a.wpml", "cannot be read"),
+        (
+            wpml_of(wayline()).replace("2.5,46.5,0", "2.5"),
+            "a.wpml",
+            "position must be longitude,lat",
+        ),
         (wpml_of(), "a.kml", "template of a DJI mission: give its waylines.wpml"),
         ("<gpx/>", "a.wpml", "must begin with <kml>"),
     ],
@@ -225,7 +229,7 @@ OUTSIDE = '<!DOCTYPE kml SYSTEM "file:///etc/passwd"><kml/>'
         ("a.gpx", GPX.format("<rte/><trk><trkseg/></trk>"), "no route"),
         ("a.gpx", GPX.format(ROUTE.replace('lat="46.51"', "")), "GPX lat must be a number"),
         ("a.gpx", GPX.format(ROUTE.replace("46.51", "nan")), "GPX lat must be a number"),
-        ("a.gpx", GPX.format(ROUTE.replace(">120<", ">high<")), "GPX ele must be a number"),
+        ("a.gpx", GPX.format(ROUTE.replace(">120<", ">high<")), "ele must be a number"),
     ],
 )
 def test_broken_and_harmful_files_are_refused(read, name, content, message):

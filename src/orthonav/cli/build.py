@@ -145,11 +145,10 @@ def _plates(manifest: "Manifest") -> list[dict[str, Any]]:
 
     now = time.gmtime()
     year = round(now.tm_year + now.tm_yday / 366, 1)
-    sheet = manifest.sheets[0].frame
-    systems = {str(each["crs"]) for each in manifest.imagery}
-    shifts = {crs: plate_shift_m(crs, sheet.lat_deg, sheet.lon_deg, year) for crs in systems}
-    return [
-        {"crs": crs, "shift_m": round(shift_m, 2), "epoch": year}
-        for crs, shift_m in sorted(shifts.items())
-        if shift_m >= LEAST_SHIFT_M
+    frame = manifest.sheets[0].frame
+    place = frame.lat_deg, frame.lon_deg
+    found: list[dict[str, Any]] = [
+        {"crs": crs, "shift_m": round(plate_shift_m(crs, *place, year), 2), "epoch": year}
+        for crs in sorted({str(each["crs"]) for each in manifest.imagery})
     ]
+    return [each for each in found if each["shift_m"] >= LEAST_SHIFT_M]

@@ -204,22 +204,15 @@ def _lattice(members: list[int], sources: list[Source]) -> Lattice:
 
 def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:
     """Columns and rows from corner to corner; None where no lattice fits."""
-    alike = (
-        first.crs == other.crs
-        and len(first.bands) == len(other.bands)
-        and first.is_indexed == other.is_indexed
-        and first.dtype == other.dtype
-    )
-    if not alike:
+    kinds = {(each.crs, len(each.bands), each.is_indexed, each.dtype) for each in (first, other)}
+    if len(kinds) > 1:
         return None
-    col, row = ~first.transform * (other.transform.c, other.transform.f)
+    t = first.transform
+    col, row = ~t * (other.transform.c, other.transform.f)
     offset = round(col), round(row)
     longest = max(other.width_px, other.height_px)
-    skew = np.array(other.transform[:6]) - np.array(first.transform[:6])
-    unit = min(
-        np.hypot(first.transform.a, first.transform.d),
-        np.hypot(first.transform.b, first.transform.e),
-    )
+    skew = np.array(other.transform[:6]) - np.array(t[:6])
+    unit = min(np.hypot(t.a, t.d), np.hypot(t.b, t.e))
     stretch_px = np.abs(skew[[0, 1, 3, 4]]).max() * longest / unit
     off_px = max(abs(col - offset[0]), abs(row - offset[1])) + stretch_px
     return offset if off_px <= MAX_OFF_PX else None

@@ -9,6 +9,7 @@ import functools
 import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -77,10 +78,9 @@ def _accuracy(wkt: str, lat_deg: float, lon_deg: float) -> tuple[float | None, s
         if system.ellipsoid and system.ellipsoid.semi_major_metre == WGS84_A_M:  # GRS 80 too
             return None, f"{named} is taken as WGS 84, from which it may differ by 1 to 2 m"
         zone = (32601 if lat_deg >= 0 else 32701) + int((lon_deg + 180) % 360 // 6)
-        better = _better(group, math.inf)
         return math.inf, (
-            f"PROJ cannot convert {named} to WGS 84, from which it may differ by 500 m; {better}"
-            f"{', or ' if better else ''}warp it with the parameters of its survey (gdalwarp "
+            f"PROJ cannot convert {named} to WGS 84, from which it may differ by 500 m"
+            f"{_better(group, math.inf)}; warp it with the parameters of its survey (gdalwarp "
             f"-s_srs '+proj=.. +towgs84=..' -t_srs EPSG:{zone})"
         )
     if used.accuracy < 0:
@@ -89,7 +89,7 @@ def _accuracy(wkt: str, lat_deg: float, lon_deg: float) -> tuple[float | None, s
     if accuracy_m <= MAX_ACCURACY_M:
         return accuracy_m, ""
     said = f"{named} is converted to WGS 84 with an accuracy of {accuracy_m:g} m only"
-    return accuracy_m, "; ".join(filter(None, (said, _better(group, accuracy_m))))
+    return accuracy_m, said + _better(group, accuracy_m)
 
 
 def _better(group: TransformerGroup, accuracy_m: float) -> str:
@@ -99,7 +99,7 @@ def _better(group: TransformerGroup, accuracy_m: float) -> str:
     for each in group.unavailable_operations:
         if each.grids and 0 <= each.accuracy < accuracy_m:
             calls = [f"pyproj sync --file {grid.short_name}{target}" for grid in each.grids]
-            return f"install the grid of {each.accuracy:g} m: {' && '.join(calls)}"
+            return f"; install the grid of {each.accuracy:g} m: {' && '.join(calls)}"
     return ""
 
 
@@ -153,10 +153,7 @@ def _moved(
 def _plate_frame(crs: str) -> str | None:
     """The geographic system of the plate that a system is fixed to, by its name as far as it can be
     read."""
-    try:
+    with suppress(pyproj.exceptions.CRSError):  # a WKT that was cut
         system = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError:  # a WKT that was cut
-        name = crs
-    else:
-        name = system.name if system.geodetic_crs is None else system.geodetic_crs.name
-    return next((code for pattern, code in _FRAMES if re.search(pattern, name)), None)
+        crs = (system.geodetic_crs or system).name
+    return next((code for pattern, code in _FRAMES if re.search(pattern, crs)), None)

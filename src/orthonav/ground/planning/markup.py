@@ -109,13 +109,21 @@ def read_gpx(data: bytes) -> list[Route]:
 
 
 def _gpx_route(element: Element, points: str) -> Route:
-    waypoints, heights = [], []
+    places = []
     for point in element.iterfind(points):
         lat, lon = (parsed(point.get(name) or "", f"GPX {name}") for name in ("lat", "lon"))
-        waypoints.append((lat, lon))
-        height = text_of(point, "ele")
-        heights.append(None if height is None else Height(parsed(height, "GPX ele"), "amsl"))
-    return Route(tuple(waypoints), tuple(heights), name=text_of(element, "name"))
+        places.append((lat, lon, _height(point, "ele", "amsl")))
+    return _route(places, text_of(element, "name"))
+
+
+def _route(places: list[_Place], name: str | None) -> Route:
+    heights = tuple(height for _, _, height in places)
+    return Route(tuple((lat, lon) for lat, lon, _ in places), heights, name=name)
+
+
+def _height(element: Element, tag: str, frame: HeightFrame | None) -> Height | None:
+    text = text_of(element, tag)
+    return None if text is None else Height(parsed(text, tag), frame)
 
 
 def read_kmz(data: bytes) -> list[Route]:
@@ -167,11 +175,7 @@ def _kml_routes(mark: Element) -> list[Route]:
         if element.tag in ("LineString", "Track")
         for place in (_line(element) if element.tag == "LineString" else _track(element))
     ]
-    if not places:
-        return []
-    heights = tuple(height for _, _, height in places)
-    waypoints = tuple((lat, lon) for lat, lon, _ in places)
-    return [Route(waypoints, heights, name=text_of(mark, "name"))]
+    return [_route(places, text_of(mark, "name"))] if places else []
 
 
 def _line(element: Element) -> Iterator[_Place]:
@@ -228,17 +232,8 @@ def _waylines(folder: Element) -> Iterator[Route]:
     require_few_waypoints(len(marks))
     marks.sort(key=lambda mark: parsed(text_of(mark, "index") or "", "WPML index"))
     if marks:
-        heights = tuple(_wpml_height(mark, frame) for mark in marks)
-        yield Route(tuple(map(_wpml_latlon, marks)), heights, name=text_of(folder, "waylineId"))
-
-
-def _wpml_latlon(mark: Element) -> tuple[float, float]:
-    values = (mark.findtext("Point/coordinates") or "").strip().split(",")
-    lon, lat = (parsed(value, "WPML position") for value in values[:2])
-    return lat, lon
-
-
-def _wpml_height(mark: Element, frame: HeightFrame | None) -> Height | None:
-    """The height that is flown; the third coordinate of the point is not."""
-    text = text_of(mark, "executeHeight")
-    return None if text is None else Height(parsed(text, "WPML executeHeight"), frame)
+        texts = [text_of(mark, "Point/coordinates") or "" for mark in marks]
+        points = [_kml_place(text.split(","), None, text) for text in texts]
+        heights = [_height(mark, "executeHeight", frame) for mark in marks]  # that are flown
+        places = [(*point[:2], height) for point, height in zip(points, heights, strict=True)]
+        yield _route(places, text_of(folder, "waylineId"))

@@ -263,17 +263,16 @@ def read_wpl(data: bytes) -> list[Route]:
         items = list(_wpl_items(lines))
     except TableError as error:
         raise RouteError(f"waypoint file cannot be read ({error})") from error
-    first = items[0] if version[2] == "110" and items and items[0].number == 0 else None
-    if first is None or first.command not in _HOMES:
+    if version[2] == "120" or not items or items[0].number or items[0].command not in _HOMES:
         return [route_of(items, None)]
+    first, *rest = items
     if first.frame != 0 and first.command == WAYPOINT and _has_place(first):
-        log.warning(
-            "item 0 is flown to, as it is in frame %d: a home position is in 0", first.frame
-        )
+        said = "item 0 is flown to, as it is in frame %d: a home position is in 0"
+        log.warning(said, first.frame)
         return [route_of(items, None)]
-    if any((each.frame, each.height_m) == (0, first.height_m) for each in items[1:]):
+    if any((each.frame, each.height_m) == (0, first.height_m) for each in rest):
         log.warning("item 0 is taken as the home position, which is not flown to")
-    return [route_of(items[1:], first if _has_place(first) else None)]
+    return [route_of(rest, first if _has_place(first) else None)]
 
 
 def _wpl_items(lines: Iterator[str]) -> Iterator[MissionItem]:
