@@ -127,7 +127,7 @@ GREY = smooth_scene(200)[:1]
 
 
 def layer(path, bands=GREY, **more):
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(exist_ok=True, parents=True)
     return write(path, bands, transform=placed(size=200), **more)
 
 
@@ -153,7 +153,13 @@ def test_colours_of_a_scene_stand_for_its_bands(tmp_path, caplog):
     layer(tmp_path / "f" / "TCI.tif", SCENE)
     (source,) = Mosaic.open([tmp_path / "f"]).sources
     assert source.path.name == "TCI.tif"
-    assert "imagery: using TCI.tif, not B02.tif: all are of one place" in caplog.text
+    assert "imagery: using TCI.tif, not B02.tif: of one place and date (1 such" in caplog.text
+
+
+def test_packages_share_the_tiles_of_their_border(tmp_path, caplog):
+    for name in ("a", "b"):
+        layer(tmp_path / "f" / name / "03-2022-0710-6600.tif")
+    assert len(Mosaic.open([tmp_path / "f"]).sources) == 1 and not caplog.text
 
 
 @pytest.mark.parametrize(

@@ -257,13 +257,11 @@ SURFACE_POSTING_M, SURFACE_UNIT_M = 1.0, 0.25
 """Of houses and trees above the terrain: half the 2 m at which views are rectified."""
 ENVELOPE_POSTING_M, WIDEST_M = 2.0, 40.0
 """Of the lower envelope that stands for bare earth, without narrower houses and trees."""
-LOW_PERCENT, OFFSET_SAMPLES, MOST_OFF_M = 5, 256, 10.0
+LOW_PERCENT, OFFSET_SAMPLES, MOST_OFF_M, MAX_DATUM_M = 5, 256, 10.0, 120.0
 """At least this percentage of a surface is bare ground; samples across the area that show it; its
-largest height above a terrain of the same datum."""
+largest height above a terrain of the same datum, and of any."""
 MAX_SURFACE_M = 3.0
 """Coarsest surface model: wider samples do not show houses."""
-MAX_UNDULATION_M = 120.0
-"""Height of one vertical datum above another."""
 ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
 """Squares per side of the area in which roughness is measured, their width in postings, and the
 most samples of the source across a posting."""
@@ -351,7 +349,7 @@ class Surface:
         if not np.isfinite(off_m).any():
             return 0.0
         low_m = float(np.nanpercentile(off_m, LOW_PERCENT))
-        if abs(low_m) > (MOST_OFF_M if known else MAX_UNDULATION_M):
+        if abs(low_m) > (MOST_OFF_M if known else MAX_DATUM_M):
             raise ImageryError(
                 f"bare ground of the surface lies {low_m:.0f} m above the terrain: check unit and "
                 f"vertical datum of {self.name} and {dem.path.name}"

@@ -37,8 +37,6 @@ try:
 except ImportError as error:
     raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
-OUTLINE_POINTS = 20
-"""Steps per side, as rasterio's `transform_bounds` uses."""
 ALPHA_SAMPLE_PX, OVERVIEW_PX = 64, 512
 MAX_PARTLY_CLEAR = 0.05
 """Largest fraction of partly transparent pixels of a mask: its resampled edges."""
@@ -154,17 +152,19 @@ def _first_of_each_place(sources: Sequence[Source], folder: Path) -> list[Source
     for each in sorted(sources, key=_preference):
         place = each.crs, each.transform, each.width_px, each.height_px, each.date
         places.setdefault(place, []).append(each)
-    for first, *others in places.values():
-        names = [each.path.name for each in others]
-        if others and len(first.bands) == 1:
+    said = []
+    for first, *others in places.values():  # neighbouring packages share tiles of one name
+        names = [each.path.name for each in others if each.path.name != first.path.name]
+        if names and len(first.bands) == 1:
             raise ImageryError(
                 f"{', '.join([first.path.name, *names])} are grey and of one place and date: give "
                 "the one that shows the ground, or join the bands of a scene (gdalbuildvrt "
                 f"-separate rgb.vrt RED GREEN BLUE, of Sentinel-2 B04 B03 B02): {folder}"
             )
-        if others:
-            said = chosen("imagery", first.path.name, names, "all are of one place and date")
-            log.warning("%s", said)
+        if names:
+            said.append(chosen("imagery", first.path.name, names, "of one place and date"))
+    if said:
+        log.warning("%s (%d such places)", said[0], len(said))
     return [first for first, *_ in places.values()]
 
 
@@ -268,9 +268,8 @@ def _inspect(
 def system_beside(path: Path) -> Any:
     """Of a .prj beside a raster, else None."""
     beside = path.with_suffix(".prj")
-    if not beside.is_file():
-        return None
-    return CRS.from_wkt(beside.read_text(errors="replace"), morph_from_esri_dialect=True)
+    text = beside.read_text(errors="replace") if beside.is_file() else None
+    return text and CRS.from_wkt(text, morph_from_esri_dialect=True)
 
 
 def _require_picture(path: Path, dataset: Any) -> None:
@@ -426,7 +425,7 @@ def _is_mask(path: Path, dataset: Any) -> bool:
 def outline_of(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
     """The border (N, 2), degrees."""
     box = 0, 0, dataset.width, dataset.height
-    x, y = dataset.transform * outline(box, OUTLINE_POINTS).T
+    x, y = dataset.transform * outline(box, 20).T  # as many as rasterio's `transform_bounds`
     try:
         lon, lat = transform_coordinates(system, "EPSG:4326", x, y)[:2]
     except CPLE_BaseError:  # a local or engineering system

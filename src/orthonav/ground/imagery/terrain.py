@@ -320,14 +320,12 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
     unit = (data.units[0] or "").strip().lower()
     axes = pyproj.CRS.from_wkt(crs.to_wkt()).axis_info
     in_feet = horizontal.is_projected and axes[0].unit_conversion_factor != 1
-    if in_feet and not unit and len(axes) < 3 and vertical.unit_m == 1:
-        raise ImageryError(
-            "heights of the terrain file have no unit, and its coordinates are in feet: state the "
-            f"unit of its heights (gdal_edit.py -units ft, or -units m): {path}"
-        )
+    if in_feet and len(axes) < 3 and vertical.unit_m == 1:
+        unit = unit or "no unit, and its coordinates in feet"
     if unit and unit not in _UNITS:
         raise ImageryError(
-            f"heights of the terrain file are in '{unit:.30}': metres or feet are expected: {path}"
+            f"heights of the terrain file are in {unit:.60}: metres or feet are expected; state "
+            f"the unit (gdal_edit.py -units m, or ft): {path}"
         )
     unit_m = _UNITS.get(unit, vertical.unit_m)
     vertical = replace(vertical, unit_m=unit_m)
