@@ -109,3 +109,19 @@ def test_an_epoch_moves_the_imagery(tmp_path):
     other = write(tmp_path / "b.tif", smooth_scene(), crs="EPSG:32631")
     with pytest.raises(ImageryError, match="not for EPSG:32631"):
         Mosaic.open([other], 2026.9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "crs, lat, lon, said",
+    [
+        ("EPSG:27700", 52, -1, "EPSG:27700 is converted to WGS 84 to 2 m, as PROJ states"),
+        (LAMBERT, 46, 3, "EPSG:2154 is taken as WGS 84, from which its tectonic plate has moved"),
+    ],
+)
+def test_build_says_one_thing_about_a_system(run, tmp_path, monkeypatch, crs, lat, lon, said):
+    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
+    path = made(tmp_path / "a.tif", crs, lat, lon)
+    more = ("--tile-px", 64, "--overlap", 0.5, "--calibration-views", 2, "--workers", 2)
+    out = run("build", "--ortho", path, *more, "--out", tmp_path / "a.onav").out
+    assert said in out and out.count("WGS 84") == 1
