@@ -175,6 +175,7 @@ def truth_en_m(flight_path, localizer):
 @pytest.fixture(scope="session")
 def make_ortho():
     """Function that writes a picture (H, W) as an orthophoto in Lambert-93, 1 m a pixel."""
+    import numpy as np
     import rasterio
     from rasterio.transform import Affine
 
@@ -182,11 +183,12 @@ def make_ortho():
         grey = textured() if grey is None else grey
         corner = Affine(gsd_m, 0, 700_000, 0, -gsd_m, 6_600_000)
         height, width = grey.shape
+        count = 1 if len(np.unique(grey)) > 30 else 3  # few values in one band are a mask
         with rasterio.open(
             path,
             "w",
             driver="GTiff",
-            count=1,
+            count=count,
             height=height,
             width=width,
             dtype="uint8",
@@ -194,7 +196,7 @@ def make_ortho():
             transform=corner,
             nodata=nodata,
         ) as data:
-            data.write(grey[None])
+            data.write(np.broadcast_to(grey, (count, height, width)))
         return Path(path)
 
     return write

@@ -142,8 +142,15 @@ def test_unknown_heights_are_refused():
     ellipsoid = Route(PLACES, tuple(Height(400.0, "hae") for _ in PLACES))
     with pytest.raises(RouteError, match=r"or it is above the ellipsoid; .*--agl-m"):
         profile(ellipsoid, (1.0, 1.0), None, 10.0, slope)
-    with pytest.raises(RouteError, match="does not cover leg 1"):
-        profile(Route(PLACES), (1.0, 1.0), 100, 10.0, lambda lat, lon: np.full(lat.shape, np.nan))
+    middle = (PLACES[0][0] + PLACES[1][0]) / 2, (PLACES[0][1] + PLACES[1][1]) / 2
+
+    def hole(lat, lon):
+        north = (lat - middle[0]) * (PLACES[1][0] - PLACES[0][0])
+        east = (lon - middle[1]) * (PLACES[1][1] - PLACES[0][1])
+        return np.where(north + east > 0, np.nan, 0.0)
+
+    with pytest.raises(RouteError, match=r"no height for (49|50|51)% of leg 1 .*a hole, or beyond"):
+        profile(Route(PLACES), (1.0, 1.0), 100, 10.0, hole)
 
 
 L_ROUTE = Route(((46.5, 2.5), (46.53, 2.5), (46.53, 2.56)), leg_bands_m=(200, 900))

@@ -107,6 +107,30 @@ def test_a_mission_of_litchi_states_what_its_heights_count_from(tmp_path):
         read_route(path)
 
 
+@pytest.mark.parametrize("name, fits", [
+    ("urn:ogc:def:crs:OGC:1.3:CRS84", True),
+    ("EPSG:4326", True),
+    ("urn:ogc:def:crs:EPSG::2154", False),
+    ("EPSG:4230", False),
+])  # fmt: skip
+def test_the_system_of_an_older_geojson_is_wgs_84(tmp_path, name, fits):
+    line = {"type": "LineString", "coordinates": [[2.5, 46.5], [2.6, 46.5]]}
+    path = tmp_path / "a.geojson"
+    path.write_text(json.dumps(line | {"crs": {"type": "name", "properties": {"name": name}}}))
+    if fits:
+        assert read_route(path).waypoints == ((46.5, 2.5), (46.5, 2.6))
+        return
+    with pytest.raises(RouteError, match=f"is in {name}: convert it to WGS 84 .ogr2ogr"):
+        read_route(path)
+
+
+@pytest.mark.parametrize("rows", ["46.5,2.5\n0,0\n46.6,2.5", "0.8116,0.0436\n0.8118,0.0436"])
+def test_positions_of_none_and_radians_are_refused(tmp_path, rows):
+    (tmp_path / "a.csv").write_text(f"lat,lon\n{rows}\n")
+    with pytest.raises(RouteError, match="at or around 0, 0, in the sea: give degrees, not rad"):
+        read_route(tmp_path / "a.csv")
+
+
 def test_a_pointer_of_git_lfs_is_named(tmp_path):
     path = tmp_path / "a.kml"
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")

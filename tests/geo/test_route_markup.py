@@ -90,6 +90,16 @@ def test_lines_of_one_placemark_are_joined_and_placemarks_picked_by_name(read):
         read(text, "a.kml")
 
 
+def test_files_that_a_kml_links_to_are_named(read, caplog):
+    link = "</Folder><NetworkLink><Link><href>files/way.kml</href></Link></NetworkLink></Document>"
+    text = kml_of().replace("</Folder></Document>", link)
+    with pytest.raises(RouteError, match=r"no LineString .* not read: files/way\.kml"):
+        read(archive(("doc.kml", text)), "a.kmz")
+    text = kml_of(("way", line())).replace("</Folder></Document>", link)
+    assert read(text, "a.kml").waypoints == PLACES
+    assert "files that it links to are not read: files/way.kml" in caplog.text
+
+
 def test_kmz_is_kml_in_an_archive(read):
     text = kml_of(("way", line()))
     assert read(archive(("doc.kml", text), ("files/b.kml", "<x/>")), "a.kmz").waypoints == PLACES
@@ -147,7 +157,11 @@ def test_several_waylines_are_picked_by_identifier_or_number(read):
         (wpml_of(), "a.wpml", "no wayline with waypoints"),
         (wpml_of(wayline("aboveTheMoon")), "a.wpml", "executeHeightMode must be relative"),
         (wpml_of(wayline()).replace("<wpml:index>1", "<wpml:index>x"), "a.wpml", "WPML index"),
-        (wpml_of(wayline()).replace("2.5,46.5,0", "2.5"), "a.wpml", "cannot be read"),
+        (
+            wpml_of(wayline()).replace("2.5,46.5,0", "2.5"),
+            "a.wpml",
+            "position must be longitude,lat",
+        ),
         (wpml_of(), "a.kml", "template of a DJI mission: give its waylines.wpml"),
         ("<gpx/>", "a.wpml", "must begin with <kml>"),
     ],
@@ -176,8 +190,9 @@ def test_routes_and_tracks_of_gpx(read, inner, name, version):
     assert route.heights == (Height(120, "amsl"), None, None)
 
 
-def test_a_route_comes_before_a_track_and_names_choose(read):
+def test_a_route_comes_before_a_track_and_names_choose(read, caplog):
     assert read(GPX.format(SEGMENTS + ROUTE), "a.gpx").name == "planned"
+    assert "route: using rte, not flown: routes come before tracks" in caplog.text
     two = GPX.format(ROUTE + ROUTE.replace("planned", "other"))
     assert read(two, "a.gpx#other").name == "other"
     with pytest.raises(RouteError, match="1 'planned', 2 'other'"):
@@ -214,7 +229,7 @@ OUTSIDE = '<!DOCTYPE kml SYSTEM "file:///etc/passwd"><kml/>'
         ("a.gpx", GPX.format("<rte/><trk><trkseg/></trk>"), "no route"),
         ("a.gpx", GPX.format(ROUTE.replace('lat="46.51"', "")), "GPX lat must be a number"),
         ("a.gpx", GPX.format(ROUTE.replace("46.51", "nan")), "GPX lat must be a number"),
-        ("a.gpx", GPX.format(ROUTE.replace(">120<", ">high<")), "GPX ele must be a number"),
+        ("a.gpx", GPX.format(ROUTE.replace(">120<", ">high<")), "ele must be a number"),
     ],
 )
 def test_broken_and_harmful_files_are_refused(read, name, content, message):

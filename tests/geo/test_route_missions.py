@@ -241,5 +241,21 @@ def test_positions_that_are_left_out_of_a_mission_are_named(read, caplog):
         read(plan(simple(0, B, 50)))
 
 
+@pytest.mark.parametrize("frame, height, said", [
+    (3, 60, "item 0 is flown to, as it is in frame 3: a home position is in 0"),
+    (0, 600, "item 0 is taken as the home position, which is not flown to"),
+    (0, 488, None),
+])  # fmt: skip
+def test_item_0_is_a_waypoint_in_the_frame_of_waypoints(read, caplog, frame, height, said):
+    """As MAVROS and converters from tables write it; a home position has frame 0."""
+    text = WPL.replace("1\t0\t16\t0\t0\t0\t0\t47.39\t8.54\t488",
+                       f"1\t{frame}\t16\t0\t0\t0\t0\t47.39\t8.54\t{height}")  # fmt: skip
+    route = read(text, "a.waypoints")
+    home = (47.39, 8.54)
+    assert route.waypoints == ((home, A, B, C) if frame else (home, A, B, C, home))
+    assert route.heights[0] == (Height(60, "home") if frame else None)
+    assert (said in caplog.text) if said else not caplog.text
+
+
 def test_the_first_item_of_a_waypoint_file_is_home_only_where_it_is_number_0(read):
     assert read(LOST.replace("\n0\t1", "\n1\t1"), "a.txt").waypoints == ((47.39, 8.54), A, B)

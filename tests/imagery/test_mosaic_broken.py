@@ -81,9 +81,9 @@ def test_no_map_is_built_from_nothing_but_nodata(ortho, tmp_path, dtype):
     assert list(tmp_path.iterdir()) == [ortho]
 
 
-@pytest.mark.parametrize("dtype, bands", [("uint16", 1), ("float32", 3)])
-def test_one_level_everywhere_is_no_division_by_zero(ortho, dtype, bands):
-    write(ortho, np.full((bands, SIZE, SIZE), 700, dtype))
+@pytest.mark.parametrize("dtype", ["uint16", "float32"])
+def test_one_level_everywhere_is_no_division_by_zero(ortho, dtype):
+    write(ortho, np.full((3, SIZE, SIZE), 700, dtype))
     pixels = read(ortho)
     assert pixels.valid[4:-4, 4:-4].all() and not pixels.rgb.any()
 

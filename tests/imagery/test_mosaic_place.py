@@ -126,8 +126,8 @@ def test_a_window_that_starts_in_the_middle_of_the_sheet(tmp_path, gsd_m):
 @pytest.mark.parametrize("coarser", [2, 3, 4, 5, 8, 2.5, 3.4])
 @pytest.mark.parametrize("deep", [False, True], ids=["8 bit", "16 bit"])
 def test_a_fine_chequerboard_comes_out_grey(tmp_path, coarser, deep):
-    board = np.indices((600, 600)).sum(axis=0) % 2 * 255
-    bands = board[None].astype(np.uint16 if deep else np.uint8)
+    board = np.indices((3, 600, 600))[1:].sum(axis=0) % 2 * 255
+    bands = board.astype(np.uint16 if deep else np.uint8)
     path = write(tmp_path / "board.tif", bands, transform=placed(gsd_m=0.2, size=600))
     pixels = read(path, int(100 / coarser / 0.2 / 5) * 4, gsd_m=0.2 * coarser)
     inner = pixels.grey[3:-3, 3:-3].astype(float)

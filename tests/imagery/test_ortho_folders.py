@@ -1,6 +1,11 @@
 """A folder as its producer delivers it is an orthophoto; other files in it are skipped."""
 
+import sqlite3
+from contextlib import closing
+
+import cv2
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 import rasterio.shutil
@@ -114,8 +119,81 @@ def test_skipped_files_are_logged_with_reasons(tmp_path, caplog):
     assert [source.path.name for source in mosaic.sources] == [
         f"tile_{row}_{col}.tif" for row in (0, 1) for col in (0, 1)
     ]
-    for reason in ("1 .001", "1 .ecw", "1 thumbnails", "skipped 2 rasters", "may hold heights"):
+    for reason in ("1 .001", "1 .ecw", "1 thumbnails", "figure.tif", "may hold heights"):
         assert reason in caplog.text
+
+
+GREY = smooth_scene(200)[:1]
+
+
+def layer(path, bands=GREY, **more):
+    path.parent.mkdir(exist_ok=True, parents=True)
+    return write(path, bands, transform=placed(size=200), **more)
+
+
+@pytest.mark.parametrize(
+    "bands",
+    [
+        ["T31UDQ_20160712T105621_B02_10m", "T31UDQ_20160712T105621_B03_10m"],
+        ["LC08_L2SP_199026_20200101_02_T1_SR_B2", "LC08_L2SP_199026_20200101_02_T1_SR_B4"],
+        ["intensity", "north"],
+    ],
+)
+def test_bands_of_one_scene_are_not_several_orthophotos(tmp_path, bands):
+    for name in bands:
+        layer(tmp_path / "f" / f"{name}.tif", GREY.astype(np.uint16) * 20)
+    with pytest.raises(
+        ImageryError, match=rf"{bands[0]}\.tif, {bands[1]}\.tif are grey and of one"
+    ):
+        Mosaic.open([tmp_path / "f"])
+
+
+def test_colours_of_a_scene_stand_for_its_bands(tmp_path, caplog):
+    layer(tmp_path / "f" / "B02.tif")
+    layer(tmp_path / "f" / "TCI.tif", SCENE)
+    (source,) = Mosaic.open([tmp_path / "f"]).sources
+    assert source.path.name == "TCI.tif"
+    assert "imagery: using TCI.tif, not B02.tif: of one place and date (1 such" in caplog.text
+
+
+def test_packages_share_the_tiles_of_their_border(tmp_path, caplog):
+    for name in ("a", "b"):
+        layer(tmp_path / "f" / name / "03-2022-0710-6600.tif")
+    assert len(Mosaic.open([tmp_path / "f"]).sources) == 1 and not caplog.text
+
+
+@pytest.mark.parametrize(
+    "name, bands",
+    [
+        ("T31UDQ_20160712T105621_AOT_10m", GREY),
+        ("LC08_L1TP_199026_20200101_02_T1_QA_PIXEL", GREY.astype(np.uint16)),
+        ("2021_hillshade_1m", GREY),
+        ("valid", (GREY > 100) * np.uint8(255)),
+        ("classes", GREY // 32),
+        ("vapour", np.full_like(GREY, 143, np.uint16)),
+    ],
+)
+def test_layers_that_show_no_ground(tmp_path, name, bands, caplog):
+    path = layer(tmp_path / "f" / f"{name}.tif", bands)
+    with pytest.raises(ImageryError, match="is a mask or another layer, not a picture"):
+        Mosaic.open([path])
+    layer(tmp_path / "f" / "ortho_2016.tif", SCENE)
+    (source,) = Mosaic.open([tmp_path / "f"]).sources
+    assert source.path.name == "ortho_2016.tif" and f"{name}.tif" in caplog.text
+
+
+def test_photographs_are_not_orthophotos(tmp_path):
+    """With the metadata of a camera, and no georeference."""
+    exif = bytes.fromhex("45786966000049492a000800000001000f010200040000004e696b000000000000")
+    cv2.imwrite(str(tmp_path / "bare.jpg"), GREY[0])
+    bare = (tmp_path / "bare.jpg").read_bytes()
+    head = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    (tmp_path / "DCIM").mkdir()
+    photo = tmp_path / "DCIM" / "DJI_0001.JPG"
+    photo.write_bytes(bare[:2] + head + bare[2:])
+    for path in (photo, tmp_path / "DCIM"):
+        with pytest.raises(ImageryError, match=r"photograph: build .* from an ortho.*0001\.JPG"):
+            Mosaic.open([path])
 
 
 @pytest.mark.parametrize(
@@ -146,15 +224,16 @@ def test_broken_files_in_a_folder_are_errors(tmp_path):
         Mosaic.open([tmp_path / "f"])
 
 
-def test_world_files(tmp_path, whole):
-    """PNG and JPEG of Lambert-93 by their names, and a TIFF with a world file."""
+@pytest.mark.parametrize("system", ["LA93", "prj"])
+def test_world_files(tmp_path, whole, system):
+    """PNG, JPEG and TIFF with world files, in Lambert-93 by their names or a .prj of ESRI."""
     flat = write(tmp_path / "flat.tif", SCENE, crs=None, transform=Affine.identity())
     corner = placed(size=200)
     world = [corner.a, 0, 0, corner.e, corner.c + corner.a / 2, corner.f + corner.e / 2]
     for name, driver, sidecar in (
-        ("a_LA93.png", "PNG", ".pgw"),
-        ("a_LA93.jpg", "JPEG", ".jgw"),
-        ("a_LA93.tif", "GTiff", ".tfw"),
+        (f"a_{system}.png", "PNG", ".pgw"),
+        (f"a_{system}.jpg", "JPEG", ".jgw"),
+        (f"a_{system}.tif", "GTiff", ".tfw"),
     ):
         folder = tmp_path / driver
         folder.mkdir()
@@ -162,6 +241,9 @@ def test_world_files(tmp_path, whole):
         rasterio.shutil.copy(flat, folder / name, driver=driver, **more)
         (folder / f"{name}.aux.xml").unlink(missing_ok=True)
         (folder / name).with_suffix(sidecar).write_text("\n".join(map(repr, world)))
+        if system == "prj":
+            text = pyproj.CRS("EPSG:2154").to_wkt("WKT1_ESRI")
+            (folder / name).with_suffix(".prj").write_text(text)
         pixels = read(folder, 190)
         np.testing.assert_array_equal(pixels.valid, whole.valid)
         off = np.abs(pixels.rgb.astype(int) - whole.rgb)
@@ -188,6 +270,34 @@ def test_tile_stores_are_read_at_their_finest(tmp_path, driver, suffix):
     assert other.valid.all()
     off = np.abs(one.rgb.astype(int) - other.rgb)
     assert off.mean() < 6  # GDAL resamples into the store's own zoom levels
+
+
+def test_rows_of_tiles_that_count_from_the_north(tmp_path):
+    if "mbtiles" not in raster_driver_extensions():
+        pytest.skip("this GDAL has no MBTiles driver")
+    transform = placed("EPSG:3857", size=200)
+    source = write(tmp_path / "a.tif", SCENE, crs="EPSG:3857", transform=transform)
+    path = tmp_path / "a.mbtiles"
+    rasterio.shutil.copy(source, path, driver="MBTiles")
+    with closing(sqlite3.connect(path)) as store, store:
+        store.execute("UPDATE tiles SET tile_row = tile_row - (1 << zoom_level)")
+        store.execute("UPDATE tiles SET tile_row = -1 - tile_row")
+        store.execute("INSERT INTO metadata VALUES ('scheme', 'xyz')")
+    with pytest.raises(ImageryError, match=r"north \(scheme xyz\).*scheme tms"):
+        Mosaic.open([path])
+
+
+def test_transparent_colours_of_a_palette_are_missing_pixels(tmp_path):
+    scene = (np.arange(200 * 200).reshape(1, 200, 200) // 100 % 4).astype(np.uint8)
+    colours = {0: (9, 9, 9, 0), 1: (9, 90, 9, 0), 2: (0, 100, 0, 255), 3: (40, 40, 240, 255)}
+    profile = {"count": 1, "height": 200, "width": 200, "dtype": "uint8", "crs": "EPSG:2154"}
+    with rasterio.open("/vsimem/a", "w", "MEM", transform=placed(size=200), **profile) as data:
+        data.write(scene)
+        data.write_colormap(1, colours)
+        rasterio.shutil.copy(data, tmp_path / "a.png", driver="PNG")
+    pixels = read(tmp_path / "a.png", 150)
+    assert 0.4 < pixels.valid.mean() < 0.6
+    assert set(map(tuple, pixels.rgb[pixels.valid][:, :2].tolist())) <= {(0, 100), (40, 40)}
 
 
 @pytest.mark.long

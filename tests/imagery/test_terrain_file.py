@@ -133,7 +133,11 @@ def test_feet_are_metres_and_other_units_are_refused(make_dem):
     corner = Affine(10, 0, 458_000, 0, -10, 5_152_000)
     dem = open_dem(make_dem("us.tif", crs="EPSG:32631+6360", transform=corner, **feet))
     assert dem.datum.unit_m == pytest.approx(1200 / 3937)
-    with pytest.raises(ImageryError, match="are in 'furlong': metres or feet"):
+    plane = {"crs": "EPSG:2277", "transform": Affine(33, 0, 3_100_000, 0, -33, 10_100_000)}
+    with pytest.raises(ImageryError, match=r"in no unit, and its coordinates in feet: .*state"):
+        open_dem(make_dem("none.tif", **plane), "msl")
+    assert open_dem(make_dem("m.tif", unit="m", **plane), "msl").datum.unit_m == 1
+    with pytest.raises(ImageryError, match="are in furlong: metres or feet"):
         open_dem(make_dem("odd.tif", unit="furlong"), "msl")
 
 

@@ -112,6 +112,11 @@ def test_above_a_terrain_of_another_datum(area, grid, surface, tmp_path, caplog)
     assert made.surface.info.low_m >= -1.0 and made.surface.info.high_m <= ROOF_M + 1.0
     with pytest.raises(ImageryError, match="lies -45 m above the terrain"):
         height_layers(open_dem(dem, "msl"), [open_dem(surface, "msl")], area, grid)
+    in_feet = write_dem(
+        tmp_path / "ft.tif", LOCAL, lambda *en: slope(*en) / 0.3048, half_m=400.0, px_m=10.0
+    )
+    with pytest.raises(ImageryError, match="m above the terrain: check unit and vertical datum"):
+        height_layers(open_dem(in_feet), [open_dem(surface)], area, grid)
 
 
 def test_a_surface_that_shows_no_houses_is_refused(area, grid, tmp_path):

@@ -129,6 +129,9 @@ def run(options: argparse.Namespace) -> None:
             "be used; --dem-datum, and a geoid grid for heights above the ellipsoid, add heights "
             "above the sea"
         )
+    accuracies = {(each["crs"], each.get("crs_accuracy_m")) for each in result.manifest.imagery}
+    for crs, accuracy_m in sorted(pair for pair in accuracies if pair[1]):
+        print(f"{crs:.60} is converted to WGS 84 to {accuracy_m:g} m, as PROJ states")
     for each in plates:
         print(
             f"{each['crs']:.60} is taken as WGS 84, from which its tectonic plate has moved it by "
@@ -138,15 +141,14 @@ def run(options: argparse.Namespace) -> None:
 
 def _plates(manifest: "Manifest") -> list[dict[str, Any]]:
     """Systems that their tectonic plate has moved away from WGS 84 by now."""
-    from orthonav.ground.imagery.plates import plate_shift_m
+    from orthonav.ground.imagery.systems import plate_shift_m
 
     now = time.gmtime()
     year = round(now.tm_year + now.tm_yday / 366, 1)
-    sheet = manifest.sheets[0].frame
-    systems = {str(each["crs"]) for each in manifest.imagery}
-    shifts = {crs: plate_shift_m(crs, sheet.lat_deg, sheet.lon_deg, year) for crs in systems}
-    return [
-        {"crs": crs, "shift_m": round(shift_m, 2), "epoch": year}
-        for crs, shift_m in sorted(shifts.items())
-        if shift_m >= LEAST_SHIFT_M
+    frame = manifest.sheets[0].frame
+    place = frame.lat_deg, frame.lon_deg
+    found: list[dict[str, Any]] = [
+        {"crs": crs, "shift_m": round(plate_shift_m(crs, *place, year), 2), "epoch": year}
+        for crs in sorted({str(each["crs"]) for each in manifest.imagery})
     ]
+    return [each for each in found if each["shift_m"] >= LEAST_SHIFT_M]

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +71,7 @@ from orthonav.ground.build.sheet import (
     one_opencv_thread,
     tiles_of,
 )
-from orthonav.ground.planning.area import Area, Extent
+from orthonav.ground.planning.area import Area, Extent, outline
 from orthonav.ground.planning.route import along_polyline_en_m
 from orthonav.ground.planning.sheets import in_box
 
@@ -199,14 +198,6 @@ class Warp:
         points = _px_from_latlon(self.frame, self.grid, *places)
         (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
         return left - 1, top - 1, right + 1, bottom + 1
-
-
-def outline(box: Extent, points: int) -> Array:
-    """Points (4 * points, 2), x and y, around a box (west, south, east, north) from its corner."""
-    west, south, east, north = box
-    corners = np.array([[west, south], [east, south], [east, north], [west, north], [west, south]])
-    share = np.arange(points)[:, None] / points
-    return np.concatenate([start + (end - start) * share for start, end in pairwise(corners)])
 
 
 def _px_from_latlon(frame: LocalFrame, grid: TileGrid, lat_deg: Array, lon_deg: Array) -> Array:

@@ -257,9 +257,9 @@ SURFACE_POSTING_M, SURFACE_UNIT_M = 1.0, 0.25
 """Of houses and trees above the terrain: half the 2 m at which views are rectified."""
 ENVELOPE_POSTING_M, WIDEST_M = 2.0, 40.0
 """Of the lower envelope that stands for bare earth, without narrower houses and trees."""
-LOW_PERCENT, OFFSET_SAMPLES, MOST_OFF_M = 5, 256, 10.0
+LOW_PERCENT, OFFSET_SAMPLES, MOST_OFF_M, MAX_DATUM_M = 5, 256, 10.0, 120.0
 """At least this percentage of a surface is bare ground; samples across the area that show it; its
-largest height above a terrain of the same datum."""
+largest height above a terrain of the same datum, and of any."""
 MAX_SURFACE_M = 3.0
 """Coarsest surface model: wider samples do not show houses."""
 ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
@@ -339,7 +339,7 @@ class Surface:
 
     def above_m(self, dem: Dem) -> float:
         """Height of bare ground above that of a terrain model, where the datum of either is not
-        known. Raises `ImageryError` where they are known and differ by more than `MOST_OFF_M`."""
+        known. Raises `ImageryError` for more than can be, as with other units."""
         known = all(each.datum.is_known for each in (dem, *self.models))
         west, south, east, north = self.area.extent_en_m
         posting_m = max(east - west, north - south) / OFFSET_SAMPLES
@@ -349,7 +349,7 @@ class Surface:
         if not np.isfinite(off_m).any():
             return 0.0
         low_m = float(np.nanpercentile(off_m, LOW_PERCENT))
-        if known and abs(low_m) > MOST_OFF_M:
+        if abs(low_m) > (MOST_OFF_M if known else MAX_DATUM_M):
             raise ImageryError(
                 f"bare ground of the surface lies {low_m:.0f} m above the terrain: check unit and "
                 f"vertical datum of {self.name} and {dem.path.name}"
@@ -571,18 +571,8 @@ def terrain_parts(
     known = sum(int(np.isfinite(each).sum()) for each in found.values())
     high_m = round(high_m, 3)
     info = TerrainInfo(
-        west_m,
-        north_m,
-        posting_m,
-        rows,
-        cols,
-        TERRAIN_CHUNK_PX,
-        low_m,
-        high_m,
-        unit_m,
-        known,
-        name,
-        datum,
+        *(west_m, north_m, posting_m, rows, cols, TERRAIN_CHUNK_PX),
+        *(low_m, high_m, unit_m, known, name, datum),
     )
     blobs = [
         encode_terrain(found[number], info) if number in found else b""

@@ -31,8 +31,9 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import ImageryError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.imagery.plates import at_epoch
 from orthonav.ground.imagery.source import Source, open_sources, quiet, sources_in, unreadable
+from orthonav.ground.imagery.systems import at_epoch
+from orthonav.ground.planning.area import outline
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
 WHOLLY_VALID = 250
@@ -172,7 +173,9 @@ def _values(source: Source, place: str, band: int) -> str:
 def _mask(source: Source, place: str) -> str:
     """255 everywhere, or the union of the masks of a file."""
     everywhere = "<ScaleOffset>255</ScaleOffset><ScaleRatio>0</ScaleRatio>"
-    valid = [(mask, "<NODATA>0</NODATA>") for mask in source.masks]
+    opaque = "<ColorTableComponent>4</ColorTableComponent>"
+    zero = opaque if source.is_indexed and source.masks == ("1",) else "<NODATA>0</NODATA>"
+    valid = [(mask, zero) for mask in source.masks]
     return "".join(
         f"<ComplexSource>{place}<SourceBand>{band}</SourceBand>{more}</ComplexSource>"
         for band, more in valid or [(str(source.bands[0]), everywhere)]
@@ -201,22 +204,15 @@ def _lattice(members: list[int], sources: list[Source]) -> Lattice:
 
 def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:
     """Columns and rows from corner to corner; None where no lattice fits."""
-    alike = (
-        first.crs == other.crs
-        and len(first.bands) == len(other.bands)
-        and first.is_indexed == other.is_indexed
-        and first.dtype == other.dtype
-    )
-    if not alike:
+    kinds = {(each.crs, len(each.bands), each.is_indexed, each.dtype) for each in (first, other)}
+    if len(kinds) > 1:
         return None
-    col, row = ~first.transform * (other.transform.c, other.transform.f)
+    t = first.transform
+    col, row = ~t * (other.transform.c, other.transform.f)
     offset = round(col), round(row)
     longest = max(other.width_px, other.height_px)
-    skew = np.array(other.transform[:6]) - np.array(first.transform[:6])
-    unit = min(
-        np.hypot(first.transform.a, first.transform.d),
-        np.hypot(first.transform.b, first.transform.e),
-    )
+    skew = np.array(other.transform[:6]) - np.array(t[:6])
+    unit = min(np.hypot(t.a, t.d), np.hypot(t.b, t.e))
     stretch_px = np.abs(skew[[0, 1, 3, 4]]).max() * longest / unit
     off_px = max(abs(col - offset[0]), abs(row - offset[1])) + stretch_px
     return offset if off_px <= MAX_OFF_PX else None
@@ -441,16 +437,9 @@ class SheetRaster:
             members = np.array(lattice.members)
             boxes = self._boxes_px[members[near[members]]]
             if len(boxes):
-                low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
-                yield (
-                    lattice,
-                    (
-                        max(left, int(low[0])),
-                        max(top, int(low[1])),
-                        min(right, int(high[0])),
-                        min(bottom, int(high[1])),
-                    ),
-                )
+                low = np.maximum(boxes[:, :2].min(axis=0), [left, top]).tolist()
+                high = np.minimum(boxes[:, 2:].max(axis=0), [right, bottom]).tolist()
+                yield lattice, (low[0], low[1], high[0], high[1])
 
     def _near(self, left: int, top: int, right: int, bottom: int) -> NDArray[np.bool_]:
         boxes = self._boxes_px
@@ -520,11 +509,7 @@ class SheetRaster:
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]
     ) -> Window | None:
         """Pixels of a lattice that a window needs; None for none."""
-        share = np.linspace(0, 1, 9)
-        zero, one = np.zeros(9), np.ones(9)
-        cols = np.concatenate([share, share, zero, one]) * shape[1]
-        rows = np.concatenate([zero, one, share, share]) * shape[0]
-        east, north = target * (cols, rows)
+        east, north = target * outline((0, 0, shape[1], shape[0]), 8).T
         lat, lon = self._frame.latlon_from_en(np.stack([east, north], axis=1))
         x, y = transform_coordinates("EPSG:4326", lattice.first.system, lon, lat)[:2]
         col, row = ~lattice.transform * (np.asarray(x), np.asarray(y))

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from orthonav.core.errors import ImageryError, MissingFileError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import require_file
+from orthonav.core.flight.telemetry_track import chosen
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.planning.area import outline
 
 try:
     import rasterio
@@ -30,16 +32,18 @@ try:
     from rasterio.transform import Affine
     from rasterio.warp import transform as transform_coordinates
     from rasterio.windows import Window
+
+    from orthonav.ground.imagery.systems import accuracy_of
 except ImportError as error:
     raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
-OUTLINE_POINTS = 21
-"""Per side, as rasterio's `transform_bounds` uses."""
-ALPHA_SAMPLE_PX = 64
+ALPHA_SAMPLE_PX, OVERVIEW_PX = 64, 512
 MAX_PARTLY_CLEAR = 0.05
 """Largest fraction of partly transparent pixels of a mask: its resampled edges."""
+MIN_VALUES = 16
+"""In a grey picture; masks, classes and quality layers hold fewer."""
 HEIGHT_TYPES = ("float32", "float64", "int16", "int32")
-OPENED_AT_ONCE = 8
+OPENED_AT_ONCE, MAX_NAMED = 8, 5
 TERMS = {
     "attribution": ("ORTHONAV_ATTRIBUTION", "TIFFTAG_COPYRIGHT"),
     "licence": ("ORTHONAV_LICENCE",),
@@ -54,6 +58,10 @@ RASTERS |= {".png", ".jpg", ".jpeg", ".webp"}
 _SMALL_PICTURE = re.compile(
     r"(?:^|[-_. ])(?:thumb(?:nail)?|quicklook|preview|browse|overview|assemblage|mask|msk|alpha)s?"
     r"(?:[-_. ]|$)",
+    re.IGNORECASE,
+)
+_LAYER = re.compile(
+    r"(?:^|[-_. ])(hill-?shade|shaded[-_ ]?relief|aot|wvp|scl|fmask|udm2?|qa[-_\w]*)(?:[-_. ]|$)",
     re.IGNORECASE,
 )
 log = logging.getLogger(__name__)
@@ -71,7 +79,7 @@ class Source:
     system: Any
     """Of rasterio."""
     is_named: bool
-    """The system was taken from names because the file has none."""
+    """The system was taken from names or a .prj because the file has none."""
     transform: Affine
     """From column, row to coordinates."""
     gsd_m: float
@@ -89,6 +97,9 @@ class Source:
     stamp: tuple[tuple[str, int, int], ...] = ()
     """Path, size and modification time in ns of its files."""
     terms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    accuracy_m: float | None = None
+    caution: str = ""
+    """Of its coordinate system, by `accuracy_of`."""
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -99,12 +110,13 @@ class Source:
             "width_px": self.width_px,
             "height_px": self.height_px,
             "dtype": self.dtype,
+            **({"crs_accuracy_m": self.accuracy_m} if self.accuracy_m else {}),
             **self.terms,
         }
 
 
 class UnfitError(ImageryError):
-    """A raster that is not an orthophoto: heights, or not georeferenced."""
+    """A raster that is not an orthophoto: heights, a mask, a photograph, or not georeferenced."""
 
 
 def sources_in(folder: Path, bands: tuple[int, ...] | None = None) -> list[Source]:
@@ -124,20 +136,42 @@ def sources_in(folder: Path, bands: tuple[int, ...] | None = None) -> list[Sourc
         skipped_vrts = by_kind.pop(".vrt", [])  # of the files that are there
         by_kind |= {"virtual rasters (.vrt)": skipped_vrts} if skipped_vrts else {}
     files = sorted(path for kind in RASTERS for path in by_kind.pop(kind, ()))
-    sources = open_sources(files, folder, bands)
+    sources = _first_of_each_place(open_sources(files, folder, bands), folder)
     seen = ", ".join(f"{len(others)} {kind}" for kind, others in by_kind.items()) or "nothing"
     if not sources:
         raise ImageryError(
-            f"folder holds no usable orthophotos (unpack archives first); beside {len(files)} "
-            f"other rasters it holds {seen}: {folder}"
+            f"folder holds no usable orthophotos (unpack archives first); it holds {seen}: {folder}"
         )
     log.info("%d orthophotos; skipped %s: %s", len(sources), seen, folder)
-    return sorted(sources, key=_preference)
+    return sources
+
+
+def _first_of_each_place(sources: Sequence[Source], folder: Path) -> list[Source]:
+    """In the order of preference, of one place and date only the first, which is in colours."""
+    places: dict[Any, list[Source]] = {}
+    for each in sorted(sources, key=_preference):
+        place = each.crs, each.transform, each.width_px, each.height_px, each.date
+        places.setdefault(place, []).append(each)
+    said = []
+    for first, *others in places.values():  # neighbouring packages share tiles of one name
+        names = [each.path.name for each in others if each.path.name != first.path.name]
+        if names and len(first.bands) == 1:
+            raise ImageryError(
+                f"{', '.join([first.path.name, *names])} are grey and of one place and date: give "
+                "the one that shows the ground, or join the bands of a scene (gdalbuildvrt "
+                f"-separate rgb.vrt RED GREEN BLUE, of Sentinel-2 B04 B03 B02): {folder}"
+            )
+        if names:
+            said.append(chosen("imagery", first.path.name, names, "of one place and date"))
+    if said:
+        log.warning("%s (%d such places)", said[0], len(said))
+    return [first for first, *_ in places.values()]
 
 
 def _preference(source: Source) -> tuple[object, ...]:
     date = tuple(-int(part) for part in (source.date or "0").split("-"))
-    return date, round(source.gsd_m, 3), source.crs, source.dtype, source.bands, str(source.path)
+    kind = round(source.gsd_m, 3), source.crs, source.dtype, source.bands, str(source.path)
+    return date, -len(source.bands), *kind
 
 
 def open_sources(
@@ -146,20 +180,23 @@ def open_sources(
     """Inspect orthophotos, several at a time; in a `folder` of the user, skip other rasters.
 
     `bands`: that are used, one or three, from 1; None: the colours, or the first."""
-    sources: list[Source] = []
-    skipped = 0
     with quiet(), ThreadPoolExecutor(OPENED_AT_ONCE) as pool:
-        for found in pool.map(lambda path: _opened(Path(path), folder, bands), paths):
-            if isinstance(found, Source):
-                sources.append(found)
-            else:
-                skipped += 1
-                log.info("skipped: %s", found)
-    if skipped:
-        log.warning("skipped %d rasters that are not orthophotos (-v names them)", skipped)
+        found = list(pool.map(lambda path: _opened(Path(path), folder, bands), paths))
+    sources = [each for each in found if isinstance(each, Source)]
+    unfit = [each for each in found if isinstance(each, UnfitError)]
+    for each in unfit:
+        log.info("skipped: %s", each)
+    if unfit and not sources:
+        raise ImageryError(f"{len(unfit)} rasters are no orthophotos; {unfit[0]}")
+    if unfit:
+        names = ", ".join(str(each).rpartition(": ")[2] for each in unfit[:MAX_NAMED])
+        log.warning("skipped %d rasters that are not orthophotos (-v: why): %s", len(unfit), names)
     named = Counter(source.crs for source in sources if source.is_named)
     for system, count in named.items():
-        log.warning("files have no coordinate system; taken from their names: %d %s", count, system)
+        said = "files have no coordinate system; taken from their names or .prj: %d %s"
+        log.warning(said, count, system)
+    for caution in sorted({source.caution for source in sources} - {""}):
+        log.warning("%s", caution)
     return sources
 
 
@@ -186,6 +223,7 @@ def _inspect(
     names = _names_of(path, folder)
     if reason := unwarped(path, dataset):
         raise UnfitError(f"orthophoto {reason}: {path}")
+    _require_picture(path, dataset)
     if folder is not None and dataset.crs is None and dataset.transform.is_identity:
         raise UnfitError(f"raster has no georeference: {path}")
     system = _system(path, dataset, names)
@@ -202,7 +240,8 @@ def _inspect(
             f"raster of one band of {dataset.dtypes[0]} may hold heights; an orthophoto has bands "
             f"of 8 or 16 bits without a sign: {path}"
         )
-    outline = _outline(path, dataset, system)
+    outline = outline_of(path, dataset, system)
+    accuracy_m, caution = accuracy_of(system, outline, path)
     return Source(
         path=path,
         bands=bands,
@@ -221,7 +260,41 @@ def _inspect(
         folder=folder,
         stamp=_stamp(path, dataset),
         terms=_terms(dataset.tags()),
+        accuracy_m=accuracy_m,
+        caution=caution,
     )
+
+
+def system_beside(path: Path) -> Any:
+    """Of a .prj beside a raster, else None."""
+    beside = path.with_suffix(".prj")
+    text = beside.read_text(errors="replace") if beside.is_file() else None
+    return text and CRS.from_wkt(text, morph_from_esri_dialect=True)
+
+
+def _require_picture(path: Path, dataset: Any) -> None:
+    """Raise `UnfitError` for photographs, and for layers of one band that show no ground."""
+    if dataset.transform.is_identity and (
+        dataset.tags().keys() & {"EXIF_Make", "EXIF_FocalLength", "EXIF_GPSLatitude"}
+    ):
+        raise UnfitError(
+            f"this is a photograph: build the map from an orthophoto, and localize this: {path}"
+        )
+    if dataset.tags().get("scheme") == "xyz":
+        raise ImageryError(
+            "rows of the MBTiles count from the north (scheme xyz), which GDAL takes as from the "
+            f"south: convert it to scheme tms: {path}"
+        )
+    if dataset.count > 1 or _is_indexed(dataset):
+        return
+    values = np.unique(_sampled(dataset, 1, valid=True))
+    if 0 < len(values) < MIN_VALUES:  # all windows may lie on water
+        shape = min(dataset.height, OVERVIEW_PX), min(dataset.width, OVERVIEW_PX)
+        values = np.unique(dataset.read(1, out_shape=shape, masked=True).compressed())
+    named = _LAYER.search(path.stem)
+    if named or 0 < len(values) < MIN_VALUES:
+        why = f"by its name ({named[1]})" if named else f"of {len(values)} values where sampled"
+        raise UnfitError(f"raster is a mask or another layer, not a picture, {why}: {path}")
 
 
 def unwarped(path: Path, dataset: Any) -> str | None:
@@ -260,7 +333,7 @@ def _names_of(path: Path, folder: Path | None) -> list[str]:
 def _system(path: Path, dataset: Any, names: Sequence[str]) -> Any:
     if dataset.crs is not None and (dataset.crs.is_projected or dataset.crs.is_geographic):
         return dataset.crs
-    named = system_of(names)
+    named = system_beside(path) or system_of(names)
     if named is not None:
         return CRS.from_user_input(named)
     if dataset.crs is None:
@@ -316,16 +389,14 @@ def _masks(path: Path, dataset: Any, bands: tuple[int, ...]) -> tuple[str, ...]:
     if has_alpha and not is_image and dataset.count == 4:  # beside a nodata value
         return (str(dataset.colorinterp.index(ColorInterp.alpha) + 1),)
     if MaskFlags.all_valid in flags or MaskFlags.alpha in flags:
-        return ()
+        clear = _is_indexed(dataset) and any(not each[3] for each in dataset.colormap(1).values())
+        return ("1",) if clear else ()
     return tuple(f"mask,{band}" for band in bands)
 
 
-def _is_mask(path: Path, dataset: Any) -> bool:
-    """GDAL marks the fourth of four bands by default; a mask has few values between its ends.
-
-    Windows all over the file are read: decimated reads may decode the whole file.
-    """
-    side, band = ALPHA_SAMPLE_PX, dataset.colorinterp.index(ColorInterp.alpha) + 1
+def _sampled(dataset: Any, band: int, *, valid: bool = False) -> NDArray[Any]:
+    """Values in windows all over a file: decimated reads may decode the whole file."""
+    side = ALPHA_SAMPLE_PX
     cols = np.linspace(0, max(0, dataset.width - side), 4).astype(int).tolist()
     rows = np.linspace(0, max(0, dataset.height - side), 4).astype(int).tolist()
     windows = [
@@ -333,7 +404,13 @@ def _is_mask(path: Path, dataset: Any) -> bool:
         for row in rows
         for col in cols
     ]
-    values = np.concatenate([dataset.read(band, window=each).ravel() for each in windows])
+    parts = (dataset.read(band, window=each, masked=valid) for each in windows)
+    return np.concatenate([each.compressed() if valid else each.ravel() for each in parts])
+
+
+def _is_mask(path: Path, dataset: Any) -> bool:
+    """GDAL marks the fourth of four bands by default; a mask has few values between its ends."""
+    values = _sampled(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1)
     partly = float(((values != 0) & (values != values.max())).mean())
     if partly <= MAX_PARTLY_CLEAR:
         return True
@@ -345,13 +422,10 @@ def _is_mask(path: Path, dataset: Any) -> bool:
     return False
 
 
-def _outline(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
+def outline_of(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
     """The border (N, 2), degrees."""
-    share = np.linspace(0, 1, OUTLINE_POINTS)
-    zero, one = np.zeros(OUTLINE_POINTS), np.ones(OUTLINE_POINTS)
-    cols = np.concatenate([share, share, zero, one]) * dataset.width
-    rows = np.concatenate([zero, one, share, share]) * dataset.height
-    x, y = dataset.transform * (cols, rows)
+    box = 0, 0, dataset.width, dataset.height
+    x, y = dataset.transform * outline(box, 20).T  # as many as rasterio's `transform_bounds`
     try:
         lon, lat = transform_coordinates(system, "EPSG:4326", x, y)[:2]
     except CPLE_BaseError:  # a local or engineering system
@@ -394,6 +468,7 @@ def quiet() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         warnings.simplefilter("ignore", NodataShadowWarning)
+        warnings.filterwarnings("ignore", "Best transformation is not available")
         yield
 
 

@@ -31,7 +31,8 @@ try:
     from rasterio.vrt import WarpedVRT
     from rasterio.windows import Window
 
-    from orthonav.ground.imagery.source import ground_m, quiet, unwarped
+    from orthonav.ground.imagery.source import ground_m, outline_of, quiet, system_beside, unwarped
+    from orthonav.ground.imagery.systems import accuracy_of
 except ImportError as error:
     raise missing_extra("reading terrain", "geo", "rasterio", error) from error
 
@@ -192,8 +193,7 @@ class Dem:
             )
 
     def covers(self, lat_deg: float, lon_deg: float) -> bool:
-        col, row = self._pixels(np.array([lat_deg]), np.array([lon_deg]))
-        return bool(0 <= col[0] <= self._data.width and 0 <= row[0] <= self._data.height)
+        return self.meets(np.array([lat_deg]), np.array([lon_deg]))
 
     def meets(self, lat_deg: Array, lon_deg: Array) -> bool:
         """Whether the box around positions may hold heights of the file."""
@@ -305,7 +305,8 @@ def open_dem(path: Path, datum: str | None = None) -> Dem:
 def _inspected(path: Path, data: Any, given: str | None) -> Dem:
     if reason := unwarped(path, data):
         raise ImageryError(f"terrain file {reason}: {path}")
-    if data.crs is None:
+    crs = data.crs or system_beside(path)
+    if crs is None:
         raise ImageryError(f"terrain file has no coordinate reference system: {path}")
     if data.count != 1 or data.dtypes[0] in ("uint8", "int8"):
         raise ImageryError(
@@ -313,11 +314,18 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
             f"band of heights is expected: {path}"
         )
     known = given or data.tags().get(DATUM_TAG)
-    horizontal, vertical = horizontal_and_vertical(data.crs, known, path)
+    horizontal, vertical = horizontal_and_vertical(crs, known, path)
+    if caution := accuracy_of(crs, outline_of(path, data, crs), path)[1]:
+        log.warning("%s: %s", caution, path)
     unit = (data.units[0] or "").strip().lower()
+    axes = pyproj.CRS.from_wkt(crs.to_wkt()).axis_info
+    in_feet = horizontal.is_projected and axes[0].unit_conversion_factor != 1
+    if in_feet and len(axes) < 3 and vertical.unit_m == 1:
+        unit = unit or "no unit, and its coordinates in feet"
     if unit and unit not in _UNITS:
         raise ImageryError(
-            f"heights of the terrain file are in '{unit:.30}': metres or feet are expected: {path}"
+            f"heights of the terrain file are in {unit:.60}: metres or feet are expected; state "
+            f"the unit (gdal_edit.py -units m, or ft): {path}"
         )
     unit_m = _UNITS.get(unit, vertical.unit_m)
     vertical = replace(vertical, unit_m=unit_m)

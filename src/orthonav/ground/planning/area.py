@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -35,12 +36,8 @@ class Area:
                 "bounds must be west,south,east,north in degrees, at most 10 degrees across"
                 f"{hint}, got {','.join(map(str, bounds_deg))}"
             )
-        share = np.linspace(0, 1, 33)
-        lon = west + (east - west) * share
-        lat = south + (north - south) * share
-        edge_lat = np.concatenate([np.full(33, south), np.full(33, north), lat, lat])
-        edge_lon = np.concatenate([lon, lon, np.full(33, west), np.full(33, east)])
-        return cls.from_outline(edge_lat, edge_lon)
+        lon, lat = outline((west, south, east, north), 32).T
+        return cls.from_outline(lat, lon)
 
     @classmethod
     def from_outline(cls, lat_deg: Array, lon_deg: Array) -> "Area":
@@ -102,6 +99,14 @@ class Area:
         ]
         shapely.prepare([each for _, each in found])
         return found
+
+
+def outline(box: Extent, points: int) -> Array:
+    """Points (4 * points, 2), x and y, around a box (west, south, east, north) from its corner."""
+    west, south, east, north = box
+    corners = np.array([[west, south], [east, south], [east, north], [west, north], [west, south]])
+    share = np.arange(points)[:, None] / points
+    return np.concatenate([start + (end - start) * share for start, end in pairwise(corners)])
 
 
 def unwrapped(bounds_deg: Extent) -> Extent:

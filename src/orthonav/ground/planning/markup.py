@@ -6,6 +6,7 @@ Files are of unknown origin: no DTD is read, hence no entities and no external f
 gpxpy are not used: neither limits the number and depth of elements, and 20 MB of empty elements
 would take gigabytes."""
 
+import logging
 import re
 import struct
 import zipfile
@@ -16,6 +17,7 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 from orthonav.core.errors import RouteError
+from orthonav.core.flight.telemetry_track import chosen
 from orthonav.ground.planning.record import (
     Height,
     HeightFrame,
@@ -37,6 +39,7 @@ _WPML_FRAMES: dict[str, HeightFrame] = {  # by `executeHeightMode`
     "realTimeFollowSurface": "agl",
 }
 _Place = tuple[float, float, Height | None]
+log = logging.getLogger(__name__)
 
 
 def read_markup(data: bytes, kind: str, root: str) -> Element:
@@ -95,24 +98,32 @@ def read_gpx(data: bytes) -> list[Route]:
     mean sea level."""
     root = read_markup(data, "GPX", "gpx")
     planned = [_gpx_route(each, "rtept") for each in root.iterfind("rte[rtept]")]
-    found = planned or [
-        _gpx_route(each, "trkseg/trkpt")
-        for each in root.iterfind("trk")
-        if each.find("trkseg/trkpt") is not None
-    ]
+    flown = [each for each in root.iterfind("trk") if each.find("trkseg/trkpt") is not None]
+    if planned and flown:
+        tracks = [text_of(each, "name") or "(no name)" for each in flown]
+        log.warning("%s", chosen("route", "rte", tracks, "routes come before tracks (trk)"))
+    found = planned or [_gpx_route(each, "trkseg/trkpt") for each in flown]
     if not found:
         raise RouteError("GPX holds no route (rte) and no track (trk) with positions")
     return found
 
 
 def _gpx_route(element: Element, points: str) -> Route:
-    waypoints, heights = [], []
+    places = []
     for point in element.iterfind(points):
         lat, lon = (parsed(point.get(name) or "", f"GPX {name}") for name in ("lat", "lon"))
-        waypoints.append((lat, lon))
-        height = text_of(point, "ele")
-        heights.append(None if height is None else Height(parsed(height, "GPX ele"), "amsl"))
-    return Route(tuple(waypoints), tuple(heights), name=text_of(element, "name"))
+        places.append((lat, lon, _height(point, "ele", "amsl")))
+    return _route(places, text_of(element, "name"))
+
+
+def _route(places: list[_Place], name: str | None) -> Route:
+    heights = tuple(height for _, _, height in places)
+    return Route(tuple((lat, lon) for lat, lon, _ in places), heights, name=name)
+
+
+def _height(element: Element, tag: str, frame: HeightFrame | None) -> Height | None:
+    text = text_of(element, tag)
+    return None if text is None else Height(parsed(text, tag), frame)
 
 
 def read_kmz(data: bytes) -> list[Route]:
@@ -146,10 +157,14 @@ def _chosen_members(members: list[str]) -> list[str]:
 def read_kml(data: bytes) -> list[Route]:
     root = read_markup(data, "KML", "kml")
     found = [route for mark in root.iter("Placemark") for route in _kml_routes(mark)]
+    links = [each.findtext(".//href") or "?" for each in root.iter("NetworkLink")]
+    linked = f"; files that it links to are not read: {', '.join(links)}" if links else ""
+    if found and linked:
+        log.warning("lines of the KML are its own%s", linked)
     if not found:
         dji = "; it is the template of a DJI mission: give its waylines.wpml, or the whole KMZ"
         hint = dji if root.find(".//missionConfig") is not None else ""
-        raise RouteError(f"KML holds no LineString and no gx:Track{hint}")
+        raise RouteError(f"KML holds no LineString and no gx:Track{hint}{linked}")
     return found
 
 
@@ -160,11 +175,7 @@ def _kml_routes(mark: Element) -> list[Route]:
         if element.tag in ("LineString", "Track")
         for place in (_line(element) if element.tag == "LineString" else _track(element))
     ]
-    if not places:
-        return []
-    heights = tuple(height for _, _, height in places)
-    waypoints = tuple((lat, lon) for lat, lon, _ in places)
-    return [Route(waypoints, heights, name=text_of(mark, "name"))]
+    return [_route(places, text_of(mark, "name"))] if places else []
 
 
 def _line(element: Element) -> Iterator[_Place]:
@@ -221,17 +232,8 @@ def _waylines(folder: Element) -> Iterator[Route]:
     require_few_waypoints(len(marks))
     marks.sort(key=lambda mark: parsed(text_of(mark, "index") or "", "WPML index"))
     if marks:
-        heights = tuple(_wpml_height(mark, frame) for mark in marks)
-        yield Route(tuple(map(_wpml_latlon, marks)), heights, name=text_of(folder, "waylineId"))
-
-
-def _wpml_latlon(mark: Element) -> tuple[float, float]:
-    values = (mark.findtext("Point/coordinates") or "").strip().split(",")
-    lon, lat = (parsed(value, "WPML position") for value in values[:2])
-    return lat, lon
-
-
-def _wpml_height(mark: Element, frame: HeightFrame | None) -> Height | None:
-    """The height that is flown; the third coordinate of the point is not."""
-    text = text_of(mark, "executeHeight")
-    return None if text is None else Height(parsed(text, "WPML executeHeight"), frame)
+        texts = [text_of(mark, "Point/coordinates") or "" for mark in marks]
+        points = [_kml_place(text.split(","), None, text) for text in texts]
+        heights = [_height(mark, "executeHeight", frame) for mark in marks]  # that are flown
+        places = [(*point[:2], height) for point, height in zip(points, heights, strict=True)]
+        yield _route(places, text_of(folder, "waylineId"))

@@ -263,11 +263,16 @@ def read_wpl(data: bytes) -> list[Route]:
         items = list(_wpl_items(lines))
     except TableError as error:
         raise RouteError(f"waypoint file cannot be read ({error})") from error
-    home = None
-    if version[2] == "110" and items and items[0].number == 0 and items[0].command in _HOMES:
-        first, *items = items
-        home = first if _has_place(first) else None
-    return [route_of(items, home)]
+    if version[2] == "120" or not items or items[0].number or items[0].command not in _HOMES:
+        return [route_of(items, None)]
+    first, *rest = items
+    if first.frame != 0 and first.command == WAYPOINT and _has_place(first):
+        said = "item 0 is flown to, as it is in frame %d: a home position is in 0"
+        log.warning(said, first.frame)
+        return [route_of(items, None)]
+    if any((each.frame, each.height_m) == (0, first.height_m) for each in rest):
+        log.warning("item 0 is taken as the home position, which is not flown to")
+    return [route_of(rest, first if _has_place(first) else None)]
 
 
 def _wpl_items(lines: Iterator[str]) -> Iterator[MissionItem]:

@@ -55,6 +55,12 @@ _BROKEN = (
 
 
 def _routes_of(plain: dict[str, Any]) -> list[Route]:
+    if crs := plain.get("crs"):  # of GeoJSON before RFC 7946
+        name = str(crs["properties"].get("name"))
+        if not re.search(r"(CRS84h?|:4326|:4979)$", name):
+            raise RouteError(
+                f"GeoJSON is in {name:.60}: convert it to WGS 84 (ogr2ogr -t_srs EPSG:4326)"
+            )
     found: list[Route] = []
     for geometry, properties in _geometries(plain):
         kind = geometry.get("type")
@@ -254,11 +260,21 @@ def read_route(path: Path) -> Route:
     try:
         found = _READERS[suffix](data)
         route = _chosen(found, name)
+        _require_degrees(route)
     except RouteError as error:
         raise RouteError(f"{error}: {path}") from error
     except _BROKEN as error:
         raise RouteError(f"route cannot be read ({described(error)}): {path}") from error
     return route
+
+
+def _require_degrees(route: Route) -> None:
+    in_radians = all(abs(lat) < 1.6 and abs(lon) < 3.2 for lat, lon in route.waypoints)
+    if in_radians or (0.0, 0.0) in route.waypoints:
+        raise RouteError(
+            "waypoints lie at or around 0, 0, in the sea: give degrees, not radians, and no "
+            "waypoints without a position"
+        )
 
 
 def _bytes_of(path: Path) -> bytes:

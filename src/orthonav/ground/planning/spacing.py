@@ -289,8 +289,11 @@ def _leg(
     lat, lon = frame.latlon_from_en(seen)
     heights = terrain(lat.ravel(), lon.ravel()).reshape(lat.shape)
     middle = heights[..., len(_VIEW) // 2]
-    if not np.isfinite(middle[:, 0]).all():
-        raise RouteError(f"the terrain does not cover leg {leg + 1} of the route")
+    if holes := float(np.isnan(middle[:, 0]).mean()):
+        raise RouteError(
+            f"the terrain has no height for {holes:.0%} of leg {leg + 1} of the route (a hole, or "
+            "beyond its edge)"
+        )
     if not np.isfinite(home_m):
         raise RouteError("the terrain does not cover the take-off position (the first waypoint)")
     flown = _flown_amsl_m(route, leg, agl_m, shares, middle[:, 0], home_m)
@@ -331,7 +334,8 @@ def terrain_cautions(legs: list[LegProfile]) -> list[Caution]:
     low = [leg for leg in legs if leg.agl_m[0] < -_BELOW_GROUND_M]
     steep = [leg for leg in legs if leg.relief > MOST_RELIEF and leg not in low]
     if low:
-        found.append(Caution("ground", f"{_named(low)} would pass below the terrain"))
+        hint = "heights of one may be in feet, or of another datum"
+        found.append(Caution("ground", f"{_named(low)} would pass below the terrain: {hint}"))
     if steep:
         most = max(leg.relief for leg in steep)
         text = (
