@@ -307,7 +307,7 @@ def test_pixels_that_are_not_square(recorded):
         CameraError, match=r"2\.000 times as wide as high, those of the camera 1\.0"
     ):
         open_source(recorded, options(recorded))
-    camera_file(recorded.parent / "camera.json", fx_px=30.0)
+    camera_file(recorded.parent / "camera.json", fx_px=30.0, unusual=True)
     assert open_source(recorded, options(recorded)).camera.fx_px == 30
 
 
