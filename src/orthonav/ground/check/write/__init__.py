@@ -35,8 +35,6 @@ from orthonav.ground.check.write.wording import (
 from orthonav.ground.report import BY_UNIT, metres_text, to_plain
 from orthonav.ground.report.imagery import Box, Grey, Mask, SheetImagery, webp
 from orthonav.ground.report.page import (
-    FOLDER,
-    LIST,
     data_url,
     joined_scripts,
     leaflet_files,
@@ -48,15 +46,7 @@ from orthonav.ground.report.page import (
 PAGE, JSON, TIF, GEOJSON = "index.html", "check.json", "check.tif", "check.geojson"
 _SIDECAR = "check.tif.aux.xml"
 """Written by GIS programs that open the raster."""
-_OURS = {
-    *(PAGE, JSON, TIF, GEOJSON, _SIDECAR, FOLDER, f"{FOLDER}/{LIST}"),
-    # Of checks by earlier versions.
-    *(
-        f"{FOLDER}/{name}.{kind}"
-        for name in ("map", "profile", "envelope")
-        for kind in ("svg", "png")
-    ),
-}
+_OURS = {PAGE, JSON, TIF, GEOJSON, _SIDECAR}
 _EXTRAS = {"rasterio": "geo", "shapely": "geo", "jinja2": "report"}
 PACKAGE = "orthonav.ground.check.write"
 _SHARED = ("format.js", "plane.js", "chart.js")
