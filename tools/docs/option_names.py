@@ -22,7 +22,8 @@ def command_parser(name: str) -> argparse.ArgumentParser:
     """The parser of one command, with all its arguments."""
     for action in _parser([name, "--help-all"])._actions:
         if isinstance(action, argparse._SubParsersAction):
-            return action.choices[name]
+            parser: argparse.ArgumentParser = action.choices[name]
+            return parser
     raise LookupError(name)
 
 
