@@ -1,5 +1,6 @@
 """How Sphinx builds the documentation site (`make docs`). Warnings are errors there."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -47,8 +48,14 @@ def _readable(_app, _what, _name, _obj, _options, lines):
         lines[row] = "`".join(pieces)
 
 
+def _of_the_site(_app, _page, source):
+    """Directives are comments in the pages, so that nothing of them is seen in the repository."""
+    source[0] = re.sub(r"<!-- site\n(.*?)\n-->", r"\1", source[0], flags=re.DOTALL)
+
+
 def setup(app):
-    """Tell Sphinx what to do with docstrings."""
+    """Tell Sphinx what to do with pages and docstrings."""
+    app.connect("source-read", _of_the_site)
     app.connect("autodoc-process-docstring", _readable)
 
 

@@ -49,7 +49,7 @@ def test_the_demo(small_demo, tmp_path, capsys, names_in):
     metrics = json.loads((out / "demo.json").read_text())
     assert metrics["n_views"] > 7 and metrics["coverage"] > 0.9
     page = (out / "report" / "index.html").read_text()
-    assert "data:image/png;base64," in page
+    assert "data:image/svg+xml;base64," in page
     assert {"index.html", "figures/map.svg", "figures/map.png"} <= set(names_in(out / "report"))
     linked = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?([^"\'>)\s]{1,40})', page)
     assert linked and all(link.startswith(("data:", "#")) for link in linked)

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from option_names import PAGE, with_options
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -32,6 +33,19 @@ def test_links_lead_somewhere(page):
         target = (page.parent / name).resolve() if name else page
         assert target.is_file(), f"{link} leads nowhere"
         assert not heading or heading in anchors(target), f"{link}: no such heading"
+
+
+def test_reference_pages_say_in_the_repository_what_the_site_shows():
+    """Directives, which only the site understands, are comments; every name stands in the text."""
+    assert with_options(PAGE.read_text("utf-8")) == PAGE.read_text("utf-8"), (
+        "tools/docs/option_names.py"
+    )
+    for page in PAGES:
+        text = page.read_text("utf-8")
+        seen = re.sub(r"<!-- site\n.*?\n-->", "", text, flags=re.DOTALL)
+        assert not re.search(r"^```\{", seen, re.MULTILINE), page
+        for name in re.findall(r"^\.\. auto\w+:: orthonav\.(\w+)", text, re.MULTILINE):
+            assert re.search(rf"`{name}\b", seen), f"{page}: {name}"
 
 
 def test_every_page_is_in_the_contents():

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from console import check_page, read_steps
+from console import check_page, read_steps, update_page
 
 from orthonav.cli import _parser
 
@@ -62,6 +62,28 @@ def test_every_command_is_understood(page, monkeypatch):
     assert count > 5
 
 
+def shown_commands(page):
+    """Calls of orthonav in the blocks of a page."""
+    text = re.sub(r"\\\n\s*", " ", page.read_text("utf-8"))
+    blocks = re.findall(
+        r"^```(?!text).*?^```|(?<=\n\n)(?:    .*\n)+", text, re.MULTILINE | re.DOTALL
+    )
+    for line in "\n".join(blocks).splitlines():
+        if re.match(r" *orthonav [a-z]", line):
+            yield from (words[1:] for words in calls(line) if words[0] == "orthonav")
+
+
+def test_every_command_of_every_page_is_understood_as_it_stands():
+    """What follows a command is a comment of the shell, so that a line can be copied."""
+    pages = [ROOT / "README.md", ROOT / "PYPI.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    count = 0
+    for page in pages:
+        for words in shown_commands(page):
+            assert _parser(words).parse_args(words).command == words[0], f"{page}: {words}"
+            count += 1
+    assert count > 60
+
+
 def test_commands_of_experiments_are_understood():
     from experiments.paper.__main__ import _parser as experiments_parser
 
@@ -74,6 +96,24 @@ def test_commands_of_experiments_are_understood():
     assert len(found) == 2
     for arguments in found:
         assert experiments_parser().parse_args(arguments).out == Path("paper")
+
+
+def test_numbers_of_output_that_is_shown_in_part_are_renewed_too(tmp_path):
+    """Otherwise two outputs of one run do not fit together."""
+    page = tmp_path / "page.md"
+    command = "printf 'head\\n40 found, 3 not\\nmean 1.5 m; of all\\nend\\n'"
+    shown = f"```bash\n{command}\n```\n\n```text\n{{}}\n```\n"
+    page.write_text(shown.format("...\n39 found, 4 not\nmean 22 m ...\n..."))
+    update_page(page, tmp_path / "run")
+    assert page.read_text() == shown.format("...\n40 found, 3 not\nmean 1.5 m ...\n...")
+
+
+def test_one_run_gives_the_same_counts_wherever_the_operator_sees_it():
+    text = (ROOT / "docs" / "tutorials" / "operator.md").read_text("utf-8")
+    localized = re.search(r"views: (\d+) confident .* (\d+) of low confidence", text)
+    evaluated = re.search(r"^fixes +\d+ +(\d+) +\d+ +(\d+)", text, re.MULTILINE)
+    assert localized and evaluated and localized.groups() == evaluated.groups()
+    assert f"none of {localized[1]} " in text and f"No error in {localized[1]} fixes" in text
 
 
 def test_the_example_that_is_shown_is_the_example():

@@ -466,8 +466,10 @@ HEAD = """# Results of the paper's experiments
 
 Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit. [The paper's
 experiments](paper.md) has the protocol, the scenes and the discussion. Generated landscapes: seed
-1.
+1. `python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds, rules
+of position, and errors of heading and height.
 """
+ONLY_IN_REPORTS = ("Accepted at", "Rules of position", "Accuracy at 15 m, %, by")
 
 
 def page(rows: Sequence[Result]) -> str:
@@ -477,7 +479,8 @@ def page(rows: Sequence[Result]) -> str:
         found = [row for row in rows if row.plain["setting"]["name"] == name]
         if found:
             text.append(f"## The {name} setting\n")
-            text += [table.markdown() for table in tables(found)]
+            shown = [each for each in tables(found) if not each.title.startswith(ONLY_IN_REPORTS)]
+            text += [table.markdown() for table in shown]
     text.append(agreement().markdown())
     return "\n".join(text)
 

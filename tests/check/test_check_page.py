@@ -1,10 +1,12 @@
 """The page of a check is complete, requests nothing, and works in a real browser."""
 
+import base64
 import hashlib
 import json
 import re
 from dataclasses import replace
 
+import cv2
 import made_check
 import numpy as np
 import pytest
@@ -56,6 +58,14 @@ def test_nothing_is_asked_for(page):
         assert "@import" not in text
         assert all(each.startswith("data:") for each in re.findall(r"url\(([^)]*)\)", text))
     assert "sourceMappingURL" not in "".join(page.texts["script"])
+
+
+def test_the_map_is_transparent_where_there_is_no_imagery(page):
+    """So that its border is as dark as the page of a reader in dark mode."""
+    sources = [attributes.get("src", "") for tag, attributes in page.elements if tag == "img"]
+    data = base64.b64decode(sources[0].removeprefix("data:image/webp;base64,"))
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(image[..., 3])) == {0, 255}
 
 
 def all_cells(cells):

@@ -176,8 +176,6 @@ def test_shapes_lie_where_things_are(written, layers):
 
 def test_an_earlier_check_is_replaced(folder, opened, frame):
     (folder / "check.tif.aux.xml").write_text("of a GIS program")
-    (folder / "figures").mkdir()
-    (folder / "figures" / "profile.svg").write_text("of an earlier version")
     write_check(made_check.nearly_empty(frame), opened, folder)
     assert {path.name for path in folder.iterdir()} == FILES
 

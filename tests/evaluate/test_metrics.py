@@ -120,13 +120,17 @@ def test_confident_and_wrong_is_distinguished_from_a_wrong_guess() -> None:
     """Wrong is above 35 m, the radius of the evaluation and the radius that the fix states."""
     guess = measure(three_fixes())
     assert (guess.n_confident, guess.n_confident_wrong) == (1, 0)
-    assert verdict(guess).startswith("No confident fix is wrong: none of 1 has an error above 35 m")
+    assert verdict(guess).startswith(
+        "No confident fix is wrong: none of 1 is off by more than 35 m or its"
+    )
     assert "largest 5.0 m" in verdict(guess)
     results = [fix("a", (0.0, 40.0), confidence=0.95), fix("b", (0.0, 30.0), confidence=0.95)]
     wrong = compare(truth_of(TRUTH_EN_M), results)
     assert worst_views(replace(wrong, errors_m=np.array([40.0, 50.0]))) == [1, 0]
     assert worst_views(replace(wrong, errors_m=np.array([36.0, 35.0]))) == [0, 1]
-    assert verdict(measure(wrong)).startswith("1 of 2 confident fixes is WRONG, by more than 35 m")
+    assert verdict(measure(wrong)).startswith(
+        "1 of 2 confident fixes is WRONG, off by more than 35 m or its radius"
+    )
     wider = replace(wrong, own_radius_m=np.array([45.0, 45.0]))
     assert measure(wider).n_confident_wrong == measure(wrong, 41.0).n_confident_wrong == 0
     none = measure(compare(truth_of(TRUTH_EN_M), [fix("a", (0.0, 0.0), confidence=0.5)]))

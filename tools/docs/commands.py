@@ -10,14 +10,13 @@ from typing import Any
 
 from docutils import nodes
 from docutils.statemachine import StringList
+from option_names import command_parser, shown_actions
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
-from orthonav.cli import COMMANDS, _parser
+from orthonav.cli import COMMANDS
 
 log = logging.getLogger(__name__)
-EVERYWHERE = ("--help", "--help-all", "--verbose", "--quiet")
-"""Options of every command: described once, at the top of the page."""
 USAGE_COLUMNS = 84
 
 
@@ -51,20 +50,11 @@ class Command(SphinxDirective):
         return holder.children
 
 
-def command_parser(name: str) -> argparse.ArgumentParser:
-    """The parser of one command, with all its arguments."""
-    for action in _parser([name, "--help-all"])._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            return action.choices[name]
-    raise LookupError(name)
-
-
 def _markdown(name: str, text: str, parser: argparse.ArgumentParser) -> Iterator[str]:
     yield from (f"{text[0].upper()}{text[1:]}.", "", "```text", _usage(parser), "```", "")
     yield from (f":::{{program}} orthonav {name}", ":::", "")
     for group in parser._action_groups:
-        actions = [each for each in group._group_actions if each.help != argparse.SUPPRESS]
-        actions = [each for each in actions if not set(each.option_strings) & set(EVERYWHERE)]
+        actions = shown_actions(group._group_actions)
         if not actions:
             continue
         usual = group.title in ("options", "positional arguments")

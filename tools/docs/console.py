@@ -184,14 +184,31 @@ def check_page(page: Path, folder: Path, steps: list[Step] | None = None) -> lis
 
 
 def update_page(page: Path, folder: Path) -> None:
-    """Run a tutorial and write what it printed; output shown in part stays as it is."""
+    """Run a tutorial and write what it printed; what is left out stays left out."""
     _link_checkout(folder)
     lines = page.read_text("utf-8").splitlines()
     wanted = [step for step in read_steps(page.read_text("utf-8")) if step.is_run]
     for step, printed in reversed(list(zip(wanted, run_steps(wanted, folder), strict=True))):
-        if step.shown and not any(line.endswith(ELIDED) for line in step.shown):
+        if any(line.endswith(ELIDED) for line in step.shown):
+            lines[step.first : step.end] = _renewed(step.shown, printed.lines)
+        elif step.shown:
             lines[step.first : step.end] = printed.lines
     page.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def _renewed(shown: tuple[str, ...], lines: tuple[str, ...]) -> Iterator[str]:
+    """Lines shown in part, with what was printed now; one that is not found stays as it is."""
+    for line in shown:
+        found = [each for each in lines if re.fullmatch(_pattern(line), masked(each) + "\n")]
+        found.sort(key=lambda each: sum(map(str.__eq__, each.split(), line.split())))
+        if line.strip() == ELIDED or not found:
+            yield line
+        elif line.endswith(f" {ELIDED}"):
+            start = masked(line.removesuffix(f" {ELIDED}"))
+            ends = [end for end in range(len(found[-1]) + 1) if masked(found[-1][:end]) == start]
+            yield f"{found[-1][: ends[-1]].rstrip()} {ELIDED}"
+        else:
+            yield found[-1]
 
 
 def main() -> int:

@@ -197,16 +197,13 @@ def unknown_ground_text(relief: str | None) -> list[str]:
 
 def recipe_text(recipe: dict[str, Any]) -> str:
     parts = [str(recipe.get("method"))]
-    for name in ("represent", "embed"):
-        found = recipe.get(name)
+    for name, key in (("tiles", "embed"), ("images", "represent")):
+        found = recipe.get(key)
         variant = dict(found) if isinstance(found, dict) else {}
         title = variant.pop("name", "?")
-        values = ",".join(
-            f"{key}={value:g}" if isinstance(value, int | float) else f"{key}={value!r}"
-            for key, value in variant.items()
-        )
-        parts.append(f"{name} {title}:{values}" if values else f"{name} {title}")
-    return ", ".join(parts) + f", overlap {recipe.get('overlap')}"
+        values = ", ".join(f"{key} {value}" for key, value in variant.items())
+        parts.append(f"{name}: {title} ({values})" if values else f"{name}: {title}")
+    return "; ".join([*parts, f"overlap {recipe.get('overlap')}"])
 
 
 def imagery_text(imagery: Iterable[Mapping[str, Any]]) -> str:

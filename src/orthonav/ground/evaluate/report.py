@@ -398,7 +398,7 @@ def reliability_picture(calibration: ConfidenceCalibration) -> Drawing:
         else:
             above.text(0.5, 0.5, "no fix states a confidence", ha="center", bbox=BACKING)
         above.set(xlim=(-0.015, 1.015), ylim=(-0.02, 1.04))
-        above.set(ylabel="fraction with an error\nwithin the stated radius")
+        above.set(ylabel="fraction off by less\nthan the radius")
         counts = [b.n_fixes for b in calibration.bins]
         middles = [(b.lower + b.upper) / 2 for b in calibration.bins]
         below.bar(middles, counts, width=0.094, color="#9DB9CC")

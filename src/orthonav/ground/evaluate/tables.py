@@ -172,7 +172,7 @@ def gnss_to_json(found: GnssMetrics) -> Plain:
 
 def verdict(metrics: Metrics) -> str:
     confident, wrong = metrics.n_confident, metrics.n_confident_wrong
-    above = f"{metrics.wrong_above_m:g} m and the stated radius"
+    above = f"off by more than {_far_text(metrics.wrong_above_m)}"
     if not confident:
         guesses = metrics.n_fixes
         return f"No fix is confident: rely on no position ({guesses} are best guesses)."
@@ -182,10 +182,13 @@ def verdict(metrics: Metrics) -> str:
         f"{measure_text(metrics.of_confident.ape.max_m, ' m')}."
     )
     if not wrong:
-        none = f"none of {confident} has an error above {above}"
-        return f"No confident fix is wrong: {none} {errors}"
+        return f"No confident fix is wrong: none of {confident} is {above} {errors}"
     verb = "is" if wrong == 1 else "are"
-    return f"{wrong} of {confident} confident fixes {verb} WRONG, by more than {above} {errors}"
+    return f"{wrong} of {confident} confident fixes {verb} WRONG, {above} {errors}"
+
+
+def _far_text(far_m: float) -> str:
+    return f"{far_m:g} m or its radius, whichever is larger"
 
 
 def wrong_bound_text(metrics: Metrics) -> str:
@@ -234,8 +237,8 @@ def confidence_text(metrics: Metrics) -> str:
     default = f" ({n_default} state no radius; {metrics.radius_m:g} m is used)" if n_default else ""
     stated = "1 fix states" if calibration.n_fixes == 1 else f"{calibration.n_fixes} fixes state"
     return (
-        f"{stated} a mean confidence of {calibration.mean_confidence:.3f}; the fraction within the "
-        f"stated radius is {calibration.share_right:.3f}{default}; "
+        f"{stated} a mean confidence of {calibration.mean_confidence:.3f}; the fraction off by "
+        f"less than the radius is {calibration.share_right:.3f}{default}; "
         f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
     )
 
@@ -396,10 +399,10 @@ def track_rows(track: TrackMetrics) -> list[tuple[str, str]]:
             f"{without}; from the first confirmed fix on {after_first}",
         ),
         (
-            "false locks",
-            f"{track.n_false_locks}, the longest {_unit(track.false_lock_longest_s, 's')}; "
-            f"{track.n_confident_wrong} confident or tracking views wrong by more than "
-            f"{track.far_m:g} m and their own radius",
+            "on wrong positions",
+            f"{track.n_false_locks} times, the longest {_unit(track.false_lock_longest_s, 's')}; "
+            f"{track.n_confident_wrong} confident or tracking views, each off by more than "
+            f"{_far_text(track.far_m)}",
         ),
         ("ahead of the ground truth", spread_text(track.along)),
         ("right of the ground truth", spread_text(track.across)),

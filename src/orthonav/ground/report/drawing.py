@@ -28,7 +28,7 @@ LOW_CONFIDENCE = "#E69F00"
 """Of best guesses, as confident fixes have the colour `RIGHT`."""
 DPI = 220
 """Resolution of the PNG: twice that of a screen, and enough for a paper."""
-MOST_POINTS = 20_000
+MOST_POINTS = 5_000
 """Lines of more points are rasterized in the SVG, which would be too large to open."""
 OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
 BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}

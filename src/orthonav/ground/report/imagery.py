@@ -36,6 +36,7 @@ Mask = NDArray[np.bool_]
 Box = tuple[float, float, float, float]
 """West, south, east, north in metres, in the plane of a sheet."""
 _QUICK = [int(cv2.IMWRITE_PNG_COMPRESSION), 1]
+_SMALL = [int(cv2.IMWRITE_WEBP_QUALITY), 70]
 
 
 @dataclass(frozen=True)
@@ -108,14 +109,20 @@ def rectified(
 
 
 def png(grey: Grey, valid: Mask) -> bytes:
-    picture = grey
-    if not valid.all():
-        picture = np.dstack([grey, grey, grey, valid.astype(np.uint8) * 255])
+    picture = grey if valid.all() else _transparent(grey, valid)
     return bytes(cv2.imencode(".png", picture, _QUICK)[1].tobytes())
 
 
-def jpeg(grey: Grey, quality: int = 95) -> bytes:
-    return bytes(cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])[1].tobytes())
+def webp(grey: Grey, valid: Mask) -> bytes:
+    return bytes(cv2.imencode(".webp", _transparent(grey, valid), _SMALL)[1].tobytes())
+
+
+def _transparent(grey: Grey, valid: Mask) -> Grey:
+    return np.dstack([grey, grey, grey, valid.astype(np.uint8) * 255])
+
+
+def jpeg(grey: Grey) -> bytes:
+    return bytes(cv2.imencode(".jpg", grey)[1].tobytes())
 
 
 def shrunk(grey: Grey, max_px: int) -> Grey:

@@ -26,6 +26,12 @@ LIST = "orthonav.sha256"
 _LONGEST_NAME = 80
 _PX_PER_IN = 110
 """Pixels of a page per inch of a drawing: text of 10 points becomes 15 pixels high."""
+_DARK = """
+@media (prefers-color-scheme: dark) {
+#figure_1 { filter: invert(1) hue-rotate(180deg) }
+[clip-path] > image { filter: brightness(.45) invert(1) } }
+"""
+"""Style of a drawing in a page: lightness is inverted in dark mode, imagery only darkened."""
 _MODULE_SYNTAX = re.compile(r"^(?:export |import .*$)", re.MULTILINE)
 _IMAGE = re.compile(r"url\((images/[\w-]+\.png)\)")
 _SOURCE_MAP = re.compile(r"^//# sourceMappingURL=.*$", re.MULTILINE)
@@ -48,7 +54,8 @@ class Figure:
 
     @property
     def data_url(self) -> str:
-        return data_url(self.drawing.png, "image/png")
+        svg = self.drawing.svg.replace("</style>", f"{_DARK}</style>", 1)
+        return data_url(svg.encode("utf-8"), "image/svg+xml")
 
 
 def render(

@@ -33,10 +33,8 @@ from orthonav.ground.check.write.wording import (
     verdict_sentence,
 )
 from orthonav.ground.report import BY_UNIT, metres_text, to_plain
-from orthonav.ground.report.imagery import Box, Grey, SheetImagery, jpeg
+from orthonav.ground.report.imagery import Box, Grey, Mask, SheetImagery, webp
 from orthonav.ground.report.page import (
-    FOLDER,
-    LIST,
     data_url,
     joined_scripts,
     leaflet_files,
@@ -48,15 +46,7 @@ from orthonav.ground.report.page import (
 PAGE, JSON, TIF, GEOJSON = "index.html", "check.json", "check.tif", "check.geojson"
 _SIDECAR = "check.tif.aux.xml"
 """Written by GIS programs that open the raster."""
-_OURS = {
-    *(PAGE, JSON, TIF, GEOJSON, _SIDECAR, FOLDER, f"{FOLDER}/{LIST}"),
-    # Of checks by earlier versions.
-    *(
-        f"{FOLDER}/{name}.{kind}"
-        for name in ("map", "profile", "envelope")
-        for kind in ("svg", "png")
-    ),
-}
+_OURS = {PAGE, JSON, TIF, GEOJSON, _SIDECAR}
 _EXTRAS = {"rasterio": "geo", "shapely": "geo", "jinja2": "report"}
 PACKAGE = "orthonav.ground.check.write"
 _SHARED = ("format.js", "plane.js", "chart.js")
@@ -69,11 +59,8 @@ DOWNLOADS = {
     "check.json": "JSON: all results and conditions",
 }
 MAX_SIDE_PX = 1500
-"""Of the image of the map: 0.5 to 1.5 MB."""
+"""Of the image of the map: 0.3 to 1 MB."""
 _MARGIN = 0.04
-_EMPTY = 226
-"""Grey level without imagery, as light as a light page."""
-_QUALITY = 60
 
 
 def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
@@ -130,7 +117,7 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
     about = result.about
     script, style = load_leaflet()
     scripts = (script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
-    image = map_image(opened, visible_box(result.cells))
+    image = webp(*map_image(opened, visible_box(result.cells)))
     values = {
         "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
         "kind": "Check before take-off",
@@ -150,7 +137,7 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "downloads": DOWNLOADS,
         "checked": _checked(result, json_sha256),
         "data": _page_data(result),
-        "image": data_url(jpeg(image, _QUALITY), "image/jpeg"),
+        "image": data_url(image, "image/webp"),
     }
     style += static_text("check.css", PACKAGE)
     return render(PACKAGE, "page.html", values, style=style, scripts=scripts)
@@ -213,12 +200,10 @@ def visible_box(cells: Cells) -> Box:
     )
 
 
-def map_image(opened: MapFile, box: Box) -> Grey:
-    """The imagery of the map within a box, north up."""
+def map_image(opened: MapFile, box: Box) -> tuple[Grey, Mask]:
+    """The imagery of the map within a box, north up, and where there is some."""
     sheet = SheetImagery(opened)
     west, south, east, north = box
     gsd_m = max(sheet.grid.gsd_m, max(east - west, north - south) / MAX_SIDE_PX)
     size = max(1, round((east - west) / gsd_m)), max(1, round((north - south) / gsd_m))
-    grey, valid = sheet.crop(box, size)
-    grey[~valid] = _EMPTY
-    return grey
+    return sheet.crop(box, size)

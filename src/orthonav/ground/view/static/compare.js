@@ -256,7 +256,7 @@ export function sentence(store, i) {
   if (Number.isFinite(c.level[i])) parts.push(`protection level ${metres(c.level[i])} at a risk of ${c.risk[i]}`);
   if (Number.isFinite(c.a[i])) parts.push(`σ ${metres(c.a[i])}`);
   if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} above ground`);
-  if (Number.isFinite(c.ms[i])) parts.push(`${number(c.ms[i], 0)} ms`);
+  if (Number.isFinite(c.ms[i])) parts.push(`localized in ${number(c.ms[i], 0)} ms`);
   if (health && health.level !== "OK") parts.push(`health ${health.level}: ${health.reasons.join(", ")}`);
   if (c.err2) parts.push(`second run: ${second(store, i)}`);
   return parts.join(", ");

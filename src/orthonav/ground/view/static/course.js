@@ -9,6 +9,7 @@ import { CONFIDENT } from "./store.js";
 const MANY = 800;
 const BAND = 9;
 const GAP = 5;
+const NAME = 14; // height of the line above a panel that names it
 const HEIGHTS = { tracking: 1, alone: 1, searching: 0.75, coasting: 0.5, lost: 0.25, none: 0.15 };
 const FLOOR_M = 0.1; // a log axis has no zero
 const TIME_STEPS_S = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200];
@@ -56,9 +57,9 @@ export class Course extends Chart {
     const bands = store.health.length ? 2 : 1;
     this.#alarms(context);
     const ground = this.box.clientHeight - 16 - bands * (BAND + 2) - GAP;
-    const split = Math.round(ground * 0.62);
-    this.#errors(context, 4, split);
-    this.#confidence(context, split + GAP + 4, ground);
+    const split = NAME + Math.round((ground - 2 * NAME - GAP) * 0.62);
+    this.#errors(context, NAME, split);
+    this.#confidence(context, split + GAP + NAME, ground);
     this.#states(context, ground + GAP);
     if (bands > 1) this.#health(context, ground + GAP + BAND + 2);
     this.#axis(context);
@@ -113,15 +114,16 @@ export class Course extends Chart {
     const y = (v) => bottom - Math.max(share(v), 0) * (bottom - top);
     this.rules(context, [this.store.run.radius_m], y, colour("wrong"));
     const decades = [0.1, 1, 10, 100, 1000, 10000].filter((v) => share(v) >= 0 && share(v) <= 1);
-    this.rules(context, decades, y, colour("line"), { text: (v) => metres(v) });
+    const close = y(1) - y(10) < NAME; // texts would touch
+    this.rules(context, decades, y, colour("line"), { text: (v) => (close && Math.log10(v) % 2 ? "" : metres(v)) });
     const positive = c.a.map((v) => (v > 0 ? v : NaN));
     this.area(context, this.places, null, positive, y, colour("shade"), bottom);
     if (withGnss) this.#points(context, gnss, (v) => Math.max(y(v), top), () => "gnss");
     if (c.err2) this.#points(context, c.err2, (v) => Math.max(y(v), top), () => "second");
     this.#points(context, c.err, (v) => Math.max(y(v), top), (i) => (c.wrong[i] ? "wrong" : this.store.trust(i)));
-    const text = withTruth ? "error; shaded: stated 1 σ" : "stated 1 σ";
+    const text = withTruth ? `error; shaded: stated 1 σ; line: ${metres(this.store.run.radius_m)}` : "stated 1 σ";
     const more = withTruth ? "; green: error of GNSS" : "; green: GNSS from the map";
-    this.label(context, withGnss ? text + more : text, LEFT + 5, top + 10);
+    this.label(context, withGnss ? text + more : text, LEFT + 5, top - 4);
   }
 
   #confidence(context, top, bottom) {
@@ -129,7 +131,7 @@ export class Course extends Chart {
     this.rules(context, [0, 1], y, colour("line"));
     this.rules(context, [CONFIDENT], y, colour("soft"), { dash: [4, 3], text: String });
     this.#points(context, this.store.columns.conf, y, (i) => this.store.trust(i));
-    this.label(context, "confidence", LEFT + 5, bottom - 3);
+    this.label(context, "confidence", LEFT + 5, top - 4);
   }
 
   #states(context, top) {

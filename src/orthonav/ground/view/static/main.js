@@ -187,7 +187,7 @@ function drawFigures(store) {
   rows.push(["low confidence", ratio(stats.fixes - stats.confident, count)], ["no fix", ratio(count - stats.fixes, count)]);
   if (stats.withTruth) {
     rows.push([`within ${metres(run.radius_m)}`, ratio(stats.right, stats.withTruth)]);
-    for (const [name, part] of [["CEP50", 0.5], ["CEP95", 0.95]]) {
+    for (const [name, part] of [["CEP50 of all fixes", 0.5], ["CEP95 of all fixes", 0.95]]) {
       rows.push([name, both.map((errors) => metres(quantile(errors, part))).join(" / ")]);
     }
     rows.push(["false fixes", stats.wrong]);
