@@ -148,6 +148,12 @@ def test_bands_of_one_scene_are_not_several_orthophotos(tmp_path, bands):
         Mosaic.open([tmp_path / "f"])
 
 
+def test_bands_given_one_by_one_are_named(tmp_path, caplog):
+    paths = [layer(tmp_path / f"B0{n}.tif", GREY.astype(np.uint16) * 20) for n in (2, 3)]
+    Mosaic.open(paths)
+    assert "imagery: using B02.tif, not B03.tif: of one place and date: they fill" in caplog.text
+
+
 def test_colours_of_a_scene_stand_for_its_bands(tmp_path, caplog):
     layer(tmp_path / "f" / "B02.tif")
     layer(tmp_path / "f" / "TCI.tif", SCENE)
@@ -272,7 +278,8 @@ def test_tile_stores_are_read_at_their_finest(tmp_path, driver, suffix):
     assert off.mean() < 6  # GDAL resamples into the store's own zoom levels
 
 
-def test_rows_of_tiles_that_count_from_the_north(tmp_path):
+@pytest.mark.parametrize("stated", [True, False])
+def test_rows_of_tiles_that_count_from_the_north(tmp_path, stated):
     if "mbtiles" not in raster_driver_extensions():
         pytest.skip("this GDAL has no MBTiles driver")
     transform = placed("EPSG:3857", size=200)
@@ -282,8 +289,9 @@ def test_rows_of_tiles_that_count_from_the_north(tmp_path):
     with closing(sqlite3.connect(path)) as store, store:
         store.execute("UPDATE tiles SET tile_row = tile_row - (1 << zoom_level)")
         store.execute("UPDATE tiles SET tile_row = -1 - tile_row")
-        store.execute("INSERT INTO metadata VALUES ('scheme', 'xyz')")
-    with pytest.raises(ImageryError, match=r"north \(scheme xyz\).*scheme tms"):
+        if stated:
+            store.execute("INSERT INTO metadata VALUES ('scheme', 'xyz')")
+    with pytest.raises(ImageryError, match=r"north \(xyz\).*scheme tms"):
         Mosaic.open([path])
 
 

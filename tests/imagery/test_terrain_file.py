@@ -168,6 +168,12 @@ def test_holes_stay_holes(make_dem, change, profile):
     assert error_m(dem) < 0.6
 
 
+@pytest.mark.parametrize("low_m, said", [(0.0, True), (-130.0, False)])
+def test_heights_of_0_are_doubted_unless_the_ground_reaches_the_sea(make_dem, caplog, low_m, said):
+    open_dem(make_dem(change=lambda heights: holes(0)(heights + low_m)), "msl")
+    assert ("heights of 0 beside others from 90 m on" in caplog.text) == said
+
+
 @pytest.mark.parametrize("posting_m", [10.0, 20.0])
 def test_a_stray_value_for_no_data_is_not_averaged(make_dem, posting_m):
     def change(heights):

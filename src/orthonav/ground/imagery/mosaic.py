@@ -31,7 +31,14 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import ImageryError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.ground.imagery.source import Source, open_sources, quiet, sources_in, unreadable
+from orthonav.ground.imagery.source import (
+    Source,
+    name_bands,
+    open_sources,
+    quiet,
+    sources_in,
+    unreadable,
+)
 from orthonav.ground.imagery.systems import at_epoch
 from orthonav.ground.planning.area import outline
 
@@ -283,6 +290,7 @@ class Mosaic:
                 sources += chain(*(sources_in(each, bands) for each in some))
             else:
                 sources += open_sources(some, bands=bands)
+                name_bands(sources)
         if epoch is not None:
             sources = at_epoch(sources, epoch)
         with rasterio.Env(**GDAL_OPTIONS):

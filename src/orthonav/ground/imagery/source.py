@@ -1,13 +1,15 @@
 """Inspection of an orthophoto file: usability, georeference, and the bands that are used."""
 
 import logging
+import math
 import re
+import sqlite3
 import threading
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -146,14 +148,27 @@ def sources_in(folder: Path, bands: tuple[int, ...] | None = None) -> list[Sourc
     return sources
 
 
-def _first_of_each_place(sources: Sequence[Source], folder: Path) -> list[Source]:
-    """In the order of preference, of one place and date only the first, which is in colours."""
+def name_bands(sources: Sequence[Source]) -> None:
+    """Warn where grey files given one by one are of one place and date, as bands of a scene are."""
+    for first, *others in _by_place(sources):
+        if others and len(first.bands) == 1:
+            names = [each.path.name for each in others]
+            why = "of one place and date: they fill its holes only, and bands are not joined"
+            log.warning("%s", chosen("imagery", first.path.name, names, why))
+
+
+def _by_place(sources: Sequence[Source]) -> list[list[Source]]:
     places: dict[Any, list[Source]] = {}
-    for each in sorted(sources, key=_preference):
+    for each in sources:
         place = each.crs, each.transform, each.width_px, each.height_px, each.date
         places.setdefault(place, []).append(each)
-    said = []
-    for first, *others in places.values():  # neighbouring packages share tiles of one name
+    return list(places.values())
+
+
+def _first_of_each_place(sources: Sequence[Source], folder: Path) -> list[Source]:
+    """In the order of preference, of one place and date only the first, which is in colours."""
+    said, places = [], _by_place(sorted(sources, key=_preference))
+    for first, *others in places:  # neighbouring packages share tiles of one name
         names = [each.path.name for each in others if each.path.name != first.path.name]
         if names and len(first.bands) == 1:
             raise ImageryError(
@@ -165,7 +180,7 @@ def _first_of_each_place(sources: Sequence[Source], folder: Path) -> list[Source
             said.append(chosen("imagery", first.path.name, names, "of one place and date"))
     if said:
         log.warning("%s (%d such places)", said[0], len(said))
-    return [first for first, *_ in places.values()]
+    return [first for first, *_ in places]
 
 
 def _preference(source: Source) -> tuple[object, ...]:
@@ -280,10 +295,10 @@ def _require_picture(path: Path, dataset: Any) -> None:
         raise UnfitError(
             f"this is a photograph: build the map from an orthophoto, and localize this: {path}"
         )
-    if dataset.tags().get("scheme") == "xyz":
+    if dataset.driver == "MBTiles" and _counts_from_north(path, dataset.tags()):
         raise ImageryError(
-            "rows of the MBTiles count from the north (scheme xyz), which GDAL takes as from the "
-            f"south: convert it to scheme tms: {path}"
+            "rows of the MBTiles count from the north (xyz), which GDAL takes as from the south: "
+            f"convert it to scheme tms: {path}"
         )
     if dataset.count > 1 or _is_indexed(dataset):
         return
@@ -295,6 +310,24 @@ def _require_picture(path: Path, dataset: Any) -> None:
     if named or 0 < len(values) < MIN_VALUES:
         why = f"by its name ({named[1]})" if named else f"of {len(values)} values where sampled"
         raise UnfitError(f"raster is a mask or another layer, not a picture, {why}: {path}")
+
+
+def _counts_from_north(path: Path, tags: Mapping[str, str]) -> bool:
+    """Whether rows of an MBTiles do, by its scheme, or as only they then lie within its bounds."""
+    if tags.get("scheme") == "xyz":
+        return True
+    try:
+        _, south, _, north = map(float, tags["bounds"].split(","))
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as file:
+            zoom, low, high = file.execute(
+                "SELECT zoom_level, MIN(tile_row), MAX(tile_row) FROM tiles "
+                "GROUP BY zoom_level ORDER BY zoom_level DESC LIMIT 1"
+            ).fetchone()
+    except (KeyError, ValueError, TypeError, sqlite3.Error):
+        return False
+    from_north = (1 - math.asinh(math.tan(math.radians((south + north) / 2))) / math.pi) / 2
+    row = from_north * 2**zoom
+    return not low <= 2**zoom - row <= high + 1 and low <= row <= high + 1
 
 
 def unwarped(path: Path, dataset: Any) -> str | None:

@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 BLOCK_PX = 256
 SAMPLE_PX = 512
 """Side of the overview from which units are judged."""
+COAST_M = 20.0  # heights of 0 beside no lower ground than this are doubted
 DATUM_TAG = "ORTHONAV_VERTICAL_DATUM"
 """In files that `orthonav fetch` wrote."""
 _UNITS = {
@@ -354,6 +355,14 @@ def _require_heights(path: Path, data: Any, datum: VerticalDatum) -> None:
         )
     if not sound.any():
         raise ImageryError(f"terrain file holds no height: {path}")
+    ground = heights[sound & (heights != 0)]
+    if (heights == 0).any() and ground.size and ground.min() > COAST_M:
+        log.warning(
+            "heights of 0 beside others from %.0f m on are taken as heights; if they are holes, "
+            "say so (gdal_edit.py -a_nodata 0): %s",
+            ground.min(),
+            path,
+        )
 
 
 def _unreadable(path: Path, error: Exception) -> ImageryError:
