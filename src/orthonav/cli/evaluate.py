@@ -15,7 +15,6 @@ from orthonav.cli.version import require_extras
 if TYPE_CHECKING:
     from orthonav.core.flight import FlightFolder
     from orthonav.core.mapfile.reader import MapFile
-    from orthonav.ground.evaluate.metrics import Metrics
     from orthonav.ground.evaluate.tables import FlightReport
 
 EXAMPLE = "fixes.jsonl --flight flight --map area.onav --report report"
@@ -47,30 +46,21 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.files import write_text
     from orthonav.core.mapfile import open_map
-    from orthonav.ground.evaluate.tables import (
-        covariance_verdict,
-        flights_to_json,
-        summary,
-        table,
-        total,
-        verdict,
-    )
+    from orthonav.ground.evaluate.tables import runs_to_json, text
 
     _check_options(options)
     opened = open_map(options.map) if options.map else None
     flights = _measured(options, opened)
-    whole = total(flights)
     if options.report:
-        _write_report(options.report, flights, whole, opened)
-    plain = flights_to_json(flights, whole)
+        _write_report(options.report, flights, opened)
+    plain = runs_to_json(flights)
     if options.metrics:
         write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
     with beside(options.metrics):
         if options.json:
             print_json(plain)
             return
-        print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
-        print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
+        print(text(flights))
         if options.report:
             print(f"report: {options.report / 'index.html'}")
 
@@ -152,9 +142,7 @@ def _flight_of(truth: Path) -> "FlightFolder | None":
     return None
 
 
-def _write_report(
-    out: Path, flights: list["FlightReport"], whole: "Metrics", opened: "MapFile | None"
-) -> None:
+def _write_report(out: Path, flights: list["FlightReport"], opened: "MapFile | None") -> None:
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.ground.evaluate.report import MadeFrom, write_report
@@ -167,7 +155,7 @@ def _write_report(
         command=" ".join(["orthonav", *sys.argv[1:]]),
         version=__version__,
     )
-    write_report(out, flights, made_from, whole=whole)
+    write_report(out, flights, made_from)
 
 
 def _view_command(options: argparse.Namespace, i: int) -> str:
