@@ -221,6 +221,7 @@ def test_one_photograph_is_placed_and_printed(run, tmp_path):
     Image.fromarray(seen(0)).save(path)
     one = ("localize", MAP, path, "--agl-m", 160, "--fov-deg", 43.6)
     code, out, err = run(*one, "--heading", "unknown")
+    assert re.search(r"protection +\d+ m, which .* with a probability of at most 0.001\n", out)
     assert code == 0 and "looks straight down is assumed" in err
     lat, lon = map(float, re.search(r"position +([\d.]+), ([\d.]+) ", out).groups())
     assert np.abs(np.subtract((lat, lon), PLACE) * [111e3, 76e3]).max() < 3
@@ -228,14 +229,18 @@ def test_one_photograph_is_placed_and_printed(run, tmp_path):
     code, out, err = run(*one, "--heading", "unknown", "--out", "-")
     (line,) = map(json.loads, out.splitlines())
     assert code == 0 and line["frame"] == "photo.png" and "1 view: " in err
+    noise = np.random.default_rng(1).integers(0, 255, seen(0).shape, np.uint8)
+    Image.fromarray(cv2.GaussianBlur(noise, (0, 0), 2)).save(tmp_path / "noise.png")
+    guess = run(*one[:2], tmp_path / "noise.png", *one[3:], "--heading", "unknown").out
+    assert re.search(r"protection +none: the place itself may be wrong .* above 0.001; more", guess)
     unknown = run(*one)
     assert "none: not a number: yaw_deg (missing_telemetry); give --heading unknown" in unknown.out
     plain = json.loads(run(*one, "--heading", "unknown", "--json").out)
     assert plain["fixes"] is None and plain["positions"][0]["lat_deg"] == pytest.approx(lat)
     both = run(*one, "--dem", path)
-    assert both[0] == 1 and "above ground of the views: give it or --dem" in both[2]
+    assert both[0] == 2 and "above ground of the views: give it or --dem" in both[2]
     refused = run("localize", MAP, tmp_path)
-    assert refused[0] == 1 and "give --out FILE, or --out - for stdout" in refused[2]
+    assert refused[0] == 2 and "give --out FILE, or --out - for stdout" in refused[2]
 
 
 def add_gps(path, gps):

@@ -31,9 +31,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     def action(name: str, text: str) -> argparse.ArgumentParser:
-        found = actions.add_parser(
-            name, help=text, description=text, parents=[common], allow_abbrev=False
-        )
+        found = actions.add_parser(name, help=text, description=text, parents=[common])
         found.add_argument("atlas", metavar="ATLAS", help="folder or URL: s3://, gs://, abfs://")
         return found
 
@@ -120,12 +118,9 @@ def _build(options: argparse.Namespace) -> int:
     try:
         with _runner(options) as runner, progress(options) as shown:
             result = build_atlas(request, runner, shown)
-    except KeyboardInterrupt:
-        print(
-            "orthonav: error: interrupted; finished sheets are stored, rerun to resume",
-            file=sys.stderr,
-        )
-        return 1
+    except KeyboardInterrupt as stopped:
+        stopped.args = ("finished sheets are stored, rerun to resume",)
+        raise
     plain = result.to_plain()
     if options.json:
         print_json(plain)

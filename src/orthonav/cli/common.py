@@ -79,8 +79,7 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "--bounds": {
         "type": bounds,
         "metavar": "W,S,E,N",
-        "help": "area: west, south, east, north in degrees; write --bounds=W,S,E,N if W is "
-        "negative",
+        "help": "area: west, south, east, north in degrees",
     },
     "--budget-ms": {
         "type": float,

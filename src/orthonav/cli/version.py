@@ -33,6 +33,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "fly --autopilot, --log": ("autopilot",),
     "fly --ros2": ("ros2",),
     "evaluate --report": ("report",),
+    "run, as all others: words completed by the shell": ("completion",),
 }
 """Extras by command, or by command with an option or an input."""
 

@@ -363,7 +363,7 @@ def open_run(request: ViewRequest) -> Run:
     Raises an `OrthonavError` where a given file is missing or damaged.
     """
     if not 0 < request.radius_m < 1e7:
-        raise FlightError(f"radius must be above 0 m, got {request.radius_m}")
+        raise FlightError(f"radius_m must be above 0, got {request.radius_m}")
     opened = open_map(request.map_path)
     sheet = SheetImagery(opened)
     feed = _feed(request)
