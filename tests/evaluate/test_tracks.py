@@ -322,10 +322,10 @@ def test_evaluate_a_track(run, flight, tmp_path: Path, no_plots) -> None:
 
 def test_evaluate_refuses_flights_that_do_not_fit(run, flight, tmp_path: Path) -> None:
     fixes, report = tmp_path / "fixes.jsonl", ("--report", tmp_path / "r")
-    for more, word in (
-        (("--flight", flight, "--flight", flight), "give --flight once per file"),
-        (("--flight", tmp_path / "none"), "does not exist"),
+    for more, code, word in (
+        (("--flight", flight, "--flight", flight), 2, "give --flight once per file"),
+        (("--flight", tmp_path / "none"), 1, "does not exist"),
     ):
         done = run("evaluate", fixes, "--map", GOLDEN, *more, *report)
-        assert (done.code, done.out, done.err.count("\n")) == (1, "", 1) and word in done.err
+        assert (done.code, done.out, done.err.count("\n")) == (code, "", 1) and word in done.err
     assert not (tmp_path / "r").exists()

@@ -12,11 +12,17 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from recorders import START_S, camera_file, packet, photo, place, tlog, video
 
+from orthonav.core.errors import FlightError
 from orthonav.core.flight import FlightWriter, open_flight, read_image
 from orthonav.core.flight.fixes import read_results
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, Telemetry
-from orthonav.ground.recordings.recording import LEVEL_GROUND, LEVEL_GROUND_IN_GAPS
+from orthonav.ground.recordings.recording import (
+    LEVEL_GROUND,
+    LEVEL_GROUND_IN_GAPS,
+    SourceOptions,
+)
+from orthonav.ground.view.run import ViewRequest, open_run
 
 DATA = Path(__file__).parents[1] / "data"
 MAP = DATA / "golden_v1.onav"
@@ -214,6 +220,38 @@ def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):
         add_gps(source / f"{index}.png", place(*PLACE))
     _, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)
     assert "from the map" not in err
+
+
+@pytest.mark.parametrize("kind", ["photos", "video", "ros"])
+def test_what_was_localized_is_evaluated_and_viewed_as_it_is(run, tmp_path, camera, kind):
+    """The recorded positions are the truth; photographs without any say so."""
+    given = ["--camera", camera]
+    if kind == "video":
+        source = filmed(tmp_path / "v")
+        header, *rows = source.with_suffix(".csv").read_text().splitlines()
+        rows = [f"{header},lat_deg,lon_deg", *(f"{row},{PLACE[0]},{PLACE[1]}" for row in rows)]
+        source.with_suffix(".csv").write_text("\n".join(rows) + "\n")
+    else:
+        source = photographs(tmp_path / "p") if kind == "photos" else bag(tmp_path / "b", "mcap")
+    for path in source.glob("*.png"):
+        add_gps(path, place(*PLACE))
+    fixes = tmp_path / "fixes.jsonl"
+    assert run("localize", MAP, source, "--out", fixes, *given).code == 0
+    done = run("evaluate", fixes, "--flight", source, "--map", MAP, *given, "--json")
+    assert done.code == 0 and "another flight" not in done.err
+    plain = json.loads(done.out)
+    assert plain["n_views"] > 1 and plain["standard"]["cep95_m"] < 5
+    options = SourceOptions(camera=camera)
+    request = ViewRequest(fixes, MAP, flight=source, source=options)
+    if kind != "photos":
+        with pytest.raises(FlightError, match="convert it with `orthonav import`"):
+            open_run(request)
+        return
+    opened = open_run(request)
+    assert opened.labels["truth"] == "p" and opened.any_known("err") and opened.raw_jpeg(0)
+    photographs(source)
+    none = run("evaluate", fixes, "--flight", source, *given)
+    assert none.code == 1 and "no positions were recorded; give --truth" in none.err
 
 
 def test_one_photograph_is_placed_and_printed(run, tmp_path):

@@ -62,7 +62,7 @@ def test_missing_and_damaged_files_are_reported_at_start(run, small, served, tmp
     refused(run("view", fixes, "--map", fixes), "not an orthonav map")
     refused(run("view", tmp_path, "--map", area), "got a folder without one")
     refused(run("view", fixes, "--map", area, "--flight", tmp_path / "none"), "flight does not")
-    refused(run("view", fixes, "--map", area, "--flight", area), "orthonav import")
+    refused(run("view", fixes, "--map", area, "--flight", area), "expected photographs")
     refused(run("view", fixes, "--map", area, "--truth", tmp_path / "none.csv"), "truth does not")
     refused(run("view", fixes, "--map", area, "--mount", fixes), "not a mount file")
     refused(run("view", fixes, "--map", area, "--radius-m", "-1"), "--radius-m must be", code=2)

@@ -17,8 +17,8 @@ import numpy as np
 
 from orthonav.core import integrity
 from orthonav.core.errors import FlightError
-from orthonav.core.flight import FlightFolder, read_truth
-from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
+from orthonav.core.flight import read_truth
+from orthonav.core.flight.fixes import Identity, read_identity, read_results
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.limits import DEFAULT_RISK
@@ -281,14 +281,12 @@ def check_truth(
         )
 
 
-def warn_of_another_run(fixes: Path, opened: MapFile | None, flight: FlightFolder | None) -> None:
+def warn_of_another_run(
+    fixes: Path, opened: MapFile | None, flight: Path | None, flight_sha256: str | None
+) -> None:
     """Log a warning where fixes were computed from another map or flight than the given ones."""
-    given = Identity(
-        opened.manifest.sha256 if opened else None, flight_digest(flight.views) if flight else None
-    )
-    other = read_identity(fixes).differences(
-        given, opened.path if opened else None, flight.path if flight else None
-    )
+    given = Identity(opened.manifest.sha256 if opened else None, flight_sha256)
+    other = read_identity(fixes).differences(given, opened.path if opened else None, flight)
     if other:
         log.warning("fixes are of %s: %s", other, fixes)
 
