@@ -49,6 +49,7 @@ GROUPS = {
         "fly": "send position fixes from a live camera to an autopilot",
     },
     "analyse a recorded flight": {
+        "run": "localize a recording on an orthophoto and show the result: all in one",
         "import": "convert photographs, a video or a ROS recording to a flight folder",
         "localize": "find the positions of the views of a flight",
         "evaluate": "compare fixes with the ground truth",

@@ -3,11 +3,10 @@
 import argparse
 import logging
 import math
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_options, watched
+from orthonav.cli.common import add_options, given, watched
 from orthonav.core.errors import FlightError, ImageryError
 
 if TYPE_CHECKING:
@@ -113,10 +112,8 @@ def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
 def source_options(options: argparse.Namespace, **more: Any) -> "SourceOptions":
     from orthonav.ground.recordings import SourceOptions
 
-    names = {each.name for each in fields(SourceOptions)}
-    given = {name: value for name, value in vars(options).items() if name in names}
-    given |= {"mount_deg": tuple(options.mount_deg), "topics": dict(options.topics)}
-    return SourceOptions(**given | more)
+    more |= {"mount_deg": tuple(options.mount_deg), "topics": dict(options.topics)}
+    return SourceOptions(**given(options, SourceOptions) | more)
 
 
 def open_source(

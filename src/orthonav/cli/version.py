@@ -11,6 +11,7 @@ from orthonav.core.extras import missing, packages, pip_line, require
 
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "demo": ("geo", "report", "web"),
+    "run": ("geo", "report"),
     "simulate": ("geo",),
     "fetch --source": ("fetch",),
     "build": ("geo",),

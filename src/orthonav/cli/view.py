@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_options
+from orthonav.cli.common import add_options, given
 from orthonav.cli.source import add_source, source_options
 
 if TYPE_CHECKING:
@@ -45,17 +45,8 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.ground.view.run import ViewRequest, open_run
     from orthonav.ground.view.server import Pages, Server, load_assets
 
-    request = ViewRequest(
-        run=options.run,
-        second=options.second,
-        map_path=options.map,
-        flight=options.flight,
-        truth=options.truth,
-        mount=options.mount,
-        radius_m=options.radius_m,
-        live=options.live,
-        source=source_options(options, skip_bad_images=True),
-    )
+    source = source_options(options, skip_bad_images=True)
+    request = ViewRequest(**given(options, ViewRequest), map_path=options.map, source=source)
     pages = Pages(open_run(request), load_assets())
     server = Server(pages, options.host, options.port)
     with server:
