@@ -376,6 +376,6 @@ def test_an_interrupt_writes_nothing(run, half_blank, tmp_path, names_in, monkey
 
     monkeypatch.setattr(check_run, "run_trials", interrupted)
     done = run("check", half_blank.map, *VIEWS, "--out", tmp_path / "report")
-    assert (done.code, done.err) == (1, "orthonav: error: interrupted; nothing was written\n")
+    assert (done.code, done.err) == (130, "orthonav: error: interrupted; nothing was written\n")
     assert names_in(tmp_path) == []
-    assert main(["check", str(half_blank.map), "--out", str(tmp_path / "report")]) == 1
+    assert main(["check", str(half_blank.map), "--out", str(tmp_path / "report")]) == 130
