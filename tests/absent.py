@@ -27,6 +27,7 @@ EXTRA_OF = {
     "mcap": "autopilot",
     "cryptography": "signing",
     "xstatic": "web",
+    "argcomplete": "completion",
     "matplotlib": "report",
     "jinja2": "report",
     "onnxruntime": "neural",

@@ -18,7 +18,7 @@ from PIL import Image
 
 from helpers import Done
 from orthonav import __version__
-from orthonav.cli import COMMANDS, common, main
+from orthonav.cli import COMMANDS, common, main, module_of
 from orthonav.core.flight.fixes import read_results
 from orthonav.core.geo.ground import unknown_slope_share
 from orthonav.core.mapfile import open_map
@@ -45,9 +45,10 @@ def finished(popen):
     return Done(popen.returncode, out, err)
 
 
-def refused(done, *words):
-    """Check for exactly one line on stderr, nothing on stdout, exit code 1."""
-    assert done.code == 1 and done.out == ""
+def refused(done, *words, code=1):
+    """Check for exactly one line on stderr, nothing on stdout, and the exit code: 2 where the
+    command has to be typed otherwise, whatever the input."""
+    assert (done.code, done.out) == (code, ""), done
     assert done.err.startswith("orthonav: error: ") and done.err.endswith("\n")
     assert done.err.count("\n") == 1 and "Traceback" not in done.err
     for word in words:
@@ -182,7 +183,7 @@ def test_localize(run, map_path, flight_path, short_flight, out, names_in):
     assert text.code == 0 and "2 views: " in text.out
     cameras = (out / "cameras.csv").read_text().splitlines()
     assert f"{len(cameras) - 1} camera positions: " in text.out
-    refused(run("localize", map_path, few, *to, "--export", "shp=a.shp"), "odm-geo")
+    refused(run("localize", map_path, few, *to, "--export", "shp=a.shp"), "odm-geo", code=2)
     assert "confident (confidence 0.9 or more), " in text.out
 
 
@@ -268,7 +269,7 @@ def test_calibrate_and_fly_with_it(run, map_path, flight_path, out, monkeypatch)
     found = [result.outcome for result in read_results(fixes)]
     assert not any(isinstance(each, Fix) and each.confidence > 0.9 for each in found)
     refused(run("localize", map_path, few, "--out", fixes, "--mount", fixes), "mount file")
-    refused(run("localize", map_path, few, "--out", fixes, "--lag", "2"), "--smooth")
+    refused(run("localize", map_path, few, "--out", fixes, "--lag", "2"), "--smooth", code=2)
 
 
 def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in, undrawn):
@@ -381,17 +382,17 @@ def test_build_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     refused(built("--ortho", no_crs, *small), "coordinate reference system", "no_crs.tif")
     refused(built("--ortho", nothing, *small))
     refused(built(*good, "--bounds=5.0,46.0,5.01,46.01", *small), "the orthophotos cover")
-    refused(built(*good, "--bounds=5.0,46.0,4.0,46.01", *small), "west < east")
+    refused(built(*good, "--bounds=5.0,46.0,4.0,46.01", *small), "west < east", code=2)
     refused(built(*good, "--tile-px", "1024"), "larger than the area")
-    refused(built(*good, "--tile-px", "100"), "multiple of 32")
-    refused(built(*good, "--gsd-m", "0", *small), "ground resolution")
-    refused(built(*good, "--overlap", "1.0"), "overlap")
+    refused(built(*good, "--tile-px", "100"), "--tile-px must be a multiple of 32", code=2)
+    refused(built(*good, "--gsd-m", "0", *small), "--gsd-m must be", code=2)
+    refused(built(*good, "--overlap", "1.0"), "--overlap", code=2)
     refused(built(*good, "--band-m", "100"), "--route")
     refused(built(*good, "--route", route), "--band-m")
     refused(built(*good, "--route", route, "--band-m", "50", *small), "no imagery")
     refused(built(*good, "--route", tmp_path / "no.csv", "--band-m", "50"), "does not exist")
-    refused(built(*good, "--method", "magic"), "unknown variant 'magic'")
-    refused(built(*good, "--edges", "canny:low=300,high=100"), "canny")
+    refused(built(*good, "--method", "magic"), "unknown variant 'magic'", code=2)
+    refused(built(*good, "--edges", "canny:low=300,high=100"), "canny", code=2)
     assert names_in(out) == []
 
 
@@ -539,8 +540,10 @@ def test_evaluate_refuses(run, fixes_path, truth_path, out, names_in, tmp_path, 
     refused(evaluated(broken, truth_path), "line 30")
     refused(evaluated(fixes_path, fixes_path), "columns are missing")
     refused(evaluated(fixes_path, other), "same flight")
-    refused(evaluated(fixes_path, truth_path, "--truth", other), "give --truth once per file")
-    refused(evaluated(fixes_path, truth_path, "--radius-m", "0"), "radius")
+    refused(
+        evaluated(fixes_path, truth_path, "--truth", other), "give --truth once per file", code=2
+    )
+    refused(evaluated(fixes_path, truth_path, "--radius-m", "0"), "--radius-m must be", code=2)
     (out / "file").write_text("in the way")
     refused(evaluated(fixes_path, truth_path, "--report", out / "file" / "report"), "cannot write")
     assert names_in(out) == ["file"]
@@ -554,12 +557,12 @@ def test_simulate_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     route.write_text("lat_deg,lon_deg\n46.498,3.002\n46.60,3.002\n")
     random, low = ["--random", "3"], ["--agl-m", "60"]
     refused(simulated(*random, "--agl-m", "9000"), "fly lower")
-    refused(simulated("--random", "0"), "number of random positions")
+    refused(simulated("--random", "0"), "--random must be", code=2)
     refused(simulated("--route", route, *low), "within the imagery")
-    refused(simulated("--route", route, *low, "--spacing-m", "0"), "above 0")
+    refused(simulated("--route", route, *low, "--spacing-m", "0"), "--spacing-m must be", code=2)
     refused(simulated("--route", tmp_path / "no.csv", *low), "does not exist")
-    refused(simulated(*random, *low, "--agl-std", "5"), "--agl-std must be", "0.05 is 5 %")
-    refused(simulated(*random, *low, "--yaw-std-deg", "nan"), "--yaw-std-deg must be")
+    refused(simulated(*random, *low, "--agl-std", "5"), "--agl-std must be", "0.05 is 5 %", code=2)
+    refused(simulated(*random, *low, "--yaw-std-deg", "nan"), "--yaw-std-deg must be", code=2)
     no_crs = make_ortho(tmp_path / "no_crs.tif", crs=None)
     refused(simulated(*random, *low, "--ortho", no_crs), "coordinate reference system")
     assert names_in(out) == []
@@ -634,6 +637,25 @@ def test_a_full_disk(run, writing, out, name, monkeypatch, undrawn):
     assert nothing_in(out)
 
 
+@pytest.mark.parametrize("name", [*WRITERS, "check"])
+def test_outputs_are_tested_before_the_work(run, writing, map_path, out, name, monkeypatch):
+    command = [*map(str, writing.get(name, ["check", map_path, "--out", out / "check"]))]
+    monkeypatch.setattr(module_of(command[0]), "run", lambda options: pytest.fail("it worked"))
+    (out / "file").write_text("in the way")
+    refused(run(*command[:-1], out / "file" / "x"), f"not a folder: {out / 'file'})")
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    refused(run(*command), "cannot write (no permission, or a read-only disk: ", command[-1])
+    monkeypatch.undo()
+    monkeypatch.setattr(module_of(command[0]), "run", lambda options: pytest.fail("it worked"))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 9, 0))
+    refused(run(*command), "disk full; nothing was written", command[-1])
+
+
+def test_a_folder_is_no_place_for_a_file(run, map_path, short_flight, out):
+    done = run("localize", map_path, short_flight, "--out", out)
+    refused(done, "cannot write over a folder or a device", str(out))
+
+
 def test_a_reader_that_has_gone_is_no_traceback(writing):
     with process(*writing["metrics"]) as popen:
         popen.stdout.close()
@@ -675,7 +697,7 @@ def test_an_interrupt_leaves_nothing(run, writing, out, monkeypatch, name, stage
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(common, "Progress", Interrupted)
-    assert run(*writing[name]) == Done(1, "", INTERRUPTED)
+    assert run(*writing[name]) == Done(130, "", INTERRUPTED)
     assert nothing_in(out)
 
 
@@ -685,7 +707,7 @@ def test_a_signal_is_an_interrupt(writing, out):
     assert popen.stdout.readline() == "here\n"
     popen.send_signal(signal.SIGTERM)
     done = finished(popen)
-    assert done == Done(1, "", INTERRUPTED)
+    assert done == Done(143, "", INTERRUPTED)
     assert nothing_in(out)
 
 

@@ -1,6 +1,5 @@
 """The demo runs all steps and leaves self-contained reports."""
 
-import functools
 import json
 import re
 import shutil
@@ -9,8 +8,7 @@ from pathlib import Path
 import pytest
 from lab.demo_imagery import write_terrain
 
-from orthonav.cli import demo, main
-from orthonav.ground.build import BuildRequest
+from orthonav.cli import build, demo, main
 
 
 @pytest.fixture
@@ -30,8 +28,8 @@ def small_demo(area, monkeypatch, tmp_path_factory):
     monkeypatch.setattr("orthonav.ground.report.drawing.DPI", 30)
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
     monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
-    quicker = functools.partial(BuildRequest, calibration_views=2)
-    monkeypatch.setattr("orthonav.ground.build.BuildRequest", quicker)
+    asked = build.asked
+    monkeypatch.setattr(build, "asked", lambda *of: asked(*of) | {"calibration_views": 2})
 
 
 @pytest.mark.long
@@ -80,6 +78,6 @@ def test_a_demo_that_fails_leaves_nothing(small_demo, tmp_path, capsys, names_in
         raise KeyboardInterrupt
 
     monkeypatch.setattr("orthonav.ground.build.build_map", broken)
-    assert main(["demo", "--quiet", "--out", str(tmp_path / "demo")]) == 1
+    assert main(["demo", "--quiet", "--out", str(tmp_path / "demo")]) == 130
     assert capsys.readouterr().err == "orthonav: error: interrupted; nothing was written\n"
     assert names_in(tmp_path) == []

@@ -128,7 +128,7 @@ def test_fixes_are_evaluated_and_a_check_is_refused(map_path, flight_path, tmp_p
     assert main(command) == 0
     metrics = orthonav.evaluate(str(fixes), flight_path / "truth.csv", radius_m=20)
     assert metrics.n_views == 30 and metrics.n_confident > 10 and metrics.radius_m == 20
-    with pytest.raises(CheckError, match="height above ground"):
+    with pytest.raises(CheckError, match="agl_m must be"):
         orthonav.check(map_path, agl_m=-5.0)
 
 

@@ -50,4 +50,4 @@ def test_an_interrupt_names_what_is_written(run, map_path, flight_path, tmp_path
     monkeypatch.setattr("orthonav.cli.localize.report_changes", interrupted)
     fixes, cameras = tmp_path / "fixes.jsonl", tmp_path / "cameras.csv"
     done = run("localize", map_path, flight_path, "--out", fixes, "--export", f"csv={cameras}")
-    assert done == (1, "", f"orthonav: error: interrupted; written: {fixes}, {cameras}\n")
+    assert done == (130, "", f"orthonav: error: interrupted; written: {fixes}, {cameras}\n")

@@ -1,10 +1,12 @@
 """An option has one meaning and one unit in all commands: one kind of value, one metavar."""
 
 import argparse
+import subprocess
+import sys
 
 import pytest
 
-from orthonav.cli import COMMANDS, _parser, main
+from orthonav.cli import COMMANDS, _parser, main, parse
 
 DIFFERENT_METAVARS = {"--out"}
 """The metavar of an output names what each command writes."""
@@ -63,3 +65,49 @@ def test_bands_are_numbers(command, capsys):
     with pytest.raises(SystemExit) as ended:
         main([command, "--bands", "r,g"])
     assert ended.value.code == 2 and "expected numbers from 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("values", ["-33.9,18.4,-33.8,18.5", "-.5,1,2,3", "-1e-3,1,2,3"])
+def test_a_value_may_begin_with_a_minus(values):
+    area = parse(["build", "--ortho", "a.tif", "--out", "a.onav", "--bounds", values]).bounds
+    assert area == tuple(map(float, values.split(",")))
+    turned = parse(["localize", "a.onav", "f", "--mount-deg", "-90", "-1e1", "-.5"]).mount_deg
+    assert turned == [-90.0, -10.0, -0.5]
+
+
+@pytest.mark.parametrize(
+    ("line", "meant"),
+    [
+        ("bild", "build, not bild"),
+        ("atlas biuld", "build, not biuld"),
+        ("localize a.onav f --hedding unknown", "--heading, not --hedding"),
+        ("localize a.onav f --heading=unknwon", "unknown, not unknwon"),
+        ("check a.onav --uot c", "--out, not --uot"),
+        ("info a.onav --completely-different", None),
+    ],
+)
+def test_wrong_words_are_answered_in_two_lines_with_what_was_probably_meant(line, meant, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(line.split())
+    usage, error = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 2 and usage.startswith("usage: orthonav ") and "error: " in error
+    assert error.endswith(f"; did you mean {meant}?") if meant else "did you mean" not in error
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        ("orthonav loc", {"localize", "locate-pixel"}),
+        ("orthonav localize --looks", {"--looks-down"}),
+        ("orthonav atlas cu", {"cut"}),
+    ],
+)
+def test_a_shell_completes_words(typed, words, tmp_path, monkeypatch):
+    """As bash asks after `register-python-argcomplete orthonav`; options beyond --help too."""
+    pytest.importorskip("argcomplete")
+    asked = {"COMP_LINE": typed, "COMP_POINT": str(len(typed)), "_ARGCOMPLETE_IFS": "\n"}
+    asked |= {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_STDOUT_FILENAME": str(tmp_path / "words")}
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    subprocess.run([sys.executable, "-m", "orthonav"], check=True)
+    assert {each.strip() for each in (tmp_path / "words").read_text().split("\n")} == words

@@ -57,6 +57,7 @@ COMMANDS: dict[str, Sequence[str]] = {
 }
 """Commands tried with an extra, in this order; later ones use what earlier ones made."""
 SCRIPTS = {
+    "completion": "import argcomplete; assert argcomplete.autocomplete",
     "ros2": "import cyclonedds.domain, rosbags.typesys",
     "web": "from orthonav.ground.view.server import load_assets; assert '/' in load_assets()",
     "neural": "import onnxruntime; assert onnxruntime.get_available_providers()",

@@ -333,7 +333,7 @@ def test_conflicting_or_impossible_options_are_refused(
 ):
     monkeypatch.chdir(tmp_path)
     done = run("atlas", "build", "a", "--ortho", ortho, *options)
-    assert done.code == 1 and why in done.err and not list(tmp_path.iterdir())
+    assert done.code == 2 and why in done.err and not list(tmp_path.iterdir())
 
 
 def test_an_interrupted_build_says_how_to_resume(run, ortho, tmp_path, monkeypatch):
@@ -342,4 +342,4 @@ def test_an_interrupted_build_says_how_to_resume(run, ortho, tmp_path, monkeypat
 
     monkeypatch.setattr(building, "build_sheet", interrupted)
     done = run("atlas", "build", tmp_path / "atlas", "--ortho", ortho, "--tile-px", "64")
-    assert done.code == 1 and "rerun to resume" in done.err
+    assert done.code == 130 and "rerun to resume" in done.err

@@ -76,8 +76,8 @@ GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
     [
         (dict(mean=Range(0.7, 0.6, 0.8)), "fixes", GO),
         (dict(mean=Range(0.9, 0.59, 0.95)), "few_fixes", MARGINAL),
-        (dict(mean=Range(0.15, 0.1, 0.21)), "few_fixes", MARGINAL),
-        (dict(mean=Range(0.1, 0.05, 0.19)), "few_fixes", NO_GO),
+        (dict(mean=Range(0.28, 0.2, 0.73)), "few_fixes", MARGINAL),
+        (dict(mean=Range(0.28, 0.05, 0.73)), "few_fixes", NO_GO),
         (dict(mean=Range(0.9, 0.61, 0.99)), "uncertain", None),
         (dict(mean=Range(0.7, 0.3, 0.9)), "uncertain", MARGINAL),
         (dict(mean=Range(0.7, 0.3, 0.9), second_date=True), "uncertain", None),
@@ -95,13 +95,13 @@ GO, MARGINAL, NO_GO = Word.GO, Word.MARGINAL, Word.NO_GO
         (flights() | dict(outside=0.11), "outside_map", NO_GO),
         (flights(), "availability", GO),
         (flights(availability=Range(0.9, 0.79, 0.95)), "availability", MARGINAL),
-        (flights(availability=Range(0.3, 0.2, 0.49)), "availability", NO_GO),
+        (flights(availability=Range(0.9, 0.49, 0.95)), "availability", NO_GO),
         (flights(outage_s=Range(20, 10, 59)), "outage", GO),
         (flights(outage_s=Range(20, 10, 61)), "outage", MARGINAL),
-        (flights(outage_s=Range(900, 601, 1000)), "outage", NO_GO),
+        (flights(outage_s=Range(20, 10, 601)), "outage", NO_GO),
         (flights(false_fix=Range(0.005, 0, 0.01)), "wrong", GO),
-        (flights(false_fix=Range(0.05, 0, 0.2)), "wrong", MARGINAL),
-        (flights(false_fix=Range(0.2, 0.11, 0.3)), "wrong", NO_GO),
+        (flights(false_fix=Range(0.05, 0, 0.1)), "wrong", MARGINAL),
+        (flights(false_fix=Range(0.05, 0, 0.11)), "wrong", NO_GO),
         (dict(after_fix_m=Range(50, 41, 60)), "availability", NO_GO),
         (dict(after_fix_m=Range(30, 25, 41)), "availability", MARGINAL),
         (dict(after_fix_m=Range(50, 39, 60)), "availability", MARGINAL),
@@ -206,7 +206,11 @@ def test_a_figure_has_one_form():
     verdict = verdict_of(Findings(**FINE | dict(flights=found)))
     cells = made_check.made_cells(4, 4, 50.0)
     result = made_check.made_check(LocalFrame(48.0, 2.0), cells, ALONG.points_en_m[[0, -1]])
-    said = text(replace(result, flights=found, verdict=verdict)).replace("\n    ", " ")
+    said = text(replace(result, flights=found, verdict=verdict)).replace("\n      ", " ")
+    assert "  !   Longest outage: 4:28 min (4 s to 7:30 min), 5360 m" in said
+    assert "; GO up to 60 s, NO-GO above 10:00 min, at the upper end.\n" in said
+    assert "  ok  Mean probability" in said
+    assert "; GO from 60 %, NO-GO below 20 %, at the lower end.\n" in said
     for shown in (
         "4:28 min (4 s to 7:30 min), 5360 m (74.8 m to 9000 m)",
         "97 % (83 % to 99 %)",

@@ -211,7 +211,7 @@ def test_json_names_and_keeps_what_was_there() -> None:
     assert shares == [1.0, 1.0, 1.0]
 
 
-def test_the_command_evaluates_several_flights(tmp_path, run) -> None:
+def test_the_command_compares_several_runs(tmp_path, run) -> None:
     lat, lon = CENTRE.latlon_from_en(np.array([3.0, 4.0]))
     fix = Fix(float(lat), float(lon), 25 * np.eye(2), 0.95, RADIUS_M, 0.0, 100.0)
     unknown = replace(fix, confidence=math.nan, cov_en_m2=np.full((2, 2), math.nan))
@@ -222,11 +222,25 @@ def test_the_command_evaluates_several_flights(tmp_path, run) -> None:
         path.write_text(result_to_json(ViewResult("a.jpg", 0, known, 10.0)) + "\n")
     done = run("evaluate", *paths, "--truth", truth, "--metrics", out)
     assert done.code == 0 and "nan" not in done.out.lower()
-    values = json.loads(out.read_text())
-    assert values["calibration"]["n_fixes"] == 1
-    flights = values["flights"]
-    assert flights["two"]["calibration"]["ece"] is None
-    assert flights["one"]["covariance"]["nees_mean"] == pytest.approx(1.0, rel=1e-3)
+    runs = json.loads(out.read_text())["runs"]
+    assert runs["two"]["calibration"]["ece"] is None
+    assert runs["one"]["covariance"]["nees_mean"] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_truth_by_which_most_confident_fixes_are_wrong_is_doubted(tmp_path, run) -> None:
+    """Of another flight, or a displaced map: false fixes are few."""
+    offsets_m = np.array([[0.0, 3.0], [0.0, 700.0], [0.0, 600.0]])
+    lat, lon = CENTRE.latlon_from_en(offsets_m)
+    fixes, truth = tmp_path / "fixes.jsonl", tmp_path / "truth.csv"
+    truth.write_text("frame,lat_deg,lon_deg\n0.jpg,48.0,-4.5\n1.jpg,48.0,-4.5\n2.jpg,48.0,-4.5\n")
+    for confidences, said in (((0.95, 0.95, 0.95), "2 of 3"), ((0.95, 0.95, 0.5), "")):
+        placed = zip(lat, lon, confidences, strict=True)
+        outcomes = [Fix(*map(float, at), np.eye(2), c, RADIUS_M, 0.0, 100.0) for *at, c in placed]
+        results = [ViewResult(f"{i}.jpg", i, each, 1.0) for i, each in enumerate(outcomes)]
+        fixes.write_text("".join(result_to_json(each) + "\n" for each in results))
+        done = run("evaluate", fixes, "--truth", truth)
+        assert done.code == 0 and done.err.startswith(f"WARNING: {said}" if said else "")
+        assert ("of the same flight, and is the map" in done.err) == bool(said)
 
 
 @pytest.mark.parametrize("n", [0.4, 1.0, 17.3, 5000.0])

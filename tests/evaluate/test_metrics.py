@@ -15,7 +15,6 @@ from orthonav.ground.evaluate.metrics import (
     Comparison,
     compare,
     measure,
-    pool,
     worst_views,
 )
 from orthonav.ground.evaluate.statistics import standard_figures, upper_bound
@@ -99,17 +98,6 @@ def test_no_overlap_is_an_error_that_shows_both_names() -> None:
         compare({}, [])
 
 
-def test_pooled_flights_count_every_view() -> None:
-    one = three_fixes()
-    two = compare(truth_of(TRUTH_EN_M), [fix("a", (1.0, 0.0)), no_fix("b", "too_dark")])
-    metrics = measure(pool([one, two]))
-    assert (metrics.n_views, metrics.n_fixes, metrics.n_without_result) == (8, 4, 2)
-    assert metrics.accuracy == 3 / 8
-    assert metrics.reasons == {"blank": 1, "too_dark": 1, "no_result": 2}
-    with pytest.raises(ValueError, match="at least one flight"):
-        pool([])
-
-
 @pytest.mark.parametrize("radius_m", [0.0, -1.0, math.nan, math.inf])
 def test_an_impossible_radius_is_refused(radius_m: float) -> None:
     with pytest.raises(ValueError, match="radius"):
@@ -155,7 +143,6 @@ def test_confident_fixes_and_gaps_have_figures_of_their_own() -> None:
     assert found.availability_95[0] < 0.25 < found.availability_95[1]
     assert found.gap.seconds_s == pytest.approx(2.0)
     assert found.gap.path_m == pytest.approx(math.hypot(100, 50) + 100, rel=1e-3)
-    assert measure(pool([comparison, comparison])).gap.seconds_s == pytest.approx(2.0)
 
 
 # APE, RPE, CEP.
@@ -180,14 +167,6 @@ def test_pose_errors_of_the_example() -> None:
         assert tuple(vars(statistics).values()) == pytest.approx(values)
     assert found.rpe_distance.n == 0
     assert (found.cep50_m, found.cep95_m) == pytest.approx((5.0, 5 + 0.85 * (10 - 5)))
-
-
-def test_relative_errors_do_not_cross_flights() -> None:
-    two = np.concatenate([PATH, PATH]), np.concatenate([PATH, PATH + np.array([1000.0, 0.0])])
-    assert standard_figures(*two).rpe_frames.max_m == pytest.approx(1000.0)
-    apart = standard_figures(*two, starts=(0, 5))
-    assert (apart.rpe_frames.n, apart.rpe_frames.max_m) == (8, pytest.approx(0.0))
-    assert apart.rpe_distance.n == 2 and apart.ape.n == 10
 
 
 def placed(frame: str, second: int, std_m: float, error_m: float, place: float) -> ViewResult:
@@ -236,8 +215,6 @@ def test_an_image_that_was_dropped_counts_as_an_outage_up_to_the_next_view() -> 
     assert found is not None and found.availability == 0.75
     assert found.availability_of_time == pytest.approx(1 / 3)
     assert found.outage.seconds_s == 2.0 and found.outage.path_m == pytest.approx(206.2, abs=0.1)
-    two = measure(pool([comparison, comparison]), 15.0, 35.0).integrity
-    assert two is not None and two.outage == found.outage
     for ends in (results[:2], results[1:]):
         cut = measure(compare(truth_of(TRUTH_EN_M), ends), 15.0, 35.0).integrity
         assert cut is not None and math.isnan(cut.outage.seconds_s + cut.availability_of_time)
@@ -249,7 +226,7 @@ def test_availability_is_the_word_of_the_alert_limit_alone() -> None:
     results = [replace(each, accepted=True) for each in results]
     comparison = compare(truth_of(TRUTH_EN_M), results)
     flight = FlightReport("f", comparison, measure(comparison, 15.0, 35.0))
-    said = summary([flight], flight.metrics)
+    said = summary(flight)
     assert "views with a confident fix: 100.0 % (" in said
     assert [line for line in said.splitlines() if "availab" in line] == [
         "available at the alert limit of 35 m: 0.0 % of views, 0.0 % of the time; longest outage "

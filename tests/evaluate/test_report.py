@@ -22,8 +22,7 @@ from orthonav.ground.evaluate.report import MadeFrom, write_report
 from orthonav.ground.evaluate.tables import (
     FlightReport,
     metrics_to_json,
-    table,
-    total,
+    text,
 )
 from orthonav.ground.report import measure_text
 from orthonav.ground.report.page import LIST
@@ -149,14 +148,17 @@ def test_a_stanford_diagram_without_any_level_has_axes_that_can_be_read(monkeypa
             assert low < 1 < 10 < high
 
 
-def test_several_flights_have_a_total_and_files_of_their_own(tmp_path: Path, no_plots) -> None:
+def test_several_runs_have_a_row_and_files_of_their_own(tmp_path: Path, no_plots) -> None:
     flights = [made_flight(n, name=name) for n, name in ((30, "../x"), (20, "a b"), (10, "a: b"))]
-    whole = total(flights)
-    assert whole.n_views == 60
-    assert whole.n_fixes == sum(flight.metrics.n_fixes for flight in flights)
     page = write_report(tmp_path / "report", flights).read_text("utf-8")
-    assert page.count("<img ") == 3 * len(FIGURES) and "Evaluation of 3 flights" in page
-    assert '<tr class="total"><td>total</td><td>60</td>' in page
+    assert page.count("<img ") == 3 * len(FIGURES) and "Evaluation of 3 runs" in page
+    rows = re.search(r'aria-label="runs"><table>.*?</table>', page, re.DOTALL)[0]
+    assert re.findall(r"<tr><td>([^<]*)</td><td>(\d+)</td>", rows) == [
+        ("../x", "30"),
+        ("a b", "20"),
+        ("a: b", "10"),
+    ]
+    assert page.count('class="answer') == 3 and "60" not in re.findall(r">(\d+)<", page)
     assert stems(tmp_path / "report") == {
         f"{name}--{figure}" for name in ("x", "a-b", "a-b-2") for figure in FIGURES
     }
@@ -178,21 +180,12 @@ def test_a_rerun_leaves_no_stale_figures_and_all_other_files(tmp_path: Path, no_
     assert {each.name for each in tmp_path.iterdir()} == {"figures", "index.html", "notes.txt"}
 
 
-def test_flights_at_different_radii_have_no_total() -> None:
-    one = made_flight(10)
-    other = replace(one, metrics=measure(one.comparison, 50.0))
-    with pytest.raises(ValueError, match="one radius"):
-        total([one, other])
-    with pytest.raises(ValueError, match="at least one flight"):
-        total([])
-
-
 def test_a_flight_without_any_fix_is_reported(tmp_path: Path, coarse) -> None:
     flight = made_flight(1, share_fixed=0.0)
     html = write_report(tmp_path, [flight]).read_text("utf-8")
     assert "No view has a fix" in html
     assert "nan" not in re.sub(r"base64,[^\"]+", "", html).lower()
-    assert "nan" not in table([flight], flight.metrics).lower()
+    assert "nan" not in text([flight]).lower()
     json.dumps(metrics_to_json(flight.metrics), allow_nan=False)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,10 @@ from orthonav.ground.evaluate.metrics import Comparison, compare, measure
 from orthonav.ground.evaluate.report import write_report
 from orthonav.ground.evaluate.tables import (
     FlightReport,
-    flights_to_json,
     metrics_to_json,
+    runs_to_json,
     summary,
-    total,
+    text,
     track_rows,
 )
 from orthonav.ground.evaluate.track import (
@@ -228,9 +229,9 @@ def test_odd_tracks_are_measured(errors, states, named) -> None:
     track = measure_track(comparison, results, 15.0)
     assert track is not None
     flight = FlightReport("odd", comparison, measure(comparison), track=track)
-    json.dumps(flights_to_json([flight], flight.metrics), allow_nan=False)
-    for text in (summary([flight], flight.metrics), "".join(said for _, said in track_rows(track))):
-        assert "nan" not in text.lower() and "inf" not in text.lower()
+    json.dumps(runs_to_json([flight]), allow_nan=False)
+    for shown in (summary(flight), "".join(said for _, said in track_rows(track))):
+        assert "nan" not in shown.lower() and "inf" not in shown.lower()
 
 
 def test_states_count_without_a_truth_and_errors_only_with_one() -> None:
@@ -257,22 +258,29 @@ def test_views_placed_one_by_one_have_no_track(tmp_path: Path, no_plots) -> None
     comparison, results = flown([(1.0, 0.0)] * 4, None)
     assert measure_track(comparison, results, 15.0) is None
     flight = FlightReport("f", comparison, measure(comparison))
-    assert flights_to_json([flight], flight.metrics) == metrics_to_json(flight.metrics)
-    assert "track" not in summary([flight], flight.metrics)
+    assert runs_to_json([flight]) == metrics_to_json(flight.metrics)
+    assert "track" not in summary(flight)
     html = write_report(tmp_path, [flight]).read_text("utf-8")
     assert "Track" not in html and html.count("<figure") == 3
 
 
-def test_tracks_of_several_flights_are_given_per_flight() -> None:
-    flights = []
-    for name, states in (("long", ["searching", *["tracking"] * 5]), ("single", None)):
+def test_runs_of_one_flight_are_compared_and_never_counted_together() -> None:
+    """Views twice would halve the bound of the rate of false fixes."""
+    runs = []
+    for name, states in (("tracked", ["searching", *["tracking"] * 5]), ("single", None)):
         comparison, results = flown([(2.0, 0.0)] * 6, states)
         track = measure_track(comparison, results, 15.0)
-        flights.append(FlightReport(name, comparison, measure(comparison), track=track))
-    plain = json.loads(json.dumps(flights_to_json(flights, total(flights)), allow_nan=False))
-    assert "track" in plain["flights"]["long"] and "track" not in plain["flights"]["single"]
-    said = summary(flights, total(flights))
-    assert "track of long:" in said and "track of single:" not in said
+        runs.append(FlightReport(name, comparison, measure(comparison), track=track))
+    plain = json.loads(json.dumps(runs_to_json(runs), allow_nan=False))
+    assert list(plain) == ["runs"] and list(plain["runs"]) == ["tracked", "single"]
+    assert plain["runs"]["single"] == runs_to_json(runs[1:]) and "track" in plain["runs"]["tracked"]
+    said = text(runs)
+    for name, views in (("tracked", 6), ("single", 6)):
+        assert f"{name}: No confident fix is wrong: none of {views} has" in said
+        assert f"\n{name}:\nviews with a confident fix: 100.0 %" in said
+    assert "12" not in re.findall(r"\d+", said) and said.count("\ntrack:\n") == 1
+    alone = text(runs[1:])
+    assert alone.startswith("No confident fix is wrong") and "single:" not in alone
 
 
 # The command.
@@ -314,10 +322,10 @@ def test_evaluate_a_track(run, flight, tmp_path: Path, no_plots) -> None:
 
 def test_evaluate_refuses_flights_that_do_not_fit(run, flight, tmp_path: Path) -> None:
     fixes, report = tmp_path / "fixes.jsonl", ("--report", tmp_path / "r")
-    for more, word in (
-        (("--flight", flight, "--flight", flight), "give --flight once per file"),
-        (("--flight", tmp_path / "none"), "does not exist"),
+    for more, code, word in (
+        (("--flight", flight, "--flight", flight), 2, "give --flight once per file"),
+        (("--flight", tmp_path / "none"), 1, "does not exist"),
     ):
         done = run("evaluate", fixes, "--map", GOLDEN, *more, *report)
-        assert (done.code, done.out, done.err.count("\n")) == (1, "", 1) and word in done.err
+        assert (done.code, done.out, done.err.count("\n")) == (code, "", 1) and word in done.err
     assert not (tmp_path / "r").exists()

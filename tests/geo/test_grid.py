@@ -64,9 +64,9 @@ def test_rows_go_south_and_columns_east():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"gsd_m": 0}, "ground resolution"),
-        ({"gsd_m": math.nan}, "ground resolution"),
-        ({"gsd_m": math.inf}, "ground resolution"),
+        ({"gsd_m": 0}, "gsd_m must be"),
+        ({"gsd_m": math.nan}, "gsd_m must be"),
+        ({"gsd_m": math.inf}, "gsd_m must be"),
         ({"tile_px": 15}, "16 to 4096 px"),
         ({"overlap": 1.0}, "overlap"),
         ({"overlap": -0.1}, "overlap"),

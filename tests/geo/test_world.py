@@ -91,7 +91,7 @@ def test_around_the_earth_and_the_poles():
     "side_m", [0.0, -1.0, SMALLEST_SIDE_M - 1, LARGEST_SIDE_M + 1, math.nan, math.inf]
 )
 def test_sides_that_no_sheet_can_have(side_m):
-    with pytest.raises(AreaError, match="km wide"):
+    with pytest.raises(AreaError, match="sheet_km must be"):
         WorldSheets(side_m)
 
 

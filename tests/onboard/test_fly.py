@@ -1042,10 +1042,13 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
 @pytest.mark.parametrize(
     ("options", "code", "word"),
     [
-        ((), 1, "--autopilot"),
+        ((), 2, "--autopilot"),
         (("--autopilot", "udpin:0", "--signing-key", "KEY"), 1, "32 bytes"),
-        (("--autopilot", "carrier-pigeon:1"), 1, "udpin"),
-        (("--autopilot", "udpin:0", "--nmea", "x:1"), 1, "udp:HOST:PORT"),
+        (("--autopilot", "carrier-pigeon:1"), 2, "udpin"),
+        (("--autopilot", "udpin:0", "--nmea", "x:1"), 2, "udp:HOST:PORT"),
+        (("--autopilot", "udpin:0", "--nmea", "udp:10.0.0.9"), 2, "udp:10.0.0.9:10110"),
+        (("--autopilot", "udpin:10.0.0.9"), 2, "such as udpin:10.0.0.9:14550, got"),
+        (("--start", "-33.9,18.4,50"), 2, "--autopilot"),
         (("--autopilot", "udpin:0", "--start", "1,2"), 2, "LAT,LON,STD_M"),
     ],
 )
@@ -1064,7 +1067,7 @@ def test_a_start_far_off_the_map_ends_the_program_and_a_near_one_is_a_warning(fl
 
     def start(*values):
         text = ",".join(map(str, values))
-        return run("fly", path, folder, *options, f"--start={text}")
+        return run("fly", path, folder, *options, "--start", text)
 
     lat, lon = frame.lat_deg, frame.lon_deg
     for values, words in {
@@ -1072,6 +1075,7 @@ def test_a_start_far_off_the_map_ends_the_program_and_a_near_one_is_a_warning(fl
         (lon, lat, 50): "seem to be swapped",
         (120, 46, 50): "seem to be swapped",
         (lat, lon, 0): "above 0 m",
+        (-33.9, 18.4, 50): "km from the map",
     }.items():
         done = start(*values)
         assert (done.code, done.err.count("\n")) == (2, 1) and words in done.err

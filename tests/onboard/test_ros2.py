@@ -879,4 +879,4 @@ def test_conflicting_options_end_with_one_line(flown, run, env):
         (["--ros2", "--ros-args", "-r", "a"], "FROM:=TO"),
     ):
         done = run("fly", path, *words)
-        assert done.code == 1 and said in done.err and done.err.count("\n") == 1
+        assert done.code == 2 and said in done.err and done.err.count("\n") == 1

@@ -192,7 +192,7 @@ REFUSED = [
     ({"tile_px": 8}, "16 to 4096"),
     ({"tile_px": 100}, "multiple of 32"),
     *(({"overlap": wrong}, "overlap") for wrong in (1.0, -0.5, float("nan"))),
-    *(({"gsd_m": wrong}, "resolution") for wrong in (-1.0, 0.0, float("nan"))),
+    *(({"gsd_m": wrong}, "gsd_m must be") for wrong in (-1.0, 0.0, float("nan"))),
     ({"method": "magic"}, "unknown variant 'magic'"),
     ({"edges": "canny:low=x"}, "low"),
     ({"method": "gradient:size=3"}, "size"),

@@ -190,9 +190,9 @@ REFUSED = {
     "too high": ({"agl_m": 5000.0}, AreaError, "fly lower"),
     "too low": ({"agl_m": 0.1}, FlightError, "1 to 50,000"),
     "nan": ({"agl_m": math.nan}, FlightError, "1 to 50,000"),
-    "none": ({"random": 0}, FlightError, "number of random positions"),
+    "none": ({"random": 0}, FlightError, "random must be 1 to"),
     "neither": ({"random": None}, FlightError, "either a route or"),
-    "turn": ({"turn_radius_m": -1.0}, FlightError, "turn radius"),
+    "turn": ({"turn_radius_m": -1.0}, FlightError, "turn_radius_m"),
 }
 
 

@@ -12,11 +12,17 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from recorders import START_S, camera_file, packet, photo, place, tlog, video
 
+from orthonav.core.errors import FlightError
 from orthonav.core.flight import FlightWriter, open_flight, read_image
 from orthonav.core.flight.fixes import read_results
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, Telemetry
-from orthonav.ground.recordings.recording import LEVEL_GROUND, LEVEL_GROUND_IN_GAPS
+from orthonav.ground.recordings.recording import (
+    LEVEL_GROUND,
+    LEVEL_GROUND_IN_GAPS,
+    SourceOptions,
+)
+from orthonav.ground.view.run import ViewRequest, open_run
 
 DATA = Path(__file__).parents[1] / "data"
 MAP = DATA / "golden_v1.onav"
@@ -216,11 +222,44 @@ def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):
     assert "from the map" not in err
 
 
+@pytest.mark.parametrize("kind", ["photos", "video", "ros"])
+def test_what_was_localized_is_evaluated_and_viewed_as_it_is(run, tmp_path, camera, kind):
+    """The recorded positions are the truth; photographs without any say so."""
+    given = ["--camera", camera]
+    if kind == "video":
+        source = filmed(tmp_path / "v")
+        header, *rows = source.with_suffix(".csv").read_text().splitlines()
+        rows = [f"{header},lat_deg,lon_deg", *(f"{row},{PLACE[0]},{PLACE[1]}" for row in rows)]
+        source.with_suffix(".csv").write_text("\n".join(rows) + "\n")
+    else:
+        source = photographs(tmp_path / "p") if kind == "photos" else bag(tmp_path / "b", "mcap")
+    for path in source.glob("*.png"):
+        add_gps(path, place(*PLACE))
+    fixes = tmp_path / "fixes.jsonl"
+    assert run("localize", MAP, source, "--out", fixes, *given).code == 0
+    done = run("evaluate", fixes, "--flight", source, "--map", MAP, *given, "--json")
+    assert done.code == 0 and "another flight" not in done.err
+    plain = json.loads(done.out)
+    assert plain["n_views"] > 1 and plain["standard"]["cep95_m"] < 5
+    options = SourceOptions(camera=camera)
+    request = ViewRequest(fixes, MAP, flight=source, source=options)
+    if kind != "photos":
+        with pytest.raises(FlightError, match="convert it with `orthonav import`"):
+            open_run(request)
+        return
+    opened = open_run(request)
+    assert opened.labels["truth"] == "p" and opened.any_known("err") and opened.raw_jpeg(0)
+    photographs(source)
+    none = run("evaluate", fixes, "--flight", source, *given)
+    assert none.code == 1 and "no positions were recorded; give --truth" in none.err
+
+
 def test_one_photograph_is_placed_and_printed(run, tmp_path):
     path = tmp_path / "photo.png"
     Image.fromarray(seen(0)).save(path)
     one = ("localize", MAP, path, "--agl-m", 160, "--fov-deg", 43.6)
     code, out, err = run(*one, "--heading", "unknown")
+    assert re.search(r"protection +\d+ m, which .* with a probability of at most 0.001\n", out)
     assert code == 0 and "looks straight down is assumed" in err
     lat, lon = map(float, re.search(r"position +([\d.]+), ([\d.]+) ", out).groups())
     assert np.abs(np.subtract((lat, lon), PLACE) * [111e3, 76e3]).max() < 3
@@ -228,14 +267,18 @@ def test_one_photograph_is_placed_and_printed(run, tmp_path):
     code, out, err = run(*one, "--heading", "unknown", "--out", "-")
     (line,) = map(json.loads, out.splitlines())
     assert code == 0 and line["frame"] == "photo.png" and "1 view: " in err
+    noise = np.random.default_rng(1).integers(0, 255, seen(0).shape, np.uint8)
+    Image.fromarray(cv2.GaussianBlur(noise, (0, 0), 2)).save(tmp_path / "noise.png")
+    guess = run(*one[:2], tmp_path / "noise.png", *one[3:], "--heading", "unknown").out
+    assert re.search(r"protection +none: the place itself may be wrong .* above 0.001; more", guess)
     unknown = run(*one)
     assert "heading_deg (yaw_deg) (missing_telemetry); give --heading unknown" in unknown.out
     plain = json.loads(run(*one, "--heading", "unknown", "--json").out)
     assert plain["fixes"] is None and plain["positions"][0]["lat_deg"] == pytest.approx(lat)
     both = run(*one, "--dem", path)
-    assert both[0] == 1 and "above ground of the views: give it or --dem" in both[2]
+    assert both[0] == 2 and "above ground of the views: give it or --dem" in both[2]
     refused = run("localize", MAP, tmp_path)
-    assert refused[0] == 1 and "give --out FILE, or --out - for stdout" in refused[2]
+    assert refused[0] == 2 and "give --out FILE, or --out - for stdout" in refused[2]
 
 
 def add_gps(path, gps):

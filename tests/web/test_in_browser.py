@@ -10,7 +10,7 @@ from axe_playwright_python.sync_playwright import Axe
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
 from browsing import LAPTOP, Visit, painted
 from playwright.sync_api import expect
-from small_run import CHUNK_PX, GSD_M, NO_FIX, PLACES_EN_M, WRONG, result, serving
+from small_run import CHUNK_PX, GSD_M, NO_FIX, PLACES_EN_M, WRONG, name, result, serving
 
 from orthonav.core.flight.fixes import result_to_json, write_results
 from orthonav.core.records import Fix
@@ -106,14 +106,16 @@ def test_the_run_is_drawn_where_it_is(page, columns):
 
 def test_two_runs_enlarged_images_and_coordinates(visit, small, tmp_path):
     second = tmp_path / "tracked.jsonl"
-    write_results(second, [result(i) for i in range(WRONG)])
+    guess = replace(result(WRONG), frame=name(COUNT - 1), accepted=False)
+    write_results(second, [*(result(i) for i in range(WRONG)), guess])
     request = ViewRequest(small.fixes, small.map_path, second=second, flight=small.flight)
     with serving(open_run(request)) as started:
         page = visit(started)
         page.pictured(0)
         assert "second run: tracked.jsonl" in page.locator("#legend").inner_text()
         assert page.locator("#list .second").all_inner_texts()[WRONG] == "no fix"
-        assert " / " in page.locator("#figures").inner_text()
+        figures = page.locator("#figures").inner_text().replace("\n", " ")
+        assert re.search(r"CEP95 of confident fixes \d\d(\.\d)? m / 0 m", figures), figures
         before = page.locator("#img-view").bounding_box()["width"]
         page.click("#enlarge")
         assert page.locator("#img-view").bounding_box()["width"] > 1.3 * before

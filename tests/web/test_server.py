@@ -42,7 +42,7 @@ def as_picture(reply):
 def test_the_summary_says_what_is_shown(ask):
     found = as_json(ask("/api/run"))
     assert found["name"] == "fixes.jsonl" and found["map_name"] == "area.onav"
-    assert found["images"] == "flight" and found["truth"] == "flight/truth.csv"
+    assert found["images"] == "flight" and found["truth"] == "flight"
     assert found["states"] == ["searching", "tracking", "coasting", "lost"]
     assert not found["live"]
     sheet = found["sheet"]

@@ -13,8 +13,8 @@ from orthonav.core.flight.fixes import Identity, write_results
 from orthonav.ground.view.run import ViewRequest, open_run
 
 
-def refused(done, *words):
-    assert done.code == 1 and done.out == ""
+def refused(done, *words, code=1):
+    assert done.code == code and done.out == ""
     assert done.err.startswith("orthonav: error: ") and done.err.count("\n") == 1
     for word in words:
         assert word in done.err
@@ -62,10 +62,10 @@ def test_missing_and_damaged_files_are_reported_at_start(run, small, served, tmp
     refused(run("view", fixes, "--map", fixes), "not an orthonav map")
     refused(run("view", tmp_path, "--map", area), "got a folder without one")
     refused(run("view", fixes, "--map", area, "--flight", tmp_path / "none"), "flight does not")
-    refused(run("view", fixes, "--map", area, "--flight", area), "orthonav import")
+    refused(run("view", fixes, "--map", area, "--flight", area), "expected photographs")
     refused(run("view", fixes, "--map", area, "--truth", tmp_path / "none.csv"), "truth does not")
     refused(run("view", fixes, "--map", area, "--mount", fixes), "not a mount file")
-    refused(run("view", fixes, "--map", area, "--radius-m", "-1"), "radius")
+    refused(run("view", fixes, "--map", area, "--radius-m", "-1"), "--radius-m must be", code=2)
     refused(run("view", fixes, "--map", area, "--host", "192.0.2.1"), "cannot listen")
     far = tmp_path / "none" / "live.jsonl"
     refused(run("view", far, "--map", area, "--live"), "folder of the run does not exist")

@@ -9,24 +9,30 @@ import importlib
 import io
 import logging
 import os
+import re
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from types import ModuleType
+from types import FrameType, ModuleType
+from typing import Any, NoReturn
 
 from orthonav.cli.version import require_extras, show_version
-from orthonav.core.errors import OrthonavError
+from orthonav.core.errors import MissingExtraError, OrthonavError, VariantError
 
 UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
 """Last words of option names that are units."""
 
 _CLOCK_S = 0.01
 """How far the times of files lag behind the clock."""
+_FILES = ("out", "metrics", "report_changes", "footprint", "preview")
+_FOLDERS = ("report", "work")
+_FILL_FOLDERS = ("check", "demo", "import", "run", "simulate")
+"""Options that name what is written, and commands whose `--out` is a folder."""
 
 GROUPS = {
     "prepare a map": {
@@ -43,6 +49,7 @@ GROUPS = {
         "fly": "send position fixes from a live camera to an autopilot",
     },
     "analyse a recorded flight": {
+        "run": "localize a recording on an orthophoto and show the result: all in one",
         "import": "convert photographs, a video or a ROS recording to a flight folder",
         "localize": "find the positions of the views of a flight",
         "evaluate": "compare fixes with the ground truth",
@@ -60,7 +67,8 @@ COMMANDS = {name: text for group in GROUPS.values() for name, text in group.item
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0 done, 1 a known error, 2 wrong usage.
+    """Run the command line; returns the exit code: 0 done, 1 a known error, 2 wrong usage, 130 and
+    143 ended by Ctrl-C and SIGTERM.
 
     Commands that judge return others, see their help.
     """
@@ -86,13 +94,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         _print_any_letter()
         with _terminable():
             require_extras(options.command)
+            _require_outputs(options)
             status: int | None = module_of(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
-        _failed(_with_options(_one_line(error), options), verbose)
-        return error.exit_code
-    except KeyboardInterrupt:
-        return _failed(f"interrupted; {_written(options, started_s)}", False)
+        said = _with_options(_one_line(error), options)
+        is_usage = isinstance(error, VariantError) or said.startswith(("--", "give "))
+        is_usage &= not isinstance(error, MissingExtraError)
+        return _failed(said, verbose, code=2 if is_usage else 1)
+    except KeyboardInterrupt as error:
+        said = f"interrupted; {str(error) or _written(options, started_s)}"
+        return _failed(said, False, code=143 if isinstance(error, _Terminated) else 130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -107,6 +119,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _failed("out of memory", verbose)
     return status or 0
+
+
+def _require_outputs(options: argparse.Namespace) -> None:
+    """Raise `OutputError` where a result could not be written, before the work for it."""
+    from orthonav.core.files import is_stdout, require_writable
+
+    asked = {name: getattr(options, name, None) for name in (*_FILES, *_FOLDERS)}
+    folders = (*_FOLDERS, *["out"] * (options.command in _FILL_FOLDERS))
+    for name, path in asked.items():
+        if isinstance(path, Path) and not is_stdout(path):
+            require_writable(path, folder=name in folders)
+    for each in getattr(options, "export", ()):
+        if path := each.partition("=")[2]:
+            require_writable(Path(path))
 
 
 def _written(options: argparse.Namespace, since_s: float) -> str:
@@ -125,13 +151,21 @@ def _print_any_letter() -> None:
         out.reconfigure(errors="backslashreplace")
 
 
+class _Terminated(KeyboardInterrupt):
+    """The interrupt by SIGTERM."""
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise _Terminated
+
+
 @contextmanager
 def _terminable() -> Iterator[None]:
     """SIGTERM ends like Ctrl-C meanwhile, so that it leaves no temporary files either."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may change signals
         return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
     finally:
@@ -140,11 +174,49 @@ def _terminable() -> Iterator[None]:
 
 def parse(arguments: list[str]) -> argparse.Namespace:
     """The options; without a command it prints the help, and wrong ones end with exit code 2."""
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks how the line may go on
+        with suppress(ImportError):
+            words = [*os.environ["COMP_LINE"].split(), "--help-all"]
+            importlib.import_module("argcomplete").autocomplete(_parser(words))
     parser = _parser(arguments)
     options, unknown = parser.parse_known_args(arguments or ["--help"])
     if unknown:  # with the usage of the command, not of the whole program
         options.command_error(f"unrecognized arguments: {' '.join(unknown)}")
     return options
+
+
+class Parser(argparse.ArgumentParser):
+    """Says in one line of usage what a command needs, and how a word was probably meant."""
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        super().__init__(*args, **named | {"allow_abbrev": False})
+        # Values such as -33.9,18.4,50 are no options either, as in Python 3.14.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
+        self._given: Sequence[str] = ()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        self._given = tuple(args or ())
+        return super().parse_known_args(args, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        needed = [each for each in self._actions if each.required or not each.option_strings]
+        usage = argparse.HelpFormatter(self.prog, width=1000)
+        usage.add_usage(None, needed, [])
+        line = f"{usage.format_help().strip()} [options]  (see {self.prog} --help)"
+        self.exit(2, f"{line}\n{self.prog}: error: {self._corrected(message)}\n")
+
+    def _corrected(self, message: str) -> str:
+        from difflib import get_close_matches
+
+        choice = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
+        asked = [(choice[1], re.findall(r"[\w-]+", choice[2]))] if choice else []
+        given = (word.partition("=")[0] for word in self._given)
+        known = list(self._option_string_actions)
+        asked += [(word, known) for word in given if word.startswith("--") and word not in known]
+        for word, names in asked:
+            if close := get_close_matches(word, names, 1, 0.7):
+                return f"{message.partition(' (choose')[0]}; did you mean {close[0]}, not {word}?"
+        return message
 
 
 def _overview() -> str:
@@ -156,13 +228,12 @@ def _overview() -> str:
 
 def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     """The parser; only the command asked for loads its own arguments."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="orthonav",
         description="Position fixes for aircraft without GNSS, from a downward camera and an "
         "orthophoto of another year.",
         epilog=_overview(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument(
         "--version",
@@ -173,7 +244,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     common = verbosity(default=False)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, text in COMMANDS.items():
-        command = commands.add_parser(name, description=text, parents=[common], allow_abbrev=False)
+        command = commands.add_parser(name, description=text, parents=[common])
         command.set_defaults(command_error=command.error)
         if name in arguments:
             module = module_of(name)
@@ -189,9 +260,9 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def verbosity(default: bool | str) -> argparse.ArgumentParser:
+def verbosity(default: bool | str) -> Parser:
     """Parent parser of commands and of their actions."""
-    parser = argparse.ArgumentParser(add_help=False)
+    parser = Parser(add_help=False)
     add = partial(parser.add_argument, action="store_true", default=default)
     add("-v", "--verbose", help="say more, on stderr")
     add("-q", "--quiet", help="errors only, no progress")
@@ -256,8 +327,8 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _failed(message: str, verbose: bool) -> int:
+def _failed(message: str, verbose: bool, code: int = 1) -> int:
     if verbose:
         logging.getLogger(__name__).debug("", exc_info=True)
     print(f"orthonav: error: {message}", file=sys.stderr)
-    return 1
+    return code

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli import verbosity
-from orthonav.cli.build import add_recipe, asked, recipe_of
-from orthonav.cli.common import add_area, add_options, area_of, print_json, progress
+from orthonav.cli.build import add_recipe, asked
+from orthonav.cli.common import add_area, add_options, area_of, given, print_json, progress
 
 if TYPE_CHECKING:
     from orthonav.ground.atlas.catalog import Atlas
@@ -31,9 +31,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     def action(name: str, text: str) -> argparse.ArgumentParser:
-        found = actions.add_parser(
-            name, help=text, description=text, parents=[common], allow_abbrev=False
-        )
+        found = actions.add_parser(name, help=text, description=text, parents=[common])
         found.add_argument("atlas", metavar="ATLAS", help="folder or URL: s3://, gs://, abfs://")
         return found
 
@@ -102,30 +100,20 @@ def run(options: argparse.Namespace) -> int | None:
 
 def _build(options: argparse.Namespace) -> int:
     from orthonav.ground.atlas.build import AtlasRequest, build_atlas
+    from orthonav.ground.atlas.catalog import AtlasRecipe
 
-    recipe = recipe_of(options)
-    if options.sheet_km is not None:
-        recipe["sheet_km"] = options.sheet_km
+    recipe = given(options, AtlasRecipe)
     coarse = {name: getattr(options, f"coarse_{name}") for name in ("gsd_m", "tile_px", "overlap")}
-    if given := {name: value for name, value in coarse.items() if value is not None}:
-        recipe["coarse"] = given
-    request = AtlasRequest(
-        url=options.atlas,
-        orthos=options.ortho,
-        recipe=recipe,
-        replace=options.replace,
-        index=options.index,
-        **asked(options),
-    )
+    if set_ := {name: value for name, value in coarse.items() if value is not None}:
+        recipe["coarse"] = set_
+    fields = asked(options, AtlasRequest) | {"url": options.atlas, "recipe": recipe}
+    request = AtlasRequest(**fields)
     try:
         with _runner(options) as runner, progress(options) as shown:
             result = build_atlas(request, runner, shown)
-    except KeyboardInterrupt:
-        print(
-            "orthonav: error: interrupted; finished sheets are stored, rerun to resume",
-            file=sys.stderr,
-        )
-        return 1
+    except KeyboardInterrupt as stopped:
+        stopped.args = ("finished sheets are stored, rerun to resume",)
+        raise
     plain = result.to_plain()
     if options.json:
         print_json(plain)

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_area, add_options, print_json, progress
+from orthonav.cli.common import add_area, add_options, given, print_json, progress
 
 if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
@@ -24,11 +24,6 @@ EVERYDAY = (
     *("--route", "--bounds", "--band-m"),
     *("--gsd-m", "--work", "--json"),
 )
-RECIPE = (
-    *("gsd_m", "tile_px", "overlap", "method", "edges"),
-    *("seed", "registration", "calibration_views"),
-)
-"""Options that are fields of `BuildRequest` and of `AtlasRecipe`; None where not given."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -74,24 +69,13 @@ def add_recipe(group: argparse._ActionsContainer, *, any_method: bool = True) ->
     add("--no-registration", dest="registration", action="store_const", const=False, help=text)
 
 
-def asked(options: argparse.Namespace) -> dict[str, Any]:
-    """Fields of a request: the area and the terrain."""
+def asked(options: argparse.Namespace, request: type) -> dict[str, Any]:
+    """Fields of a request for a map or an atlas."""
     from orthonav.ground.planning.route import read_route
 
-    return {
-        "bounds_deg": options.bounds,
-        "route": read_route(options.route) if options.route else None,
-        "band_m": options.band_m,
-        "dem": options.dem,
-        "surface": options.surface,
-        "true_ortho": options.true_ortho,
-        "dem_datum": options.dem_datum,
-        "relief": options.relief,
-    }
-
-
-def recipe_of(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: value for name in RECIPE if (value := getattr(options, name, None)) is not None}
+    route = read_route(options.route) if options.route else None
+    area = {"bounds_deg": options.bounds, "route": route}
+    return given(options, request) | area | {"orthos": options.ortho}
 
 
 def run(options: argparse.Namespace) -> None:
@@ -99,18 +83,7 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.ground.build import BuildRequest, build_map
 
     start = time.perf_counter()
-    request = BuildRequest(
-        orthos=options.ortho,
-        out=options.out,
-        other_dates=options.other_date,
-        work=options.work,
-        workers=options.workers,
-        device=options.device,
-        epoch=options.epoch,
-        bands=options.bands,
-        **asked(options),
-        **recipe_of(options),
-    )
+    request = BuildRequest(**asked(options, BuildRequest), other_dates=options.other_date)
     with progress(options) as shown:
         result = build_map(request, shown)
     plates = _plates(result.manifest) if options.epoch is None else []

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_options, print_json, progress
+from orthonav.cli.common import add_options, given, print_json, progress
 from orthonav.core.limits import CAMERA_KINDS
 from orthonav.core.tilt import UNSTATED
 
@@ -138,28 +138,18 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         raise CheckError("--band-m is the width of a band around a route; give --route too")
     route = read_route(options.route) if options.route else None
     agl_m, origin = _agl_m(options, route)
-    return CheckRequest(
-        map_path=options.map,
-        route=route,
-        band_m=options.band_m,
-        other_date=options.other_date,
-        camera=DEFAULT_CAMERA if options.camera is None else read_camera_file(options.camera),
-        agl_m=agl_m,
-        yaw_std_deg=None if options.heading == "unknown" else options.yaw_std_deg,
-        agl_std=options.agl_std,
-        prior_std_m=None if options.prior == "none" else options.prior_std_m,
-        alert_limit_m=options.alert_limit_m,
-        risk=options.risk,
-        speed_mps=options.speed_mps,
-        relief_m=options.relief_m,
-        camera_pitch_deg=options.camera_pitch_deg,
-        effort=options.effort,
-        workers=options.workers,
-        tilt_std_deg=options.tilt_std_deg,
-        camera_kind=options.camera_kind,
-        changes=_changes(options),
-        about=replace(_checked_inputs(options, route), height=origin),
-    )
+    camera = DEFAULT_CAMERA if options.camera is None else read_camera_file(options.camera)
+    more = {
+        "map_path": options.map,
+        "route": route,
+        "camera": camera,
+        "agl_m": agl_m,
+        "yaw_std_deg": None if options.heading == "unknown" else options.yaw_std_deg,
+        "prior_std_m": None if options.prior == "none" else options.prior_std_m,
+        "changes": _changes(options),
+        "about": replace(_checked_inputs(options, route), height=origin),
+    }
+    return CheckRequest(**given(options, CheckRequest) | more)
 
 
 def _changes(options: argparse.Namespace) -> "ChangedGround | None":

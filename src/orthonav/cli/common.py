@@ -1,13 +1,14 @@
 """Shared by several commands: options, what they ask for, progress bars, JSON output."""
 
 import argparse
+import io
 import json
 import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stdout
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -28,13 +29,17 @@ NADIR_DEG = (0.0, 0.0, 0.0)
 log = logging.getLogger(__name__)
 
 
-def bounds(text: str) -> tuple[float, float, float, float]:
-    """West, south, east, north in degrees, from `W,S,E,N`."""
-    try:
-        west, south, east, north = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"expected W,S,E,N in degrees, got '{text}'") from error
-    return west, south, east, north
+def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != count:
+            raise argparse.ArgumentTypeError(f"expected {expected}, got '{text}'")
+        return values
+
+    return parse
 
 
 def _within(least: float, most: float) -> Callable[[str], float]:
@@ -77,10 +82,9 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "help": "width of the search band for legs without a width of their own",
     },
     "--bounds": {
-        "type": bounds,
+        "type": numbers(4, "W,S,E,N in degrees"),
         "metavar": "W,S,E,N",
-        "help": "area: west, south, east, north in degrees; write --bounds=W,S,E,N if W is "
-        "negative",
+        "help": "area: west, south, east, north in degrees",
     },
     "--budget-ms": {
         "type": float,
@@ -340,6 +344,28 @@ def beside(*outputs: Path | None) -> Iterator[None]:
     taken = any(path is not None and is_stdout(path) for path in outputs)
     with redirect_stdout(sys.stderr) if taken else nullcontext():
         yield
+
+
+def given(options: argparse.Namespace, record: type) -> dict[str, Any]:
+    """The options that are fields of a record, without those that were not given."""
+    named = {each.name: getattr(options, each.name, None) for each in fields(record)}
+    return {name: value for name, value in named.items() if value is not None}
+
+
+def say(options: argparse.Namespace, text: str) -> None:
+    if not options.quiet:
+        print(text, file=sys.stderr, flush=True)
+
+
+def run_command(options: argparse.Namespace, *words: object, **values: Any) -> str:
+    """What a command prints, as quiet as this one; `values` replace those of its options."""
+    from orthonav import cli
+
+    parsed = cli.parse([*map(str, words), *["--quiet"] * options.quiet])
+    vars(parsed).update(values)
+    with redirect_stdout(io.StringIO()) as printed:
+        cli.module_of(parsed.command).run(parsed)
+    return printed.getvalue()
 
 
 def counted(number: int, noun: str) -> str:

@@ -2,16 +2,14 @@
 
 import argparse
 import contextlib
-import io
 import json
 import shlex
 import shutil
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
-from orthonav.cli.common import add_options, print_json
+from orthonav.cli.common import add_options, print_json, run_command, say
 
 EXAMPLE = ""
 IMAGERY = Path(__file__).parents[1] / "ground" / "demo_data"
@@ -84,40 +82,30 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
     past, present, dem = (shutil.copy(path, folder) for path in sorted(IMAGERY.glob("*.tif")))
     with contextlib.chdir(folder):
         past, present, dem = (Path(each).name for each in (past, present, dem))
-        _say(options, f"1/4 building the map from {past}")
-        built = _run(options, "build", "--ortho", past, "--dem", dem, "--out", "area.onav")
+        say(options, f"1/4 building the map from {past}")
+        built = run_command(options, "build", "--ortho", past, "--dem", dem, "--out", "area.onav")
         frame = open_map(Path("area.onav")).manifest.sheets[0].frame
         _write_route(Path("route.geojson"), frame.latlon_from_en(WAYPOINTS_EN_M))
         flown = ("--route", "route.geojson", "--agl-m", HEIGHT_M)
-        _say(options, f"2/4 checking from {past} alone where along the route fixes are expected")
+        say(options, f"2/4 checking from {past} alone where along the route fixes are expected")
         trials = ("--band-m", CHECKED_BAND_M, "--effort", CHECK_EFFORT)
-        checked = _run(options, "check", "area.onav", *flown, *trials, "--out", "check")
-        _say(
+        checked = run_command(options, "check", "area.onav", *flown, *trials, "--out", "check")
+        say(
             options,
             f"3/4 simulating a flight over {present}, heading error 5 deg, height error 5 %, "
             "unreported tilt of mount and horizon 1 deg each",
         )
         errors = ("--yaw-std-deg", 5, "--agl-std", 0.05, "--seed", 1)
         spaced = ("--spacing-m", SPACING_M, "--out", "flight")
-        _run(options, "simulate", "--ortho", present, *flown, *errors, *spaced)
-        _say(options, "4/4 localizing every view, searching the whole map")
+        run_command(options, "simulate", "--ortho", present, *flown, *errors, *spaced)
+        say(options, "4/4 localizing every view, searching the whole map")
         searched = ("--prior", "none", "--no-diagnosis", "--out", "fixes.jsonl")
-        _run(options, "localize", "area.onav", "flight", *searched)
+        run_command(options, "localize", "area.onav", "flight", *searched)
         reported = ("--map", "area.onav", "--report", "report", "--metrics", MARKER)
-        measured = _run(options, "evaluate", "fixes.jsonl", "--flight", "flight", *reported)
+        measured = run_command(options, "evaluate", "fixes.jsonl", "--flight", "flight", *reported)
         plain = json.loads(Path(MARKER).read_text(encoding="utf-8"))
     verdict = checked.partition("\n")[0]
     return plain, f"{built}\ncheck      {verdict}\n\n{measured.rpartition('report: ')[0]}"
-
-
-def _run(options: argparse.Namespace, *words: object) -> str:
-    from orthonav import cli
-
-    quiet = ["--quiet"] if options.quiet else []
-    parsed = cli.parse([*map(str, words), *quiet])
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        cli.module_of(parsed.command).run(parsed)
-    return printed.getvalue()
 
 
 def _write_route(path: Path, latlon_deg: Any) -> None:
@@ -125,8 +113,3 @@ def _write_route(path: Path, latlon_deg: Any) -> None:
     geometry = {"type": "LineString", "coordinates": line}
     feature = {"type": "Feature", "properties": {"name": "demo"}, "geometry": geometry}
     path.write_text(json.dumps(feature) + "\n", encoding="utf-8")
-
-
-def _say(options: argparse.Namespace, text: str) -> None:
-    if not options.quiet:
-        print(text, file=sys.stderr, flush=True)

@@ -10,15 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import add_options, beside, print_json
+from orthonav.cli.source import add_source, open_source
 from orthonav.cli.version import require_extras
 
 if TYPE_CHECKING:
-    from orthonav.core.flight import FlightFolder
     from orthonav.core.mapfile.reader import MapFile
-    from orthonav.ground.evaluate.metrics import Metrics
+    from orthonav.ground.evaluate.metrics import Positions
     from orthonav.ground.evaluate.tables import FlightReport
 
 EXAMPLE = "fixes.jsonl --flight flight --map area.onav --report report"
+EVERYDAY = (
+    *("--flight", "--truth", "--map", "--report", "--metrics", "--radius-m", "--alert-limit-m"),
+    *("--risk", "--json"),
+)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -26,8 +30,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "fixes of a flight, as written by localize or fly --jsonl; several files are compared"
     add("fixes", type=Path, nargs="+", metavar="fixes.jsonl", help=text)
     each: dict[str, Any] = {"type": Path, "action": "append", "default": []}
-    text = "ground truth: the true positions (default: truth.csv of --flight); one for all files "
-    text += "of fixes, or one for each in the same order"
+    text = "ground truth: the true positions (default: those of --flight); one for all files of "
+    text += "fixes, or one for each in the same order"
     add("--truth", **each, metavar="truth.csv", help=text)
     text = "largest horizontal error that the mission allows: availability and false fixes at it"
     add_options(parser, "--radius-m", "--json")
@@ -38,39 +42,31 @@ def add(parser: argparse.ArgumentParser) -> None:
     add("--report", type=Path, metavar="REPORT/", help=text)
     text = "map of the flight: background of the report"
     add("--map", type=Path, metavar="MAP.onav", help=text)
-    text = "flight folder with the true positions; one for all files of fixes, or one for each in "
-    text += "the same order"
+    text = "what was localized, with the recorded positions: flight folder, photographs, video, "
+    text += "ROS; one for all files of fixes, or one for each in the same order"
     add("--flight", **each, metavar="FLIGHT_DIR", help=text)
-    parser.set_defaults(wrong_usage=parser.error)
+    add_source(parser, dem=False)
+    parser.set_defaults(wrong_usage=parser.error, skip_bad_images=True)
 
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.core.files import write_text
     from orthonav.core.mapfile import open_map
-    from orthonav.ground.evaluate.tables import (
-        covariance_verdict,
-        flights_to_json,
-        summary,
-        table,
-        total,
-        verdict,
-    )
+    from orthonav.ground.evaluate.tables import runs_to_json, text
 
     _check_options(options)
     opened = open_map(options.map) if options.map else None
     flights = _measured(options, opened)
-    whole = total(flights)
     if options.report:
-        _write_report(options.report, flights, whole, opened)
-    plain = flights_to_json(flights, whole)
+        _write_report(options.report, flights, opened)
+    plain = runs_to_json(flights)
     if options.metrics:
         write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
     with beside(options.metrics):
         if options.json:
             print_json(plain)
             return
-        print(f"{verdict(whole)}\n{covariance_verdict(whole.consistency)}\n")
-        print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
+        print(text(flights))
         if options.report:
             print(f"report: {options.report / 'index.html'}")
 
@@ -80,11 +76,8 @@ def _check_options(options: argparse.Namespace) -> None:
 
     options.flight = _one_each(options.flight, options.fixes, "--flight")
     options.truth = _one_each(options.truth, options.fixes, "--truth")
-    options.truth = options.truth or [folder / "truth.csv" for folder in options.flight]
-    if not options.truth:
-        options.wrong_usage(
-            "give --flight FLIGHT_DIR, whose truth.csv is used, or --truth truth.csv"
-        )
+    if not (options.truth or options.flight):
+        options.wrong_usage("give --flight with recorded positions, or --truth truth.csv")
     if not 0 < options.radius_m < 1e7:
         raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
     if options.report:
@@ -105,7 +98,7 @@ def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
 
 
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
-    from orthonav.core.flight import open_flight, read_truth
+    from orthonav.core.flight import read_truth
     from orthonav.core.flight.fixes import read_results
     from orthonav.core.mapfile.layer import preview
     from orthonav.ground.evaluate.metrics import check_truth, compare, measure, warn_of_another_run
@@ -118,16 +111,19 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         sheet = opened.manifest.sheets[0]
         local, place = sheet.frame, (sheet.frame.lat_deg, sheet.frame.lon_deg)
         background = Background(preview(opened), sheet.grid.extent_en_m)
-    folders = [open_flight(path, images_needed=False) for path in options.flight]
+    recorded = {str(path): _recorded(path, options) for path in options.flight}
     names = [path.stem for path in options.fixes]
     if len(set(names)) < len(names):
         names = [str(path) for path in options.fixes]
     flights = []
-    for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
-        results, known = read_results(fixes), read_truth(truth)
+    for i, fixes in enumerate(options.fixes):
+        truth = options.truth[i] if options.truth else options.flight[i]
+        flight = options.flight[i] if options.flight else truth.parent
+        known, sha256 = recorded[str(flight)] if options.flight else ({}, _digest_of(flight))
+        results, known = read_results(fixes), read_truth(truth) if options.truth else known
         comparison = compare(known, results, local, options.risk)
         check_truth(known, results, place, truth)
-        warn_of_another_run(fixes, opened, folders[i] if folders else _flight_of(truth))
+        warn_of_another_run(fixes, opened, flight, sha256)
         flights.append(
             FlightReport(
                 names[i],
@@ -142,19 +138,33 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     return flights
 
 
-def _flight_of(truth: Path) -> "FlightFolder | None":
+def _recorded(path: Path, options: argparse.Namespace) -> "tuple[Positions, str]":
+    """Recorded positions of what was localized, by frame, and its digest."""
+    from orthonav.core.errors import FlightError
+    from orthonav.core.flight.fixes import FlightDigest
+
+    digest = FlightDigest()
+    views = digest.watching(open_source(path, options).views)
+    places = {view.frame: view.truth_latlon_deg for view in views}
+    known = {name: at for name, at in places.items() if at is not None}
+    if not (known or options.truth):
+        raise FlightError(f"no positions were recorded; give --truth: {path}")
+    return known, digest.sha256
+
+
+def _digest_of(folder: Path) -> str | None:
+    """The digest of the flight folder in which a file with the truth lies, if it is one."""
     from orthonav.core.errors import OrthonavError
     from orthonav.core.flight import open_flight
+    from orthonav.core.flight.fixes import flight_digest
 
     with suppress(OrthonavError):
-        if (truth.parent / "telemetry.csv").is_file():
-            return open_flight(truth.parent, images_needed=False)
+        if (folder / "telemetry.csv").is_file():
+            return flight_digest(open_flight(folder, images_needed=False).views)
     return None
 
 
-def _write_report(
-    out: Path, flights: list["FlightReport"], whole: "Metrics", opened: "MapFile | None"
-) -> None:
+def _write_report(out: Path, flights: list["FlightReport"], opened: "MapFile | None") -> None:
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.ground.evaluate.report import MadeFrom, write_report
@@ -167,7 +177,7 @@ def _write_report(
         command=" ".join(["orthonav", *sys.argv[1:]]),
         version=__version__,
     )
-    write_report(out, flights, made_from, whole=whole)
+    write_report(out, flights, made_from)
 
 
 def _view_command(options: argparse.Namespace, i: int) -> str:
@@ -175,5 +185,6 @@ def _view_command(options: argparse.Namespace, i: int) -> str:
         return ""
     words = ["orthonav", "view", str(options.fixes[i]), "--map", str(options.map)]
     words += ["--flight", str(options.flight[i])] if options.flight else []
-    words += ["--truth", str(options.truth[i]), "--radius-m", f"{options.radius_m:g}"]
+    words += ["--truth", str(options.truth[i])] if options.truth else []
+    words += ["--radius-m", f"{options.radius_m:g}"]
     return shlex.join(words)

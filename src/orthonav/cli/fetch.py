@@ -3,12 +3,19 @@
 import argparse
 import logging
 import shlex
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_area, add_options, area_of, print_json, progress
+from orthonav.cli.common import (
+    add_area,
+    add_options,
+    area_of,
+    given,
+    print_json,
+    progress,
+    say,
+)
 from orthonav.cli.version import require_extras
 from orthonav.core.errors import FetchError
 
@@ -109,9 +116,7 @@ def run(options: argparse.Namespace) -> None:
         _print_estimate(options, estimate_fetch(request), names)
         return
     with progress(options) as shown:
-        result = fetch(
-            request, shown, lambda estimate: _say(options, f"fetching {estimate.text()}")
-        )
+        result = fetch(request, shown, lambda estimate: say(options, f"fetching {estimate.text()}"))
     imagery = request.spec.provenance.datum is None and not holds_heights(options.out)
     found: dict[str, tuple[Path, FetchResult]] = {}
     for kind, name in names.items():
@@ -169,7 +174,7 @@ def _heights(
     from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
     from orthonav.ground.fetch.run import fetch_heights, heights_request
 
-    _say(options, f"fetching the {kind} of {name}")
+    say(options, f"fetching the {kind} of {name}")
     try:
         request = heights_request(imagery, kind, name)
         with progress(options) as shown:
@@ -203,27 +208,15 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
 
     if not (1 <= options.parallel <= 16 and 1 <= options.quality <= 100 and options.retries >= 0):
         raise FetchError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
-    spec = parse_source(
-        options.source,
-        _imagery(options),
-        date=options.date,
-        licence=options.licence,
-        attribution=options.attribution,
-        key_env=options.key_env,
-    )
-    return FetchRequest(
-        spec=spec,
-        area=area_of(options),
-        out=options.out or Path("none.tif"),
-        margin_m=options.margin_m,
-        compress=options.compress,
-        quality=options.quality,
-        cache=options.cache,
-        max_tiles=options.max_tiles,
-        max_mb=options.max_mb,
-        allow_holes=options.allow_holes,
-        limits=RequestLimits(parallel=options.parallel, attempts=options.retries + 1),
-    )
+    terms = ("date", "licence", "attribution", "key_env")
+    named = {name: getattr(options, name) for name in terms}
+    more = {
+        "spec": parse_source(options.source, _imagery(options), **named),
+        "area": area_of(options),
+        "out": options.out or Path("none.tif"),
+        "limits": RequestLimits(parallel=options.parallel, attempts=options.retries + 1),
+    }
+    return FetchRequest(**given(options, FetchRequest) | more)
 
 
 def _imagery(options: argparse.Namespace) -> "ImageryOptions":
@@ -231,13 +224,7 @@ def _imagery(options: argparse.Namespace) -> "ImageryOptions":
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
-    named = {name: getattr(options, name) for name in vars(ImageryOptions()) if name in options}
-    return ImageryOptions(**named)
-
-
-def _say(options: argparse.Namespace, text: str) -> None:
-    if not options.quiet:
-        print(text, file=sys.stderr)
+    return ImageryOptions(**given(options, ImageryOptions))
 
 
 def _summary(out: Path, result: "FetchResult") -> str:

@@ -2,11 +2,10 @@
 
 import argparse
 import logging
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from orthonav.cli.common import add_acceptance, add_options
+from orthonav.cli.common import add_acceptance, add_options, numbers
 
 EXAMPLE = "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550"
 EVERYDAY = (
@@ -16,19 +15,6 @@ EVERYDAY = (
 )
 SEND = ("global-position", "gps-input", "odometry", "vision", "external-position")
 HEIGHTS = ("distance", "terrain", "amsl", "home", "relative")
-
-
-def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
-    def parse(text: str) -> tuple[float, ...]:
-        try:
-            values = tuple(float(part) for part in text.split(","))
-        except ValueError:
-            values = ()
-        if len(values) != count:
-            raise argparse.ArgumentTypeError(f"expected {expected}, got '{text}'")
-        return values
-
-    return parse
 
 
 def add(parser: argparse.ArgumentParser) -> None:

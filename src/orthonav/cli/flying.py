@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import acceptance, checked_signature, search_plan
 from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
-from orthonav.core.errors import CameraError, FlightError, OutputError, UsageError, VariantError
+from orthonav.core.errors import CameraError, FlightError, OutputError, VariantError
 from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
@@ -503,7 +503,7 @@ def given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | No
         return None
     start, place = Prior.known(*options.start), options.start[:2]
     if start is None or abs(start.lon_deg) > 180 or start.std_m == 0:
-        raise UsageError(
+        raise VariantError(
             "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a standard "
             f"deviation above 0 m, got {','.join(f'{value:g}' for value in options.start)}"
             f"{swapped_hint(*place)}"
@@ -511,7 +511,7 @@ def given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | No
     far_m, hint = distance_from_map(place, localizer)
     most_m = START_OFF_M + START_SIGMAS * start.std_m
     if far_m > most_m:
-        raise UsageError(
+        raise VariantError(
             f"--start is {far_m / 1000:,.1f} km from the map, more than {START_OFF_M / 1000:g} "
             f"km and {START_SIGMAS:g} times its deviation; check the map and the position{hint}"
         )

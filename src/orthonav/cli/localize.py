@@ -520,7 +520,12 @@ def _position_text(result: "ViewResult", alert_limit_m: float | None) -> str:
 def _lines(fix: "Fix", result: "ViewResult", alert_limit_m: float | None) -> dict[str, str]:
     east_m, north_m = (math.sqrt(float(fix.cov_en_m2[i, i])) for i in (0, 1))
     level_m = fix.protection_level_m(result.risk)
-    level = f"{level_m:.0f} m" if math.isfinite(level_m) else "infinite"
+    level = f"{level_m:.0f} m"
+    protection = f"{level}, which the error exceeds with a probability of at most {result.risk:g}"
+    if math.isinf(level_m):
+        level = "infinite"
+        protection = "none: the place itself may be wrong with a probability above "
+        protection += f"{result.risk:g}; more views of a flight (--track) confirm it"
     low = "low confidence"
     if alert_limit_m is not None:
         low = f"protection level {level}, at most {alert_limit_m:g} m is allowed"
@@ -531,7 +536,7 @@ def _lines(fix: "Fix", result: "ViewResult", alert_limit_m: float | None) -> dic
         "position": f"{fix.lat_deg:.7f}, {fix.lon_deg:.7f} (latitude, longitude, WGS 84)",
         "deviation": f"{east_m:.1f} m east, {north_m:.1f} m north (1 sigma)",
         "confidence": judged,
-        "protection": f"{level}, which the error exceeds with a probability of {result.risk:g}",
+        "protection": protection,
         "heading": f"{fix.heading_deg:.1f} deg from true north, of the top of the image",
         "height": f"{fix.agl_m:.1f} m above ground",
     }

@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     if route is None and (options.band_m is not None or options.dem or options.out):
         raise RouteError("--band-m, --dem and --out need a route (--route)")
     if options.speed_mps is not None and not 0 < options.speed_mps < 10_000:
-        raise RouteError(f"ground speed must be above 0 m/s, got {options.speed_mps}")
+        raise RouteError(f"speed_mps must be above 0, got {options.speed_mps}")
     dem = dem_of(options, route)
     view = _view(options, route, dem)
     cautions, legs = [], []

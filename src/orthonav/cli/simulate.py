@@ -1,11 +1,10 @@
 """`orthonav simulate`: simulate a flight over an orthophoto of another year."""
 
 import argparse
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
-from orthonav.cli.common import add_options, counted, print_json, progress
+from orthonav.cli.common import add_options, counted, given, print_json, progress
 from orthonav.cli.source import dem_of
 
 EXAMPLE = "--ortho other-year.tif --route route.kml --agl-m 120 --out flight"
@@ -69,30 +68,21 @@ def run(options: argparse.Namespace) -> None:
     )
     from orthonav.ground.simulate.receiver import receiver_of
 
-    dem, given = dem_of(options), vars(options)
+    dem = dem_of(options)
     surface = [open_dem(path, options.dem_datum) for path in options.surface]
     for each in (*surface, *([] if dem is None else [dem])):
         each.require_datum("heights of simulated flights are above the sea")
-    request = SimulateRequest(
-        orthos=options.ortho,
-        out=options.out,
-        route=read_route(options.route) if options.route else None,
-        random=options.random,
-        agl_m=options.agl_m,
-        spacing_m=options.spacing_m,
-        airspeed_mps=options.airspeed_mps,
-        camera=read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA,
-        errors=Errors(
-            **{each.name: given[each.name] for each in fields(Errors) if each.name in given}
-        ),
-        seed=options.seed,
-        turn_radius_m=options.turn_radius_m,
-        terrain=dem,
-        surface=surface,
-        terrain_posting_m=1.0 if dem is None else dem.gsd_m,
-        camera_pitch_deg=options.camera_pitch_deg,
-        gnss=receiver_of(options.receiver) if options.receiver else None,
-    )
+    more = {
+        "orthos": options.ortho,
+        "route": read_route(options.route) if options.route else None,
+        "camera": read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA,
+        "errors": Errors(**given(options, Errors)),
+        "terrain": dem,
+        "surface": surface,
+        "terrain_posting_m": 1.0 if dem is None else dem.gsd_m,
+        "gnss": receiver_of(options.receiver) if options.receiver else None,
+    }
+    request = SimulateRequest(**given(options, SimulateRequest) | more)
     with progress(options) as shown:
         views = simulate_flight(request, lambda share: shown("simulate", share))
     if options.json:

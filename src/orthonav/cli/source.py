@@ -3,11 +3,10 @@
 import argparse
 import logging
 import math
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_options, watched
+from orthonav.cli.common import add_options, given, watched
 from orthonav.core.errors import FlightError, ImageryError
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from orthonav.core.records import ViewResult
     from orthonav.ground.imagery.terrain import Dem
     from orthonav.ground.planning.route import Route
-    from orthonav.ground.recordings import Recording, SourceView
+    from orthonav.ground.recordings import Recording, SourceOptions, SourceView
     from orthonav.onboard.run import Locator
 
 AREA_POINTS = 48  # positions along a side of a map at which its terrain is averaged
@@ -110,18 +109,21 @@ def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
         log.warning("%s", far_text("the recorded position of the first view is", *found))
 
 
+def source_options(options: argparse.Namespace, **more: Any) -> "SourceOptions":
+    from orthonav.ground.recordings import SourceOptions
+
+    more |= {"mount_deg": tuple(options.mount_deg), "topics": dict(options.topics)}
+    return SourceOptions(**given(options, SourceOptions) | more)
+
+
 def open_source(
     path: Path | list[Path], options: argparse.Namespace, *, over_terrain: bool = False
 ) -> "Recording":
     """The open recording of the command line; its warnings are logged. `over_terrain`: whether a
     terrain turns its heights into heights above ground."""
-    from orthonav.ground.recordings import SourceOptions, open_source
+    from orthonav.ground.recordings import open_source
 
-    names = {each.name for each in fields(SourceOptions)}
-    given = {name: value for name, value in vars(options).items() if name in names}
-    given |= {"mount_deg": tuple(options.mount_deg), "topics": dict(options.topics)}
-    source_options = SourceOptions(**given, over_terrain=over_terrain)
-    recording = open_source(path, source_options)
+    recording = open_source(path, source_options(options, over_terrain=over_terrain))
     for said in (*recording.choices, *recording.warnings):
         log.warning("%s", said)
     return recording

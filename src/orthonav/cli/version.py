@@ -11,6 +11,7 @@ from orthonav.core.extras import missing, packages, pip_line, require
 
 NEEDS: Mapping[str, tuple[str, ...]] = {
     "demo": ("geo", "report", "web"),
+    "run": ("geo", "report"),
     "simulate": ("geo",),
     "fetch --source": ("fetch",),
     "build": ("geo",),
@@ -33,6 +34,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "fly --autopilot, --log": ("autopilot",),
     "fly --ros2": ("ros2",),
     "evaluate --report": ("report",),
+    "run, as all others: words completed by the shell": ("completion",),
 }
 """Extras by command, or by command with an option or an input."""
 

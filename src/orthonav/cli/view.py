@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_options
+from orthonav.cli.common import add_options, given
+from orthonav.cli.source import add_source, source_options
 
 if TYPE_CHECKING:
     from orthonav.ground.view.server import Server
@@ -25,9 +26,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "another run of the same flight to compare, such as single and tracked fixes"
     add("second", type=Path, nargs="?", metavar="SECOND", help=text)
     add("--map", type=Path, required=True, metavar="MAP.onav", help="map of the flight")
-    text = "flight folder or flight log with the images (not needed if RUN is a log)"
+    text = "images: flight folder, photographs or flight log (not needed if RUN is a log)"
     add("--flight", type=Path, metavar="FLIGHT_DIR", help=text)
-    text = "ground truth: the true positions (default: those of the flight folder, if any)"
+    text = "ground truth: the true positions (default: those that --flight has, if any)"
     add("--truth", type=Path, metavar="truth.csv", help=text)
     add_options(parser, "--mount", "--radius-m")
     text = "the run is in progress: show new views as they arrive; the file need not exist yet"
@@ -37,22 +38,15 @@ def add(parser: argparse.ArgumentParser) -> None:
     add("--host", default=LOOPBACK, help=text)
     text = "print the address without opening a browser"
     add("--no-browser", action="store_true", help=text)
+    add_source(parser, dem=False)
 
 
 def run(options: argparse.Namespace) -> None:
     from orthonav.ground.view.run import ViewRequest, open_run
     from orthonav.ground.view.server import Pages, Server, load_assets
 
-    request = ViewRequest(
-        run=options.run,
-        second=options.second,
-        map_path=options.map,
-        flight=options.flight,
-        truth=options.truth,
-        mount=options.mount,
-        radius_m=options.radius_m,
-        live=options.live,
-    )
+    source = source_options(options, skip_bad_images=True)
+    request = ViewRequest(**given(options, ViewRequest), map_path=options.map, source=source)
     pages = Pages(open_run(request), load_assets())
     server = Server(pages, options.host, options.port)
     with server:

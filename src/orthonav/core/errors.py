@@ -1,14 +1,12 @@
 """Errors raised for broken input; each says what came, what was expected, and what to do.
 
-All derive from `OrthonavError`, which the command line turns into one line and `exit_code`,
+All derive from `OrthonavError`, which the command line turns into one line and an exit code,
 and from the builtin that fits, so that callers who know nothing of orthonav can still catch them.
 A view that cannot be placed is not an error: see `orthonav.core.records.NoFix`."""
 
 
 class OrthonavError(Exception):
     """Root of everything orthonav raises on purpose."""
-
-    exit_code = 1
 
 
 class MissingFileError(OrthonavError, FileNotFoundError):
@@ -64,13 +62,7 @@ class WorkerError(OrthonavError, RuntimeError):
 
 
 class VariantError(OrthonavError, ValueError):
-    """An unknown method, representation or parameter was named."""
-
-
-class UsageError(VariantError):
-    """The value of an option is impossible."""
-
-    exit_code = 2
+    """An unknown method, representation or parameter was named, or its value is impossible."""
 
 
 class OutputError(OrthonavError, OSError):

@@ -31,8 +31,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """A temporary path, synced and renamed to `path` on success, else removed. Raises
     `OutputError`."""
     path = Path(path).resolve()
-    if path.exists() and not path.is_file():
-        raise OutputError(f"cannot write over a folder or a device: {path}")
+    require_writable(path)
     made: list[Path] = []
     try:
         made = _made_folders(path.parent)
@@ -92,6 +91,19 @@ def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) 
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         _remove_empty(made)
+
+
+def require_writable(path: Path, *, folder: bool = False) -> None:
+    """Raise `OutputError` where a file, or a `folder`, can surely not be written to `path`."""
+    path = Path(path).resolve()
+    if not folder and path.exists() and not path.is_file():
+        raise OutputError(f"cannot write over a folder or a device: {path}")
+    there = next(each for each in path.parents if each.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+        why = "no permission, or a read-only disk" if there.is_dir() else "not a folder"
+        raise OutputError(f"cannot write ({why}: {there}): {path}")
+    if shutil.disk_usage(there).free < _ALMOST_NONE:
+        raise OutputError(f"disk full; nothing was written: {path}")
 
 
 def _made_folders(folder: Path) -> list[Path]:

@@ -209,7 +209,7 @@ def open_sink(url: str) -> Sink:
     it cannot be opened."""
     kind, _, rest = url.partition(":")
     if kind == "udp":
-        return Udp(None, host_port(rest, url))
+        return Udp(None, host_port(rest, url, 10110))
     if kind == "serial":
         return SerialSink(*device_baud(rest, url))
     raise VariantError(f"expected udp:HOST:PORT or serial:DEVICE:BAUD, got '{url}'")

@@ -141,11 +141,12 @@ def transport_opener(url: str) -> Callable[[], Transport]:
     return lambda: open_serial(device, baud)
 
 
-def host_port(text: str, url: str) -> tuple[str, int]:
-    """Host and port of `[HOST:]PORT`; the default host is the loopback."""
+def host_port(text: str, url: str, usual: int = 14550) -> tuple[str, int]:
+    """Host and port of `[HOST:]PORT`; the default host is the loopback. `usual`: port of hints."""
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdigit() and 0 <= int(port) <= 65_535):
-        raise VariantError(f"expected HOST:PORT, such as {LOOPBACK}:14550: '{url}'")
+        hint = f"{url.partition(':')[0]}:{host or text or LOOPBACK}:{usual}"
+        raise VariantError(f"expected HOST:PORT, such as {hint}, got '{url}'")
     return host or LOOPBACK, int(port)
 
 

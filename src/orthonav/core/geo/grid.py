@@ -39,7 +39,7 @@ class TileGrid:
         """Over west, south, east, north (m); `overlap` of neighbours. Raises `AreaError`."""
         west, south, east, north = extent_en_m
         if not (np.isfinite(gsd_m) and gsd_m > 0):
-            raise AreaError(f"ground resolution must be above 0 m per pixel, got {gsd_m}")
+            raise AreaError(f"gsd_m must be above 0 m per pixel, got {gsd_m}")
         if not 16 <= tile_px <= MAX_TILE_PX:
             raise AreaError(f"tiles must be 16 to {MAX_TILE_PX} px across, got {tile_px}")
         if not 0 <= overlap < 1:

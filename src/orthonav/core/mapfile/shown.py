@@ -27,7 +27,7 @@ def write_preview(opened: MapFile, path: Path) -> None:
     Raises `OutputError` for another ending, `MapFileError` where the map is damaged."""
     path = Path(path)
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
-        raise OutputError(f"a preview is a .png or .tif file: {path}")
+        raise OutputError(f"preview must be a .png or .tif file: {path}")
     grey, px_m, sheet = _picture(opened, MAX_PX)
     done, data = cv2.imencode(path.suffix.lower(), grey)
     if not done:

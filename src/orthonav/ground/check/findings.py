@@ -95,7 +95,7 @@ def likely_outages(along: Along, flights: Flights, conditions: Conditions) -> tu
 
 
 class Threshold(NamedTuple):
-    """GO up to `go` at the cautious end of the interval, NO-GO beyond `no_go` at the other end.
+    """GO up to `go`, NO-GO beyond `no_go`, both at the cautious end of the interval.
 
     Where more is better `go` is the larger one.
     """
@@ -105,11 +105,16 @@ class Threshold(NamedTuple):
 
     def word(self, figure: Range) -> Word:
         more = self.go > self.no_go
-        cautious, other = (figure.low, figure.high) if more else (figure.high, figure.low)
-        sign = 1 if more else -1
-        if sign * (other - self.no_go) < 0:
+        cautious, sign = (figure.low, 1) if more else (figure.high, -1)
+        if sign * (cautious - self.no_go) < 0:
             return Word.NO_GO
         return Word.GO if sign * (cautious - self.go) >= 0 else Word.MARGINAL
+
+    def text(self, as_text: Callable[[float], str]) -> str:
+        more = self.go > self.no_go
+        good, bad, end = ("from", "below", "lower") if more else ("up to", "above", "upper")
+        go, no_go = as_text(self.go), as_text(self.no_go)
+        return f"; GO {good} {go}, NO-GO {bad} {no_go}, at the {end} end"
 
 
 # A planner's judgement, not a measurement.
@@ -190,7 +195,8 @@ def verdict_of(found: Findings) -> Verdict:
         reasons += [Reason("uncertain", text, Word.MARGINAL)]
     if found.changed > 0:  # a warning: it lowers the probability already
         text = f"At least {percent_text(found.changed)} of the ground {where} changed since the "
-        text += "map was made: fixes are less likely there; build the map from newer imagery."
+        text += "map was made: fixes are less likely there; build the map from newer imagery. "
+        text += f"Limit: {100 * CHANGED.go:g} %."
         reasons += [Reason("changed_ground", text, CHANGED.word(_exact(found.changed)))]
     reasons += [_objects(found), *_oblique(found.conditions), *_thermal(found.conditions)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
@@ -268,22 +274,22 @@ def _trust(found: Findings) -> list[Reason]:
     fraction = found.wrong / max(found.trials, 1)
     word = WRONG.word(_exact(fraction))
     text = f"Confident fixes beyond {metres_text(found.conditions.radius_m)}: {found.wrong} of "
-    text += f"{found.trials} trial views. Limit: {100 * WRONG.go:g} %."
+    text += f"{found.trials} trial views. Limits: {100 * WRONG.go:g} %, NO-GO above "
+    text += f"{100 * WRONG.no_go:g} %."
     return [Reason("wrong", text, word)] if found.wrong >= MIN_WRONG and word is not Word.GO else []
 
 
 def _mean(mean: Range, where: str) -> Reason:
     word = FIXES.word(mean)
     text = f"Mean probability of a confident, correct fix per view {where}: "
-    text += range_text(mean, probability_text)
-    text += "" if word is Word.GO else f"; GO requires {100 * FIXES.go:.0f} % at the lower end"
+    text += range_text(mean, probability_text) + FIXES.text(probability_text)
     return Reason("fixes" if word is Word.GO else "few_fixes", f"{text}.", word)
 
 
 def _outside(fraction: float) -> list[Reason]:
     word = OUTSIDE.word(_exact(fraction))
-    text = f"{percent_text(fraction)} of the route is outside the map. Limit: "
-    text += f"{100 * OUTSIDE.go:g} %."
+    text = f"{percent_text(fraction)} of the route is outside the map. Limits: "
+    text += f"{100 * OUTSIDE.go:g} %, NO-GO above {100 * OUTSIDE.no_go:g} %."
     return [] if word is Word.GO else [Reason("outside_map", text, word)]
 
 
@@ -299,23 +305,23 @@ def _available(found: Findings) -> list[Reason]:
     if math.isfinite(after_m.median):
         level = range_text(after_m, metres_text)
     if flights is None:
-        text = f"Protection level right after a fix: {level}; alert limit: {limit}."
-        return [Reason("availability", text, Threshold(limit_m, limit_m).word(after_m))]
+        text = f"Protection level right after a fix: {level}; alert limit: {limit}: GO within it "
+        text += "at the upper end, NO-GO beyond it at the lower end, of places of the map."
+        word = Word.GO if after_m.high <= limit_m else Word.MARGINAL
+        return [Reason("availability", text, Word.NO_GO if after_m.low > limit_m else word)]
     text = f"Availability, the fraction of the route with a protection level within {limit}: "
     text += range_text(flights.availability, probability_text)
+    text += AVAILABILITY.text(probability_text)
     word = AVAILABILITY.word(flights.availability)
-    if word is not Word.GO:
-        text += f"; GO requires {100 * AVAILABILITY.go:.0f} % at the lower end"
-        if after_m.median > limit_m:
-            text += f". Protection level right after a fix: {level}"
+    if word is not Word.GO and after_m.median > limit_m:
+        text += f". Protection level right after a fix: {level}"
     reasons = [Reason("availability", f"{text}.", word)]
     text = f"Longest outage: {range_text(flights.outage_s, seconds_text)}, "
-    text += f"{range_text(flights.outage_m, metres_text)}. Limit: {seconds_text(OUTAGE_S.go)} at "
-    return [*reasons, Reason("outage", f"{text}the upper end.", OUTAGE_S.word(flights.outage_s))]
+    text += f"{range_text(flights.outage_m, metres_text)}{OUTAGE_S.text(seconds_text)}."
+    return [*reasons, Reason("outage", text, OUTAGE_S.word(flights.outage_s))]
 
 
 def _false_fix(flights: Flights, conditions: Conditions) -> Reason:
     text = f"Probability of a confident fix beyond {metres_text(conditions.radius_m)} on this "
-    text += f"route: {range_text(flights.false_fix, percent_text)}. Limit: "
-    text += f"{100 * FALSE_FIX.go:g} % at the upper end."
+    text += f"route: {range_text(flights.false_fix, percent_text)}{FALSE_FIX.text(percent_text)}."
     return Reason("wrong", text, FALSE_FIX.word(flights.false_fix))

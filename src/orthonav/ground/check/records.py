@@ -127,7 +127,7 @@ class CheckRequest:
         if self.camera_kind != "colour" and self.other_date is not None:
             raise CheckError("--camera-kind is for checks without --other-date, which shows it")
         limits: dict[str, tuple[float | None, float, float, str]] = {
-            "height above ground": (self.agl_m, 1.0, 50_000.0, " m"),
+            "agl_m": (self.agl_m, 1.0, 50_000.0, " m"),
             "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, " deg"),
             "agl_std": (self.agl_std, 0.0, 0.5, " (a fraction of the height: 0.05 is 5 %)"),
             "prior_std_m": (self.prior_std_m, 0.0, 1e6, " m"),

@@ -8,19 +8,18 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
 
 from orthonav.core import integrity
 from orthonav.core.errors import FlightError
 from orthonav.core.files import StrPath
-from orthonav.core.flight import FlightFolder, read_truth
-from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
+from orthonav.core.flight import read_truth
+from orthonav.core.flight.fixes import Identity, read_identity, read_results
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.limits import DEFAULT_RISK
@@ -82,7 +81,6 @@ class Comparison:
     `followed` (N,): 1, or 0 where true positions without a result come next; NaN at the end of a
     flight whose first or last true position has none.
     `n_without_truth`, `n_without_result`: results without truth, and the reverse.
-    `starts`: index at which each pooled flight begins.
     """
 
     lat_deg: float
@@ -104,16 +102,11 @@ class Comparison:
     followed: FloatArray
     n_without_truth: int
     n_without_result: int
-    starts: tuple[int, ...] = (0,)
 
     @property
     def n_views(self) -> int:
         """Number of true positions: views without a result have no fix either."""
         return self.errors_m.size + self.n_without_result
-
-    @property
-    def flights(self) -> list[slice]:
-        return [slice(*ends) for ends in pairwise((*self.starts, len(self.frames)))]
 
     def confident_wrong(self, least_m: float) -> BoolArray:
         """(N,): confident fixes with an error above `least_m` and above the stated radius."""
@@ -143,7 +136,7 @@ class CriterionRow:
 
 @dataclass(frozen=True)
 class Integrity:
-    """Protection levels of one flight, or of several pooled; NaN where undefined.
+    """Protection levels of one flight; NaN where undefined.
 
     `risk`: of the levels. `n_levels`: fixes with a finite one; `n_beyond`, `beyond`,
     `beyond_upper_95`: errors larger than their own level, their fraction of these fixes, and its
@@ -171,7 +164,7 @@ class Integrity:
 
 @dataclass(frozen=True, eq=False)
 class Metrics:
-    """Metrics of one flight, or of several pooled; undefined ones are NaN.
+    """Metrics of one flight; undefined ones are NaN.
 
     `radius_m`: a fix within it is right.
     `n_confident_wrong`: confident fixes that err by more than `wrong_above_m` and their own radius.
@@ -179,7 +172,7 @@ class Metrics:
     `availability`: fraction of the true positions with a confident fix; `availability_95`: its 95 %
     interval. Both bounds are those of independent views.
     `coverage`: fraction of the true positions with a fix, low confidence included.
-    `gap`: the longest stretch without a confident fix, of one flight.
+    `gap`: the longest stretch without a confident fix.
     `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
     `reasons`: number of views without a fix by reason.
     `standard`, `of_confident`: errors of all and of confident fixes.
@@ -251,15 +244,16 @@ def check_truth(
     path: Path,
 ) -> None:
     """Log a warning where true positions are far from the fixes of the same views or, without any,
-    from the centre of the map.
+    from the centre of the map, and where most of the confident fixes are wrong by them.
 
     Raises `FlightError` where they are near once latitude and longitude are exchanged.
     """
-    both = [
-        (truth[result.frame], (result.outcome.lat_deg, result.outcome.lon_deg))
+    placed = [
+        (result.outcome, truth[result.frame], result.is_confident)
         for result in results
         if isinstance(result.outcome, Fix) and result.frame in truth
     ]
+    both = [(place, (fix.lat_deg, fix.lon_deg)) for fix, place, _ in placed]
     compared = "the fixes" if both else "the map"
     if not both and centre_latlon_deg is not None:
         both = [(place, centre_latlon_deg) for place in truth.values()]
@@ -272,18 +266,28 @@ def check_truth(
     far = f"true positions are {far_m / 1000:,.0f} km from {compared} (median)"
     if far_m > _SWAPPED_M and swapped_m < far_m / 10:
         raise FlightError(f"{far}; {HINT}: {path}")
+    errors_m = distances_m(true, expected)
+    wrong = [
+        error_m > np.fmax(FAR_M, fix.radius_m)
+        for error_m, (fix, _, is_confident) in zip(errors_m, placed, strict=False)
+        if is_confident
+    ]
     if far_m > _OTHER_FLIGHT_M:
         log.warning("%s; are these of the same flight?: %s", far, path)
+    elif 2 * sum(wrong) > len(wrong):  # false fixes are few: rather the truth or the map is wrong
+        log.warning(
+            "%d of %d confident fixes are far from the true positions (all fixes: %.0f m in the "
+            "median); are these of the same flight, and is the map in its place?: %s",
+            *(sum(wrong), len(wrong), far_m, path),
+        )
 
 
-def warn_of_another_run(fixes: Path, opened: MapFile | None, flight: FlightFolder | None) -> None:
+def warn_of_another_run(
+    fixes: Path, opened: MapFile | None, flight: Path | None, flight_sha256: str | None
+) -> None:
     """Log a warning where fixes were computed from another map or flight than the given ones."""
-    given = Identity(
-        opened.manifest.sha256 if opened else None, flight_digest(flight.views) if flight else None
-    )
-    other = read_identity(fixes).differences(
-        given, opened.path if opened else None, flight.path if flight else None
-    )
+    given = Identity(opened.manifest.sha256 if opened else None, flight_sha256)
+    other = read_identity(fixes).differences(given, opened.path if opened else None, flight)
     if other:
         log.warning("fixes are of %s: %s", other, fixes)
 
@@ -362,27 +366,6 @@ def protection_levels_m(results: Sequence[ViewResult], risk: float | None = None
     return frozen(levels_m)
 
 
-def pool(comparisons: Sequence[Comparison]) -> Comparison:
-    """Several comparisons of one flight each as one, for metrics; each stays in its own plane."""
-    if not comparisons:
-        raise ValueError("no results: expected at least one flight")
-    joined: dict[str, Any] = {
-        field.name: _joined([getattr(part, field.name) for part in comparisons])
-        for field in fields(Comparison)
-    }
-    joined |= {name: getattr(comparisons[0], name) for name in ("lat_deg", "lon_deg", "risk")}
-    joined["starts"] = tuple(np.cumsum([0, *(len(each.frames) for each in comparisons[:-1])]))
-    return Comparison(**joined)
-
-
-def _joined(values: list[Any]) -> Any:
-    if isinstance(values[0], np.ndarray):
-        return np.concatenate(values)
-    if isinstance(values[0], Mapping):
-        return {name: np.concatenate([each[name] for each in values]) for name in values[0]}
-    return sum(values, start=type(values[0])())
-
-
 def measure(
     comparison: Comparison, radius_m: float = 15.0, alert_limit_m: float = math.nan
 ) -> Metrics:
@@ -406,7 +389,7 @@ def measure(
     if comparison.n_without_result:
         reasons[NO_RESULT] += comparison.n_without_result
     standard, of_confident = (
-        standard_figures(comparison.truth_en_m, fix_en_m, comparison.starts)
+        standard_figures(comparison.truth_en_m, fix_en_m)
         for fix_en_m in (
             comparison.fix_en_m,
             np.where(comparison.confident[:, None], comparison.fix_en_m, np.nan),
@@ -509,29 +492,24 @@ def _criterion_row(
 
 
 def _share_of_time(comparison: Comparison, flags: BoolArray) -> float:
-    """Of the views with `flags` (N,), each up to the next view of its flight, none where a view
-    between has no result; NaN where a flight has no result at an end or its times do not rise."""
+    """Of the views with `flags` (N,), each up to the next view, none where a view between has no
+    result; NaN where the flight has no result at an end or its times do not rise."""
     if np.isnan(comparison.followed).any():
         return math.nan
-    part_s = whole_s = 0.0
-    for views in comparison.flights:
-        steps_s = np.diff(seconds_since_first(comparison.time_ns[views]))
-        part_s += float(steps_s[(flags & (comparison.followed > 0))[views][:-1]].sum())
-        whole_s += float(steps_s.sum())
+    steps_s = np.diff(seconds_since_first(comparison.time_ns))
+    whole_s = float(steps_s.sum())
+    part_s = float(steps_s[(flags & (comparison.followed > 0))[:-1]].sum())
     return part_s / whole_s if whole_s else math.nan
 
 
 def _longest_without(comparison: Comparison, flags: BoolArray) -> Longest:
-    """The longest stretch of any flight without `flags` (N,), as `_share_of_time` counts them, time
-    and path each by itself; NaN likewise."""
+    """The longest stretch without `flags` (N,), as `_share_of_time` counts them, time and path each
+    by itself; NaN likewise."""
     if np.isnan(comparison.followed).any():
         return Longest(math.nan, math.nan)
-    without, gaps = ~(flags & (comparison.followed > 0)), []
-    for views in comparison.flights:
-        seconds_s = seconds_since_first(comparison.time_ns[views])
-        path_m = path_so_far_m(comparison.truth_en_m[views])
-        gaps.append(astuple(longest(without[views], seconds_s, path_m)))
-    return Longest(*map(float, np.max(gaps, axis=0)))
+    seconds_s = seconds_since_first(comparison.time_ns)
+    without = ~(flags & (comparison.followed > 0))
+    return longest(without, seconds_s, path_so_far_m(comparison.truth_en_m))
 
 
 def _covariance(outcome: Fix | NoFix) -> FloatArray:

@@ -33,7 +33,6 @@ from orthonav.ground.evaluate.tables import (
     standard_rows,
     table_header,
     table_rows,
-    total,
     track_rows,
     verdict,
     wrong_bound_text,
@@ -88,33 +87,27 @@ def write_report(
     out_dir: Path,
     flights: Sequence[FlightReport],
     made_from: MadeFrom | None = None,
-    whole: Metrics | None = None,
 ) -> Path:
     """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
 
-    `whole`: what `total` gives, computed where it is None. Figures are also written beside it.
-    Raises `ValueError` as `total` and `OutputError` as `write_figures`.
+    Figures are also written beside it. Raises `OutputError`.
     """
-    whole = whole or total(flights)
+    first = flights[0].metrics
     several = len(flights) > 1
     prefixes = [""]
     if several:  # two dashes, which neither `file_names` nor the names of figures contain
         prefixes = [f"{name}--" for name in file_names([flight.name for flight in flights])]
     sections = [_section(*each) for each in zip(flights, prefixes, strict=True)]
-    subject = f"{len(flights)} flights" if several else flights[0].name
+    subject = f"{len(flights)} runs" if several else flights[0].name
     values: dict[str, Any] = {
         "title": f"Evaluation of {subject}",
         "kind": "Evaluation of flights",
-        "verdict": verdict(whole),
-        "verdict_kind": "bad" if whole.n_confident_wrong else "good" if whole.n_confident else "",
-        "cards": _cards(whole),
-        "notes": _notes(whole),
-        "radius": f"{whole.radius_m:g} m",
-        "wrong_above": f"{whole.wrong_above_m:g} m",
-        "table_header": table_header(whole),
-        "table_rows": table_rows(flights, whole),
+        "radius": f"{first.radius_m:g} m",
+        "wrong_above": f"{first.wrong_above_m:g} m",
+        "table_header": table_header(first),
+        "table_rows": table_rows(flights),
         "standard_header": STANDARD_HEADER,
-        "criteria_header": criteria_header(whole),
+        "criteria_header": criteria_header(first),
         "sections": sections,
         "made_from": [
             ("orthonav" if name == "version" else name.removesuffix("_name"), text)
@@ -176,6 +169,10 @@ def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
     metrics, figures = flight.metrics, _figures(flight)
     return {
         "name": flight.name,
+        "verdict": verdict(metrics),
+        "verdict_kind": "bad" if metrics.n_confident_wrong else "good" * (metrics.n_confident > 0),
+        "cards": _cards(metrics),
+        "notes": _notes(metrics),
         "view_command": flight.view_command,
         "figures": [
             Figure(f"{prefix}{name}", f"{flight.name}: {alt}", caption, drawing)

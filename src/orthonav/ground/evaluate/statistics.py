@@ -13,7 +13,6 @@ number), at most the radius of the evaluation. Undefined figures are NaN.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,7 +154,7 @@ class ErrorStatistics:
 
 @dataclass(frozen=True)
 class StandardFigures:
-    """The standard figures of one flight, or of several pooled.
+    """The standard figures of one flight.
 
     `ape`: absolute pose error, the distance between a fix and its true position.
     `rpe_frames`: relative pose error from each fix to the next.
@@ -171,29 +170,19 @@ class StandardFigures:
     cep95_m: float
 
 
-def standard_figures(
-    truth_en_m: FloatArray,
-    fix_en_m: FloatArray,
-    starts: Sequence[int] = (0,),
-) -> StandardFigures:
-    """Standard figures of positions (N, 2) in metres, NaN where there is no fix.
-
-    `starts` are the indices at which flights begin: relative errors do not cross them.
-    """
+def standard_figures(truth_en_m: FloatArray, fix_en_m: FloatArray) -> StandardFigures:
+    """Standard figures of positions (N, 2) in metres, NaN where there is no fix."""
     errors_m = np.hypot(*(fix_en_m - truth_en_m).T)
     errors_m = errors_m[np.isfinite(errors_m)]
-    frames: list[FloatArray] = []
-    distances: list[FloatArray] = []
-    for first, last in pairwise((*starts, len(truth_en_m))):
-        fixes = np.flatnonzero(np.isfinite(fix_en_m[first:last]).all(axis=1)) + first
-        marks = fixes[_marks(truth_en_m[fixes])]
-        for chosen, errors in ((fixes, frames), (marks, distances)):
-            change = np.diff(fix_en_m[chosen] - truth_en_m[chosen], axis=0)
-            errors.append(np.hypot(change[:, 0], change[:, 1]))
+    fixes = np.flatnonzero(np.isfinite(fix_en_m).all(axis=1))
+    frames, distances = (
+        error_statistics(np.hypot(*np.diff((fix_en_m - truth_en_m)[chosen], axis=0).T))
+        for chosen in (fixes, fixes[_marks(truth_en_m[fixes])])
+    )
     return StandardFigures(
         ape=error_statistics(errors_m),
-        rpe_frames=error_statistics(np.concatenate(frames)),
-        rpe_distance=error_statistics(np.concatenate(distances)),
+        rpe_frames=frames,
+        rpe_distance=distances,
         cep50_m=percentile(errors_m, 50.0),
         cep95_m=percentile(errors_m, 95.0),
     )

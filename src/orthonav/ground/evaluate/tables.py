@@ -7,7 +7,7 @@ from typing import Any
 
 from orthonav.core.flight.fixes import STATES
 from orthonav.core.flight.gnss import BIASES as GNSS_BIASES
-from orthonav.ground.evaluate.metrics import FAR_M, Comparison, Metrics, measure, pool, radius_key
+from orthonav.ground.evaluate.metrics import FAR_M, Comparison, Metrics, radius_key
 from orthonav.ground.evaluate.statistics import (
     NEES_LEVELS,
     RPE_DISTANCE_M,
@@ -25,7 +25,7 @@ from orthonav.ground.report.drawing import Background
 
 Plain = dict[str, Any]
 _COLUMNS = (
-    *("flight", "views", "confident", "wrong", "low confidence", "coverage", "right", "of fixes"),
+    *("run", "views", "confident", "wrong", "low confidence", "coverage", "right", "of fixes"),
     *("median m", "95 % m", "max m", "latency ms"),
 )
 STANDARD_HEADER = ("", "fixes", "RMSE m", "mean m", "median m", "std m", "max m", "number")
@@ -53,20 +53,6 @@ class FlightReport:
     track: TrackMetrics | None = None
     gnss: GnssMetrics | None = None
     view_command: str = ""
-
-
-def total(flights: Sequence[FlightReport]) -> Metrics:
-    """Metrics of all views of all flights together.
-
-    Raises `ValueError` for no flight, and where flights were measured at different radii.
-    """
-    if len({flight.metrics.radius_m for flight in flights}) != 1:
-        raise ValueError("a total needs at least one flight, and one radius for all of them")
-    first = flights[0].metrics
-    if len(flights) == 1:
-        return first
-    limit_m = math.nan if first.integrity is None else first.integrity.alert_limit_m
-    return measure(pool([flight.comparison for flight in flights]), first.radius_m, limit_m)
 
 
 # JSON.
@@ -130,16 +116,13 @@ def _standard_to_json(standard: StandardFigures) -> Plain:
     }
 
 
-def flights_to_json(flights: Sequence[FlightReport], whole: Metrics) -> Plain:
-    """The figures of all flights together, and of several also of each, for strict JSON; those of a
-    track or of GNSS are given per flight."""
-    plain = metrics_to_json(whole)
-    if len(flights) == 1:
-        track, gnss = flights[0].track, flights[0].gnss
-        plain |= {} if track is None else {"track": track_to_json(track)}
-        return plain | ({} if gnss is None else {"gnss": gnss_to_json(gnss)})
-    plain["flights"] = {each.name: flights_to_json([each], each.metrics) for each in flights}
-    return plain
+def runs_to_json(runs: Sequence[FlightReport]) -> Plain:
+    """The figures of a run, or of several by name, for strict JSON."""
+    if len(runs) > 1:
+        return {"runs": {each.name: runs_to_json([each]) for each in runs}}
+    plain, track, gnss = metrics_to_json(runs[0].metrics), runs[0].track, runs[0].gnss
+    plain |= {} if track is None else {"track": track_to_json(track)}
+    return plain | ({} if gnss is None else {"gnss": gnss_to_json(gnss)})
 
 
 def track_to_json(track: TrackMetrics) -> Plain:
@@ -195,14 +178,25 @@ def wrong_bound_text(metrics: Metrics) -> str:
     return f"95 % bound of the rate: below {percent_text(metrics.wrong_upper_95)}"
 
 
-def table(flights: Sequence[FlightReport], whole: Metrics) -> str:
-    lines = aligned([table_header(whole), *table_rows(flights, whole)])
-    if len(flights) > 1:
-        lines.insert(-1, "-" * max(map(len, lines)))
+def text(runs: Sequence[FlightReport]) -> str:
+    """Runs beside each other, never together: those of one flight are not independent."""
+    names = [f"{_name(run)}: " * (len(runs) > 1) for run in runs]
+    lines = []
+    for name, run in zip(names, runs, strict=True):
+        judged = covariance_verdict(run.metrics.consistency)
+        lines += [f"{name}{verdict(run.metrics)}", f"{name}{judged}"]
+    lines += ["", *aligned([table_header(runs[0].metrics), *table_rows(runs)])]
+    for name, run in zip(names, runs, strict=True):
+        lines += ["", *([name.rstrip()] if name else []), summary(run)]
     return "\n".join(lines)
 
 
-def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
+def _name(run: FlightReport) -> str:
+    return " ".join(run.name.split())
+
+
+def summary(flight: FlightReport) -> str:
+    whole, rows = flight.metrics, list[tuple[str, str]]()
     low, high = map(percent_text, whole.availability_95)
     gap = f"{measure_text(whole.gap.seconds_s, ' s')}, {measure_text(whole.gap.path_m, ' m')}"
     lines = [
@@ -217,16 +211,12 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
         f"covariance: {covariance_text(whole.consistency)}",
         *(f"{name}: {text}" for name, text in integrity_rows(whole)),
     ]
-    for flight in flights:
-        rows: list[tuple[str, str]] = []
-        if flight.track is not None:
-            of = f" of {' '.join(flight.name.split())}" if len(flights) > 1 else ""
-            lines.append(f"track{of}:")
-            rows += track_rows(flight.track)
-        if flight.gnss is not None:
-            rows += gnss_rows(flight.gnss)
-        lines += [f"  {name}: {text}" for name, text in rows]
-    return "\n".join(lines)
+    if flight.track is not None:
+        lines.append("track:")
+        rows += track_rows(flight.track)
+    if flight.gnss is not None:
+        rows += gnss_rows(flight.gnss)
+    return "\n".join([*lines, *(f"  {name}: {text}" for name, text in rows)])
 
 
 def confidence_text(metrics: Metrics) -> str:
@@ -318,11 +308,10 @@ def table_header(whole: Metrics) -> list[str]:
     return [f"acc@{whole.radius_m:g} m" if name == "right" else name for name in _COLUMNS]
 
 
-def table_rows(flights: Sequence[FlightReport], whole: Metrics) -> list[list[str]]:
-    named = [(" ".join(flight.name.split()), flight.metrics) for flight in flights]
+def table_rows(runs: Sequence[FlightReport]) -> list[list[str]]:
     return [
         [
-            name,
+            _name(run),
             str(metrics.n_views),
             str(metrics.n_confident),
             str(metrics.n_confident_wrong),
@@ -335,7 +324,8 @@ def table_rows(flights: Sequence[FlightReport], whole: Metrics) -> list[list[str
             measure_text(metrics.standard.ape.max_m),
             measure_text(metrics.latency_median_ms),
         ]
-        for name, metrics in [*named, *[("total", whole)] * (len(flights) > 1)]
+        for run in runs
+        for metrics in [run.metrics]
     ]
 
 

@@ -226,11 +226,12 @@ def parse_source(
         return SourceSpec(head, rest, options, provenance, _secrets(rest, key_env))
     if head.lower() in ("http", "https", "file"):
         raise FetchError(
-            f"write the protocol before the address ({'|'.join(PROTOCOLS)}:ADDRESS): {shown(text)}"
+            f"--source: write the protocol before the address ({'|'.join(PROTOCOLS)}:ADDRESS): "
+            f"{shown(text)}"
         )
     if head not in presets():
         raise FetchError(
-            f"unknown service '{head}'; available: {listed(list(presets()), head, 40)}"
+            f"--source: unknown service '{head}'; available: {listed(list(presets()), head, 40)}"
         )
     preset = presets()[head]
     layer = preset.layers.get(rest or CURRENT)

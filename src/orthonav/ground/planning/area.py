@@ -58,7 +58,7 @@ class Area:
         """Search band around `route`, `band_m` metres wide for legs without a width of their
         own."""
         if band_m is not None and not (np.isfinite(band_m) and band_m > 0):
-            raise AreaError(f"search band must be wider than 0 m, got {band_m}")
+            raise AreaError(f"band_m must be wider than 0 m, got {band_m}")
         bands_m = route.bands_m(band_m)
         if bands_m is None:
             raise AreaError("the route has no search band; give its width in metres (--band-m)")

@@ -134,8 +134,8 @@ class WorldSheets:
     def __post_init__(self) -> None:
         if not SMALLEST_SIDE_M <= self.side_m <= LARGEST_SIDE_M:
             raise AreaError(
-                f"sheets of an atlas must be {SMALLEST_SIDE_M / 1000:g} to "
-                f"{LARGEST_SIDE_M / 1000:g} km wide, got {self.side_m / 1000:g} km"
+                f"sheet_km must be {SMALLEST_SIDE_M / 1000:g} to {LARGEST_SIDE_M / 1000:g}, "
+                f"got {self.side_m / 1000:g}"
             )
 
     @property

@@ -81,12 +81,12 @@ class SourceOptions:
             raise FlightError("give a height above ground or an altitude of the ground, not both")
         numbers = (self.time_offset_s, *self.mount_deg, self.ground_alt_m or 0.0)
         if not all(math.isfinite(number) for number in numbers):
-            raise FlightError("time offset, mount and ground altitude must be finite numbers")
+            raise FlightError("give finite numbers as time offset, mount and ground altitude")
         if self.kind is not None and self.kind not in KINDS:
             raise FlightError(f"kind must be one of {', '.join(KINDS)}, got '{self.kind}'")
         unknown = [role for role in self.topics if role not in ROLES]
         if unknown:
-            raise FlightError(f"topics are for {', '.join(ROLES)}, got '{unknown[0]}'")
+            raise FlightError(f"give topics of {', '.join(ROLES)}, got '{unknown[0]}'")
 
     @property
     def time_offset_ns(self) -> int:

@@ -255,11 +255,11 @@ def _check(request: SimulateRequest) -> None:
     if (request.route is None) == (request.random is None):
         raise FlightError("give either a route or a number of random positions")
     limits: dict[str, tuple[float | None, float, float]] = {
-        "number of random positions": (request.random, 1, MAX_VIEWS),
-        "height above ground": (request.agl_m, 1, 50_000),
+        "random": (request.random, 1, MAX_VIEWS),
+        "agl_m": (request.agl_m, 1, 50_000),
         "seed": (request.seed, 0, math.inf),
-        "turn radius": (request.turn_radius_m, 0, 100_000),
-        "camera pitch": (request.camera_pitch_deg, 0, MAX_PITCH_DEG),
+        "turn_radius_m": (request.turn_radius_m, 0, 100_000),
+        "camera_pitch_deg": (request.camera_pitch_deg, 0, MAX_PITCH_DEG),
     }
     for what, (value, least, most) in limits.items():
         if value is not None and not least <= value <= most:
@@ -378,7 +378,7 @@ def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
     airspeed_mps = request.airspeed_mps
     spacing_m = airspeed_mps if request.spacing_m is None else request.spacing_m
     if not (0 < spacing_m < math.inf and 0 < airspeed_mps < math.inf):
-        raise FlightError("distance between views and airspeed must be above 0")
+        raise FlightError("spacing_m must be above 0, and the airspeed too")
     line = rounded(line_en_m, request.turn_radius_m) if request.turn_radius_m else line_en_m
     length_m = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
     if length_m / spacing_m > MAX_VIEWS:

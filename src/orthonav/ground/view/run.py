@@ -8,8 +8,9 @@ import logging
 import math
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,8 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.core.files import with_paths
-from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.flight.fixes import STATES
-from orthonav.core.flight.folder import FlightFolder
+from orthonav.core.flight import read_truth
+from orthonav.core.flight.fixes import STATES, flight_digest
 from orthonav.core.flight.gnss import fault_of, gnss_of
 from orthonav.core.flight.mount import Mount, read_mount
 from orthonav.core.mapfile import open_map
@@ -33,7 +33,9 @@ from orthonav.ground.evaluate.metrics import (
     protection_levels_m,
     warn_of_another_run,
 )
+from orthonav.ground.recordings import Recording, SourceOptions, open_source
 from orthonav.ground.recordings.flightlog import is_flight_log
+from orthonav.ground.recordings.opening import source_kind
 from orthonav.ground.report import to_plain
 from orthonav.ground.report.imagery import (
     GroundWindow,
@@ -67,6 +69,8 @@ class ViewRequest:
     mount: Path | None = None
     radius_m: float = 15.0
     live: bool = False
+    source: SourceOptions = field(default_factory=partial(SourceOptions, skip_bad_images=True))
+    """How `flight` is read, where it is no flight log."""
 
     def __post_init__(self) -> None:
         with_paths(self, "run", "map_path", "second", "flight", "truth", "mount")
@@ -83,7 +87,7 @@ class Run:
         self,
         labels: dict[str, Any],
         feed: Feed,
-        images: "LogReader | FolderImages | None",
+        images: "LogReader | RecordedImages | None",
         sheet: SheetImagery,
         truth: Mapping[str, LatLon],
         radius_m: float,
@@ -363,12 +367,12 @@ def open_run(request: ViewRequest) -> Run:
     Raises an `OrthonavError` where a given file is missing or damaged.
     """
     if not 0 < request.radius_m < 1e7:
-        raise FlightError(f"radius must be above 0 m, got {request.radius_m}")
+        raise FlightError(f"radius_m must be above 0, got {request.radius_m}")
     opened = open_map(request.map_path)
     sheet = SheetImagery(opened)
     feed = _feed(request)
     images = _images(request, feed)
-    truth, truth_name = _truth(request)
+    truth, truth_name = _truth(request, images)
     if truth:
         centre = sheet.frame.lat_deg, sheet.frame.lon_deg
         check_truth(truth, (), centre, Path(truth_name))
@@ -385,7 +389,7 @@ def open_run(request: ViewRequest) -> Run:
     run = Run(labels, feed, images, sheet, truth, request.radius_m, mount, second)
     for problem in run.problems:
         log.warning("%s", problem)
-    _warn(request, opened, run, feed, getattr(images, "folder", None))
+    _warn(request, opened, run, feed, images)
     return run
 
 
@@ -416,19 +420,24 @@ def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
     return {result.frame: result for result in batch.results}
 
 
-class FolderImages:
-    def __init__(self, path: Path) -> None:
-        self.folder = open_flight(path, images_needed=False)
-        self._views = {view.frame: view for view in self.folder.views}
+class RecordedImages:
+    """Images of a flight folder or of photographs, with what is known of their positions."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.camera, self.views = recording.camera, {each.frame: each for each in recording.views}
+        places = ((name, view.truth_latlon_deg) for name, view in self.views.items())
+        self.truth = {name: place for name, place in places if place is not None}
+        for said in (*recording.choices, *recording.warnings):
+            log.warning("%s", said)
 
     def shot(self, frame: str) -> Shot:
-        view = self._views.get(frame)
+        view = self.views.get(frame)
         if view is None:
             raise FlightError("this view is not in the flight")
-        return Shot(view.telemetry, self.folder.camera, view.grey)
+        return Shot(view.telemetry, self.camera, view.grey)
 
 
-def _images(request: ViewRequest, feed: Feed) -> LogReader | FolderImages | None:
+def _images(request: ViewRequest, feed: Feed) -> LogReader | RecordedImages | None:
     path = request.flight
     if path is None:
         return feed if isinstance(feed, LogReader) else None
@@ -438,32 +447,38 @@ def _images(request: ViewRequest, feed: Feed) -> LogReader | FolderImages | None
         reader = LogReader(path, live=request.live)
         reader.poll()
         return reader
-    if path.is_file():
+    if path.exists() and (request.source.kind or source_kind(path)) in ("video", "ros"):
         raise FlightError(
-            f"expected a flight folder or a flight log; convert other sources with `orthonav "
-            f"import`: {path}"
+            "images of a video or of ROS messages are decoded one after the other only; convert "
+            f"it with `orthonav import` and give that flight folder: {path}"
         )
-    return FolderImages(path)
+    return RecordedImages(open_source(path, request.source))
 
 
-def _truth(request: ViewRequest) -> tuple[Mapping[str, LatLon], str]:
+def _truth(
+    request: ViewRequest, images: LogReader | RecordedImages | None
+) -> tuple[Mapping[str, LatLon], str]:
     if request.truth is not None:
         return read_truth(request.truth), request.truth.name
-    if request.flight is not None and (request.flight / "truth.csv").is_file():
-        path = request.flight / "truth.csv"
-        return read_truth(path), f"{request.flight.name}/{path.name}"
+    if isinstance(images, RecordedImages) and images.truth and request.flight is not None:
+        return images.truth, request.flight.name
     return {}, ""
 
 
 def _warn(
-    request: ViewRequest, opened: MapFile, run: Run, feed: Feed, folder: FlightFolder | None
+    request: ViewRequest,
+    opened: MapFile,
+    run: Run,
+    feed: Feed,
+    images: LogReader | RecordedImages | None,
 ) -> None:
+    sha256 = flight_digest(images.views.values()) if isinstance(images, RecordedImages) else None
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
     if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
     for path in filter(None, (request.run, request.second)):
         if path.is_file() and not is_log(path):
-            warn_of_another_run(path, opened, folder)
+            warn_of_another_run(path, opened, request.flight, sha256)
     if not run.count:
         return
     if run.labels["truth"] and not run.any_known("tx"):

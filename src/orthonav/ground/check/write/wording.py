@@ -14,6 +14,8 @@ from orthonav.ground.report import (
 )
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
+MARKS = {Word.GO: "ok", Word.MARGINAL: "!", Word.NO_GO: "X"}
+"""On terminals, which may lack the symbols."""
 VERDICTS = {
     Word.GO: "This {} can be flown with this map.",
     Word.MARGINAL: "This {} does not meet all requirements for GO; see the reasons.",
@@ -138,7 +140,8 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
 def text(result: CheckResult) -> str:
     """Verdict, reasons, key figures and outages; control characters in names are replaced."""
     lines = [f"{result.verdict.word.value.upper()}: {verdict_sentence(result)}"]
-    lines += [line for each in result.verdict.reasons for line in _item(each.text)]
+    for each in result.verdict.reasons:
+        lines += _item(MARKS[each.word], each.text)
     rows = key_figures(result)
     width = max(len(value) for value, _ in rows)
     lines += ["", *(f"{value:>{width}}  {name}" for value, name in rows)]
@@ -152,8 +155,10 @@ def text(result: CheckResult) -> str:
     return "\n".join("".join(c if c.isprintable() else "\ufffd" for c in line) for line in lines)
 
 
-def _item(sentence: str) -> list[str]:
+def _item(mark: str, sentence: str) -> list[str]:
     """A sentence as an item of a list; "%" stays with its number."""
     joined = sentence.replace(" %", "\N{NO-BREAK SPACE}%")
-    wrapped = textwrap.wrap(joined, 100, initial_indent="  - ", subsequent_indent="    ")
+    wrapped = textwrap.wrap(
+        joined, 100, initial_indent=f"  {mark:<4}", subsequent_indent=" " * len("  ok  ")
+    )
     return [line.replace("\N{NO-BREAK SPACE}", " ") for line in wrapped]

@@ -178,7 +178,8 @@ function drawProblems(problems) {
 function drawFigures(store) {
   const { stats, count, run } = store;
   const sorted = (values = []) => values.filter((v) => v >= 0).sort((p, q) => p - q);
-  const both = [store.columns.err, store.columns.err2].filter(Boolean).map(sorted);
+  const both = ["", "2"].filter((run) => store.columns[`err${run}`]) // confident ones, as in reports
+    .map((run) => sorted(store.columns[`err${run}`].filter((_, i) => store.columns[`confident${run}`][i])));
   const quantile = (errors, part) => { // interpolated, as in reports
     const at = part * (errors.length - 1), low = Math.floor(at);
     return errors.length ? errors[low] + (at - low) * (errors[Math.ceil(at)] - errors[low]) : NaN;
@@ -187,7 +188,7 @@ function drawFigures(store) {
   rows.push(["low confidence", ratio(stats.fixes - stats.confident, count)], ["no fix", ratio(count - stats.fixes, count)]);
   if (stats.withTruth) {
     rows.push([`within ${metres(run.radius_m)}`, ratio(stats.right, stats.withTruth)]);
-    for (const [name, part] of [["CEP50 of all fixes", 0.5], ["CEP95 of all fixes", 0.95]]) {
+    for (const [name, part] of [["CEP50 of confident fixes", 0.5], ["CEP95 of confident fixes", 0.95]]) {
       rows.push([name, both.map((errors) => metres(quantile(errors, part))).join(" / ")]);
     }
     rows.push(["false fixes", stats.wrong]);

@@ -1,0 +1,81 @@
+"""`orthonav run`: from a recording and an orthophoto to positions and a page."""
+
+import argparse
+import csv
+import io
+import shlex
+from pathlib import Path
+
+from orthonav.cli.common import progress, run_command, say, watched
+from orthonav.cli.source import add_source, source_options
+
+EXAMPLE = "DCIM --map ortho.tif --dem dem.tif"
+EVERYDAY = ("--out", "--dem", "--camera", "--fov-deg", "--telemetry", "--agl-m")
+MAP, FIXES, TRUTH, REPORT = "area.onav", "fixes.jsonl", "truth.csv", "report"
+MARGIN_M = 300.0
+"""Ground beside the recorded positions that belongs to the map, beyond the height of the views."""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    text = "flight folder, photographs, video or ROS recording, as for `orthonav localize`"
+    add("flight", type=Path, nargs="+", metavar="SOURCE", help=text)
+    text = "map, or an orthophoto (or a folder of them): a map of it is built around the recorded "
+    add("--map", type=Path, required=True, metavar="MAP.onav", help=f"{text}positions")
+    text = (
+        "folder to write (default ./orthonav-run); after an interrupt the map there is used again"
+    )
+    add("--out", type=Path, default=Path("orthonav-run"), metavar="DIR", help=text)
+    add_source(parser)
+    parser.set_defaults(skip_bad_images=True)
+
+
+def run(options: argparse.Namespace) -> None:
+    from orthonav.core.errors import OutputError
+    from orthonav.core.files import write_text
+
+    out, area, source = options.out, options.map, vars(source_options(options))
+    ours = {MAP, f"{MAP}.work", FIXES, TRUTH, REPORT}
+    if foreign := {each.name for each in out.glob("[!.]*")} - ours:
+        raise OutputError(f"output folder holds what no run wrote ({min(foreign)}): {out}")
+    truth, band_m = _recorded(options)
+    for earlier in (out / FIXES, out / REPORT / "index.html"):
+        earlier.unlink(missing_ok=True)
+    write_text(out / TRUTH, truth)
+    terrain = {name: getattr(options, name) for name in ("dem", "dem_datum")}
+    if area.suffix != ".onav":
+        area = out / MAP
+        around = ("--route", out / TRUTH, "--band-m", band_m) if band_m else ()
+        say(options, f"building the map; after an interrupt --map {area} uses it, once it is there")
+        run_command(options, "build", "--ortho", options.map, "--out", area, *around, **terrain)
+        terrain = dict.fromkeys(terrain)
+    say(options, f"localizing the views on {area}")
+    placed = ("--track", "--out", out / FIXES)
+    print(run_command(options, "localize", area, *options.flight, *placed, **source | terrain))
+    if band_m:
+        compared = ("--truth", out / TRUTH, "--map", area, "--report", out / REPORT)
+        print(run_command(options, "evaluate", out / FIXES, *compared), end="")
+        print(f"open it: {(out / REPORT / 'index.html').resolve().as_uri()}")
+    else:
+        print("no positions were recorded to compare with: there is no report")
+    words = ["orthonav", "view", out / FIXES, "--map", area, "--flight", options.flight[0]]
+    print(f"step through the views: {shlex.join(map(str, words))}")
+
+
+def _recorded(options: argparse.Namespace) -> tuple[str, float]:
+    """Recorded positions as `truth.csv`, and the width of the band around them that views show; 0
+    without any."""
+    from orthonav.ground.recordings import open_source
+
+    text, most_m, count = io.StringIO(newline=""), 0.0, 0
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("frame", "lat_deg", "lon_deg"))
+    over_terrain = options.dem is not None or options.map.suffix == ".onav"
+    found = open_source(options.flight, source_options(options, over_terrain=over_terrain))
+    with progress(options) as shown:
+        for view in watched(found.views, found.expected, "positions", shown):
+            most_m = max(most_m, view.telemetry.agl_m)  # not by NaN
+            if view.truth_latlon_deg is not None:
+                writer.writerow((view.frame, *(f"{each:.8f}" for each in view.truth_latlon_deg)))
+                count += 1
+    return text.getvalue(), 2 * (MARGIN_M + most_m) if count else 0.0
