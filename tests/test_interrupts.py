@@ -47,7 +47,7 @@ def test_the_search_for_another_set_up_ends_in_time(run, map_path, turned, tmp_p
 
 
 def test_an_interrupt_names_what_is_written(run, map_path, flight_path, tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.cli.localize.report_changes", interrupted)
+    monkeypatch.setattr("orthonav.ground.recordings.setups.Counts.of", interrupted)
     fixes, cameras = tmp_path / "fixes.jsonl", tmp_path / "cameras.csv"
     done = run("localize", map_path, flight_path, "--out", fixes, "--export", f"csv={cameras}")
     assert done == (130, "", f"orthonav: error: interrupted; written: {fixes}, {cameras}\n")

@@ -61,7 +61,6 @@ def made_cells(rows, cols, side_m, seed=1, west_m=None, north_m=None):
         wrong=0.03 * (1 - probability),
         trials=rng.integers(4, 20, (rows, cols)).astype(np.int32),
         persistence=np.clip(probability + 0.1 * rng.normal(size=(rows, cols)), 0, 1),
-        changed=np.where(rng.random((rows, cols)) < 0.1, 1.0, 0.0),
     )
 
 
@@ -71,7 +70,6 @@ def lost_in(cells, mask):
     names = ("probability", "low", "high", "error_m", "wrong", "persistence")
     values = {name: getattr(cells, name) * hole for name in names}
     values["trials"] = np.where(mask, 0, cells.trials).astype(np.int32)
-    values["changed"] = np.where(mask, 0.0, cells.changed)
     corner = {"west_m": cells.west_m, "north_m": cells.north_m, "side_m": cells.side_m}
     return Cells(**corner, **values)
 

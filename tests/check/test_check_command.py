@@ -15,8 +15,6 @@ from orthonav.core.errors import AreaError, CameraError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile import open_map
-from orthonav.core.mapfile.signature import map_digest
-from orthonav.ground.changes.record import ChangedGround, ChangeGrid, write_changes
 from orthonav.ground.check import run as check_run
 from orthonav.ground.check.records import CheckRequest, Verdict, Word
 from orthonav.ground.check.run import check_map
@@ -271,27 +269,6 @@ def test_command(run, untried, half_blank, route_path, tmp_path):
 def unwritten(untried, monkeypatch):
     """Nothing is written."""
     monkeypatch.setattr("orthonav.ground.check.write.write_check", lambda result, opened, out: out)
-
-
-def test_changed_ground_is_named(run, unwritten, half_blank, frame, tmp_path):
-    """In the west it is part of the cells, and the report of another map is doubted."""
-    grid = ChangeGrid(-400.0, 100.0, 100.0, 2, 2, frame)
-    ones = np.ones((2, 2))
-    path = tmp_path / "changes.geojson"
-    command = ("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
-    for digest, said in ((map_digest(half_blank.map), ""), ("0" * 64, "with another map")):
-        gone = ChangedGround(grid, ones, ones.astype(np.int32), ones > 0, "old.onav", digest)
-        write_changes(path, gone)
-        done = run(*command, "--changes", path)
-        assert said in done.err and (said or not done.err)
-    plain = json.loads(done.out)
-    assert "changed_ground" in [reason["code"] for reason in plain["verdict"]["reasons"]]
-    cells = plain["cells"]
-    changed_m2 = np.array(cells["changed"]).sum() * cells["side_m"] ** 2
-    assert changed_m2 == pytest.approx(4 * 100.0**2, rel=0.1)
-    unchanged = json.loads(run(*command).out)
-    assert not np.any(unchanged["cells"]["changed"])
-    assert "changed_ground" not in [each["code"] for each in unchanged["verdict"]["reasons"]]
 
 
 @pytest.mark.parametrize("word", list(Word), ids=lambda word: word.value)

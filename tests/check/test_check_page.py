@@ -72,7 +72,7 @@ def all_cells(cells):
     """The cells of the page as in `check.json`: unknown ones are None, or 0 of what was counted."""
     known = cells.pop("known")
     for name in CELL_VALUES:
-        grid = [0 if name in ("trials", "changed") else None] * (cells["rows"] * cells["cols"])
+        grid = [0 if name == "trials" else None] * (cells["rows"] * cells["cols"])
         for number, value in zip(known, cells[name], strict=True):
             grid[number] = value
         starts = range(0, len(grid), cells["cols"])

@@ -7,7 +7,7 @@ import pytest
 
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.changes.record import CellGrid
+from orthonav.ground.check.cells import CellGrid
 from orthonav.ground.check.run import (
     BATCH,
     MapCoverage,

@@ -15,7 +15,6 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.changes.record import ChangedGround, ChangeGrid
 from orthonav.ground.check import trials
 from orthonav.ground.check.records import CheckRequest, Conditions
 
@@ -64,19 +63,6 @@ def test_unchanged_views_are_found_where_they_were_made(exact):
         assert math.dist(trial.en_m, place) < 0.75  # of whole pixels
         assert trial.error_m < 0.5 and trial.right
         assert math.isnan(trial.expected)
-
-
-def test_views_of_ground_that_changed_are_not_found(asked, registration):
-    grid = ChangeGrid(-450.0, 300.0, 100.0, 6, 9, registration.sheet.frame)
-    shape = grid.rows, grid.cols
-    gone = np.zeros(shape, np.bool_)
-    gone[:, :5] = True
-    changes = ChangedGround(grid, np.ones(shape), np.ones(shape, np.int32), gone)
-    still = ChangedGround(grid, np.ones(shape), np.ones(shape, np.int32), ~gone)
-    before = run_trials(asked, WEST[:3])[0]
-    assert plain([before]) == plain([run_trials(replace(asked, changes=still), WEST[:3])[0]])
-    after = run_trials(replace(asked, changes=changes), WEST[:3])[0]
-    assert not any(trial.right for trial in after) and any(trial.right for trial in before)
 
 
 def test_places_off_the_map_are_left_out(asked):

@@ -2,12 +2,11 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.mount import Bias, Mount, MountedFlight, read_mount, write_mount
+from orthonav.core.flight.mount import Bias, Mount, read_mount, write_mount
 from orthonav.core.records import Telemetry
 
 MOUNT = Mount(
@@ -21,7 +20,6 @@ def test_a_mount_comes_back(tmp_path):
 
 
 def test_reported_values_are_corrected():
-    """Of a view, and of all views of a flight."""
     telemetry = Telemetry(5, 350.0, 1.0, 2.0, 100.0, vel_en_mps=(1.0, 2.0), tilt_std_deg=0.5)
     found = MOUNT.corrected(telemetry)
     assert (found.yaw_deg, found.pitch_deg, found.roll_deg) == (354.0, 7.5, 0.75)
@@ -32,12 +30,6 @@ def test_reported_values_are_corrected():
     again = MOUNT.corrected(fixed)
     assert again.tilt_std_deg == pytest.approx(math.hypot(0.7, 0.4))
     assert again.mount_std_deg == 0.4 and again.horizon_std_deg == pytest.approx(0.7)
-    views = [SimpleNamespace(frame="1.png", telemetry=telemetry)]
-    flight = SimpleNamespace(views=views, camera="camera", note="note", expected=1)
-    mounted = MountedFlight(flight, MOUNT)
-    (view,) = mounted.views
-    assert (view.frame, view.telemetry) == ("1.png", found)
-    assert (mounted.camera, mounted.note, mounted.expected) == ("camera", "note", 1)
 
 
 BROKEN = {

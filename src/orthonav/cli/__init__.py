@@ -29,7 +29,7 @@ UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
 
 _CLOCK_S = 0.01
 """How far the times of files lag behind the clock."""
-_FILES = ("out", "metrics", "report_changes", "footprint", "preview")
+_FILES = ("out", "metrics", "footprint", "preview")
 _FOLDERS = ("report", "work")
 _FILL_FOLDERS = ("check", "demo", "import", "run", "simulate")
 """Options that name what is written, and commands whose `--out` is a folder."""

@@ -17,7 +17,7 @@ from orthonav.core.tilt import UNSTATED
 
 EXAMPLE = "area.onav --route route.kml --agl-m 120 --out check"
 EVERYDAY = (
-    *("--route", "--band-m", "--other-date", "--camera-kind", "--changes", "--camera", "--agl-m"),
+    *("--route", "--band-m", "--other-date", "--camera-kind", "--camera", "--agl-m"),
     *("--dem", "--alert-limit-m", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior"),
     *("--quick", "--json"),
 )
@@ -26,7 +26,6 @@ FIRST_SHARE = 0.03
 log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
-    from orthonav.ground.changes.record import ChangedGround
     from orthonav.ground.check.records import CheckedInputs, CheckRequest
     from orthonav.ground.planning.route import Route
 
@@ -49,9 +48,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("ground")
     text = "orthophoto of another date than the map's, which improves the prediction"
     group.add_argument("--other-date", type=Path, metavar="TIF", help=text)
-    text = "ground that changed since the map was made, as written by localize "
-    text += "--report-changes: the check warns of it and predicts fixes without it"
-    group.add_argument("--changes", type=Path, metavar="FILE.geojson", help=text)
     _add_errors(parser.add_argument_group("camera, telemetry and motion"))
     group = parser.add_argument_group("trials")
     text = "factor on the number of trials (default 1), which end when more would not change the "
@@ -146,28 +142,9 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         "agl_m": agl_m,
         "yaw_std_deg": None if options.heading == "unknown" else options.yaw_std_deg,
         "prior_std_m": None if options.prior == "none" else options.prior_std_m,
-        "changes": _changes(options),
         "about": replace(_checked_inputs(options, route), height=origin),
     }
     return CheckRequest(**given(options, CheckRequest) | more)
-
-
-def _changes(options: argparse.Namespace) -> "ChangedGround | None":
-    from orthonav.core.mapfile.signature import map_digest
-    from orthonav.ground.changes.record import read_changes
-
-    if options.changes is None:
-        return None
-    found = read_changes(options.changes)
-    if found.map_sha256 and found.map_sha256 != map_digest(options.map):
-        log.warning(
-            "changes were found with another map (%.80s); where the imagery of %s is newer, they "
-            "may be in it already: %s",
-            found.map_name,
-            options.map.name,
-            options.changes,
-        )
-    return found
 
 
 def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | None, str]:

@@ -11,7 +11,6 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import (
-    Progress,
     acceptance,
     add_acceptance,
     add_options,
@@ -40,7 +39,6 @@ from orthonav.cli.version import require_extras
 if TYPE_CHECKING:
     from orthonav.core.flight.fixes import Identity
     from orthonav.core.flight.mount import Mount
-    from orthonav.core.flight.recording import Flight
     from orthonav.core.geo.ground import TerrainHeights
     from orthonav.core.localize import Localizer
     from orthonav.core.localize.confidence import Acceptance
@@ -73,8 +71,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     text += "trajectory for evo) or odm-geo (OpenDroneMap's geo.txt); heights above sea need a "
     text += "terrain; can be repeated"
     add("--export", action="append", default=[], metavar="FORMAT=PATH", help=text)
-    text = "write where the ground no longer looks like the map, by the confident views; `check "
-    add("--report-changes", type=Path, metavar="FILE.geojson", help=f"{text}--changes` reads it")
     add_options(parser, "--json")
     text = "if few views are confident, do not try other headings and heights to find the cause"
     add("--no-diagnosis", dest="diagnosis", action="store_false", help=text)
@@ -131,7 +127,6 @@ def _above_sea(dem: "Dem | None", layer: "TerrainLayer | None") -> "TerrainHeigh
 def _on_map(options: argparse.Namespace) -> None:
     from orthonav.core.errors import VariantError
     from orthonav.core.flight.fixes import FlightDigest, Identity
-    from orthonav.core.flight.mount import MountedFlight
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.core.track.tracker import Tracker
@@ -184,37 +179,12 @@ def _on_map(options: argparse.Namespace) -> None:
         _write_positions(options, results, Identity(opened.manifest.sha256, digest.sha256))
         export_all(exports, results, _above_sea(dem, TerrainLayer.of(opened)))
         advice, tried = advisor.advice(results, accept)
-        seen_by = MountedFlight(flight, mount) if mount else flight
-        changed = report_changes(options, opened, seen_by, results, shown)
-    _print_summary(options, results, accept, advice, tried, changed)
-
-
-def report_changes(
-    options: argparse.Namespace,
-    opened: "MapFile",
-    flight: "Flight",
-    results: "Sequence[ViewResult]",
-    shown: Progress,
-) -> tuple[dict[str, Any], list[str]]:
-    """Write the changed ground that `--report-changes` asks for; JSON values and lines about it."""
-    from orthonav.ground.changes.ground import changes_of_flight
-    from orthonav.ground.changes.record import write_changes
-
-    path = options.report_changes
-    if path is None:
-        return {}, []
-    found = changes_of_flight(opened, flight, results, lambda share: shown("changes", share))
-    if found is None:
-        return {"changes": None}, ["changes: no view is confident; nothing was written"]
-    write_changes(path, found)
-    areas = {"seen_m2": round(found.seen_m2), "changed_m2": round(found.changed_m2)}
-    lines = [f"changes: {found.text()}; written to {path}"]
-    return {"changes": {"file": str(path), **areas}}, lines
+    _print_summary(options, results, accept, advice, tried)
 
 
 def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptance") -> "Localizer":
     """The localizer of a map; raises `VariantError` where the criterion does not fit it."""
-    from orthonav.core.errors import MapFileError, VariantError
+    from orthonav.core.errors import VariantError
     from orthonav.core.localize import Localizer
     from orthonav.core.tiles.position import check_rule
 
@@ -226,11 +196,6 @@ def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptan
     )
     if made.registration is not None and accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
-    if made.registration is None and options.report_changes:
-        raise MapFileError(
-            "--report-changes needs a map with a registration layer, and not --registration off: "
-            f"{opened.path}"
-        )
     if made.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions are at tile level")
     return made
@@ -250,7 +215,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
         name
         for name in (
             *("track", "smooth", "mount", "as_flown", "require_signed", "not_before", "lag"),
-            *("dem", "dem_datum", "report_changes"),
+            *("dem", "dem_datum"),
         )
         if getattr(options, name) not in (None, False)
     ]
@@ -289,7 +254,6 @@ def _print_summary(
     accept: "Acceptance",
     advice: Sequence[str] = (),
     tried: Sequence[dict[str, Any]] = (),
-    changed: tuple[dict[str, Any], list[str]] = ({}, []),
 ) -> None:
     """Print, on stderr where an output is stdout, how many views have positions and why not."""
     from orthonav.core.files import is_stdout
@@ -314,11 +278,10 @@ def _print_summary(
         "median_latency_ms": None if median_ms is None else round(median_ms, 3),
         "advice": list(advice),
         "setups": list(tried),
-        **changed[0],
     }
     if out is None:
         plain["positions"] = [json.loads(result_to_json(result)) for result in results]
-    with beside(out, options.report_changes, *exported):
+    with beside(out, *exported):
         if options.json:
             print_json(plain)
             return
@@ -339,7 +302,7 @@ def _print_summary(
             where = "stdout" if is_stdout(out) else out
             guesses = f"; positions {others} are best guesses, marked as such"
             lines.append(f"written to {where}{guesses * bool(counts.low)}")
-        for line in (*lines, *changed[1]):
+        for line in lines:
             print(line)
 
 

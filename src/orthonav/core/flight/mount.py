@@ -5,15 +5,13 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from orthonav.core.errors import FlightError, described
 from orthonav.core.files import require_file, write_text
-from orthonav.core.flight.recording import Flight, WithTelemetry
-from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Telemetry
 
 _LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg": 60.0}
@@ -62,35 +60,6 @@ class Mount:
             tilt_std_deg=None if tilt is None else math.hypot(tilt, mount),
             mount_std_deg=None if tilt is None else mount,
         )
-
-
-@dataclass(frozen=True)
-class MountedFlight:
-    """A recorded flight without the errors of its mount."""
-
-    flight: Flight
-    mount: Mount
-
-    @property
-    def camera(self) -> Camera:
-        """See `Flight.camera`."""
-        return self.flight.camera
-
-    @property
-    def note(self) -> str:
-        """See `Flight.note`."""
-        return self.flight.note
-
-    @property
-    def views(self) -> Iterator[WithTelemetry]:
-        """See `Flight.views`."""
-        for view in self.flight.views:
-            yield WithTelemetry(view, self.mount.corrected(view.telemetry))
-
-    @property
-    def expected(self) -> int:
-        """See `Flight.expected`."""
-        return self.flight.expected
 
 
 def write_mount(path: Path, mount: Mount) -> None:

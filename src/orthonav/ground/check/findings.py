@@ -130,8 +130,6 @@ WRONG = Threshold(0.005, 0.02)
 """Fraction of trials that were false fixes, without a route; at least two."""
 OUTSIDE = Threshold(0.005, 0.1)
 """Fraction of the route outside the map."""
-CHANGED = Threshold(0.1, math.inf)
-"""Fraction of the ground that changed since the map was made."""
 MOST_UNCERTAIN = 0.5
 """Width of the interval of the mean chance beyond which the map alone cannot tell."""
 NARROW_PX, WIDE_PRIOR_PX = 140.0, 100.0
@@ -158,7 +156,7 @@ class Findings(NamedTuple):
     `mean`: chance of a fix along the route, or over the map; `flights`: along the route.
     `calibrated`: the map carries a confidence model.
     `wrong`: number of false fixes among `trials`.
-    `outside`: fraction of the route outside the map; `changed`: of the area since the map was made.
+    `outside`: fraction of the route outside the map.
     `after_fix_m`: protection level right after a fix, over the cells or points of the route.
     `view_px`: root of the area of a view in pixels of the map; `prior_px`: standard deviation of
     the prior position, infinite without one; `second_date`: tried on one.
@@ -173,7 +171,6 @@ class Findings(NamedTuple):
     wrong: int
     trials: int
     outside: float
-    changed: float
     after_fix_m: Range
     view_px: float
     prior_px: float
@@ -193,11 +190,6 @@ def verdict_of(found: Findings) -> Verdict:
         text = f"The map alone cannot tell how often views of {found.view_px:.0f} map pixels are "
         text += f"localized: {why}. A second date (--other-date) would help."
         reasons += [Reason("uncertain", text, Word.MARGINAL)]
-    if found.changed > 0:  # a warning: it lowers the probability already
-        text = f"At least {percent_text(found.changed)} of the ground {where} changed since the "
-        text += "map was made: fixes are less likely there; build the map from newer imagery. "
-        text += f"Limit: {100 * CHANGED.go:g} %."
-        reasons += [Reason("changed_ground", text, CHANGED.word(_exact(found.changed)))]
     reasons += [_objects(found), *_oblique(found.conditions), *_thermal(found.conditions)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))

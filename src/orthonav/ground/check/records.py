@@ -20,7 +20,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.limits import ALERT_LIMITS_M, CAMERA_KINDS, DEFAULT_RISK, RISKS
 from orthonav.core.records import CONFIDENT, DEFAULT_TILT_STD_DEG
 from orthonav.core.track.model import Model
-from orthonav.ground.changes.record import CellGrid, ChangedGround
+from orthonav.ground.check.cells import CellGrid
 from orthonav.ground.check.estimate import INTERVAL, LEARNT, Prediction, Recalibration
 from orthonav.ground.planning.route import Route
 from orthonav.ground.planning.spacing import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
@@ -91,7 +91,6 @@ class CheckRequest:
     `risk`: allowed probability of an error beyond it.
     `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20.
     `camera_kind`: of `CAMERA_KINDS`: how the camera's light differs from that of the map's imagery.
-    `changes`: ground that changed since the map was made, as a flight saw it.
     """
 
     map_path: Path
@@ -116,7 +115,6 @@ class CheckRequest:
     tilt_std_deg: float = DEFAULT_TILT_STD_DEG
     camera_kind: str = "colour"
     recalibration: Recalibration = LEARNT
-    changes: ChangedGround | None = None
     about: CheckedInputs = field(default_factory=CheckedInputs)
 
     def __post_init__(self) -> None:
@@ -231,7 +229,6 @@ class Cells(Prediction):
     north_m: float
     side_m: float
     trials: NDArray[np.int32]
-    changed: Array
 
     @property
     def grid(self) -> CellGrid:
@@ -246,7 +243,6 @@ CELL_VALUES = {
     "wrong": "fraction of trials that were false fixes",
     "trials": "number of views tried",
     "persistence": "expected correlation of the ground with another year, 0 to 1",
-    "changed": "fraction that changed since the map was made",
 }
 """Arrays of `Cells` and their meaning, in the order of the bands of the raster."""
 

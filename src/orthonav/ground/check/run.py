@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from orthonav.core.cores import usable_cores
 from orthonav.core.errors import AreaError, CameraError, MapFileError
 from orthonav.core.files import Progress, StrPath, no_progress
-from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.ground import MIN_KNOWN
 from orthonav.core.mapfile import open_map
@@ -23,7 +22,7 @@ from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import MAP_STD_M
 from orthonav.core.register.window import GreyPyramid
-from orthonav.ground.changes.record import CellGrid, ChangedGround
+from orthonav.ground.check.cells import CellGrid
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
     Findings,
@@ -233,7 +232,6 @@ class _Check:
             wrong=wrong,
             trials=len(own) + len(other),
             outside=outside,
-            changed=float(cells.changed[known].mean()) if known.any() else 0.0,
             after_fix_m=after_fix_m((cells if along is None else along).error_m, conditions.risk),
             view_px=conditions.side_m / self.sheet.grid.gsd_m,
             prior_px=math.inf if prior_m is None else prior_m / self.sheet.grid.gsd_m,
@@ -259,7 +257,6 @@ class _Check:
 
     def _predictor(self, own: Sequence[Trial], other: Sequence[Trial]) -> Predictor:
         request, side_m = self.request, self.conditions.side_m
-        lasting = self.coverage.without(request.changes, self.sheet.frame)
         recalibration = request.recalibration.of_camera(request.camera_kind)
         recalibrated: Callable[[Array], Array] = np.asarray  # a second date needs no recalibration
         scenes_std = recalibration.std
@@ -273,7 +270,7 @@ class _Check:
             spacing_m=math.sqrt(self.checked_m2 / max(len(own), 1)),
             other_date=other,
             least_error_m=math.sqrt(2) * MAP_STD_M,
-            coverage=lambda points: lasting.seen_share(points, side_m),
+            coverage=lambda points: self.coverage.seen_share(points, side_m),
             recalibrated=recalibrated,
             scenes_std=scenes_std,
         )
@@ -307,20 +304,10 @@ class _Check:
         columns = {name: np.full((grid.rows, grid.cols), np.nan) for name in vars(found)}
         for name, values in vars(found).items():
             columns[name].ravel()[here] = values
-        columns["changed"] = self._changed(points, side_m).reshape(grid.rows, grid.cols)
         trials = grid.counts(np.array([each.en_m for each in own]))
         return Cells(
             west_m=grid.west_m, north_m=grid.north_m, side_m=side_m, trials=trials, **columns
         )
-
-    def _changed(self, points: Array, side_m: float) -> Array:
-        """Fraction (N,) of squares around points (N, 2) that changed since the map was made."""
-        if self.request.changes is None:
-            return np.zeros(len(points))
-        whole = self.coverage.seen_share(points, side_m)
-        lasting = self.coverage.without(self.request.changes, self.sheet.frame)
-        share = lasting.seen_share(points, side_m) / np.maximum(whole, 1e-6)
-        return np.clip(1 - share, 0.0, 1.0) * (whole > 0)
 
     def _objects(self, places: Array) -> tuple[float, float]:
         """Fractions of places (N, 2) whose view shows many houses and trees, and for which the map
@@ -359,12 +346,6 @@ class MapCoverage:
         rows, cols = layer.shape(level)
         _, valid = layer.read(level, 0, 0, rows, cols)
         return cls(CellGrid(grid.west_m, grid.north_m, grid.gsd_m * 2**level, rows, cols), valid)
-
-    def without(self, changes: ChangedGround | None, frame: LocalFrame) -> "MapCoverage":
-        if changes is None:
-            return self
-        changed = changes.covers(self.pixels.centres_en_m, frame).reshape(self.valid.shape)
-        return replace(self, valid=self.valid & ~changed)
 
     def of_each(self, at_en_m: Callable[[Array], Array]) -> Array:
         """Values (rows, cols) at the pixels, a row at a time."""

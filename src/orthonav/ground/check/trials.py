@@ -343,12 +343,7 @@ class Trier:
         grey, valid, place = crop
         donor = mirrored_donor(rng, registration.pyramid, size, level)
         inner = np.s_[MARGIN_PX : MARGIN_PX + size, MARGIN_PX : MARGIN_PX + size]
-        lasting = valid[inner]
-        if request.changes is not None and not second_date:
-            steps = (np.arange(size) + 0.5 - size / 2) * gsd_m
-            points = np.stack(np.meshgrid(steps, -steps), axis=-1) + place
-            lasting = lasting & ~request.changes.covers(points, registration.sheet.frame)
-        picture = np.where(lasting, grey[inner], donor)
+        picture = np.where(valid[inner], grey[inner], donor)
         expected = math.nan
         if not second_date:
             maps = [

@@ -52,7 +52,7 @@ PACKAGE = "orthonav.ground.check.write"
 _SHARED = ("format.js", "plane.js", "chart.js")
 _SCRIPTS = ("data.js", "map.js", "profile.js", "page.js")
 MAX_ROWS = 200
-LAYERS = ("probability", "low", "error_m", "wrong", "persistence", "changed")
+LAYERS = ("probability", "low", "error_m", "wrong", "persistence")
 DOWNLOADS = {
     "check.geojson": "GeoJSON: route, outages, cells",
     "check.tif": "GeoTIFF: a band per layer of the map",
@@ -165,7 +165,7 @@ def _page_data(result: CheckResult) -> str:
     The text contains no `<`, so that no name can end the script element.
     """
     along, cells = result.along, result.cells
-    known = np.isfinite(cells.persistence) | (cells.trials > 0) | (cells.changed > 0)
+    known = np.isfinite(cells.persistence) | (cells.trials > 0)
     known_m = cells.error_m[np.isfinite(cells.error_m)]
     most_m = float(np.percentile(known_m, 98)) if len(known_m) else 1.0
     most_wrong = float(np.nanmax(cells.wrong, initial=0.0, where=np.isfinite(cells.wrong)))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.changes.record import lonlat
+from orthonav.ground.check.cells import lonlat
 from orthonav.ground.check.records import (
     CELL_VALUES,
     Along,

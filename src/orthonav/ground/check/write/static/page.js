@@ -30,7 +30,6 @@ function rowsOf(east, north, index) {
   }
   rows.push(["rate of false fixes", percent(here("wrong"))]);
   rows.push(["expected persistence", percent(here("persistence"))]);
-  if (here("changed") > 0) rows.push(["changed since the map", percent(here("changed"))]);
   rows.push(["views tried", known(here("trials")) ? String(here("trials")) : "–"]);
   return rows;
 }
