@@ -253,7 +253,9 @@ class View(ByValue):
             vel_en_mps=vel_en_mps,
             tilt_std_deg=tilt_std_deg,
         )
-        return cls(grey_levels(image), camera, telemetry)
+        made = cls(grey_levels(image), camera, telemetry)
+        made.camera.plausible()
+        return made
 
     def __repr__(self) -> str:
         reported = self.telemetry

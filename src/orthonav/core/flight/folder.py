@@ -237,7 +237,7 @@ def camera_from_plain(raw: Any) -> Camera:
         model=str(raw.get("model", "brown")),
         focal_std=float(raw.get("focal_std", 0.0)),
         unusual=raw.get("unusual") is True,
-    )
+    ).plausible()
 
 
 def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[FlightView]:

@@ -52,8 +52,8 @@ class Camera:
     OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
     for a calibrated camera. `mask` (H, W), see `masked`, is no part of comparisons. `unusual`: a
     principal point more than a tenth of a side from the middle (a crop, a shifted lens) or pixels
-    that are not square are meant; without it they are refused. Raises `CameraError` on values no
-    camera has."""
+    that are not square are meant; without it files and views with them are refused. Raises
+    `CameraError` on values no camera has."""
 
     width_px: int
     height_px: int
@@ -70,7 +70,7 @@ class Camera:
     def __post_init__(self) -> None:
         if self.distortion and not any(self.distortion):
             object.__setattr__(self, "distortion", ())  # none at all, and faster
-        if wrong := self._impossible() or self._implausible():
+        if wrong := self._impossible():
             raise CameraError(f"camera {wrong}: {self}")
         for name in ("width_px", "height_px"):
             object.__setattr__(self, name, int(getattr(self, name)))
@@ -95,8 +95,14 @@ class Camera:
         known = len(self.distortion) in allowed
         return "" if known else f"distortion of a {self.model} lens must be empty or {names}"
 
+    def plausible(self) -> "Camera":
+        """The camera itself. Raises `CameraError` where it is of a wrong file or unit, by shares of
+        sides, which remain where a picture is scaled."""
+        if wrong := self._implausible():
+            raise CameraError(f"camera {wrong}: {self}")
+        return self
+
     def _implausible(self) -> str:
-        """By shares of sides, which remain where a picture is scaled."""
         fx, fy, wide, high = self.fx_px, self.fy_px, self.width_px, self.height_px
         off = max(abs(self.cx_px / wide - 0.5), abs(self.cy_px / high - 0.5))
         apart = abs(fx / fy - 1)
@@ -127,7 +133,8 @@ class Camera:
         across_px = math.hypot(width_px, height_px) if diagonal else width_px
         focal_px = across_px / 2 / math.tan(math.radians(fov_deg) / 2)
         middle_px = width_px / 2, height_px / 2
-        return cls(width_px, height_px, focal_px, focal_px, *middle_px, focal_std=FOV_STD)
+        made = cls(width_px, height_px, focal_px, focal_px, *middle_px, focal_std=FOV_STD)
+        return made.plausible()
 
     @classmethod
     def from_matrix(
@@ -161,7 +168,7 @@ class Camera:
         # OpenCV counts from the centre of the first pixel.
         numbers = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
         more = () if distortion is None else np.ravel(np.asarray(distortion, np.float64)).tolist()
-        return cls(*size_px, *numbers, tuple(more), model, unusual=unusual)
+        return cls(*size_px, *numbers, tuple(more), model, unusual=unusual).plausible()
 
     @classmethod
     def from_file(cls, path: StrPath) -> "Camera":
