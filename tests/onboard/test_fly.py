@@ -316,6 +316,21 @@ def test_a_slow_processor_degrades_and_stale_positions_are_not_sent(flight):
     assert flight.port.sent("GLOBAL_POSITION_SENSOR") == []
 
 
+def test_the_search_of_the_whole_map_is_not_slow(begin):
+    """It is expected to take long; views that continue a track are not."""
+    flight = begin(FakeLocator(state="searching"))
+
+    def search(view):
+        flight.time.go(2.0)
+        flight.locator.state_name, flight.locator.outcome = "tracking", FakeLocator().outcome
+        return fix(heading_deg=view.telemetry.yaw_deg)
+
+    flight.locator.outcome = search
+    flight.views(30)
+    assert flight.runner.counter.total["confident"] > 20
+    assert not any("slow" in each.get("reasons", ()) for each in flight.written())
+
+
 def test_an_internal_error_is_one_no_fix(flight, caplog):
     whole = flight.locator.outcome
 
@@ -753,6 +768,15 @@ def test_inputs_that_are_missing_come_and_go_are_said(flight):
     flight.talks = True
     flight.views(120)
     assert flight.said.lines[-1].endswith("health OK")
+
+
+def test_a_camera_that_cannot_be_opened_is_named_while_it_is_waited_for(begin):
+    flight, pauses = begin(), []
+    camera = cameras.LiveCamera(4242, flight.time.clocks)
+    cameras.read_into(flight.newest, camera, lambda: len(pauses) > 2, pauses.append)
+    flight.health()
+    text = "waiting for images; camera cannot be opened: /dev/video4242"
+    assert flight.said.with_word("images") == [text]
 
 
 def test_inputs_are_waited_for(begin):
