@@ -110,7 +110,7 @@ def fly(log, numbers):
 def gathered(reader, count):
     """So many results and lines of health; the log is written by a thread of its own."""
     results, health = [], []
-    until = time.monotonic() + 20
+    until = time.monotonic() + 120
     while (len(results) < count or len(health) < count) and time.monotonic() < until:
         batch = reader.poll()
         results, health = results + batch.results, health + batch.health

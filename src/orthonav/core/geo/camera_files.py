@@ -1,6 +1,7 @@
 """Camera files of other programs: OpenCV, ROS and Kalibr count from the first pixel's centre."""
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -201,17 +202,21 @@ def _stored(storage: cv2.FileStorage) -> Camera:
     fisheye = _whole(storage, "fisheye_model") or _whole(storage, "fisheye")
     return camera_from_numbers(
         sides,
-        matrix.ravel()[[0, 4, 2, 5]].tolist(),
-        [] if lens is None else lens.ravel().tolist(),
+        matrix[[0, 4, 2, 5]].tolist(),
+        [] if lens is None else lens.tolist(),
         "fisheye" if fisheye else "brown",
     )
 
 
 def _matrix(storage: cv2.FileStorage, *names: str) -> Any:
     for name in names:
-        node = storage.getNode(name)
-        if not node.empty() and (matrix := node.mat()) is not None:
-            return np.asarray(matrix, dtype=np.float64)
+        # Not `mat`: it writes beyond its memory where rows, columns and data disagree.
+        node, data = storage.getNode(name), storage.getNode(name).getNode("data")
+        if not data.empty():
+            numbers = [data.at(i).real() for i in range(data.size())]
+            if math.prod(node.getNode(each).real() for each in ("rows", "cols")) != len(numbers):
+                raise CameraError(f"rows, columns and data of {name} disagree")
+            return np.array(numbers)
     return None
 
 

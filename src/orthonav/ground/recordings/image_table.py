@@ -41,7 +41,7 @@ _SYNONYMS = {
     "lon": ("lon", "longitude"),
     "time": ("time", "timestamp", "datetimeoriginal"),
 }
-_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]")
+_BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]")
 _FEET = ("ft", "feet", "foot")
 _UNITS = ("deg", "degree", "degrees", "m", "meter", "meters", "metre", "metres", "s", *_FEET)
 _EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
@@ -127,6 +127,8 @@ def read_image_table(path: Path) -> ImageTable:
                 (table.line, {key: (row.get(name) or "").strip() for key, (name, _) in named})
                 for row in table
             ]
+    except UnicodeDecodeError as error:
+        raise FlightError(f"not a CSV file in UTF-8 ({error}): {path}") from error
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
     comma = delimiter != ","
