@@ -262,15 +262,14 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
     """Nanoseconds of seconds, of milliseconds since 1970, or of a date; UTC where no zone."""
     if text.lower() in _EMPTY:
         return None
-    number = number_of(text)
-    if math.isfinite(number):
-        seconds = Decimal(text)
-        while abs(seconds) > _LARGEST_S:
-            seconds /= 1000
-        return round(seconds * 10**9)
     try:
+        if math.isfinite(number_of(text)):
+            seconds = Decimal(text)
+            while abs(seconds) > _LARGEST_S:
+                seconds /= 1000
+            return round(seconds * 10**9)
         moment = datetime.fromisoformat(_DATE.sub(r"\1-\2-\3", text))
-    except ValueError as error:
+    except (ValueError, ArithmeticError) as error:
         raise FlightError(
             f"line {line}: time must be seconds or a date such as 2024-05-01T10:00:00Z, got "
             f"{text!r:.40}: {path}"
