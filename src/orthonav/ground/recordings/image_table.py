@@ -99,10 +99,13 @@ def is_image_table(path: Path) -> bool:
     """Whether a file is a CSV with a column of file names and others that a view needs."""
     if path.suffix.lower() not in (".csv", ".tsv", ".txt") or not path.is_file():
         return False
-    with path.open("rb") as stream:
-        header = stream.readline(MAX_LINE_CHARS).decode("utf-8-sig", errors="replace")
-    found = _columns([name.strip().strip('"') for name in re.split(r"[,;\t]", header)])
+    found = _columns([name.strip().strip('"') for name in re.split(r"[,;\t]", _header(path))])
     return "file" in found and len(found) > 1
+
+
+def _header(path: Path) -> str:
+    with path.open("rb") as stream:
+        return stream.readline(MAX_LINE_CHARS).decode("utf-8-sig", errors="replace")
 
 
 def read_image_table(path: Path) -> ImageTable:
@@ -111,9 +114,7 @@ def read_image_table(path: Path) -> ImageTable:
         raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            header = stream.readline(MAX_LINE_CHARS)
-            stream.seek(0)
-            delimiter = max(",;\t", key=header.count)
+            delimiter = max(",;\t", key=_header(path).count)
             table = TableRows(stream, delimiter=delimiter)
             columns = _columns(table.columns)
             named = list(columns.items())
@@ -127,8 +128,6 @@ def read_image_table(path: Path) -> ImageTable:
                 (table.line, {key: (row.get(name) or "").strip() for key, (name, _) in named})
                 for row in table
             ]
-    except UnicodeDecodeError as error:
-        raise FlightError(f"not a CSV file in UTF-8 ({error}): {path}") from error
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
     comma = delimiter != ","
