@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -36,6 +35,7 @@ from fake_autopilot import (
 )
 from paced import pace_by
 
+from helpers import wait_for
 from orthonav.cli import main
 from orthonav.core.errors import CameraError, MapChangedError, MapFileError
 from orthonav.core.flight.fixes import result_from_json
@@ -43,7 +43,7 @@ from orthonav.core.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
 from orthonav.core.flight.heights import FlownHeights
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize.confidence import ALERT_LIMIT, Acceptance
-from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
+from orthonav.core.records import CONFIDENT, NoFix, Prior, Telemetry
 from orthonav.onboard import cameras
 from orthonav.onboard import fly as loop
 from orthonav.onboard import state as states
@@ -891,13 +891,6 @@ def views_in(path):
     return [line for line in lines if "frame" in line], [result_from_json(t) for t in texts]
 
 
-def wait_for(condition):
-    deadline = time.monotonic() + 240  # only ends a hang
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert condition()
-
-
 @pytest.fixture
 def paced(monkeypatch):
     """Function that makes a playback wait until a line was written for every earlier image."""
@@ -1162,4 +1155,3 @@ def test_a_flight_loads_neither_torch_nor_gdal_nor_ros():
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "set()"
-    assert isinstance(fix(), Fix) and Path(__file__).exists()

@@ -24,17 +24,16 @@ from mcap.reader import make_reader
 from recorders import picture
 from ros2_peer import (
     BEST_EFFORT,
-    LONGEST_S,
     RELIABLE,
     TRANSIENT_LOCAL,
     Peer,
     environment,
-    wait_for,
 )
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from helpers import LONGEST_S, wait_for
 from orthonav.core.errors import CameraError
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.frames import LocalFrame
