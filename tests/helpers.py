@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import time
 import tracemalloc
 from typing import NamedTuple
 
@@ -60,3 +61,18 @@ def write_dem(path, frame, height_of, half_m=1500.0, px_m=25.0, change=lambda he
     ) as data:  # fmt: skip
         data.write(heights[None])
     return path
+
+
+LONGEST_S = 240.0
+"""Only what hangs takes so long."""
+
+
+def wait_for(condition, why=""):
+    """What the condition gives, once that is true; an assertion where it never is."""
+    deadline = time.monotonic() + LONGEST_S
+    while time.monotonic() < deadline:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.01)
+    raise AssertionError(f"not within {LONGEST_S} s: {why or condition}")

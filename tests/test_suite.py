@@ -1,15 +1,9 @@
-"""Tests run together, however they are chosen: names are for all. And every run ends."""
+"""Tests run together, however they are chosen: names are for all."""
 
-import os
 import re
-import shlex
-import subprocess
-import sys
 import tomllib
 from collections import Counter
 from pathlib import Path
-
-import pytest
 
 import absent
 from orthonav.core.extras import module_of
@@ -27,40 +21,6 @@ def test_nothing_is_imported_from_conftest():
     """Any folder may have one of its own, and the last one loaded is what the name means."""
     importing = re.compile(r"^\s*(from|import) conftest", re.MULTILINE)
     assert [path.name for path in TESTS if importing.search(path.read_text("utf-8"))] == []
-
-
-FAULTS = {
-    "crash": "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
-    "sleep": "import time; time.sleep(1000)",
-    # No signal reaches Python while this runs.
-    "deaf": "import itertools; sum(itertools.repeat(1))",
-}
-
-
-@pytest.mark.slow  # four processes; a suite that hangs shows it by itself
-def test_a_run_ends_with_the_names_of_the_tests_that_crashed_or_hung(tmp_path):
-    """Under the command of `make test` and the project's own options, but for shorter limits."""
-    (tmp_path / "test_quick.py").write_text("def test_one(): pass\ndef test_two(): pass\n")
-    for name, fault in FAULTS.items():
-        broken = f"def test_before(): pass\ndef test_broken(): {fault}\ndef test_after(): pass\n"
-        (tmp_path / f"test_{name}.py").write_text(broken)
-    makefile = (ROOT / "Makefile").read_text("utf-8")
-    options = re.search(r"^PYTEST := \$\(BIN\)/python (.*)$", makefile, re.MULTILINE)
-    assert options
-    command = [sys.executable, *shlex.split(options[1]), "-p", "no:cacheprovider"]
-    limits = ["-o", "timeout=1", "-o", "faulthandler_timeout=2"]
-    done = subprocess.run(
-        [*command, "-c", str(ROOT / "pyproject.toml"), *limits, "--rootdir", ".", "."],
-        cwd=tmp_path,
-        env={**os.environ, "PYTEST_XDIST_AUTO_NUM_WORKERS": "3"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 1, done.stdout
-    for name in FAULTS:
-        assert re.search(rf"^FAILED test_{name}.py::test_broken", done.stdout, re.MULTILINE)
-    assert re.search(r"^3 failed, [1-9] passed", done.stdout, re.MULTILINE)
 
 
 def test_only_what_is_absent_skips_a_test(monkeypatch):

@@ -162,6 +162,7 @@ NESTED = b"<Layer>" * 5000 + b"</Layer>" * 5000
     "protocol, body, words",
     [
         ("wmts", b"<a/>", "lists no layer"),
+        ("wmts", b"<?xml version='1.0' encoding='UTF-88'?><a/>", "not an XML document"),
         ("wmts", b"<Capabilities version='1.0.0'>" + NESTED + b"</Capabilities>", "no layer"),
         ("wms", b"<a/>", r"supported versions of WMS are 1\.1\.1 and 1\.3\.0"),
         ("wms", b"<WMS_Capabilities version='2.0'/>", r"supported versions of WMS"),

@@ -214,6 +214,7 @@ def test_a_wrong_or_missing_value_is_named(key: str, value: object) -> None:
         json.dumps(FIX_LINE).replace("120.0", "1e999").encode(),
         json.dumps(FIX_LINE).replace("120.0", "1" * 5000).encode(),
         json.dumps(FIX_LINE).replace("12.5", "1e999999999").encode(),
+        json.dumps(FIX_LINE).replace("12.5", "1e" + "9" * 400).encode(),
     ],
 )
 def test_a_broken_line_is_named_by_its_number(tmp_path: Path, bad: bytes) -> None:

@@ -106,6 +106,7 @@ def test_spreadsheets_are_read(folder):
         (f"{HEADER}\n,1,90,0,0,100\n", "not a name inside"),
         (f"{HEADER}\na.png,soon,90,0,0,100\n", "line 2: time_s is not a time"),
         (f"{HEADER}\na.png,1e10,90,0,0,100\n", "line 2: time_s is not a time"),
+        (f"{HEADER}\na.png,1e-{10**30},90,0,0,100\n", "line 2: time_s is not a time"),
         (f"{HEADER}\na.png,1,{'9' * 200_000},0,0,100\n", "line 2 is longer than 65,536"),
         (f"{HEADER},{PRIOR}\n{ROW},121.5,24,30\n", "line 2: prior .* seem to be swapped"),
     ],

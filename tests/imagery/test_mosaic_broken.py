@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.shutil
-from geotiffs import LAMBERT, SIZE, read, sheet_of, smooth_scene, write
+from geotiffs import FRAME, LAMBERT, SIZE, read, sheet_of, smooth_scene, write
 from rasterio.control import GroundControlPoint
 from rasterio.drivers import raster_driver_extensions
 from rasterio.transform import Affine
@@ -126,6 +126,13 @@ def test_an_incomplete_file_is_an_error(ortho, kind, kept):
     with pytest.raises(ImageryError, match="cannot be read") as caught:
         read(path, 500)
     assert "previous exception" not in str(caught.value)
+
+
+def test_a_coordinate_system_whose_name_is_no_text(ortho):
+    write(ortho, noise(), crs=FRAME.proj4)
+    ortho.write_bytes(ortho.read_bytes().replace(b"unknown|", b"unkno\xb1n|"))
+    with pytest.raises(ImageryError, match="cannot be read"):
+        Mosaic.open([ortho])
 
 
 @pytest.mark.parametrize("kind", ["deflate tiles", "lzw tiles", "jpeg tiles", "PNG"])

@@ -206,6 +206,10 @@ def test_files_that_cannot_be_read(tmp_path, make_dem):
     with pytest.raises(ImageryError, match="terrain file cannot be read"):
         open_dem(tmp_path / "broken.tif", "msl")
     path = make_dem()
+    path.write_bytes(path.read_bytes().replace(b"unknown|", b"unkno\xb1n|"))
+    with pytest.raises(ImageryError, match=r"terrain file cannot be read .*utf-8"):
+        open_dem(path, "msl")
+    path = make_dem()
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(ImageryError, match="terrain file cannot be read"):
         open_dem(path, "msl")(*places(0.0, -2000.0))

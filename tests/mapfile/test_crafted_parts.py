@@ -49,7 +49,7 @@ def used(path):
 
 def everything_of_the_layer(opened):
     layer = GreyLayer.of(opened)
-    for level in range(layer.levels):
+    for level in range(layer.levels if layer else 0):
         layer.read(level, 0, 0, *layer.shape(level))
 
 

@@ -5,7 +5,6 @@ Loopback only: every test has a domain of its own, and no multicast leaves the m
 
 import os
 import random
-import time
 
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
@@ -29,21 +28,6 @@ def environment():
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
     domain = 4 * random.Random(os.urandom(8)).randint(0, 24) + 1 + worker % 4
     return {"CYCLONEDDS_URI": LOOPBACK, "ROS_DOMAIN_ID": str(domain)}
-
-
-LONGEST_S = 60.0
-"""Only what hangs takes so long."""
-
-
-def wait_for(condition, why=""):
-    """What the condition gives, once that is true; an assertion where it is not in time."""
-    deadline = time.monotonic() + LONGEST_S
-    while time.monotonic() < deadline:
-        found = condition()
-        if found:
-            return found
-        time.sleep(0.01)
-    raise AssertionError(f"not within {LONGEST_S} s: {why or condition}")
 
 
 class Peer:

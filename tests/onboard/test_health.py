@@ -104,7 +104,7 @@ def test_changes_are_reported_at_most_every_five_seconds():
 def test_systemd_is_notified(tmp_path, abstract, monkeypatch):
     name = f"@orthonav-test-{os.getpid()}" if abstract else str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
-        receiver.settimeout(2)
+        receiver.settimeout(60)
         receiver.bind(name.replace("@", "\0"))
         monkeypatch.setenv("NOTIFY_SOCKET", name)
         assert notify("READY=1", "STATUS=flying")

@@ -17,6 +17,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from helpers import wait_for
 from orthonav.core.errors import OutputError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
@@ -79,13 +80,6 @@ def read_chunks(path):
 
 def plain(messages):
     return [json.loads(message.data) for message in messages]
-
-
-def wait_for(condition):
-    until = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.002)
 
 
 def files_in(folder):

@@ -24,6 +24,7 @@ from orthonav.onboard.outputs import (
     JsonOut,
     Messenger,
     NmeaOut,
+    Publisher,
     open_sink,
 )
 from orthonav.onboard.telemetry import VehicleState
@@ -215,7 +216,7 @@ def sentences(data):
 def test_nmea_over_udp():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
         heard.bind(("127.0.0.1", 0))
-        heard.settimeout(2)
+        heard.settimeout(60)
         out = NmeaOut(open_sink(f"udp:127.0.0.1:{heard.getsockname()[1]}"))
         out.write(ESTIMATE, UTC_NS, 0.9)
         gga, rmc, gst = sentences(heard.recv(500))
@@ -240,6 +241,38 @@ def test_nmea_over_a_serial_port_that_is_unplugged():
         with pytest.raises(OSError):
             out.write(ESTIMATE, UTC_NS, 0.9)
     out.close()
+
+
+class Written:
+    """A sink that stores what is written."""
+
+    def __init__(self):
+        self.data = b""
+
+    def write(self, data):
+        self.data += data
+
+
+def test_nmea_times_are_those_of_exposures_and_never_step_back():
+    time, sink = Time(), Written()
+    gate = Gate(GateRules(), Clock.BOOT)
+    publisher = Publisher(gate, time.clocks, nmea=[NmeaOut(sink)])
+    begin_ns = time.now_ns
+    ages_s = [(0.1, False), (0.4, True), (0.1, True), (0.3, False), (0.2, True)]
+    for age_s, is_found in ages_s:
+        time.go(0.1)
+        outcome = fix() if is_found else NoFix("searching", "")
+        exposed_ns = time.now_ns - round(age_s * S)
+        publisher.publish(
+            ViewResult("a", 5, outcome, 1.0, "tracking"), exposed_ns, VEHICLE, judged=True
+        )
+    times = [each.time for each in sentences(sink.data)]
+    shown = [(each.second + each.microsecond / 1e6) for each in times]
+    begin_s = (UTC_NS + begin_ns) / S % 60
+    assert [each - begin_s for each in shown] == pytest.approx([0.0] * 3 + [0.2] * 3 + [0.3] * 3)
+    time.utc_ahead_ns -= 3600 * S  # a clock that is set back is followed
+    publisher.publish(ViewResult("a", 5, fix(), 1.0, None), time.now_ns, VEHICLE, judged=True)
+    assert len(sentences(sink.data)) == 12
 
 
 @pytest.mark.parametrize("url", ["", "udp:here", "http://x", "serial:ttyS0", "tcp-listen:0"])

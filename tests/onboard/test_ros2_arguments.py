@@ -93,12 +93,15 @@ def test_parameters_of_files_are_those_of_the_node(tmp_path, caplog):
     assert parsed("-p", "other:map_frame:=x").parameters.map_frame == "map"
 
 
-@pytest.mark.parametrize("text", ["[1, 2", "- a", "orthonav: {map_frame: x}", "", "\x00"])
+@pytest.mark.parametrize(
+    "text", ["[1, 2", "- a", "orthonav: {map_frame: x}", "", "\x00", "[" * 1500, "a:\n  b: c: d"]
+)
 def test_a_file_without_parameters_is_refused(tmp_path, text):
     path = tmp_path / "params.yaml"
     path.write_text(text)
-    with pytest.raises(VariantError, match="parameter file"):
+    with pytest.raises(VariantError, match="parameter file") as caught:
         parsed("--params-file", str(path))
+    assert "\n" not in str(caught.value)
 
 
 def test_other_arguments_of_ros_are_taken():

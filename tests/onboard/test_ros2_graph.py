@@ -25,7 +25,7 @@ FLY = "-c", "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1
 PACKAGE = Path(__file__).parents[2] / "ros2" / "orthonav_ros"
 HEADING, SPEED_MPS, COUNT, EVERY_S = 60.0, 14.0, 40, 0.4
 ENOUGH = 5
-LONGEST_S = 60.0
+LONGEST_S = 120.0
 
 
 @pytest.fixture(scope="module")

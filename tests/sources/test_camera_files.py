@@ -157,6 +157,10 @@ REFUSED = {
     "other JSON": (written(json.dumps({"a": 1})), "key .image_width. is missing"),
     "bytes": (written(b"\xff\xfe\x00\x80"), "not UTF-8 text"),
     "broken OpenCV": (written("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: x"), "."),
+    "rows of nothing": (
+        lambda p: p.write_text(opencv(p).read_text().replace("rows: 5", "rows: 0")) and p,
+        "rows, columns and data of distortion_coefficients disagree",
+    ),
     "negative": (lambda p: kalibr(p, intrinsics=[-1, 1, 1, 1]), "focal length"),
 }
 

@@ -25,7 +25,7 @@ def images(tmp_path):
 
 
 def views_of(folder, table, options=FOV):
-    (folder / "poses.csv").write_text(table)
+    (folder / "poses.csv").write_bytes(table.encode("utf-8", "surrogateescape"))
     recording = open_source(folder, options)
     return SimpleNamespace(
         warnings="\n".join(recording.warnings), by={view.frame: view for view in recording.views}
@@ -167,9 +167,11 @@ def test_what_is_missing_is_named(images):
     [
         ("file,yaw\na.png,north\n", "line 2: yaw is not a number, got 'north'"),
         ("file,lat,lon\na.png,146.5,2.5\n", "line 2: not a latitude and longitude in degrees"),
+        (f"file,time\na.png,1e-{10**30}\n", "line 2: time must be seconds or a date"),
         ("file,time\na.png,noon\n", "line 2: time must be seconds or a date"),
         ("file,yaw\na.png,1\na.png,2\n", "names 'a.png' twice"),
         ("file,yaw\n", "names no image"),
+        ("file,yaw,\udcff\n", "not a CSV file in UTF-8"),
     ],
 )
 def test_tables_that_are_refused(images, table, message):

@@ -195,6 +195,10 @@ BROKEN = {
     ),
     "cut": (lambda path, srt: path.write_bytes(path.read_bytes()[:-9000]), r"\d+ of 30 frames"),
     "no blocks": (lambda path, srt: srt.write_text("words\n\nand words\n"), "expected a PX4 log"),
+    "endless numbers": (  # minutes for every million digits, where the search starts at each
+        lambda path, srt: srt.write_text("0:00:00,0 --> G.PRY (" + "9" * 2_000_000 + "\n"),
+        "hold no telemetry",
+    ),
     "empty subtitles": (lambda path, srt: srt.write_bytes(b""), "telemetry log is empty"),
     "of a film": (lambda path, srt: subtitles(srt, ["- Who is it?"] * 30), "neither position nor"),
     "no subtitles": (lambda path, srt: srt.unlink(), "no telemetry beside the video"),

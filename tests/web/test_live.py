@@ -1,13 +1,13 @@
 """A run is followed while it is flown, whatever its file goes through."""
 
 import json
-import time
 
 import numpy as np
 import pytest
 from blots import CAMERA
 from small_run import result
 
+from helpers import wait_for
 from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.flight.fixes import result_to_json
 from orthonav.core.records import Telemetry
@@ -110,11 +110,14 @@ def fly(log, numbers):
 def gathered(reader, count):
     """So many results and lines of health; the log is written by a thread of its own."""
     results, health = [], []
-    until = time.monotonic() + 20
-    while (len(results) < count or len(health) < count) and time.monotonic() < until:
+
+    def all_there():
         batch = reader.poll()
-        results, health = results + batch.results, health + batch.health
-        time.sleep(0.005)
+        results.extend(batch.results)
+        health.extend(batch.health)
+        return min(len(results), len(health)) >= count
+
+    wait_for(all_there)
     assert len(results) == count
     return results, health
 

@@ -89,10 +89,10 @@ def test_a_real_one_serves_until_it_is_ended(small):
     popen = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         address = popen.stdout.readline().split()[0]
-        with urllib.request.urlopen(address + "api/run", timeout=20) as reply:
+        with urllib.request.urlopen(address + "api/run", timeout=120) as reply:
             assert reply.status == 200
         popen.send_signal(signal.SIGTERM)
-        out, err = popen.communicate(timeout=20)
+        out, err = popen.communicate(timeout=120)
     finally:
         popen.kill()
     assert (popen.returncode, out, err) == (0, "ended\n", "")

@@ -69,7 +69,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     add = group.add_argument
     text = "message to send to the autopilot (default global-position); can be repeated"
     add("--send", action="append", choices=SEND, help=text)
-    text = "NMEA to udp:HOST:PORT or serial:DEVICE:BAUD; can be repeated"
+    text = "NMEA to udp:HOST:PORT or serial:DEVICE:BAUD; can be repeated. RMC has status V, which "
+    text += "most displays ignore: see --nmea-as-gps"
     add("--nmea", action="append", default=[], metavar="URL", help=text)
     text = "append one line of JSON per view to a file, or to stdout (-); can be repeated"
     add("--jsonl", action="append", default=[], metavar="FILE|-", help=text)
@@ -99,7 +100,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     add("--satellites", type=int, default=0, metavar="N", help=text)
     text = "hdop of GPS_INPUT: standard deviation divided by this many metres (default: ignored)"
     add("--hdop-m", type=float, metavar="M", help=text)
-    text = "NMEA quality 1 (GPS fix) instead of 6 (estimated)"
+    text = "NMEA quality 1 and RMC status A (GPS fix) instead of 6 and V (estimated)"
     add("--nmea-as-gps", action="store_true", help=text)
 
 

@@ -81,6 +81,7 @@ class LiveCamera:
         capture: Callable[[int | str], Any] | None = None,
     ) -> None:
         self._name, self._clocks, self._size = name, clocks, size_px
+        self._shown = f"/dev/video{name}" if isinstance(name, int) else name
         self._opener = capture or _capture
         self._capture: Any = None
         self._number = 0
@@ -95,7 +96,7 @@ class LiveCamera:
             self._capture = self._open()
         if not self._capture.grab():
             self.close()
-            raise CameraGoneError(f"camera delivers no images: {self._name}")
+            raise CameraGoneError(f"camera delivers no images: {self._shown}")
         arrived_ns = self._clocks.mono_ns()
         self._count_interruptions(arrived_ns)
         found, frame = self._capture.retrieve()
@@ -134,7 +135,7 @@ class LiveCamera:
         capture = self._opener(self._name)
         if not capture.isOpened():
             capture.release()
-            raise CameraGoneError(f"camera cannot be opened: {self._name}")
+            raise CameraGoneError(f"camera cannot be opened: {self._shown}")
         if self._size is not None and isinstance(self._name, int):
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
@@ -279,6 +280,7 @@ class NewestImage:
         self._condition = threading.Condition()
         self._picture: CameraImage | None = None
         self.taken = self.replaced = self.outages = 0
+        self.problem = ""  # why there are none now
         self.ended = False
 
     def put(self, image: CameraImage) -> None:
@@ -320,6 +322,7 @@ def read_into(
             try:
                 image = source.read()
             except Exception as error:  # unplugged, or a fault of the driver: it may come back
+                newest.problem = str(error)
                 if failures == 0:
                     newest.outages += 1
                     expected = isinstance(error, CameraGoneError)

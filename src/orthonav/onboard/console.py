@@ -208,7 +208,9 @@ class Narrator:
     def _watch(self, now_ns: int) -> None:
         if self._link is not None:
             self._remind(self._missing_of(self._link), now_ns)
-        self._remind(None if self._newest.taken else self._images, now_ns)
+        problem = self._newest.problem
+        images = f"images; {problem}" if self._images and problem else self._images
+        self._remind(None if self._newest.taken else images, now_ns)
 
     def _missing_of(self, link: AutopilotLink) -> str | None:
         """What is waited for from the autopilot; None where telemetry came."""

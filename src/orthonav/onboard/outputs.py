@@ -23,7 +23,7 @@ from orthonav.onboard.messages.estimate import (
     NavigationEstimate,
     estimate_from_result,
 )
-from orthonav.onboard.messages.gate import Gate
+from orthonav.onboard.messages.gate import MAX_AGE_S, Gate
 from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
     Autopilot,
@@ -296,6 +296,7 @@ class Publisher:
         self._nmea, self._lines, self._least = nmea, lines, min_confidence
         self._graph = [] if graph is None else [graph]
         self._covariance = FilterCovariance(min_std_m)
+        self._nmea_ns = 0
         self.failed = 0
 
     def publish(
@@ -311,12 +312,12 @@ class Publisher:
         processed (`judged`) gives one: the prediction of a track is not a measurement."""
         estimate: NavigationEstimate | None = None
         sent: tuple[str, ...] = ()
+        now_ns = self._clocks.mono_ns()
+        ahead_ns = self._clocks.utc_ns() - now_ns
         if withheld is not None:
             self.gate.withheld[withheld] += 1
         elif judged:
-            now_ns = self._clocks.mono_ns()
             by_our_clock = replace(result, time_ns=exposed_ns)
-            ahead_ns = self._clocks.utc_ns() - now_ns
             made = estimate_from_result(by_our_clock, clock=Clock.BOOT, utc_minus_boot_ns=ahead_ns)
             before = self.gate.withheld.copy()
             estimate = self.gate.admit(made, now_ns)
@@ -326,7 +327,7 @@ class Publisher:
                 if not estimate.dead_reckoned:  # messages of ROS cannot mark it
                     sent += self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
             withheld = None if sent else next(iter(self.gate.withheld - before), None)
-        self._write_nmea(estimate)
+        self._write_nmea(estimate, exposed_ns + ahead_ns)
         age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
         self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))
         return sent
@@ -352,9 +353,11 @@ class Publisher:
             self._covariance.sent("ROS2", exposed_ns)
         return tuple(sent)
 
-    def _write_nmea(self, estimate: NavigationEstimate | None) -> None:
-        if self._nmea and self.gate.due("NMEA", self._clocks.mono_ns()):
-            utc_ns = self._clocks.utc_ns()
+    def _write_nmea(self, estimate: NavigationEstimate | None, utc_ns: int) -> None:
+        # Farther behind, the clock was set back.
+        goes_back = 0 < self._nmea_ns - utc_ns <= MAX_AGE_S * 1e9
+        if self._nmea and not goes_back and self.gate.due("NMEA", self._clocks.mono_ns()):
+            self._nmea_ns = utc_ns
             self._each(self._nmea, lambda out: out.write(estimate, utc_ns, self._least))
 
     def _each(self, outs: Sequence[Any], call: Callable[[Any], None]) -> None:

@@ -185,7 +185,7 @@ def result_from_json(line: str) -> ViewResult:
     """
     try:
         values = json.loads(line, parse_float=Decimal, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
+    except (ValueError, ArithmeticError, RecursionError) as error:  # of an exponent
         raise FlightError(f"not a JSON object, cut off or damaged? ({error})") from error
     if not isinstance(values, dict):
         raise FlightError(f"expected a JSON object, got {values!r:.40}")

@@ -302,7 +302,10 @@ def time_ns_of(text: str | None) -> int | None:
     """
     if text is None or not abs(number_of(text)) < 9e9:  # NaN too
         return None
-    return round(Decimal(text.strip()) * 10**9)
+    try:
+        return round(Decimal(text.strip()) * 10**9)
+    except ArithmeticError:  # 1e-99999999999999999999, which is 0 as a float
+        return None
 
 
 def number_of(text: Any) -> float:

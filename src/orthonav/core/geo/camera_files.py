@@ -30,7 +30,7 @@ _READ = (
     "JSON), ROS (camera_matrix, distortion_coefficients, ..) or Kalibr (intrinsics, resolution, ..)"
 )
 _UNREAD = {  # programs by what their files hold
-    "COLMAP": re.compile(r"^\s*\d+ [A-Z_]+ \d+ \d+( [\d.e+-]+)+\s*$", re.M),
+    "COLMAP": re.compile(r"^ *\d+ [A-Z_]+ \d+ \d+( [\d.e+-]+)+ *$", re.M),
     "Metashape": re.compile(r"<(calibration|document)\b"),
 }
 _BROKEN = (
@@ -172,8 +172,8 @@ def _plain(plain: Any, name: str | None = None) -> Camera:
     fisheye = plain.get("fisheye_model") or plain.get("fisheye")
     return camera_from_numbers(
         [_first(plain, f"image_{side}", f"image_{side.title()}") for side in ("width", "height")],
-        _first(plain, "camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")["data"],
-        _first(plain, *lens)["data"],
+        _data(_first(plain, "camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")),
+        _data(next((plain[name] for name in lens if name in plain), [])),
         "fisheye" if fisheye else str(plain.get("distortion_model", "plumb_bob")),
         bool(plain.get("unusual")),
     )
@@ -207,16 +207,22 @@ def _opencv(text: str) -> Any:
 
 
 def _value(node: cv2.FileNode) -> Any:
+    # Not `mat`: it writes beyond its memory where rows, columns and data disagree.
     if node.isMap():
         names = node.keys()
         return {name: _value(node.getNode(name)) for name in names}
-    if node.isSeq():
-        return [_value(node.at(number)) for number in range(node.size())]
+    if node.isSeq():  # long ones, points of a calibration, are not needed and take minutes
+        return [_value(node.at(n)) for n in range(node.size())] if node.size() < 100 else []
     return node.string() if node.isString() else node.real()
 
 
 def _first(plain: Mapping[str, Any], *names: str) -> Any:
     return plain[next((name for name in names if name in plain), names[0])]
+
+
+def _data(matrix: Any) -> Any:
+    """Of a matrix with rows, cols and data, or of plain lists."""
+    return np.ravel(matrix["data"] if isinstance(matrix, Mapping) else matrix)
 
 
 def _numbers(values: Any, count: int) -> Any:

@@ -16,7 +16,6 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import MaskFlags, Resampling
-from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
@@ -42,7 +41,7 @@ from orthonav.ground.fetch.service import (
 from orthonav.ground.fetch.urls import TOKEN, Secret, checked_url, linked, origin_of, shown
 from orthonav.ground.fetch.web import Web
 from orthonav.ground.imagery.mosaic import WHOLLY_VALID
-from orthonav.ground.imagery.source import quiet
+from orthonav.ground.imagery.source import GDAL_ERRORS, quiet
 from orthonav.ground.planning.area import Area
 
 MAX_ITEMS = 500  # files of one fetch: an open dataset each, per thread
@@ -127,7 +126,7 @@ def _opened(web: Web, url: str, level: int | None = None) -> Iterator[Any]:
             rasterio.open(path, driver="GTiff", **options) as file,
         ):
             yield file
-    except RasterioError as error:
+    except GDAL_ERRORS as error:
         reason = web.redacted(reason_of(error)[0])
         raise FetchError(f"not a GeoTIFF that can be read ({reason}): {shown(url)}") from None
 

@@ -170,7 +170,7 @@ def epsg_name(crs: str) -> str:
     """A coordinate system as EPSG:CODE. Raises `FetchError` where it has no such code."""
     if crs.endswith(("CRS84", "CRS:84")):
         return "EPSG:4326"
-    found = re.search(r"EPSG\b.*?[:/](\d{4,6})$", crs)
+    found = re.search(r"EPSG\b.*?[:/](\d{4,6})$", crs[-200:])
     code = int(found.group(1)) if found else known_crs(crs).to_epsg()
     if code in (900913, 3785, 102100, 102113):
         code = 3857

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from orthonav.core.errors import FetchError
@@ -24,6 +23,7 @@ from orthonav.ground.fetch.grid import CellGrid, Selection
 from orthonav.ground.fetch.presets import HEIGHTS_FORMAT, Provenance, SourceSpec
 from orthonav.ground.fetch.urls import checked_url, shown
 from orthonav.ground.fetch.web import CONNECT_S, READ_S, USER_AGENT, Web, is_temporary
+from orthonav.ground.imagery.source import GDAL_ERRORS
 
 GDAL_OPTIONS = {
     "GDAL_HTTP_CONNECTTIMEOUT": CONNECT_S,
@@ -160,7 +160,7 @@ def _read(web: Web, description: str, window: Window, where: str) -> NDArray[Any
         try:
             with rasterio.Env(**GDAL_OPTIONS), rasterio.open(description) as dataset:
                 return np.asarray(dataset.read(window=window))
-        except RasterioError as error:
+        except GDAL_ERRORS as error:
             reason, is_worth_it = reason_of(error)
         if not is_worth_it:
             break

@@ -84,7 +84,7 @@ class Web:
             raise FetchError(f"document declares entities, which are not read: {shown(url)}")
         try:
             root = fromstring(body)
-        except (ParseError, ValueError):
+        except (ParseError, ValueError, LookupError):  # of an unknown encoding
             raise FetchError(f"not an XML document ({self._excerpt(body)}): {shown(url)}") from None
         if "Exception" in root.tag:
             raise FetchError(f"an error of the service ({self._excerpt(body)}): {shown(url)}")

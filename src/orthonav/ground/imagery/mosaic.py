@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from rasterio._err import CPLE_BaseError
 from rasterio.dtypes import dtype_rev, typename_fwd
 from rasterio.enums import Resampling
-from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 from rasterio.warp import transform as transform_coordinates
@@ -32,6 +31,7 @@ from orthonav.core.errors import ImageryError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.ground.imagery.source import (
+    GDAL_ERRORS,
     Source,
     name_bands,
     open_sources,
@@ -262,7 +262,7 @@ def _valid_values(source: Source) -> NDArray[Any]:
             shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
             pixels = data.read(out_shape=(data.count, *shape))
             valid = data.dataset_mask(out_shape=shape) > 0
-    except RasterioError as error:
+    except GDAL_ERRORS as error:
         raise unreadable(source.path, error) from error
     sampled = pixels[:, valid].ravel()
     return np.asarray(sampled[np.isfinite(sampled)])
@@ -465,7 +465,7 @@ class SheetRaster:
             return np.zeros((*shape, colours), np.uint8), np.zeros(shape, np.uint8)
         try:
             values, mask, transform = lattice.read(self._dataset(lattice), part, self._gsd_m)
-        except RasterioError as error:
+        except GDAL_ERRORS as error:
             said = f"{error} {error.__cause__}"
             named = (each.path for each in lattice.sources if each.path.name in said)
             raise unreadable(next(named, lattice.first.path), error) from error

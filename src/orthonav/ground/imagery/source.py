@@ -39,6 +39,8 @@ try:
 except ImportError as error:
     raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
+GDAL_ERRORS = RasterioError, CPLE_BaseError, UnicodeDecodeError
+"""Of damaged files; the last of names that are no text."""
 ALPHA_SAMPLE_PX, OVERVIEW_PX = 64, 512
 MAX_PARTLY_CLEAR = 0.05
 """Largest fraction of partly transparent pixels of a mask: its resampled edges."""
@@ -226,7 +228,7 @@ def _opened(
         if folder is None:
             raise
         return error
-    except RasterioError as error:
+    except GDAL_ERRORS as error:
         raise unreadable(path, error) from error
 
 
@@ -505,10 +507,10 @@ def quiet() -> Iterator[None]:
         yield
 
 
-def unreadable(path: Path, error: Exception) -> ImageryError:
+def unreadable(path: Path, error: Exception, what: str = "orthophoto") -> ImageryError:
     reason = error.__cause__ or error  # rasterio itself only says "see previous exception"
     line = (str(reason).splitlines() or [type(reason).__name__])[0]
-    return ImageryError(f"orthophoto cannot be read ({line}): {path}")
+    return ImageryError(f"{what} cannot be read ({line}): {path}")
 
 
 _TAGS = ("TIFFTAG_DATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "DATE")

@@ -23,15 +23,21 @@ try:
     import pyproj
     import rasterio
     from pyproj.exceptions import ProjError
-    from rasterio._err import CPLE_BaseError
     from rasterio.crs import CRS
     from rasterio.enums import Resampling
-    from rasterio.errors import RasterioError
     from rasterio.transform import Affine
     from rasterio.vrt import WarpedVRT
     from rasterio.windows import Window
 
-    from orthonav.ground.imagery.source import ground_m, outline_of, quiet, system_beside, unwarped
+    from orthonav.ground.imagery.source import (
+        GDAL_ERRORS,
+        ground_m,
+        outline_of,
+        quiet,
+        system_beside,
+        unreadable,
+        unwarped,
+    )
     from orthonav.ground.imagery.systems import accuracy_of
 except ImportError as error:
     raise missing_extra("reading terrain", "geo", "rasterio", error) from error
@@ -248,8 +254,8 @@ class Dem:
                 ) as warped,
             ):
                 return self._metres(warped.read(1, masked=True))
-        except (RasterioError, CPLE_BaseError) as error:
-            raise _unreadable(self.path, error) from error
+        except GDAL_ERRORS as error:
+            raise unreadable(self.path, error, "terrain file") from error
 
     def _above_sea(self, heights: Array, lat_deg: Array, lon_deg: Array) -> Array:
         if self.datum.above_ellipsoid:
@@ -288,8 +294,8 @@ class Dem:
             window = Window(left, top, right - left, bottom - top)
             try:
                 raw = self._data.read(1, window=window, masked=True)
-            except (RasterioError, CPLE_BaseError) as error:
-                raise _unreadable(self.path, error) from error
+            except GDAL_ERRORS as error:
+                raise unreadable(self.path, error, "terrain file") from error
             yield some, left, top, self._metres(raw)
 
 
@@ -299,8 +305,8 @@ def open_dem(path: Path, datum: str | None = None) -> Dem:
     try:
         with quiet(), rasterio.Env(**_OPTIONS):
             return _inspected(path, rasterio.open(path), datum)
-    except (RasterioError, CPLE_BaseError) as error:
-        raise _unreadable(path, error) from error
+    except GDAL_ERRORS as error:
+        raise unreadable(path, error, "terrain file") from error
 
 
 def _inspected(path: Path, data: Any, given: str | None) -> Dem:
@@ -363,7 +369,3 @@ def _require_heights(path: Path, data: Any, datum: VerticalDatum) -> None:
             ground.min(),
             path,
         )
-
-
-def _unreadable(path: Path, error: Exception) -> ImageryError:
-    return ImageryError(f"terrain file cannot be read ({error}): {path}")

@@ -158,7 +158,7 @@ _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
 )
 _MODES = ("altitudemode", "altitude_mode")  # columns of Litchi
 _FRAME_OF_MODE: dict[float | None, HeightFrame] = {0: "home", 1: "agl"}
-_UNIT = re.compile(r"\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
+_UNIT = re.compile(r"(?<!\s)\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
 _METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
 _Values = Callable[[str], list[float | None]]
 

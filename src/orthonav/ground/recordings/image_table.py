@@ -43,7 +43,7 @@ _SYNONYMS = {
     "lon": ("lon", "longitude", "xlongitude"),
     "time": ("time", "timestamp", "datetimeoriginal"),
 }
-_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]")
+_BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]")
 _SCALES = dict.fromkeys(("ft", "feet", "foot"), 0.3048) | {"km": 1000.0, "cm": 0.01}
 _SCALES |= dict.fromkeys(("rad", "radian", "radians"), math.degrees(1.0))
 _UNITS = ("deg", "degree", "degrees", "m", "meter", "meters", "metre", "metres", "s", *_SCALES)
@@ -105,10 +105,13 @@ def is_image_table(path: Path) -> bool:
     """Whether a file is a CSV with a column of file names and others that a view needs."""
     if path.suffix.lower() not in _SUFFIXES or not path.is_file():
         return False
-    with path.open("rb") as stream:
-        header = stream.readline(MAX_LINE_CHARS).decode("utf-8-sig", errors="replace")
-    found = _columns([name.strip().strip('"') for name in re.split(r"[,;\t]", header)])
+    found = _columns([name.strip().strip('"') for name in re.split(r"[,;\t]", _header(path))])
     return "file" in found and len(found) > 1
+
+
+def _header(path: Path) -> str:
+    with path.open("rb") as stream:
+        return stream.readline(MAX_LINE_CHARS).decode("utf-8-sig", errors="replace")
 
 
 def read_image_table(path: Path) -> ImageTable:
@@ -117,9 +120,7 @@ def read_image_table(path: Path) -> ImageTable:
         raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            header = stream.readline(MAX_LINE_CHARS)
-            stream.seek(0)
-            delimiter = max(",;\t", key=header.count)
+            delimiter = max(",;\t", key=_header(path).count)
             table = TableRows(stream, delimiter=delimiter)
             columns = _columns(table.columns)
             named = list(columns.items())
@@ -253,15 +254,14 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
     """Nanoseconds of seconds, of milliseconds since 1970, or of a date; UTC where no zone."""
     if text.lower() in _EMPTY:
         return None
-    number = number_of(text)
-    if math.isfinite(number):
-        seconds = Decimal(text)
-        while abs(seconds) > _LARGEST_S:
-            seconds /= 1000
-        return round(seconds * 10**9)
     try:
+        if math.isfinite(number_of(text)):
+            seconds = Decimal(text)
+            while abs(seconds) > _LARGEST_S:
+                seconds /= 1000
+            return round(seconds * 10**9)
         moment = datetime.fromisoformat(_DATE.sub(r"\1-\2-\3", text))
-    except ValueError as error:
+    except (ValueError, ArithmeticError) as error:
         raise FlightError(
             f"line {line}: time must be seconds or a date such as 2024-05-01T10:00:00Z, got "
             f"{text!r:.40}: {path}"

@@ -349,8 +349,10 @@ def _position(columns: Columns) -> TimeSeries | None:
 
 _SRT = re.compile(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->")
 MAX_BYTES = 500_000_000
-_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
-_TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\d)[,.](\d{1,3})")
+_NUMBER = r"([-+]?\d{1,20}(?:\.\d{1,20})?)"  # limited, as the time of a search is
+_TIMES = re.compile(
+    r"(?<!\d)(\d{1,9}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d{1,9}):(\d\d):(\d\d)[,.](\d{1,3})"
+)
 _ENDS = (">", "]", ")")  # what blocks end with that are whole, besides the end of a line
 _TAG = re.compile(r"<[^<>]*>")
 _FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")

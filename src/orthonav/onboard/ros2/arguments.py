@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from orthonav.core.errors import VariantError
+from orthonav.core.errors import VariantError, described
 from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 
@@ -209,8 +209,8 @@ def _values_of_file(path: Path, full_name: str) -> Iterator[tuple[str, str]]:
     yaml = needed("yaml", "ros2", "--params-file")
     try:
         content = yaml.safe_load(require_file(path, "parameter file").read_text("utf-8"))
-    except (ValueError, yaml.YAMLError) as error:
-        raise VariantError(f"parameter file is not YAML ({error}): {path}") from error
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise VariantError(f"parameter file is not YAML ({described(error)}): {path}") from error
     flat = dict(_flat(content if isinstance(content, dict) else {}, "/"))
     marker = "/ros__parameters"
     if not any(marker in name for name in flat):
