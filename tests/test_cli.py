@@ -480,7 +480,7 @@ BAD_FLIGHTS = {
     "no camera": (lambda f: (f / "flight.json").unlink(), "flight.json"),
     "camera is no json": (lambda f: (f / "flight.json").write_text("{"), "flight.json"),
     "impossible camera": (lambda f: edit_camera(f, fx_px=-5), "focal length"),
-    "camera of others": (lambda f: edit_camera(f, width_px=640), "640 x 240"),
+    "camera of others": (lambda f: edit_camera(f, width_px=640, cx_px=320), "640 x 240"),
     "empty telemetry": (lambda f: (f / "telemetry.csv").write_text(""), "columns are missing"),
     "binary telemetry": (lambda f: (f / "telemetry.csv").write_bytes(noise(999)), "telemetry"),
     "no views": (

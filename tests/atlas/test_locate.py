@@ -83,7 +83,7 @@ def test_options_of_maps_are_refused(atlas, flown, tmp_path, run):
     refused = run(
         "localize", "--atlas", atlas.url, flown, "--out", tmp_path / "fixes.jsonl", "--track"
     )
-    assert refused.code == 1 and "--track" in refused.err
+    assert refused.code == 2 and "--track" in refused.err
 
 
 def test_a_negative_has_no_confident_fix(locator, first_view):

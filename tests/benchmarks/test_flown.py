@@ -25,9 +25,7 @@ def lap(tmp_path_factory):
     """A lap of a few tiny pictures eastwards; its last view is 5 m short of the first."""
     folder = tmp_path_factory.mktemp("flown") / "lap"
     (folder / "frames").mkdir(parents=True)
-    camera = {"width_px": 8, "height_px": 6} | {
-        k: 5.0 for k in ("fx_px", "fy_px", "cx_px", "cy_px")
-    }
+    camera = {"width_px": 8, "height_px": 6, "fx_px": 5, "fy_px": 5, "cx_px": 4, "cy_px": 3}
     (folder / "flight.json").write_text(json.dumps({"camera": camera}))
     telemetry = ["frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m,vel_east_mps,vel_north_mps"]
     true = ["frame,lat_deg,lon_deg"]

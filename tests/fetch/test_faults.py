@@ -233,7 +233,7 @@ def test_an_interrupt_leaves_no_half_file(tmp_path):
             os.kill(process.pid, signal.SIGTERM)
             assert process.stderr is not None
             message = process.stderr.read()
-    assert process.returncode == 1 and "interrupted" in message and "Traceback" not in message
+    assert process.returncode == 143 and "interrupted" in message and "Traceback" not in message
     assert not (tmp_path / "o.tif").exists()
 
 

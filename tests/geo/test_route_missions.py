@@ -252,7 +252,8 @@ def test_item_0_is_a_waypoint_in_the_frame_of_waypoints(read, caplog, frame, hei
                        f"1\t{frame}\t16\t0\t0\t0\t0\t47.39\t8.54\t{height}")  # fmt: skip
     route = read(text, "a.waypoints")
     home = (47.39, 8.54)
-    assert route.waypoints == ((home, A, B, C) if frame else (home, A, B, C, home))
+    # The return ends at item 0 in any frame.
+    assert route.waypoints == ((home, home, A, B, C, home) if frame else (home, A, B, C, home))
     assert route.heights[0] == (Height(60, "home") if frame else None)
     assert (said in caplog.text) if said else not caplog.text
 

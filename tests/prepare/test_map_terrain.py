@@ -155,7 +155,7 @@ def test_heights_over_an_unknown_datum(run, map_path, flown, dem, tmp_path):
     assert "vertical datum" in run(*flat).err
     assert run(*flat, "--dem-datum", "msl").code == 0
     flying = run("fly", tmp_path / "a.onav", few, "--recorded-telemetry", "--height", "amsl")
-    assert flying.code == 1 and "--height amsl" in flying.err and "--dem-datum" in flying.err
+    assert flying.code == 2 and "--height amsl" in flying.err and "--dem-datum" in flying.err
 
 
 def test_terrain_elsewhere_is_refused(tmp_path):

@@ -159,7 +159,7 @@ REFUSED = {
     "broken OpenCV": (written("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: x"), "."),
     "rows of nothing": (
         lambda p: p.write_text(opencv(p).read_text().replace("rows: 5", "rows: 0")) and p,
-        "rows, columns and data of distortion_coefficients disagree",
+        "rows, columns and data of a matrix disagree",
     ),
     "negative": (lambda p: kalibr(p, intrinsics=[-1, 1, 1, 1]), "focal length"),
 }

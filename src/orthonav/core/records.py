@@ -2,9 +2,9 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
-from typing import Any, ClassVar, Literal, NoReturn
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ DEFAULT_AGL_STD = 0.08  # over the height
 DEFAULT_TILT_STD_DEG = UNSTATED.aided_deg
 RADIUS_SHARE = 0.025  # least radius of the confidence over the height: an error of 1.4 deg of tilt
 MAP_STD_M = 3.0  # per axis, of a displacement of the map as a whole: it never averages out
+MAX_STD = 1e6  # of what an autopilot reports
 MAX_TIME_S = 1e11  # the year 5138; since 1970 there were more milliseconds
 
 Evidence = Mapping[str, float]
@@ -47,21 +48,30 @@ def number(
     any value, NaN too) to `most`."""
     try:
         found = None if isinstance(value, str | bytes) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = None
     if found is None or not (math.isnan(least) or least <= found <= most):
         raise ArgumentError(f"{name} must be {how}, got {value!r:.40}")
     return found
 
 
-class ReadOnly(dict[str, float]):
+class ReadOnly(Mapping[str, float]):
     """Unlike a mapping proxy it can be pickled and copied."""
 
-    def __setitem__(self, *_: Any) -> NoReturn:
-        raise TypeError("values of a record are read-only")
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self._values = dict(values)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return ReadOnly, (dict(self),)
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return repr(self._values)
 
 
 class ByValue:
@@ -237,7 +247,12 @@ class View(ByValue):
         camera have different proportions."""
         stds = heading_std_deg, agl_std_m, tilt_std_deg
         for name, std in zip(("heading_std_deg", "agl_std_m", "tilt_std_deg"), stds, strict=True):
-            number(name, std or 0, "0 or more; None: unknown", 0)
+            if std is not None:
+                number(name, std, "0 or more; None: unknown", 0, MAX_STD)
+        if vel_en_mps is not None:
+            east, north = vel_en_mps if np.shape(vel_en_mps) == (2,) else ("", "")
+            pair = "a pair, east and north, m/s"
+            vel_en_mps = number("vel_en_mps", east, pair), number("vel_en_mps", north, pair)
         if prior is not None:
             has_type("prior", prior, Prior, "(lat_deg, lon_deg, std_m)")
         number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S)

@@ -22,7 +22,7 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError, MissingExtraError
+from orthonav.core.errors import ArgumentError, FlightError, MissingExtraError
 from orthonav.core.files import StrPath, require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.limits import DEFAULT_RISK
@@ -282,7 +282,12 @@ def feature(
 
 
 def _all(fixes: StrPath | Iterable[Any]) -> Iterable[Any]:
-    return read_results(fixes) if isinstance(fixes, str | os.PathLike) else fixes
+    found = read_results(fixes) if isinstance(fixes, str | os.PathLike) else fixes
+    for each in (found := list(found) if isinstance(found, Iterable) else [found]):
+        if not isinstance(each, Fix | NoFix | ViewResult):
+            kind = "a path, or Fix, NoFix or ViewResult records"
+            raise ArgumentError(f"fixes must be {kind}, got {type(each).__name__}")
+    return found
 
 
 def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:

@@ -51,9 +51,9 @@ class Camera:
     k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
     OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
     for a calibrated camera. `mask` (H, W), see `masked`, is no part of comparisons. `unusual`: a
-    principal point more than a tenth of a side from the middle (a crop, a shifted lens) or pixels
-    that are not square are meant; without it files and views with them are refused. Raises
-    `CameraError` on values no camera has."""
+    principal point more than a tenth of a side from the middle (a crop, a shifted lens), pixels
+    that are not square, or a focal length below 0.3 or above 20 widths are meant; without it files
+    and views with them are refused. Raises `CameraError` on values no camera has."""
 
     width_px: int
     height_px: int
@@ -68,8 +68,11 @@ class Camera:
     unusual: bool = False
 
     def __post_init__(self) -> None:
-        if self.distortion and not any(self.distortion):
-            object.__setattr__(self, "distortion", ())  # none at all, and faster
+        try:
+            lens = tuple(map(float, () if self.distortion is None else self.distortion))
+        except (TypeError, ValueError) as error:
+            raise CameraError(f"camera distortion must be numbers: {self}") from error
+        object.__setattr__(self, "distortion", lens if any(lens) else ())  # none is faster
         if wrong := self._impossible():
             raise CameraError(f"camera {wrong}: {self}")
         for name in ("width_px", "height_px"):
@@ -106,12 +109,15 @@ class Camera:
         fx, fy, wide, high = self.fx_px, self.fy_px, self.width_px, self.height_px
         off = max(abs(self.cx_px / wide - 0.5), abs(self.cy_px / high - 0.5))
         apart = abs(fx / fy - 1)
+        if self.unusual:
+            return ""
         if max(fx / wide, fy / high) < MIN_FOCAL or min(fx / wide, fy / high) > MAX_FOCAL:
-            return f"focal length {fx:g} px is {fx / wide:.2g} widths, expected 0.3 to 20"
-        if off > MAX_OFF_MIDDLE and not self.unusual:
+            far = f"focal length {fx:g} px is {fx / wide:.2g} widths, expected {MIN_FOCAL:g} to "
+            return far + f'{MAX_FOCAL:g} ("unusual": true states another one)'
+        if off > MAX_OFF_MIDDLE:
             middle = f"principal point {self.cx_px:g}, {self.cy_px:g} px is {off:.0%} of a side "
             return middle + 'from the middle ("unusual": true states a crop or a shifted lens)'
-        if apart > MAX_OBLONG + 2 / min(wide, high) and not self.unusual:  # sides are rounded
+        if apart > MAX_OBLONG + 2 / min(wide, high):  # sides are rounded
             differ = f"focal lengths {fx:g} and {fy:g} px differ by {apart:.0%} "
             return differ + '("unusual": true states pixels that are not square)'
         return ""
@@ -125,7 +131,7 @@ class Camera:
         It is that across the width of the picture; with `diagonal` that from corner to corner, as
         makers of cameras often state it. Stated fields of view are often those of the lens or of
         another mode: good to 5 %. Raises `CameraError`."""
-        if not MIN_FOV_DEG <= fov_deg < 180:
+        if isinstance(fov_deg, str) or fov_deg is None or not MIN_FOV_DEG <= fov_deg < 180:
             turned = f"; {math.degrees(fov_deg):.1f} if these are radians" if fov_deg > 0 else ""
             raise CameraError(
                 f"field of view must be {MIN_FOV_DEG} to 180 deg, got {fov_deg:g}{turned}"

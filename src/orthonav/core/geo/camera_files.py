@@ -222,7 +222,12 @@ def _first(plain: Mapping[str, Any], *names: str) -> Any:
 
 def _data(matrix: Any) -> Any:
     """Of a matrix with rows, cols and data, or of plain lists."""
-    return np.ravel(matrix["data"] if isinstance(matrix, Mapping) else matrix)
+    if not isinstance(matrix, Mapping):
+        return np.ravel(matrix)
+    data = np.ravel(matrix["data"])
+    if int(matrix.get("rows", 1)) * int(matrix.get("cols", len(data))) != len(data):
+        raise CameraError("rows, columns and data of a matrix disagree")
+    return data
 
 
 def _numbers(values: Any, count: int) -> Any:

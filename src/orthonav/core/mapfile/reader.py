@@ -155,7 +155,7 @@ class MapFile:
 
     @property
     def dates(self) -> tuple[str, ...]:
-        """First and last date of its imagery as ISO 8601, as far as they are known."""
+        """Dates of its imagery as ISO 8601, as far as they are known, in order."""
         sources = self.manifest.imagery
         found = {str(x[end]) for x in sources for end in ("date_from", "date") if x.get(end)}
         return tuple(sorted(found))

@@ -4,6 +4,7 @@ Every view is registered around the predicted position, or anywhere while that i
 plausible places go to the mixture with their odds. Overlapping views are registered on each other.
 """
 
+import logging
 import math
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import ArgumentError, MapFileError
+from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.integrity import probability_within
@@ -68,6 +69,7 @@ UNKNOWN_STEP_S = 1.0  # where the clock stands still or jumps back
 KNOWN_MPS = 5.0  # least certainty of an estimated velocity that predicts the next displacement
 KNOWN_PLACE_M = 50.0  # least certainty of a position whose ground is known
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 
 class SearchArea(NamedTuple):
@@ -179,10 +181,11 @@ class Tracker:
     ) -> Fix | NoFix:
         """The position of the aircraft by this image and all before it; arguments as of `View.of`.
 
-        `time_s`: seconds, greater than that of the image before, by at most 600. `heading_deg` may
-        be None in a tracker made with `heading_known=False`. Standard deviations are those from
-        view to view, without constant errors, which are estimated; None: `heading_std_deg` 2 deg,
-        `agl_std_m` 2 % of the height, `tilt_std_deg` 2 deg. Raises as `View.of`."""
+        `time_s`: seconds, greater than that of the image before by at most 600: other steps count
+        as 1 s or 600 s, with a warning. `heading_deg` may be None in a tracker made with
+        `heading_known=False`. Standard deviations are those from view to view, without constant
+        errors, which are estimated; None: `heading_std_deg` 2 deg, `agl_std_m` 2 % of the height,
+        `tilt_std_deg` 2 deg. Raises as `View.of`."""
         view = View.of(
             image,
             camera,
@@ -200,9 +203,10 @@ class Tracker:
         if self._time_ns is not None:
             step_s = (view.telemetry.time_ns - self._time_ns) / 1e9
             if not 0 < step_s <= LONGEST_GAP_S:
-                raise ArgumentError(
-                    f"time_s must grow, by at most {LONGEST_GAP_S:g} s, got {step_s:+g} s; it is "
-                    "in seconds, not ms or ns; after a pause use another Tracker"
+                log.warning(
+                    "time_s changed by %+g s since the image before: it is in seconds, not ms or "
+                    "ns, and grows; the position is known to little more than the map now",
+                    step_s,
                 )
         return self.locate(view)
 

@@ -244,8 +244,9 @@ def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
                 f"Stanford diagram; errors beyond the protection level: {beyond}",
                 f"Stanford diagram: error and protection level of {metrics.integrity.n_levels} of "
                 f"{metrics.n_fixes} fixes at a risk of {metrics.integrity.risk:g}; the level of "
-                "the others is infinite. Below the diagonal the error is beyond the level; "
-                "dotted: the alert limit.",
+                "the others is infinite. Below the diagonal the error is beyond the level"
+                + "; dotted: the alert limit" * math.isfinite(metrics.integrity.alert_limit_m)
+                + ".",
                 stanford_picture(comparison, metrics.integrity.alert_limit_m),
             )
         )

@@ -30,7 +30,12 @@ try:
     from rasterio._err import CPLE_BaseError
     from rasterio.crs import CRS
     from rasterio.enums import ColorInterp, MaskFlags
-    from rasterio.errors import NodataShadowWarning, NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import (
+        CRSError,
+        NodataShadowWarning,
+        NotGeoreferencedWarning,
+        RasterioError,
+    )
     from rasterio.transform import Affine
     from rasterio.warp import transform as transform_coordinates
     from rasterio.windows import Window
@@ -44,8 +49,8 @@ GDAL_ERRORS = RasterioError, CPLE_BaseError, UnicodeDecodeError
 ALPHA_SAMPLE_PX, OVERVIEW_PX = 64, 512
 MAX_PARTLY_CLEAR = 0.05
 """Largest fraction of partly transparent pixels of a mask: its resampled edges."""
-MIN_VALUES = 16
-"""In a grey picture; masks, classes and quality layers hold fewer."""
+MIN_VALUES, MAX_FLAT = 16, 3
+"""In a grey picture; masks, classes and quality layers hold fewer. One colour, by compression."""
 HEIGHT_TYPES = ("float32", "float64", "int16", "int32")
 OPENED_AT_ONCE, MAX_NAMED = 8, 5
 TERMS = {
@@ -65,7 +70,8 @@ _SMALL_PICTURE = re.compile(
     re.IGNORECASE,
 )
 _LAYER = re.compile(
-    r"(?:^|[-_. ])(hill-?shade|shaded[-_ ]?relief|aot|wvp|scl|fmask|udm2?|qa[-_\w]*)(?:[-_. ]|$)",
+    r"(?:^|[-_. ])(hill-?shade|shaded[-_ ]?relief|aot|wvp|scl|fmask|udm2?|bqa|qa60|"
+    r"qa(?:[-_](?:pixel|radsat|aerosol))?)(?:[-_. ]|$)",
     re.IGNORECASE,
 )
 log = logging.getLogger(__name__)
@@ -120,7 +126,11 @@ class Source:
 
 
 class UnfitError(ImageryError):
-    """A raster that is not an orthophoto: heights, a mask, a photograph, or not georeferenced."""
+    """A raster that is not an orthophoto: heights, a photograph, or not georeferenced."""
+
+
+class LayerError(UnfitError):
+    """A mask or another layer, or a tile of one colour: left out of files given one by one too."""
 
 
 def sources_in(folder: Path, bands: tuple[int, ...] | None = None) -> list[Source]:
@@ -140,7 +150,7 @@ def sources_in(folder: Path, bands: tuple[int, ...] | None = None) -> list[Sourc
         skipped_vrts = by_kind.pop(".vrt", [])  # of the files that are there
         by_kind |= {"virtual rasters (.vrt)": skipped_vrts} if skipped_vrts else {}
     files = sorted(path for kind in RASTERS for path in by_kind.pop(kind, ()))
-    sources = _first_of_each_place(open_sources(files, folder, bands), folder)
+    sources = _first_of_each_place(open_sources(files, folder, bands), folder, bands is not None)
     seen = ", ".join(f"{len(others)} {kind}" for kind, others in by_kind.items()) or "nothing"
     if not sources:
         raise ImageryError(
@@ -167,12 +177,12 @@ def _by_place(sources: Sequence[Source]) -> list[list[Source]]:
     return list(places.values())
 
 
-def _first_of_each_place(sources: Sequence[Source], folder: Path) -> list[Source]:
+def _first_of_each_place(sources: Sequence[Source], folder: Path, asked: bool) -> list[Source]:
     """In the order of preference, of one place and date only the first, which is in colours."""
     said, places = [], _by_place(sorted(sources, key=_preference))
     for first, *others in places:  # neighbouring packages share tiles of one name
         names = [each.path.name for each in others if each.path.name != first.path.name]
-        if names and len(first.bands) == 1:
+        if names and len(first.bands) == 1 and not asked:
             raise ImageryError(
                 f"{', '.join([first.path.name, *names])} are grey and of one place and date: give "
                 "the one that shows the ground, or join the bands of a scene (gdalbuildvrt "
@@ -204,7 +214,8 @@ def open_sources(
     for each in unfit:
         log.info("skipped: %s", each)
     if unfit and not sources:
-        raise ImageryError(f"{len(unfit)} rasters are no orthophotos; {unfit[0]}")
+        several = f"{len(unfit)} rasters are no orthophotos; " if len(unfit) > 1 else ""
+        raise ImageryError(f"{several}{unfit[0]}")
     if unfit:
         names = ", ".join(str(each).rpartition(": ")[2] for each in unfit[:MAX_NAMED])
         log.warning("skipped %d rasters that are not orthophotos (-v: why): %s", len(unfit), names)
@@ -225,7 +236,7 @@ def _opened(
         with rasterio.open(path) as dataset:
             return _inspect(path, dataset, folder, bands)
     except UnfitError as error:
-        if folder is None:
+        if folder is None and not isinstance(error, LayerError):
             raise
         return error
     except GDAL_ERRORS as error:
@@ -285,8 +296,14 @@ def _inspect(
 def system_beside(path: Path) -> Any:
     """Of a .prj beside a raster, else None."""
     beside = path.with_suffix(".prj")
-    text = beside.read_text(errors="replace") if beside.is_file() else None
-    return text and CRS.from_wkt(text, morph_from_esri_dialect=True)
+    beside = beside if beside.is_file() else path.with_suffix(".PRJ")
+    text = beside.read_text(errors="replace") if beside.is_file() else ""
+    try:
+        return CRS.from_wkt(text, morph_from_esri_dialect=True) if text else None
+    except CRSError as error:
+        raise UnfitError(
+            f"coordinate system is not WKT as GDAL and ESRI write it: {beside}"
+        ) from error
 
 
 def _require_picture(path: Path, dataset: Any) -> None:
@@ -309,9 +326,17 @@ def _require_picture(path: Path, dataset: Any) -> None:
         shape = min(dataset.height, OVERVIEW_PX), min(dataset.width, OVERVIEW_PX)
         values = np.unique(dataset.read(1, out_shape=shape, masked=True).compressed())
     named = _LAYER.search(path.stem)
-    if named or 0 < len(values) < MIN_VALUES:
+    if named or _are_codes(values):
         why = f"by its name ({named[1]})" if named else f"of {len(values)} values where sampled"
-        raise UnfitError(f"raster is a mask or another layer, not a picture, {why}: {path}")
+        raise LayerError(f"raster is a mask or another layer, not a picture, {why}: {path}")
+
+
+def _are_codes(values: NDArray[Any]) -> bool:
+    """Whether grey levels are those of a mask, of classes or of one colour; haze and snow have few
+    too, next to each other."""
+    few = 0 < len(values) < MIN_VALUES
+    alone = few and (len(values) <= MAX_FLAT or float(values[-1]) < MIN_VALUES)
+    return alone or (few and float(values[-1]) - float(values[0]) > 4 * len(values))
 
 
 def _counts_from_north(path: Path, tags: Mapping[str, str]) -> bool:

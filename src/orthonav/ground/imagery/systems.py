@@ -75,7 +75,8 @@ def _accuracy(wkt: str, lat_deg: float, lon_deg: float) -> tuple[float | None, s
     stated = system.coordinate_operation
     zeros = stated is not None and not any(stated.towgs84 or [1])
     if "Ballpark" in used.description or zeros:
-        if system.ellipsoid and system.ellipsoid.semi_major_metre == WGS84_A_M:  # GRS 80 too
+        shape = system.ellipsoid  # of GRS 80 too; a sphere has no flattening
+        if shape and shape.semi_major_metre == WGS84_A_M and shape.inverse_flattening:
             return None, f"{named} is taken as WGS 84, from which it may differ by 1 to 2 m"
         zone = (32601 if lat_deg >= 0 else 32701) + int((lon_deg + 180) % 360 // 6)
         return math.inf, (

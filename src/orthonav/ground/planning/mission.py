@@ -269,7 +269,7 @@ def read_wpl(data: bytes) -> list[Route]:
     if first.frame != 0 and first.command == WAYPOINT and _has_place(first):
         said = "item 0 is flown to, as it is in frame %d: a home position is in 0"
         log.warning(said, first.frame)
-        return [route_of(items, None)]
+        return [route_of(items, replace(first, height_m=None))]  # not above the sea
     if any((each.frame, each.height_m) == (0, first.height_m) for each in rest):
         log.warning("item 0 is taken as the home position, which is not flown to")
     return [route_of(rest, first if _has_place(first) else None)]

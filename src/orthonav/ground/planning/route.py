@@ -56,8 +56,9 @@ _BROKEN = (
 
 def _routes_of(plain: dict[str, Any]) -> list[Route]:
     if crs := plain.get("crs"):  # of GeoJSON before RFC 7946
-        name = str(crs["properties"].get("name"))
-        if not re.search(r"(CRS84h?|:4326|:4979)$", name):
+        properties = crs.get("properties", {}) if isinstance(crs, dict) else {}
+        name = str(properties.get("name") or properties.get("href") or crs)
+        if not re.search(r"(CRS84h?|WGS ?84|[:/](4326|4979|4258|4269|4283|7844))$", name):
             raise RouteError(
                 f"GeoJSON is in {name:.60}: convert it to WGS 84 (ogr2ogr -t_srs EPSG:4326)"
             )
