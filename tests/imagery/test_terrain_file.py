@@ -199,6 +199,13 @@ def test_files_that_are_no_terrain_are_refused(make_dem, change, words):
         open_dem(make_dem(change=change), "msl")
 
 
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+@pytest.mark.parametrize("place", [(1e-300, 0, -3000, 0, -1e-300, 3000), (1, 0, 0, 0, 1, 0)])
+def test_a_file_without_a_place_is_refused(make_dem, place):
+    with pytest.raises(ImageryError, match="no georeference"):
+        open_dem(make_dem(transform=Affine(*place)), "msl")
+
+
 def test_files_that_cannot_be_read(tmp_path, make_dem):
     with pytest.raises(MissingFileError, match="terrain file does not exist"):
         open_dem(tmp_path / "none.tif")

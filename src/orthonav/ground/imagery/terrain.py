@@ -315,6 +315,8 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
     crs = data.crs or system_beside(path)
     if crs is None:
         raise ImageryError(f"terrain file has no coordinate reference system: {path}")
+    if data.transform.is_identity or not abs(data.transform.determinant) > 0:  # NaN too
+        raise ImageryError(f"terrain file has no georeference (geotransform): {path}")
     if data.count != 1 or data.dtypes[0] in ("uint8", "int8"):
         raise ImageryError(
             f"terrain file has {data.count} bands of {data.dtypes[0]}, which is a picture: one "
