@@ -143,6 +143,18 @@ def test_times_in_many_forms(images, column, text, seconds):
     assert found.by["a.png"].telemetry.time_ns == round(seconds * 1e9)
 
 
+def test_the_roll_of_the_aircraft_is_not_that_of_a_gimbal(images):
+    table = "file,yaw,pitch,roll,gimbal_pitch,agl\na.png,30,3,20,-90,100\n"
+    found = views_of(images, table)
+    assert angles(found.by["a.png"]) == (30, 0, 0, 100)
+
+
+@pytest.mark.parametrize("yaw, heading", [(0, math.nan), (7, 7)])
+def test_a_heading_that_is_0_beside_an_unrecorded_gimbal_is_unknown(images, yaw, heading):
+    found = views_of(images, f"file,yaw,gimbal_pitch,agl\na.png,{yaw},0,100\n")
+    assert angles(found.by["a.png"])[0] == pytest.approx(heading, nan_ok=True)
+
+
 @pytest.mark.parametrize(
     "column, pitch, expected, said",
     [("pitch", -80, 10, True), ("pitch", 5, 5, False), ("gimbal_pitch", -40, 50, False)],

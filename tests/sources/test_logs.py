@@ -174,7 +174,7 @@ def test_a_gimbal_in_a_tlog_is_not_the_aircraft(tmp_path, heartbeats):
     with pytest.raises(FlightError, match=r"no GPS for position; available: GPS_RAW_INT: "):
         read_log(path, DOWN, {"position": "GPS"})
     only = appended(tmp_path / "b.tlog", GIMBAL, ("attitude", 0, 0.0, -1.5, 1.0, 0, 0, 0))
-    with pytest.raises(FlightError, match=r"no attitude; .* not ATTITUDE\[1:154\]"):
+    with pytest.raises(FlightError, match=r"no attitude; .* none fits of ATTITUDE\[1:154\]"):
         read_log(only, DOWN)
 
 
@@ -212,7 +212,26 @@ def test_distances_in_a_tlog(tmp_path):
     track = read_log(path, DOWN)
     assert track.telemetry((START_S + 3) * 10**9).agl_m == 90
     assert track.telemetry((START_S + 9) * 10**9).agl_m == 114  # above home
-    assert "height: using DISTANCE_SENSOR[3], not DISTANCE_SENSOR[1] (0 valid" in track.choices[0]
+    assert "height: using DISTANCE_SENSOR[3], not DISTANCE_SENSOR[1] (no valid" in track.choices[0]
+
+
+def test_a_second_rangefinder_is_used_where_the_first_has_no_height(tmp_path):
+    path = dataflash(tmp_path / "a.bin")  # the first is valid for 5 s
+    later = (record("RFND", us, 1, 6_000, 4, 25) for us in range(9_000_000, 13_000_000, 200_000))
+    path.write_bytes(path.read_bytes() + b"".join(later))
+    track = read_log(path, DOWN)
+    heights = [track.telemetry((START_S + s) * 10**9).agl_m for s in (3, 8)]
+    assert heights == [95.5, 60] and "RFND[0], in its gaps RFND[1]" in track.choices[0]
+
+
+def test_a_receiver_with_fewer_positions_a_second_is_as_good(tmp_path):
+    path = dataflash(tmp_path / "a.bin", gps=False)
+    slow, fast = (
+        b"".join(record("GPS", *gps(us, 3, *fix)) for us in range(3_000_000, 13_000_000, step_us))
+        for fix, step_us in (((465_000_000, 0), 500_000), ((475_000_000, 1), 100_000))
+    )
+    path.write_bytes(path.read_bytes() + fast + slow)
+    assert read_log(path, DOWN).latlon_deg((START_S + 5) * 10**9) == (46.5, 2.5)
 
 
 def gps(us, fix_type, lat_e7, instance=0):
@@ -231,8 +250,9 @@ def test_the_receiver_with_a_fix_in_a_dataflash_log(tmp_path):
     track = read_log(path, DOWN)
     at = int(track.attitude.time_ns[10])
     assert track.latlon_deg(at) == (46.5, 2.5) and track.telemetry(at).vel_en_mps is not None
-    assert "position: using GPS[1], not GPS[0] (0 valid messages): first" in track.choices[0]
-    assert read_log(path, DOWN, {"position": "GPS[0]"}).position is None
+    assert "position: using GPS[1], not GPS[0] (no valid message): first" in track.choices[0]
+    with pytest.raises(FlightError, match=r"GPS\[0\] has no valid message for position: "):
+        read_log(path, DOWN, {"position": "GPS[0]"})
     with pytest.raises(FlightError, match=r"no GPS\[2\] .*available: GPS\[0\], GPS\[1\]: "):
         read_log(path, DOWN, {"position": "GPS[2]"})
     with pytest.raises(FlightError, match="logs have no sources of velocity: "):
@@ -245,7 +265,7 @@ def test_rangefinders_of_ardupilot_3_6(tmp_path, monkeypatch):
     monkeypatch.setattr(recorders, "rangefinder", lambda us, t: (us, 300, 0, 9_550, 25))
     track = read_log(dataflash(tmp_path / "a.bin"), DOWN)
     assert track.telemetry((START_S + 3) * 10**9).agl_m == 95.5
-    assert "height: using RFND[1], not RFND[0] (0 valid messages)" in track.choices[0]
+    assert "height: using RFND[1], not RFND[0] (no valid message)" in track.choices[0]
 
 
 @pytest.mark.parametrize("write", [dataflash, tlog])
@@ -274,13 +294,13 @@ def test_instances_of_a_ulog(tmp_path):
     assert track.latlon_deg(at) == (46.5, 2.5) and track.telemetry(at).agl_m == 80
     assert turned(angles_at(track.attitude, at)[0], 350 + 12) == pytest.approx(0, abs=0.02)
     for role, used in (
-        ("attitude", "vehicle_attitude[1], not vehicle_attitude[0] (0 valid messages)"),
-        ("position", "sensor_gps[1], not sensor_gps[0] (0 valid messages)"),
-        ("height", "distance_sensor[2], not distance_sensor[0] (0 valid messages), distance_"),
+        ("attitude", "vehicle_attitude[1], not vehicle_attitude[0] (no valid message)"),
+        ("position", "sensor_gps[1], not sensor_gps[0] (no valid message)"),
+        ("height", "distance_sensor[2], not distance_sensor[0] (no valid message), distance_"),
     ):
         assert any(line.startswith(f"{role}: using {used}") for line in track.choices)
-    named = read_log(path, DOWN, {"height": "distance_sensor[1]"})
-    assert named.telemetry(at).agl_m != 80
+    with pytest.raises(FlightError, match=r"distance_sensor\[1\] has no valid message"):
+        read_log(path, DOWN, {"height": "distance_sensor[1]"})
 
 
 def test_positions_of_px4_without_a_receiver_are_called_an_estimate(tmp_path):

@@ -193,8 +193,10 @@ def test_parrot_and_skydio(tmp_path, nested):
         camera = 'CameraOrientationNED rdf:parseType="Resource"'
         camera = f"<drone-skydio:{camera}>{inner}</drone-skydio:CameraOrientationNED>"
     body = camera.replace("Camera", "Vehicle").replace("30.5", "99").replace("-80.0", "1")
-    xmp = packet(SKYDIO).replace("</rdf:Description>", f"{camera}{body}</rdf:Description>")
-    assert attitude(read_photo(photo(tmp_path / "b.jpg", xmp=xmp))) == pytest.approx((30.5, 10, 0))
+    xmp = packet(SKYDIO, RelativeAltitude="55.5")
+    xmp = xmp.replace("</rdf:Description>", f"{camera}{body}</rdf:Description>")
+    read = read_photo(photo(tmp_path / "b.jpg", xmp=xmp))
+    assert attitude(read) == pytest.approx((30.5, 10, 0)) and read.home_m == 55.5
 
 
 @pytest.mark.parametrize(
@@ -568,6 +570,24 @@ def test_focal_lengths_that_differ_by_rounding_are_one(tmp_path):
         time = f"2023:11:14 22:13:2{number}"
         photo(tmp_path / f"p/{number}.jpg", time, {0x920A: focal_mm}, xmp=dji())
     assert len(views_of(tmp_path / "p", sensor_width_mm=13.2)) == 3
+
+
+def test_a_stated_zone_holds_where_the_time_of_the_gps_stands_still(tmp_path):
+    """A receiver without a fix repeats its last time."""
+    for minute in range(4):
+        gps = place(46.5, 2.5) | {29: "2023:11:14", 7: (22, 13, 20.0)}
+        photo(tmp_path / f"p/{minute}.jpg", f"2023:11:14 22:1{minute}:20", gps=gps, xmp=dji())
+    recording = open_source(tmp_path / "p")
+    assert not any("clock of the camera" in said for said in recording.warnings)
+    first = next(recording.views).telemetry.time_ns
+    assert first == (START_S - 180) * 10**9
+
+
+def test_focal_lengths_of_one_lens_count_together(tmp_path):
+    for number, focal_mm in enumerate((24.0, 24.0, 24.1, 24.1, 24.2, 24.2, 48.0, 48.0, 48.0)):
+        time = f"2023:11:14 22:13:2{number}"
+        photo(tmp_path / f"p/{number}.jpg", time, {0xA405: None, 0x920A: focal_mm}, xmp=dji())
+    assert len(views_of(tmp_path / "p", sensor_width_mm=36.0)) == 6
 
 
 def test_photographs_without_a_time_go_in_the_order_of_their_names(tmp_path):

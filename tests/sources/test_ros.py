@@ -229,7 +229,10 @@ def test_frames_that_are_not_of_the_body(tmp_path, messages, topics):
         odometry.child_frame_id = "camera_pose_frame"
     recording = open_source(record(tmp_path / "flight", topics, messages))
     assert "no topic has the attitude of the aircraft" in recording.warnings
-    assert "using none, not /imu/data (named 'ned'), /odom (named 'camera')" in recording.choices[0]
+    assert (
+        "none fits of /imu/data ('ned' in its name), /odom ('camera' in its name)"
+        in recording.choices[0]
+    )
     assert next(recording.views).telemetry.vel_en_mps is None
 
 
@@ -240,7 +243,7 @@ def test_the_receiver_that_has_a_fix(tmp_path, messages, topics):
     topics["/b/fix"] = fixes
     topics["/orthonav/fix"] = [(t, messages.fix(t, 2.0, 2.0)) for t, _ in fixes]
     recording = open_source(record(tmp_path / "flight", topics, messages))
-    assert "position: using /b/fix, not /a/fix (0 valid messages): first" in recording.choices[1]
+    assert "position: using /b/fix, not /a/fix (no valid message): first" in recording.choices[1]
     assert next(recording.views).truth_latlon_deg == pytest.approx((46.5005, 2.5))
 
 
@@ -254,8 +257,18 @@ def test_ranges_that_are_no_heights(tmp_path, messages, topics):
     recording = open_source(record(tmp_path / "flight", topics, messages))
     assert [view.telemetry.agl_m for view in recording.views] == [85, 95, 105, 115]
     assert recording.choices[1].startswith(
-        "height: using /down, not /a (named 'left'), /a_front (named 'front'), /b (no valid message"
+        "height: using /down, not /a ('left' in its name), /a_front ('front' in its name), /b (no "
     )
+
+
+def test_heights_above_take_off_beyond_the_reach_of_a_range_finder(tmp_path, messages, topics):
+    down = topics["/range"]
+    topics["/rel_alt"] = [(t, messages.number(200.0)) for t, _ in down]
+    topics["/range"] = [
+        (t, messages.range(t, 50.0 if n < 20 else 120.0)) for n, (t, _) in enumerate(down)
+    ]
+    recording = open_source(record(tmp_path / "flight", topics, messages))
+    assert [view.telemetry.agl_m for view in recording.views] == [50, 50, 200, 200]
 
 
 def test_odometry_of_mavros_in_the_global_frame_has_no_velocity_of_the_body(

@@ -14,6 +14,7 @@ from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.onboard.messages.estimate import Clock, EstimateError
 from orthonav.onboard.messages.mavlink import (
+    DOWNWARD,
     KINDS,
     NO_AUTOPILOT,
     Autopilot,
@@ -94,6 +95,7 @@ class AutopilotLink:
         self.armed: bool | None = None
         self.system_status = 1  # MAV_STATE_BOOT
         self.counts: Counter[str] = Counter()
+        self._has_limits = False  # a DISTANCE_SENSOR looks down: RANGEFINDER is the same without
         self._heard_ns: int | None = None
         self._attitude_ns: int | None = None
         self._asked: list[int] = []
@@ -326,14 +328,14 @@ class AutopilotLink:
             self.buffer.add_height("altitude", time_ns, message.altitude_amsl)
 
     def _distance(self, message: Message, now_ns: int) -> None:
+        self._has_limits |= bool(message.orientation == DOWNWARD)
         if is_height(message):
             time_ns = self._timed(message.time_boot_ms, now_ns)
             self.buffer.add_distance(time_ns, message.current_distance * 1e-2)
 
     def _rangefinder(self, message: Message, now_ns: int) -> None:
         arrived_ns = self.sync.boot_ns(now_ns)
-        limited = self.counts["DISTANCE_SENSOR"] > 0  # the same, with its limits
-        if arrived_ns is not None and message.distance > 0 and not limited:
+        if arrived_ns is not None and message.distance > 0 and not self._has_limits:
             self.buffer.add_distance(arrived_ns, message.distance)
 
     def _system_time(self, message: Message, now_ns: int) -> None:

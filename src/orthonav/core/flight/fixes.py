@@ -290,6 +290,9 @@ def _all(fixes: StrPath | Iterable[Any]) -> Iterable[Any]:
     return found
 
 
+_NUMBERS = "lat_deg", "lon_deg", "confidence", "radius_m", "heading_deg", "agl_m"
+
+
 def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
     if isinstance(outcome, NoFix):
         no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
@@ -297,7 +300,7 @@ def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
     return {
         "status": "fix",
         "confident": outcome.is_confident,
-        **{key: _or_none(getattr(outcome, key)) for key in (*KEYS[4:6], *KEYS[7:11])},
+        **{key: _or_none(getattr(outcome, key)) for key in _NUMBERS},
         "cov_en_m2": _rows(outcome.cov_en_m2),
         **_NULL_IN_FIX,
         **_ground_values(outcome),

@@ -48,7 +48,8 @@ def odd_word(message: Any, topic: str = "") -> str:
     """The word in the name of a frame, or of the topic of a `Range`, by which it does not look down
     or another message is not of the body; "" without one."""
     ranges, header = hasattr(message, "max_range"), getattr(message, "header", None)
-    frames = getattr(header, "frame_id", ""), getattr(message, "child_frame_id", "")
+    named = getattr(header, "frame_id", ""), getattr(message, "child_frame_id", "")
+    frames = (re.split("/|::", frame)[-1] for frame in named)  # without that of its vehicle
     words = re.findall("[a-z]+", " ".join((topic * ranges, *frames)).lower())
     return next((word for word in words if word in (_NOT_DOWN if ranges else _NOT_BODY)), "")
 
@@ -131,7 +132,7 @@ def camera_of_info(message: Any, topic: str = "") -> Camera:
 
     Raises `CameraError` where it is not calibrated, or has an unsupported model.
     """
-    rectified = re.search("(^|[/_])rect", topic) is not None
+    rectified = re.search("(^|[/_])rect(ified)?(?=[/_]|$)", topic) is not None
     name = "P" if rectified else "K"
     matrix = np.ravel(getattr(message, name, getattr(message, name.lower(), [])))
     lens = np.ravel(getattr(message, "D", getattr(message, "d", [])))

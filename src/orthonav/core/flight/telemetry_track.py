@@ -290,7 +290,13 @@ def _at(series: TimeSeries | None, time_ns: int, width: int) -> Array:
 
 def chosen(role: str, used: str, others: Iterable[str], why: str) -> str:
     """Which of several sources is used for a role, and why not the others."""
-    return f"{role}: using {used}, not {', '.join(others)}: {why}"
+    unused = ", ".join(others)
+    if used == NO_SOURCE:
+        return f"{role}: none fits of {unused}; --topic {role}=NAME selects one"
+    return f"{role}: using {used}{f', not {unused}' * bool(unused)}: {why}"
+
+
+NO_SOURCE = "none"
 
 
 class Sources:
@@ -317,7 +323,9 @@ class Sources:
             if not faults[name]:
                 break
         fit = [name for name, value in values.items() if value is not None]
-        used = self.used[role] = min(fit, key=lambda name: faults[name] != "", default="none")
+        used = self.used[role] = min(fit, key=lambda name: faults[name] != "", default=NO_SOURCE)
+        if named is not None and not fit:
+            raise FlightError(f"{named} has no valid message for {role}: {self.path}")
         faults.pop(used, None)
         others = [f"{name} ({fault})" if fault else name for name, fault in faults.items()]
         if others and named is None:
@@ -326,12 +334,34 @@ class Sources:
         return values.get(used)
 
     def best(self, role: str, series: Mapping[str, TimeSeries | None]) -> TimeSeries | None:
-        """As `first`: a series with less than half the samples of another one has a fault."""
-        held = {name: 0 if one is None else len(one.time_ns) for name, one in series.items()}
+        """As `first`: a series of less than half the time of another one has a fault."""
+        held = {name: _seconds(one) for name, one in series.items()}
         most = max(held.values(), default=0)
-        few = {name: f"{n} valid messages" for name, n in held.items() if 2 * n < most}
+        few = {name: f"valid for {s} s of {most} s" for name, s in held.items() if 0 < 2 * s < most}
         self.first(role, series, lambda name: (series[name], few.get(name, "")))
         return series.get(self.used[role])
+
+    def all(
+        self, role: str, series: Mapping[str, TimeSeries | None], faults: Mapping[str, str]
+    ) -> tuple[TimeSeries, ...]:
+        """The named series, else all with a value, that of the longest time first: the others are
+        for its gaps. `faults`: of those that are None."""
+        if role in self.named:
+            return (self.first(role, series, lambda name: (series[name], "")),)
+        held = {name: one for name, one in series.items() if one is not None}
+        fit = sorted(held, key=lambda name: -_seconds(held[name]))
+        others = [f"{n} ({faults.get(n, 'no valid message')})" for n in series if n not in held]
+        self.used[role] = fit[0] if fit else NO_SOURCE
+        if len(fit) > 1 or others:
+            used = ", in its gaps ".join(fit) or NO_SOURCE
+            why = f"--topic {role}=NAME selects one"
+            self.choices += (chosen(role, used, others, why),)
+        return tuple(held[name] for name in fit)
+
+
+def _seconds(series: TimeSeries | None) -> int:
+    """Whole seconds with a sample."""
+    return 0 if series is None else len(np.unique(series.time_ns // 10**9))
 
 
 def measured(height_m: float) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
-from orthonav.core.flight.telemetry_track import LATEST_NS, measured
+from orthonav.core.flight.telemetry_track import measured
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
 from orthonav.ground.recordings.image_table import ImageRow, ns_of
@@ -185,7 +185,7 @@ _OFFSET, _OFFSET_ORIGINAL = 0x9010, 0x9011
 _SUBSEC, _SUBSEC_ORIGINAL = 0x9290, 0x9291
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
 _ZOOM = 0xA404
-_ZONE = re.compile(r"Z|[+-]\d\d:?\d\d")
+_ZONE = re.compile(r"Z|[+-][01]\d:?[0-5]\d")
 _FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
 _BODY_YAW, _CAMERA_ANGLES = 7, (10, 9, 11)  # yaw, pitch, roll
 _VALUE = re.compile(
@@ -195,11 +195,11 @@ _VALUE = re.compile(
 _NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
 """A number with a decimal point or comma, or a fraction."""
 _ANGLE_OR_PLACE = re.compile(
-    r"(?:drone(?:-dji)?|Camera|sensefly):(?:Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|Altitude|Height|Lat"
-    r"|Lon)"
+    r"(?:drone(?:-dji)?|Camera|sensefly|skydio|drone-parrot):(?:Gimbal|Flight(?:Yaw|Pitch|Roll)|"
+    r"(?:Camera)?(?:Yaw|Pitch|Roll)|Heading|Altitude|Height|Lat|Lon)"
 )
 """Values that a view is worse off without."""
-_SKYDIO = re.compile(r"(?s)(drone-skydio:CameraOrientationNED\b)(?:[^<>]*/>|.{0,600}?</\1)")
+_SKYDIO = re.compile(r"(?s)(drone-skydio:CameraOrientationNED\b)(?:[^<>]{0,600}/>|.{0,600}?</\1)")
 _EXPOSED = re.compile(
     r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
     r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)"
@@ -257,6 +257,7 @@ def read_photo(path: Path) -> Photo:
     notes = more.get(_MAKER_NOTE)
     gimbal, heading = read_maker_notes(notes if isinstance(notes, bytes) else b"", make)
     time_ns, zone_known = (xmp.time_ns, True) if xmp.time_ns else _time(tags, more)
+    gps_ns = None if xmp.time_ns else _gps_time_ns(gps)  # that of XMP is of the exposure
     if void := _void(gps):
         gps = {}
     latlon, alt, doubt = _place(gps)
@@ -279,14 +280,17 @@ def read_photo(path: Path) -> Photo:
         height_px=height,
         time_ns=time_ns,
         zone_known=zone_known,
-        gps_ns=_gps_time_ns(gps),
+        gps_ns=None if void else gps_ns,
         latlon_deg=None if void else xmp.latlon_deg() or latlon,
         alt_m=alt,
         gimbal_deg=gimbal,
         rotation=rotation,
         body_yaw_deg=body_yaw,
         home_m=measured(
-            xmp.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
+            xmp.first(
+                *("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height"),
+                *("drone-skydio:RelativeAltitude", "drone-parrot:RelativeAltitude"),
+            )
         ),
         amsl_m=xmp.first("sensefly:AltitudeAMSL"),
         hae_m=xmp.first("drone-dji:AbsoluteAltitude" if rtk else "sensefly:AltitudeWGS84"),
@@ -327,10 +331,9 @@ def _time(tags: dict[int, Any], more: dict[int, Any]) -> tuple[int | None, bool]
     nanoseconds = int(fraction[:9].ljust(9, "0")) if fraction.isdecimal() else 0
     try:
         moment = datetime.strptime(text + zone, "%Y:%m:%d %H:%M:%S" + "%z" * bool(zone))
+        return ns_of(moment) + nanoseconds, bool(zone)
     except ValueError:
         return None, False
-    time_ns = ns_of(moment) + nanoseconds
-    return (time_ns, bool(zone)) if abs(time_ns) < LATEST_NS else (None, False)
 
 
 def _gps_time_ns(gps: dict[int, Any]) -> int | None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.folder import check_latlon, number_of
-from orthonav.core.flight.telemetry_track import measured
+from orthonav.core.flight.telemetry_track import LATEST_NS, measured
 from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.headings import RADIANS, seem_radians
@@ -163,6 +163,9 @@ def _columns(names: Sequence[str]) -> dict[str, tuple[str, float]]:
         name = next((spelt[each] for each in synonyms if each in spelt), None)
         if name is not None:
             found[field] = name, _scale(name)
+    pitch, roll = (found.get(name, ("", 0.0))[0].lower() for name in ("pitch", "roll"))
+    if "gimbal" in pitch and "gimbal" not in roll:  # that of the aircraft
+        found.pop("roll", None)
     return found
 
 
@@ -211,14 +214,15 @@ def _is_gimbal(columns: Columns, rows: Sequence[Mapping[str, float]]) -> bool:
 def _is_unrecorded(gimbal: bool, rows: Sequence[Mapping[str, float]]) -> bool:
     """Whether a gimbal reports 0 in all rows, where it would look at the horizon."""
     angles = [values.get(name, 0.0) for values in rows for name in ("pitch", "roll")]
-    return gimbal and not any(angles)
+    return gimbal and any("pitch" in values for values in rows) and not any(angles)
 
 
 def _head(unrecorded: bool, rows: Sequence[dict[str, float]]) -> None:
     """Give views the heading of the aircraft where that of the gimbal was not recorded either."""
     if unrecorded and not any(values.get("yaw") for values in rows):
+        turns = any(values.get("body_yaw") for values in rows)
         for values in rows:
-            values["yaw"] = values.get("body_yaw", math.nan)
+            values["yaw"] = values.get("body_yaw", math.nan) if turns else math.nan
 
 
 def _row(
@@ -270,9 +274,12 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
 
 
 def ns_of(moment: datetime) -> int:
-    """Nanoseconds since 1970 of a time, UTC without a zone."""
+    """Nanoseconds since 1970 of a time, UTC without a zone. Raises `ValueError` beyond 64 bits."""
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    return round(moment.replace(microsecond=0).timestamp()) * 10**9 + moment.microsecond * 1000
+    time_ns = round(moment.replace(microsecond=0).timestamp()) * 10**9 + moment.microsecond * 1000
+    if abs(time_ns) >= LATEST_NS:
+        raise ValueError(f"a time in the year {moment.year}")
+    return time_ns
 
 
 def _doubts(

@@ -1,13 +1,14 @@
 """Telemetry logs of all kinds, detected by content."""
 
 import contextlib
+import io
 import math
+import mmap
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,6 +79,7 @@ class _Collected:
         self.fixes: dict[str, Samples] = {}
         """By receiver: latitude, longitude, altitude, height above the ellipsoid, velocity."""
         self.distances: dict[str, Samples] = {}
+        self.has_limits = False  # a DISTANCE_SENSOR that looks down, with its limits
 
     def add_attitude(self, time_ns: int, yaw: float, pitch: float, roll: float) -> None:
         if yaw or pitch or roll:  # all are 0 where none is known
@@ -90,15 +92,16 @@ class _Collected:
         )
         if attitude is None:
             raise FlightError(f"{what} has no attitude other than 0: {sources.path}")
-        fixes = {name: each.arrays() for name, each in self.fixes.items()}
+        # The first receiver first, whichever sent first: GPS_RAW_INT before GPS2_RAW.
+        ordered = sorted(self.fixes.items(), key=lambda item: item[0].replace("_", " "))
+        fixes = {name: each.arrays() for name, each in ordered}
         places = {name: position_series(time, fix[:, :3]) for name, (time, fix) in fixes.items()}
         position = sources.best("position", places)
         times, fix = fixes.get(sources.used["position"], Samples(6).arrays())
         distances = {name: each.series() for name, each in self.distances.items()}
-        distance = sources.best("height", distances)
         return RecordedTrack(
             attitude=attitude,
-            heights=() if distance is None else (distance,),
+            heights=sources.all("height", distances, {}),
             home=self.above_home.series(),
             amsl=altitude_series(position),
             hae=series_of(times, fix[:, 3:4]),
@@ -204,26 +207,33 @@ def _from_tlog(collected: _Collected, message: Any, time_ns: int) -> None:
         hae_m = message.alt_ellipsoid * 1e-3 or math.nan  # 0 without this extension
         place = message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3, hae_m
         _add(collected.fixes, kind, message.fix_type >= 3, time_ns, *place, math.nan, math.nan)
-    elif kind == "DISTANCE_SENSOR":
+    elif kind in ("DISTANCE_SENSOR", "RANGEFINDER"):
+        _distance_of_tlog(collected, kind, message, time_ns)
+
+
+def _distance_of_tlog(collected: _Collected, kind: str, message: Any, time_ns: int) -> None:
+    if kind == "DISTANCE_SENSOR":
         name, distance_m = f"{kind}[{message.id}]", message.current_distance * 1e-2
         _add(collected.distances, name, mavlink.is_height(message), time_ns, distance_m)
-        collected.distances.pop("RANGEFINDER", None)  # the same without its limits
-    elif kind == "RANGEFINDER" and collected.distances.keys() <= {kind}:
+        if message.orientation == mavlink.DOWNWARD:  # RANGEFINDER is the same without its limits
+            collected.has_limits = True
+            collected.distances.pop("RANGEFINDER", None)
+    elif not collected.has_limits:
         _add(collected.distances, kind, message.distance > 0, time_ns, message.distance)
 
 
 def read_ulog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     """The track of a ULog; times are UTC where the log has a GPS fix, else since boot."""
     core = needed("pyulog.core", "PX4 logs")
-    with reading("PX4 log", path, silent=True), path.open("rb") as whole, TemporaryFile() as first:
-        data = whole.read()
-        end = data.find(ULOG_MAGIC, 1)  # of a log behind it, on a card that was not erased
-        first.write(data[: max(0, end)])
-        (stream := whole if end < 0 else first).seek(0)
+    with reading("PX4 log", path, silent=True), path.open("rb") as whole:
+        with mmap.mmap(whole.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            end = data.find(ULOG_MAGIC, 1)  # of a log behind it, on a card that was not erased
+            stream: Any = whole if end < 0 else io.BytesIO(data[:end])
         log = core.ULog(stream, _TOPICS)
         topics: dict[str, dict[str, Columns]] = {name: {} for name in _TOPICS}
         for one in log.data_list:
             topics[one.name][f"{one.name}[{one.multi_id}]"] = one.data
+        topics = {name: dict(sorted(each.items())) for name, each in topics.items()}
         gps = topics["vehicle_gps_position"] | topics["sensor_gps"]
         shift_us = next(filter(None, map(_utc_shift_us, gps.values())), 0)
         for one in log.data_list:
@@ -250,11 +260,11 @@ def read_ulog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
         if not gps and (positions := series("vehicle_global_position", _position)):
             warnings += ("positions are an estimate: the log has no receiver",)
         position = sources.best("position", positions)
-        distance = sources.best("height", series("distance_sensor", _distance))
+        distances = sources.all("height", series("distance_sensor", _distance), {})
         single = {name: next(iter(each.values()), {}) for name, each in topics.items()}
         local = single["vehicle_local_position"]
         bottom = _bottom(local, len(topics["distance_sensor"]))
-        heights = (distance,) if "height" in sources.named else (bottom, distance)
+        heights = distances if "height" in sources.named else (bottom, *distances)
         return RecordedTrack(
             attitude=attitude,
             heights=tuple(filter(None, heights)),
@@ -329,9 +339,11 @@ def _home(local: Columns, single: dict[str, Columns]) -> TimeSeries | None:
 
 
 def _hae(gps: Columns) -> TimeSeries | None:
-    sound = _flag(gps, "fix_type", 3) >= 3
-    since_1_14 = _series(gps, ("altitude_ellipsoid_m",), sound)
-    return since_1_14 or _series(gps, ("alt_ellipsoid",), sound, 1e-3)
+    for name, scale in (("altitude_ellipsoid_m", 1.0), ("alt_ellipsoid", 1e-3)):  # since 1.14
+        if name in gps:
+            known = (_flag(gps, "fix_type", 3) >= 3) & (gps[name] != 0)
+            return _series(gps, (name,), known, scale)
+    return None
 
 
 def _position(columns: Columns) -> TimeSeries | None:
@@ -363,7 +375,9 @@ _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
 _HOME = re.compile(r"\bHOME\s*\(")
 _HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
 _GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
-_DIGITAL_ZOOM = re.compile(rf"\bd(?:igital)?[_ ]?zoom[a-z_]*\s*:?\s*{_NUMBER}", re.IGNORECASE)
+_DIGITAL_ZOOM = re.compile(
+    rf"\bd(?:igital)?[_ ]?zoom[a-z_]*\s{{0,9}}(?::\s{{0,9}})?{_NUMBER}", re.IGNORECASE
+)
 SAME_ZOOM = 0.02  # zooms that differ by less, as a fraction, are one
 NEEDED = ("time_s", "pitch_deg", "roll_deg")
 _COLUMNS = {
@@ -422,6 +436,8 @@ def read_log(
     kind, sources = log_kind(path), Sources(named or {}, path)
     if unknown := sources.named.keys() - {"image", "camera_info", "attitude", "position", "height"}:
         raise FlightError(f"logs have no sources of {', '.join(unknown)}: {path}")
+    if kind in ("srt", "table") and sources.named.keys() & {"attitude", "position", "height"}:
+        raise FlightError(f"a file of this kind has one source each; omit --topic: {path}")
     if kind in ("srt", "table") and path.stat().st_size > MAX_BYTES:
         raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
     if kind == "ulog":

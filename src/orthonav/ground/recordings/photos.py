@@ -145,7 +145,8 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
     recorded = {photo.optics.model for photo in turned}
     lost = [photo.optics.model not in recorded for photo in photos]
     # A heading of the aircraft that is 0 in all of them was not recorded either.
-    turns = any(photo.body_yaw_deg for photo, gone in zip(photos, lost, strict=True) if gone)
+    yaws = [photo.body_yaw_deg for photo, gone in zip(photos, lost, strict=True) if gone]
+    turns = any(math.isfinite(yaw) and yaw != 0 for yaw in yaws)
     poses = [_pose(photo, gone, turns) for photo, gone in zip(photos, lost, strict=True)]
     warnings = []
     if any(lost):
@@ -310,6 +311,9 @@ def _alike(
     counted = Counter(key for key in keys if key is not None and key == key)
     if not counted:
         return photos, []
+    if tolerance:  # those that are as near count as one
+        near = {key: [k for k in counted if np.isclose(k, key, rtol=tolerance)] for key in counted}
+        counted = Counter({key: sum(counted[k] for k in near[key]) for key in counted})
     usual = max(counted, key=lambda key: (counted[key], key))
     first = {key: photo.path.name for key, photo in zip(keys, photos, strict=True)}
     rivals = [key for key in counted if counted[key] == counted[usual] > 1]
@@ -354,7 +358,8 @@ def _by_gps(photos: list[Photo]) -> tuple[list[Photo], list[str]]:
     for known in (True, False):
         alike = (each for each in photos if each.zone_known == known)
         lags = [each.time_ns - each.gps_ns for each in alike if each.time_ns and each.gps_ns]
-        if not lags:
+        # A GPS without a fix repeats its last time: then nothing is known of a stated zone.
+        if not lags or (known and max(lags) - min(lags) > MAX_LAG_NS):
             continue
         shifts_ns[known] = lag_ns = round(statistics.median(lags))
         steps = 0 if known else round(lag_ns / ZONE_STEP_NS)

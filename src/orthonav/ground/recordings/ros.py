@@ -36,6 +36,7 @@ from orthonav.core.flight.telemetry_track import (
     RecordedTrack,
     Samples,
     Sources,
+    TimeSeries,
     altitude_series,
     attitude_series,
 )
@@ -485,23 +486,36 @@ def _broken(reason: str, where: str) -> NDArray[np.uint8]:
 
 
 def read_track(reader: Any, topics: Topics, sources: Sources, mount_deg: Angles) -> RecordedTrack:
-    def first(role: str, read: Callable[[Any, Any], tuple[Any, str]]) -> Any:
-        def value(name: str) -> tuple[Any, str]:
-            one = topics[role][name]
-            word = odd_word(next((each for _, each in _messages(reader, one)), None), name)
-            odd = word and role not in sources.named
-            return (None, f"named '{word}'") if odd else read(reader, one)
+    def value(role: str, read: Callable[[Any, Any], tuple[Any, str]], name: str) -> Any:
+        one = topics[role][name]
+        word = odd_word(next((each for _, each in _messages(reader, one)), None), name)
+        odd = word and role not in sources.named
+        return (None, f"'{word}' in its name") if odd else read(reader, one)
 
-        return sources.first(role, topics[role], value)
+    def first(role: str, read: Callable[[Any, Any], tuple[Any, str]]) -> Any:
+        return sources.first(role, topics[role], partial(value, role, read))
+
+    def heights() -> tuple[tuple[TimeSeries, ...], TimeSeries | None, TimeSeries | None]:
+        held, faults = dict[str, Any](), {}
+        for name in topics["height"]:
+            held[name], faults[name] = value("height", _heights, name)
+        if "height" in sources.named:
+            agl, *others = sources.first("height", held, lambda name: (held[name], ""))
+            return (() if agl is None else (agl,)), others[0], others[1]
+        known = [each for each in held.values() if each]
+        measured = {name: each and each[0] for name, each in held.items() if not each or each[0]}
+        agls = sources.all("height", measured, {name: why for name, why in faults.items() if why})
+        home, amsl = (next((x[i] for x in known if x[i]), None) for i in (1, 2))
+        return agls, home, amsl
 
     attitude, horizon = first("attitude", partial(_attitude, mount_deg)) or (None, None)
-    agl, home, amsl = first("height", _heights) or (None, None, None)
+    agl, home, amsl = heights()
     receivers = topics["position"].items()
     fixes = {name: _samples(reader, one, _position, 3).positions() for name, one in receivers}
     places = sources.best("position", fixes)
     return RecordedTrack(
         attitude=attitude,
-        heights=() if agl is None else (agl,),
+        heights=agl,
         home=home,
         amsl=amsl,
         hae=altitude_series(places),  # sensor_msgs/NavSatFix
