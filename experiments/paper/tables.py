@@ -466,10 +466,10 @@ HEAD = """# Results of the paper's experiments
 
 Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit. [The paper's
 experiments](paper.md) has the protocol, the scenes and the discussion. Generated landscapes: seed
-1. `python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds, rules
-of position, and errors of heading and height.
+1. `python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds and
+rules of position.
 """
-ONLY_IN_REPORTS = ("Accepted at", "Rules of position", "Accuracy at 15 m, %, by")
+ONLY_IN_REPORTS = ("Accepted at", "Rules of position")
 
 
 def page(rows: Sequence[Result]) -> str:
