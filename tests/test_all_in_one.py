@@ -51,6 +51,27 @@ def test_an_orthophoto_and_a_flight_become_a_page(run, area, few, tmp_path, name
     assert again.code == 0 and "building the map" not in again.err and page.is_file()
 
 
+def test_views_far_apart_in_time_are_localized_one_by_one(run, map_path, few, tmp_path):
+    table = few / "telemetry.csv"
+    head, *rows = table.read_text().splitlines()
+    at = head.split(",").index("time_s")
+    split = [row.split(",") for row in rows]
+    late = [",".join([*r[:at], str(60 * n), *r[at + 1 :]]) for n, r in enumerate(split)]
+    table.write_text("\n".join([head, *late]) + "\n")
+    assert run("run", few, "--map", map_path, "--out", tmp_path / "out").code == 0
+    results = read_results(tmp_path / "out" / "fixes.jsonl")
+    assert len(results) == 5 and not any(each.state for each in results)
+
+
+def test_nothing_is_lost_where_an_input_is_missing(run, map_path, few, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "fixes.jsonl").write_text("earlier")
+    for more in (("--map", tmp_path / "none.tif"), ("--map", map_path, "--dem", "none.tif")):
+        done = run("run", few, *more, "--out", tmp_path / "out")
+        assert done.code == 1 and "does not exist" in done.err
+    assert (tmp_path / "out" / "fixes.jsonl").read_text() == "earlier"
+
+
 def test_without_recorded_positions_the_views_are_localized_only(run, map_path, few, tmp_path):
     (few / "truth.csv").unlink()
     done = run("run", few, "--map", map_path, "--out", tmp_path / "out", "-q")

@@ -130,9 +130,10 @@ def _require_outputs(options: argparse.Namespace) -> None:
     for name, path in asked.items():
         if isinstance(path, Path) and not is_stdout(path):
             require_writable(path, folder=name in folders)
-    for each in getattr(options, "export", ()):
-        if path := each.partition("=")[2]:
-            require_writable(Path(path))
+    exported = (Path(each.partition("=")[2]) for each in getattr(options, "export", ()))
+    for path in exported:
+        if path.name and not is_stdout(path):
+            require_writable(path)
 
 
 def _written(options: argparse.Namespace, since_s: float) -> str:
@@ -214,8 +215,12 @@ class Parser(argparse.ArgumentParser):
         known = list(self._option_string_actions)
         asked += [(word, known) for word in given if word.startswith("--") and word not in known]
         for word, names in asked:
-            if close := get_close_matches(word, names, 1, 0.7):
-                return f"{message.partition(' (choose')[0]}; did you mean {close[0]}, not {word}?"
+            bare = word.strip("-")
+            plain = {name.strip("-"): name for name in names}
+            alike = [x for x in plain if x[:1] == bare[:1] or sorted(x) == sorted(bare)]
+            if close := get_close_matches(bare, alike, 1):
+                meant = plain[close[0]]
+                return f"{message.partition(' (choose')[0]}; did you mean {meant}, not {word}?"
         return message
 
 

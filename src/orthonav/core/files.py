@@ -95,14 +95,16 @@ def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) 
 
 def require_writable(path: Path, *, folder: bool = False) -> None:
     """Raise `OutputError` where a file, or a `folder`, can surely not be written to `path`."""
+    if path.exists() and not (path.is_dir() if folder else path.is_file()):
+        kind = "a file" if folder else "a folder or a device"
+        raise OutputError(f"cannot write over {kind}: {path}")
     path = Path(path).resolve()
-    if not folder and path.exists() and not path.is_file():
-        raise OutputError(f"cannot write over a folder or a device: {path}")
-    there = next(each for each in path.parents if each.exists())
+    there = path if path.is_dir() else next(each for each in path.parents if each.exists())
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
         why = "no permission, or a read-only disk" if there.is_dir() else "not a folder"
         raise OutputError(f"cannot write ({why}: {there}): {path}")
-    if shutil.disk_usage(there).free < _ALMOST_NONE:
+    disk = shutil.disk_usage(there)
+    if disk.total and disk.free < _ALMOST_NONE:
         raise OutputError(f"disk full; nothing was written: {path}")
 
 

@@ -35,8 +35,8 @@ _STATES = {
     "lost": "the track does not fit the map any more",
 }
 _FAULTS = {
-    "no_camera": "no image any more",
-    "link_down": "no message from the autopilot any more",
+    "no_camera": "no image",
+    "link_down": "no message from the autopilot",
     "no_telemetry": "no attitude; set the stream rates of the autopilot",
     "wrong_camera": "images do not fit --camera",
     "motion_mismatch": "check the camera, --mount-deg, height and heading",

@@ -43,6 +43,7 @@ RETRY_S = (0.5, 1.0, 2.0, 5.0)
 """Pauses before a port is opened again; the last one repeats."""
 HEARTBEAT_NS, TIMESYNC_NS = 10**9, 10**9
 """Intervals; 1 Hz is what the MAVLink heartbeat and TIMESYNC protocols expect."""
+LIMITED_NS = 5 * 10**9  # RANGEFINDER repeats a DISTANCE_SENSOR that looked down meanwhile
 RESIGN_NS = 10 * 10**9
 """Interval at which signature timestamps are set to the current time."""
 _MOST_READS = 200
@@ -95,7 +96,7 @@ class AutopilotLink:
         self.armed: bool | None = None
         self.system_status = 1  # MAV_STATE_BOOT
         self.counts: Counter[str] = Counter()
-        self._has_limits = False  # a DISTANCE_SENSOR looks down: RANGEFINDER is the same without
+        self._limited_ns = -LIMITED_NS
         self._heard_ns: int | None = None
         self._attitude_ns: int | None = None
         self._asked: list[int] = []
@@ -328,14 +329,16 @@ class AutopilotLink:
             self.buffer.add_height("altitude", time_ns, message.altitude_amsl)
 
     def _distance(self, message: Message, now_ns: int) -> None:
-        self._has_limits |= bool(message.orientation == DOWNWARD)
+        if message.orientation == DOWNWARD:
+            self._limited_ns = now_ns
         if is_height(message):
             time_ns = self._timed(message.time_boot_ms, now_ns)
             self.buffer.add_distance(time_ns, message.current_distance * 1e-2)
 
     def _rangefinder(self, message: Message, now_ns: int) -> None:
         arrived_ns = self.sync.boot_ns(now_ns)
-        if arrived_ns is not None and message.distance > 0 and not self._has_limits:
+        limited = now_ns - self._limited_ns < LIMITED_NS
+        if arrived_ns is not None and message.distance > 0 and not limited:
             self.buffer.add_distance(arrived_ns, message.distance)
 
     def _system_time(self, message: Message, now_ns: int) -> None:
