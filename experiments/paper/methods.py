@@ -72,7 +72,8 @@ REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 100
 class Setting:
     """Size of the experiments.
 
-    - `name`: "reduced", "full", or "gpu": the full auto-encoder on B and D.
+    - `name`: "reduced"; "lengths": the paper's lengths, methods without a network; "full"; or "gpu":
+      the full auto-encoder on B and D.
     - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper.
     - `encoder_rate`, `encoder_batch`: learning rate of the auto-encoder, 3e-4 in the paper, and its
       tiles per batch. With few tiles shown, more and larger steps.
@@ -120,8 +121,8 @@ class Setting:
 LEARNABLE = ",mining=semihard,similarity=cosine,margin=0.2"
 REDUCED = Setting("reduced", 32, 3e-3, 16, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
 FULL = Setting("full", 512, 3e-4, 32, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
-GPU = replace(FULL, name="gpu")
-SETTINGS = {each.name: each for each in (REDUCED, GPU, FULL)}
+LENGTHS, GPU = replace(FULL, name="lengths"), replace(FULL, name="gpu")
+SETTINGS = {each.name: each for each in (REDUCED, LENGTHS, GPU, FULL)}
 PAPER_EPOCHS = 200
 
 
@@ -273,6 +274,8 @@ def methods(
     networks.append(Method("autoencoder", encoder, f"{LEARNT}:weights={BETWEEN_DATES}"))
     networks.append(Method("caevl", caevl, CANNY))
     ours = Method(DEFAULT, DEFAULT, DEFAULT, True)
+    if setting.name == "lengths":
+        return [*rows, ours]
     if setting.name == "gpu":
         return [rows[0], *(each for each in networks[:2] if column(scene) in GPU_SCENES), ours]
     rows += [each for each in networks if setting.name != "reduced" or _reduced(each, scene)]

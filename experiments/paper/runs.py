@@ -9,6 +9,7 @@ import json
 import logging
 import os
 import re
+import resource
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -102,6 +103,7 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     made |= _placed(scene, localizer, place.setting, method.registration)
     made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
     made["cpu_minutes"] = round((time.process_time() - cpu_s) / 60, 2)
+    made["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / MB)
     written = save(out, made, start)
     if not place.keep_checkpoints:
         (work / "checkpoint.pt").unlink(missing_ok=True)
@@ -113,7 +115,8 @@ def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, float
 
     Raises `BrokenProcessPool` where a process died: memory has run out, or somebody ended it.
     """
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare, (jobs,)) as pool:
+    spawn = get_context("spawn")  # a process a task: the peak of its memory is the task's
+    with ProcessPoolExecutor(jobs, spawn, _prepare, (jobs,), max_tasks_per_child=1) as pool:
         waiting = {pool.submit(run, *task): task for task in tasks}
         try:
             for done in as_completed(waiting):
