@@ -72,8 +72,8 @@ REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 100
 class Setting:
     """Size of the experiments.
 
-    - `name`: "reduced"; "lengths": the paper's lengths, methods without a network; "full"; "gpu": the
-      full auto-encoder on B and D.
+    - `name`: "reduced"; "lengths": the paper's, methods without a network; "full"; "gpu": the full
+      auto-encoder on B and D.
     - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper.
     - `encoder_rate`, `encoder_batch`: learning rate of the auto-encoder, 3e-4 in the paper, and its
       tiles per batch. With few tiles shown, more and larger steps.
