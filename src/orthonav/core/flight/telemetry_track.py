@@ -338,8 +338,8 @@ class Sources:
         held = {name: _seconds(one) for name, one in series.items()}
         most = max(held.values(), default=0)
         few = {name: f"valid for {s} s of {most} s" for name, s in held.items() if 0 < 2 * s < most}
-        self.first(role, series, lambda name: (series[name], few.get(name, "")))
-        return series.get(self.used[role])
+        found: TimeSeries | None = self.first(role, series, lambda n: (series[n], few.get(n, "")))
+        return found
 
     def all(
         self, role: str, series: Mapping[str, TimeSeries | None], faults: Mapping[str, str]
@@ -350,7 +350,7 @@ class Sources:
             return (self.first(role, series, lambda name: (series[name], "")),)
         held = {name: one for name, one in series.items() if one is not None}
         fit = sorted(held, key=lambda name: -_seconds(held[name]))
-        others = [f"{n} ({faults.get(n, 'no valid message')})" for n in series if n not in held]
+        others = [f"{n} ({faults.get(n) or 'no valid message'})" for n in series if n not in held]
         self.used[role] = fit[0] if fit else NO_SOURCE
         if len(fit) > 1 or others:
             used = ", in its gaps ".join(fit) or NO_SOURCE

@@ -504,7 +504,7 @@ def read_track(reader: Any, topics: Topics, sources: Sources, mount_deg: Angles)
             return (() if agl is None else (agl,)), others[0], others[1]
         known = [each for each in held.values() if each]
         measured = {name: each and each[0] for name, each in held.items() if not each or each[0]}
-        agls = sources.all("height", measured, {name: why for name, why in faults.items() if why})
+        agls = sources.all("height", measured, faults)
         home, amsl = (next((x[i] for x in known if x[i]), None) for i in (1, 2))
         return agls, home, amsl
 
