@@ -34,6 +34,7 @@ from orthonav.core.extras import require
 from orthonav.core.tiles.learned import VARIABLE
 
 PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
+PARTS_OF = {"gpu": GPU_SCENES, "epochs": ("B",)}
 ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
 
 
@@ -67,22 +68,23 @@ def _run(options: argparse.Namespace, command: str) -> int:
     os.environ[VARIABLE] = str(BETWEEN_DATES)  # maps do not say where their network lies
     start = time.perf_counter()
     setting = dry(SETTINGS[options.setting]) if options.dry_run else SETTINGS[options.setting]
-    more = options.device, options.workers, options.keep_checkpoints
-    place = runs.Workplace(options.out, setting, command, *more)
-    wanted = set(options.only or (GPU_SCENES if options.setting == "gpu" else PARTS))
+    goes_on = setting.name == "epochs"
+    keeps = options.keep_checkpoints or goes_on
+    place = runs.Workplace(options.out, setting, command, options.device, options.workers, keeps)
+    wanted = set(options.only or PARTS_OF.get(setting.name, PARTS))
     if "field" in wanted and not _has_matchers(options):
         wanted.discard("field")
     tasks = _tasks(options, place, wanted)
-    # Those that learn longest first, so that no core is idle at the end.
-    tasks.sort(key=lambda task: ORDER.index(task[2].family))
-    jobs = options.jobs or (runs.cores() if options.setting == "reduced" else 1)
+    jobs = 1 if goes_on else options.jobs or (runs.cores() if setting.name == "reduced" else 1)
+    if jobs > 1:  # those that learn longest first, so that no core is idle at the end
+        tasks.sort(key=lambda task: ORDER.index(task[2].family))
     flown_over = {task[1].name: task[1] for task in tasks}.values()
     for scene in flown_over:
         scenes.render(scene)
         say(f"{_minutes(start)}  {scene.name}: imagery is there")
     failed = 0
     for (_, scene, method), minutes in runs.side_by_side(tasks, jobs):
-        if not options.keep_checkpoints:  # `run` has removed the last one; CAEVL has an earlier one
+        if not keeps:  # `run` has removed the last one; CAEVL has an earlier one
             for left in place.work(scene, method.key).glob("*/checkpoint.pt"):
                 left.unlink()
         status = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"

@@ -72,8 +72,8 @@ REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 100
 class Setting:
     """Size of the experiments.
 
-    - `name`: "reduced"; "lengths": the paper's, methods without a network; "full"; "gpu": the full
-      auto-encoder on B and D.
+    - `name`: "reduced"; "lengths": the paper's, methods without a network; "epochs": networks of
+      the paper's size on the reduced B as they learn; "full"; "gpu": auto-encoder on B and D.
     - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper.
     - `encoder_rate`, `encoder_batch`: learning rate of the auto-encoder, 3e-4 in the paper, and its
       tiles per batch. With few tiles shown, more and larger steps.
@@ -111,7 +111,7 @@ class Setting:
         whole = TABLE_1[name]
         if self.dry:
             return two_tiles(whole)
-        if self.name == "reduced":
+        if self.name in ("reduced", "epochs"):
             length_m, band_m = REDUCED_M[name]
             return replace(whole, length_m=length_m, band_m=band_m)
         gsd_m = IMPLIED_GSD_M.get(name, whole.gsd_m)
@@ -122,7 +122,10 @@ LEARNABLE = ",mining=semihard,similarity=cosine,margin=0.2"
 REDUCED = Setting("reduced", 32, 3e-3, 16, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
 FULL = Setting("full", 512, 3e-4, 32, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
 LENGTHS, GPU = replace(FULL, name="lengths"), replace(FULL, name="gpu")
-SETTINGS = {each.name: each for each in (REDUCED, LENGTHS, GPU, FULL)}
+EPOCHS = replace(FULL, name="epochs", views=100, swept=0)
+SETTINGS = {each.name: each for each in (REDUCED, LENGTHS, EPOCHS, GPU, FULL)}
+CURVE = {"autoencoder": (1, 2, 3, 5, 7, 10, 15, 20, 30), "triplet": (1, 2, 3, 5)}
+"""Epochs after which the setting "epochs" looks at a network."""
 PAPER_EPOCHS = 200
 
 
@@ -154,13 +157,24 @@ BETWEEN_DATES = Path(__file__).resolve().parent / "between_dates.onnx"
 class Method:
     """A row of Table 2: `recipe` and `edges` as `orthonav build` takes them.
 
-    With `registration` views are placed by orthonav's default instead of the paper's rule.
+    With `registration` views are placed by orthonav's default instead of the paper's rule. `curve`:
+    the training goes on in the next row.
     """
 
     family: str
     recipe: str
     edges: str
     registration: bool = False
+    curve: bool = False
+
+    def number(self, name: str) -> int:
+        """A whole number of the recipe ("epochs")."""
+        return int(self.recipe.partition(f"{name}=")[2].partition(",")[0])
+
+    @property
+    def training(self) -> str:
+        """Name of the folder of checkpoints, the same for all rows of a training."""
+        return f"{self.family}-{self.edges}-{self.number('width')}" if self.curve else self.key
 
     @property
     def needs_dates(self) -> bool:
@@ -170,6 +184,8 @@ class Method:
     @property
     def key(self) -> str:
         """Short name for files, unique within one setting."""
+        if self.curve:
+            return f"{self.training}-{self.number('epochs')}"
         words = self.recipe.partition("words=")[2].partition(",")[0]
         layer = "registration" if self.registration else ""
         singly = "tile" if PER_TILE in self.edges else ""
@@ -276,10 +292,30 @@ def methods(
     ours = Method(DEFAULT, DEFAULT, DEFAULT, True)
     if setting.name == "lengths":
         return [*rows, ours]
+    if setting.name == "epochs":
+        return _curves()
     if setting.name == "gpu":
         return [rows[0], *(each for each in networks[:2] if column(scene) in GPU_SCENES), ours]
     rows += [each for each in networks if setting.name != "reduced" or _reduced(each, scene)]
     return [*rows, ours]
+
+
+def _curves() -> list[Method]:
+    """The reduced auto-encoder and the paper's networks after some epochs each."""
+    small = f"autoencoder:width={REDUCED.encoder_width},batch={REDUCED.encoder_batch},"
+    networks = (
+        f"{small}learning_rate={REDUCED.encoder_rate:g}",
+        f"autoencoder:width={FULL.encoder_width},batch={FULL.encoder_batch},"
+        f"learning_rate={FULL.encoder_rate:g}",
+        f"triplet:width={FULL.triplet_width},batch={FULL.triplet_batch}",
+    )
+    return [
+        Method(family, f"{network},epochs={count}", edges, curve=True)
+        for network in networks
+        for family in [network.partition(":")[0]]
+        for edges in (CANNY, GREY)
+        for count in CURVE[family]
+    ]
 
 
 def _reduced(method: Method, scene: str) -> bool:

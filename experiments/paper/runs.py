@@ -88,7 +88,7 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
         if found["method"]["recipe"] == method.recipe:
             return found
     start, cpu_s, before = time.perf_counter(), time.process_time(), provenance("paper")
-    work = place.work(scene, method.key)
+    work = place.work(scene, method.training)
     opened, built = _map(place, scene, method, work)
     localizer = Localizer(
         opened,
@@ -102,6 +102,8 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     made |= {"method": asdict(method) | {"edges": edges}, **built, **_sizes(opened)}
     made |= _placed(scene, localizer, place.setting, method.registration)
     made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
+    for learnt in work.glob("*/history.json"):
+        made["loss"] = json.loads(learnt.read_text(encoding="utf-8"))["loss"]
     made["cpu_minutes"] = round((time.process_time() - cpu_s) / 60, 2)
     made["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / MB)
     written = save(out, made, start)
@@ -255,7 +257,7 @@ def _placed(
     if not times_ms:
         raise ValueError(f"no view of {scene.name} lies wholly on the imagery of the later date")
     result["view_ms"] = statistics.median(times_ms)
-    if scene.name == SWEPT_ON and seen["grid"]:
+    if scene.name == SWEPT_ON and setting.swept and seen["grid"]:
         count = min(setting.swept, len(seen["grid"]))
         few = [seen["grid"][at] for at in np.linspace(0, len(seen["grid"]) - 1, count, dtype=int)]
         turned = {v: _hits(locate(each, turned_deg=v)[0] for each in few) for v in HEADINGS_DEG}

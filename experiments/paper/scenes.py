@@ -105,7 +105,7 @@ def generated(setting: Setting, name: str, folder: Path, gsd_m: float | None = N
     east_m, north_m = trajectory.imagery_m
     place = folder / f"{name}-{east_m:.0f}x{north_m:.0f}m-{trajectory.gsd_m:g}m"
     reduced = "".join(REDUCED_NETWORKS["triplet"].values())
-    learns = setting.name == "full" or (setting.name == "reduced" and name in reduced)
+    learns = setting.name == "full" or (setting.name in ("reduced", "epochs") and name in reduced)
     dates = DEFAULT_DATES if learns else DEFAULT_DATES[:2]
     paths = [place / f"{date.name}.tif" for date in dates]
     return Scene(title, paths[0], paths[1], trajectory, tuple(paths[2:]))
