@@ -51,7 +51,10 @@ class Trajectory:
     @property
     def imagery_m(self) -> tuple[float, float]:
         """East and north extent of the imagery that holds all tiles and views."""
+        # A band around a route ends half its width behind the last waypoint.
         slack_m = 2 * self.margin_m + 2 * CONVERGENCE * self.length_m
+        if self.band_m < TILE_PX * self.gsd_m:
+            slack_m += self.band_m
         return self.length_m + slack_m, self.band_m + slack_m
 
 
@@ -124,7 +127,7 @@ FULL = Setting("full", 512, 3e-4, 32, None, 64, None, 512, "", (256, 1000, 3000,
 LENGTHS, GPU = replace(FULL, name="lengths"), replace(FULL, name="gpu")
 EPOCHS = replace(FULL, name="epochs", views=100, swept=0)
 SETTINGS = {each.name: each for each in (REDUCED, LENGTHS, EPOCHS, GPU, FULL)}
-CURVE = {"autoencoder": (1, 2, 3, 5, 7, 10, 15, 20, 30), "triplet": (1, 2, 3, 5)}
+CURVE = {"autoencoder": (1, 2, 3, 5, 7, 10, 15, 20), "triplet": (1, 2, 3, 5)}
 """Epochs after which the setting "epochs" looks at a network."""
 PAPER_EPOCHS = 200
 

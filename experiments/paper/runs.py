@@ -101,9 +101,12 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     edges = re.sub("[:,]weights=[^,]*", "", method.edges)
     made |= {"method": asdict(method) | {"edges": edges}, **built, **_sizes(opened)}
     made |= _placed(scene, localizer, place.setting, method.registration)
-    made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
-    for learnt in work.glob("*/history.json"):
-        made["loss"] = json.loads(learnt.read_text(encoding="utf-8"))["loss"]
+    made["rules"] = (
+        {} if method.registration or method.curve else _rules(scene, opened, place.setting)
+    )
+    history = work / "history.json"
+    if history.is_file():
+        made["loss"] = json.loads(history.read_text(encoding="utf-8"))["loss"]
     made["cpu_minutes"] = round((time.process_time() - cpu_s) / 60, 2)
     made["peak_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / MB)
     written = save(out, made, start)
