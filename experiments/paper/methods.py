@@ -127,7 +127,7 @@ FULL = Setting("full", 512, 3e-4, 32, None, 64, None, 512, "", (256, 1000, 3000,
 LENGTHS, GPU = replace(FULL, name="lengths"), replace(FULL, name="gpu")
 EPOCHS = replace(FULL, name="epochs", views=100, swept=0)
 SETTINGS = {each.name: each for each in (REDUCED, LENGTHS, EPOCHS, GPU, FULL)}
-CURVE = {"autoencoder": (1, 2, 3, 5, 7, 10, 15, 20), "triplet": (1, 2, 3, 5)}
+CURVE = {"autoencoder": (1, 2, 3, 5, 7, 10), "triplet": (1, 2, 3)}
 """Epochs after which the setting "epochs" looks at a network."""
 PAPER_EPOCHS = 200
 
