@@ -15,6 +15,8 @@ from orthonav.core.files import write_text
 
 ROWS = Path(__file__).resolve().parent / "rows"
 """Results that the page shows, a folder for each setting."""
+WORDS = Path(__file__).resolve().parent / "words.json"
+"""Results of `experiments.paper.words`."""
 BASELINES, FIELD = "baselines", "field"
 DIGITS = 5
 """Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""

@@ -1,0 +1,116 @@
+"""`python -m experiments.paper.words`: what the bag of words finds on the reduced A and B, and why.
+
+Views on the grid, of the date of the map and of the later date, with several vocabularies,
+similarities and numbers of features. The results go to `words.json` beside this file.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from benchmarks.record import provenance, say
+from numpy.typing import NDArray
+
+from experiments.paper import scenes
+from experiments.paper.dates import found_again
+from experiments.paper.methods import REDUCED, TILE_PX
+from experiments.paper.results import ACCURACY_M, WORDS
+from experiments.paper.runs import Workplace, geometry, head, save
+from experiments.paper.scenes import Scene
+from orthonav.core.tiles.words import WordsRecipe
+from orthonav.ground.build.encoders import MAX_WORD_TILES
+from orthonav.research.words import learn_words
+
+Array = NDArray[np.float64]
+COMMAND = "python -m experiments.paper.words"
+PAPER = (("product", 0),)
+WAYS = (*PAPER, ("cosine", 0), ("cosine", 1))
+"""Similarity of two bags, and whether words are weighed by tf-idf."""
+SMALL = ((256, 2000, PAPER), (1000, 2000, WAYS), (1000, 500, WAYS), (3000, 2000, PAPER))
+TRIED = {"A": SMALL, "B": (*SMALL, (10_000, 2000, PAPER))}
+"""Words, features of a picture, ways. A has five times the tiles of B: no 10,000 words there."""
+ALL = np.ones((TILE_PX, TILE_PX), np.bool_)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Measure both trajectories and write the file; returns the exit code."""
+    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
+    parser.add_argument("--work", type=Path, default=Path("paper_results"), metavar="DIR")
+    parser.add_argument("--out", type=Path, default=WORDS, metavar="FILE")
+    options = parser.parse_args(arguments)
+    cv2.setNumThreads(1)
+    place = Workplace(options.work, REDUCED, COMMAND)
+    start, started, made = time.perf_counter(), provenance("paper words"), []
+    for name in TRIED:
+        scene = scenes.generated(REDUCED, name, options.work / "areas")
+        scenes.render(scene)
+        made.append(head(place, scene, started) | measured(place, scene))
+    save(options.out, {"scenes": made}, start)
+    say(f"written to {options.out}")
+    return 0
+
+
+def measured(place: Workplace, scene: Scene) -> dict[str, Any]:
+    """Views within 15 m by vocabulary, rank of the correct tile, and features found again.
+
+    Each for views of the date of the map ("same") and of the later date ("other"); features also
+    for a tile half a trajectory away.
+    """
+    localizer, began = geometry(place, scene), time.perf_counter()
+    centres = localizer.tiles.centres_en_m
+    ground = localizer.sheet.frame, localizer.grid, centres
+    tiles = scenes.reference_tiles(scene, *ground)
+    flown = {"same": replace(scene, present=scene.past), "other": scene}
+    seen = {
+        date: list(scenes.grid_views(each, *ground, place.setting.views))
+        for date, each in flown.items()
+    }
+    correct, half = [tile for tile, _ in seen["other"]], len(seen["other"]) // 2
+    far = zip(correct[half:] + correct[:half], (view for _, view in seen["other"]), strict=True)
+    again = {
+        date: float(np.mean([found_again(view, tiles[tile]) for tile, view in pairs]))
+        for date, pairs in (seen | {"elsewhere": list(far)}).items()
+    }
+    rows = []
+    for words, features, ways in TRIED[scene.name]:
+        recipe = WordsRecipe(words=words, max_features=features, tfidf=1)
+        chosen = tiles[:: -(-len(tiles) // MAX_WORD_TILES)]
+        embedder = learn_words(recipe, ((tile, ALL) for tile in chosen), seed=0)
+        counts = np.array([embedder.counts(tile, ALL) for tile in tiles])
+        views = {d: np.array([embedder.counts(v, ALL) for _, v in seen[d]]) for d in seen}
+        for similarity, tfidf in ways:
+            row = {"words": words, "features": features, "similarity": similarity, "tfidf": tfidf}
+            bags = weighed(counts, embedder.idf, similarity, tfidf)
+            for date, counted in views.items():
+                scores = weighed(counted, embedder.idf, similarity, tfidf) @ bags.T
+                row[date] = placed(scores, [tile for tile, _ in seen[date]], centres)
+            rows.append(row)
+        say(f"{scene.name}: {words} words, {time.perf_counter() - began:.0f} s")
+    return {"found_again": again, "rows": rows}
+
+
+def weighed(counts: NDArray[Any], idf: NDArray[Any], similarity: str, tfidf: int) -> Array:
+    """Bags (N, k) of counts (N, k)."""
+    bags = counts / np.maximum(1, counts.sum(axis=1, keepdims=True)) * (idf if tfidf else 1.0)
+    if similarity == "cosine":
+        bags /= np.maximum(np.linalg.norm(bags, axis=1, keepdims=True), 1e-12)
+    return np.asarray(bags, np.float64)
+
+
+def placed(scores: Array, correct: Sequence[int], centres_en_m: NDArray[Any]) -> dict[str, Any]:
+    """Views within 15 m of all, by scores (V, N), and the median share of tiles above the correct
+    one, 0 to 1: a half for a guess."""
+    away = np.hypot(*(centres_en_m[scores.argmax(axis=1)] - centres_en_m[correct]).T)
+    own = scores[np.arange(len(correct)), correct]
+    above = (scores > own[:, None]).mean(axis=1)
+    return {"right": [int((away <= ACCURACY_M).sum()), len(away)], "above": float(np.median(above))}
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
