@@ -36,7 +36,7 @@ from orthonav.core.tiles.learned import VARIABLE
 
 PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
 PICTURES = f"{tables.PROGRAM} pictures"
-PICTURED = ("A", "B", "real", "untuned")
+PICTURED = (*TABLE_1, "real", "untuned")
 PARTS_OF = {"gpu": GPU_SCENES, "epochs": ("B",)}
 ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
 

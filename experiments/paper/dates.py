@@ -14,7 +14,6 @@ from benchmarks.record import provenance
 from numpy.typing import NDArray
 
 from experiments.paper import scenes
-from experiments.paper.methods import TABLE_1, column
 from experiments.paper.results import DATES
 from experiments.paper.runs import Workplace, geometry, head, save
 from experiments.paper.scenes import Scene
@@ -28,8 +27,8 @@ BLUR_STD_PX = 1.0
 """Edges are compared smoothed by a Gaussian, so that those a pixel apart agree."""
 FOUND_PX = 3.0
 """A feature is found again if the most similar one of the tile lies so near."""
-GENERATED = "generated"
-"""Picture of all generated landscapes, below each other; the docs show it."""
+GENERATED, SHOWN = "generated", ("A", "B")
+"""Picture of these trajectories over generated landscapes, which the docs show."""
 TITLE_PX, GAP_PX, WHITE = 24, 6, 255
 GREY_STEP = 8
 """Grey levels of pictures are multiples of this: a PNG is half as large."""
@@ -43,7 +42,7 @@ def run(place: Workplace, chosen: Iterable[Scene]) -> None:
         scenes.render(scene)
         pairs = pairs_of(place, scene)
         made.append(head(place, scene, started) | {"views": len(pairs)} | alike(pairs))
-        name = GENERATED if column(scene.name) in TABLE_1 else scene.name
+        name = GENERATED if scene.name in SHOWN else scene.name
         strips.setdefault(name, []).append(strip(scene, pairs[len(pairs) // 2]))
     save(place.out / DATES.name, {"scenes": made}, start)
     folder = place.out / "pictures"

@@ -5,7 +5,6 @@ similarities and numbers of features. The results go to `words.json` beside this
 """
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +22,7 @@ from experiments.paper.methods import REDUCED, TILE_PX
 from experiments.paper.results import ACCURACY_M, WORDS
 from experiments.paper.runs import Workplace, geometry, head, save
 from experiments.paper.scenes import Scene
-from orthonav.core.tiles.words import WordsRecipe
+from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe, describe
 from orthonav.ground.build.encoders import MAX_WORD_TILES
 from orthonav.research.words import learn_words
 
@@ -32,18 +31,18 @@ COMMAND = "python -m experiments.paper.words"
 PAPER = (("product", 0),)
 WAYS = (*PAPER, ("cosine", 0), ("cosine", 1))
 """Similarity of two bags, and whether words are weighed by tf-idf."""
-SMALL = ((256, 2000, PAPER), (1000, 2000, WAYS), (1000, 500, WAYS), (3000, 2000, PAPER))
-TRIED = {"A": SMALL, "B": (*SMALL, (10_000, 2000, PAPER))}
-"""Words, features of a picture, ways. A has five times the tiles of B: no 10,000 words there."""
+FEW = ((256, 2000, PAPER), (1000, 2000, WAYS))
+MORE = ((1000, 500, WAYS), (3000, 2000, PAPER), (10_000, 2000, PAPER))
+TRIED = {"A": FEW, "B": FEW + MORE}
+"""Words, features of a picture, and ways; fewer on A, which has five times the tiles of B."""
 ALL = np.ones((TILE_PX, TILE_PX), np.bool_)
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Measure both trajectories and write the file; returns the exit code."""
+def main() -> None:
+    """Measure both trajectories and write the file."""
     parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
     parser.add_argument("--work", type=Path, default=Path("paper_results"), metavar="DIR")
-    parser.add_argument("--out", type=Path, default=WORDS, metavar="FILE")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     cv2.setNumThreads(1)
     place = Workplace(options.work, REDUCED, COMMAND)
     start, started, made = time.perf_counter(), provenance("paper words"), []
@@ -51,9 +50,7 @@ def main(arguments: Sequence[str]) -> int:
         scene = scenes.generated(REDUCED, name, options.work / "areas")
         scenes.render(scene)
         made.append(head(place, scene, started) | measured(place, scene))
-    save(options.out, {"scenes": made}, start)
-    say(f"written to {options.out}")
-    return 0
+    save(WORDS, {"scenes": made}, start)
 
 
 def measured(place: Workplace, scene: Scene) -> dict[str, Any]:
@@ -71,28 +68,36 @@ def measured(place: Workplace, scene: Scene) -> dict[str, Any]:
         date: list(scenes.grid_views(each, *ground, place.setting.views))
         for date, each in flown.items()
     }
-    correct, half = [tile for tile, _ in seen["other"]], len(seen["other"]) // 2
-    far = zip(correct[half:] + correct[:half], (view for _, view in seen["other"]), strict=True)
+    pictures = {"map": tiles} | {date: [view for _, view in seen[date]] for date in seen}
+    far = np.roll([tile for tile, _ in seen["other"]], len(seen["other"]) // 2).tolist()
+    compared = seen | {"elsewhere": list(zip(far, pictures["other"], strict=True))}
     again = {
         date: float(np.mean([found_again(view, tiles[tile]) for tile, view in pairs]))
-        for date, pairs in (seen | {"elsewhere": list(far)}).items()
+        for date, pairs in compared.items()
     }
-    rows = []
+    rows, described = [], {}
     for words, features, ways in TRIED[scene.name]:
         recipe = WordsRecipe(words=words, max_features=features, tfidf=1)
+        for date, greys in pictures.items():
+            if (features, date) not in described:
+                described[features, date] = [describe(recipe, grey, ALL) for grey in greys]
         chosen = tiles[:: -(-len(tiles) // MAX_WORD_TILES)]
         embedder = learn_words(recipe, ((tile, ALL) for tile in chosen), seed=0)
-        counts = np.array([embedder.counts(tile, ALL) for tile in tiles])
-        views = {d: np.array([embedder.counts(v, ALL) for _, v in seen[d]]) for d in seen}
+        counts = {date: counted(embedder, described[features, date]) for date in pictures}
         for similarity, tfidf in ways:
             row = {"words": words, "features": features, "similarity": similarity, "tfidf": tfidf}
-            bags = weighed(counts, embedder.idf, similarity, tfidf)
-            for date, counted in views.items():
-                scores = weighed(counted, embedder.idf, similarity, tfidf) @ bags.T
+            bags = {d: weighed(each, embedder.idf, similarity, tfidf) for d, each in counts.items()}
+            for date in seen:
+                scores = bags[date] @ bags["map"].T
                 row[date] = placed(scores, [tile for tile, _ in seen[date]], centres)
             rows.append(row)
         say(f"{scene.name}: {words} words, {time.perf_counter() - began:.0f} s")
     return {"found_again": again, "rows": rows}
+
+
+def counted(embedder: WordsEmbedder, described: Sequence[NDArray[np.float32]]) -> NDArray[np.int64]:
+    """Features (N, k) of each word in pictures, by their descriptors (F, D)."""
+    return np.array([np.bincount(embedder.assigned(d), minlength=embedder.dims) for d in described])
 
 
 def weighed(counts: NDArray[Any], idf: NDArray[Any], similarity: str, tfidf: int) -> Array:
@@ -113,4 +118,4 @@ def placed(scores: Array, correct: Sequence[int], centres_en_m: NDArray[Any]) ->
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main()
