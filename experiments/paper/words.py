@@ -32,7 +32,7 @@ PAPER = (("product", 0),)
 WAYS = (*PAPER, ("cosine", 0), ("cosine", 1))
 """Similarity of two bags, and whether words are weighed by tf-idf."""
 FEW = ((256, 2000, PAPER), (1000, 2000, WAYS))
-MORE = ((1000, 500, WAYS), (3000, 2000, PAPER), (10_000, 2000, PAPER))
+MORE = ((1000, 500, WAYS), (3000, 2000, PAPER))
 TRIED = {"A": FEW, "B": FEW + MORE}
 """Words, features of a picture, and ways; fewer on A, which has five times the tiles of B."""
 ALL = np.ones((TILE_PX, TILE_PX), np.bool_)
@@ -56,8 +56,7 @@ def main() -> None:
 def measured(place: Workplace, scene: Scene) -> dict[str, Any]:
     """Views within 15 m by vocabulary, rank of the correct tile, and features found again.
 
-    Each for views of the date of the map ("same") and of the later date ("other"); features also
-    for a tile half a trajectory away.
+    Views are of the map's date ("same") or the later one ("other"); "elsewhere": another tile.
     """
     localizer, began = geometry(place, scene), time.perf_counter()
     centres = localizer.tiles.centres_en_m
