@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.record import say
 from benchmarks.scenes import DATA
 
-from experiments.paper import field, matchers, runs, scenes, tables
+from experiments.paper import curves, field, matchers, runs, scenes, tables
 from experiments.paper.methods import (
     BETWEEN_DATES,
     FIELD_SCENES,
@@ -46,6 +46,7 @@ def main(arguments: list[str]) -> int:
         for name in keep(options.out, options.setting):
             say(f"stored: {name}")
         tables.PAGE.write_text(tables.page(stored()), encoding="utf-8")
+        curves.figure(stored(), curves.FIGURE)
         return 0
     failed = 0
     if options.what == "run":

@@ -11,6 +11,7 @@ from benchmarks.record import Table, number
 from benchmarks.scenes import far_m
 from numpy.typing import NDArray
 
+from experiments.paper import curves
 from experiments.paper.methods import BETWEEN_DATES, SETTINGS, SWEPT_ON, Method
 from experiments.paper.published import LOWE, TRAJECTORIES, published_accuracy, published_criterion
 from experiments.paper.results import (
@@ -60,6 +61,9 @@ def report(out: Path, setting: str) -> Path | None:
 
 def tables(results: Sequence[Result]) -> list[Table]:
     """All tables of results of one setting."""
+    learning = curves.table(results)
+    if learning:  # rows of one training share their label
+        return [*learning, provenance(results)]
     made = [each for each in results if each.family]
     return [
         *scenes(made),
