@@ -61,6 +61,12 @@ def learnt():
     return learn_words(WordsRecipe(words=256), pictures_of(tiles(area())), seed=1)
 
 
+def test_features_are_opencvs_sift():
+    grey = tiles(area())[0]
+    _, expected = cv2.SIFT.create(nfeatures=2000).detectAndCompute(grey, None)
+    np.testing.assert_array_equal(describe(WordsRecipe(), grey, everywhere(grey)), expected)
+
+
 @pytest.mark.parametrize("words", [256, 2000])
 def test_assignment_is_exact(words):
     """Whole numbers: the same as OpenCV's exhaustive search, ties included."""
