@@ -61,21 +61,10 @@ def learnt():
     return learn_words(WordsRecipe(words=256), pictures_of(tiles(area())), seed=1)
 
 
-# Frequencies.
-
-
-def test_frequencies_are_counts_of_nearest_words():
-    """Against a plain calculation in float64."""
-    embedder = random_embedder()
+def test_features_are_opencvs_sift():
     grey = tiles(area())[0]
-    _, descriptors = cv2.SIFT_create().detectAndCompute(grey, None)
-    words = embedder.vocabulary.astype(float)
-    nearest = [((each.astype(float) - words) ** 2).sum(axis=1).argmin() for each in descriptors]
-    expected = np.bincount(nearest, minlength=300) / len(descriptors)
-    out = embedder.view(maps_of(grey), everywhere(grey))
-    assert len(descriptors) > 100 and len(np.unique(nearest)) > 10
-    assert out.shape == (300,) and out.dtype == np.float32
-    np.testing.assert_allclose(out, expected, rtol=1e-6)
+    _, expected = cv2.SIFT.create(nfeatures=2000).detectAndCompute(grey, None)
+    np.testing.assert_array_equal(describe(WordsRecipe(), grey, everywhere(grey)), expected)
 
 
 @pytest.mark.parametrize("words", [256, 2000])

@@ -1,6 +1,8 @@
 """Learns a bag of visual words: k-means of the features of reference pictures.
 
-Needs faiss, and PyTorch for SuperPoint. The embedder that flies is `orthonav.core.tiles.words`.
+"The BoVW method gathers features from all the images and group them into k clusters" (Di Piazza et
+al. 2024, section Related work, Bag of Visual Words); k-means, of a sample, is our choice. Needs
+faiss, and PyTorch for SuperPoint. The embedder that flies is `orthonav.core.tiles.words`.
 """
 
 import warnings

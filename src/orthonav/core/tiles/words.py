@@ -1,6 +1,8 @@
 """Bag of visual words (Sivic and Zisserman, ICCV 2003): how often which local features occur.
 
-As in Di Piazza et al. 2024, section 2, on grey levels, with SIFT (Lowe, IJCV 2004) or SuperPoint
+"A frequency vector that records how many features [...] fall into each cluster" (Di Piazza et al.
+2024, section Related work, Bag of Visual Words), here divided by the number of features. As in
+section Methodology, features are those of grey levels, by SIFT (Lowe, IJCV 2004) or SuperPoint
 (DeTone et al. 2018), which needs PyTorch and does not fly. `orthonav.research.words` learns them.
 
 SIFT descriptors and words are whole numbers, and sums below 2^24 that decide on the nearest word
