@@ -548,7 +548,7 @@ def test_what_the_middleware_does_not_take_is_an_error_of_output():
     def refuse(cdr):
         raise RuntimeError("closed")
 
-    with pytest.raises(OSError, match="cannot publish on /a .closed"):
+    with pytest.raises(OSError, match=r"cannot publish on /a .closed"):
         node._writing("/a", refuse)(MESSAGES.number(1.0))
 
 
