@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from orthonav.core.errors import MissingExtraError, OutputError, described
+from orthonav.core.extras import needed
 from orthonav.onboard.ros2.arguments import RosArguments
 
 log = logging.getLogger(__name__)
@@ -28,8 +29,8 @@ Writer = Callable[[Any], None]
 """Sends one message. Raises `OSError` where the middleware does not take it."""
 
 
-def ros2_module(name: str) -> Any:
-    """A module of ROS or of the extra `ros2`. Raises `MissingExtraError` where it is missing."""
+def _ros_module(name: str) -> Any:
+    """A module of ROS. Raises `MissingExtraError` where it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -46,7 +47,7 @@ class Definitions:
 
         Raises `MissingExtraError`.
         """
-        typesys = ros2_module("rosbags.typesys")
+        typesys = needed("rosbags.typesys", "ros2", "--ros2")
         stores = {store.value: store for store in typesys.Stores}
         self._store = typesys.get_typestore(stores.get(f"ros2_{distro}", typesys.Stores.LATEST))
         for name, text in _GEOGRAPHIC.items():
@@ -94,8 +95,8 @@ class Node:
         self._join()
 
     def _join(self) -> None:
-        rclpy, self._qos = ros2_module("rclpy"), ros2_module("rclpy.qos")
-        signals, executors = ros2_module("rclpy.signals"), ros2_module("rclpy.executors")
+        rclpy, self._qos = _ros_module("rclpy"), _ros_module("rclpy.qos")
+        signals, executors = _ros_module("rclpy.signals"), _ros_module("rclpy.executors")
         arguments = self.arguments
         try:
             self._context = rclpy.Context()
@@ -234,7 +235,7 @@ def _note(found: dict[str, str], topic: str, kind: str, other_kind: str, why: st
 
 def _message(kind: str) -> Any:
     package, _, name = kind.split("/")
-    return getattr(ros2_module(f"{package}.msg"), name)
+    return getattr(_ros_module(f"{package}.msg"), name)
 
 
 class Rosout(logging.Handler):
