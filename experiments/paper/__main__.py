@@ -1,7 +1,8 @@
 """`python -m experiments.paper`: run the paper's experiments; `report`: tables of them.
 
 Every run leaves one file under `paper_results/<setting>/` and is not run again while it is there.
-`keep` copies these files into the repository and makes `docs/paper-results.md` of what is there.
+`pictures` compares the two dates of each scene. `keep` copies these files into the repository and
+makes `docs/paper-results.md` of what is there.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from pathlib import Path
 from benchmarks.record import say
 from benchmarks.scenes import DATA
 
-from experiments.paper import curves, field, matchers, runs, scenes, tables
+from experiments.paper import curves, dates, field, matchers, runs, scenes, tables
 from experiments.paper.methods import (
     BETWEEN_DATES,
     FIELD_SCENES,
@@ -34,6 +35,8 @@ from orthonav.core.extras import require
 from orthonav.core.tiles.learned import VARIABLE
 
 PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
+PICTURES = f"{tables.PROGRAM} pictures"
+PICTURED = (*TABLE_1, "real", "untuned")
 PARTS_OF = {"gpu": GPU_SCENES, "epochs": ("B",)}
 ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
 
@@ -47,6 +50,11 @@ def main(arguments: list[str]) -> int:
             say(f"stored: {name}")
         tables.PAGE.write_text(tables.page(stored()), encoding="utf-8")
         curves.figure(stored(), curves.FIGURE)
+        return 0
+    if options.what == "pictures":
+        place = runs.Workplace(options.out, SETTINGS[options.setting], PICTURES)
+        dates.run(place, _scenes(options, place.setting, set(options.only or PICTURED)))
+        say(f"written to {options.out}")
         return 0
     failed = 0
     if options.what == "run":
@@ -164,7 +172,9 @@ def _scenes(options: argparse.Namespace, setting: Setting, wanted: set[str]) -> 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m experiments.paper", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=("run", "report", "keep"), default="run")
+    parser.add_argument(
+        "what", nargs="?", choices=("run", "report", "pictures", "keep"), default="run"
+    )
     parser.add_argument("--setting", choices=tuple(SETTINGS), default="reduced")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
     parser.add_argument(

@@ -15,6 +15,10 @@ from orthonav.core.files import write_text
 
 ROWS = Path(__file__).resolve().parent / "rows"
 """Results that the page shows, a folder for each setting."""
+WORDS = ROWS.with_name("words.json")
+"""Results of `python -m experiments.paper.words`."""
+DATES = ROWS.with_name("dates.json")
+"""How alike two dates look: results of `python -m experiments.paper pictures`."""
 BASELINES, FIELD = "baselines", "field"
 DIGITS = 5
 """Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
@@ -86,8 +90,12 @@ def stored() -> list[Result]:
 def keep(results: Path, setting: str) -> list[str]:
     """Copy the results of a setting into the repository; the names of the rows that changed."""
     changed = []
-    for path in sorted((results / setting).glob("*.json")):
-        target = ROWS / setting / path.name
+    found = [
+        (path, ROWS / setting / path.name) for path in sorted((results / setting).glob("*.json"))
+    ]
+    for path, target in [*found, (results / DATES.name, DATES)]:
+        if not path.is_file():
+            continue
         text = path.read_text(encoding="utf-8")
         if not target.is_file() or target.read_text(encoding="utf-8") != text:
             target.parent.mkdir(parents=True, exist_ok=True)

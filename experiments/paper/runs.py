@@ -28,7 +28,7 @@ from benchmarks.scenes import store
 from numpy.typing import NDArray
 
 from experiments.paper import scenes as views
-from experiments.paper.methods import SWEPT_ON, TILE_PX, Method, Setting
+from experiments.paper.methods import DEFAULT, SWEPT_ON, TILE_PX, Method, Setting
 from experiments.paper.published import most_views
 from experiments.paper.results import ACCURACY_M, compact
 from experiments.paper.results import BASELINES as BASELINES_KEY
@@ -213,6 +213,14 @@ def _map(
     build_s = time.perf_counter() - start
     opened = open_map(work / "map.onav")
     return opened, {"build_s": build_s, "learn_s": marks[1.0] - marks[0.0]}
+
+
+def geometry(place: Workplace, scene: Scene) -> Localizer:
+    """Frame, grid and tiles of a scene: its map by gradients, built if it is not there."""
+    work = place.work(scene, MAP_OF)
+    if not (work / "map.onav").is_file():
+        _map(place, scene, Method(DEFAULT, DEFAULT, DEFAULT), work)
+    return Localizer(open_map(work / "map.onav"), registration=False)
 
 
 def _sizes(opened: MapFile) -> dict[str, float]:

@@ -240,6 +240,32 @@ def grounds(scene: Scene, frame: LocalFrame, grid: TileGrid, places: Array) -> l
     return found
 
 
+def reference_tiles(
+    scene: Scene, frame: LocalFrame, grid: TileGrid, centres_en_m: NDArray[np.floating[Any]]
+) -> list[NDArray[np.uint8]]:
+    """Grey levels (256, 256) of the tiles with these centres (N, 2), of the date of the map."""
+    with Mosaic.open([scene.past]).grid_sheet(frame, grid) as raster:
+        grey = raster.read(0, 0, grid.width_px, grid.height_px).grey
+    corners = grid.tiles_rc(centres_en_m) * grid.stride_px
+    return [grey[row : row + TILE_PX, col : col + TILE_PX] for row, col in corners.tolist()]
+
+
+def grid_views(
+    scene: Scene,
+    frame: LocalFrame,
+    grid: TileGrid,
+    centres_en_m: NDArray[np.floating[Any]],
+    count: int,
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """The views on the grid: number of the tile, a row of the centres (N, 2), and grey levels."""
+    places = on_grid(places_en_m(centres_en_m, count), centres_en_m)
+    agl_m = scene.trajectory.agl_m
+    camera = camera_of(agl_m, grid.gsd_m)
+    for ground in grounds(scene, frame, grid, places):
+        tile = int(np.hypot(*(centres_en_m - ground.truth_en_m).T).argmin())
+        yield tile, view_of(ground, camera, agl_m, grid.gsd_m)
+
+
 def camera_of(agl_m: float, gsd_m: float) -> Camera:
     """The camera whose views from `agl_m` are exactly one tile."""
     focal, middle = agl_m / gsd_m, TILE_PX / 2

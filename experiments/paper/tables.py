@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from benchmarks.record import Table, number
@@ -12,12 +13,25 @@ from benchmarks.scenes import far_m
 from numpy.typing import NDArray
 
 from experiments.paper import curves
-from experiments.paper.methods import BETWEEN_DATES, SETTINGS, SWEPT_ON, Method
+from experiments.paper.methods import (
+    BETWEEN_DATES,
+    CANNY,
+    DEFAULT,
+    GREY,
+    LEARNT,
+    SETTINGS,
+    SWEPT_ON,
+    TABLE_1,
+    Method,
+    column,
+)
 from experiments.paper.published import LOWE, TRAJECTORIES, published_accuracy, published_criterion
 from experiments.paper.results import (
     ACCURACY_M,
+    DATES,
     FIELD,
     TUNED,
+    WORDS,
     Result,
     Row,
     accepted_at,
@@ -68,6 +82,7 @@ def tables(results: Sequence[Result]) -> list[Table]:
     return [
         *scenes(made),
         *accuracy(made),
+        *dates(made),
         *criterion(made),
         *accepted(made),
         *above_default(made),
@@ -113,6 +128,128 @@ def accuracy(results: Sequence[Result]) -> list[Table]:
     notes = ("views along the route / on the grid / anywhere", TUNED)
     title = "Table 2: accuracy at 15 m, %"
     return _by_scene(title, results, cell, notes, published_accuracy, chance)
+
+
+COMPARED = (
+    ("autoencoder", CANNY),
+    ("autoencoder", GREY),
+    ("autoencoder", LEARNT),
+    ("bovw", GREY),
+    (DEFAULT, DEFAULT),
+)
+"""Columns of `dates`: family and input."""
+
+
+def dates(results: Sequence[Result]) -> list[Table]:
+    """Canny edges and grey levels of each scene with standard errors, and their difference."""
+    found = {scene: _compared(rows) for scene, rows in by_scene(results)}
+    found = {scene: rows for scene, rows in found.items() if COMPARED[0] in rows}
+    real = [scene for scene in found if column(scene) not in TABLE_1]
+    if not real:
+        return []
+    drawn = [scene for scene in found if scene not in real]
+    both = [found[scene] for scene in real if COMPARED[1] in found[scene]]
+    differences = [difference(*(rows[each] for each in COMPARED[:2])) for rows in both]
+    rows = [_dates_row(scene, found[scene]) for scene in (*drawn, *real)]
+    means = []
+    for each in COMPARED:
+        shares = [found[scene][each].accuracy("grid") for scene in real if each in found[scene]]
+        means.append(_of_scenes(shares, len(real)))
+    of_both = _of_scenes([mean for mean, _ in differences], len(real), signed=True)
+    empty = ["", "", "", ""]
+    rows.append(["mean of the real scenes", "", "", *means[:2], of_both, *means[2:], *empty])
+    signs = [0 if abs(mean) <= 2 * error else math.copysign(1, mean) for mean, error in differences]
+    counted = " / ".join(str(signs.count(sign)) for sign in (1, -1, 0))
+    counts = ["Canny better / worse / equal", "", "", "", "", counted, "", "", ""]
+    rows.append([*counts, *empty])
+    labels = [row_label(Row((0, False, 0), *each, False)) for each in COMPARED]
+    header = (
+        *("scene", "dates", "m per pixel", *labels[:2], "Canny minus grey", *labels[2:]),
+        *("default, anywhere", "alike: grey", "alike: Canny", "SIFT found again"),
+    )
+    notes = (
+        "accuracy at 15 m in %, with its standard error over the views; views on the grid: where "
+        "tiles lie more than 15 m apart this is the share of correct tiles; default, anywhere: "
+        "orthonav's default, views between the tiles",
+        "Canny minus grey: of the same views; the mean is over scenes, with the standard error "
+        "over scenes; better, worse: scenes with a difference of more than two standard errors",
+        f"alike: correlation of a view and its tile, of grey levels and of Canny edges smoothed by "
+        "a Gaussian of 1 px; SIFT found again: features of a view whose most similar feature of "
+        f"the correct tile is within 3 px, in %; means over the views, `{PROGRAM} pictures`",
+    )
+    return [Table("Canny or grey between dates", header, rows, notes)]
+
+
+def _compared(rows: Sequence[Result]) -> dict[tuple[str, str], Result]:
+    """Results of a scene by family and input; orthonav's default as "default"."""
+    placed = {(each.family, each.edges): each for each in best_words(rows) if not each.registration}
+    ours = [each for each in rows if each.registration]
+    return placed | ({("default", ""): ours[0]} if ours else {})
+
+
+def difference(canny: Result, grey: Result) -> tuple[float, float]:
+    """Mean difference of two results over the same views on the grid, and its standard error."""
+    pairs = zip(canny.right("grid"), grey.right("grid"), strict=True)
+    return mean_and_error([float(one) - float(other) for one, other in pairs])
+
+
+def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
+    """Mean and its standard error; NaN of fewer than two values."""
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+    return (float(np.mean(values)) if values else math.nan), spread / math.sqrt(len(values) or 1)
+
+
+def _dates_row(scene: str, rows: dict[tuple[str, str], Result]) -> list[str]:
+    plain = rows[COMPARED[0]].plain
+    stems = [Path(name).stem for name in list(plain.get("inputs", {}))[:2]]
+    shown = " / ".join(stem.removeprefix(f"{scene.replace('-', '_')}_") for stem in stems)
+    cells = []
+    for each in COMPARED:
+        star = "*" if each in rows and is_tuned(rows[each]) else ""
+        cells.append(_accuracy(rows[each]) + star if each in rows else "-")
+    apart = "-"
+    if COMPARED[1] in rows:
+        apart = _plus_minus(*difference(*(rows[each] for each in COMPARED[:2])), signed=True)
+    ours = rows.get(("default", ""))
+    alike = _alike().get(scene)
+    seen = [f"{alike['grey']:.2f}", f"{alike['canny']:.2f}"] if alike else ["-", "-"]
+    seen.append(percent(alike["features"]) if alike else "-")
+    default = "-" if ours is None else _accuracy(ours, "anywhere")
+    start = [scene, shown or "-", f"{plain['trajectory']['gsd_m']:g}"]
+    return [*start, *cells[:2], apart, *cells[2:], default, *seen]
+
+
+def _accuracy(each: Result, placement: str = "grid") -> str:
+    return _share(int(each.right(placement).sum()), len(each.right(placement)))
+
+
+def _share(right: int, count: int) -> str:
+    """A share in per cent with its standard error."""
+    if not count:
+        return "-"
+    mean = right / count
+    return _plus_minus(mean, math.sqrt(mean * (1 - mean) / count))
+
+
+def _plus_minus(mean: float, error: float, *, signed: bool = False) -> str:
+    if math.isnan(mean):
+        return "-"
+    shown = f"{100 * mean:+.0f}" if signed else percent(mean)
+    return f"{shown} ± {percent(error)}"
+
+
+def _of_scenes(values: Sequence[float], scenes: int, *, signed: bool = False) -> str:
+    """Mean and standard error over scenes, with their number where some are missing."""
+    shown = _plus_minus(*mean_and_error(values), signed=signed)
+    return shown if len(values) == scenes else f"{shown} ({len(values)} of {scenes})"
+
+
+def _alike() -> dict[str, dict[str, Any]]:
+    """What `pictures` has measured, by scene."""
+    if not DATES.is_file():
+        return {}
+    found = json.loads(DATES.read_text(encoding="utf-8"))
+    return {each["scene"]: each for each in found["scenes"]}
 
 
 def criterion(results: Sequence[Result]) -> list[Table]:
@@ -471,9 +608,13 @@ HEAD = """# Results of the paper's experiments
 Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit. [The paper's
 experiments](paper.md) has the protocol, the scenes and the discussion. Generated landscapes: seed
 1. `python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds and
-rules of position.
+rules of position, and other imagery along the route and anywhere.
 """
-ONLY_IN_REPORTS = ("Accepted at", "Rules of position")
+ONLY_IN_REPORTS = (
+    "Accepted at",
+    "Rules of position",
+    "Table 2: accuracy at 15 m, %: other imagery",
+)
 
 
 def page(rows: Sequence[Result]) -> str:
@@ -485,7 +626,7 @@ def page(rows: Sequence[Result]) -> str:
             text.append(f"## The {name} setting\n")
             shown = [each for each in tables(found) if not each.title.startswith(ONLY_IN_REPORTS)]
             text += [table.markdown() for table in shown]
-    text.append(agreement().markdown())
+    text += [agreement().markdown(), words().markdown()]
     return "\n".join(text)
 
 
@@ -506,3 +647,37 @@ def agreement() -> Table:
     )
     header = ("m per pixel", "Canny", "learnt", "density Canny", "density learnt")
     return Table("Edges between dates", header, rows, notes)
+
+
+def words() -> Table:
+    """The bag of words by vocabulary and similarity, on views of the map's date and of another."""
+    found = json.loads(WORDS.read_text(encoding="utf-8"))["scenes"]
+    rows = [
+        [
+            *(each["scene"], f"{row['words']:,}", f"{row['features']:,}"),
+            row["similarity"] + (", tf-idf" if row["tfidf"] else ""),
+            *(_share(*row[date]["right"]) for date in ("same", "other")),
+            *(number(100 * row[date]["above"]) for date in ("same", "other")),
+        ]
+        for each in found
+        for row in each["rows"]
+    ]
+    again = [
+        f"{each['scene']} "
+        + " / ".join(number(100 * each["found_again"][n]) for n in ("same", "other", "elsewhere"))
+        for each in found
+    ]
+    about = found[0]["provenance"]
+    notes = (
+        "views on the grid: accuracy at 15 m in % with its standard error; features: most SIFT "
+        "features of a picture; tiles above: median share of the tiles with a higher score than "
+        "the correct one, in %, 50 for a guess",
+        "SIFT features of a view whose most similar feature of the tile is within 3 px, in %, same "
+        f"date / other date / another tile: {'; '.join(again)}",
+        f"made by `{found[0]['command']}` at {about['commit'][:10]}, {about['date'][:10]}",
+    )
+    header = (
+        *("scene", "words", "features", "similarity", "same date", "other date"),
+        *("tiles above, same", "tiles above, other"),
+    )
+    return Table("Bag of words between dates", header, rows, notes)

@@ -3,9 +3,10 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from experiments.paper import published, runs, scenes
+from experiments.paper import dates, published, runs, scenes, words
 from experiments.paper.__main__ import main
 from experiments.paper.methods import (
     FULL,
@@ -67,6 +68,32 @@ def test_the_full_setting_leaves_no_row_out():
         fewer = {each.key for each in methods(REDUCED, scene, 900)}
         assert {"gradient-gradient", "autoencoder-canny"} <= fewer
     assert {"autoencoder-segments", "triplet-segments", "triplet-gray"} <= rows
+
+
+def test_every_real_scene_gets_the_auto_encoder_on_edges_and_grey_levels():
+    for scene in (*scenes.REDUCED_REAL, *scenes.UNTUNED):
+        rows = {each.key for each in methods(REDUCED, scene, 900)}
+        assert {f"autoencoder-{edges}" for edges in ("canny", "gray", "onnx")} <= rows
+
+
+def test_a_picture_is_like_itself_and_not_like_another():
+    rng = np.random.default_rng(0)
+    one, other = (cv2.resize(each, (256, 256)) for each in rng.integers(0, 256, (2, 32, 32), "u1"))
+    assert dates.alike([(one, one)]) == pytest.approx({"grey": 1, "canny": 1, "features": 1})
+    assert max(map(abs, dates.alike([(one, other)]).values())) < 0.2
+    assert dates.correlation(one, np.zeros_like(one)) == 0
+    assert dates.found_again(np.zeros_like(one), one) == 0
+
+
+def test_bags_of_words_are_weighed_and_ranked():
+    counts = np.array([[3, 1], [0, 4], [0, 0]])
+    bags = words.weighed(counts, np.array([1.0, 2.0]), "product", 0)
+    assert bags.tolist() == [[0.75, 0.25], [0, 1], [0, 0]]
+    scaled = words.weighed(counts, np.array([1.0, 3.0]), "cosine", 1)
+    assert scaled == pytest.approx(np.array([[1, 1], [0, 2**0.5], [0, 0]]) / 2**0.5)
+    centres = np.array([[0.0, 0], [10, 0], [99, 0]])
+    found = words.placed(np.array([[0.2, 0.5, 0.1], [0.3, 0.2, 0.9]]), [0, 1], centres)
+    assert found == {"right": [1, 2], "above": pytest.approx(0.5)}
 
 
 def test_views_snap_to_the_nearest_tile_centre():

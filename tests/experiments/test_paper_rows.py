@@ -8,7 +8,7 @@ from experiments.paper import curves, results
 from experiments.paper.__main__ import main
 from experiments.paper.methods import CURVE, EPOCHS, REDUCED, TABLE_1, methods
 from experiments.paper.results import Result, compact, stored
-from experiments.paper.tables import PAGE, above_default, page
+from experiments.paper.tables import PAGE, above_default, dates, page
 
 TILES = 940
 
@@ -97,3 +97,37 @@ def test_networks_are_shown_as_they_learn(tmp_path):
     ]
     curves.figure(learnt, tmp_path / "epochs.png")
     assert cv2.imread(str(tmp_path / "epochs.png")) is not None
+
+
+def placed(key, scene, errors_m):
+    """A row whose views on the grid have these errors."""
+    made = row(key)
+    made.plain["scene"], made.plain["inputs"] = scene, {"2009_04.tif": "", "2015_04.tif": ""}
+    made.plain["views"]["grid"] = [[error, 1.0, 1.0, 1.0, 0.0] for error in errors_m]
+    return made
+
+
+def test_canny_and_grey_are_compared_on_the_same_views(tmp_path, monkeypatch):
+    """Differences 0, 1, 0, 1: 50 with a standard error of sqrt(1/3) / 2; and 1, 1, 1, 1."""
+    alike = {"scene": "garching", "grey": 0.254, "canny": 0.5, "features": 0.02}
+    (tmp_path / "dates.json").write_text(json.dumps({"scenes": [alike]}))
+    monkeypatch.setattr("experiments.paper.tables.DATES", tmp_path / "dates.json")
+    canny, grey = "autoencoder-canny", "autoencoder-gray"
+    rows = [
+        placed(canny, "garching", [0, 0, 99, 0]),
+        placed(grey, "garching", [0, 99, 99, 99]),
+        placed(canny, "aral", [0, 0, 0, 0]),
+        placed(grey, "aral", [99, 99, 99, 99]),
+        placed(canny, "tours", [99, 99, 99, 99]),
+        placed(canny, "B", [0, 0, 0, 0]),
+    ]
+    (table,) = dates(rows)
+    found = {each[0]: each[1:] for each in table.rows}
+    assert list(found)[:2] == ["B", "aral"]
+    shown = ["2009_04 / 2015_04", "1", "75 ± 22", "25 ± 22", "+50 ± 29"]
+    assert found["garching"] == [*shown, "-", "-", "-", "-", "0.25", "0.50", "2"]
+    assert found["aral"][2:5] == ["100 ± 0", "0 ± 0", "+100 ± 0"]
+    means = found["mean of the real scenes"]
+    assert means[2:5] == ["58 ± 30", "12 ± 12 (2 of 3)", "+75 ± 25 (2 of 3)"]
+    assert found["Canny better / worse / equal"][4] == "1 / 0 / 1"
+    assert dates(rows[-1:]) == []

@@ -1,0 +1,118 @@
+"""How alike two dates look to each method, and pictures of what the encoder sees of them.
+
+`python -m experiments.paper pictures` writes `dates.json`, which `keep` stores, and pictures: a
+tile of the map and the view of the same place, as grey levels and as Canny edges. Those of real
+imagery stay where they are written: the imagery is not ours.
+"""
+
+import time
+from collections.abc import Iterable, Sequence
+
+import cv2
+import numpy as np
+from benchmarks.record import provenance
+from numpy.typing import NDArray
+
+from experiments.paper import scenes
+from experiments.paper.results import DATES
+from experiments.paper.runs import Workplace, geometry, head, save
+from experiments.paper.scenes import Scene
+from orthonav.core.tiles.represent import Canny
+from orthonav.core.tiles.words import WordsRecipe
+
+Grey = NDArray[np.uint8]
+Pair = tuple[Grey, Grey]
+"""Tile of the map and view of the same place."""
+BLUR_STD_PX = 1.0
+"""Edges are compared smoothed by a Gaussian, so that those a pixel apart agree."""
+FOUND_PX = 3.0
+"""A feature is found again if the most similar one of the tile lies so near."""
+GENERATED, SHOWN = "generated", ("A", "B")
+"""Picture of these trajectories over generated landscapes, which the docs show."""
+TITLE_PX, GAP_PX, WHITE = 24, 6, 255
+GREY_STEP = 8
+"""Grey levels of pictures are multiples of this: a PNG is half as large."""
+
+
+def run(place: Workplace, chosen: Iterable[Scene]) -> None:
+    """Write `dates.json` and `pictures` into the folder of results."""
+    start, started, made = time.perf_counter(), provenance("paper pictures"), []
+    strips: dict[str, list[Grey]] = {}
+    for scene in chosen:
+        scenes.render(scene)
+        pairs = pairs_of(place, scene)
+        made.append(head(place, scene, started) | {"views": len(pairs)} | alike(pairs))
+        name = GENERATED if scene.name in SHOWN else scene.name
+        strips.setdefault(name, []).append(strip(scene, pairs[len(pairs) // 2]))
+    save(place.out / DATES.name, {"scenes": made}, start)
+    folder = place.out / "pictures"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, parts in strips.items():
+        cv2.imwrite(str(folder / f"{name}.png"), np.vstack(parts))
+
+
+def pairs_of(place: Workplace, scene: Scene) -> list[Pair]:
+    """The views on the grid, each with its tile."""
+    localizer = geometry(place, scene)
+    ground = localizer.sheet.frame, localizer.grid, localizer.tiles.centres_en_m
+    tiles = scenes.reference_tiles(scene, *ground)
+    views = scenes.grid_views(scene, *ground, place.setting.views)
+    return [(tiles[tile], view) for tile, view in views]
+
+
+def alike(pairs: Sequence[Pair]) -> dict[str, float]:
+    """Means over pairs: correlation of grey levels and of Canny edges, and features found again."""
+    found = {
+        "grey": [correlation(tile, view) for tile, view in pairs],
+        "canny": [correlation(blurred(edges(a)), blurred(edges(b))) for a, b in pairs],
+        "features": [found_again(view, tile) for tile, view in pairs],
+    }
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def edges(grey: Grey) -> NDArray[np.float32]:
+    """Canny edges (H, W), 0 or 1, with the paper's thresholds."""
+    return np.asarray(Canny()(grey, np.ones(grey.shape, np.bool_))[0], np.float32)
+
+
+def blurred(seen: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(seen, (0, 0), BLUR_STD_PX), np.float32)
+
+
+def correlation(one: NDArray[np.generic], other: NDArray[np.generic]) -> float:
+    """Correlation coefficient of two pictures (H, W); 0 where one of them is flat."""
+    a, b = (np.asarray(each, np.float64).ravel() for each in (one, other))
+    a, b = a - a.mean(), b - b.mean()
+    power = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / power if power else 0.0
+
+
+def found_again(view: Grey, tile: Grey) -> float:
+    """Share of the SIFT features of a view whose most similar feature of the tile is in place."""
+    sift = cv2.SIFT.create(nfeatures=WordsRecipe.max_features)
+    (here, ours), (there, theirs) = (sift.detectAndCompute(each, None) for each in (view, tile))
+    if not here or not there:
+        return 0.0
+    pairs = cv2.BFMatcher(cv2.NORM_L2).match(ours, theirs)
+    away = [np.subtract(here[m.queryIdx].pt, there[m.trainIdx].pt) for m in pairs]
+    return float((np.hypot(*np.array(away).T) <= FOUND_PX).mean())
+
+
+def strip(scene: Scene, pair: Pair) -> Grey:
+    """Tile and view as grey levels, then as edges, side by side under their titles."""
+    dates = scene.past.stem, scene.present.stem
+    names = [f"{scene.name}, {dates[0]}, map", f"{dates[1]}, view", *(f"{d}, Canny" for d in dates)]
+    greys = [each // GREY_STEP * GREY_STEP for each in pair]
+    drawn = [WHITE - WHITE * edges(each).astype(np.uint8) for each in pair]
+    return np.hstack([titled(*each) for each in zip(names, [*greys, *drawn], strict=True)])
+
+
+def titled(title: str, picture: Grey) -> Grey:
+    """The picture (H, W) with a title above and a gap to the next one."""
+    height, width = picture.shape
+    out = np.full((TITLE_PX + height + GAP_PX, width + GAP_PX), WHITE, np.uint8)
+    out[TITLE_PX : TITLE_PX + height, :width] = picture
+    cv2.rectangle(out, (0, TITLE_PX), (width - 1, TITLE_PX + height - 1), 0)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(out, title, (0, TITLE_PX - 7), font, 0.5, 0, 1, cv2.LINE_AA)
+    return out
