@@ -40,7 +40,7 @@ class Table:
     def markdown(self, level: int = 3) -> str:
         """The table in Markdown, its columns aligned for the terminal."""
         lines = [self.header, *self.rows]
-        widths = [max(len(line[col]) for line in lines) for col in range(len(self.header))]
+        widths = [max(2, *(len(line[col]) for line in lines)) for col in range(len(self.header))]
         rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
         text = [f"{'#' * level} {self.title}", ""]
         for line in (self.header, rule, *self.rows):

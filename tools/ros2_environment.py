@@ -3,8 +3,9 @@
     python tools/ros2_environment.py
 
 makes those that are missing, under `~/.cache/orthonav` (or `$XDG_CACHE_HOME/orthonav`). Where one
-cannot be installed, it says so, and the tests that need it are skipped by name. Wheels exist for
-Linux on x86-64 with Python 3.10 to 3.13.
+cannot be installed, it says so, and the tests that need it are skipped by name. They are not in the
+environment of the project: a package of theirs starts every Python there twice, with the library
+path of ROS, and distributions exclude each other. Wheels exist for x86-64, Python 3.10 to 3.14.
 """
 
 import os

@@ -58,7 +58,7 @@ COMMANDS: dict[str, Sequence[str]] = {
 """Commands tried with an extra, in this order; later ones use what earlier ones made."""
 SCRIPTS = {
     "completion": "import argcomplete; assert argcomplete.autocomplete",
-    "ros2": "import cyclonedds.domain, rosbags.typesys",
+    "ros2": "import rclpy, rosbags.typesys; rclpy.init(); rclpy.create_node('a')",
     "web": "from orthonav.ground.view.server import load_assets; assert '/' in load_assets()",
     "neural": "import onnxruntime; assert onnxruntime.get_available_providers()",
 }

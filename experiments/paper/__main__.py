@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks.record import say
 from benchmarks.scenes import DATA
 
-from experiments.paper import dates, field, matchers, runs, scenes, tables
+from experiments.paper import curves, dates, field, matchers, runs, scenes, tables
 from experiments.paper.methods import (
     BETWEEN_DATES,
     FIELD_SCENES,
@@ -49,6 +49,7 @@ def main(arguments: list[str]) -> int:
         for name in keep(options.out, options.setting):
             say(f"stored: {name}")
         tables.PAGE.write_text(tables.page(stored()), encoding="utf-8")
+        curves.figure(stored(), curves.FIGURE)
         return 0
     if options.what == "pictures":
         place = runs.Workplace(options.out, SETTINGS[options.setting], PICTURES)

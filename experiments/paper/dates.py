@@ -27,8 +27,8 @@ BLUR_STD_PX = 1.0
 """Edges are compared smoothed by a Gaussian, so that those a pixel apart agree."""
 FOUND_PX = 3.0
 """A feature is found again if the most similar one of the tile lies so near."""
-GENERATED, SHOWN = "generated", ("A", "B")
-"""Picture of these trajectories over generated landscapes, which the docs show."""
+FIGURE, SHOWN = "dates.png", ("A", "B")
+"""Picture of these trajectories over generated landscapes; `docs/figures` has a copy."""
 TITLE_PX, GAP_PX, WHITE = 24, 6, 255
 GREY_STEP = 8
 """Grey levels of pictures are multiples of this: a PNG is half as large."""
@@ -42,13 +42,13 @@ def run(place: Workplace, chosen: Iterable[Scene]) -> None:
         scenes.render(scene)
         pairs = pairs_of(place, scene)
         made.append(head(place, scene, started) | {"views": len(pairs)} | alike(pairs))
-        name = GENERATED if scene.name in SHOWN else scene.name
+        name = FIGURE if scene.name in SHOWN else f"{scene.name}.png"
         strips.setdefault(name, []).append(strip(scene, pairs[len(pairs) // 2]))
     save(place.out / DATES.name, {"scenes": made}, start)
     folder = place.out / "pictures"
     folder.mkdir(parents=True, exist_ok=True)
     for name, parts in strips.items():
-        cv2.imwrite(str(folder / f"{name}.png"), np.vstack(parts))
+        cv2.imwrite(str(folder / name), np.vstack(parts))
 
 
 def pairs_of(place: Workplace, scene: Scene) -> list[Pair]:

@@ -124,7 +124,8 @@ class Setting:
 LEARNABLE = ",mining=semihard,similarity=cosine,margin=0.2"
 REDUCED = Setting("reduced", 32, 3e-3, 16, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
 FULL = Setting("full", 512, 3e-4, 32, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
-LENGTHS, GPU = replace(FULL, name="lengths"), replace(FULL, name="gpu")
+LENGTHS = replace(FULL, name="lengths", swept=100)
+GPU = replace(FULL, name="gpu")
 EPOCHS = replace(FULL, name="epochs", views=100, swept=0)
 SETTINGS = {each.name: each for each in (REDUCED, LENGTHS, EPOCHS, GPU, FULL)}
 CURVE = {"autoencoder": (1, 2, 3, 5, 7, 10), "triplet": (1, 2, 3)}

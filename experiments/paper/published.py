@@ -1,4 +1,4 @@
-"""The paper's own figures, from its Tables 2 and 3: other imagery, so shapes and no targets."""
+"""The paper's own figures, from its Tables 2 and 3, of other imagery: compare the order."""
 
 from experiments.paper.methods import CANNY, GREY, SAM, SEGMENTS, column
 
@@ -21,9 +21,9 @@ TABLE_3 = {
 """Table 3: accuracy and accepted share in per cent at Lowe's ratio 1.13, auto-encoder."""
 LOWE = 1.13
 VIEWS = {"A": 625, "B": 500, "C": 300, "D": 84}
-"""Numbers of views that the shares of Table 2 are multiples of; the triplet's have one less."""
+"""Numbers of views that most shares of Table 2 are multiples of; the triplet's have one less."""
 MOST_VIEWS = 500
-"""Views along a route that the paper has not."""
+"""Most views along the route of a scene that is not in the paper."""
 
 
 def most_views(scene: str) -> int:

@@ -161,15 +161,15 @@ def accepted_at(right: NDArray[np.bool_], ratio: Array, accuracy: float = ACCURA
 
 
 def ceiling(stride_m: float) -> float:
-    """Accuracy at 15 m of one who always names the right tile, for views anywhere: the part of a
-    square of `stride_m` that lies within the circle."""
+    """Accuracy at 15 m of a method that always finds the correct tile, for views anywhere: the
+    part of a square of `stride_m` that lies within the circle."""
     axis = (np.arange(400) + 0.5) / 400 * stride_m / 2
     return float((np.hypot(axis[:, None], axis) <= ACCURACY_M).mean())
 
 
 TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
 FAMILIES = {
-    "bovw": "Bag of Words",
+    "bovw": "BoVW",
     "triplet": "Triplet",
     "autoencoder": "Auto-Encoder",
     "caevl": "CAEVL",
@@ -181,7 +181,7 @@ EDGES = {
     "segments": "segments",
     "sam": "Segment Anything, sheet",
     "sam-tile": "Segment Anything, tile",
-    "onnx": "learnt",
+    "onnx": "learnt edges",
     "gradient": "gradients",
 }
 

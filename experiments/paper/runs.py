@@ -154,7 +154,7 @@ def _prepare(jobs: int) -> None:
 
 
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
-    """Header of a result file: method, imagery and settings of the run."""
+    """Header of a result file: imagery and settings of the run."""
     return {
         "scene": scene.name,
         "trajectory": asdict(scene.trajectory),
@@ -242,7 +242,7 @@ def _sizes(opened: MapFile) -> dict[str, float]:
 def _placed(
     scene: Scene, localizer: Localizer, setting: Setting, registration: bool
 ) -> dict[str, Any]:
-    """Errors and evidence of the views of both placements, the sweep, chance, and times."""
+    """Errors and evidence of the views of all placements, the sweep, chance, and times."""
     grid, frame = localizer.grid, localizer.sheet.frame
     agl_m, gsd_m = scene.trajectory.agl_m, grid.gsd_m
     camera = views.camera_of(agl_m, gsd_m)
@@ -296,7 +296,7 @@ def placements(
 
 
 def _chance(grounds: list[views.Ground], centres_en_m: NDArray[np.float32]) -> float:
-    """Share of tiles within the radius of a view, the mean over views: what a guess gets."""
+    """Share of tiles within the radius of a view, the mean over views: what a random tile gets."""
     if not grounds:
         return float("nan")
     shares = [

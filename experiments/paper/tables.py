@@ -12,6 +12,7 @@ from benchmarks.record import Table, number
 from benchmarks.scenes import far_m
 from numpy.typing import NDArray
 
+from experiments.paper import curves
 from experiments.paper.methods import (
     BETWEEN_DATES,
     CANNY,
@@ -24,7 +25,13 @@ from experiments.paper.methods import (
     Method,
     column,
 )
-from experiments.paper.published import LOWE, TRAJECTORIES, published_accuracy, published_criterion
+from experiments.paper.published import (
+    LOWE,
+    TRAJECTORIES,
+    published_accuracy,
+    published_criterion,
+    stands_for,
+)
 from experiments.paper.results import (
     ACCURACY_M,
     DATES,
@@ -54,7 +61,7 @@ from orthonav.core.records import CONFIDENT
 
 PROGRAM = "python -m experiments.paper"
 SHOWN_RULES = ("product best", "product weighted", "cosine best", "cosine neighbours")
-STEPS = (("heading_deg", "heading error, deg"), ("drop_m", "height lower by, m"))
+STEPS = (("heading_deg", "orientation, deg"), ("drop_m", "altitude drop, m"))
 Cell = Callable[[Result], str]
 Published = Callable[[str, str, str], str]
 """The paper's figure of a family, an input and a scene."""
@@ -74,6 +81,9 @@ def report(out: Path, setting: str) -> Path | None:
 
 def tables(results: Sequence[Result]) -> list[Table]:
     """All tables of results of one setting."""
+    learning = curves.table(results)
+    if learning:  # rows of one training share their label
+        return [*learning, provenance(results)]
     made = [each for each in results if each.family]
     return [
         *scenes(made),
@@ -103,13 +113,13 @@ def scenes(results: Sequence[Result]) -> list[Table]:
         rows.append([scene, *size, *grid, percent(ceiling(first.stride_m)), views])
     header = (
         *("scene", "area m", "height m", "m per pixel", "tiles", "tile step m"),
-        *("possible %", "views"),
+        *("upper bound %", "views"),
     )
     notes = (
-        "possible: accuracy at 15 m, anywhere, of a method that always finds the correct tile; "
+        "upper bound: accuracy at 15 m, anywhere, of a method that always finds the correct tile; "
         "views: along the route (one per tile step), on the grid of tiles, anywhere",
     )
-    return [Table("Scenes", header, rows, notes)] if rows else []
+    return [Table("Table 1: trajectories and scenes", header, rows, notes)] if rows else []
 
 
 def accuracy(results: Sequence[Result]) -> list[Table]:
@@ -301,7 +311,7 @@ def _by_scene(
             names = [scene for scene, _ in found]
             rows = _rows(found, cell, paper if papers else None)
             if chance:
-                rows.append(["a guess", *(chance(each[0]) for _, each in found)])
+                rows.append(["random tile", *(chance(each[0]) for _, each in found)])
             header = ("method", *names)
             made.append(Table(f"{title}: {what}", header, rows, () if made else notes))
     return made
@@ -321,7 +331,8 @@ def _rows(
         rows.append([row_label(row), *(cells[row].get(scene, "-") for scene, _ in found)])
         figures = [paper(row.family, row.edges, scene) for scene, _ in found] if paper else []
         if not row.registration and any(each != "-" for each in figures):
-            rows.append(["- in the paper", *figures])
+            known = " (Segment Anything)" if stands_for(row.edges) != row.edges else ""
+            rows.append([f"- in the paper{known}", *figures])
     return rows
 
 
@@ -364,9 +375,12 @@ def sensitivity(results: Sequence[Result]) -> list[Table]:
                 ]
                 for each in swept
             ]
-            notes = (f"{count} views on the grid of {swept[0].scene}",)
+            notes = (
+                f"{count} views on the grid of {swept[0].scene}; the default searches headings, "
+                "the other methods take the reported one as exact",
+            )
             header = ("method", *values)
-            made.append(Table(f"Accuracy at 15 m, %, by {title}", header, rows, notes))
+            made.append(Table(f"Figure 3: accuracy at 15 m, %, by {title}", header, rows, notes))
     return made
 
 
@@ -405,8 +419,8 @@ def costs(results: Sequence[Result]) -> list[Table]:
         rows.append([named(each), *map(number, figures)])
     header = ("method", "learn s", "MB per km2", "encoder MB", "ms per view")
     notes = (
-        "learn s: the encoder, with embedding all tiles; MB per km2: the map file less the encoder "
-        "or vocabulary, which it holds once; ms: one view from its picture to the fix, one core",
+        "times: wall-clock, in the reduced setting two rows at a time; learn s: the encoder, with "
+        "embedding all tiles; MB per km2: the map file less the encoder or vocabulary, which it holds once; ms: one view from its picture to the fix, one core",
     )
     return [Table(f"Cost, {scene}", header, rows, notes)]
 

@@ -1,4 +1,4 @@
-"""Ratios by hand, and a logistic confidence that is right as often as it says."""
+"""A logistic confidence that is right as often as it says."""
 
 import math
 
@@ -7,24 +7,7 @@ import pytest
 
 from orthonav.core.errors import VariantError
 from orthonav.core.localize.confidence import TILE_FEATURES, USUAL_TILES, LogisticConfidence
-from orthonav.core.localize.tiles import MAX_RATIO, lowe_ratio
 from orthonav.ground.build.calibrate import fit_few, fit_weights
-
-
-@pytest.mark.parametrize(
-    "values, expected",
-    [
-        ((0.5, 1.0, 0.25), 2.0),
-        ((1.0, 0.01), MAX_RATIO),
-        ((1.0, -0.5), MAX_RATIO),
-        ((-0.5, -0.25), 1.0),
-        ((0.5,), MAX_RATIO),
-        ((), MAX_RATIO),
-    ],
-)
-def test_lowe_ratio_by_hand(values, expected):
-    assert lowe_ratio(np.array(values, np.float32)) == expected
-
 
 TRUTH = LogisticConfidence(-6.0, (5.0, 12.0))
 

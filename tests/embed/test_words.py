@@ -12,7 +12,7 @@ from orthonav.core.errors import VariantError
 from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe, describe
 from orthonav.core.variants import Variant, make_variant
-from orthonav.research.words import learn_words
+from orthonav.research.words import SheetWords, learn_words
 
 TABLE = {"bovw": Variant("orthonav.core.tiles.words:WordsRecipe")}
 NOTHING = np.zeros(0, np.float32)
@@ -61,21 +61,10 @@ def learnt():
     return learn_words(WordsRecipe(words=256), pictures_of(tiles(area())), seed=1)
 
 
-# Frequencies.
-
-
-def test_frequencies_are_counts_of_nearest_words():
-    """Against a plain calculation in float64."""
-    embedder = random_embedder()
+def test_features_are_opencvs_sift():
     grey = tiles(area())[0]
-    _, descriptors = cv2.SIFT_create().detectAndCompute(grey, None)
-    words = embedder.vocabulary.astype(float)
-    nearest = [((each.astype(float) - words) ** 2).sum(axis=1).argmin() for each in descriptors]
-    expected = np.bincount(nearest, minlength=300) / len(descriptors)
-    out = embedder.view(maps_of(grey), everywhere(grey))
-    assert len(descriptors) > 100 and len(np.unique(nearest)) > 10
-    assert out.shape == (300,) and out.dtype == np.float32
-    np.testing.assert_allclose(out, expected, rtol=1e-6)
+    _, expected = cv2.SIFT.create(nfeatures=2000).detectAndCompute(grey, None)
+    np.testing.assert_array_equal(describe(WordsRecipe(), grey, everywhere(grey)), expected)
 
 
 @pytest.mark.parametrize("words", [256, 2000])
@@ -138,6 +127,31 @@ def test_places_are_found_again(learnt):
         best = np.array(starts[int(scores.argmax())])[::-1] + 63.5
         right += np.abs(best - place).max() <= 64
     assert right >= 8
+
+
+@pytest.mark.parametrize("block_px", [400, 1024])
+def test_words_of_a_tile_are_those_of_the_sheet_within_it(learnt, monkeypatch, block_px):
+    """But for the few whose surroundings the edge of the tile cuts."""
+    monkeypatch.setattr("orthonav.research.words.BLOCK_PX", block_px)
+    grey, corners = area(), np.array([[96, 192], [500, 11]])
+    shares = []
+    found = SheetWords.find(learnt, grey, everywhere(grey), shares.append)
+    assert shares[-1] == 1 and len(shares) == (4 if block_px == 400 else 1)
+    for (row, col), sheet in zip(corners, found.views(corners, 192), strict=True):
+        tile = grey[row : row + 192, col : col + 192]
+        alone = learnt.view(maps_of(tile), everywhere(tile))
+        assert sheet.sum() == pytest.approx(1) and np.minimum(sheet, alone).sum() > 0.85
+
+
+def test_words_of_a_tile_are_those_of_its_strongest_features(learnt):
+    grey, recipe = area(), WordsRecipe(words=256, max_features=20)
+    few = WordsEmbedder(recipe, learnt.vocabulary, NOTHING)
+    valid = everywhere(grey)
+    valid[:, 300:] = False
+    found = SheetWords.find(few, grey, valid, lambda share: None)
+    (view,) = found.views(np.array([[96, 100]]), 192)
+    np.testing.assert_array_equal(view * 20, np.rint(view * 20))
+    assert view.sum() == pytest.approx(1) and found.points[:, 0].max() < 300
 
 
 @pytest.mark.parametrize("greys", [[], [np.zeros((64, 64), np.uint8)], [area(size=100)]])

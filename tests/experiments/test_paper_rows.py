@@ -3,9 +3,10 @@
 import json
 from dataclasses import asdict
 
-from experiments.paper import results
+import cv2
+from experiments.paper import curves, results
 from experiments.paper.__main__ import main
-from experiments.paper.methods import REDUCED, TABLE_1, methods
+from experiments.paper.methods import CURVE, EPOCHS, REDUCED, TABLE_1, methods
 from experiments.paper.results import Result, compact, stored
 from experiments.paper.tables import PAGE, above_default, dates, page
 
@@ -53,6 +54,7 @@ def test_results_are_kept_and_the_page_follows(tmp_path, monkeypatch):
     shown = tmp_path / "page.md"
     monkeypatch.setattr("experiments.paper.tables.PAGE", shown)
     monkeypatch.setattr(results, "ROWS", tmp_path / "rows")
+    monkeypatch.setattr("experiments.paper.curves.FIGURE", tmp_path / "epochs.png")
     folder = tmp_path / "results" / "reduced"
     folder.mkdir(parents=True)
     (folder / "B-autoencoder-canny.json").write_text(compact(row().plain))
@@ -78,6 +80,23 @@ def test_rows_above_the_default_are_named():
     ours.plain["views"]["route"] = [*[[1.0] * 5] * 49, [99.0] * 5]
     assert above_default([canny, ours])[0].rows[0][-1] == "within the noise"
     assert above_default([canny]) == []
+
+
+def test_networks_are_shown_as_they_learn(tmp_path):
+    chosen = [each for each in methods(EPOCHS, "B", TILES) if each.training.endswith("canny-512")]
+    assert len({each.key for each in chosen}) == len(CURVE["autoencoder"]) == len(chosen)
+    plain = row().plain | {"peak_mb": 900, "setting": asdict(EPOCHS)}
+    learnt = [
+        Result(plain | {"method": asdict(each), "loss": [0.2] * each.number("epochs")})
+        for each in chosen[:2]
+    ]
+    (shown,) = curves.table(learnt)
+    assert shown.header[1:3] == ("1", "2")
+    assert shown.rows == [
+        ["Auto-Encoder, Canny, width 512", "50", "50", "0.2 to 0.2", "900"],
+    ]
+    curves.figure(learnt, tmp_path / "epochs.png")
+    assert cv2.imread(str(tmp_path / "epochs.png")) is not None
 
 
 def placed(key, scene, errors_m):

@@ -51,16 +51,6 @@ def test_tiles_fill_the_raster_exactly(extent_and_grid):
     np.testing.assert_allclose(last, [corner[0] - half, corner[1] + half], atol=1e-6)
 
 
-def test_rows_go_south_and_columns_east():
-    grid = TileGrid.covering((0, 0, 96, 64), gsd_m=1, tile_px=64, overlap=0.5)
-    assert (grid.rows, grid.cols, grid.stride_m, grid.tile_m) == (2, 3, 32, 64)
-    assert grid.centres_en_m(np.array([[0, 0], [0, 2], [1, 0]])).tolist() == [
-        [16, 48],
-        [80, 48],
-        [16, 16],
-    ]
-
-
 @pytest.mark.parametrize(
     "change, message",
     [

@@ -152,6 +152,9 @@ def test_bands_given_one_by_one_are_named(tmp_path, caplog):
     paths = [layer(tmp_path / f"B0{n}.tif", GREY.astype(np.uint16) * 20) for n in (2, 3)]
     Mosaic.open(paths)
     assert "imagery: using B02.tif, not B03.tif: of one place and date: they fill" in caplog.text
+    caplog.clear()
+    Mosaic.open(paths, bands=(1,))
+    assert not caplog.text
 
 
 def test_colours_of_a_scene_stand_for_its_bands(tmp_path, caplog):

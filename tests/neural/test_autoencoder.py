@@ -1,21 +1,11 @@
-"""The auto-encoder has the paper's layers and size, and its loss is the mean squared error."""
+"""The auto-encoder reconstructs tiles of any size; pictures show what it does."""
 
 import numpy as np
 import pytest
 import torch
 
-from orthonav.core.tiles.network import AutoEncoderRecipe
 from orthonav.research.autoencoder import AutoEncoder, reconstructions
 from orthonav.research.tiles import SheetTiles
-
-PAPER_PARAMETERS = 172_506_561
-
-
-def test_the_default_has_exactly_the_papers_number_of_parameters():
-    recipe = AutoEncoderRecipe()
-    with torch.device("meta"):
-        model = AutoEncoder(width=recipe.width, dims=recipe.dims)
-    assert sum(values.numel() for values in model.parameters()) == PAPER_PARAMETERS
 
 
 @pytest.mark.parametrize("tile_px", [32, 48, 128])

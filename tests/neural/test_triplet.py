@@ -9,13 +9,6 @@ from orthonav.research.tiles import SheetTiles
 from orthonav.research.triplet import ResNet34, Triplets, triplet_loss
 
 
-def test_it_has_the_papers_number_of_parameters():
-    with torch.device("meta"):
-        model = ResNet34()
-    assert sum(values.numel() for values in model.parameters()) == 21_278_400
-    assert model.dims == 1024
-
-
 @pytest.mark.parametrize("tile_px", [32, 64, 96, 100])
 def test_channels_are_averaged_over_the_left_and_the_right_half(tile_px):
     model = ResNet34(tile_px=tile_px, width=2).eval()

@@ -1,11 +1,13 @@
 """The other end of the graph in a real ROS 2: a node of `rclpy`, run by the Python of its own
 environment. Nothing of this program is imported here.
 
-    python rclpy_peer.py FLIGHT.npz [--seconds S] [--enough N]
+    python rclpy_peer.py FLIGHT.npz [--seconds S] [--enough N] [--simulated]
 
-publishes the images of a flight with their camera_info, imu and range, stamped with the time of
-now, until the flight is over or N positions came. Without a flight (`-`) it publishes a number on
-/rel_alt. It prints what it hears on the topics of orthonav, one line of JSON each.
+publishes the images of a flight with their camera_info, imu, range and a GNSS receiver that lies,
+stamped with the time of now, until S seconds are over or N positions came. `--simulated`: the time
+is that of a /clock that began long ago. Without a flight (`-`) it publishes a number on /rel_alt.
+`odd` has endpoints that cannot match those of orthonav. It prints what it hears on the topics of
+orthonav, one line of JSON each.
 """
 
 import argparse
@@ -19,11 +21,14 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rcl_interfaces.msg import Log
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, Imu, NavSatFix, Range
 from std_msgs.msg import Float64
 
 IMU_HZ = 20.0
+LATCHED = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+SIMULATED_NS = 1_700_000_000 * 10**9
 
 
 def say(**values):
@@ -38,19 +43,19 @@ class Peer:
     def __init__(self):
         self.node = rclpy.create_node("peer")
         self.fixes = 0
-        for topic, kind, heard in (
-            ("/orthonav/fix", NavSatFix, self.fix),
-            ("/orthonav/pose", PoseWithCovarianceStamped, self.pose),
-            ("/diagnostics", DiagnosticArray, self.health),
-            ("/rosout", Log, self.log),
+        for topic, kind, heard, quality in (
+            ("/orthonav/fix", NavSatFix, self.fix, 10),
+            ("/orthonav/pose", PoseWithCovarianceStamped, self.pose, 10),
+            ("/diagnostics", DiagnosticArray, self.health, 10),
+            ("/rosout", Log, self.log, LATCHED),
         ):
-            self.node.create_subscription(kind, topic, heard, 10)
+            self.node.create_subscription(kind, topic, heard, quality)
 
     def fix(self, message):
         self.fixes += 1
         cov = list(message.position_covariance)
         place = message.latitude, message.longitude, message.altitude
-        say(fix=place, stamp_ns=stamp_ns(message), var_m2=cov[0], heard_ns=time.time_ns())
+        say(fix=place, stamp_ns=stamp_ns(message), var_m2=cov[0])
 
     def pose(self, message):
         where = message.pose.pose.position
@@ -64,7 +69,7 @@ class Peer:
 
     def log(self, message):
         if message.name == "orthonav":
-            say(log=message.msg, severity=message.level)
+            say(log=message.msg)
 
     def spin(self, until_s):
         while (left_s := until_s - time.monotonic()) > 0:
@@ -76,36 +81,49 @@ class Peer:
             publisher.publish(Float64(data=100.0))
             self.spin(time.monotonic() + 0.1)
 
+    def odd(self, seconds):
+        self.node.create_publisher(Image, "/cam/image_raw", qos_profile_sensor_data)
+        self.node.create_publisher(Float64, "/range", 10)
+        self.node.create_subscription(NavSatFix, "/orthonav/fix", self.fix, LATCHED)
+        self.spin(time.monotonic() + seconds)
+
     def stamped(self, kind, time_ns):
         made = kind()
         made.header.stamp.sec, made.header.stamp.nanosec = divmod(time_ns, 10**9)
         return made
 
-    def fly(self, flight, seconds, enough, reliable):
+    def fly(self, flight, seconds, enough, simulated):
         """Publish a flight, from its start again when it is over, for so long."""
         greys, yaw_rad = flight["greys"], math.radians(float(flight["yaw_enu_deg"]))
-        quality = 10 if reliable else qos_profile_sensor_data
-        image, info, imu, height = (
-            self.node.create_publisher(kind, topic, quality)
+        image, info, imu, height, gnss, clock = (
+            self.node.create_publisher(kind, topic, 10)
             for kind, topic in (
                 (Image, "/cam/image_raw"),
                 (CameraInfo, "/cam/camera_info"),
                 (Imu, "/imu"),
                 (Range, "/range"),
+                (NavSatFix, "/gnss"),
+                (Clock, "/clock"),
             )
         )
         while image.get_subscription_count() == 0:
             self.spin(time.monotonic() + 0.1)
         _, rows, columns = greys.shape
         begun_s, every_s, sent, step = time.monotonic(), float(flight["every_s"]), 0, 0
+        ahead_ns = SIMULATED_NS - time.time_ns() if simulated else 0
         while time.monotonic() - begun_s < seconds and self.fixes < enough:
-            now_ns = time.time_ns()
+            now_ns = time.time_ns() + ahead_ns
+            if simulated:
+                clock.publish(Clock(clock=self.stamped(Imu, now_ns).header.stamp))
             turn = self.stamped(Imu, now_ns)
             turn.orientation.z, turn.orientation.w = math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)
             imu.publish(turn)
             above = self.stamped(Range, now_ns)
             above.min_range, above.max_range, above.range = 1.0, 1000.0, float(flight["agl_m"])
             height.publish(above)
+            lie = self.stamped(NavSatFix, now_ns)
+            lie.latitude, lie.longitude = 10.0, 20.0
+            gnss.publish(lie)
             if time.monotonic() - begun_s >= sent * every_s:
                 made = self.stamped(CameraInfo, now_ns)
                 made.height, made.width, made.distortion_model = rows, columns, "plumb_bob"
@@ -126,14 +144,16 @@ def main():
     parser.add_argument("flight")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--enough", type=int, default=10**6)
-    parser.add_argument("--reliable", action="store_true")
+    parser.add_argument("--simulated", action="store_true")
     options = parser.parse_args()
     rclpy.init()
     peer = Peer()
     if options.flight == "-":
         peer.number(options.seconds)
+    elif options.flight == "odd":
+        peer.odd(options.seconds)
     else:
-        peer.fly(np.load(options.flight), options.seconds, options.enough, options.reliable)
+        peer.fly(np.load(options.flight), options.seconds, options.enough, options.simulated)
     say(nodes=peer.node.get_node_names())
     peer.node.destroy_node()
     rclpy.shutdown()

@@ -992,7 +992,7 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
 
     first = start(tmp_path / "1.jsonl", folder)
     try:
-        wait_for(state.exists)
+        wait_for(state.exists, process=first)
     finally:
         first.send_signal(signal.SIGKILL)
         first.wait()
@@ -1004,7 +1004,7 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
     (rest / "telemetry.csv").write_text("\n".join([names, *views[flown_views:]]) + "\n")
     second = start(tmp_path / "2.jsonl", rest)
     try:
-        wait_for(lambda: len(autopilot.named("GLOBAL_POSITION_SENSOR")) > heard)
+        wait_for(lambda: len(autopilot.named("GLOBAL_POSITION_SENSOR")) > heard, process=second)
     finally:
         second.send_signal(signal.SIGTERM)
         code = second.wait()
@@ -1034,7 +1034,7 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
         [sys.executable, PACED, *map(str, arguments)], stderr=subprocess.PIPE, text=True
     )
     try:
-        wait_for(state.exists)  # a confident position was found
+        wait_for(state.exists, process=process)  # a confident position was found
         size = area.stat().st_size
         if how == "rewritten":
             with area.open("r+b") as stream:
@@ -1042,7 +1042,7 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
         else:
             os.truncate(area, size // 3 if how == "truncated" else 0)
         release.touch()
-        wait_for(lambda: '"reason": "map_file_changed"' in lines.read_text())
+        wait_for(lambda: '"reason": "map_file_changed"' in lines.read_text(), process=process)
     finally:
         process.send_signal(signal.SIGTERM)
         err = process.communicate()[1]

@@ -7,25 +7,27 @@ import os
 import random
 import signal
 import subprocess
-import sys
 import sysconfig
-import time
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import ros2_environment
+from bags import Messages
 from blots import AGL_M, CAMERA, GROUND, known_map, rendered
+from mcap.reader import make_reader
 
 import orthonav
+from helpers import wait_for
 
 pytestmark = pytest.mark.long
 PEER = Path(__file__).with_name("rclpy_peer.py")
 FLY = "-c", "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))", "fly"
-PACKAGE = Path(__file__).parents[2] / "ros2" / "orthonav_ros"
 HEADING, SPEED_MPS, COUNT, EVERY_S = 60.0, 14.0, 40, 0.4
 ENOUGH = 5
 LONGEST_S = 120.0
+INPUTS = "-r", "image:=/cam/image_raw"
 
 
 @pytest.fixture(scope="module")
@@ -66,116 +68,150 @@ def env(monkeypatch):
 
 
 class Flying:
-    """The program in a process of its own, without ROS or in a sourced environment of it."""
+    """`orthonav fly --ros2` in a process of the environment of a distribution."""
 
-    def __init__(self, env, folder, distribution, sourced, *words):
-        name, ros_python = distribution
-        source = str(Path(orthonav.__file__).parents[1])
-        env = {**env, "PYTHONPATH": source}
-        if sourced:
-            env |= {"AMENT_PREFIX_PATH": str(ros_python.parents[1]), "ROS_DISTRO": name}
-            env["PYTHONPATH"] += os.pathsep + sysconfig.get_paths()["platlib"]
-        python = ros_python if sourced else sys.executable
+    def __init__(self, env, folder, distribution, *words, ros=INPUTS):
+        name, python = distribution
+        paths = str(Path(orthonav.__file__).parents[1]), sysconfig.get_paths()["platlib"]
+        env = {**env, "ROS_DISTRO": name, "PYTHONPATH": os.pathsep.join(paths)}
+        words = [python, *FLY, *map(str, words), "--ros2", "--ros-args", *ros]
         self.errors = folder / "errors"
         with self.errors.open("w") as stream:
-            self.process = subprocess.Popen([python, *words], env=env, stderr=stream)
+            self.process = subprocess.Popen(words, env=env, stderr=stream)
 
     def said(self):
         return self.errors.read_text()
 
-    def interrupt(self):
-        self.process.send_signal(signal.SIGINT)
+    def wait_for(self, condition):
+        """What the condition gives; a failure with what was said where the process has ended."""
+        return wait_for(condition, self.said, self.process)
+
+    def stop(self, number=signal.SIGINT):
+        self.process.send_signal(number)
         try:
             return self.process.wait(LONGEST_S)
         finally:
             self.process.kill()
 
 
-def peer(env, distribution, *words):
-    """What a node of ROS hears, see rclpy_peer.py."""
-    done = subprocess.run(
-        [distribution[1], PEER, *map(str, words)],
-        env=env,
-        capture_output=True,
-        text=True,
-        timeout=2 * LONGEST_S,
-    )
-    assert done.returncode == 0, done.stderr
-    return [json.loads(line) for line in done.stdout.splitlines()]
+@pytest.fixture
+def fly(env, distribution, tmp_path):
+    """Function that starts a flight, which ends with the test."""
+    started = []
+
+    def start(*words, **options):
+        started.append(Flying(env, tmp_path, distribution, *words, **options))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.process.kill()
+        each.process.wait()
 
 
-def of_kind(heard, key):
-    return [each for each in heard if key in each]
+@pytest.fixture
+def hear(env, distribution):
+    """Function that gives what a node of ROS hears, by kind, see rclpy_peer.py."""
+
+    def peer(*words):
+        done = subprocess.run(
+            [distribution[1], PEER, *map(str, words)],
+            env=env,
+            capture_output=True,
+            text=True,
+            timeout=2 * LONGEST_S,
+        )
+        assert done.returncode == 0, done.stderr
+        heard = defaultdict(list)
+        for line in map(json.loads, done.stdout.splitlines()):
+            for kind in ("fix", "pose", "image", "level", "log", "nodes"):
+                if kind in line:
+                    heard[kind].append(line)
+        return heard
+
+    return peer
 
 
-@pytest.mark.parametrize("sourced", [False, True], ids=["dds", "rclpy"])
-def test_a_flight_in_a_graph(flown, env, tmp_path, distribution, sourced):
+@pytest.mark.parametrize("simulated", [False, True], ids=["", "use_sim_time"])
+def test_a_flight_in_a_graph(flown, fly, hear, tmp_path, simulated):
     path, frame, flight, places = flown
-    words = [*FLY, path, "--ros2", "--deadline-ms", "5000", "--ros-args"]
-    words += ["-r", "image:=/cam/image_raw", "-p", "covariance:=fix", "-p", "altitude:=321"]
-    words += ["-p", "unknown:=1"]
-    flying = Flying(env, tmp_path, distribution, sourced, *words)
-    try:
-        waiting = []
-        deadline = time.monotonic() + LONGEST_S
-        while not of_kind(waiting, "level"):  # each time a publisher comes and leaves
-            assert time.monotonic() < deadline and flying.process.poll() is None, flying.said()
-            waiting = peer(env, distribution, "-", "--seconds", 2)
-        words = [flight, "--seconds", LONGEST_S, "--enough", ENOUGH, "--reliable"]
-        heard = peer(env, distribution, *words)
-        time.sleep(1.0)  # the publishers of images and telemetry leave
-        assert flying.process.poll() is None, flying.said()
-    finally:
-        code = flying.interrupt()
-    assert code == 0, flying.said()
-    status = of_kind(waiting, "level")[-1]
+    lines = tmp_path / "lines.jsonl"
+    ros = [*INPUTS, "-p", "covariance:=fix", "-p", "altitude:=321"]
+    ros += ["-p", f"use_sim_time:={str(simulated).lower()}"]
+    outputs = "--log", tmp_path / "log.mcap", "--jsonl", lines
+    flying = fly(path, "--deadline-ms", "5000", *outputs, ros=ros)
+    reminder = "no message on /cam/camera_info"
+    flying.wait_for(lambda: reminder in flying.said())
+
+    def heard_waiting():  # each time a publisher comes and leaves
+        heard = hear("-", "--seconds", 2)
+        is_latched = any(reminder in each["log"] for each in heard["log"])  # said before
+        return heard["level"] if is_latched else None
+
+    status = flying.wait_for(heard_waiting)[-1]
+    words = flight, "--seconds", LONGEST_S, "--enough", ENOUGH
+    heard = hear(*words, *(["--simulated"] if simulated else []))
+    flying.wait_for(lambda: '"sent": ["NavSatFix' in lines.read_text())
+    flying.wait_for(lambda: hear("-", "--seconds", 2)["level"])  # it goes on without the camera
+    assert flying.stop() == 0, flying.said()
+
     assert (status["level"], status["message"]) == (2, "no_camera")
     assert "/cam/camera_info" in status["values"]["waiting"]
-    assert any("unknown is ignored" in each["log"] for each in of_kind(waiting + heard, "log")) or (
-        "unknown is ignored" in flying.said()
-    )
-    number = {each["stamp_ns"]: each["image"] for each in of_kind(heard, "image")}
-    poses = {each["stamp_ns"]: each["pose"] for each in of_kind(heard, "pose")}
-    fixes = of_kind(heard, "fix")
-    assert "orthonav" in heard[-1]["nodes"]
-    assert len(fixes) >= ENOUGH, flying.said()
-    for each in fixes:  # stamped as its image
+    number = {each["stamp_ns"]: each["image"] for each in heard["image"]}
+    poses = {each["stamp_ns"]: each["pose"] for each in heard["pose"]}
+    assert "orthonav" in heard["nodes"][0]["nodes"]
+    assert len(heard["fix"]) >= ENOUGH, flying.said()
+    for each in heard["fix"]:  # stamped as its image
         lat, lon, altitude = each["fix"]
-        there = frame.en_from_latlon(lat, lon)
+        there = frame.en_from_latlon(lat, lon)  # nowhere near what the receiver says
         assert np.hypot(*(there - places[number[each["stamp_ns"]]])) < 6
         assert altitude == 321 and 0 < each["var_m2"] < 36
         if each["stamp_ns"] in poses:
             assert poses[each["stamp_ns"]] == pytest.approx(there.tolist(), abs=1e-3)
-    assert "QoS" not in flying.said() and "invalid" not in flying.said()
+    for text in ("QoS", "invalid", "cannot be used", "expected"):
+        assert text not in flying.said()
+    with next(tmp_path.glob("log_*.mcap")).open("rb") as stream:
+        _, _, logged = next(make_reader(stream).iter_messages(topics=["/orthonav/gnss"]))
+    sample = Messages().store.deserialize_cdr(logged.data, "sensor_msgs/msg/NavSatFix")
+    assert (sample.latitude, sample.longitude) == (10.0, 20.0)
 
 
-@pytest.mark.parametrize("sourced", [False, True], ids=["dds", "rclpy"])
-def test_qos_that_does_not_match_is_named(flown, env, tmp_path, distribution, sourced):
-    """The program wants every part of an image, and the camera publishes with best effort."""
-    path, _, flight, _ = flown
-    words = [*FLY, path, "--ros2", "--ros-args", "-r", "image:=/cam/image_raw"]
-    words += ["-p", "image_reliability:=reliable"]
-    flying = Flying(env, tmp_path, distribution, sourced, *words)
-    camera = subprocess.Popen([distribution[1], PEER, flight], env=env)
-    named = "topic /cam/image_raw a publisher has QoS that does not match ours: reliability"
-    try:
-        deadline = time.monotonic() + LONGEST_S
-        while named not in flying.said():
-            assert time.monotonic() < deadline and flying.process.poll() is None, flying.said()
-            time.sleep(0.1)
-    finally:
-        camera.kill()
-        camera.wait()
-        flying.interrupt()
+def test_types_and_qos_that_do_not_match_are_named(flown, env, fly, distribution):
+    """A camera with best effort where every part is wanted, a number in place of a range, a
+    subscriber that wants positions of before it came."""
+    flying = fly(flown[0], ros=[*INPUTS, "-p", "image_reliability:=reliable"])
+    words = [distribution[1], PEER, "odd", "--seconds", str(LONGEST_S)]
+    odd = subprocess.Popen(words, env=env, stderr=subprocess.PIPE, text=True)
+    qos = "has QoS that does not match ours:"
+    named = (
+        f"topic /cam/image_raw a publisher {qos} reliability",
+        "topic /range is of type std_msgs/msg/Float64; expected sensor_msgs/msg/Range",
+        f"topic /orthonav/fix a subscriber {qos} durability",
+    )
+
+    def all_named():
+        assert odd.poll() is None, odd.stderr.read()
+        return all(each in flying.said() for each in named)
+
+    with odd:
+        try:
+            flying.wait_for(all_named)
+        finally:
+            odd.kill()
+    assert flying.stop() == 0, flying.said()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_the_wait_for_a_camera(flown, env, tmp_path, distribution, number):
-    words = [*FLY, flown[0], "--ros2", "--ros-args", "-r", "image:=/cam/image_raw"]
-    flying = Flying(env, tmp_path, distribution, True, *words)
-    deadline = time.monotonic() + LONGEST_S
-    while "camera_info" not in flying.said():
-        assert time.monotonic() < deadline and flying.process.poll() is None, flying.said()
-        time.sleep(0.1)
-    flying.process.send_signal(number)
-    assert flying.process.wait(LONGEST_S) == 0, flying.said()
+def test_signals_end_the_wait_for_a_camera(flown, fly, number):
+    flying = fly(flown[0])
+    flying.wait_for(lambda: "no message on /cam/camera_info" in flying.said())
+    assert flying.stop(number) == 0, flying.said()
+    assert "--camera" in flying.said().splitlines()[-1]
+
+
+def test_a_graph_that_cannot_be_joined_is_one_line(flown, env, fly):
+    env["ROS_DOMAIN_ID"] = "here"
+    flying = fly(flown[0])
+    assert flying.process.wait(LONGEST_S) == 1, flying.said()
+    assert "error: cannot join the ROS graph: " in flying.said().splitlines()[-1]
+    assert "Traceback" not in flying.said()

@@ -39,18 +39,6 @@ def test_neighbours_tell_where_between_tiles(rule, within_m):
         assert np.hypot(*(found - truth)) <= np.hypot(*(best - truth)) + 1e-3
 
 
-def test_the_mean_of_all_is_the_weighted_mean_of_all():
-    rng = np.random.default_rng(0)
-    scores = rng.normal(size=len(CENTRES)).astype(np.float32)
-    weights = np.maximum(scores.astype(np.float64), 0)
-    expected = weights @ CENTRES / weights.sum()
-    np.testing.assert_allclose(position("weighted", scores), expected, atol=1e-2)
-    # Nearly alike scores: the mean lies in the middle of the area, wherever the best is.
-    flat = np.full(len(CENTRES), 0.5, np.float32)
-    flat[3] = 0.51
-    np.testing.assert_allclose(position("weighted", flat), CENTRES.mean(axis=0), atol=2)
-
-
 @pytest.mark.parametrize("rule", RULES)
 def test_a_part_of_the_tiles_is_a_part_of_the_answer(rule):
     tile = inner_tile()

@@ -26,9 +26,9 @@ FORMATS = ("bag", "db3", "mcap")
 class Messages:
     """Makes messages of ROS 1 or ROS 2."""
 
-    def __init__(self, ros1=False):
+    def __init__(self, ros1=False, store=Stores.ROS2_HUMBLE):
         self.ros1 = ros1
-        self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+        self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else store)
         self.store.register(get_types_from_msg(ALTITUDE, "mavros_msgs/msg/Altitude"))
 
     def new(self, name, **fields):

@@ -388,6 +388,34 @@ def test_what_is_not_believed_is_an_error(tmp_path):
         open_source(tmp_path / "p")
 
 
+def dewarped(flag=0, fx=44.8, right=0.5, k1=-0.2687):
+    """XMP as a Phantom 4 RTK writes it, for the pictures of these tests."""
+    numbers = fx, fx + 0.1, right, -0.3, k1, 0.1147, 0.000015, -0.000046, -0.035
+    data = "2018-09-04;" + ",".join(f"{number:.12f}" for number in numbers)
+    return packet(GimbalYawDegree="+30.00", DewarpFlag=flag, DewarpData=data)
+
+
+def test_the_calibration_of_dji_is_used(tmp_path):
+    path = photo(tmp_path / "p/a.jpg", xmp=dewarped())
+    recording = open_source(path.parent)
+    camera = recording.camera
+    assert (camera.fx_px, camera.fy_px, camera.focal_std) == (44.8, 44.9, 0.01)
+    assert (camera.cx_px, camera.cy_px) == (
+        camera.width_px / 2 + 0.5,
+        camera.height_px / 2 - 0.3,
+    )
+    assert camera.distortion == (-0.2687, 0.1147, 0.000015, -0.000046, -0.035)
+    assert "focal length 45 px and distortion: DewarpData of DJI" in recording.note
+
+
+@pytest.mark.parametrize("other", [{"flag": 1}, {"fx": 60}, {"right": 30}, {"k1": math.nan}])
+def test_other_calibrations_of_dji_are_not(tmp_path, other):
+    """The picture was dewarped; of another size; not of this camera; damaged."""
+    path = photo(tmp_path / "p/a.jpg", xmp=dewarped(**other))
+    recording = open_source(path.parent)
+    assert FILM_NOTE in recording.note and recording.camera.distortion == ()
+
+
 # senseFly, maker notes, XMP in the Exif directory.
 
 

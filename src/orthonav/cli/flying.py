@@ -161,11 +161,11 @@ def _ros2(
     """Reader and publisher of a new node, which `stack` closes. The centre of `frame` is the origin
     of the ROS map frame unless `--origin` is given."""
     from orthonav.onboard.ros2.arguments import ros_arguments
-    from orthonav.onboard.ros2.node import Rosout, joined_graph
+    from orthonav.onboard.ros2.node import Node, Rosout
     from orthonav.onboard.ros2.publisher import Ros2Publisher
     from orthonav.onboard.ros2.reader import Ros2Reader
 
-    node = joined_graph(ros_arguments(options.ros_args, os.environ), os.environ)
+    node = Node(ros_arguments(options.ros_args, os.environ))
     stack.callback(node.close)
     rosout, logger = Rosout(node), logging.getLogger("orthonav")
     logger.addHandler(rosout)

@@ -86,7 +86,9 @@ def _unavailable(extras: Sequence[str]) -> list[str]:
 def _answer(extras: Sequence[str]) -> str:
     """What to type for these extras, or which of their packages this machine cannot install."""
     if never := _unavailable(extras):
-        return f"{', '.join(never)}: no wheel for this machine and Python; build it from source"
+        return (
+            f"{', '.join(never)}: no wheel for this machine and Python; source ROS 2 (docs/ros2.md)"
+        )
     return pip_line(*extras)
 
 

@@ -109,7 +109,7 @@ def missing_extra(what: str, extra: str, module: str, error: Exception) -> Missi
 
 
 def module_of(package: str) -> str:
-    plain = re.sub(r"[-_.]+", "-", package).lower()
+    plain = re.sub(r"[-_.]+", "-", package).lower().removeprefix("ros-jazzy-")
     return _MODULES.get(plain, plain.replace("-", "_"))
 
 

@@ -1,5 +1,5 @@
-"""Neural networks: learning them from reference tiles and turning them into what flies.
+"""The methods of Di Piazza et al. 2024, one module a method; `docs/paper.md` maps its sections.
 
-Nothing here flies. Learning needs PyTorch, writing what flies needs ONNX and onnxruntime; on
-board, `orthonav.core.tiles.network` needs onnxruntime alone.
+Encoders and words are learned here before the flight, with PyTorch or faiss; `orthonav.core.tiles`
+runs them on board. Of this package, only `segments` and `caevl_recipe` are used in flight.
 """

@@ -1,15 +1,16 @@
-"""The auto-encoder of Di Piazza et al. 2024: a tile through 1024 numbers and back.
+"""The auto-encoder of Di Piazza et al. 2024: tiles (N, C, 256, 256) to vectors (N, 1024) and back.
 
 "The Encoder consists of 4 strided convolutional layers, followed by batch normalization and a
 LeakyReLU activation function. The latent space dimension is 1024. The Decoder consists of 4
 deconvolution layers, followed by batch normalization and a LeakyReLU activation function. If the
 inputs are binary maps, a sigmoid is added to the last layer of the Decoder. The neural network has
-172 506 561 parameters." (section Methodology, after Bianchi and Barfoot 2021)
+172 506 561 parameters." (section Methodology, Considered methods). The loss is equation 1 (section
+Related work, Auto-Encoder, after Bianchi and Barfoot 2021).
 
-The text leaves kernels and widths open, and the authors' released code has five strided
-convolutions. Its count comes out exactly with convolutions of 3 x 3 and widths 64, 128, 256, 512,
-512, a dense layer from 8 x 8 x 512 to 1024 numbers and one back to 16 x 16 x 512, and transposed
-convolutions of 2 x 2 to 256, 128, 64 and 1 channels, each but the last normalized and rectified.
+The text leaves kernels and widths open. The count comes out exactly with strided convolutions of
+3 x 3 and widths 64, 128, 256, 512, 512: five, as in the authors' released code, not four; a dense
+layer from 8 x 8 x 512 to 1024 numbers and one back to 16 x 16 x 512; and transposed convolutions of
+2 x 2 to 256, 128, 64 and 1 channels, each but the last normalized and rectified.
 """
 
 from itertools import pairwise
@@ -73,7 +74,7 @@ class AutoEncoder(nn.Module):
 
 
 def reconstruction_loss(tiles: Tensor, reconstructed: Tensor) -> Tensor:
-    """The L2 loss ||I - D(E(I))||^2, as the mean over pixels and tiles."""
+    """Equation 1, ||I - D(E(I))||^2, of (N, C, S, S); here the mean over pixels and tiles."""
     return torch.mean((tiles - reconstructed) ** 2)
 
 

@@ -4,9 +4,9 @@ Amadei et al., WACV 2026 (arXiv 2512.02737): "An autoencoder is trained using a 
 and a perceptual loss. The decoder is then discarded and the encoder is fine-tuned using a
 non-contrastive approach": VICReg on the embeddings of a tile and of the same tile augmented, and on
 their feature maps before the dense layer, through projection heads that are discarded. The encoder
-has the five strided convolutions of `orthonav.research.autoencoder`. Not as there: the perceptual
-loss, which needs DINOv2, is left out; LeakyReLU has the slope of our auto-encoder; heads are
-normalized as there (batch norm), and there is no validation set that would stop a training early.
+has the five strided convolutions of `orthonav.research.autoencoder`. Differences: there is no
+perceptual loss, which needs DINOv2; LeakyReLU has the slope of our auto-encoder; and there is no
+validation set that would stop a training early.
 
 Augmentations: geometry (one of rotation, displacement and magnification), then blur, contrast and
 brightness, in the ranges of the authors' released configuration. Their vignetting and the mask of

@@ -1,8 +1,9 @@
 """Pretrained networks from Hugging Face folders, and SuperPoint (DeTone et al., CVPRW 2018).
 
-The network is that of the `transformers` library (Apache-2.0). Its weights are not part of
-orthonav and it never downloads them: their licence forbids commercial use. They are published as
-`magic-leap-community/superpoint` on the Hugging Face hub. This module needs PyTorch.
+SuperPoint is the second detector of the bag of words in Di Piazza et al. 2024, section Methodology,
+Considered methods. The network is that of the `transformers` library (Apache-2.0). Its weights are
+not part of orthonav and it never downloads them: their licence forbids commercial use. They are
+published as `magic-leap-community/superpoint` on the Hugging Face hub. This module needs PyTorch.
 It never flies.
 """
 

@@ -1,12 +1,12 @@
 """Boundaries of Segment Anything masks (Kirillov et al., ICCV 2023) as binary edge maps.
 
-Di Piazza et al. 2024, section 4: Segment Anything is applied to each picture, and its masks are
-turned into one binary map of all their boundaries; Base does as well as Large and Huge. Masks come
-from the automatic mask generator of the paper's appendix B: a grid of points prompts the network,
-which returns three masks each. Masks with a low expected IoU or a low stability are dropped, then
-near duplicates. The network is that of the `transformers` library (Apache-2.0); its weights are
-given by path and never downloaded. This module needs PyTorch and seconds to minutes per picture; it
-never flies.
+"We apply SAM to each image to obtain a segmentation masks, which are then transformed into binary
+maps containing all the segmentation boundaries"; Base does as well as Large and Huge (Di Piazza et
+al. 2024, section Methodology). It leaves the generator of masks open; here it is the automatic one
+of Kirillov et al., appendix B: a grid of points prompts the network, which returns three masks
+each. Masks with a low expected IoU or a low stability are dropped, then near duplicates. The
+network is that of the `transformers` library (Apache-2.0); its weights are given by path and never
+downloaded. This module needs PyTorch and seconds to minutes per picture; it never flies.
 """
 
 import hashlib

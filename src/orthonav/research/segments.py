@@ -1,9 +1,9 @@
 """Boundaries of a classical graph-based segmentation: a light substitute for Segment Anything.
 
-Di Piazza et al. 2024, section 4, compare Canny with the boundaries of Segment Anything, which is
-too expensive for an aircraft. This one finds region boundaries with the method of Felzenszwalb and
-Huttenlocher (IJCV 2004): pixels are merged into regions in the order of increasing difference, as
-long as a difference is small compared with those inside the two regions.
+It is not in Di Piazza et al. 2024: Segment Anything, in their section Methodology, needs weights
+and is too expensive for an aircraft. This one finds region boundaries with the method of
+Felzenszwalb and Huttenlocher (IJCV 2004): pixels are merged into regions in the order of increasing
+difference, as long as a difference is small compared with those inside the two regions.
 """
 
 import math

@@ -1,4 +1,9 @@
-"""Reference tiles for training, cut on demand out of one sheet; no tile is stored."""
+"""Reference tiles for training, cut on demand out of one sheet; no tile is stored.
+
+"The reference area is divided into tiles (256x256)"; "the training set is made of images of the
+reference area in a given year" (Di Piazza et al. 2024, section Dataset). Edges are extracted from
+the sheet before tiles are cut out of it, unless tiles are given as `singles`.
+"""
 
 import math
 from collections import deque

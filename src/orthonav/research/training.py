@@ -1,11 +1,15 @@
 """Trains the neural encoders: one engine for the auto-encoder, the triplet network and CAEVL.
 
-Both of the paper are trained as in Di Piazza et al. 2024 (section Methodology): the auto-encoder
-with AdamW, a rate of 3e-4 that halves on plateaus, batches of 32; the triplet network with Adam,
-1e-3, batches of 512; 200 epochs each. The order of tiles and every positive depend on the seed, the
-epoch and the tile alone. An interrupted training therefore resumes with the same result, also
-within an epoch, and a finished one goes on where it is given more epochs. Checkpoints and pictures
-are written atomically, between batches and after epochs.
+Both of the paper are trained as in Di Piazza et al. 2024 (section Methodology, Considered methods):
+the auto-encoder with AdamW, a rate of 3e-4 that halves on plateaus, batches of 32; the triplet
+network with Adam, 1e-3, batches of 512; 200 epochs each. The rest is our choice: plateaus are seen
+in the mean training loss; patience (10 epochs) and weight decay (0.01 for AdamW, 0 for Adam) are
+PyTorch's defaults; tiles are neither augmented nor held out for validation.
+
+The order of tiles and every positive depend on the seed, the epoch and the tile alone. An
+interrupted training therefore resumes with the same result, also within an epoch, and a finished
+one goes on where it is given more epochs. Checkpoints and pictures are written atomically, between
+batches and after epochs.
 
 Tensors stay contiguous (NCHW) on every device. In `channels_last` oneDNN writes past a buffer in
 the backward pass of strided 1 x 1 convolutions with fewer channels than its block: the shortcuts

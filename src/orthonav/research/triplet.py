@@ -1,10 +1,15 @@
-"""The triplet model of Di Piazza et al. 2024: a ResNet34 that pulls dates of a place together.
+"""The triplet model of Di Piazza et al. 2024: tiles (N, C, 256, 256) to embeddings (N, 1024).
 
 "The Encoder architecture corresponds to the ResNet34 implementation. The latent space dimension is
 1024. The neural network has 21 278 400 parameters. We add a hard negative mining step" (section
-Methodology). That count is ResNet34 (He et al., CVPR 2016, table 1) with one input channel and
-without its last dense layer; its 512 channels averaged over the left and the right half of the
-tile are the 1024 numbers. The loss is FaceNet's (Schroff et al., CVPR 2015).
+Methodology, Considered methods). That count is ResNet34 (He et al., CVPR 2016, table 1) with one
+input channel and without its last dense layer; its 512 channels averaged over the left and the
+right half of the tile are the 1024 numbers. The loss is equation 2 (section Related work, Triplet
+Model), which is FaceNet's (Schroff et al., CVPR 2015).
+
+The paper leaves open the margin alpha, how negatives are mined and where a training set of one year
+gets its positives. Here the margin is 1 by default, negatives are other places in the batch, and
+positives are the same tiles of further dates or simulated ageing.
 """
 
 from collections.abc import Callable, Sequence
@@ -113,7 +118,7 @@ def hard_negatives(
 def triplet_loss(
     anchors: Tensor, positives: Tensor, apart: Tensor, *, margin: float, semi_hard: bool
 ) -> Tensor:
-    """Mean over anchors of max(0, ||xa - xp||^2 - ||xa - xn||^2 + margin), xn mined in the batch.
+    """Equation 2, mean over anchors: max(0, ||xa - xp||^2 - ||xa - xn||^2 + margin), xn mined.
 
     `anchors` and `positives` (B, D); `apart` (B, B) as in `hard_negatives`. Anchors without a
     negative are left out; if no anchor has one, loss and gradient are zero.

@@ -1,6 +1,8 @@
 """Learns a bag of visual words: k-means of the features of reference pictures.
 
-Needs faiss, and PyTorch for SuperPoint. The embedder that flies is `orthonav.core.tiles.words`.
+"The BoVW method gathers features from all the images and group them into k clusters" (Di Piazza et
+al. 2024, section Related work, Bag of Visual Words); k-means, of a sample, is our choice. Needs
+faiss, and PyTorch for SuperPoint. The embedder that flies is `orthonav.core.tiles.words`.
 """
 
 import warnings
@@ -22,12 +24,17 @@ from orthonav.core.tiles.words import (
     WordsEmbedder,
     WordsRecipe,
     describe,
+    filled,
+    seen,
+    sift_features,
 )
 
 SAMPLES_PER_WORD = 40
 """Descriptors per word: faiss warns below 39, as fewer make empty clusters."""
 MIN_SAMPLES = 100_000
 """Descriptors that are clustered at least, if the pictures have that many."""
+BLOCK_PX, AROUND_PX = 1024, 256
+"""Side of the blocks in which features of a sheet are found, and what is seen around them."""
 ITERATIONS = 20
 """Iterations of k-means; faiss's own default is 25."""
 SUPERPOINT_RADIUS_PX = 8.0
@@ -128,6 +135,86 @@ def learn_words(
     pictures_with = np.bincount(pairs[0], minlength=recipe.words)
     idf = np.log((count + 1) / np.maximum(1, pictures_with)).astype(np.float32)
     return WordsEmbedder(recipe, embedder.vocabulary, idf, detector)
+
+
+@dataclass(frozen=True, eq=False)
+class SheetWords:
+    """SIFT features of a sheet picture and their words, found once for all tiles.
+
+    Neighbouring tiles overlap by 87.5 %: finding the features of each tile would take 64 times as
+    long. A tile has the features that SIFT could find in it alone: those farther from its edge than
+    OpenCV's border.
+
+    - `points` (N, 2): column and row, by rows. `margins` (N,): OpenCV's border, px.
+    - `strengths` (N,), `words` (N,): responses and nearest words of the features.
+    """
+
+    embedder: WordsEmbedder
+    points: Array
+    margins: Array
+    strengths: Array
+    words: NDArray[np.intp]
+
+    @classmethod
+    def find(
+        cls, embedder: WordsEmbedder, grey: Grey, valid: Mask, progress: Callable[[float], None]
+    ) -> "SheetWords":
+        """`grey` (H, W) uint8 and `valid` (H, W): arrays or memory maps."""
+        blocks, parts = _blocks(*grey.shape), []
+        for done, (block, window) in enumerate(blocks):
+            if valid[block].any():
+                parts.append(_found(embedder, block, window, grey[window], valid[window]))
+            progress((done + 1) / len(blocks))
+        points, margins, strengths, words = (
+            np.concatenate(each) for each in zip(*parts, strict=True)
+        )
+        order = np.argsort(points[:, 1], kind="stable")
+        return cls(embedder, points[order], margins[order], strengths[order], words[order])
+
+    def views(self, tiles_px: NDArray[np.integer[Any]], tile_px: int) -> Array:
+        """Embeddings (N, k) of tiles whose first pixels are `tiles_px` (N, 2), row and column."""
+        made = [self.embedder.weighted(self._counts(at[::-1], tile_px)) for at in tiles_px]
+        return np.stack(made)
+
+    def _counts(self, corner: NDArray[np.integer[Any]], tile_px: int) -> NDArray[np.int64]:
+        """Features by words (k,) of the tile whose first column and row are `corner` (2,)."""
+        first, last = np.searchsorted(self.points[:, 1], (corner[1], corner[1] + tile_px))
+        points = self.points[first:last] - corner
+        to_edge = np.minimum(points, tile_px - points).min(axis=1)
+        inside = first + np.flatnonzero(to_edge >= self.margins[first:last])
+        most = self.embedder.recipe.max_features
+        if len(inside) > most:
+            inside = inside[np.argpartition(-self.strengths[inside], most)[:most]]
+        return np.bincount(self.words[inside], minlength=self.embedder.dims)
+
+
+Part = tuple[slice, slice]
+
+
+def _found(
+    embedder: WordsEmbedder, block: Part, window: Part, grey: Grey, valid: Mask
+) -> tuple[Array, Array, Array, NDArray[np.intp]]:
+    """Points (N, 2), margins, strengths and words (N,) in a block, found in the window around."""
+    found = sift_features(filled(grey, valid))
+    points = found.points + np.array([window[1].start, window[0].start], np.float32)
+    low, high = ([getattr(part, end) for part in block[::-1]] for end in ("start", "stop"))
+    kept = seen(valid, found.points, found.radii)
+    kept &= ((points >= low) & (points < high)).all(axis=1)
+    words = embedder.assigned(found.descriptors[kept])
+    return points[kept], found.margins[kept], found.strengths[kept], words
+
+
+def _blocks(height: int, width: int) -> list[tuple[Part, Part]]:
+    """Blocks of a picture, and each with the pixels around it that its features see."""
+    made = []
+    for row in range(0, height, BLOCK_PX):
+        for col in range(0, width, BLOCK_PX):
+            block = slice(row, min(row + BLOCK_PX, height)), slice(col, min(col + BLOCK_PX, width))
+            window = tuple(
+                slice(max(0, each.start - AROUND_PX), each.stop + AROUND_PX) for each in block
+            )
+            made.append((block, (window[0], window[1])))
+    return made
 
 
 def _clustered(

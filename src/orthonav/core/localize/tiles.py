@@ -1,7 +1,7 @@
 """Placing a view by its tile: embed it under a few headings, and find the most similar tile.
 
-As in Di Piazza et al. 2024, to a fraction of a tile. Maps with a registration layer use the tiles
-for candidates only (`TileProposer`)."""
+As in Di Piazza et al. 2024, section Methodology, to a fraction of a tile. Maps with a registration
+layer use the tiles for candidates only (`TileProposer`)."""
 
 import math
 from dataclasses import dataclass, replace
@@ -36,7 +36,9 @@ MAX_RATIO = 10.0  # A rival at or below zero leaves the best without any
 
 
 def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
-    """Best score over second best (Di Piazza et al. 2024, section 4), up to `MAX_RATIO`."""
+    """Best score over second best of tiles (N,), at most `MAX_RATIO`; 1 for a best of 0 or less.
+
+    Equation 3 of Di Piazza et al. 2024, section Methodology, Confidence criterion."""
     if scores.size < 2:
         return MAX_RATIO
     if best is None:

@@ -1,4 +1,7 @@
-"""Embeddings: pictures as short vectors whose scalar product is the similarity of two places."""
+"""Embeddings: pictures as short vectors whose scalar product is the similarity of two places.
+
+Auto-encoder, triplet network and bag of words are those of Di Piazza et al. 2024, section
+Methodology; gradients are orthonav's default, CAEVL is a later work."""
 
 from collections.abc import Callable
 from typing import Any, Protocol

@@ -1,6 +1,7 @@
 """Neural encoders as they fly: an ONNX graph in the map, run by onnxruntime, without PyTorch.
 
-Embeddings of Di Piazza et al. 2024, section Methodology; `orthonav.research` learns them."""
+"Only the embeddings of the reference images E(I) and encoder weights are stored on board the UAV"
+(Di Piazza et al. 2024, section Related work, Auto-Encoder); `orthonav.research` learns them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -40,11 +41,11 @@ OPERATORS = frozenset(
 
 @dataclass(frozen=True)
 class AutoEncoderRecipe:
-    """Parameters of the auto-encoder.
+    """Parameters of the auto-encoder; defaults are the paper's (section Methodology).
 
-    `width`: channels before its dense layer, a multiple of 8; 512 is the paper's. `epochs`,
-    `batch`, `learning_rate`: of AdamW. `similarity`: "product" (the paper) or "cosine".
-    `precision`: "float32", "float16" (weights only) or "int8"."""
+    `width`: channels before its dense layer, a multiple of 8. `epochs`, `batch`, `learning_rate`:
+    of AdamW. `similarity`: "product" (the paper) or "cosine". `precision`: "float32", "float16"
+    (weights only) or "int8"."""
 
     dims: int = 1024
     width: int = 512
@@ -63,12 +64,12 @@ class AutoEncoderRecipe:
 
 @dataclass(frozen=True)
 class TripletRecipe:
-    """Parameters of the triplet network.
+    """Parameters of the triplet network; defaults are the paper's, and ours where it has none.
 
     `width`: channels of its first stage, 64 in ResNet34; embeddings have 16 times as many numbers.
-    `margin`: alpha of the loss, squared distances. `mining`: "hardest" or "semihard" negatives.
-    `apart`: distance of another place in tile widths. The others are as in `AutoEncoderRecipe`, for
-    Adam."""
+    `margin`: alpha of equation 2, squared distances (ours). `mining`: "hardest" or "semihard"
+    negatives (ours). `apart`: distance of another place in tile widths (ours). The others are as in
+    `AutoEncoderRecipe`, for Adam."""
 
     width: int = 64
     epochs: int = 200

@@ -1,10 +1,10 @@
 """Scores of tiles by exact search, and a position from them by the rules of the literature.
 
-*best*: the highest score (Di Piazza et al., IGARSS 2024). *weighted*: mean of all centres, weighted
-by scores above zero (Bianchi and Barfoot, RA-L 2021). *neighbours*: the best tile and those around
-it, weighted by scores above the lowest (after Couturier and Akhloufi, 2021). *peak*: a parabola
-through the best tile and its neighbours: a third of the error (`python -m benchmarks --only
-compare`)."""
+*best*: "the position of the reference embedding leading to the highest scalar product" (Di Piazza
+et al. 2024, section Methodology, Considered methods). *weighted*: mean of all centres, weighted by
+scores above zero (Bianchi and Barfoot, RA-L 2021). *neighbours*: the best tile and those around it,
+weighted by scores above the lowest (after Couturier and Akhloufi, 2021). *peak*: a parabola through
+the best tile and its neighbours: a third of the error (`python -m benchmarks --only compare`)."""
 
 from collections.abc import Iterator
 from typing import Literal, get_args

@@ -1,5 +1,7 @@
 """Image representations that are compared: grey levels, edges or gradients.
 
+Grey levels, Canny and Segment Anything are those of Di Piazza et al. 2024, section Methodology.
+
 `variant(grey, valid)` with (H, W) uint8 and bool gives float32 `(C, H, W)`, zero where not valid.
 """
 
@@ -89,7 +91,7 @@ TABLE = {
 
 @dataclass(frozen=True)
 class Gray:
-    """0..1, (1, H, W): the baseline of Di Piazza et al. 2024."""
+    """0..1, (1, H, W)."""
 
     channels = 1
 
@@ -101,8 +103,10 @@ class Gray:
 
 @dataclass(frozen=True)
 class Canny:
-    """Binary edges, by default as in Di Piazza et al. 2024, section 4; thresholds on the Sobel
-    gradient (L1 norm, 8-bit grey), aperture 3, 5 or 7."""
+    """Binary edges, by default of "a threshold in the interval [100, 200] and a kernel of size 3".
+
+    We read this as the low and the high threshold, on the Sobel gradient of 8-bit grey levels; the
+    L1 norm is our choice. `kernel`: aperture 3, 5 or 7."""
 
     low: float = 100.0
     high: float = 200.0

@@ -1,5 +1,7 @@
 """The whitened embedding: pooled oriented gradients, decorrelated on the reference area itself.
 
+It is orthonav's default, not a method of Di Piazza et al. 2024.
+
 Cells overlap with triangular weights, so that a shift moves energy gradually. Each is divided by
 its own norm: contrast differs between years, directions do not. Principal components of the
 reference tiles are divided by their standard deviations (whitening, Jegou and Chum, ECCV 2012).

@@ -1,6 +1,8 @@
 """Bag of visual words (Sivic and Zisserman, ICCV 2003): how often which local features occur.
 
-As in Di Piazza et al. 2024, section 2, on grey levels, with SIFT (Lowe, IJCV 2004) or SuperPoint
+"A frequency vector that records how many features [...] fall into each cluster" (Di Piazza et al.
+2024, section Related work, Bag of Visual Words), here divided by the number of features. As in
+section Methodology, features are those of grey levels, by SIFT (Lowe, IJCV 2004) or SuperPoint
 (DeTone et al. 2018), which needs PyTorch and does not fly. `orthonav.research.words` learns them.
 
 SIFT descriptors and words are whole numbers, and sums below 2^24 that decide on the nearest word
@@ -101,7 +103,7 @@ class WordsEmbedder:
         """(k,) of grey levels (1, S, S), 0..1 as of `represent.Gray`, or 0..255 if one is above 1.
 
         Zeros without features. Raises `ValueError` unless there is one channel."""
-        return self._weighted(self.counts(_levels(maps), valid))
+        return self.weighted(self.counts(_levels(maps), valid))
 
     def views(self, maps: Array, valid: Mask | None = None) -> Array:
         """Of (N, 1, S, S), everywhere valid or where (N, S, S) says."""
@@ -127,7 +129,8 @@ class WordsEmbedder:
             out[part] = nearness.argmax(axis=1)
         return out
 
-    def _weighted(self, counts: NDArray[np.int64]) -> Array:
+    def weighted(self, counts: NDArray[np.int64]) -> Array:
+        """The embedding (k,) of a picture with so many features of each word (k,)."""
         vector = counts / max(1, counts.sum())
         if self.recipe.tfidf:
             vector = vector * self.idf
@@ -156,30 +159,64 @@ def describe(
         raise VariantError(f"features '{recipe.features}' do not fly; they need their detector")
     if not valid.any():
         return np.zeros((0, DIMS[recipe.features]), dtype=np.float32)
+    picture = filled(grey, valid)
+    if detector is None:
+        found = sift_features(picture, recipe.max_features)
+        points, radii, descriptors = found.points, found.radii, found.descriptors
+    else:
+        points, radii, descriptors = detector(picture)
+    return descriptors[seen(valid, points, radii)]
+
+
+def filled(grey: Grey, valid: Mask) -> Grey:
+    """The picture (H, W) with the mean grey level where it is not valid."""
     if not valid.all():
         grey = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
-    picture = np.ascontiguousarray(grey)
-    found = _sift(picture, recipe.max_features) if detector is None else detector(picture)
-    points, radii, descriptors = found
-    if len(points) and not valid.all():
-        free = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        height, width = valid.shape
-        columns, rows = np.floor(points).astype(int).T
-        descriptors = descriptors[
-            free.reshape(height, width)[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-            > radii
-        ]
-    return descriptors
+    return np.ascontiguousarray(grey)
 
 
-def _sift(grey: Grey, most: int) -> tuple[Array, Array, Array]:
-    """Points (N, 2) from the outer corner, radii (N,), descriptors (N, 128), whole numbers."""
-    sift = cv2.SIFT.create(nfeatures=most)
-    found, descriptors = sift.detectAndCompute(grey, None)
-    if not len(found):
-        nothing = np.zeros((0, 2), dtype=np.float32)
-        return nothing, nothing[:, 0], np.zeros((0, DIMS["sift"]), dtype=np.float32)
-    points = np.array([point.pt for point in found], dtype=np.float32) + np.float32(0.5)
-    radii = np.array([point.size / 2 for point in found], dtype=np.float32)
-    kept = slice(most)  # of equally strong ones there may be more
-    return points[kept], radii[kept], np.asarray(descriptors, dtype=np.float32)[kept]
+def seen(valid: Mask, points: Array, radii: Array) -> Mask:
+    """Which features (N,) see valid pixels (H, W) only, within their radius."""
+    if not len(points) or valid.all():
+        return np.ones(len(points), dtype=bool)
+    free = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    height, width = valid.shape
+    columns, rows = np.floor(points).astype(int).T
+    inside = free.reshape(height, width)[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+    return np.asarray(inside > radii)
+
+
+@dataclass(frozen=True, eq=False)
+class SiftFeatures:
+    """Features of a picture, N of them.
+
+    - `points` (N, 2): column and row from the outer corner. `radii` (N,) px.
+    - `descriptors` (N, 128): whole numbers. `strengths` (N,).
+    - `margins` (N,): px from the edge within which OpenCV finds no feature of this scale.
+    """
+
+    points: Array
+    radii: Array
+    descriptors: Array
+    strengths: Array
+    margins: Array
+
+
+SIFT_BORDER_PX = 5
+"""Of every octave, within which OpenCV finds no feature."""
+
+
+def sift_features(grey: Grey, most: int = 0) -> SiftFeatures:
+    """The strongest features of a picture (H, W); all of them where `most` is 0."""
+    found, descriptors = cv2.SIFT.create(nfeatures=most).detectAndCompute(grey, None)
+    found = found[: most or None]  # of equally strong ones there may be more
+    if descriptors is None:
+        descriptors = np.zeros((0, DIMS["sift"]))
+    octaves = np.array([point.octave & 255 for point in found], dtype=np.uint8).view(np.int8)
+    return SiftFeatures(
+        np.array([point.pt for point in found], np.float32).reshape(-1, 2) + np.float32(0.5),
+        np.array([point.size / 2 for point in found], np.float32),
+        np.asarray(descriptors[: len(found)], np.float32),
+        np.array([point.response for point in found], np.float32),
+        SIFT_BORDER_PX * np.exp2(octaves.astype(np.float32)),
+    )

@@ -23,7 +23,7 @@ from orthonav.ground.build.calibrate import changed
 from orthonav.ground.build.sheet import SheetPictures
 from orthonav.research.caevl_recipe import CaevlRecipe
 from orthonav.research.tiles import SheetTiles
-from orthonav.research.words import learn_words
+from orthonav.research.words import SheetWords, learn_words
 
 if TYPE_CHECKING:
     from orthonav.ground.build.build import BuildRequest
@@ -115,6 +115,12 @@ def learn_encoder(
         encoder = learn_words(
             recipe, chosen, request.seed, lambda share: progress("learn words", share)
         )
+        if encoder.detector is None:
+            found = SheetWords.find(
+                encoder, tiles.pixels[0], tiles.valid, lambda share: progress("find words", share)
+            )
+            at, side = tiles.tiles_px, tiles.tile_px
+            return encoder, _embedded(lambda of: found.views(at[of], side), tiles, progress)
 
         def words(indices: NDArray[np.intp]) -> NDArray[np.float32]:
             valid = np.stack([tiles.valid_tile(int(index)) for index in indices])

@@ -290,7 +290,8 @@ class Mosaic:
                 sources += chain(*(sources_in(each, bands) for each in some))
             else:
                 sources += open_sources(some, bands=bands)
-                name_bands(sources)
+                if bands is None:
+                    name_bands(sources)
         if epoch is not None:
             sources = at_epoch(sources, epoch)
         with rasterio.Env(**GDAL_OPTIONS):

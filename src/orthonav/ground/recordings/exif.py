@@ -204,6 +204,10 @@ _EXPOSED = re.compile(
     r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
     r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)"
 )
+_DEWARP = re.compile(
+    r"\bdrone-dji:DewarpData\s*(?:=\s*[\"']|>)\s*[\d-]{8,10};([-+\d.eE]{1,30}(?:,[-+\d.eE]{1,30}){8})"
+)
+"""Date; then fx, fy, cx, cy from the middle of the picture in px, k1, k2, p1, p2, k3."""
 _WRITER = re.compile(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})")
 
 
@@ -230,6 +234,9 @@ class Photo:
     hae_m: float  # height above the ellipsoid, where its reference is stated
     vel_en_mps: tuple[float, float] | None  # velocity over ground, east and north
     optics: Optics  # camera and lens
+    lens: tuple[float, ...] | None
+    """DJI's calibration of a picture that is as the lens made it: fx, fy, and the principal point
+    from the middle, px; k1, k2, p1, p2, k3."""
     software: str  # programs that wrote the file; of a camera its firmware
     turned: bool  # whether other programs show it turned, by the orientation of EXIF
     agl_m: float = math.nan  # height above ground, where a table states it
@@ -296,6 +303,7 @@ def read_photo(path: Path) -> Photo:
         hae_m=xmp.first("drone-dji:AbsoluteAltitude" if rtk else "sensefly:AltitudeWGS84"),
         vel_en_mps=(east, north) if math.isfinite(east + north) else None,
         optics=_optics(tags, more),
+        lens=xmp.lens if xmp.first("drone-dji:DewarpFlag") == 0 else None,
         software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
         turned=tags.get(_ORIENTATION, 1) not in (0, 1),
         doubts=tuple(filter(None, (*doubts, void, doubt))),
@@ -407,6 +415,7 @@ class Xmp:
     values: Mapping[str, float]
     time_ns: int | None  # UTC at exposure
     writer: str  # program that wrote the packet, empty where it is not named
+    lens: tuple[float, ...] | None = None  # `DewarpData`, see `Photo`
     unread: tuple[str, ...] = ()
     """Angles, heights and positions that are not numbers, as name and value."""
 
@@ -424,7 +433,8 @@ class Xmp:
             if _ANGLE_OR_PLACE.match(name)
         )
         writer = _WRITER.search(text)
-        return cls(values, _exposed_ns(text), writer[1].strip() if writer else "", unread)
+        name = writer[1].strip() if writer else ""
+        return cls(values, _exposed_ns(text), name, _lens(text), unread)
 
     def first(self, *names: str) -> float:
         return next((self.values[name] for name in names if name in self.values), math.nan)
@@ -469,6 +479,14 @@ class Xmp:
     def _angles(self, pattern: str) -> tuple[float, float, float] | None:
         yaw, pitch, roll = (self.first(pattern.format(name)) for name in ("Yaw", "Pitch", "Roll"))
         return (yaw, pitch, roll) if math.isfinite(yaw + pitch + roll) else None
+
+
+def _lens(text: str) -> tuple[float, ...] | None:
+    found = _DEWARP.search(text)
+    try:
+        return tuple(map(float, found[1].split(","))) if found else None
+    except ValueError:
+        return None
 
 
 def _stated(text: str) -> float:

@@ -61,6 +61,9 @@ _EDITOR = re.compile(
 """Programs that show, turn or develop photographs."""
 _FIRMWARE = re.compile(r"[vV]?\d+(?:\.\d+)+")
 ROUNDED = 0.02  # focal lengths of EXIF that differ by less, as a fraction, are of one lens
+MAX_OFF_EXIF = 0.1
+"""Of the focal length in DJI's calibration from that of EXIF: otherwise it is of another size."""
+FACTORY_STD = 0.01  # of that focal length, which differs with focus and temperature
 _BY_NAME_NS = 10**9  # spacing of photographs without a time, which are ordered by name
 
 
@@ -430,9 +433,25 @@ def _camera(photo: Photo, options: SourceOptions) -> tuple[Camera, str]:
         raise CameraError(
             f"photograph has no focal length; give --camera FILE or --fov-deg: {path}"
         )
+    if lens := _factory_camera(photo, focal.px):
+        return lens, f"focal length {lens.fx_px:.0f} px and distortion: DewarpData of DJI"
     camera = Camera(width, height, focal.px, focal.px, width / 2, height / 2, focal_std=focal.std)
     share = f"good to {100 * focal.std:.0f} %"
     return camera, f"focal length {focal.px:.0f} px, {share}: {focal.source}"
+
+
+def _factory_camera(photo: Photo, focal_px: float) -> Camera | None:
+    """The camera as DJI calibrated it; None where that is not stated, or of another picture size
+    than this one by the focal length of EXIF."""
+    if photo.lens is None or abs(photo.lens[0] / focal_px - 1) > MAX_OFF_EXIF:
+        return None
+    (fx, fy, right, down, *distortion), size = photo.lens, (photo.width_px, photo.height_px)
+    middle = size[0] / 2 + right, size[1] / 2 + down
+    try:
+        made = Camera(*size, fx, fy, *middle, tuple(distortion), focal_std=FACTORY_STD)
+        return made.plausible()
+    except CameraError:
+        return None
 
 
 def _views(

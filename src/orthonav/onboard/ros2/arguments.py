@@ -19,8 +19,6 @@ from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 
 log = logging.getLogger(__name__)
-MAX_DOMAIN_ID = 232
-"""Beyond it the ports of the domain would exceed 65535."""
 _TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
 _NAME = re.compile(rf"(~|~?/?{_TOKEN}(/{_TOKEN})*)")
 _NAMESPACE = re.compile(rf"/|(/{_TOKEN})+")
@@ -58,25 +56,17 @@ class Parameters:
 
 @dataclass(frozen=True)
 class RosArguments:
-    """Name and namespace of the node, remapping rules in their order, parameters and domain.
+    """Name and namespace of the node, remapping rules in their order, and parameters.
 
-    `rules` are pairs of a name to match and its replacement, not yet expanded. `is_local`:
-    discovery and traffic stay on the loopback interface. `is_alone`: it discovers nobody. `peers`:
-    addresses to be found beside that. `distro`: whose message definitions. `cyclonedds_uri`: the
-    user's configuration of Cyclone DDS. `passed`: arguments about security and logging that only
-    ROS understands.
+    `rules` are pairs of a name to match and its replacement, not yet expanded. `distro`: whose
+    message definitions. `passed`: arguments about security and logging, for `rclpy`.
     """
 
     node: str = "orthonav"
     namespace: str = "/"
     rules: tuple[tuple[str, str], ...] = ()
     parameters: Parameters = field(default_factory=Parameters)
-    domain_id: int = 0
-    is_local: bool = False
     distro: str = ""
-    is_alone: bool = False
-    peers: tuple[str, ...] = ()
-    cyclonedds_uri: str = ""
     passed: tuple[str, ...] = ()
 
     @property
@@ -107,10 +97,9 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
     """Arguments after `--ros-args`, and variables of the environment.
 
     Reads `-r FROM:=TO` (`--remap`; `__node`, `__name` and `__ns` too), `-p NAME:=VALUE`
-    (`--param`), `--params-file`, and `ROS_DOMAIN_ID`, `ROS_NAMESPACE`, `ROS_LOCALHOST_ONLY`,
-    `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS`, `ROS_DISTRO` and `CYCLONEDDS_URI`. As in
-    ROS, an unknown parameter is ignored. Raises `VariantError` for an argument that ROS does not
-    have either, and `MissingFileError`.
+    (`--param`), `--params-file`, and `ROS_NAMESPACE` and `ROS_DISTRO`; `rclpy` reads the other
+    variables of ROS. As in ROS, an unknown parameter is ignored. Raises `VariantError` for an
+    argument that ROS does not have either, and `MissingFileError`.
     """
     given, parameters, passed = _words(words)
     node, namespace = "orthonav", environment.get("ROS_NAMESPACE", "") or "/"
@@ -128,22 +117,14 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
         raise VariantError(f"not a node name of ROS 2: '{node}'")
     if not _NAMESPACE.fullmatch(namespace):
         raise VariantError(f"not a namespace of ROS 2: '{namespace}'")
-    scope = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
-    only_local = environment.get("ROS_LOCALHOST_ONLY") == "1"
-    peers = environment.get("ROS_STATIC_PEERS", "").split(";")
     full_name = f"{namespace.rstrip('/')}/{node}"
     made = RosArguments(
         node,
         namespace,
         tuple(rules),
         _parameters(list(_values(parameters, node, full_name))),
-        _domain_id(environment.get("ROS_DOMAIN_ID", "")),
-        only_local or scope == "LOCALHOST",
         environment.get("ROS_DISTRO", ""),
-        is_alone=not only_local and scope == "OFF",
-        peers=tuple(peer.strip() for peer in peers if peer.strip()),
-        cyclonedds_uri=environment.get("CYCLONEDDS_URI", ""),
-        passed=tuple(passed),
+        tuple(passed),
     )
     for rule in rules:
         for name in rule:
@@ -258,11 +239,3 @@ def _is_number(text: str) -> bool:
         return math.isfinite(float(text))
     except ValueError:
         return False
-
-
-def _domain_id(text: str) -> int:
-    if not text:
-        return 0
-    if not (text.isascii() and text.isdigit() and int(text) <= MAX_DOMAIN_ID):
-        raise VariantError(f"ROS_DOMAIN_ID is 0 to {MAX_DOMAIN_ID}, got '{text}'")
-    return int(text)

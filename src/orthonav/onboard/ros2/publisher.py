@@ -17,7 +17,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.onboard.messages.estimate import NavigationEstimate, floored
 from orthonav.onboard.messages.mavlink import require_confident
-from orthonav.onboard.ros2.node import Graph
+from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import VehicleState
 
 NOT_MEASURED_RAD2 = math.pi**2
@@ -32,7 +32,7 @@ class Ros2Publisher:
 
     def __init__(
         self,
-        node: Graph,
+        node: Node,
         origin: LocalFrame,
         now_ns: Callable[[], int],
         *,

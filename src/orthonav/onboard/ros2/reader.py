@@ -30,7 +30,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.records import NoFix
 from orthonav.core.tilt import AUTOPILOT
 from orthonav.onboard.cameras import CameraImage
-from orthonav.onboard.ros2.node import TIME_NS, Graph
+from orthonav.onboard.ros2.node import TIME_NS, Node
 from orthonav.onboard.telemetry import FIX_NS, Clocks, TelemetryBuffer
 
 log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ class Ros2Reader:
 
     def __init__(
         self,
-        node: Graph,
+        node: Node,
         buffer: TelemetryBuffer,
         clocks: Clocks,
         stopped: Callable[[], bool],

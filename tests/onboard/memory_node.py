@@ -1,0 +1,52 @@
+"""A node without ROS: what others write and hear of its topics stays in this process."""
+
+from collections import defaultdict, deque
+
+from benchmarks.fakes import Time
+
+from orthonav.onboard.ros2.node import Node
+
+
+class MemoryNode(Node):
+    """`time` goes on while it waits in vain. `heard`: messages by topic. `mismatched`: topics whose
+    endpoints do not match. `latched`, `reliable`: topics with such a writer or reader of ours."""
+
+    def __init__(self, arguments):
+        self.time, self.heard, self.mismatched = Time(), defaultdict(list), {}
+        self.latched, self.reliable, self.kinds = set(), set(), {}
+        self._handlers, self._waiting = {}, deque()
+        super().__init__(arguments)
+
+    def _join(self):
+        """Nobody to join."""
+
+    def subscribe(self, topic, kind, handler, *, depth=5, reliable=False):
+        self._handlers[topic], self.kinds[topic] = (kind, handler), kind
+        if reliable:
+            self.reliable.add(topic)
+
+    def advertise(self, topic, kind, *, depth=10, latched=False):
+        self.kinds[topic] = kind
+        if latched:
+            self.latched.add(topic)
+        hear = self.heard[topic].append
+        return self._writing(topic, lambda cdr: hear(self.definitions.decoded(kind, cdr)))
+
+    def write(self, topic, cdr):
+        """A sample of another node, read by the next `spin`."""
+        self._waiting.append((topic, cdr))
+
+    def spin(self, timeout_s):
+        self._handled = 0
+        while self._waiting:
+            topic, cdr = self._waiting.popleft()
+            self._handle(topic, *self._handlers[topic], cdr)
+        if not self._handled:
+            self.time.go(timeout_s)
+        return self._handled
+
+    def close(self):
+        """Nothing to leave."""
+
+    def _mismatches(self):
+        return self.mismatched
