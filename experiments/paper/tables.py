@@ -420,7 +420,8 @@ def costs(results: Sequence[Result]) -> list[Table]:
     header = ("method", "learn s", "MB per km2", "encoder MB", "ms per view")
     notes = (
         "times: wall-clock, in the reduced setting two rows at a time; learn s: the encoder, with "
-        "embedding all tiles; MB per km2: the map file less the encoder or vocabulary, which it holds once; ms: one view from its picture to the fix, one core",
+        "embedding all tiles; MB per km2: the map file less the encoder or vocabulary, which it "
+        "holds once; ms: one view from its picture to the fix, one core",
     )
     return [Table(f"Cost, {scene}", header, rows, notes)]
 
