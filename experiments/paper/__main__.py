@@ -16,28 +16,29 @@ from pathlib import Path
 from benchmarks.record import say
 from benchmarks.scenes import DATA
 
-from experiments.paper import curves, dates, field, matchers, runs, scenes, tables
+from experiments.paper import curves, dates, field, matchers, page, runs, scenes, tables
 from experiments.paper.methods import (
     BETWEEN_DATES,
     FIELD_SCENES,
     GPU_SCENES,
     SETTINGS,
+    STUDIED,
     TABLE_1,
     Setting,
     dry,
     flown,
     methods,
 )
-from experiments.paper.results import keep, stored
+from experiments.paper.results import BASELINES, FIELD, PROGRAM, keep, stored
 from experiments.paper.scenes import Scene
 from orthonav.core.errors import MissingExtraError, OrthonavError
 from orthonav.core.extras import require
 from orthonav.core.tiles.learned import VARIABLE
 
-PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
-PICTURES = f"{tables.PROGRAM} pictures"
+PARTS = ("A", "B", "C", "D", "real", "untuned", "own", BASELINES, FIELD)
+PICTURES = f"{PROGRAM} pictures"
 PICTURED = (*TABLE_1, "real", "untuned")
-PARTS_OF = {"gpu": GPU_SCENES, "epochs": ("B",)}
+PARTS_OF = {"gpu": GPU_SCENES, "epochs": (STUDIED,)}
 ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
 
 
@@ -48,7 +49,7 @@ def main(arguments: list[str]) -> int:
     if options.what == "keep":
         for name in keep(options.out, options.setting):
             say(f"stored: {name}")
-        tables.PAGE.write_text(tables.page(stored()), encoding="utf-8")
+        page.PAGE.write_text(page.page(stored()), encoding="utf-8")
         curves.figure(stored(), curves.FIGURE)
         return 0
     if options.what == "pictures":
@@ -59,7 +60,7 @@ def main(arguments: list[str]) -> int:
     failed = 0
     if options.what == "run":
         shown = [Path(each).name if "/" in each else each for each in arguments]
-        failed = _run(options, " ".join(["python -m experiments.paper", *shown]))
+        failed = _run(options, " ".join([PROGRAM, *shown]))
     folder = f"dry-{options.setting}" if options.dry_run else options.setting
     made = tables.report(options.out, folder)
     if made is None:
@@ -73,7 +74,7 @@ def main(arguments: list[str]) -> int:
 def _run(options: argparse.Namespace, command: str) -> int:
     """Run all rows that are wanted, several at a time; how many failed."""
     learnt = not options.methods or set(options.methods) != {"gradient"}
-    require("python -m experiments.paper", "geo", *(["train"] if learnt else []))
+    require(PROGRAM, "geo", *(["train"] if learnt else []))
     os.environ[VARIABLE] = str(BETWEEN_DATES)  # maps do not say where their network lies
     start = time.perf_counter()
     setting = dry(SETTINGS[options.setting]) if options.dry_run else SETTINGS[options.setting]
@@ -81,8 +82,8 @@ def _run(options: argparse.Namespace, command: str) -> int:
     keeps = options.keep_checkpoints or goes_on
     place = runs.Workplace(options.out, setting, command, options.device, options.workers, keeps)
     wanted = set(options.only or PARTS_OF.get(setting.name, PARTS))
-    if "field" in wanted and not _has_matchers(options):
-        wanted.discard("field")
+    if FIELD in wanted and not _has_matchers(options):
+        wanted.discard(FIELD)
     tasks = _tasks(options, place, wanted)
     jobs = 1 if goes_on else options.jobs or (runs.cores() if setting.name == "reduced" else 1)
     if jobs > 1:  # those that learn longest first, so that no core is idle at the end
@@ -100,10 +101,10 @@ def _run(options: argparse.Namespace, command: str) -> int:
         failed += isinstance(minutes, Exception)
         say(f"{_minutes(start)}  {scene.name} {method.key}: {status}")
     for scene in flown_over:
-        tried = scene.name == runs.TRIED_ON and "baselines" in wanted
+        tried = scene.name == STUDIED and BASELINES in wanted
         if tried and runs.run_baselines(place, scene):
             say(f"{_minutes(start)}  baselines")
-        in_field = "field" in wanted and scene.name in FIELD_SCENES
+        in_field = FIELD in wanted and scene.name in FIELD_SCENES
         if in_field and field.run(place, scene):
             say(f"{_minutes(start)}  {scene.name}: the field today")
     return failed
@@ -114,7 +115,7 @@ def _has_matchers(options: argparse.Namespace) -> bool:
     try:
         matchers.require_packages()
     except MissingExtraError as error:
-        if "field" in (options.only or ()):
+        if FIELD in (options.only or ()):
             raise
         say(f"field skipped: {error}")
         return False
@@ -131,8 +132,8 @@ def _tasks(options: argparse.Namespace, place: runs.Workplace, wanted: set[str])
         if not scene.others:
             chosen = [each for each in chosen if not each.needs_dates]
         if not _whole(scene, wanted):
-            needed = {runs.MAP_OF} if "baselines" in wanted else set()
-            if "field" in wanted and scene.name in FIELD_SCENES:
+            needed = {runs.MAP_OF} if BASELINES in wanted else set()
+            if FIELD in wanted and scene.name in FIELD_SCENES:
                 needed |= {each.key for each in flown(chosen)}
             chosen = [each for each in rows if each.key in needed]
         tasks += [(place, scene, method) for method in chosen]
@@ -155,13 +156,13 @@ def _minutes(start: float) -> str:
 
 def _scenes(options: argparse.Namespace, setting: Setting, wanted: set[str]) -> Iterator[Scene]:
     for name in ("B", "D", "A", "C"):
-        if name in wanted or (name == "B" and wanted & {"baselines", "field"}):
+        if name in wanted or (name == STUDIED and wanted & {BASELINES, FIELD}):
             yield scenes.generated(setting, name, options.out / "areas", options.gsd_m)
     if "own" in wanted and options.past and options.present:
         name = f"own-{options.past.stem}-{options.present.stem}"
         yield scenes.over(name, options.past, options.present, options.gsd_m).of(setting)
     sets = {"real": scenes.real(options.data, setting), "untuned": scenes.untuned(options.data)}
-    for name in (each for each in sets if wanted & {each, "field"}):
+    for name in (each for each in sets if wanted & {each, FIELD}):
         found = list(sets[name])
         if not found:
             say(f"{name} skipped: the optional real imagery beside the checkout is absent")
@@ -171,7 +172,7 @@ def _scenes(options: argparse.Namespace, setting: Setting, wanted: set[str]) -> 
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m experiments.paper", description=__doc__)
+    parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__)
     parser.add_argument(
         "what", nargs="?", choices=("run", "report", "pictures", "keep"), default="run"
     )

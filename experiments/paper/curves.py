@@ -6,8 +6,8 @@ from pathlib import Path
 import matplotlib.figure
 from benchmarks.record import Table
 
-from experiments.paper.methods import FULL, Method
-from experiments.paper.results import EDGES, FAMILIES, Result, percent
+from experiments.paper.methods import FULL
+from experiments.paper.results import Result, of_methods, percent
 
 FIGURE = Path(__file__).resolve().parents[2] / "docs" / "figures" / "epochs.png"
 PLACEMENT = "grid"
@@ -17,10 +17,10 @@ COLOURS = {"canny": "#0072B2", "gray": "#E69F00"}
 def curves(results: Sequence[Result]) -> dict[str, list[tuple[int, Result]]]:
     """Rows of each training by epochs."""
     found: dict[str, list[tuple[int, Result]]] = {}
-    for each in results:
-        if each.plain.get("method", {}).get("curve"):
-            method = Method(**each.plain["method"])
-            found.setdefault(method.training, []).append((method.number("epochs"), each))
+    for each in of_methods(results):
+        if each.method.curve:
+            count = each.method.number("epochs")
+            found.setdefault(each.method.training, []).append((count, each))
     return {name: sorted(rows, key=lambda row: row[0]) for name, rows in found.items()}
 
 
@@ -50,17 +50,16 @@ def table(results: Sequence[Result]) -> list[Table]:
 
 def figure(results: Sequence[Result], path: Path) -> None:
     """Accuracy and loss of the auto-encoders by epoch, as a PNG; none without rows."""
-    made = [rows for rows in curves(results).values() if rows[0][1].family == "autoencoder"]
+    made = [rows for rows in curves(results).values() if rows[0][1].method.family == "autoencoder"]
     if not made:
         return
     drawn = matplotlib.figure.Figure(figsize=(8, 3.4), layout="constrained")
     left, right = drawn.subplots(1, 2)
     for rows in made:
         last = rows[-1][1]
-        method = Method(**last.plain["method"])
         style = {
-            "color": COLOURS[last.edges],
-            "linestyle": "-" if method.number("width") == FULL.encoder_width else ":",
+            "color": COLOURS[last.method.input],
+            "linestyle": "-" if last.method.number("width") == FULL.encoder_width else ":",
             "label": _label(last),
         }
         epochs = [count for count, _ in rows]
@@ -75,5 +74,4 @@ def figure(results: Sequence[Result], path: Path) -> None:
 
 
 def _label(each: Result) -> str:
-    method = Method(**each.plain["method"])
-    return f"{FAMILIES[each.family]}, {EDGES[each.edges]}, width {method.number('width')}"
+    return f"{each.method.label}, width {each.method.number('width')}"

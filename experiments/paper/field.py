@@ -10,7 +10,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -21,19 +21,19 @@ import cv2
 import numpy as np
 from benchmarks.placing import memory_mb
 from benchmarks.posed import Picture
-from benchmarks.record import provenance
-from benchmarks.scenes import store
+from benchmarks.record import Table, number, provenance
+from benchmarks.scenes import far_m, store
 from numpy.typing import NDArray
 
 from experiments.paper import matchers
 from experiments.paper import scenes as views
 from experiments.paper.methods import Method, flown, methods
-from experiments.paper.results import FIELD
+from experiments.paper.results import ACCURACY_M, FIELD, Result, numbers, percent
 from experiments.paper.runs import MB, Workplace, head, save
 from experiments.paper.scenes import Scene
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import Fix, Prior, Telemetry, View
+from orthonav.core.records import CONFIDENT, Fix, Prior, Telemetry, View
 
 VIEWS = 20
 YAW_STD_DEG, AGL_STD, PRIOR_STD_PX = 5.0, 0.03, 40.0
@@ -73,7 +73,7 @@ def run(place: Workplace, scene: Scene) -> bool:
     start, made = time.perf_counter(), head(place, scene, provenance("paper"))
     before: dict[str, Any] = json.loads(out.read_text(encoding="utf-8")) if out.is_file() else {}
     names = [*matchers.LOCAL, *(each.key for each in maps)]
-    found = before.get("field", {})
+    found = before.get(FIELD, {})
     missing = [name for name in names if name not in found]
     if not missing:
         return False
@@ -82,8 +82,8 @@ def run(place: Workplace, scene: Scene) -> bool:
     with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as pool:
         for name in missing:
             found[name] = pool.submit(_measured, place, scene, maps[0].key, name).result()
-    made["field"] = {name: found[name] for name in names}
-    made["methods"] = [asdict(each) | {"edges": each.edges.partition(":")[0]} for each in maps]
+    made[FIELD] = {name: found[name] for name in names}
+    made["methods"] = [asdict(each) | {"edges": each.input} for each in maps]
     made["errors"] = {"yaw_std_deg": YAW_STD_DEG, "agl_std": AGL_STD, "prior_std_px": PRIOR_STD_PX}
     save(out, made, start)
     return True
@@ -193,3 +193,127 @@ def _method(
         return matchers.Found(np.asarray(found), float(known.get(criterion, math.nan)))
 
     return place_by_map, path.stat().st_size
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """What a method made of the views of one or several scenes.
+
+    - `error_m` (N,): infinite without an answer. `far_m` (N,): error above which it is wrong.
+    - `evidence` (N,): -inf without an answer. `mirrored` (M,): that of mirrored views.
+    """
+
+    error_m: NDArray[np.float64]
+    far_m: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+    mirrored: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rows: Sequence[Result], name: str) -> "Placed":
+        parts = [
+            (each.plain[FIELD][name], far_m(each.trajectory.gsd_m))
+            for each in rows
+            if name in each.plain[FIELD]
+        ]
+        seen = [(*view, far) for part, far in parts for view in part["views"]]
+        return cls(
+            numbers([error for error, _, _ in seen], math.inf),
+            np.array([far for _, _, far in seen]),
+            numbers([evidence for _, evidence, _ in seen], -math.inf),
+            numbers([each for part, _ in parts for each in part["mirrored"]], -math.inf),
+        )
+
+    @property
+    def right(self) -> NDArray[np.bool_]:
+        """Mask (N,) of the views that are not wrong."""
+        return self.error_m <= self.far_m
+
+    def within(self, radius_m: float = ACCURACY_M) -> float:
+        return float((self.error_m <= radius_m).mean())
+
+    def trusted(self) -> float:
+        """Largest share of the right views that a threshold accepts with no wrong one."""
+        wrong = np.concatenate([self.evidence[~self.right], self.mirrored, [-math.inf]])
+        right = self.evidence[self.right]
+        return float((right > wrong.max()).mean()) if right.size else math.nan
+
+    def accepted(self, threshold: float) -> tuple[float, int]:
+        """Share of the right views that a threshold accepts, and how many wrong ones."""
+        accepted = self.evidence >= threshold
+        right = float(accepted[self.right].mean()) if self.right.any() else math.nan
+        return right, int((accepted & ~self.right).sum() + (self.mirrored >= threshold).sum())
+
+    def median_m(self) -> float:
+        """Median error of the right views."""
+        return float(np.median(self.error_m[self.right])) if self.right.any() else math.nan
+
+
+def tables(results: Sequence[Result]) -> list[Table]:
+    """Each method over all scenes, and scene by scene."""
+    rows = [each for each in results if FIELD in each.plain]
+    if not rows:
+        return []
+    names = list(dict.fromkeys(name for each in rows for name in each.plain[FIELD]))
+    flying = [Method(**plain) for each in rows for plain in each.plain["methods"]]
+    shown = {each.key: each.label for each in flying}
+    return [_summary(rows, names, shown), _field_by_scene(rows, names, shown)]
+
+
+def _summary(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]) -> Table:
+    lines = []
+    for name in names:
+        placed = Placed.of(rows, name)
+        parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
+        own = placed.accepted(CONFIDENT) if name.endswith("registration") else None
+        lines.append(
+            [
+                shown.get(name, name),
+                percent(placed.within()),
+                percent(float(placed.right.mean())),
+                percent(placed.trusted()),
+                "-" if own is None else f"{percent(own[0])} / {own[1]}",
+                number(placed.median_m()),
+                number(max(part["cpu_s"] for part in parts)),
+                number(max(part["peak_mb"] for part in parts)),
+                number(sum(part["carried_mb"] for part in parts)),
+            ]
+        )
+    errors = rows[0].plain["errors"]
+    counts = Placed.of(rows, names[0])
+    header = (
+        *("method", "15 m", "35 m or 10 px", "accepted at no wrong"),
+        *("accepted / wrong", "median m", "CPU s per view", "peak MB", "carried MB"),
+    )
+    notes = (
+        f"scenes: {', '.join(each.scene for each in rows)}; "
+        f"{len(counts.error_m)} views anywhere, of the later date, and {len(counts.mirrored)} "
+        "mirrored; "
+        f"standard deviations of the reported heading, {errors['yaw_std_deg']:g} deg, the height, "
+        f"{errors['agl_std']:.0%}, and the prior, {errors['prior_std_px']:g} px: the same for all",
+        "views in %; accepted at no wrong: of those correct within 35 m or 10 px, the "
+        "largest fraction that one threshold over all scenes accepts without a wrong one; every "
+        "answer to a mirrored view is wrong; evidence: inliers, Lowe's ratio, or the confidence",
+        f"accepted / wrong: of the correct ones, and number of wrong ones, at a confidence of "
+        f"{CONFIDENT:g}, where a method states one",
+        "CPU s, peak MB: the largest of the scenes' medians and peaks, one core; carried: "
+        "keypoints (descriptors in 16 bits) or maps with their encoders, all scenes",
+    )
+    return Table("The field today: all scenes", header, lines, notes)
+
+
+def _field_by_scene(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]) -> Table:
+    lines = []
+    for name in names:
+        lines.append([shown.get(name, name)])
+        for each in rows:
+            placed = Placed.of([each], name)
+            shares = (placed.within(), float(placed.right.mean())) if placed.error_m.size else ()
+            lines[-1].append("/".join(map(percent, shares)) or "-")
+    guess = ["the prior itself"]
+    for each in rows:
+        away = np.array(next(iter(each.plain[FIELD].values()))["prior_m"])
+        radii = ACCURACY_M, far_m(each.trajectory.gsd_m)
+        guess.append("/".join(percent(float((away <= radius).mean())) for radius in radii))
+    header = ("method", *(each.scene for each in rows))
+    notes = ("fraction of the views within 15 m / within 35 m or 10 px, in %",)
+    return Table("The field today, scene by scene", header, [*lines, guess], notes)

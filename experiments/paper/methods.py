@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 TILE_PX = 256
-SWEPT_ON = "B"
-"""Trajectory of the sensitivity to heading and altitude."""
+STUDIED = "B"
+"""Trajectory of the baselines and of the sensitivity to heading and altitude."""
 VIEW_ROOM = 1.5
 """Ground around a view, in view widths: it contains the view turned by up to 45 deg."""
 LARGEST_M = 49_500.0
@@ -155,6 +155,23 @@ DEFAULT = "gradient"
 PER_TILE = "per=tile"
 BETWEEN_DATES = Path(__file__).resolve().parent / "between_dates.onnx"
 """Edges that stay between dates: made by `experiments.paper.between_dates` at d63ac91."""
+FAMILIES = {
+    "bovw": "BoVW",
+    "triplet": "Triplet",
+    "autoencoder": "Auto-Encoder",
+    "caevl": "CAEVL",
+    DEFAULT: "orthonav",
+}
+INPUTS = {
+    GREY: "grey",
+    CANNY: "Canny",
+    SEGMENTS: "segments",
+    SAM: "Segment Anything, sheet",
+    f"{SAM}-tile": "Segment Anything, tile",
+    LEARNT: "learnt edges",
+    DEFAULT: "gradients",
+}
+"""Names of families and inputs in tables, in their order there."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +193,27 @@ class Method:
         return int(self.recipe.partition(f"{name}=")[2].partition(",")[0])
 
     @property
+    def input(self) -> str:
+        """What the method looks at: its edges without their options."""
+        return self.edges.partition(":")[0] + ("-tile" if PER_TILE in self.edges else "")
+
+    @property
+    def label(self) -> str:
+        """Name of the row in tables."""
+        if self.family == DEFAULT:
+            return "orthonav, default" if self.registration else "orthonav, embedding only"
+        return f"{FAMILIES[self.family]}, {INPUTS[self.input]}"
+
+    @property
+    def order(self) -> tuple[int, bool, int]:
+        """Methods are sorted by this in tables."""
+        return (
+            list(FAMILIES).index(self.family),
+            self.registration,
+            list(INPUTS).index(self.input),
+        )
+
+    @property
     def training(self) -> str:
         """Name of the folder of checkpoints, the same for all rows of a training."""
         return f"{self.family}-{self.edges}-{self.number('width')}" if self.curve else self.key
@@ -192,9 +230,22 @@ class Method:
             return f"{self.training}-{self.number('epochs')}"
         words = self.recipe.partition("words=")[2].partition(",")[0]
         layer = "registration" if self.registration else ""
-        singly = "tile" if PER_TILE in self.edges else ""
-        parts = (self.family, self.edges.partition(":")[0], singly, words, layer)
-        return "-".join(part for part in parts if part)
+        return "-".join(part for part in (self.family, self.input, words, layer) if part)
+
+    def tuned_on(self, scene: str) -> bool:
+        """Whether it was tuned with imagery or views of a scene, or of the same generator.
+
+        docs/paper.md lists what was tuned on what. The default was chosen on generated landscapes,
+        the Szada pairs and NAIP; learnt edges are learnt on generated landscapes; training of the
+        reduced networks was chosen by their accuracy on B; the number of words is chosen by its
+        accuracy everywhere, as in the paper.
+        """
+        drawn = column(scene) in TABLE_1
+        if self.family == DEFAULT:
+            return drawn or scene.startswith(("naip-", "szada-"))
+        chosen = {"triplet": LEARNABLE, "autoencoder": f"learning_rate={REDUCED.encoder_rate:g},"}
+        by_training = self.family in chosen and chosen[self.family] in self.recipe
+        return self.family == "bovw" or (drawn and (self.input == LEARNT or by_training))
 
 
 FLOWN = (
@@ -209,24 +260,8 @@ FLOWN = (
 
 def flown(rows: Sequence[Method]) -> list[Method]:
     """Those of `FLOWN`, in its order."""
-    found = {(each.family, each.edges.partition(":")[0], each.registration): each for each in rows}
+    found = {(each.family, each.input, each.registration): each for each in rows}
     return [found[each] for each in FLOWN if each in found]
-
-
-def tuned(family: str, recipe: str, scene: str, edges: str = "") -> bool:
-    """Whether a row was tuned with imagery or views of its scene, or of the same generator.
-
-    docs/paper.md lists what was tuned on what. The default was chosen on generated landscapes, the
-    Szada pairs and NAIP; learnt edges are learnt on generated landscapes; training of the reduced
-    networks was chosen by their accuracy on B; the number of words is chosen by its accuracy
-    everywhere, as in the paper.
-    """
-    drawn = column(scene) in TABLE_1
-    if family == "gradient":
-        return drawn or scene.startswith(("naip-", "szada-"))
-    chosen = {"triplet": LEARNABLE, "autoencoder": f"learning_rate={REDUCED.encoder_rate:g},"}
-    by_training = family in chosen and chosen[family] in recipe
-    return family == "bovw" or (drawn and (edges == LEARNT or by_training))
 
 
 def column(scene: str) -> str:
@@ -324,10 +359,9 @@ def _curves() -> list[Method]:
 
 def _reduced(method: Method, scene: str) -> bool:
     """Whether the reduced setting learns this network here."""
-    edges = method.edges.partition(":")[0]
     name = column(scene)
     if name not in TABLE_1:
         if method.family == "caevl":
             return scene in FIELD_SCENES
-        return method.family == "autoencoder" and edges in REAL_INPUTS
-    return name in REDUCED_NETWORKS[method.family].get(edges, "")
+        return method.family == "autoencoder" and method.input in REAL_INPUTS
+    return name in REDUCED_NETWORKS[method.family].get(method.input, "")

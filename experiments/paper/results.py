@@ -4,15 +4,18 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.paper.methods import PER_TILE, SETTINGS, Method, tuned
+from experiments.paper.methods import SETTINGS, Method, Trajectory
 from orthonav.core.files import write_text
 
+PROGRAM = "python -m experiments.paper"
 ROWS = Path(__file__).resolve().parent / "rows"
 """Results that the page shows, a folder for each setting."""
 WORDS = ROWS.with_name("words.json")
@@ -25,6 +28,8 @@ DIGITS = 5
 
 ACCURACY_M = 15.0
 ACCURACY = 0.95
+ORDER = attrgetter("method.order")
+"""Results are sorted by this in tables."""
 COLUMNS = {"error_m": 0, "score": 1, "lowe_ratio": 2, "peak_ratio": 3, "confidence": 4}
 Array = NDArray[np.float64]
 
@@ -40,26 +45,23 @@ class Result:
         """Name of the trajectory or pair of orthophotos."""
         return str(self.plain["scene"])
 
-    @property
-    def family(self) -> str:
-        """Method without its parameters; "" for a file of baselines."""
-        return str(self.plain.get("method", {}).get("family", ""))
+    @cached_property
+    def method(self) -> Method:
+        return Method(**self.plain["method"])
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        return Trajectory(**self.plain["trajectory"])
 
     @property
-    def edges(self) -> str:
-        """Input of the method, for tables."""
-        edges = str(self.plain["method"]["edges"])
-        return edges.partition(":")[0] + ("-tile" if PER_TILE in edges else "")
+    def star(self) -> str:
+        """A star if the method was tuned on the scene."""
+        return "*" if self.method.tuned_on(self.scene) else ""
 
     @property
-    def registration(self) -> bool:
-        """Whether views are placed below tile size."""
-        return bool(self.plain.get("method", {}).get("registration"))
-
-    @property
-    def stride_m(self) -> float:
-        flown = self.plain["trajectory"]
-        return float(max(1, round(256 * (1 - flown["overlap"]))) * flown["gsd_m"])
+    def label(self) -> str:
+        """Name of the method in tables, with its star."""
+        return self.method.label + self.star
 
     def column(self, placement: str, name: str) -> Array:
         """A number per view (N,); NaN where there was none, errors then infinite."""
@@ -126,9 +128,13 @@ def rounded(value: Any) -> Any:
 
 def name_of(row: Result) -> str:
     """Scene and method of a row, as its file is named."""
-    if not row.family:
-        return f"{row.scene}-{FIELD if FIELD in row.plain else BASELINES}"
-    return f"{row.scene}-{Method(**row.plain['method']).key}"
+    keys = [each for each in (BASELINES, FIELD) if each in row.plain] or [row.method.key]
+    return f"{row.scene}-{keys[0]}"
+
+
+def of_methods(results: Iterable[Result]) -> list[Result]:
+    """Those of one method each, not of the baselines or of the field."""
+    return [each for each in results if "method" in each.plain]
 
 
 def numbers(values: Sequence[float | None], missing: float) -> Array:
@@ -145,6 +151,32 @@ def share(counted: Sequence[int]) -> float:
     """Share of views within 15 m: number of them, and of all."""
     hits, count = counted
     return hits / count if count else math.nan
+
+
+def share_with_error(right: int, count: int) -> str:
+    """A share in per cent with its standard error."""
+    mean = share((right, count))
+    return with_error(mean, math.sqrt(mean * (1 - mean) / (count or 1)))
+
+
+def with_error(mean: float, error: float, *, signed: bool = False) -> str:
+    """A share or a difference in per cent with its standard error."""
+    if math.isnan(mean):
+        return "-"
+    shown = f"{100 * mean:+.0f}" if signed else percent(mean)
+    return f"{shown} ± {percent(error)}"
+
+
+def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
+    """Mean and its standard error; NaN of fewer than two values."""
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+    return (float(np.mean(values)) if values else math.nan), spread / math.sqrt(len(values) or 1)
+
+
+def difference(one: Result, other: Result, placement: str) -> tuple[float, float]:
+    """Mean difference of two results over the same views, and its standard error."""
+    pairs = zip(one.right(placement), other.right(placement), strict=True)
+    return mean_and_error([float(here) - float(there) for here, there in pairs])
 
 
 def confident(right: NDArray[np.bool_], ratio: Array, threshold: float) -> tuple[float, float]:
@@ -168,71 +200,19 @@ def ceiling(stride_m: float) -> float:
 
 
 TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
-FAMILIES = {
-    "bovw": "BoVW",
-    "triplet": "Triplet",
-    "autoencoder": "Auto-Encoder",
-    "caevl": "CAEVL",
-    "gradient": "orthonav",
-}
-EDGES = {
-    "gray": "grey",
-    "canny": "Canny",
-    "segments": "segments",
-    "sam": "Segment Anything, sheet",
-    "sam-tile": "Segment Anything, tile",
-    "onnx": "learnt edges",
-    "gradient": "gradients",
-}
 
 
 def best_words(found: Sequence[Result]) -> list[Result]:
     """All but the worse ones of several vocabularies: "the best performances will be displayed"."""
-    words = [each for each in found if each.family == "bovw"]
+    words = [each for each in found if each.method.family == "bovw"]
     best = max(words, key=lambda each: each.accuracy("grid"), default=None)
-    shown = [each for each in found if each.family != "bovw" or each is best]
-    return sorted(shown, key=row_of)
+    shown = [each for each in found if each.method.family != "bovw" or each is best]
+    return sorted(shown, key=ORDER)
 
 
-class Row(NamedTuple):
-    """A method and its input, as a row of a table; sorted as the tables list them."""
-
-    order: tuple[int, bool, int]
-    family: str
-    edges: str
-    registration: bool
-
-
-def row_of(each: Result) -> Row:
-    order = (list(FAMILIES).index(each.family), each.registration, list(EDGES).index(each.edges))
-    return Row(order, each.family, each.edges, each.registration)
-
-
-def row_label(row: Row) -> str:
-    if row.family == "gradient":
-        return "orthonav, default" if row.registration else "orthonav, embedding only"
-    return f"{FAMILIES[row.family]}, {EDGES[row.edges]}"
-
-
-def named(each: Result) -> str:
-    """Name of a method and its input, with a star if it was tuned on its scene."""
-    return row_label(row_of(each)) + ("*" if is_tuned(each) else "")
-
-
-def is_tuned(each: Result) -> bool:
-    """Whether a row was tuned on its scene."""
-    return tuned(each.family, each.plain["method"]["recipe"], each.scene, each.edges)
-
-
-def label(method: Method) -> str:
-    """The same of a `Method`."""
-    edges = method.edges.partition(":")[0]
-    return row_label(Row((0, False, 0), method.family, edges, method.registration))
-
-
-def by_scene(results: Iterable[Result]) -> list[tuple[str, list[Result]]]:
+def by_scene(results: Iterable[Result]) -> dict[str, list[Result]]:
     """Results of each scene, by its name."""
     scenes: dict[str, list[Result]] = {}
     for each in results:
         scenes.setdefault(each.scene, []).append(each)
-    return sorted(scenes.items())
+    return dict(sorted(scenes.items()))

@@ -28,10 +28,9 @@ from benchmarks.scenes import store
 from numpy.typing import NDArray
 
 from experiments.paper import scenes as views
-from experiments.paper.methods import DEFAULT, SWEPT_ON, TILE_PX, Method, Setting
+from experiments.paper.methods import DEFAULT, STUDIED, TILE_PX, Method, Setting
 from experiments.paper.published import most_views
-from experiments.paper.results import ACCURACY_M, compact
-from experiments.paper.results import BASELINES as BASELINES_KEY
+from experiments.paper.results import ACCURACY_M, BASELINES, compact
 from experiments.paper.scenes import Scene
 from orthonav.core.files import write_text
 from orthonav.core.localize import Localizer
@@ -268,7 +267,7 @@ def _placed(
     if not times_ms:
         raise ValueError(f"no view of {scene.name} lies wholly on the imagery of the later date")
     result["view_ms"] = statistics.median(times_ms)
-    if scene.name == SWEPT_ON and setting.swept and seen["grid"]:
+    if scene.name == STUDIED and setting.swept and seen["grid"]:
         count = min(setting.swept, len(seen["grid"]))
         few = [seen["grid"][at] for at in np.linspace(0, len(seen["grid"]) - 1, count, dtype=int)]
         turned = {v: _hits(locate(each, turned_deg=v)[0] for each in few) for v in HEADINGS_DEG}
@@ -356,7 +355,6 @@ def _digest(path: Path) -> str:
 
 MAP_OF = "gradient-gradient"
 """The baselines get the plane and pixels of this run's map."""
-TRIED_ON = "B"
 COARSER = 2
 """Mutual information is taken on pixels of so many of the map's, averaged: it is slow."""
 BASELINE_VIEWS = 50
@@ -376,7 +374,7 @@ def _reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any
     return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
 
 
-BASELINES = (
+RELATED_WORK = (
     Baseline("mutual information (Patel et al.)", _reported_pose(MutualSurface), COARSER),
     Baseline(
         "Sobel edges matched (Conte and Doherty)",
@@ -393,19 +391,19 @@ BASELINES = (
 
 def run_baselines(place: Workplace, scene: Scene) -> bool:
     """Place views by every baseline; false where an earlier run has its file or there is no map."""
-    out, map_path = place.result(scene, BASELINES_KEY), place.work(scene, MAP_OF) / "map.onav"
+    out, map_path = place.result(scene, BASELINES), place.work(scene, MAP_OF) / "map.onav"
     if out.is_file() or not map_path.is_file():
         return False
     start, made = time.perf_counter(), head(place, scene, provenance("paper"))
     localizer = Localizer(open_map(map_path), registration=False)
-    pixels_path = place.work(scene, BASELINES_KEY).with_suffix(".npz")
+    pixels_path = place.work(scene, BASELINES).with_suffix(".npz")
     store(scene.past, localizer, pixels_path)
     count = min(BASELINE_VIEWS, place.setting.views)
     grounds = dict(placements(scene, localizer, count))
     del grounds["route"]
-    made["baselines"] = {
+    made[BASELINES] = {
         each.name: _placed_by(each, scene, localizer, map_path, pixels_path, grounds)
-        for each in BASELINES
+        for each in RELATED_WORK
     }
     save(out, made, start)
     return True

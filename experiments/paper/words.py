@@ -5,6 +5,7 @@ similarities and numbers of features. The results go to `words.json` beside this
 """
 
 import argparse
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,13 +14,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.record import provenance, say
+from benchmarks.record import Table, number, provenance, say
 from numpy.typing import NDArray
 
 from experiments.paper import scenes
 from experiments.paper.dates import found_again
 from experiments.paper.methods import REDUCED, TILE_PX
-from experiments.paper.results import ACCURACY_M, WORDS
+from experiments.paper.results import ACCURACY_M, PROGRAM, WORDS, share_with_error
 from experiments.paper.runs import Workplace, geometry, head, save
 from experiments.paper.scenes import Scene
 from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe, describe
@@ -27,7 +28,7 @@ from orthonav.ground.build.encoders import MAX_WORD_TILES
 from orthonav.research.words import learn_words
 
 Array = NDArray[np.float64]
-COMMAND = "python -m experiments.paper.words"
+COMMAND = f"{PROGRAM}.words"
 PAPER = (("product", 0),)
 WAYS = (*PAPER, ("cosine", 0), ("cosine", 1))
 """Similarity of two bags, and whether words are weighed by tf-idf."""
@@ -114,6 +115,40 @@ def placed(scores: Array, correct: Sequence[int], centres_en_m: NDArray[Any]) ->
     own = scores[np.arange(len(correct)), correct]
     above = (scores > own[:, None]).mean(axis=1)
     return {"right": [int((away <= ACCURACY_M).sum()), len(away)], "above": float(np.median(above))}
+
+
+def table() -> Table:
+    """The bag of words by vocabulary and similarity, on views of the map's date and of another."""
+    found = json.loads(WORDS.read_text(encoding="utf-8"))["scenes"]
+    rows = [
+        [
+            *(each["scene"], f"{row['words']:,}", f"{row['features']:,}"),
+            row["similarity"] + (", tf-idf" if row["tfidf"] else ""),
+            *(share_with_error(*row[date]["right"]) for date in ("same", "other")),
+            *(number(100 * row[date]["above"]) for date in ("same", "other")),
+        ]
+        for each in found
+        for row in each["rows"]
+    ]
+    again = [
+        f"{each['scene']} "
+        + " / ".join(number(100 * each["found_again"][n]) for n in ("same", "other", "elsewhere"))
+        for each in found
+    ]
+    about = found[0]["provenance"]
+    notes = (
+        "views on the grid: accuracy at 15 m in % with its standard error; features: most SIFT "
+        "features of a picture; tiles above: median share of the tiles with a higher score than "
+        "the correct one, in %, 50 for a guess",
+        "SIFT features of a view whose most similar feature of the tile is within 3 px, in %, same "
+        f"date / other date / another tile: {'; '.join(again)}",
+        f"made by `{found[0]['command']}` at {about['commit'][:10]}, {about['date'][:10]}",
+    )
+    header = (
+        *("scene", "words", "features", "similarity", "same date", "other date"),
+        *("tiles above, same", "tiles above, other"),
+    )
+    return Table("Bag of words between dates", header, rows, notes)
 
 
 if __name__ == "__main__":

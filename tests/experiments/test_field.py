@@ -1,7 +1,7 @@
 """The field today: features are matched under the reported pose and prior, and counted fairly."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import cv2
 import numpy as np
@@ -9,6 +9,7 @@ import pytest
 from benchmarks.posed import Picture
 from experiments.paper import field, matchers, runs, scenes
 from experiments.paper.__main__ import main
+from experiments.paper.field import Placed
 from experiments.paper.matchers import FeatureMap, Features, Sift
 from experiments.paper.methods import (
     FIELD_SCENES,
@@ -18,10 +19,9 @@ from experiments.paper.methods import (
     Method,
     flown,
     methods,
-    tuned,
 )
 from experiments.paper.results import Result, compact, name_of, read
-from experiments.paper.tables import Placed, tables
+from experiments.paper.tables import tables
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
@@ -119,7 +119,8 @@ def result(scene, errors, evidence, mirrored, gsd_m=1.0, key="SIFT, ratio test")
     views = [[error, each] for error, each in zip(errors, evidence, strict=True)]
     part = {"views": views, "mirrored": mirrored, "prior_m": [20.0] * len(views)}
     part |= dict.fromkeys(("cpu_s", "prepare_cpu_s", "peak_mb", "carried_mb"), 1.0)
-    made = {"scene": scene, "trajectory": {"gsd_m": gsd_m}, "field": {key: part}, "methods": []}
+    flown = asdict(replace(SMALL, gsd_m=gsd_m))
+    made = {"scene": scene, "trajectory": flown, "field": {key: part}, "methods": []}
     made["errors"] = {"yaw_std_deg": 5.0, "agl_std": 0.03, "prior_std_px": 40.0}
     made |= {"provenance": {"commit": "0", "dirty": False, "date": "", "cpu": ""}, "minutes": 1.0}
     return Result(json.loads(compact(made)))
@@ -237,11 +238,9 @@ def test_rows_of_the_field_are_flown_in_one_order():
 @pytest.mark.slow  # an experiment
 def test_learnt_edges_are_tuned_on_generated_landscapes():
     rows = {each.key: each for each in methods(REDUCED, "B", 900)}
-    learnt = rows["autoencoder-onnx"]
-    assert tuned(learnt.family, learnt.recipe, "B", learnt.edges.partition(":")[0])
-    assert not tuned(learnt.family, learnt.recipe, "tours", "onnx")
-    caevl = rows["caevl-canny"]
-    assert not tuned(caevl.family, caevl.recipe, "B", caevl.edges)
+    assert rows["autoencoder-onnx"].tuned_on("B")
+    assert not rows["autoencoder-onnx"].tuned_on("tours")
+    assert not rows["caevl-canny"].tuned_on("B")
 
 
 def test_features_count_what_an_aircraft_carries():
