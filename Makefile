@@ -49,7 +49,6 @@ bench: $(VENV)/.dev-installed
 
 paper: $(VENV)/.dev-installed
 	$(BIN)/python -m experiments.paper
-	$(BIN)/python -m experiments.paper report
 
 docs: $(VENV)/.docs-installed
 	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs site

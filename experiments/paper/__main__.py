@@ -143,11 +143,9 @@ def _tasks(options: argparse.Namespace, place: runs.Workplace, wanted: set[str])
 
 def _whole(scene: Scene, wanted: set[str]) -> bool:
     """Whether all rows of a scene are wanted, not only those that another part needs."""
-    if scene.name in scenes.UNTUNED:
-        return "untuned" in wanted
-    if scene.name in scenes.REAL:
-        return "real" in wanted
-    return scene.name not in TABLE_1 or scene.name in wanted
+    parts = dict.fromkeys(scenes.UNTUNED, "untuned") | dict.fromkeys(scenes.REAL, "real")
+    part = parts.get(scene.name, scene.name)
+    return part in wanted or part not in PARTS
 
 
 def _minutes(start: float) -> str:
@@ -161,9 +159,10 @@ def _scenes(options: argparse.Namespace, setting: Setting, wanted: set[str]) -> 
     if "own" in wanted and options.past and options.present:
         name = f"own-{options.past.stem}-{options.present.stem}"
         yield scenes.over(name, options.past, options.present, options.gsd_m).of(setting)
-    sets = {"real": scenes.real(options.data, setting), "untuned": scenes.untuned(options.data)}
+    few = scenes.REDUCED_REAL if setting.name == "reduced" else scenes.REAL
+    sets = {"real": few, "untuned": scenes.UNTUNED}
     for name in (each for each in sets if wanted & {each, FIELD}):
-        found = list(sets[name])
+        found = list(scenes.real(options.data, sets[name]))
         if not found:
             say(f"{name} skipped: the optional real imagery beside the checkout is absent")
         for each in found:
@@ -173,55 +172,46 @@ def _scenes(options: argparse.Namespace, setting: Setting, wanted: set[str]) -> 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=PROGRAM, description=__doc__)
-    parser.add_argument(
-        "what", nargs="?", choices=("run", "report", "pictures", "keep"), default="run"
-    )
-    parser.add_argument("--setting", choices=tuple(SETTINGS), default="reduced")
-    parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
-    parser.add_argument(
-        "--methods", nargs="+", metavar="NAME", help="gradient, bovw, autoencoder, caevl, triplet"
-    )
-    parser.add_argument("--out", type=Path, default=Path("paper_results"), metavar="DIR")
-    parser.add_argument(
-        "--data", type=Path, default=DATA, metavar="DIR", help="optional real imagery"
-    )
-    parser.add_argument(
-        "--jobs", type=int, help="runs at a time (default one per core; 1 in the full setting)"
-    )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="every step once, on two tiles of every scene"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("what", nargs="?", choices=("run", "report", "pictures", "keep"), default="run")
+    add("--setting", choices=tuple(SETTINGS), default="reduced")
+    add("--only", nargs="+", choices=PARTS, help="only these parts")
+    add("--methods", nargs="+", metavar="NAME", help="gradient, bovw, autoencoder, caevl, triplet")
+    add("--out", type=Path, default=Path("paper_results"), metavar="DIR")
+    add("--data", type=Path, default=DATA, metavar="DIR", help="optional real imagery")
+    add("--jobs", type=int, help="runs at a time (default one per core; 1 in the full setting)")
+    add("--dry-run", action="store_true", help="every step once, on two tiles of every scene")
+    add(
         "--device",
         default="auto",
         choices=("auto", "cpu", "cuda"),
         help="where networks are learnt (default auto: a GPU if there is one)",
     )
-    parser.add_argument(
+    add(
         "--workers",
         type=int,
         metavar="N",
         help="threads that make batches and read imagery (default up to 16 with a GPU, else 2)",
     )
-    parser.add_argument(
+    add(
         "--keep-checkpoints",
         action="store_true",
         help="keep checkpoints of finished rows, so that epochs can be added",
     )
-    parser.add_argument(
+    add(
         "--epochs",
         type=int,
         metavar="N",
         help="epochs of networks; added to a training whose checkpoint was kept",
     )
-    parser.add_argument("--past", type=Path, help="an orthophoto of your own, for the map")
-    parser.add_argument("--present", type=Path, help="the same ground at another date")
-    parser.add_argument(
+    add("--past", type=Path, help="an orthophoto of your own, for the map")
+    add("--present", type=Path, help="the same ground at another date")
+    add(
         "--gsd-m",
         type=float,
         help="ground resolution for --past (default its own), and of A to D, as further scenes",
     )
-    parser.add_argument("--sam", metavar="PATH", help="weights of Segment Anything: adds its rows")
+    add("--sam", metavar="PATH", help="weights of Segment Anything: adds its rows")
     return parser
 
 

@@ -68,9 +68,8 @@ def run(place: Workplace, chosen: Iterable[Scene]) -> None:
 def pairs_of(place: Workplace, scene: Scene) -> list[Pair]:
     """The views on the grid, each with its tile."""
     localizer = geometry(place, scene)
-    ground = localizer.sheet.frame, localizer.grid, localizer.tiles.centres_en_m
-    tiles = scenes.reference_tiles(scene, *ground)
-    views = scenes.grid_views(scene, *ground, place.setting.views)
+    tiles = scenes.reference_tiles(scene, localizer)
+    views = scenes.grid_views(scene, localizer, place.setting.views)
     return [(tiles[tile], view) for tile, view in views]
 
 

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -93,23 +93,14 @@ def seen(scene: Scene, localizer: Localizer, count: int) -> Iterator[Seen]:
     """Views anywhere, each with errors of heading, height and prior."""
     rng = np.random.default_rng([SEED, count])
     agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
-    camera = views.camera_of(agl_m, gsd_m)
     places = views.places_en_m(localizer.tiles.centres_en_m, count)
-    telemetry = Telemetry(
-        0,
-        0.0,
-        0.0,
-        0.0,
-        agl_m,
-        yaw_std_deg=YAW_STD_DEG,
-        agl_std_m=AGL_STD * agl_m,
-        tilt_std_deg=0.0,
+    telemetry = replace(
+        views.telemetry_at(agl_m), yaw_std_deg=YAW_STD_DEG, agl_std_m=AGL_STD * agl_m
     )
-    for ground in views.grounds(scene, localizer.sheet.frame, localizer.grid, places):
+    for ground in views.grounds(scene, localizer, places):
         turned, lower, *off = np.clip(rng.normal(size=4), -CLIPPED, CLIPPED)
         grey = views.view_of(
             ground,
-            camera,
             agl_m,
             gsd_m,
             turned_deg=float(turned) * YAW_STD_DEG,
@@ -132,8 +123,9 @@ def _measured(place: Workplace, scene: Scene, any_map: str, name: str) -> dict[s
     Path("/proc/self/clear_refs").write_text("5")  # the peak is counted from here
     frame, gsd_m = localizer.sheet.frame, localizer.grid.gsd_m
     camera = views.camera_of(scene.trajectory.agl_m, gsd_m)
-    straight, mirrored, times_s = [], [], []
+    straight, mirrored, prior_m, times_s = [], [], [], []
     for each in seen(scene, localizer, min(VIEWS, place.setting.views)):
+        prior_m.append(float(np.hypot(*(each.prior_en_m - each.truth_en_m))))
         lat, lon = frame.latlon_from_en(each.prior_en_m)
         prior = Prior(float(lat), float(lon), PRIOR_STD_PX * gsd_m)
         for grey in (each.grey, np.ascontiguousarray(each.grey[:, ::-1])):
@@ -149,10 +141,7 @@ def _measured(place: Workplace, scene: Scene, any_map: str, name: str) -> dict[s
     return {
         "views": straight,
         "mirrored": mirrored,
-        "prior_m": [
-            float(np.hypot(*(each.prior_en_m - each.truth_en_m)))
-            for each in seen(scene, localizer, min(VIEWS, place.setting.views))
-        ],
+        "prior_m": prior_m,
         "cpu_s": float(np.median(times_s[2:] or times_s)),  # the first view loads what is needed
         "prepare_cpu_s": prepared_s,
         "peak_mb": memory_mb(),
@@ -255,19 +244,19 @@ def tables(results: Sequence[Result]) -> list[Table]:
         return []
     names = list(dict.fromkeys(name for each in rows for name in each.plain[FIELD]))
     flying = [Method(**plain) for each in rows for plain in each.plain["methods"]]
-    shown = {each.key: each.label for each in flying}
-    return [_summary(rows, names, shown), _field_by_scene(rows, names, shown)]
+    labels = dict(zip(names, names, strict=True)) | {each.key: each.label for each in flying}
+    return [_summary(rows, labels), _by_scene(rows, labels)]
 
 
-def _summary(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]) -> Table:
+def _summary(rows: Sequence[Result], labels: dict[str, str]) -> Table:
     lines = []
-    for name in names:
+    for name, label in labels.items():
         placed = Placed.of(rows, name)
         parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
         own = placed.accepted(CONFIDENT) if name.endswith("registration") else None
         lines.append(
             [
-                shown.get(name, name),
+                label,
                 percent(placed.within()),
                 percent(float(placed.right.mean())),
                 percent(placed.trusted()),
@@ -279,7 +268,7 @@ def _summary(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]
             ]
         )
     errors = rows[0].plain["errors"]
-    counts = Placed.of(rows, names[0])
+    counts = Placed.of(rows, next(iter(labels)))
     header = (
         *("method", "15 m", "35 m or 10 px", "accepted at no wrong"),
         *("accepted / wrong", "median m", "CPU s per view", "peak MB", "carried MB"),
@@ -301,10 +290,10 @@ def _summary(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]
     return Table("The field today: all scenes", header, lines, notes)
 
 
-def _field_by_scene(rows: Sequence[Result], names: Sequence[str], shown: dict[str, str]) -> Table:
+def _by_scene(rows: Sequence[Result], labels: dict[str, str]) -> Table:
     lines = []
-    for name in names:
-        lines.append([shown.get(name, name)])
+    for name, label in labels.items():
+        lines.append([label])
         for each in rows:
             placed = Placed.of([each], name)
             shares = (placed.within(), float(placed.right.mean())) if placed.error_m.size else ()

@@ -219,9 +219,8 @@ class FeatureMap:
         turn_deg = abs(math.degrees(math.atan2(matrix[1, 0], matrix[0, 0])))
         scale = abs(math.log(max(math.hypot(matrix[0, 0], matrix[1, 0]), 1e-9)))
         agl_std = (reported.agl_std_m or math.inf) / reported.agl_m
-        if turn_deg > GATE_SIGMAS * (reported.yaw_std_deg or math.inf):
-            return None
-        if scale > GATE_SIGMAS * agl_std:
+        turned = turn_deg > GATE_SIGMAS * (reported.yaw_std_deg or math.inf)
+        if turned or scale > GATE_SIGMAS * agl_std:
             return None
         centre = matrix @ [*(np.array(seen.grey.shape[::-1]) / 2), 1.0]
         return Found(self._picture.place_en_m(*centre) - seen.offset_en_m, count)

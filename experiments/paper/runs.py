@@ -7,6 +7,7 @@ again. Baselines are the paper's related work: methods that carry the reference 
 import hashlib
 import json
 import logging
+import math
 import os
 import re
 import resource
@@ -77,6 +78,8 @@ class Workplace:
 
 
 Task = tuple[Workplace, Scene, Method]
+Grounds = dict[str, list[views.Ground]]
+"""Ground of the views, by placement."""
 
 
 def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
@@ -99,10 +102,10 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     # Where weights lie is no part of a result.
     edges = re.sub("[:,]weights=[^,]*", "", method.edges)
     made |= {"method": asdict(method) | {"edges": edges}, **built, **_sizes(opened)}
-    made |= _placed(scene, localizer, place.setting, method.registration)
-    made["rules"] = (
-        {} if method.registration or method.curve else _rules(scene, opened, place.setting)
-    )
+    seen = placements(scene, localizer, place.setting.views)
+    made |= _placed(scene, localizer, seen, method.registration, place.setting.swept)
+    ruled = not (method.registration or method.curve)
+    made["rules"] = _rules(scene, localizer, seen) if ruled else {}
     history = work / "history.json"
     if history.is_file():
         made["loss"] = json.loads(history.read_text(encoding="utf-8"))["loss"]
@@ -160,13 +163,9 @@ def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, A
         "setting": asdict(place.setting),
         "command": place.command,
         "seeds": {"views": views.VIEW_SEED, "build": 0},
-        "inputs": {path.name: _digest(path) for path in _imagery(scene)},
+        "inputs": {path.name: _digest(path) for path in scene.imagery},
         "provenance": started,
     }
-
-
-def _imagery(scene: Scene) -> tuple[Path, ...]:
-    return scene.past, scene.present, *scene.others
 
 
 def save(out: Path, made: dict[str, Any], start: float) -> dict[str, Any]:
@@ -239,7 +238,7 @@ def _sizes(opened: MapFile) -> dict[str, float]:
 
 
 def _placed(
-    scene: Scene, localizer: Localizer, setting: Setting, registration: bool
+    scene: Scene, localizer: Localizer, seen: Grounds, registration: bool, swept: int
 ) -> dict[str, Any]:
     """Errors and evidence of the views of all placements, the sweep, chance, and times."""
     grid, frame = localizer.grid, localizer.sheet.frame
@@ -249,26 +248,25 @@ def _placed(
     times_ms: list[float] = []
 
     def locate(ground: views.Ground, **wrong: float) -> list[float]:
-        grey = views.view_of(ground, camera, agl_m, gsd_m, **wrong)
+        grey = views.view_of(ground, agl_m, gsd_m, **wrong)
         start = time.perf_counter()
         found = localizer.locate(View(grey, camera, telemetry))
         times_ms.append(1e3 * (time.perf_counter() - start))
         if not isinstance(found, Fix):
-            return [float("nan")] * (2 + len(EVIDENCE))
+            return [math.nan] * (2 + len(EVIDENCE))
         error = frame.en_from_latlon(found.lat_deg, found.lon_deg) - ground.truth_en_m
-        evidence = [float(found.evidence.get(name, float("nan"))) for name in EVIDENCE]
+        evidence = [float(found.evidence.get(name, math.nan)) for name in EVIDENCE]
         return [float(np.hypot(*error)), *evidence, found.confidence]
 
     result: dict[str, Any] = {"views": {}, "chance": {}, "sweep": {}}
-    seen = dict(placements(scene, localizer, setting.views))
     for name, grounds in seen.items():
         result["views"][name] = [locate(ground) for ground in grounds]
         result["chance"][name] = _chance(grounds, localizer.tiles.centres_en_m)
     if not times_ms:
         raise ValueError(f"no view of {scene.name} lies wholly on the imagery of the later date")
     result["view_ms"] = statistics.median(times_ms)
-    if scene.name == STUDIED and setting.swept and seen["grid"]:
-        count = min(setting.swept, len(seen["grid"]))
+    if scene.name == STUDIED and swept and seen["grid"]:
+        count = min(swept, len(seen["grid"]))
         few = [seen["grid"][at] for at in np.linspace(0, len(seen["grid"]) - 1, count, dtype=int)]
         turned = {v: _hits(locate(each, turned_deg=v)[0] for each in few) for v in HEADINGS_DEG}
         lower = {v: _hits(locate(each, drop_m=v)[0] for each in few) for v in DROPS_M}
@@ -276,9 +274,7 @@ def _placed(
     return result
 
 
-def placements(
-    scene: Scene, localizer: Localizer, count: int
-) -> Iterator[tuple[str, list[views.Ground]]]:
+def placements(scene: Scene, localizer: Localizer, count: int) -> Grounds:
     """Views along the route, on the grid and anywhere.
 
     The last two are at the same places but for where they are snapped to.
@@ -290,37 +286,30 @@ def placements(
         "grid": views.on_grid(anywhere, centres),
         "anywhere": anywhere,
     }
-    for name in views.PLACEMENTS:
-        yield name, views.grounds(scene, localizer.sheet.frame, localizer.grid, places[name])
+    return {name: views.grounds(scene, localizer, places[name]) for name in views.PLACEMENTS}
 
 
 def _chance(grounds: list[views.Ground], centres_en_m: NDArray[np.float32]) -> float:
     """Share of tiles within the radius of a view, the mean over views: what a random tile gets."""
-    if not grounds:
-        return float("nan")
-    shares = [
-        (np.hypot(*(centres_en_m - ground.truth_en_m).T) <= ACCURACY_M).mean() for ground in grounds
-    ]
-    return float(np.mean(shares))
+    away_m = (np.hypot(*(centres_en_m - ground.truth_en_m).T) for ground in grounds)
+    shares = [(each <= ACCURACY_M).mean() for each in away_m]
+    return float(np.mean(shares)) if shares else math.nan
 
 
-def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
+def _rules(scene: Scene, localizer: Localizer, seen: Grounds) -> dict[str, Any]:
     """Views within 15 m by each rule of position, with scalar product and cosine.
 
     "We use the position of the reference embedding leading to the highest scalar product, as we
     observed that it yields better results than the weighted average" (section Methodology).
     """
-    localizer = Localizer(opened, registration=False, flying=False)
     placer, gsd_m, agl_m = localizer.tiles, localizer.grid.gsd_m, scene.trajectory.agl_m
     camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
-    tiles, centres = opened.array("sheet0/embeddings", np.float16, 2), placer.centres_en_m
+    tiles, centres = localizer.opened.array("sheet0/embeddings", np.float16, 2), placer.centres_en_m
     made: dict[str, Any] = {}
-    for name, grounds in placements(scene, localizer, setting.views):
-        if name == "route":
-            continue
+    for name in ("grid", "anywhere"):
         queries = []
-        for ground in grounds:
-            view = View(views.view_of(ground, camera, agl_m, gsd_m), camera, telemetry)
+        for ground in seen[name]:
+            view = View(views.view_of(ground, agl_m, gsd_m), camera, telemetry)
             rectified = placer.rectified(downsampled(view, gsd_m), telemetry.yaw_deg)
             queries.append(placer.embedded([rectified]))
         for similarity in ("product", "cosine"):
@@ -328,7 +317,7 @@ def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
             scaled = _unit(tiles).astype(np.float16) if cosine else tiles
             for rule in RULES:
                 matcher, errors = TileMatcher(localizer.grid, centres, scaled, rule), []
-                for query, ground in zip(queries, grounds, strict=True):
+                for query, ground in zip(queries, seen[name], strict=True):
                     match = matcher.match(_unit(query) if cosine else query)
                     found = centres[match.tile].astype(np.float64) + match.shift_en_m
                     errors.append(float(np.hypot(*(found - ground.truth_en_m))))
@@ -374,17 +363,15 @@ def _reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any
     return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
 
 
+def _matched(edges: bool) -> Callable[[Picture], Any]:
+    return _reported_pose(lambda picture: TemplateSurface(picture, edges))
+
+
 RELATED_WORK = (
     Baseline("mutual information (Patel et al.)", _reported_pose(MutualSurface), COARSER),
-    Baseline(
-        "Sobel edges matched (Conte and Doherty)",
-        _reported_pose(lambda picture: TemplateSurface(picture, False)),
-        sobel=True,
-    ),
-    Baseline("Canny edges matched", _reported_pose(lambda picture: TemplateSurface(picture, True))),
-    Baseline(
-        "grey levels matched", _reported_pose(lambda picture: TemplateSurface(picture, False))
-    ),
+    Baseline("Sobel edges matched (Conte and Doherty)", _matched(edges=False), sobel=True),
+    Baseline("Canny edges matched", _matched(edges=True)),
+    Baseline("grey levels matched", _matched(edges=False)),
     Baseline("SIFT, ratio test, RANSAC", Keypoints),
 )
 
@@ -398,44 +385,31 @@ def run_baselines(place: Workplace, scene: Scene) -> bool:
     localizer = Localizer(open_map(map_path), registration=False)
     pixels_path = place.work(scene, BASELINES).with_suffix(".npz")
     store(scene.past, localizer, pixels_path)
-    count = min(BASELINE_VIEWS, place.setting.views)
-    grounds = dict(placements(scene, localizer, count))
-    del grounds["route"]
+    seen = placements(scene, localizer, min(BASELINE_VIEWS, place.setting.views))
     made[BASELINES] = {
-        each.name: _placed_by(each, scene, localizer, map_path, pixels_path, grounds)
+        each.name: _placed_by(each, Picture.read(map_path, pixels_path, each.factor), scene, seen)
         for each in RELATED_WORK
     }
     save(out, made, start)
     return True
 
 
-def _placed_by(
-    baseline: Baseline,
-    scene: Scene,
-    localizer: Localizer,
-    map_path: Path,
-    pixels_path: Path,
-    grounds: dict[str, list[views.Ground]],
-) -> dict[str, Any]:
-    picture = Picture.read(map_path, pixels_path, baseline.factor)
+def _placed_by(baseline: Baseline, picture: Picture, scene: Scene, seen: Grounds) -> dict[str, Any]:
+    agl_m, gsd_m = scene.trajectory.agl_m, picture.grid.gsd_m
+    camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
     if baseline.sobel:
         picture = replace(picture, grey=sobel(picture.grey))
-    method = baseline.make(picture)
-    agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
-    camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
-    hits: dict[str, list[int]] = {}
-    times_ms = []
-    for name, seen in grounds.items():
-        hits[name] = [0, len(seen)]
-        for ground in seen:
-            grey = views.view_of(ground, camera, agl_m, gsd_m)
-            start = time.perf_counter()
-            grey = sobel(grey) if baseline.sobel else grey
-            view = View(grey, camera, telemetry)
-            found = method.locate(view, True)
-            times_ms.append(1e3 * (time.perf_counter() - start))
-            right = found is not None and np.hypot(*(found - ground.truth_en_m)) <= ACCURACY_M
-            hits[name][0] += bool(right)
+    method, times_ms = baseline.make(picture), []
+
+    def error_m(ground: views.Ground) -> float:
+        grey = views.view_of(ground, agl_m, gsd_m)
+        start = time.perf_counter()
+        grey = sobel(grey) if baseline.sobel else grey
+        found = method.locate(View(grey, camera, telemetry), True)
+        times_ms.append(1e3 * (time.perf_counter() - start))
+        return math.inf if found is None else float(np.hypot(*(found - ground.truth_en_m)))
+
+    hits = {name: _hits(map(error_m, seen[name])) for name in ("grid", "anywhere")}
     return {"views": hits, "view_ms": float(np.median(times_ms))}
 
 

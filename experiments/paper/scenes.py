@@ -6,7 +6,7 @@ route*, one per tile step, for views *on the grid* all over the search band, and
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from experiments.paper.methods import (
 )
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.geo.grid import TileGrid
+from orthonav.core.localize import Localizer
 from orthonav.core.records import Telemetry
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
@@ -69,6 +69,10 @@ class Scene:
     present: Path
     trajectory: Trajectory
     others: tuple[Path, ...] = ()
+
+    @property
+    def imagery(self) -> tuple[Path, ...]:
+        return self.past, self.present, *self.others
 
     def of(self, setting: Setting) -> "Scene":
         """The scene as a setting runs it: a dry run has two tiles."""
@@ -113,10 +117,9 @@ def generated(setting: Setting, name: str, folder: Path, gsd_m: float | None = N
 
 def render(scene: Scene) -> None:
     """Generate the imagery of a scene, unless it is there."""
-    paths = (scene.past, scene.present, *scene.others)
-    if all(path.is_file() for path in paths):
+    if all(path.is_file() for path in scene.imagery):
         return
-    flown, names = scene.trajectory, [path.stem for path in paths]
+    flown, names = scene.trajectory, [path.stem for path in scene.imagery]
     dates = [date for date in DEFAULT_DATES if date.name in names]
     folder = scene.past.parent
     generate_area(folder, size_m=flown.imagery_m, gsd_m=flown.gsd_m, dates=dates, seed=SEED)
@@ -141,22 +144,13 @@ def over(
     return Scene(name, past, present, made, others)
 
 
-def real(data: Path, setting: Setting) -> Iterator[Scene]:
-    """Scenes of the optional real imagery, those that are there; fewer in the reduced setting."""
-    yield from _there(data, REAL, REDUCED_REAL if setting.name == "reduced" else tuple(REAL))
+def real(data: Path, names: Iterable[str]) -> Iterator[Scene]:
+    """Scenes of the optional real imagery, those that are there.
 
-
-def untuned(data: Path) -> Iterator[Scene]:
-    """Those of `UNTUNED` that are there."""
-    yield from _there(data, UNTUNED, tuple(UNTUNED))
-
-
-def _there(
-    data: Path, pairs: dict[str, tuple[str, str, str]], names: Sequence[str]
-) -> Iterator[Scene]:
-    """Scenes of two dates; all others of the catalogue are for what learns from several."""
+    All other dates of the catalogue are for what learns from several.
+    """
     for name in names:
-        place, past, present = pairs[name]
+        place, past, present = (REAL | UNTUNED)[name]
         dates = [each for each in SCENES[place].dates if each not in (past, present)]
         first, second, *others = (data / SCENES[place].file(d) for d in (past, present, *dates))
         if first.is_file() and second.is_file():
@@ -168,9 +162,7 @@ def _outline(path: Path) -> Area:
     return Area.from_outline(outline[:, 0], outline[:, 1])
 
 
-def _box_deg(
-    frame: LocalFrame, low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[float, float, float, float]:
+def _box_deg(frame: LocalFrame, low: Array, high: Array) -> tuple[float, float, float, float]:
     middle = (low + high) / 2
     sides = np.array(
         [[low[0], middle[1]], [high[0], middle[1]], [middle[0], low[1]], [middle[0], high[1]]]
@@ -219,51 +211,41 @@ def along_route(centres_en_m: NDArray[np.floating[Any]], most: int) -> Array:
     return np.asarray(places[chosen])
 
 
-def grounds(scene: Scene, frame: LocalFrame, grid: TileGrid, places: Array) -> list[Ground]:
+def grounds(scene: Scene, localizer: Localizer, places: Array) -> list[Ground]:
     """What the later date shows around places (N, 2); those without whole imagery are left out."""
-    side_px = 2 * round(VIEW_ROOM * TILE_PX / 2)
-    half_m = side_px * grid.gsd_m / 2
+    side_px, gsd_m = 2 * round(VIEW_ROOM * TILE_PX / 2), localizer.grid.gsd_m
+    half_m = side_px * gsd_m / 2
     mosaic, found = Mosaic.open([scene.present]), []
     for place in places:
-        west, north = place[0] - half_m, place[1] + half_m
-        with mosaic.sheet(
-            frame,
-            west_m=float(west),
-            north_m=float(north),
-            width_px=side_px,
-            height_px=side_px,
-            gsd_m=grid.gsd_m,
-        ) as raster:
+        west_m, north_m = float(place[0] - half_m), float(place[1] + half_m)
+        size = {"width_px": side_px, "height_px": side_px}
+        sheet = mosaic.sheet(
+            localizer.sheet.frame, west_m=west_m, north_m=north_m, gsd_m=gsd_m, **size
+        )
+        with sheet as raster:
             pixels = raster.read(0, 0, side_px, side_px)
         if pixels.valid.all():
             found.append(Ground(place, pixels.rgb))
     return found
 
 
-def reference_tiles(
-    scene: Scene, frame: LocalFrame, grid: TileGrid, centres_en_m: NDArray[np.floating[Any]]
-) -> list[NDArray[np.uint8]]:
-    """Grey levels (256, 256) of the tiles with these centres (N, 2), of the date of the map."""
-    with Mosaic.open([scene.past]).grid_sheet(frame, grid) as raster:
+def reference_tiles(scene: Scene, localizer: Localizer) -> list[NDArray[np.uint8]]:
+    """Grey levels (256, 256) of all tiles, of the date of the map."""
+    grid = localizer.grid
+    with Mosaic.open([scene.past]).grid_sheet(localizer.sheet.frame, grid) as raster:
         grey = raster.read(0, 0, grid.width_px, grid.height_px).grey
-    corners = grid.tiles_rc(centres_en_m) * grid.stride_px
+    corners = grid.tiles_rc(localizer.tiles.centres_en_m) * grid.stride_px
     return [grey[row : row + TILE_PX, col : col + TILE_PX] for row, col in corners.tolist()]
 
 
 def grid_views(
-    scene: Scene,
-    frame: LocalFrame,
-    grid: TileGrid,
-    centres_en_m: NDArray[np.floating[Any]],
-    count: int,
+    scene: Scene, localizer: Localizer, count: int
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """The views on the grid: number of the tile, a row of the centres (N, 2), and grey levels."""
-    places = on_grid(places_en_m(centres_en_m, count), centres_en_m)
-    agl_m = scene.trajectory.agl_m
-    camera = camera_of(agl_m, grid.gsd_m)
-    for ground in grounds(scene, frame, grid, places):
-        tile = int(np.hypot(*(centres_en_m - ground.truth_en_m).T).argmin())
-        yield tile, view_of(ground, camera, agl_m, grid.gsd_m)
+    """The views on the grid: number of the tile, and grey levels."""
+    centres = localizer.tiles.centres_en_m
+    for ground in grounds(scene, localizer, on_grid(places_en_m(centres, count), centres)):
+        tile = int(np.hypot(*(centres - ground.truth_en_m).T).argmin())
+        yield tile, view_of(ground, scene.trajectory.agl_m, localizer.grid.gsd_m)
 
 
 def camera_of(agl_m: float, gsd_m: float) -> Camera:
@@ -273,16 +255,10 @@ def camera_of(agl_m: float, gsd_m: float) -> Camera:
 
 
 def view_of(
-    ground: Ground,
-    camera: Camera,
-    agl_m: float,
-    gsd_m: float,
-    *,
-    turned_deg: float = 0.0,
-    drop_m: float = 0.0,
+    ground: Ground, agl_m: float, gsd_m: float, *, turned_deg: float = 0.0, drop_m: float = 0.0
 ) -> NDArray[np.uint8]:
     """Grey view (256, 256) from the place, with these errors of heading and height."""
-    half_m = ground.rgb.shape[0] * gsd_m / 2
+    camera, half_m = camera_of(agl_m, gsd_m), ground.rgb.shape[0] * gsd_m / 2
     attitude = (turned_deg, 0.0, 0.0, agl_m - drop_m)
     corner = np.array([-half_m, half_m])
     rng = np.random.default_rng(0)

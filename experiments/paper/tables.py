@@ -216,24 +216,18 @@ def rules(results: Sequence[Result]) -> list[Table]:
 def sensitivity(results: Sequence[Result]) -> list[Table]:
     """Accuracy at each error of heading and height, on the trajectory that the paper sweeps."""
     made: list[Table] = []
-    for step, title in STEPS:
-        swept = [each for each in best_words(results) if each.plain.get("sweep")]
-        if swept:
-            values = list(swept[0].plain["sweep"][step])
-            count = swept[0].plain["sweep"][step][values[0]][1]
-            rows = [
-                [
-                    each.label,
-                    *(percent(share(each.plain["sweep"][step][value])) for value in values),
-                ]
-                for each in swept
-            ]
-            notes = (
-                f"{count} views on the grid of {swept[0].scene}; the default searches headings, "
-                "the other methods take the reported one as exact",
-            )
-            header = ("method", *values)
-            made.append(Table(f"Figure 3: accuracy at 15 m, %, by {title}", header, rows, notes))
+    swept = [each for each in best_words(results) if each.plain.get("sweep")]
+    for step, title in STEPS if swept else ():
+        found = [each.plain["sweep"][step] for each in swept]
+        counts = [[percent(share(each[value])) for value in found[0]] for each in found]
+        rows = [[each.label, *cells] for each, cells in zip(swept, counts, strict=True)]
+        _, count = next(iter(found[0].values()))
+        notes = (
+            f"{count} views on the grid of {swept[0].scene}; the default searches headings, "
+            "the other methods take the reported one as exact",
+        )
+        header = ("method", *found[0])
+        made.append(Table(f"Figure 3: accuracy at 15 m, %, by {title}", header, rows, notes))
     return made
 
 
@@ -242,16 +236,15 @@ def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
     found = []
     for tried in (each for each in results if BASELINES in each.plain):
         rows = []
-        for name, result in tried.plain[BASELINES].items():
-            fractions = [share(result["views"][placement]) for placement in ("grid", "anywhere")]
-            count = result["views"]["anywhere"][1]
-            rows.append([name, *map(percent, fractions), str(count), number(result["view_ms"])])
+        for name, plain in tried.plain[BASELINES].items():
+            grid, anywhere = (plain["views"][placement] for placement in ("grid", "anywhere"))
+            cells = [percent(share(grid)), percent(share(anywhere)), str(anywhere[1])]
+            rows.append([name, *cells, number(plain["view_ms"])])
         for each in made:
             if each.method.family == DEFAULT and each.scene == tried.scene:
-                fractions = [each.accuracy(placement) for placement in ("grid", "anywhere")]
-                count = len(each.plain["views"]["anywhere"])
-                ms = number(each.plain["view_ms"])
-                rows.append([each.label, *map(percent, fractions), str(count), ms])
+                cells = [percent(each.accuracy(name)) for name in ("grid", "anywhere")]
+                cells.append(str(len(each.plain["views"]["anywhere"])))
+                rows.append([each.label, *cells, number(each.plain["view_ms"])])
         header = ("method", "on grid", "anywhere", "of", "ms per view")
         notes = ("the baselines carry the orthophoto itself; reported pose, whole map, no prior",)
         title = f"Related work, {tried.scene}: accuracy at 15 m, %"
@@ -290,10 +283,8 @@ def provenance(results: Sequence[Result]) -> Table:
     rows = []
     for (day, commit, command), found in sorted(made.items()):
         minutes = sum(each.plain.get("cpu_minutes", each.plain["minutes"]) for each in found)
-        names = " ".join(map(name_of, found))
-        rows.append(
-            [commit, day, number(minutes), f"`{command.removeprefix(PROGRAM).strip()}`", names]
-        )
+        options = f"`{command.removeprefix(PROGRAM).strip()}`"
+        rows.append([commit, day, number(minutes), options, " ".join(map(name_of, found))])
     header = ("commit", "date", "core minutes", "options", "rows")
     processors = ", ".join(sorted({str(each.plain["provenance"]["cpu"]) for each in results}))
     notes = (

@@ -61,11 +61,10 @@ def measured(place: Workplace, scene: Scene) -> dict[str, Any]:
     """
     localizer, began = geometry(place, scene), time.perf_counter()
     centres = localizer.tiles.centres_en_m
-    ground = localizer.sheet.frame, localizer.grid, centres
-    tiles = scenes.reference_tiles(scene, *ground)
+    tiles = scenes.reference_tiles(scene, localizer)
     flown = {"same": replace(scene, present=scene.past), "other": scene}
     seen = {
-        date: list(scenes.grid_views(each, *ground, place.setting.views))
+        date: list(scenes.grid_views(each, localizer, place.setting.views))
         for date, each in flown.items()
     }
     pictures = {"map": tiles} | {date: [view for _, view in seen[date]] for date in seen}

@@ -1,6 +1,7 @@
 """The field today: features are matched under the reported pose and prior, and counted fairly."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 
 import cv2
@@ -11,15 +12,7 @@ from experiments.paper import field, matchers, runs, scenes
 from experiments.paper.__main__ import main
 from experiments.paper.field import Placed
 from experiments.paper.matchers import FeatureMap, Features, Sift
-from experiments.paper.methods import (
-    FIELD_SCENES,
-    FULL,
-    REDUCED,
-    TABLE_1,
-    Method,
-    flown,
-    methods,
-)
+from experiments.paper.methods import FIELD_SCENES, FULL, REDUCED, TABLE_1, Method, flown, methods
 from experiments.paper.results import Result, compact, name_of, read
 from experiments.paper.tables import tables
 
@@ -161,26 +154,9 @@ def placed(tmp_path_factory, area):
         names = {"SIFT, ratio test": Sift}
         patch.setattr(matchers, "LOCAL", names)
         patch.setattr(matchers, "one_thread", lambda: None)
-        patch.setattr(field, "ProcessPoolExecutor", HereAndNow)
+        patch.setattr(field, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
         assert field.run(place, scene) and not field.run(place, scene)
     return place, scene
-
-
-class HereAndNow:
-    """Runs what is submitted at once, in this process."""
-
-    def __init__(self, *_, **__):
-        pass
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def submit(self, function, *arguments):
-        made = function(*arguments)
-        return type("Done", (), {"result": staticmethod(lambda: made)})
 
 
 @pytest.mark.slow  # an experiment
@@ -205,7 +181,7 @@ def test_a_map_that_was_built_later_is_added(placed, monkeypatch):
     place, scene = placed
     out = place.result(scene, "field")
     asked, whole = [], out.read_text()
-    monkeypatch.setattr(field, "ProcessPoolExecutor", HereAndNow)
+    monkeypatch.setattr(field, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
     monkeypatch.setattr(matchers, "LOCAL", {"SIFT, ratio test": Sift})
     monkeypatch.setattr(field, "_measured", lambda *task: asked.append(task[-1]) or {})
     plain = json.loads(whole)
