@@ -63,7 +63,8 @@ def test_every_page_is_in_the_contents():
 
 
 def test_figures_are_shown_small_and_made_by_a_script():
-    scripts = ROOT / "tools" / "docs" / "pictures.py", ROOT / "experiments" / "paper" / "dates.py"
+    experiments = ROOT / "experiments" / "paper"
+    scripts = ROOT / "tools/docs/pictures.py", experiments / "dates.py", experiments / "curves.py"
     made = "".join(script.read_text("utf-8") for script in scripts)
     shown = {Path(link).name for page in PAGES for link in LINK.findall(prose(page))}
     for figure in (ROOT / "docs" / "figures").iterdir():

@@ -66,7 +66,7 @@ def figure(results: Sequence[Result], path: Path) -> None:
         left.plot(epochs, [100 * each.accuracy(PLACEMENT) for _, each in rows], "o", **style)
         loss = last.plain["loss"]
         right.plot(range(1, len(loss) + 1), loss, **style)
-    left.set(xlabel="epochs", ylabel="views on the grid within 15 m, %", ylim=(0, 100))
+    left.set(xlabel="epochs", ylabel="views on the grid within 15 m, %", ylim=(0, None))
     right.set(xlabel="epoch", ylabel="loss (mean squared error)", yscale="log")
     left.legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
