@@ -70,7 +70,7 @@ CORE_COMMANDS = {
     "localize MAP FLIGHT --require-signed MAP --out new.jsonl": "signing",
     "fly MAP FLIGHT --autopilot udpin:127.0.0.1:0 --dry-run": "autopilot",
     "fly MAP FLIGHT --recorded-telemetry --log new.mcap": "autopilot",
-    "fly MAP --ros2 --dry-run": "ros2",
+    "fly MAP --ros2 --dry-run": "flights",
     "evaluate FIXES --truth FLIGHT/truth.csv --report new": "report",
     "view FIXES --map MAP --no-browser": "web",
 }

@@ -60,7 +60,7 @@ def distribution(request):
 @pytest.fixture
 def env(monkeypatch):
     """A domain of its own on the loopback, without a sourced ROS."""
-    made = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "AMENT_", "CYCLONE"))}
+    made = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "AMENT_"))}
     made.pop("PYTHONPATH", None)
     domain = random.Random(os.urandom(8)).randint(1, 100)
     made |= {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

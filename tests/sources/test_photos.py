@@ -408,10 +408,13 @@ def test_the_calibration_of_dji_is_used(tmp_path):
     assert "focal length 45 px and distortion: DewarpData of DJI" in recording.note
 
 
-@pytest.mark.parametrize("other", [{"flag": 1}, {"fx": 60}, {"right": 30}, {"k1": math.nan}])
+@pytest.mark.parametrize("other", [{"flag": 1}, {"fx": 49}, {"right": 30}, {"k1": math.nan}])
 def test_other_calibrations_of_dji_are_not(tmp_path, other):
     """The picture was dewarped; of another size; not of this camera; damaged."""
     path = photo(tmp_path / "p/a.jpg", xmp=dewarped(**other))
+    photo(tmp_path / "mixed/a.jpg", "2023:11:14 22:13:20", xmp=dewarped())
+    photo(tmp_path / "mixed/b.jpg", "2023:11:14 22:13:21", xmp=dewarped(**other))
+    assert open_source(tmp_path / "mixed").camera.distortion == ()
     recording = open_source(path.parent)
     assert FILM_NOTE in recording.note and recording.camera.distortion == ()
 

@@ -167,9 +167,10 @@ def _ros2(
 
     node = Node(ros_arguments(options.ros_args, os.environ))
     stack.callback(node.close)
-    rosout, logger = Rosout(node), logging.getLogger("orthonav")
-    logger.addHandler(rosout)
-    stack.callback(logger.removeHandler, rosout)
+    if "--disable-rosout-logs" not in node.arguments.passed:
+        rosout, logger = Rosout(node), logging.getLogger("orthonav")
+        logger.addHandler(rosout)
+        stack.callback(logger.removeHandler, rosout)
     reader = Ros2Reader(
         node,
         TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),

@@ -141,9 +141,10 @@ def learn_words(
 class SheetWords:
     """SIFT features of a sheet picture and their words, found once for all tiles.
 
-    Neighbouring tiles overlap by 87.5 %: finding the features of each tile would take 64 times as
-    long. A tile has the features that SIFT could find in it alone: those farther from its edge than
-    OpenCV's border.
+    With tiles that overlap by 87.5 %, finding the features of each would take 64 times as long. A
+    tile has the features farther from its edge than OpenCV's border, which SIFT could find in it
+    alone; their descriptors see what is beyond the edge, and the strongest are chosen among those
+    that see valid pixels only.
 
     - `points` (N, 2): column and row, by rows. `margins` (N,): OpenCV's border, px.
     - `strengths` (N,), `words` (N,): responses and nearest words of the features.
@@ -160,7 +161,8 @@ class SheetWords:
         cls, embedder: WordsEmbedder, grey: Grey, valid: Mask, progress: Callable[[float], None]
     ) -> "SheetWords":
         """`grey` (H, W) uint8 and `valid` (H, W): arrays or memory maps."""
-        blocks, parts = _blocks(*grey.shape), []
+        blocks, nothing = _blocks(*grey.shape), np.zeros(0, np.float32)
+        parts = [(np.zeros((0, 2), np.float32), nothing, nothing, np.zeros(0, np.intp))]
         for done, (block, window) in enumerate(blocks):
             if valid[block].any():
                 parts.append(_found(embedder, block, window, grey[window], valid[window]))
@@ -178,7 +180,9 @@ class SheetWords:
 
     def _counts(self, corner: NDArray[np.integer[Any]], tile_px: int) -> NDArray[np.int64]:
         """Features by words (k,) of the tile whose first column and row are `corner` (2,)."""
-        first, last = np.searchsorted(self.points[:, 1], (corner[1], corner[1] + tile_px))
+        # Limits of the type of the points: else all points are converted for every tile.
+        rows = np.array([corner[1], corner[1] + tile_px], np.float32)
+        first, last = np.searchsorted(self.points[:, 1], rows)
         points = self.points[first:last] - corner
         to_edge = np.minimum(points, tile_px - points).min(axis=1)
         inside = first + np.flatnonzero(to_edge >= self.margins[first:last])

@@ -22,7 +22,7 @@ from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
 from orthonav.core.tilt import ASSUMED, AUTOPILOT, GIMBAL, TiltSource
-from orthonav.ground.recordings.exif import Photo, focal_length, read_photo
+from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, read_photo
 from orthonav.ground.recordings.image_table import (
     ImageTable,
     is_image_table,
@@ -61,9 +61,11 @@ _EDITOR = re.compile(
 """Programs that show, turn or develop photographs."""
 _FIRMWARE = re.compile(r"[vV]?\d+(?:\.\d+)+")
 ROUNDED = 0.02  # focal lengths of EXIF that differ by less, as a fraction, are of one lens
-MAX_OFF_EXIF = 0.1
-"""Of the focal length in DJI's calibration from that of EXIF: otherwise it is of another size."""
-FACTORY_STD = 0.01  # of that focal length, which differs with focus and temperature
+MAX_EXIF_SIGMA = 3.0
+"""Largest difference between the focal lengths of DJI's calibration and of EXIF, in standard
+deviations of the latter; a larger one means another size of the picture."""
+FACTORY_STD = 0.01
+"""Standard deviation of the calibrated focal length, a fraction: it changes with focus."""
 _BY_NAME_NS = 10**9  # spacing of photographs without a time, which are ordered by name
 
 
@@ -211,7 +213,7 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     focal_px = [_focal_px(photo, options) for photo in photos]
     photos, zoomed = _alike(photos, focal_px, "of another focal length than most", ROUNDED)
     warnings += zoomed
-    camera, note = _camera(photos[0], options)
+    camera, note = _camera(photos, options)
     track = None
     if options.telemetry is not None:
         track = read_log(options.telemetry, options.mount_deg, options.topics)
@@ -420,7 +422,8 @@ def _focal_px(photo: Photo, options: SourceOptions) -> float | None:
     return None if found is None else found.px
 
 
-def _camera(photo: Photo, options: SourceOptions) -> tuple[Camera, str]:
+def _camera(photos: Sequence[Photo], options: SourceOptions) -> tuple[Camera, str]:
+    photo = photos[0]
     width, height, path = photo.width_px, photo.height_px, photo.path
     given = given_camera(options, width, height, str(path))
     if given is not None:
@@ -433,19 +436,22 @@ def _camera(photo: Photo, options: SourceOptions) -> tuple[Camera, str]:
         raise CameraError(
             f"photograph has no focal length; give --camera FILE or --fov-deg: {path}"
         )
-    if lens := _factory_camera(photo, focal.px):
+    if lens := _factory_camera(photos, focal):
         return lens, f"focal length {lens.fx_px:.0f} px and distortion: DewarpData of DJI"
     camera = Camera(width, height, focal.px, focal.px, width / 2, height / 2, focal_std=focal.std)
     share = f"good to {100 * focal.std:.0f} %"
     return camera, f"focal length {focal.px:.0f} px, {share}: {focal.source}"
 
 
-def _factory_camera(photo: Photo, focal_px: float) -> Camera | None:
-    """The camera as DJI calibrated it; None where that is not stated, or of another picture size
-    than this one by the focal length of EXIF."""
-    if photo.lens is None or abs(photo.lens[0] / focal_px - 1) > MAX_OFF_EXIF:
+def _factory_camera(photos: Sequence[Photo], focal: FocalLength) -> Camera | None:
+    """The camera as DJI calibrated it; None where not all photographs state the same one, where an
+    editor may have turned or dewarped them, and where it is of another size by EXIF."""
+    lens, size = photos[0].lens, (photos[0].width_px, photos[0].height_px)
+    if lens is None or any(each.lens != lens for each in photos) or _edited(photos):
         return None
-    (fx, fy, right, down, *distortion), size = photo.lens, (photo.width_px, photo.height_px)
+    if size[0] < size[1] or abs(lens[0] / focal.px - 1) > MAX_EXIF_SIGMA * focal.std:
+        return None
+    fx, fy, right, down, *distortion = lens
     middle = size[0] / 2 + right, size[1] / 2 + down
     try:
         made = Camera(*size, fx, fy, *middle, tuple(distortion), focal_std=FACTORY_STD)

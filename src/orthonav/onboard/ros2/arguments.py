@@ -187,7 +187,7 @@ def _values(given: Sequence[_Given], node: str, full_name: str) -> Iterator[tupl
 
 def _values_of_file(path: Path, full_name: str) -> Iterator[tuple[str, str]]:
     """Those of a parameter file of ROS: nodes by name or pattern, each with `ros__parameters`."""
-    yaml = needed("yaml", "ros2", "--params-file")
+    yaml = needed("yaml", "flights", "--params-file")
     try:
         content = yaml.safe_load(require_file(path, "parameter file").read_text("utf-8"))
     except (ValueError, RecursionError, yaml.YAMLError) as error:

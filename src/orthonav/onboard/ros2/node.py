@@ -47,7 +47,7 @@ class Definitions:
 
         Raises `MissingExtraError`.
         """
-        typesys = needed("rosbags.typesys", "ros2", "--ros2")
+        typesys = needed("rosbags.typesys", "flights", "--ros2")
         stores = {store.value: store for store in typesys.Stores}
         self._store = typesys.get_typestore(stores.get(f"ros2_{distro}", typesys.Stores.LATEST))
         for name, text in _GEOGRAPHIC.items():
@@ -129,7 +129,11 @@ class Node:
             self._handle(topic, kind, handler, cdr)
 
         qos = self._made_qos(depth, reliable=reliable)
-        made = self._node.create_subscription(_message(kind), topic, take, qos, raw=True)
+        message = _message(kind)
+        try:
+            made = self._node.create_subscription(message, topic, take, qos, raw=True)
+        except Exception as error:  # of the middleware
+            raise OutputError(f"cannot subscribe to {topic}: {described(error)}") from error
         self._subscriptions.append((made, kind))
 
     def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
@@ -143,6 +147,8 @@ class Node:
         except MissingExtraError:
             log.warning("nothing is published on %s: ROS has no %s here", topic, kind)
             return lambda message: None
+        except Exception as error:  # of the middleware
+            raise OutputError(f"cannot publish on {topic}: {described(error)}") from error
         self._publishers.append((made, kind))
         return self._writing(topic, made.publish)
 
