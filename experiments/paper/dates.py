@@ -32,7 +32,7 @@ from experiments.paper.results import (
 from experiments.paper.runs import Workplace, geometry, head, save
 from experiments.paper.scenes import Scene
 from orthonav.core.tiles.represent import Canny
-from orthonav.core.tiles.words import WordsRecipe
+from orthonav.core.tiles.words import WordsRecipe, sift_features
 
 Grey = NDArray[np.uint8]
 Pair = tuple[Grey, Grey]
@@ -102,12 +102,12 @@ def correlation(one: NDArray[np.generic], other: NDArray[np.generic]) -> float:
 
 def found_again(view: Grey, tile: Grey) -> float:
     """Share of the SIFT features of a view whose most similar feature of the tile is in place."""
-    sift = cv2.SIFT.create(nfeatures=WordsRecipe.max_features)
-    (here, ours), (there, theirs) = (sift.detectAndCompute(each, None) for each in (view, tile))
-    if not here or not there:
+    ours, theirs = (sift_features(each, WordsRecipe.max_features) for each in (view, tile))
+    if not ours.keypoints or not theirs.keypoints:
         return 0.0
-    pairs = cv2.BFMatcher(cv2.NORM_L2).match(ours, theirs)
-    away = [np.subtract(here[m.queryIdx].pt, there[m.trainIdx].pt) for m in pairs]
+    pairs = cv2.BFMatcher(cv2.NORM_L2).match(ours.descriptors, theirs.descriptors)
+    here, there = ours.points, theirs.points
+    away = [here[pair.queryIdx] - there[pair.trainIdx] for pair in pairs]
     return float((np.hypot(*np.array(away).T) <= FOUND_PX).mean())
 
 

@@ -200,9 +200,10 @@ def _found(
 ) -> tuple[Array, Array, Array, NDArray[np.intp]]:
     """Points (N, 2), margins, strengths and words (N,) in a block, found in the window around."""
     found = sift_features(filled(grey, valid))
-    points = found.points + np.array([window[1].start, window[0].start], np.float32)
+    here = found.points
+    points = here + np.array([window[1].start, window[0].start], np.float32)
     low, high = ([getattr(part, end) for part in block[::-1]] for end in ("start", "stop"))
-    kept = seen(valid, found.points, found.radii)
+    kept = seen(valid, here, found.radii)
     kept &= ((points >= low) & (points < high)).all(axis=1)
     words = embedder.assigned(found.descriptors[kept])
     return points[kept], found.margins[kept], found.strengths[kept], words

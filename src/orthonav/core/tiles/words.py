@@ -8,7 +8,7 @@ section Methodology, features are those of grey levels, by SIFT (Lowe, IJCV 2004
 SIFT descriptors and words are whole numbers, and sums below 2^24 that decide on the nearest word
 are exact in float32, on every machine and in any order."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -186,24 +186,38 @@ def seen(valid: Mask, points: Array, radii: Array) -> Mask:
     return np.asarray(inside > radii)
 
 
-@dataclass(frozen=True, eq=False)
-class SiftFeatures:
-    """Features of a picture, N of them.
-
-    - `points` (N, 2): column and row from the outer corner. `radii` (N,) px.
-    - `descriptors` (N, 128): whole numbers. `strengths` (N,).
-    - `margins` (N,): px from the edge within which OpenCV finds no feature of this scale.
-    """
-
-    points: Array
-    radii: Array
-    descriptors: Array
-    strengths: Array
-    margins: Array
-
-
 SIFT_BORDER_PX = 5
 """Of every octave, within which OpenCV finds no feature."""
+
+
+@dataclass(frozen=True, eq=False)
+class SiftFeatures:
+    """Features of a picture, N of them; `descriptors` (N, 128): whole numbers."""
+
+    keypoints: Sequence[cv2.KeyPoint]
+    descriptors: Array
+
+    @property
+    def points(self) -> Array:
+        """Columns and rows (N, 2) from the outer corner."""
+        places = np.array([point.pt for point in self.keypoints], np.float32)
+        return places.reshape(-1, 2) + np.float32(0.5)
+
+    @property
+    def radii(self) -> Array:
+        """(N,) px."""
+        return np.array([point.size / 2 for point in self.keypoints], np.float32)
+
+    @property
+    def strengths(self) -> Array:
+        """Responses (N,)."""
+        return np.array([point.response for point in self.keypoints], np.float32)
+
+    @property
+    def margins(self) -> Array:
+        """Px (N,) from the edge within which OpenCV finds no feature of this scale."""
+        octaves = np.array([point.octave & 255 for point in self.keypoints], np.uint8)
+        return SIFT_BORDER_PX * np.exp2(octaves.view(np.int8).astype(np.float32))
 
 
 def sift_features(grey: Grey, most: int = 0) -> SiftFeatures:
@@ -212,11 +226,4 @@ def sift_features(grey: Grey, most: int = 0) -> SiftFeatures:
     found = found[: most or None]  # of equally strong ones there may be more
     if descriptors is None:
         descriptors = np.zeros((0, DIMS["sift"]))
-    octaves = np.array([point.octave & 255 for point in found], dtype=np.uint8).view(np.int8)
-    return SiftFeatures(
-        np.array([point.pt for point in found], np.float32).reshape(-1, 2) + np.float32(0.5),
-        np.array([point.size / 2 for point in found], np.float32),
-        np.asarray(descriptors[: len(found)], np.float32),
-        np.array([point.response for point in found], np.float32),
-        SIFT_BORDER_PX * np.exp2(octaves.astype(np.float32)),
-    )
+    return SiftFeatures(found, np.asarray(descriptors[: len(found)], np.float32))
