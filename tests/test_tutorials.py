@@ -65,7 +65,7 @@ def test_every_command_is_understood(page, monkeypatch):
 def shown_commands(page):
     """Calls of orthonav in the blocks of a page."""
     text = re.sub(r"\\\n\s*", " ", page.read_text("utf-8"))
-    blocks = re.findall(r"^```.*?^```|(?<=\n\n)(?:    .*\n)+", text, re.MULTILINE | re.DOTALL)
+    blocks = re.findall(r"^```.*?^```|(?<=\n\n)(?:    [^\n]*\n)+", text, re.MULTILINE | re.DOTALL)
     commands = "\n".join(block for block in blocks if not block.startswith("```text"))
     for line in commands.splitlines():
         if re.match(r" *orthonav [a-z]", line):
