@@ -161,11 +161,31 @@ FLIGHTS = {
 
 def located(name: str, folder: Path) -> list[Row]:
     """Results of the views of a flight; map and flight are written to a folder, the map once."""
+    prepare(name, folder)
+    return locate(name, folder)
+
+
+def prepare(name: str, folder: Path) -> None:
+    """Write the map and the flight of a flight to a folder, the map once."""
     flight = FLIGHTS[name]
     place = folder / flight.area
     if not place.exists():
         _build(AREAS[flight.area], place)
-    return _fly(flight, place)
+    _simulate(flight, place)
+
+
+def locate(name: str, folder: Path) -> list[Row]:
+    """Results of the views of a flight that is prepared in a folder."""
+    flight = FLIGHTS[name]
+    place = folder / flight.area
+    opened = open_map(place / "map.onav")
+    localizer = Localizer(opened, registration=flight.registration)
+    locator = (Tracker if flight.track else SingleViews)(
+        localizer, heading_known=flight.heading_known
+    )
+    flown = open_flight(place / f"flight{flight.seed}")
+    results = localize_flight(locator, flown, heights=map_heights(opened))
+    return [row_of(result, opened.manifest.sheets[0].frame) for result in results]
 
 
 def _build(area: Area, folder: Path) -> None:
@@ -180,11 +200,10 @@ def _build(area: Area, folder: Path) -> None:
     build_map(BuildRequest([mapped], folder / "map.onav", dem=dem, **usual, **area.build))
 
 
-def _fly(flight: Flight, place: Path) -> list[Row]:
-    """Simulate a flight over the area in a folder, locate its views."""
+def _simulate(flight: Flight, place: Path) -> None:
+    """Simulate a flight over the area in a folder."""
     area = AREAS[flight.area]
-    opened = open_map(place / "map.onav")
-    frame = opened.manifest.sheets[0].frame
+    frame = open_map(place / "map.onav").manifest.sheets[0].frame
     on_route = "random" not in flight.flown
     request = SimulateRequest(
         [place / "flown.tif"],
@@ -199,12 +218,6 @@ def _fly(flight: Flight, place: Path) -> list[Row]:
     )
     with _same_on_every_processor():
         simulate_flight(request)
-    localizer = Localizer(opened, registration=flight.registration)
-    locator = (Tracker if flight.track else SingleViews)(
-        localizer, heading_known=flight.heading_known
-    )
-    results = localize_flight(locator, open_flight(request.out), heights=map_heights(opened))
-    return [row_of(result, frame) for result in results]
 
 
 @dataclass(frozen=True)
