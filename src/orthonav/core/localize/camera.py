@@ -29,11 +29,11 @@ FIRST_REACH_PX, REACH_PX = 7, 4
 """Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
 SURFACE_REACHES_PX = 16, 8
 """The first reaches over houses and trees, at the finer level: coarser ones do not show the camera
-(docs/decisions/terrain.md)."""
+(docs/terrain.md)."""
 LEAST_FIT, CLOSE_FIT = 0.13, 0.15
 """Mean correlation of the blocks of a view among houses: below the first the camera is not shown,
 from the second on one close to the reported one is not sought any farther. Over towns right ones
-had 0.15 and more, wrong ones at most 0.12 (docs/decisions/terrain.md)."""
+had 0.15 and more, wrong ones at most 0.12 (docs/terrain.md)."""
 AGAIN_PX = 1.0
 """A view is orthorectified once more where its correction moves a block by more pixels of the final
 level."""

@@ -28,9 +28,9 @@ MAX_SPEED_MPS = 80.0  # for which a displacement is sought
 MIN_SCORE_RATIO = 2.5
 """Over the strongest rival: at least 4 for right ones, at most 1.7 for wrong ones."""
 MIN_CORRELATION = 0.4
-"""Right ones have at least 0.56, wrong ones at most 0.11 (docs/decisions/tracking.md)."""
+"""Right ones have at least 0.56, wrong ones at most 0.11 (docs/tracking.md)."""
 EXPECTED_CORRELATION = 0.6
-"""An expected displacement that fits this well ends the search (docs/decisions/tracking.md)."""
+"""An expected displacement that fits this well ends the search (docs/tracking.md)."""
 NOISE_PX, NOISE_SHARE = 0.4, 0.01  # per axis: in pixels, and as a fraction of its length
 CANDIDATES = 8
 EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
@@ -156,7 +156,7 @@ class OdometryView:
 
     def corrected(self, bias: Array) -> "OdometryView | None":
         """With the present biases: what was learnt between two views would else appear as motion
-        (docs/decisions/tracking.md)."""
+        (docs/tracking.md)."""
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
             return OdometryView.of(self.view, self.pixel_m, bias)
         # Rectified with its heading up, so only the heading may change without rectifying again.
@@ -278,7 +278,7 @@ def over_terrain(
     A slope along the displacement looks like a change of scale, one across it like a turn, each by
     half, about the middle of the views: this parallax displaces the camera. The displacement is
     seen at the distance of the ground there, and the height changes by what this rises
-    (docs/decisions/terrain.md)."""
+    (docs/terrain.md)."""
     seen, ground = measured.displacement, terrain or LEVEL
     steep = max(1 + float(ground.seen @ ahead_en_m) / agl_m[0], LEAST_SCALED)
     share_en = seen.moved_en_m / (agl_m[0] * steep)

@@ -65,7 +65,7 @@ def places_of(
 
     A search of a share of the map finds fewer rivals, and chance is lower: the log odds are those
     within the area times `searched_share`, or, if less, those of a whole search whose rivals are
-    what chance makes (docs/decisions/tracking.md)."""
+    what chance makes (docs/tracking.md)."""
     share, chances = math.log(searched_share), confidence.chances
     chance = {
         "rival": chances.of_strength(best.scores),

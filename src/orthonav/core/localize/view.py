@@ -146,7 +146,7 @@ MIN_AGL_STD = 0.03  # of the log scale searched, whatever is reported
 MAX_AGL_STD = 0.15
 """Three are 0.64 to 1.57, as far as chance was measured alike (docs/decisions/registration.md)."""
 NEAR_SHARE = 0.6
-"""A part far off nadir is judged as one so many times smaller (docs/decisions/terrain.md)."""
+"""A part far off nadir is judged as one so many times smaller (docs/terrain.md)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,7 +74,7 @@ def major(group: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 def _divergence(means: Array, covariances: Array) -> Array:
     """Kullback-Leibler divergence (nats, (N,)) of Gaussians (N, 6) of `COMPARED` from the first: a
-    well-known place must not vanish in a wide hypothesis (docs/decisions/tracking.md)."""
+    well-known place must not vanish in a wide hypothesis (docs/tracking.md)."""
     inverse = np.linalg.inv(covariances[0])
     off = means - means[0]
     turned = inverse @ covariances

@@ -19,7 +19,7 @@ from orthonav.core.track.model import (
 )
 
 LEAST_NEW = 0.15
-"""Of a view, however it overlaps: noise, light and tilt differ (docs/decisions/tracking.md)."""
+"""Of a view, however it overlaps: noise, light and tilt differ (docs/tracking.md)."""
 ROUNDING = 1e-7  # of variances: where a view shows less than its camera, rounding has no root
 POSE = slice(2, 4)
 SEARCHED_SIGMAS = 6.0  # width of the search over heading and scale, from end to end

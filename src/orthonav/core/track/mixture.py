@@ -4,7 +4,7 @@ A view's true place may be the second best, or none of those found. So every hyp
 one for each place and one for none, weighted by likelihood (multiple hypothesis tracking, Reid
 1979; a Gaussian sum filter, Sorenson and Alspach 1971). Unlikely ones are dropped, similar ones
 merged. The rest is "elsewhere": 1 at the start, new hypotheses are born from it, and some returns
-to it with every view, so that no error is permanent (docs/decisions/tracking.md)."""
+to it with every view, so that no error is permanent (docs/tracking.md)."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -21,7 +21,7 @@ HEADING, SCALE, TILT, HORIZON, COMMON = 4, 5, slice(6, 8), slice(8, 10), slice(1
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 """Least standard deviations of heading and log scale of a registered view."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
-"""Of a good mount: metres on the ground, within these angles (docs/decisions/tracking.md)."""
+"""Of a good mount: metres on the ground, within these angles (docs/tracking.md)."""
 TILT_WALK_SHARE = 1 / 30
 """Drift per root of a second, over the misalignment: as much in a quarter of an hour."""
 SEEN: Array = np.zeros((6, STATE))
@@ -38,7 +38,7 @@ class Model:
     speed_mps: float = 30.0  # of an unknown velocity, per axis
     accel_mps2: float = 4.0  # while no velocity is reported, per axis
     reported_velocity_s: float = 120.0
-    """Correlation time of the error of a reported velocity (docs/decisions/tracking.md)."""
+    """Correlation time of the error of a reported velocity (docs/tracking.md)."""
     heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)  # of the constant error,
     heading_noise_rad: float = math.radians(2.0)  # from view to view, without `yaw_std_deg`,
     heading_walk: float = math.radians(0.05)
@@ -47,7 +47,7 @@ class Model:
     log_scale_noise: float = 0.02  # from view to view, without `agl_std_m`,
     log_scale_walk: float = 5e-4  # and of the drift, per root of a second
     tilt_rad: float = math.radians(0.5)  # of a good mount, in pitch and roll; see `at_height`
-    off_tilt_rad: float = math.radians(6.0)  # of a bad mount (docs/decisions/tracking.md),
+    off_tilt_rad: float = math.radians(6.0)  # of a bad mount (docs/tracking.md),
     off_mount: float = 0.03  # and its probability
     horizon_rad: float = math.radians(2.0)
     """Of the autopilot's horizon, in pitch and roll, without `tilt_std_deg`."""
@@ -58,7 +58,7 @@ class Model:
     bias_jump: float = 0.01
     """Per view: a gimbal that moved (by `off_tilt_rad`), a compass that was reset."""
     odometry_outlier: float = 0.01
-    """A displacement that fits well and is wrong (docs/decisions/tracking.md)."""
+    """A displacement that fits well and is wrong (docs/tracking.md)."""
     turn: float = 0.03  # per second: the velocity changes by more than `accel_mps2` allows
     miss: float = 0.5  # A view of ground on the map cannot be found on it
     wide_m: float = 50.0  # per axis: less certain positions are confirmed again after a while

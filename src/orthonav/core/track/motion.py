@@ -24,7 +24,7 @@ VELOCITY_JITTER = 0.3
 """Of the error of a reported velocity, independent at every view (docs/tracking.md)."""
 VELOCITY_STD_MPS, VELOCITY_SHARE = 3.0, 0.02
 """Of a reported velocity without deviation, and fraction of the speed: of an autopilot without
-GNSS, whose velocity was wrong by 1 to 3 m/s (docs/decisions/tracking.md)."""
+GNSS, whose velocity was wrong by 1 to 3 m/s (docs/tracking.md)."""
 
 PLAUSIBLE_SIGMAS = 4.0
 """A heading, height or velocity that differs more from the reported one is that of odometry which

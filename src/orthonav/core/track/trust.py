@@ -1,7 +1,7 @@
 """Whether a track is believed: by what views showed, where, and on how much new ground.
 
 The mixture filters; its best place is judged here after every view. States and transitions:
-docs/decisions/tracking.md, with the evidence for the values."""
+docs/tracking.md, with the evidence for the values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
