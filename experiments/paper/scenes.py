@@ -31,7 +31,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
 from orthonav.core.records import Telemetry
 from orthonav.ground.imagery.mosaic import Mosaic
-from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.area import Extent
 from orthonav.ground.planning.route import Route
 from orthonav.ground.simulate.render import ViewEffects, render_view
 
@@ -83,16 +83,16 @@ class Scene:
 
         A rectangle; where that is narrower than a tile, a band around the trajectory.
         """
-        flown, area = self.trajectory, _outline(self.past)
-        west, south, east, north = area.extent_en_m
+        flown = self.trajectory
+        frame, (west, south, east, north) = _outline(self.past)
         middle = np.array([west + east, south + north]) / 2
         half = np.array([flown.length_m, flown.band_m]) / 2
         if flown.band_m < TILE_PX * flown.gsd_m:
             ends = middle + np.array([[-half[0], 0.0], [half[0], 0.0]])
-            lat, lon = area.frame.latlon_from_en(ends)
+            lat, lon = frame.latlon_from_en(ends)
             waypoints = tuple(zip(lat.tolist(), lon.tolist(), strict=True))
             return {"route": Route(waypoints), "band_m": flown.band_m}
-        return {"bounds_deg": _box_deg(area.frame, middle - half, middle + half)}
+        return {"bounds_deg": _box_deg(frame, middle - half, middle + half)}
 
 
 def generated(setting: Setting, name: str, folder: Path, gsd_m: float | None = None) -> Scene:
@@ -129,10 +129,10 @@ def over(
     name: str, past: Path, present: Path, gsd_m: float | None = None, others: tuple[Path, ...] = ()
 ) -> Scene:
     """The same protocol over two orthophotos: all of the first that holds whole views."""
-    area, mosaic = _outline(past), Mosaic.open([past])
+    mosaic = Mosaic.open([past])
     pixel_m = gsd_m or float(f"{mosaic.gsd_m:.3g}")
     empty = Trajectory(name, AGL_M, 1.0, 1.0, TABLE_1["B"].overlap, pixel_m)
-    west, south, east, north = area.extent_en_m
+    _, (west, south, east, north) = _outline(past)
     sides = [side - 2 * empty.margin_m for side in (east - west, north - south)]
     if min(sides) <= 0:
         raise ValueError(
@@ -157,9 +157,13 @@ def real(data: Path, names: Iterable[str]) -> Iterator[Scene]:
             yield over(name, first, second, others=tuple(others))
 
 
-def _outline(path: Path) -> Area:
-    outline = Mosaic.open([path]).outline_latlon_deg
-    return Area.from_outline(outline[:, 0], outline[:, 1])
+def _outline(path: Path) -> tuple[LocalFrame, Extent]:
+    """Plane and extent of imagery, which may be larger than a sheet of a map."""
+    corners = Mosaic.open([path]).outline_latlon_deg
+    frame = LocalFrame(*((corners.min(axis=0) + corners.max(axis=0)) / 2).round(7).tolist())
+    points = frame.en_from_latlon(corners[:, 0], corners[:, 1])
+    west, south, east, north = *points.min(axis=0).tolist(), *points.max(axis=0).tolist()
+    return frame, (west, south, east, north)
 
 
 def _box_deg(frame: LocalFrame, low: Array, high: Array) -> tuple[float, float, float, float]:
