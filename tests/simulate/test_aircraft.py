@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from lab.clouds import Clouds
@@ -14,7 +15,6 @@ from helpers import textured
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera, enu_from_camera
-from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
 
@@ -170,7 +170,8 @@ def test_rounded_corners_stay_near_the_route(points, radius_m):
     assert np.isfinite(made).all()
     assert (made[0] == line[0]).all() and (made[-1] == line[-1]).all()
     legs = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    assert distance_to_polyline_m(made, line).max() <= legs.max() / 2 + 1e-6
+    off = shapely.distance(shapely.linestrings(line), shapely.points(made))
+    assert off.max() <= legs.max() / 2 + 1e-6
     assert np.linalg.norm(np.diff(made, axis=0), axis=1).sum() <= legs.sum() + 1e-6
 
 

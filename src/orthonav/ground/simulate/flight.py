@@ -6,7 +6,7 @@ height; the telemetry differs from these by the requested errors."""
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +48,6 @@ from orthonav.ground.simulate.receiver import Good, samples_of, solutions
 from orthonav.ground.simulate.render import Clouds, Raster, ViewEffects, degraded, render_view
 
 MAX_VIEWS = 1_000_000  # sanity limit
-TRIES_PER_VIEW = 400  # suffices if 2 % of random positions are covered by imagery
-MAX_PITCH_DEG = 65.0
-MARGIN_PX = 4  # margin of the ground window: radius of the bicubic kernel, and rounding
 Array = NDArray[np.float64]
 
 
@@ -69,7 +66,7 @@ class Errors:
     Standard deviations of unreported tilt, pitch and roll each, degrees, 0..20:
 
     `horizon_std_deg`: error of the reported attitude; along a route it is correlated in time
-    (`attitude.HORIZON_TIME_S`), at random positions it is independent.
+    (`motion.HORIZON_TIME_S`), at random positions it is independent.
 
     `velocity_drift`: standard deviation of the scale (a share) and direction (rad) of the reported
     velocity, 0..0.5, see `motion.drifting`; None reports no velocity.
@@ -113,10 +110,6 @@ class Errors:
         return self.tilt_std_deg
 
 
-NO_ERRORS = Errors()
-USUAL_EFFECTS = ViewEffects()
-
-
 @dataclass(frozen=True)
 class SimulateRequest:
     """Parameters of a simulated flight.
@@ -142,8 +135,8 @@ class SimulateRequest:
     spacing_m: float | None = None
     airspeed_mps: float = 25.0
     camera: Camera = DEFAULT_CAMERA
-    errors: Errors = NO_ERRORS
-    effects: ViewEffects = USUAL_EFFECTS
+    errors: Errors = field(default_factory=Errors)
+    effects: ViewEffects = field(default_factory=ViewEffects)
     seed: int = 0  # of all random draws, 0 or more; equal requests give equal bytes
     turn_radius_m: float = 0.0
     clouds: Callable[[int, int], Clouds] | None = None  # by the number of views and the seed
@@ -259,7 +252,7 @@ def _check(request: SimulateRequest) -> None:
         "agl_m": (request.agl_m, 1, 50_000),
         "seed": (request.seed, 0, math.inf),
         "turn_radius_m": (request.turn_radius_m, 0, 100_000),
-        "camera_pitch_deg": (request.camera_pitch_deg, 0, MAX_PITCH_DEG),
+        "camera_pitch_deg": (request.camera_pitch_deg, 0, 65),
     }
     for what, (value, least, most) in limits.items():
         if value is not None and not least <= value <= most:
@@ -312,7 +305,7 @@ def _poses(
     for number in range(count):
         tilt_deg = horizon[number], mount_deg
         rng = np.random.default_rng([request.seed, 0, number])
-        for _ in range(TRIES_PER_VIEW):
+        for _ in range(400):  # suffices if imagery covers 2 % of random positions
             place = rng.uniform([west, south], [east, north])
             yaw_deg = rng.uniform(0, 360)
             pose = _tilted(request, rng, place, yaw_deg, agl_m, number * 1.0, tilt_deg)
@@ -439,9 +432,9 @@ def _picture(
     if surface is not None:
         above_m = pose.agl_m if pose.amsl_m is None else pose.amsl_m
         position = np.array([*pose.position_en_m, above_m])
-        picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m, MARGIN_PX)
+        picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m)
         return degraded(picture, request.effects, rng, cover)
-    rgb, corner_en_m = ground.window(_corners_en_m(camera, pose), MARGIN_PX)
+    rgb, corner_en_m = ground.window(_corners_en_m(camera, pose))
     corner = corner_en_m - pose.position_en_m
     return render_view(camera, attitude, rgb, corner, ground.gsd_m, request.effects, rng, cover)
 
