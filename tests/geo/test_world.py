@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, UsageError
 from orthonav.core.geo.frames import MAX_SHEET_M
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.sheets import WorldSheets
@@ -92,7 +92,7 @@ def test_around_the_earth_and_the_poles():
     [0.0, -1.0, WorldSheets.MIN_SIDE_M - 1, WorldSheets.MAX_SIDE_M + 1, math.nan, math.inf],
 )
 def test_sides_that_no_sheet_can_have(side_m):
-    with pytest.raises(AreaError, match="sheet_km must be"):
+    with pytest.raises(UsageError, match="sheet_km must be"):
         WorldSheets(side_m)
 
 
@@ -108,5 +108,5 @@ def test_names_that_no_sheet_has(name):
     "box", [(1.0, 47.0, 2.0, 46.0), (math.nan, 46.0, 2.0, 47.0), (1.0, 46.0, 2.0, math.inf)]
 )
 def test_boxes_that_are_none(box):
-    with pytest.raises(AreaError, match="bounds must be"):
+    with pytest.raises(UsageError, match="bounds must be"):
         list(WorldSheets(10_000.0).over(box))

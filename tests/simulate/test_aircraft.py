@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_flight import PLAIN, SMALL, plane_of, route_of
 
 from helpers import textured
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import UsageError
 from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
@@ -118,7 +118,7 @@ def test_clouds_hide_some_views_and_leave_the_others(fly):
     ids=["turn_radius_m", "velocity_drift"],
 )
 def test_random_positions_refuse_route_options(fly, request, request_):
-    with pytest.raises(FlightError, match=f"{request.node.callspec.id}: only along a route"):
+    with pytest.raises(UsageError, match=f"{request.node.callspec.id}: only along a route"):
         fly(route=None, random=3, **request_)
 
 

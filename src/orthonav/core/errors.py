@@ -13,6 +13,10 @@ class MissingFileError(OrthonavError, FileNotFoundError):
     """A file or folder that was named does not exist or cannot be read."""
 
 
+class UsageError(OrthonavError, ValueError):
+    """An impossible value was asked for, or values that do not fit together."""
+
+
 class ArgumentError(OrthonavError, TypeError, ValueError):
     """An argument of another type, or a number out of range, was given to a function."""
 
@@ -61,7 +65,7 @@ class WorkerError(OrthonavError, RuntimeError):
     """A process that was to do part of the work ended on its own: killed, or out of memory."""
 
 
-class VariantError(OrthonavError, ValueError):
+class VariantError(UsageError):
     """An unknown method, representation or parameter was named, or its value is impossible."""
 
 

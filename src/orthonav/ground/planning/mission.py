@@ -238,7 +238,8 @@ def _landing(raw: dict[str, Any], where: str) -> list[MissionItem]:
     relative = raw.get("altitudesAreRelative", raw.get("landingAltitudeRelative", True))
     frame = Frame.ABOVE_HOME if relative else Frame.ABOVE_SEA
     items = []
-    ends = [(Command.WAYPOINT, approach), (Command.LAND, raw.get("landCoordinate"))]
+    land: Any = raw.get("landCoordinate")
+    ends = [(Command.WAYPOINT, approach), (Command.LAND, land)]
     for command, point in ends:
         lat, lon = _latlon(point, where)
         height = number_or_none(next(iter(point[2:]), None), where)

@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, UsageError
 from orthonav.core.geo.frames import MAX_SHEET_M
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.ground.planning.area import Area, Extent
@@ -129,7 +129,7 @@ class WorldSheets:
 
     def __post_init__(self) -> None:
         if not self.MIN_SIDE_M <= self.side_m <= self.MAX_SIDE_M:
-            raise AreaError(
+            raise UsageError(
                 f"sheet_km must be {self.MIN_SIDE_M / 1000:g} to {self.MAX_SIDE_M / 1000:g}, "
                 f"got {self.side_m / 1000:g}"
             )
@@ -171,7 +171,7 @@ class WorldSheets:
         if west > east:
             east += 360
         if not (math.isfinite(west + south + east + north) and south <= north and west <= east):
-            raise AreaError(
+            raise UsageError(
                 "bounds must be west,south,east,north in degrees with west < east and "
                 f"south < north, got {','.join(map(str, bounds_deg))}"
             )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError, CameraError, FlightError
+from orthonav.core.errors import AreaError, CameraError, FlightError, UsageError
 from orthonav.core.files import GivenPath, replacing_folder, with_paths
 from orthonav.core.flight.folder import FlightWriter
 from orthonav.core.flight.gnss import FILE as GNSS_FILE
@@ -93,7 +93,7 @@ class Errors:
             if value is not None and not least <= value <= limit:
                 whole = {"agl": "the height", "velocity": "the velocity"}.get(name.split("_")[0])
                 hint = f" (a fraction of {whole}: 0.05 is 5 %)" if whole else ""
-                raise FlightError(f"{name} must be {least:g} to {limit:g}, got {value}{hint}")
+                raise UsageError(f"{name} must be {least:g} to {limit:g}, got {value}{hint}")
 
     def mount_deg(self, seed: int) -> Array:
         """Unreported pitch and roll (2,) of the camera in the aircraft."""
@@ -246,7 +246,7 @@ def simulate_flight(
 
 def _check(request: SimulateRequest) -> None:
     if (request.route is None) == (request.random is None):
-        raise FlightError("give either a route or a number of random positions")
+        raise UsageError("give either a route or a number of random positions")
     limits: dict[str, tuple[float | None, float, float]] = {
         "random": (request.random, 1, MAX_VIEWS),
         "agl_m": (request.agl_m, 1, 50_000),
@@ -256,9 +256,9 @@ def _check(request: SimulateRequest) -> None:
     }
     for what, (value, least, most) in limits.items():
         if value is not None and not least <= value <= most:
-            raise FlightError(f"{what} must be {least:,} to {most:,g}, got {value}")
+            raise UsageError(f"{what} must be {least:,} to {most:,g}, got {value}")
     if request.clouds and request.camera_pitch_deg:
-        raise FlightError("clouds are simulated below cameras that look straight down only")
+        raise UsageError("clouds are simulated below cameras that look straight down only")
     on_a_route = {
         "turn_radius_m": request.turn_radius_m > 0,
         "velocity_drift": request.errors.velocity_drift is not None,
@@ -266,7 +266,7 @@ def _check(request: SimulateRequest) -> None:
     }
     given = [name for name, value in on_a_route.items() if value]
     if request.route is None and given:
-        raise FlightError(f"{', '.join(given)}: only along a route, not at random positions")
+        raise UsageError(f"{', '.join(given)}: only along a route, not at random positions")
 
 
 def _require_above(surface: Raster, poses: Sequence[_Pose]) -> None:
@@ -371,11 +371,11 @@ def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
     airspeed_mps = request.airspeed_mps
     spacing_m = airspeed_mps if request.spacing_m is None else request.spacing_m
     if not (0 < spacing_m < math.inf and 0 < airspeed_mps < math.inf):
-        raise FlightError("spacing_m must be above 0, and the airspeed too")
+        raise UsageError("spacing_m must be above 0, and the airspeed too")
     line = rounded(line_en_m, request.turn_radius_m) if request.turn_radius_m else line_en_m
     length_m = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
     if length_m / spacing_m > MAX_VIEWS:
-        raise FlightError(
+        raise UsageError(
             f"route of {length_m / 1000:,.1f} km with a view every {spacing_m:g} m has more than "
             f"{MAX_VIEWS:,} views; increase the distance between views"
         )

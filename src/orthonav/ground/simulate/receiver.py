@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import UsageError
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.variants import Table, Variant, make_variant
@@ -61,7 +61,7 @@ class Good:
         for name, most in limits.items():
             value = getattr(self, name, 0.0)
             if not 0 <= value <= most:
-                raise FlightError(f"GNSS receiver: {name} must be 0 to {most:g}, got {value:g}")
+                raise UsageError(f"GNSS receiver: {name} must be 0 to {most:g}, got {value:g}")
 
     def _with_fault(self, track: GnssTrack) -> GnssTrack:
         return track

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import UsageError
 from orthonav.core.geo.camera import (
     Camera,
     camera_from_en,
@@ -53,9 +53,9 @@ class ViewEffects:
         limits = {"exposure_std": 1.0, "blur_px": 50.0, "noise_std": 128.0}
         for name, limit in limits.items():
             if not 0 <= getattr(self, name) <= limit:
-                raise FlightError(f"{name} must be 0 to {limit:g}, got {getattr(self, name)}")
+                raise UsageError(f"{name} must be 0 to {limit:g}, got {getattr(self, name)}")
         if not 1 <= self.jpeg_quality <= 100:
-            raise FlightError(f"JPEG quality must be 1 to 100, got {self.jpeg_quality}")
+            raise UsageError(f"JPEG quality must be 1 to 100, got {self.jpeg_quality}")
 
 
 def render_view(
