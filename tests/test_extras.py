@@ -66,7 +66,7 @@ CORE_COMMANDS = {
     "localize MAP FLIGHT/frames --out new.jsonl": "flights",
     "locate-pixel FIXES 0001.jpg 10 10 --flight FLIGHT": None,
     "calibrate MAP FLIGHT/frames --out new.json": "flights",
-    "localize new FLIGHT --atlas --out new.jsonl": "atlas",
+    "localize memory://new FLIGHT --out new.jsonl": "atlas",
     "localize MAP FLIGHT --require-signed MAP --out new.jsonl": "signing",
     "fly MAP FLIGHT --autopilot udpin:127.0.0.1:0 --dry-run": "autopilot",
     "fly MAP FLIGHT --recorded-telemetry --log new.mcap": "autopilot",
