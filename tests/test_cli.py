@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from helpers import Done
+from helpers import Done, shorten
 from orthonav import __version__
 from orthonav.cli import COMMANDS, common, main, module_of
 from orthonav.core.flight.fixes import read_results
@@ -79,13 +79,6 @@ def out(tmp_path):
 def flown(flight_path, tmp_path):
     """A copy of the flight, to be broken."""
     return shutil.copytree(flight_path, tmp_path / "flight")
-
-
-def shorten(flight, views):
-    """Leave out all but the first views."""
-    lines = (flight / "telemetry.csv").read_text().splitlines()
-    (flight / "telemetry.csv").write_text("\n".join(lines[: views + 1]) + "\n")
-    return flight
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers import shorten
 from orthonav.cli import COMMANDS, version
 from orthonav.cli.version import NEEDS
 from orthonav.core import extras
@@ -98,9 +99,7 @@ def core_only(*arguments, cwd, script=ONE):
 def fixes(map_path, flight_path, tmp_path_factory):
     """Fixes of the first views of the flight, made by the core alone."""
     folder = tmp_path_factory.mktemp("fixes")
-    few = shutil.copytree(flight_path, folder / "flight")
-    lines = (few / "telemetry.csv").read_text().splitlines(keepends=True)
-    (few / "telemetry.csv").write_text("".join(lines[:4]))
+    few = shorten(shutil.copytree(flight_path, folder / "flight"), 3)
     done = core_only("localize", map_path, few, "--out", "fixes.jsonl", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder / "fixes.jsonl"

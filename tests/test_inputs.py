@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from helpers import shorten
 from orthonav.cli import main
 from orthonav.core.errors import FlightError, VariantError
 from orthonav.core.flight import open_flight
@@ -27,11 +28,7 @@ GREY = np.random.default_rng(0).integers(0, 256, (48, 64)).astype(np.uint8)
 @pytest.fixture(scope="module")
 def few(flight_path, tmp_path_factory):
     """A flight of four views, not to be changed."""
-    flight = shutil.copytree(flight_path, tmp_path_factory.mktemp("few") / "flight")
-    for name in ("telemetry.csv", "truth.csv"):
-        lines = (flight / name).read_text().splitlines()
-        (flight / name).write_text("\n".join(lines[:5]) + "\n")
-    return flight
+    return shorten(shutil.copytree(flight_path, tmp_path_factory.mktemp("few") / "flight"), 4)
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.errors import UsageError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.onboard.messages.estimate import NavigationEstimate
+from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
 from orthonav.onboard.messages.gate import Gate, GateRules, unavailable_text
 
 START_NS = 1_789_000_000_000_000_000
@@ -203,5 +202,5 @@ def test_the_rate_limit_works_after_a_clock_was_set_back() -> None:
     ],
 )
 def test_invalid_rules_are_refused(rules: dict) -> None:
-    with pytest.raises(UsageError):
+    with pytest.raises(EstimateError):
         GateRules(**rules)

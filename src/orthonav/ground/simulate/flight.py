@@ -53,37 +53,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of the telemetry, and motion of the camera. All default to none.
+    """Errors of the telemetry, and motion of the camera; none by default.
 
-    Standard deviations, drawn independently for every view; the telemetry reports them:
+    Standard deviations of reported values are drawn for every view, and the telemetry states them;
+    it states neither biases nor unreported tilt."""
 
-    `prior_std_m`: reported prior position, metres per axis, 0..1e6; None reports no prior.
-
-    Constant biases, which the reported standard deviations do not include:
-
-    `pitch_bias_deg`, `roll_bias_deg`: unreported tilt of the camera mount, degrees, -20..20.
-
-    Standard deviations of unreported tilt, pitch and roll each, degrees, 0..20:
-
-    `horizon_std_deg`: error of the reported attitude; along a route it is correlated in time
-    (`motion.HORIZON_TIME_S`), at random positions it is independent.
-
-    `velocity_drift`: standard deviation of the scale (a share) and direction (rad) of the reported
-    velocity, 0..0.5, see `motion.drifting`; None reports no velocity.
-    """
-
-    yaw_std_deg: float = 0.0  # reported heading, degrees, 0..180
-    agl_std: float = 0.0  # reported height, as a fraction of it, 0..0.5
-    tilt_std_deg: float = 0.0  # reported pitch and roll, degrees, 0..20
-    attitude_std_deg: float = 0.0  # true pitch and roll (which are reported), degrees, 0..20
-    prior_std_m: float | None = None
-    yaw_bias_deg: float = 0.0  # reported minus true heading, degrees, -180..180
-    agl_bias: float = 0.0  # reported minus true height, as a fraction of it, -0.5..0.5
-    pitch_bias_deg: float = 0.0
+    yaw_std_deg: float = 0.0  # reported heading, 0..180
+    agl_std: float = 0.0  # reported height, a fraction of it, 0..0.5
+    tilt_std_deg: float = 0.0  # reported pitch and roll, 0..20
+    attitude_std_deg: float = 0.0  # true pitch and roll, which are reported, 0..20
+    prior_std_m: float | None = None  # reported prior position, per axis, 0..1e6; None: no prior
+    yaw_bias_deg: float = 0.0  # reported minus true heading, -180..180
+    agl_bias: float = 0.0  # reported minus true height, a fraction of it, -0.5..0.5
+    pitch_bias_deg: float = 0.0  # unreported tilt of the camera mount, -20..20
     roll_bias_deg: float = 0.0
     velocity_drift: float | None = None
-    mount_std_deg: float = 0.0  # of the camera mount, drawn once a flight and added to its bias
+    """Standard deviation of scale (a share) and direction (rad) of the reported velocity, 0..0.5,
+    see `motion.drifting`; None: no velocity is reported."""
+    mount_std_deg: float = 0.0  # unreported tilt of the mount, drawn once a flight, 0..20
     horizon_std_deg: float = 0.0
+    """Unreported tilt of the horizon, 0..20: independent at random positions, along a route
+    correlated over `motion.HORIZON_TIME_S`."""
 
     def __post_init__(self) -> None:
         limits = {"agl": 0.5, "prior": 1e6, "velocity": 0.5, "yaw": 180.0}  # tilt: 20 deg
@@ -112,38 +102,31 @@ class Errors:
 
 @dataclass(frozen=True)
 class SimulateRequest:
-    """Parameters of a simulated flight.
-
-    `route`: route to fly; or `random`: number of random positions, 1 to 1e6. One of the two.
-    `agl_m`: height above ground, 1..50,000 m; None: the shorter side of the image covers 256 pixels
-    of the orthophoto. On a route over a terrain it is the height above the ground at the first
-    view, and the altitude is constant. `spacing_m`: distance between views on a route; None: flown
-    in one second. `camera`: intrinsics; `errors`: of the telemetry; `effects`: image degradation.
-    `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot. `terrain`:
-    heights of the ground or surface above mean sea level. Views are then true perspectives of it,
-    and the telemetry reports heights above sea level and, on a route, above the first view, and no
-    measured one above ground. `surface`: models with houses and trees, which views then show;
-    heights above ground count from `terrain`, or else from their lower envelope.
-    `camera_pitch_deg`: angle by which the camera looks ahead of straight down, 0..65; reported.
-    """
+    """Parameters of a simulated flight: along `route`, or at `random` positions, one of the two."""
 
     orthos: Sequence[GivenPath]  # orthophotos to fly over; earlier ones take precedence
     out: GivenPath  # flight folder to write
     route: Route | None = None
-    random: int | None = None
+    random: int | None = None  # number of positions, 1..1e6
     agl_m: float | None = None
-    spacing_m: float | None = None
+    """Height above ground, 1..50,000 m; on a route over a terrain that at the first view, and the
+    altitude is constant. None: the shorter side of a view covers 256 pixels of the orthophoto."""
+    spacing_m: float | None = None  # between views on a route; None: flown in one second
     airspeed_mps: float = 25.0
     camera: Camera = DEFAULT_CAMERA
     errors: Errors = field(default_factory=Errors)
     effects: ViewEffects = field(default_factory=ViewEffects)
     seed: int = 0  # of all random draws, 0 or more; equal requests give equal bytes
-    turn_radius_m: float = 0.0
+    turn_radius_m: float = 0.0  # of the corners of a route, 0..100,000; 0 turns on the spot
     clouds: Callable[[int, int], Clouds] | None = None  # by the number of views and the seed
     terrain: TerrainHeights | None = None
+    """Heights above mean sea level. Views are then true perspectives, and the telemetry reports
+    heights above sea level and, on a route, above the first view, but none above ground."""
     terrain_posting_m: float = 5.0  # resolution of the terrain, if there is no surface
-    surface: Sequence[Dem] = ()  # earlier ones take precedence; above sea, as the terrain
-    camera_pitch_deg: float = 0.0
+    surface: Sequence[Dem] = ()
+    """Models with houses and trees, which views show, above sea; earlier ones take precedence.
+    Heights above ground count from `terrain`, or else from their lower envelope."""
+    camera_pitch_deg: float = 0.0  # ahead of straight down, 0..65; reported
     gnss: Good | None = None  # receiver whose solutions are written to `gnss.csv`; only on a route
 
     def __post_init__(self) -> None:

@@ -13,11 +13,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import UsageError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT, error_ellipse
 from orthonav.onboard.messages.estimate import (
     Clock,
+    EstimateError,
     NavigationEstimate,
 )
 
@@ -61,9 +61,9 @@ class GateRules:
         }
         for name, value in limits.items():
             if not value > 0:  # NaN too
-                raise UsageError(f"{name} must be above 0, got {value}")
+                raise EstimateError(f"{name} must be above 0, got {value}")
         if not 0 <= self.min_confidence <= 1:
-            raise UsageError(f"min_confidence must be 0 to 1, got {self.min_confidence}")
+            raise EstimateError(f"min_confidence must be 0 to 1, got {self.min_confidence}")
 
 
 class Gate:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import MissingExtraError, UsageError
+from orthonav.core.errors import MissingExtraError
 from orthonav.core.extras import needed
 from orthonav.core.geo.attitude import matrices_of_wxyz, wxyz_of_angles
 from orthonav.core.geo.swapped import swapped_hint
@@ -128,7 +128,7 @@ def global_position_sensor(
     coordinates that mean "unknown" for a place, and an unknown accuracy for a good one.
     """
     if not 1 <= sensor_id <= 255:
-        raise UsageError(f"sensor_id must be 1 to 255, got {sensor_id}")
+        raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
     if not estimate.dead_reckoned:
         require_confident(estimate, min_confidence, "GLOBAL_POSITION_SENSOR")
     eph_m = estimate.horizontal_std_m()
@@ -311,7 +311,7 @@ def _hdop(eph_m: float, hdop_m: float | None) -> float:
     if hdop_m is None:
         return UNKNOWN_DOP
     if not hdop_m > 0:
-        raise UsageError(f"hdop_m must be metres per unit, above 0, got {hdop_m}")
+        raise EstimateError(f"hdop_m must be metres per unit, above 0, got {hdop_m}")
     return min(eph_m / hdop_m, 99.99)
 
 
