@@ -89,7 +89,8 @@ def _measured(
         sheet = opened.manifest.sheets[0]
         local, place = sheet.frame, (sheet.frame.lat_deg, sheet.frame.lon_deg)
         background = Background(preview(opened), sheet.grid.extent_en_m)
-    recorded = {path: _recorded(path, needed=not options.truth) for path in set(options.flight)}
+    sources = dict.fromkeys(options.flight)
+    recorded = {path: _recorded(path, needed=not options.truth) for path in sources}
     names = [path.stem for path in options.fixes]
     if len(set(names)) < len(names):
         names = [str(path) for path in options.fixes]

@@ -143,11 +143,8 @@ def _named(item: MissionItem) -> str:
 
 
 def _height(item: MissionItem) -> Height | None:
-    frames: dict[int, HeightFrame] = {
-        **{0: "amsl", 5: "amsl"},
-        **{3: "home", 6: "home"},
-        **{10: "agl", 11: "agl"},
-    }
+    frames: dict[int, HeightFrame] = {0: "amsl", 5: "amsl", 3: "home", 6: "home"}
+    frames |= {10: "agl", 11: "agl"}
     if item.frame not in frames:
         raise RouteError(
             f"mission has a waypoint in MAV_FRAME {item.frame}; expected a global one "
