@@ -58,7 +58,7 @@ class StoppedError(CameraError):
 
 
 class CheckError(OrthonavError, ValueError):
-    """A check was asked for under conditions that cannot be: a share above 1, a negative seed."""
+    """A check cannot be made: the heights of its route are not those above ground, or near 0."""
 
 
 class WorkerError(OrthonavError, RuntimeError):

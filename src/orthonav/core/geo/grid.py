@@ -40,7 +40,7 @@ class TileGrid:
     ) -> "TileGrid":
         """Over west, south, east, north (m); `overlap` of neighbours, 0.875 and 0.995 in Table 1.
 
-        The stride is rounded to whole pixels. Raises `AreaError`."""
+        The stride is rounded to whole pixels. Raises `AreaError` or `UsageError`."""
         west, south, east, north = extent_en_m
         if not (np.isfinite(gsd_m) and gsd_m > 0):
             raise UsageError(f"gsd_m must be above 0 m per pixel, got {gsd_m}")

@@ -39,7 +39,7 @@ _ROUNDED = (
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a recording is read. Raises `FlightError` for invalid values."""
+    """How a recording is read. Raises `UsageError` for invalid values."""
 
     kind: str | None = None  # one of `KINDS`; None: detected by content
     camera: Path | None = None  # camera file; None: the recording's own camera

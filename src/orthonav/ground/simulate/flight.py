@@ -170,8 +170,8 @@ def simulate_flight(
 ) -> int:
     """Write a flight folder to `request.out`, complete or not at all; returns the number of views.
 
-    Raises `FlightError` on impossible parameters, `AreaError` if no view fits into the imagery or
-    the route leaves it, and as `Mosaic.open` does.
+    Raises `UsageError` on impossible parameters, `FlightError` where a view would be too low,
+    `AreaError` if no view fits into the imagery or the route leaves it, and as `Mosaic.open` does.
     """
     _check(request)
     mosaic = Mosaic.open(request.orthos)
