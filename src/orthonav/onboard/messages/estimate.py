@@ -8,14 +8,14 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import UsageError
+from orthonav.core.errors import OrthonavError
 from orthonav.core.records import CONFIDENT, Fix, ViewResult, error_ellipse
 
 AVERAGING_S = 3.0
 """Over which the filters of autopilots average positions (docs/decisions/correlated-errors.md)."""
 
 
-class EstimateError(UsageError):
+class EstimateError(OrthonavError, ValueError):
     """An estimate is invalid, or the requested message cannot represent it."""
 
 
