@@ -20,7 +20,7 @@ from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.simulate.motion import gauss_markov
 from orthonav.ground.simulate.receiver import (
-    LATENCY_S,
+    ERRORS,
     RATE_HZ,
     GnssTrack,
     receiver_of,
@@ -297,7 +297,8 @@ def recovered(
     """Errors (5,) of the learnt biases and the biases, after each of the ascending `minutes`."""
     rng = np.random.default_rng([seed, 2])
     path = lawnmower(60.0 * minutes[-1] + 2, speeds_mps)
-    errors = replace(MAPS["usual"], mount_m=0.0, pitch_deg=PITCH_DEG, late_s=LATE_S + LATENCY_S)
+    late_s = LATE_S + ERRORS.latency_s
+    errors = replace(MAPS["usual"], mount_m=0.0, pitch_deg=PITCH_DEG, late_s=late_s)
     positions = map_positions(path, errors, rng)
     solved = solutions(receiver_of("good"), path.times_s, path.en_m, rng, 1.0)
     true = np.array([*errors.displaced_en_m, math.radians(PITCH_DEG), 0.0, LATE_S])

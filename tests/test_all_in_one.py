@@ -8,6 +8,7 @@ from urllib.request import url2pathname
 
 import pytest
 
+from helpers import shorten
 from orthonav.core.flight import read_truth
 from orthonav.core.flight.fixes import read_results
 from orthonav.core.mapfile import open_map
@@ -23,10 +24,7 @@ def fewer_crops(map_path, monkeypatch):
 @pytest.fixture
 def few(flight_path, tmp_path):
     """The first views of the flight."""
-    folder = shutil.copytree(flight_path, tmp_path / "flight")
-    lines = (folder / "telemetry.csv").read_text().splitlines()
-    (folder / "telemetry.csv").write_text("\n".join(lines[:6]) + "\n")
-    return folder
+    return shorten(shutil.copytree(flight_path, tmp_path / "flight"), 5)
 
 
 def test_an_orthophoto_and_a_flight_become_a_page(run, area, few, tmp_path, names_in):

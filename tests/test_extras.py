@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers import shorten
 from orthonav.cli import COMMANDS, version
 from orthonav.cli.version import NEEDS
 from orthonav.core import extras
@@ -66,7 +67,7 @@ CORE_COMMANDS = {
     "localize MAP FLIGHT/frames --out new.jsonl": "flights",
     "locate-pixel FIXES 0001.jpg 10 10 --flight FLIGHT": None,
     "calibrate MAP FLIGHT/frames --out new.json": "flights",
-    "localize new FLIGHT --atlas --out new.jsonl": "atlas",
+    "localize memory://new FLIGHT --out new.jsonl": "atlas",
     "localize MAP FLIGHT --require-signed MAP --out new.jsonl": "signing",
     "fly MAP FLIGHT --autopilot udpin:127.0.0.1:0 --dry-run": "autopilot",
     "fly MAP FLIGHT --recorded-telemetry --log new.mcap": "autopilot",
@@ -98,9 +99,7 @@ def core_only(*arguments, cwd, script=ONE):
 def fixes(map_path, flight_path, tmp_path_factory):
     """Fixes of the first views of the flight, made by the core alone."""
     folder = tmp_path_factory.mktemp("fixes")
-    few = shutil.copytree(flight_path, folder / "flight")
-    lines = (few / "telemetry.csv").read_text().splitlines(keepends=True)
-    (few / "telemetry.csv").write_text("".join(lines[:4]))
+    few = shorten(shutil.copytree(flight_path, folder / "flight"), 3)
     done = core_only("localize", map_path, few, "--out", "fixes.jsonl", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder / "fixes.jsonl"

@@ -35,7 +35,7 @@ def test_an_interrupt_of_the_search_for_another_set_up_skips_it(
     assert "! the search for another configuration was interrupted" in done.out
     assert f"written to {tmp_path / 'fixes.jsonl'}" in done.out
     assert len(read_results(tmp_path / "fixes.jsonl")) == 2
-    assert "!" not in run(*command, "--no-diagnosis").out
+    assert "!" not in run(*command, "--quiet").out
 
 
 def test_the_search_for_another_set_up_ends_in_time(run, map_path, turned, tmp_path, monkeypatch):

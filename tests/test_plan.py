@@ -2,10 +2,10 @@
 
 import json
 
-import numpy as np
 import pytest
 from pyproj import Transformer
 
+from helpers import write_dem
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile import open_map
 from orthonav.ground.planning.route import Height, read_route
@@ -29,27 +29,15 @@ def camera(tmp_path):
 @pytest.fixture
 def dem(tmp_path):
     """Terrain of 6 x 6 km, 300 m high in the middle, 5 m more every 100 m to the north."""
-    import rasterio
-    from rasterio.transform import Affine
 
-    path = tmp_path / "dem.tif"
-    north = 3000 - 10.0 * (np.arange(600) + 0.5)
-    heights = np.repeat((300 + 0.05 * north)[:, None], 600, axis=1).astype(np.float32)
-    heights[:5, :5] = -9999
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        count=1,
-        height=600,
-        width=600,
-        dtype="float32",
-        crs=FRAME.proj4,
-        transform=Affine(10, 0, -3000, 0, -10, 3000),
-        nodata=-9999,
-    ) as data:
-        data.write(heights[None])
-    return path
+    def pierced(heights):
+        heights[:5, :5] = -9999
+        return heights
+
+    def slope(east_m, north_m):
+        return 300 + 0.05 * north_m + 0 * east_m
+
+    return write_dem(tmp_path / "dem.tif", FRAME, slope, 3000.0, 10.0, pierced)
 
 
 @pytest.fixture

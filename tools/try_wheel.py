@@ -43,7 +43,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "": (
         f"info {MAP}",
         f"localize {MAP} {FLIGHT} --out {FIXES}",
-        f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --metrics metrics.json",
+        f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --json",
     ),
     "report": (f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --report report",),
     "autopilot": (f"fly {MAP} {FLIGHT} --recorded-telemetry --pace 100 --jsonl - --log run.mcap",),

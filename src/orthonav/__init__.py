@@ -12,62 +12,7 @@
 ground truth. The names in `__all__` are stable from version 0.2 on; modules below are not.
 """
 
-from importlib import import_module
-from typing import Any
+import lazy_loader
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "CONFIDENT",
-    "BuildRequest",
-    "Camera",
-    "Fix",
-    "FlightFolder",
-    "Localizer",
-    "MapFile",
-    "NoFix",
-    "OrthonavError",
-    "Prior",
-    "SimulateRequest",
-    "Telemetry",
-    "Tracker",
-    "View",
-    "ViewResult",
-    "build_map",
-    "check",
-    "evaluate",
-    "open_flight",
-    "open_map",
-    "read_results",
-    "read_truth",
-    "simulate_flight",
-    "to_dataframe",
-    "to_geojson",
-]
-_HOMES = {
-    **dict.fromkeys(("BuildRequest", "build_map"), "ground.build"),
-    **dict.fromkeys(("CONFIDENT", "Fix", "NoFix", "Prior"), "core.records"),
-    **dict.fromkeys(("Telemetry", "View", "ViewResult"), "core.records"),
-    **dict.fromkeys(("FlightFolder", "open_flight", "read_truth"), "core.flight"),
-    "Localizer": "core.localize",
-    "Tracker": "core.track.tracker",
-    **dict.fromkeys(("MapFile", "open_map"), "core.mapfile"),
-    **dict.fromkeys(("SimulateRequest", "simulate_flight"), "ground.simulate.flight"),
-    "Camera": "core.geo.camera",
-    "check": "ground.check.run",
-    "evaluate": "ground.evaluate.metrics",
-    "OrthonavError": "core.errors",
-    **dict.fromkeys(("read_results", "to_dataframe", "to_geojson"), "core.flight.fixes"),
-}
-
-
-def __getattr__(name: str) -> Any:
-    """A public name, imported when it is used first."""
-    if name not in _HOMES:
-        raise AttributeError(f"module orthonav has no attribute {name}; see orthonav.__all__")
-    globals()[name] = found = getattr(import_module(f"orthonav.{_HOMES[name]}"), name)
-    return found
-
-
-def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

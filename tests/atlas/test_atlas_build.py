@@ -303,7 +303,7 @@ def test_only_sheets_of_the_area_are_planned(ortho, built):
     assert planned(route=route, band_m=10.0) == names[:1]
     assert planned(route=route, band_m=1500.0) == names
     for area in ({"bounds_deg": (10.0, 10.0, 11.0, 11.0)}, {"band_m": 5.0}):
-        with pytest.raises(AreaError, match=r"outside the orthophotos|band"):
+        with pytest.raises(ValueError, match=r"outside the orthophotos|band"):
             planned(**area)
 
 

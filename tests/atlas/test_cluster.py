@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from test_atlas_build import SMALL, content, made
 
-from orthonav.core.errors import MissingExtraError, WorkerError
+from orthonav.core.errors import MissingExtraError, UsageError
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.cluster import RayRunner
@@ -36,7 +36,7 @@ def test_ray_is_required_only_where_it_is_used(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"orthonav\[cluster\]"):
         RayRunner().__enter__()
-    with pytest.raises(WorkerError, match="workers must be 1 or more"):
+    with pytest.raises(UsageError, match="workers must be 1 or more"):
         RayRunner(workers=0)
 
 

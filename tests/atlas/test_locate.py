@@ -62,7 +62,7 @@ def copied(atlas, tmp_path):
 @pytest.mark.long
 def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, run):
     out = tmp_path / "fixes.jsonl"
-    done = run("localize", "--atlas", atlas.url, flown, "--out", out, "--heading", "unknown")
+    done = run("localize", atlas.url, flown, "--out", out, "--heading", "unknown")
     assert done.code == 0, done.err
     lines = [json.loads(line) for line in out.read_text().splitlines()]
     # One view alone never gives a fix.
@@ -80,9 +80,7 @@ def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, r
 
 
 def test_options_of_maps_are_refused(atlas, flown, tmp_path, run):
-    refused = run(
-        "localize", "--atlas", atlas.url, flown, "--out", tmp_path / "fixes.jsonl", "--track"
-    )
+    refused = run("localize", atlas.url, flown, "--out", tmp_path / "fixes.jsonl", "--track")
     assert refused.code == 2 and "--track" in refused.err
 
 

@@ -11,7 +11,7 @@ from made_trials import lost, right
 
 from helpers import write_dem
 from orthonav.cli import main
-from orthonav.core.errors import AreaError, CameraError
+from orthonav.core.errors import AreaError, CameraError, UsageError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile import open_map
@@ -225,7 +225,7 @@ def test_routes_outside_the_map(checked, frame):
             checked(route=route_of(frame, points))
     with pytest.raises(AreaError, match="does not touch the map"):
         checked(route=Route(((-40.0, 170.0), (-40.0, 170.01))))
-    with pytest.raises(AreaError, match="wider than 0 m"):
+    with pytest.raises(UsageError, match="wider than 0 m"):
         checked(route=route_of(frame, [[-200, 0], [200, 0]]), band_m=-5.0)
     with pytest.raises(AreaError, match="km across"):
         checked(route=route_of(frame, [[-40_000, 0], [40_000, 0]]))

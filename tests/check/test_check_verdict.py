@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from made_check import CONDITIONS, flown
 
-from orthonav.core.errors import CheckError
+from orthonav.core.errors import UsageError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.findings import AVAILABILITY, FIXES, OUTAGE_S, Findings, verdict_of
 from orthonav.ground.check.records import (
@@ -240,7 +240,7 @@ def test_limits_are_those_of_the_command():
     """And the default is a figure that people would state."""
     out = {"alert_limit_m": 0.5}, {"alert_limit_m": 2e5}, {"risk": 1e-7}, {"camera_pitch_deg": 66.0}
     for asked in out:
-        with pytest.raises(CheckError, match=next(iter(asked))):
+        with pytest.raises(UsageError, match=next(iter(asked))):
             CheckRequest("area.onav", **asked)
     for agl_m, limit_m in ((270.0, 35.0), (2506.668, 63.0)):
         assert Conditions.of(CheckRequest("area.onav"), agl_m, 35.0).alert_limit_m == limit_m

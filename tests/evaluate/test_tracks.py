@@ -307,12 +307,12 @@ def flight(tmp_path) -> Path:
 
 
 def test_evaluate_a_track(run, flight, tmp_path: Path, no_plots) -> None:
-    fixes, report, out = (tmp_path / name for name in ("fixes.jsonl", "report", "metrics.json"))
-    more = ("--map", GOLDEN, "--report", report, "--metrics", out)
+    fixes, report = (tmp_path / name for name in ("fixes.jsonl", "report"))
+    more = ("--map", GOLDEN, "--report", report)
     done = run("evaluate", fixes, "--flight", flight, *more)
     assert (done.code, done.err) == (0, "")
     assert "first confirmed fix: view 2 of 4" in done.out
-    track = json.loads(out.read_text())["track"]
+    track = json.loads(run("evaluate", fixes, "--flight", flight, "--json").out)["track"]
     assert (track["first_view"], track["first_s"], track["n_false_locks"]) == (2, 1.0, 1)
     assert isinstance(track["first_view"], int)
     html = (report / "index.html").read_text("utf-8")

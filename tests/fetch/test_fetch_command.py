@@ -69,7 +69,7 @@ def test_a_route_and_its_band(command, tmp_path):
         code, stdout, _ = command(*route, "--band-m", "50", *source, *out)
         assert code == 0 and json.loads(stdout)["images"] > 0
         code, _, stderr = command(*route, *source, *out)
-    assert code == 1 and "--band-m" in stderr
+    assert code == 2 and "--band-m" in stderr
 
 
 def test_a_dry_run_fetches_no_tile(command, area, tmp_path, names_below):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from orthonav.core.errors import FetchError
+from orthonav.core.errors import FetchError, UsageError
 from orthonav.ground.fetch.presets import (
     CURRENT,
     PROTOCOLS,
@@ -65,9 +65,9 @@ def test_sources_without_a_surface_are_told_those_with_one():
 
 
 def test_unknown_names_list_the_known_ones():
-    with pytest.raises(FetchError, match=r"unknown service 'ing'; available: .*ign"):
+    with pytest.raises(UsageError, match=r"unknown service 'ing'; available: .*ign"):
         parse_source("ing", ImageryOptions())
-    with pytest.raises(FetchError, match="write the protocol"):
+    with pytest.raises(UsageError, match="write the protocol"):
         parse_source("https://a.example/wmts", ImageryOptions())
     with pytest.raises(FetchError, match=r"add a year: naip:YEAR; available: 2010"):
         parse_source("naip", ImageryOptions())
@@ -99,7 +99,7 @@ def test_keys_come_from_the_environment_only(monkeypatch):
 
 @pytest.mark.parametrize("date", ["21", "2021-13", "2021-02-40", "June", "2021/2022/2023", ""])
 def test_dates_are_checked(date):
-    with pytest.raises(FetchError, match="date must be"):
+    with pytest.raises(UsageError, match="date must be"):
         parse_source("ign", ImageryOptions(), date=date)
 
 

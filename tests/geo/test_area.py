@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, OrthonavError, UsageError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
@@ -77,7 +77,7 @@ def test_each_leg_has_its_own_band():
 
 def test_a_band_is_needed_where_a_leg_has_none():
     route = Route(((46.5, 2.5), (46.51, 2.5), (46.51, 2.51)), leg_bands_m=(100, None))
-    with pytest.raises(AreaError, match="no search band"):
+    with pytest.raises(UsageError, match="no search band"):
         Area.from_route(route)
     whole = Route(route.waypoints, leg_bands_m=(100, 300))
     assert Area.from_route(whole) == Area.from_route(whole, None)
@@ -120,7 +120,7 @@ def test_every_point_of_the_band_is_near_a_tile(route, band_m, overlap, seed):
     ],
 )
 def test_bounds_that_are_no_area_are_refused(bounds, message):
-    with pytest.raises(AreaError, match=message):
+    with pytest.raises(OrthonavError, match=message):
         Area.from_bounds(bounds)
 
 
@@ -133,7 +133,7 @@ def test_a_band_that_makes_the_sheet_too_large_is_refused():
 
 @pytest.mark.parametrize("band_m", [0, -5, math.nan, math.inf])
 def test_a_band_without_width_is_refused(band_m):
-    with pytest.raises(AreaError, match="wider than 0"):
+    with pytest.raises(UsageError, match="wider than 0"):
         Area.from_route(Route(((46.5, 2.5),)), band_m)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, UsageError
 from orthonav.core.geo.grid import TileGrid
 
 coordinates = st.floats(-25_000, 25_000)
@@ -64,7 +64,7 @@ def test_tiles_fill_the_raster_exactly(extent_and_grid):
     ],
 )
 def test_impossible_numbers_are_refused(change, message):
-    with pytest.raises(AreaError, match=message):
+    with pytest.raises(UsageError, match=message):
         TileGrid.covering((0, 0, 1000, 1000), **(GOOD | change))
 
 

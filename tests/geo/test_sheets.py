@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, OrthonavError
 from orthonav.core.geo.frames import MAX_SHEET_M
 from orthonav.ground.planning import sheets as sheets_module
 from orthonav.ground.planning.area import Area
@@ -71,7 +71,7 @@ def test_a_leg_longer_than_a_sheet_is_cut():
     ],
 )
 def test_routes_that_cannot_be_cut_are_refused(route, band_m, message):
-    with pytest.raises(AreaError, match=message):
+    with pytest.raises(OrthonavError, match=message):
         sheets_of_route(route, band_m)
 
 

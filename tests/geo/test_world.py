@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, UsageError
 from orthonav.core.geo.frames import MAX_SHEET_M
 from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.sheets import LARGEST_SIDE_M, SMALLEST_SIDE_M, WorldSheets
+from orthonav.ground.planning.sheets import WorldSheets
 
-SIDES_M = [SMALLEST_SIDE_M, 1234.5, 10_000.0, LARGEST_SIDE_M]
+SIDES_M = [WorldSheets.MIN_SIDE_M, 1234.5, 10_000.0, WorldSheets.MAX_SIDE_M]
 LATITUDES = st.floats(-90, 90)
 LONGITUDES = st.floats(-180, 180)
 
@@ -39,7 +39,7 @@ def test_names_round_trip(side_m, up, along):
     assert sheets.name_at((south + north) / 2, (west + east) / 2) == name
 
 
-@pytest.mark.parametrize("side_m", [SMALLEST_SIDE_M, 10_000.0, LARGEST_SIDE_M])
+@pytest.mark.parametrize("side_m", [WorldSheets.MIN_SIDE_M, 10_000.0, WorldSheets.MAX_SIDE_M])
 @pytest.mark.parametrize("lat", [-87.0, -75.0, -30.0, -0.01, 0.01, 46.6, 60.0, 85.0, 87.0])
 def test_every_sheet_fits_a_map(side_m, lat):
     sheets = WorldSheets(side_m)
@@ -88,10 +88,11 @@ def test_around_the_earth_and_the_poles():
 
 
 @pytest.mark.parametrize(
-    "side_m", [0.0, -1.0, SMALLEST_SIDE_M - 1, LARGEST_SIDE_M + 1, math.nan, math.inf]
+    "side_m",
+    [0.0, -1.0, WorldSheets.MIN_SIDE_M - 1, WorldSheets.MAX_SIDE_M + 1, math.nan, math.inf],
 )
 def test_sides_that_no_sheet_can_have(side_m):
-    with pytest.raises(AreaError, match="sheet_km must be"):
+    with pytest.raises(UsageError, match="sheet_km must be"):
         WorldSheets(side_m)
 
 
@@ -107,5 +108,5 @@ def test_names_that_no_sheet_has(name):
     "box", [(1.0, 47.0, 2.0, 46.0), (math.nan, 46.0, 2.0, 47.0), (1.0, 46.0, 2.0, math.inf)]
 )
 def test_boxes_that_are_none(box):
-    with pytest.raises(AreaError, match="bounds must be"):
+    with pytest.raises(UsageError, match="bounds must be"):
         list(WorldSheets(10_000.0).over(box))

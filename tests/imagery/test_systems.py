@@ -8,7 +8,7 @@ from geotiffs import FRAME, LAMBERT, placed, read, smooth_scene, write
 from pyproj import Transformer
 from pyproj.transformer import TransformerGroup
 
-from orthonav.core.errors import ImageryError
+from orthonav.core.errors import ImageryError, UsageError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.systems import plate_shift_deg, plate_shift_m
@@ -104,7 +104,7 @@ def test_an_epoch_moves_the_imagery(tmp_path):
     east_m, north_m = FRAME.en_from_latlon(FRAME.lat_deg + expected[0], FRAME.lon_deg + expected[1])
     shift = moved.sources[0].transform.c - as_it_is.sources[0].transform.c
     assert shift == pytest.approx(east_m, abs=0.01) and 0.5 < north_m < 0.7
-    with pytest.raises(ImageryError, match="epoch must be a year"):
+    with pytest.raises(UsageError, match="epoch must be a year"):
         Mosaic.open([path], 20.5)
     other = write(tmp_path / "b.tif", smooth_scene(), crs="EPSG:32631")
     with pytest.raises(ImageryError, match="not for EPSG:32631"):

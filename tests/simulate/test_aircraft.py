@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from lab.clouds import Clouds
@@ -11,10 +12,9 @@ from scipy.spatial.transform import Rotation
 from test_flight import PLAIN, SMALL, plane_of, route_of
 
 from helpers import textured
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import UsageError
 from orthonav.core.flight import open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera, enu_from_camera
-from orthonav.ground.planning.route import distance_to_polyline_m
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
 
@@ -118,7 +118,7 @@ def test_clouds_hide_some_views_and_leave_the_others(fly):
     ids=["turn_radius_m", "velocity_drift"],
 )
 def test_random_positions_refuse_route_options(fly, request, request_):
-    with pytest.raises(FlightError, match=f"{request.node.callspec.id}: only along a route"):
+    with pytest.raises(UsageError, match=f"{request.node.callspec.id}: only along a route"):
         fly(route=None, random=3, **request_)
 
 
@@ -170,7 +170,8 @@ def test_rounded_corners_stay_near_the_route(points, radius_m):
     assert np.isfinite(made).all()
     assert (made[0] == line[0]).all() and (made[-1] == line[-1]).all()
     legs = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    assert distance_to_polyline_m(made, line).max() <= legs.max() / 2 + 1e-6
+    off = shapely.distance(shapely.linestrings(line), shapely.points(made))
+    assert off.max() <= legs.max() / 2 + 1e-6
     assert np.linalg.norm(np.diff(made, axis=0), axis=1).sum() <= legs.sum() + 1e-6
 
 

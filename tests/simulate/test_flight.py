@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from orthonav.core.errors import AreaError, FlightError, OutputError
+from orthonav.core.errors import AreaError, OutputError, UsageError
 from orthonav.core.flight import FlightWriter, open_flight, read_image, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
@@ -188,11 +188,11 @@ def test_the_folder(area, tmp_path, names_in):
 
 REFUSED = {
     "too high": ({"agl_m": 5000.0}, AreaError, "fly lower"),
-    "too low": ({"agl_m": 0.1}, FlightError, "1 to 50,000"),
-    "nan": ({"agl_m": math.nan}, FlightError, "1 to 50,000"),
-    "none": ({"random": 0}, FlightError, "random must be 1 to"),
-    "neither": ({"random": None}, FlightError, "either a route or"),
-    "turn": ({"turn_radius_m": -1.0}, FlightError, "turn_radius_m"),
+    "too low": ({"agl_m": 0.1}, UsageError, "1 to 50,000"),
+    "nan": ({"agl_m": math.nan}, UsageError, "1 to 50,000"),
+    "none": ({"random": 0}, UsageError, "random must be 1 to"),
+    "neither": ({"random": None}, UsageError, "either a route or"),
+    "turn": ({"turn_radius_m": -1.0}, UsageError, "turn_radius_m"),
 }
 
 
@@ -219,7 +219,7 @@ def test_routes_that_cannot_be_are_refused_before_views_are_placed(
 ):
     monkeypatch.setattr(flight_module, "steady_path", None)
     route = route_of(plane.frame, [0.0, 0.0], [100.0, 0.0])
-    with pytest.raises(FlightError, match=message):
+    with pytest.raises(UsageError, match=message):
         flown(area, tmp_path / "f", random=None, route=route, **request_)
 
 
@@ -253,7 +253,7 @@ def test_views_keep_off_missing_imagery(make_ortho, tmp_path):
 )
 def test_impossible_values_are_refused(name, value):
     kind = Errors if hasattr(Errors, name) else ViewEffects
-    with pytest.raises(FlightError, match=r"must be -?\d"):
+    with pytest.raises(UsageError, match=r"must be -?\d"):
         kind(**{name: value})
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_flight import plane_of, route_of
 
-from orthonav.core.errors import FlightError, VariantError
+from orthonav.core.errors import UsageError, VariantError
 from orthonav.core.flight.gnss import read_gnss
 from orthonav.ground.simulate.receiver import RATE_HZ, receiver_of, solutions
 
@@ -55,7 +55,7 @@ def test_faults_begin_in_time():
 def test_invalid_receivers_are_refused():
     with pytest.raises(VariantError, match="unknown variant 'broken'"):
         receiver_of("broken")
-    with pytest.raises(FlightError, match="metres must be 0 to"):
+    with pytest.raises(UsageError, match="metres must be 0 to"):
         receiver_of("step:metres=-1")
 
 
@@ -71,4 +71,4 @@ def test_a_simulated_flight_has_solutions(area, tmp_path, run):
     assert {each.has_fix for each in samples if each.arrived_ns < 5e9} == {True}
     assert {each.has_fix for each in samples if each.arrived_ns >= 5e9} == {False}
     done = run(*flown, "--random", 2, "--receiver", "good")
-    assert done.code == 1 and "gnss: only along a route" in done.err
+    assert done.code == 2 and "gnss: only along a route" in done.err

@@ -83,7 +83,7 @@ def test_what_the_telemetry_states(tilts):
 
 def test_the_command_tilts_by_default(run, ortho, tmp_path):
     fly = ["simulate", "--ortho", ortho, "--random", "3", "--agl-m", "100"]
-    exact = ["--mount-std-deg", "0", "--horizon-std-deg", "0"]
+    exact = ["--unreported-tilt-deg", "0"]
     pictures = {}
     for name, options, stated in (("usual", [], None), ("exact", exact, 0.0)):
         assert run(*fly, *options, "--out", tmp_path / name).code == 0

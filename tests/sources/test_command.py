@@ -238,7 +238,7 @@ def test_what_was_localized_is_evaluated_and_viewed_as_it_is(run, tmp_path, came
         add_gps(path, place(*PLACE))
     fixes = tmp_path / "fixes.jsonl"
     assert run("localize", MAP, source, "--out", fixes, *given).code == 0
-    done = run("evaluate", fixes, "--flight", source, "--map", MAP, *given, "--json")
+    done = run("evaluate", fixes, "--flight", source, "--map", MAP, "--json")
     assert done.code == 0 and "another flight" not in done.err
     plain = json.loads(done.out)
     assert plain["n_views"] > 1 and plain["standard"]["cep95_m"] < 5
@@ -251,7 +251,7 @@ def test_what_was_localized_is_evaluated_and_viewed_as_it_is(run, tmp_path, came
     opened = open_run(request)
     assert opened.labels["truth"] == "p" and opened.any_known("err") and opened.raw_jpeg(0)
     photographs(source)
-    none = run("evaluate", fixes, "--flight", source, *given)
+    none = run("evaluate", fixes, "--flight", source)
     assert none.code == 1 and "no positions were recorded; give --truth" in none.err
 
 

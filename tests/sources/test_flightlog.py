@@ -189,7 +189,7 @@ def test_another_map_causes_a_warning(full, flight, map_path, tmp_path, run):
 @pytest.mark.parametrize(
     "options",
     [{"heading": "--out"}, {"track": "yes"}, {"accept": ["a"]}, {"mount": {"views": 3}},
-     {"mount": 7}, {"position": {}}, {"alert_limit_m": "far"}, {"risk": None}],
+     {"mount": 7}, {"alert_limit_m": "far"}, {"risk": None}],
 )  # fmt: skip
 def test_invalid_options_are_rejected(map_path, tmp_path, run, options):
     crafted(tmp_path / "a.mcap", [session(options=options), reported(), shown()])

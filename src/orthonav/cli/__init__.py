@@ -22,17 +22,8 @@ from types import FrameType, ModuleType
 from typing import Any, NoReturn
 
 from orthonav.cli.version import require_extras, show_version
-from orthonav.core.errors import MissingExtraError, OrthonavError, VariantError
-
-UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
-"""Last words of option names that are units."""
-
-_CLOCK_S = 0.01
-"""How far the times of files lag behind the clock."""
-_FILES = ("out", "metrics", "footprint", "preview")
-_FOLDERS = ("report", "work")
-_FILL_FOLDERS = ("check", "demo", "import", "run", "simulate")
-"""Options that name what is written, and commands whose `--out` is a folder."""
+from orthonav.core.errors import OrthonavError, UsageError
+from orthonav.core.files import is_stdout, require_writable
 
 GROUPS = {
     "prepare a map": {
@@ -98,10 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             status: int | None = module_of(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
-        said = _with_options(_one_line(error), options)
-        is_usage = isinstance(error, VariantError) or said.startswith(("--", "give "))
-        is_usage &= not isinstance(error, MissingExtraError)
-        return _failed(said, verbose, code=2 if is_usage else 1)
+        code = 2 if isinstance(error, UsageError) else 1
+        return _failed(_with_options(_one_line(error), options), verbose, code)
     except KeyboardInterrupt as error:
         said = f"interrupted; {str(error) or _written(options, started_s)}"
         return _failed(said, False, code=143 if isinstance(error, _Terminated) else 130)
@@ -123,25 +112,29 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _require_outputs(options: argparse.Namespace) -> None:
     """Raise `OutputError` where a result could not be written, before the work for it."""
-    from orthonav.core.files import is_stdout, require_writable
-
-    asked = {name: getattr(options, name, None) for name in (*_FILES, *_FOLDERS)}
-    folders = (*_FOLDERS, *["out"] * (options.command in _FILL_FOLDERS))
-    for name, path in asked.items():
+    out_is_folder = options.command in ("check", "demo", "import", "run", "simulate")
+    is_folder = {"out": out_is_folder, "footprint": False, "preview": False}
+    is_folder |= {"report": True, "work": True}
+    for name, folder in is_folder.items():
+        path = getattr(options, name, None)
         if isinstance(path, Path) and not is_stdout(path):
-            require_writable(path, folder=name in folders)
-    exported = (Path(each.partition("=")[2]) for each in getattr(options, "export", ()))
-    for path in exported:
+            require_writable(path, folder=folder)
+    for path in _exported(options):
         if path.name and not is_stdout(path):
             require_writable(path)
+
+
+def _exported(options: argparse.Namespace) -> list[Path]:
+    return [Path(each.partition("=")[2]) for each in getattr(options, "export", ())]
 
 
 def _written(options: argparse.Namespace, since_s: float) -> str:
     """Which of the paths among the options were written since a time; outputs appear when whole."""
     paths = [value for value in vars(options).values() if isinstance(value, Path)]
     paths += [Path(f"{path}{kept}") for path in paths for kept in (".work", ".tiles")]
-    paths += [Path(each.partition("=")[2]) for each in getattr(options, "export", [])]
-    new = [path for path in paths if path.exists() and path.stat().st_mtime > since_s - _CLOCK_S]
+    paths += _exported(options)
+    since_s -= 0.01  # times of files lag behind the clock
+    new = [path for path in paths if path.exists() and path.stat().st_mtime > since_s]
     return f"written: {', '.join(map(str, new))}" if new else "nothing was written"
 
 
@@ -282,13 +275,14 @@ def _actions(command: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPar
 
 def _name_units(command: argparse.ArgumentParser) -> None:
     """Name numbers in the help by the unit that ends their option: `--agl-m M`; integers N."""
+    units = ("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz")
     for action in command._actions:
         if isinstance(action, argparse._SubParsersAction):
             for sub_command in action.choices.values():
                 _name_units(sub_command)
         elif action.type in (int, float) and action.metavar is None:
             unit = action.option_strings[0].rpartition("-")[2] if action.option_strings else ""
-            if unit in UNITS:
+            if unit in units:
                 action.metavar = unit.upper()
             elif action.type is int:
                 action.metavar = "N"

@@ -1,23 +1,34 @@
 """`orthonav calibrate`: estimate constant errors of mount, compass and height from a flight."""
 
 import argparse
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import orthonav
 from orthonav.cli.common import add_options, beside, counted, print_json, progress, watched
-from orthonav.cli.source import add_source, dem_of, flight_heights, located, open_source
+from orthonav.cli.source import (
+    add_source,
+    dem_of,
+    flight_heights,
+    located,
+    open_source,
+    warn_if_far_from_map,
+)
+from orthonav.core.errors import UsageError
 
 if TYPE_CHECKING:
     from orthonav.ground.recordings.calibrate import MountCalibration
 
-GNSS_STD_M = 5.0
-"""Standard deviation of measured positions, per axis."""
 EXAMPLE = "area.onav flight --out mount.json"
-EVERYDAY = ("--latency", "--gnss-positions", "--heading", "--camera", "--telemetry", "--json")
+EVERYDAY = ("--latency", "--prior-std-m", "--heading", "--camera", "--telemetry", "--json")
 
 
 def add(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "recorded positions (--prior-std-m 5 for GNSS) make pitch and roll observable from "
+        "positions, not from the perspective alone"
+    )
     add = parser.add_argument
     add("map", type=Path, metavar="MAP.onav", help="map of the area")
     text = "flight to calibrate with, as for `localize`"
@@ -26,20 +37,16 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "estimate the time from exposure to arrival of the camera instead, from a flight log of "
     text += "`fly --log` with turns; --out is then a file for `fly --camera-latency-ms`"
     add("--latency", action="store_true", help=text)
-    text = "measured positions of some or all views (frame,lat_deg,lon_deg), 5 m per axis; they "
-    text += "make pitch and roll observable from positions, not from the perspective alone"
-    add("--gnss-positions", type=Path, metavar="positions.csv", help=text)
     add_options(parser, "--heading", "--json")
     add_source(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import FlightError
     from orthonav.core.flight.mount import write_mount
 
     if options.latency:
         if options.dem is not None:
-            raise FlightError("--latency uses the heights of the log: omit --dem")
+            raise UsageError("--latency uses the heights of the log: omit --dem")
         _run_latency(options)
         return
     found = _calibrated(options)
@@ -66,37 +73,26 @@ def run(options: argparse.Namespace) -> None:
 
 def _calibrated(options: argparse.Namespace) -> "MountCalibration":
     """The mount by the smoothed track of the flight."""
-    from orthonav.core.flight import read_truth
-    from orthonav.core.flight.recording import WithTelemetry
-    from orthonav.core.localize import Localizer
-    from orthonav.core.mapfile import open_map
-    from orthonav.core.records import Prior
-    from orthonav.core.track.tracker import Tracker
-    from orthonav.ground.evaluate.metrics import check_truth
     from orthonav.ground.recordings.calibrate import calibrate_mount
     from orthonav.ground.recordings.localize import smoothed_track
 
-    dem, opened = dem_of(options), open_map(options.map)
+    dem, opened = dem_of(options), orthonav.open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
     flight = open_source(options.flight, options, over_terrain=over_terrain)
-    places = read_truth(options.gnss_positions) if options.gnss_positions else {}
-    if places:
-        frame = opened.manifest.sheets[0].frame
-        check_truth(places, (), (frame.lat_deg, frame.lon_deg), options.gnss_positions)
-    priors = {frame: Prior(*place, GNSS_STD_M) for frame, place in places.items()}
-    tracker = Tracker(
-        Localizer(opened),
+    localizer, measured = orthonav.Localizer(opened), options.prior_std_m is not None
+    options.prior = "telemetry" if measured else "none"
+    if measured:
+        warn_if_far_from_map(flight, localizer)
+    tracker = orthonav.Tracker(
+        localizer,
         heading_known=options.heading == "known",
-        use_prior=bool(options.gnss_positions),
-        every_prior=bool(options.gnss_positions),
+        use_prior=measured,
+        every_prior=measured,
         smooth=True,
-    )
-    views = (
-        WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
     )
     heights = flight_heights(options, opened, flight, dem)
     with progress(options) as shown:
-        results = located(options, tracker, flight, views, shown, heights=heights)
+        results = located(options, tracker, flight, flight.views, shown, heights=heights)
     return calibrate_mount(smoothed_track(tracker, results, None))
 
 

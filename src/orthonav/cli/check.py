@@ -124,14 +124,14 @@ class _Lines:
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
-    from orthonav.core.errors import CheckError
+    from orthonav.core.errors import UsageError
     from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.check.records import CheckRequest
     from orthonav.ground.planning.route import read_route
     from orthonav.ground.planning.spacing import DEFAULT_CAMERA
 
     if options.band_m is not None and options.route is None:
-        raise CheckError("--band-m is the width of a band around a route; give --route too")
+        raise UsageError("--band-m is the width of a band around a route; give --route too")
     route = read_route(options.route) if options.route else None
     agl_m, origin = _agl_m(options, route)
     camera = DEFAULT_CAMERA if options.camera is None else read_camera_file(options.camera)

@@ -14,18 +14,17 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
-from orthonav.core.errors import AreaError, VariantError
+from orthonav.core.errors import UsageError
+from orthonav.core.files import is_stdout
 from orthonav.core.limits import ALERT_LIMITS_M, DEFAULT_RISK, RISKS
+from orthonav.ground import planning
 
 if TYPE_CHECKING:
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.localize.policy import SearchPlan
     from orthonav.core.mapfile.signature import Signature
-    from orthonav.ground.planning.area import Area
 
 T = TypeVar("T")
-MAX_THREADS = 64
-NADIR_DEG = (0.0, 0.0, 0.0)
 log = logging.getLogger(__name__)
 
 
@@ -42,10 +41,10 @@ def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
     return parse
 
 
-def _within(least: float, most: float) -> Callable[[str], float]:
+def within(least: float, most: float, kind: type = float) -> Callable[[str], float]:
     def number(text: str) -> float:
         try:
-            value = float(text)
+            value: float = kind(text)
         except ValueError:
             value = math.nan
         if not least <= value <= most:
@@ -70,7 +69,7 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "peak_ratio:1.3",
     },
     "--alert-limit-m": {
-        "type": _within(*ALERT_LIMITS_M),
+        "type": within(*ALERT_LIMITS_M),
         "metavar": "M",
         "help": "largest horizontal error that the mission allows: a fix is confident if its "
         "protection level is at most that (replaces --accept)",
@@ -87,7 +86,9 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "help": "area: west, south, east, north in degrees",
     },
     "--budget-ms": {
-        "type": float,
+        "type": within(0.001, 1e9),
+        "default": math.inf,
+        "metavar": "MS",
         "help": "time limit per view (default: none); a search that would exceed it is not "
         "started, and the result is the best position so far",
     },
@@ -155,7 +156,7 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "--mount-deg": {
         "type": float,
         "nargs": 3,
-        "default": NADIR_DEG,
+        "default": (0.0, 0.0, 0.0),
         "metavar": ("YAW", "PITCH", "ROLL"),
         "help": "orientation of the camera in the aircraft; 0 0 0 (default) looks straight down "
         "with the top of the image forward",
@@ -196,7 +197,7 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "help": "refuse a map that was not signed with this key (see `orthonav sign`)",
     },
     "--risk": {
-        "type": _within(*RISKS),
+        "type": within(*RISKS),
         "default": DEFAULT_RISK,
         "metavar": "P",
         "help": "probability with which the error exceeds the protection level "
@@ -211,8 +212,9 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "--seed": {"type": int, "help": "seed of all random draws"},
     "--speed-mps": {"type": float, "help": "ground speed"},
     "--threads": {
-        "type": int,
+        "type": within(1, 64, int),
         "default": 1,
+        "metavar": "N",
         "help": "threads that search for one view (default 1); positions do not depend on them",
     },
     "--tile-px": {"type": int, "help": "width of a tile (default 256, or suited to the view)"},
@@ -233,17 +235,15 @@ def add_area(parser: argparse._ActionsContainer, *, required: bool = False) -> N
     add_options(parser, "--band-m")
 
 
-def area_of(options: argparse.Namespace) -> "Area":
-    """The area that the options of `add_area` name; raises `AreaError` or `RouteError`."""
-    from orthonav.ground.planning.area import Area, require_one_area
-    from orthonav.ground.planning.route import read_route
-
+def area_of(options: argparse.Namespace) -> "planning.Area":
+    """The area that the options of `add_area` name; raises `AreaError`, `RouteError` or
+    `UsageError`."""
     if options.route is None and options.bounds is None:
-        raise AreaError("give one area: --route FILE, or --bounds W,S,E,N in degrees")
+        raise UsageError("give one area: --route FILE, or --bounds W,S,E,N in degrees")
     if options.route is None:
-        require_one_area(None, options.band_m, options.bounds)
-        return Area.from_bounds(options.bounds)
-    return Area.from_route(read_route(options.route), options.band_m)
+        planning.require_one_area(None, options.band_m, options.bounds)
+        return planning.Area.from_bounds(options.bounds)
+    return planning.Area.from_route(planning.read_route(options.route), options.band_m)
 
 
 def add_acceptance(parser: argparse._ActionsContainer, **accept: Any) -> None:
@@ -264,15 +264,10 @@ def acceptance(options: argparse.Namespace) -> "Acceptance":
 
 
 def search_plan(options: argparse.Namespace) -> "SearchPlan":
-    """The plan of the search with `--budget-ms` and `--threads`; raises `VariantError`."""
+    """The plan of the search with `--budget-ms` and `--threads`."""
     from orthonav.core.localize.policy import DEFAULT_PLAN
 
-    budget_ms = math.inf if options.budget_ms is None else options.budget_ms
-    if not budget_ms > 0:
-        raise VariantError(f"--budget-ms must be above 0, got {budget_ms:g}")
-    if not 1 <= options.threads <= MAX_THREADS:
-        raise VariantError(f"--threads must be 1 to {MAX_THREADS}, got {options.threads}")
-    return replace(DEFAULT_PLAN, budget_ms=budget_ms, threads=options.threads)
+    return replace(DEFAULT_PLAN, budget_ms=options.budget_ms, threads=options.threads)
 
 
 def checked_signature(options: argparse.Namespace) -> "Signature | None":
@@ -282,7 +277,7 @@ def checked_signature(options: argparse.Namespace) -> "Signature | None":
     if options.require_signed is not None:
         return require_signature(options.map, options.require_signed, options.not_before)
     if options.not_before is not None:
-        raise VariantError("--not-before needs --require-signed")
+        raise UsageError("--not-before needs --require-signed")
     return None
 
 
@@ -339,8 +334,6 @@ def reporter(options: argparse.Namespace) -> Callable[[str], None]:
 @contextmanager
 def beside(*outputs: Path | None) -> Iterator[None]:
     """What is printed goes to stderr where one of the outputs of a command is `-`, stdout."""
-    from orthonav.core.files import is_stdout
-
     taken = any(path is not None and is_stdout(path) for path in outputs)
     with redirect_stdout(sys.stderr) if taken else nullcontext():
         yield

@@ -9,18 +9,17 @@ import time
 from pathlib import Path
 from typing import Any
 
+import orthonav
 from orthonav.cli.common import add_options, print_json, run_command, say
+from orthonav.core.files import replacing_folder
 
 EXAMPLE = ""
 IMAGERY = Path(__file__).parents[1] / "ground" / "demo_data"
 """Two dates of a generated area of 2 x 2 km and its level terrain, from `lab/demo_imagery.py`."""
 MARKER = "demo.json"
 """File that marks a folder as an earlier demo, which may be replaced."""
-HEIGHT_M = 270.0
-"""Views then cover 346 x 259 m, a whole tile of 256 m."""
 SPACING_M = 24.0
 """About 220 views along the route."""
-CHECKED_BAND_M = 300.0
 CHECK_EFFORT = 0.5
 """Half of the trials of a full check, to keep the demo short."""
 WAYPOINTS_EN_M = (
@@ -42,8 +41,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.files import replacing_folder
-
     start, out = time.perf_counter(), options.out
     with replacing_folder(out, _is_earlier_demo) as folder:
         plain, text = _demo(folder, options)
@@ -77,18 +74,17 @@ def _is_earlier_demo(out: Path) -> bool:
 
 def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], str]:
     """Run the commands in the folder; the metrics, and what the commands printed about them."""
-    from orthonav.core.mapfile import open_map
-
     past, present, dem = (shutil.copy(path, folder) for path in sorted(IMAGERY.glob("*.tif")))
     with contextlib.chdir(folder):
         past, present, dem = (Path(each).name for each in (past, present, dem))
         say(options, f"1/4 building the map from {past}")
         built = run_command(options, "build", "--ortho", past, "--dem", dem, "--out", "area.onav")
-        frame = open_map(Path("area.onav")).manifest.sheets[0].frame
+        frame = orthonav.open_map("area.onav").manifest.sheets[0].frame
         _write_route(Path("route.geojson"), frame.latlon_from_en(WAYPOINTS_EN_M))
-        flown = ("--route", "route.geojson", "--agl-m", HEIGHT_M)
+        # Views then cover 346 x 259 m, a whole tile of 256 m.
+        flown = ("--route", "route.geojson", "--agl-m", 270)
         say(options, f"2/4 checking from {past} alone where along the route fixes are expected")
-        trials = ("--band-m", CHECKED_BAND_M, "--effort", CHECK_EFFORT)
+        trials = ("--band-m", 300, "--effort", CHECK_EFFORT)
         checked = run_command(options, "check", "area.onav", *flown, *trials, "--out", "check")
         say(
             options,
@@ -99,11 +95,12 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
         spaced = ("--spacing-m", SPACING_M, "--out", "flight")
         run_command(options, "simulate", "--ortho", present, *flown, *errors, *spaced)
         say(options, "4/4 localizing every view, searching the whole map")
-        searched = ("--prior", "none", "--no-diagnosis", "--out", "fixes.jsonl")
+        searched = ("--prior", "none", "--out", "fixes.jsonl")
         run_command(options, "localize", "area.onav", "flight", *searched)
-        reported = ("--map", "area.onav", "--report", "report", "--metrics", MARKER)
-        measured = run_command(options, "evaluate", "fixes.jsonl", "--flight", "flight", *reported)
-        plain = json.loads(Path(MARKER).read_text(encoding="utf-8"))
+        scored = ("evaluate", "fixes.jsonl", "--flight", "flight")
+        plain = json.loads(run_command(options, *scored, "--json"))
+        reported = ("--map", "area.onav", "--report", "report")
+        measured = run_command(options, *scored, *reported)
     verdict = checked.partition("\n")[0]
     return plain, f"{built}\ncheck      {verdict}\n\n{measured.rpartition('report: ')[0]}"
 

@@ -1,7 +1,6 @@
 """`orthonav evaluate`: accuracy of fixes against the ground truth."""
 
 import argparse
-import json
 import math
 import shlex
 import sys
@@ -9,20 +8,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_options, beside, print_json
-from orthonav.cli.source import add_source, open_source
+import orthonav
+from orthonav.cli.common import add_options, print_json
+from orthonav.cli.source import open_recording
 from orthonav.cli.version import require_extras
+from orthonav.core.errors import FlightError, OrthonavError, UsageError
 
 if TYPE_CHECKING:
-    from orthonav.core.mapfile.reader import MapFile
     from orthonav.ground.evaluate.metrics import Positions
     from orthonav.ground.evaluate.tables import FlightReport
 
 EXAMPLE = "fixes.jsonl --flight flight --map area.onav --report report"
-EVERYDAY = (
-    *("--flight", "--truth", "--map", "--report", "--metrics", "--radius-m", "--alert-limit-m"),
-    *("--risk", "--json"),
-)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -30,76 +26,58 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "fixes of a flight, as written by localize or fly --jsonl; several files are compared"
     add("fixes", type=Path, nargs="+", metavar="fixes.jsonl", help=text)
     each: dict[str, Any] = {"type": Path, "action": "append", "default": []}
-    text = "ground truth: the true positions (default: those of --flight); one for all files of "
-    text += "fixes, or one for each in the same order"
-    add("--truth", **each, metavar="truth.csv", help=text)
-    text = "largest horizontal error that the mission allows: availability and false fixes at it"
-    add_options(parser, "--radius-m", "--json")
-    add_options(parser, "--alert-limit-m", help=text)
-    add_options(parser, "--risk")
-    add("--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file")
-    text = "write an HTML report with its figures as SVG and PNG"
-    add("--report", type=Path, metavar="REPORT/", help=text)
-    text = "map of the flight: background of the report"
-    add("--map", type=Path, metavar="MAP.onav", help=text)
     text = "what was localized, with the recorded positions: flight folder, photographs, video, "
     text += "ROS; one for all files of fixes, or one for each in the same order"
     add("--flight", **each, metavar="FLIGHT_DIR", help=text)
-    add_source(parser, dem=False)
-    parser.set_defaults(wrong_usage=parser.error, skip_bad_images=True)
+    text = "ground truth: the true positions (default: those of --flight); one for all files of "
+    text += "fixes, or one for each in the same order"
+    add("--truth", **each, metavar="truth.csv", help=text)
+    text = "map of the flight: background of the report"
+    add("--map", type=Path, metavar="MAP.onav", help=text)
+    text = "write an HTML report with its figures as SVG and PNG"
+    add("--report", type=Path, metavar="REPORT/", help=text)
+    text = "largest horizontal error that the mission allows: availability and false fixes at it"
+    add_options(parser, "--alert-limit-m", help=text)
+    add_options(parser, "--risk", "--radius-m", "--json")
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.files import write_text
-    from orthonav.core.mapfile import open_map
     from orthonav.ground.evaluate.tables import runs_to_json, text
-
-    _check_options(options)
-    opened = open_map(options.map) if options.map else None
-    flights = _measured(options, opened)
-    if options.report:
-        _write_report(options.report, flights, opened)
-    plain = runs_to_json(flights)
-    if options.metrics:
-        write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    with beside(options.metrics):
-        if options.json:
-            print_json(plain)
-            return
-        print(text(flights))
-        if options.report:
-            print(f"report: {options.report / 'index.html'}")
-
-
-def _check_options(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import FlightError
 
     options.flight = _one_each(options.flight, options.fixes, "--flight")
     options.truth = _one_each(options.truth, options.fixes, "--truth")
     if not (options.truth or options.flight):
-        options.wrong_usage("give --flight with recorded positions, or --truth truth.csv")
+        raise UsageError("give --flight with recorded positions, or --truth truth.csv")
     if not 0 < options.radius_m < 1e7:
-        raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
+        raise UsageError(f"--radius-m must be above 0, got {options.radius_m}")
     if options.report:
         require_extras("evaluate --report")
+    opened = orthonav.open_map(options.map) if options.map else None
+    flights = _measured(options, opened)
+    if options.report:
+        _write_report(options.report, flights, opened)
+    if options.json:
+        print_json(runs_to_json(flights))
+        return
+    print(text(flights))
+    if options.report:
+        print(f"report: {options.report / 'index.html'}")
 
 
 def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
-    from orthonav.core.errors import FlightError
-
     if len(given) == 1:
         return given * len(fixes)
     if given and len(given) != len(fixes):
-        raise FlightError(
+        raise UsageError(
             f"give {option} once per file of fixes, or one for all: {len(fixes)} expected, got "
             f"{len(given)}"
         )
     return given
 
 
-def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
-    from orthonav.core.flight import read_truth
-    from orthonav.core.flight.fixes import read_results
+def _measured(
+    options: argparse.Namespace, opened: "orthonav.MapFile | None"
+) -> "list[FlightReport]":
     from orthonav.core.mapfile.layer import preview
     from orthonav.ground.evaluate.metrics import check_truth, compare, measure, warn_of_another_run
     from orthonav.ground.evaluate.tables import FlightReport
@@ -111,7 +89,8 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         sheet = opened.manifest.sheets[0]
         local, place = sheet.frame, (sheet.frame.lat_deg, sheet.frame.lon_deg)
         background = Background(preview(opened), sheet.grid.extent_en_m)
-    recorded = {str(path): _recorded(path, options) for path in options.flight}
+    sources = dict.fromkeys(options.flight)
+    recorded = {path: _recorded(path, needed=not options.truth) for path in sources}
     names = [path.stem for path in options.fixes]
     if len(set(names)) < len(names):
         names = [str(path) for path in options.fixes]
@@ -119,8 +98,9 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     for i, fixes in enumerate(options.fixes):
         truth = options.truth[i] if options.truth else options.flight[i]
         flight = options.flight[i] if options.flight else truth.parent
-        known, sha256 = recorded[str(flight)] if options.flight else ({}, _digest_of(flight))
-        results, known = read_results(fixes), read_truth(truth) if options.truth else known
+        known, sha256 = recorded[flight] if options.flight else ({}, _digest_of(flight))
+        results = orthonav.read_results(fixes)
+        known = orthonav.read_truth(truth) if options.truth else known
         comparison = compare(known, results, local, options.risk)
         check_truth(known, results, place, truth)
         warn_of_another_run(fixes, opened, flight, sha256)
@@ -138,34 +118,34 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     return flights
 
 
-def _recorded(path: Path, options: argparse.Namespace) -> "tuple[Positions, str]":
+def _recorded(path: Path, *, needed: bool) -> "tuple[Positions, str]":
     """Recorded positions of what was localized, by frame, and its digest."""
-    from orthonav.core.errors import FlightError
     from orthonav.core.flight.fixes import FlightDigest
+    from orthonav.ground.recordings import SourceOptions
 
     digest = FlightDigest()
-    views = digest.watching(open_source(path, options).views)
+    how = SourceOptions(fov_deg=60.0, agl_m=100.0, skip_bad_images=True)  # any: not used here
+    views = digest.watching(open_recording(path, how).views)
     places = {view.frame: view.truth_latlon_deg for view in views}
     known = {name: at for name, at in places.items() if at is not None}
-    if not (known or options.truth):
+    if needed and not known:
         raise FlightError(f"no positions were recorded; give --truth: {path}")
     return known, digest.sha256
 
 
 def _digest_of(folder: Path) -> str | None:
     """The digest of the flight folder in which a file with the truth lies, if it is one."""
-    from orthonav.core.errors import OrthonavError
-    from orthonav.core.flight import open_flight
     from orthonav.core.flight.fixes import flight_digest
 
     with suppress(OrthonavError):
         if (folder / "telemetry.csv").is_file():
-            return flight_digest(open_flight(folder, images_needed=False).views)
+            return flight_digest(orthonav.open_flight(folder, images_needed=False).views)
     return None
 
 
-def _write_report(out: Path, flights: list["FlightReport"], opened: "MapFile | None") -> None:
-    from orthonav import __version__
+def _write_report(
+    out: Path, flights: "list[FlightReport]", opened: "orthonav.MapFile | None"
+) -> None:
     from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.ground.evaluate.report import MadeFrom, write_report
 
@@ -175,7 +155,7 @@ def _write_report(out: Path, flights: list["FlightReport"], opened: "MapFile | N
         imagery=imagery_text(opened.manifest.imagery) if opened else "",
         flight=", ".join(flight.name for flight in flights),
         command=" ".join(["orthonav", *sys.argv[1:]]),
-        version=__version__,
+        version=orthonav.__version__,
     )
     write_report(out, flights, made_from)
 

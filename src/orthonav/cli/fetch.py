@@ -17,7 +17,7 @@ from orthonav.cli.common import (
     say,
 )
 from orthonav.cli.version import require_extras
-from orthonav.core.errors import FetchError
+from orthonav.core.errors import FetchError, UsageError
 
 if TYPE_CHECKING:
     from orthonav.ground.fetch.presets import ImageryOptions
@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
         _print_presets(options.json)
         return
     if options.source is None or (options.out is None and not options.dry_run):
-        raise FetchError("give a --source (--list shows the known ones) and an --out")
+        raise UsageError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
     from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
     from orthonav.ground.fetch.run import estimate_fetch, fetch, holds_heights
@@ -207,7 +207,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
     from orthonav.ground.fetch.web import RequestLimits
 
     if not (1 <= options.parallel <= 16 and 1 <= options.quality <= 100 and options.retries >= 0):
-        raise FetchError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
+        raise UsageError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
     terms = ("date", "licence", "attribution", "key_env")
     named = {name: getattr(options, name) for name in terms}
     more = {
@@ -223,7 +223,7 @@ def _imagery(options: argparse.Namespace) -> "ImageryOptions":
     from orthonav.ground.fetch.presets import ImageryOptions
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
-        raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
+        raise UsageError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
     return ImageryOptions(**given(options, ImageryOptions))
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import acceptance, checked_signature, search_plan
 from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
-from orthonav.core.errors import CameraError, FlightError, OutputError, VariantError
+from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
 from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
@@ -82,7 +82,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
 
     heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     if heights is not None and not heights.datum_known and set(options.height or ()) == {"amsl"}:
-        raise FlightError(
+        raise UsageError(
             "--height amsl needs the height of the ground above the sea, and the vertical datum of "
             f"the map's terrain is unknown: {DATUM_ADVICE}"
         )
@@ -380,7 +380,6 @@ def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[st
     return {
         "heading": options.heading,
         "prior": "telemetry",
-        "registration": "on",
         "accept": None,
         "alert_limit_m": options.alert_limit_m,
         "mask": None if options.mask is None else str(options.mask),

@@ -7,13 +7,14 @@ from pathlib import Path
 
 from orthonav.cli.common import add_options, counted, print_json, progress
 from orthonav.cli.source import add_source, open_source
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import UsageError
+from orthonav.core.geo.headings import RADIANS
 
 log = logging.getLogger(__name__)
 
 EXAMPLE = "photos/ --out flight"
 EVERYDAY = (
-    *("--kind", "--camera", "--telemetry", "--time-offset-s", "--mount-deg", "--rate-hz"),
+    *("--camera", "--telemetry", "--time-offset-s", "--mount-deg", "--rate-hz"),
     *("--agl-m", "--json"),
 )
 
@@ -24,23 +25,17 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", type=Path, nargs="+", metavar="SOURCE", help=text)
     parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR", help="to write")
     add_source(parser, dem=False)
-    text = "quality of JPEG images, 1 to 100; raw images and frames of a video are then stored as "
-    text += "JPEG (default: PNG, lossless)"
-    parser.add_argument("--jpeg-quality", type=int, choices=range(1, 101), metavar="N", help=text)
     add_options(parser, "--json")
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.geo.headings import RADIANS
     from orthonav.ground.recordings import import_flight
 
     if options.mask is not None:
-        raise FlightError("a flight folder keeps no mask: give --mask where it is read")
+        raise UsageError("a flight folder keeps no mask: give --mask where it is read")
     recording = open_source(options.source, options)
     with progress(options) as shown:
-        done = import_flight(
-            recording, options.out, options.jpeg_quality, lambda share: shown("import", share)
-        )
+        done = import_flight(recording, options.out, progress=lambda share: shown("import", share))
     if done.broken:
         log.warning("%d views left out, the first: %s", done.broken, done.first_broken)
     if done.radians:

@@ -1,7 +1,6 @@
 """`orthonav localize`: find the positions of the views of a flight."""
 
 import argparse
-import json
 import logging
 import math
 import time
@@ -10,6 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+import orthonav
 from orthonav.cli.common import (
     acceptance,
     add_acceptance,
@@ -35,16 +35,16 @@ from orthonav.cli.source import (
     warn_if_far_from_map,
 )
 from orthonav.cli.version import require_extras
+from orthonav.core.errors import UsageError
+from orthonav.core.files import is_stdout
+from orthonav.core.geo.headings import RADIANS, seem_radians
 
 if TYPE_CHECKING:
     from orthonav.core.flight.fixes import Identity
     from orthonav.core.flight.mount import Mount
     from orthonav.core.geo.ground import TerrainHeights
-    from orthonav.core.localize import Localizer
     from orthonav.core.localize.confidence import Acceptance
-    from orthonav.core.mapfile import MapFile
     from orthonav.core.mapfile.terrain import TerrainLayer
-    from orthonav.core.records import Fix, Telemetry, ViewResult
     from orthonav.ground.imagery.terrain import Dem
     from orthonav.ground.recordings import Recording, SourceView
     from orthonav.ground.recordings.setups import Tried
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 EXAMPLE = "area.onav flight --out fixes.jsonl"
 EVERYDAY = (
     *("--heading", "--prior", "--track", "--smooth", "--accept", "--alert-limit-m", "--mount"),
-    *("--atlas", "--camera", "--fov-deg", "--agl-m", "--dem", "--json"),
+    *("--camera", "--fov-deg", "--agl-m", "--dem", "--json"),
 )
 BUDGET_S = 15.0
 """After so long no further view is localized: the search for the cause takes at most 20 s."""
@@ -61,7 +61,8 @@ log = logging.getLogger(__name__)
 
 def add(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("map", metavar="MAP.onav", help="map, or with --atlas an atlas")
+    text = "map, or an atlas (a folder or URL), on which no prior is used and a fix needs the "
+    add("map", metavar="MAP.onav", help=f"{text}agreement of several views")
     text = "flight folder, photographs, video or ROS recording, as for `orthonav import`"
     add("flight", type=Path, nargs="+", metavar="SOURCE", help=text)
     text = "file to write (-: stdout, with the summary on stderr); without it the command prints "
@@ -72,25 +73,19 @@ def add(parser: argparse.ArgumentParser) -> None:
     text += "terrain; can be repeated"
     add("--export", action="append", default=[], metavar="FORMAT=PATH", help=text)
     add_options(parser, "--json")
-    text = "if few views are confident, do not try other headings and heights to find the cause"
-    add("--no-diagnosis", dest="diagnosis", action="store_false", help=text)
 
     group = parser.add_argument_group("placing views")
     add = group.add_argument
     add_options(group, "--heading", "--prior")
     text = "criterion of a confident fix and its threshold: confidence:0.9 (default), "
-    text += "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (with --registration off); other fixes "
+    text += "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (positions of tiles); other fixes "
     text += 'are written too, marked "confident": false'
     add_acceptance(group, help=text)
-    text = "the first argument is an atlas (folder or URL); no prior is used, and a fix needs the "
-    add("--atlas", action="store_true", help=f"{text}agreement of several views")
-    text = "on: positions within a pixel, where the map has a registration layer (default); off: "
-    text += "positions at tile level, as in the paper"
-    add("--registration", choices=("on", "off"), default="on", help=text)
-    text = "with --registration off, how scores become a position: interpolated peak (default), "
-    text += "best tile (the paper), mean of the best tile and its neighbours, or weighted mean of "
-    rules = ("peak", "best", "neighbours", "weighted")
-    add("--position", choices=rules, default="peak", help=f"{text}all")
+    text = "registered: within a pixel, where the map has a registration layer (default); else by "
+    text += "the scores of tiles: interpolated peak, best tile (the paper), mean of the best tile "
+    text += "and its neighbours, or weighted mean of all"
+    kinds = ("registered", "peak", "best", "neighbours", "weighted")
+    add("--position", choices=kinds, default="registered", help=text)
     add_options(group, "--budget-ms", "--threads", "--require-signed", "--not-before")
     text = "write images that are missing or cannot be decoded as no_fix instead of stopping"
     add("--skip-bad-images", action="store_true", help=text)
@@ -101,8 +96,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     add("--track", action="store_true", help=text)
     text = "track, then smooth: every position uses all views of the flight"
     add("--smooth", action="store_true", help=text)
-    text = "with --smooth: number of later views that a position uses (default: all)"
-    add("--lag", type=int, metavar="VIEWS", help=text)
     add_options(group, "--mount")
     add("--as-flown", action="store_true", help="flight log: use the options of the flight")
     add_source(parser)
@@ -110,7 +103,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     _check_destination(options)
-    if options.atlas:
+    if "://" in options.map or Path(options.map).is_dir():
         _on_atlas(options)
     else:
         options.map = Path(options.map)
@@ -125,22 +118,17 @@ def _above_sea(dem: "Dem | None", layer: "TerrainLayer | None") -> "TerrainHeigh
 
 
 def _on_map(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import VariantError
     from orthonav.core.flight.fixes import FlightDigest, Identity
-    from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
-    from orthonav.core.track.tracker import Tracker
     from orthonav.ground.recordings.export import export_all, export_of
     from orthonav.ground.recordings.flightlog import compare_with_flight
     from orthonav.ground.recordings.localize import smoothed_track
     from orthonav.onboard.run import Locator, MountCorrected, SingleViews, model_of
 
-    if options.lag is not None and not (options.smooth and options.lag >= 0):
-        raise VariantError("--lag needs --smooth and a number of views, 0 or more")
     exports = [export_of(each) for each in options.export]
     signature = checked_signature(options)
     dem = dem_of(options)
-    opened = open_map(options.map, signature.manifest_sha256 if signature else None)
+    opened = orthonav.open_map(options.map, signature.manifest_sha256 if signature else None)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
     flight = open_source(options.flight, options, over_terrain=over_terrain)
     mount = _take_flown(options, flight)
@@ -155,14 +143,12 @@ def _on_map(options: argparse.Namespace) -> None:
     tracker = None
     if options.track or options.smooth:
         model = model_of(mount) if mount else None
-        locator = tracker = Tracker(
-            localizer, smooth=options.smooth, lag=options.lag, model=model, **how
-        )
+        locator = tracker = orthonav.Tracker(localizer, smooth=options.smooth, model=model, **how)
     if mount:
         locator = MountCorrected(locator, mount)
     heights = flight_heights(options, opened, flight, dem)
 
-    def corrected(telemetry: "Telemetry") -> "Telemetry":
+    def corrected(telemetry: orthonav.Telemetry) -> orthonav.Telemetry:
         made = telemetry if heights is None else heights.corrected(telemetry)
         return mount.corrected(made) if mount else made
 
@@ -182,50 +168,45 @@ def _on_map(options: argparse.Namespace) -> None:
     _print_summary(options, results, accept, advice, tried)
 
 
-def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptance") -> "Localizer":
-    """The localizer of a map; raises `VariantError` where the criterion does not fit it."""
-    from orthonav.core.errors import VariantError
-    from orthonav.core.localize import Localizer
-    from orthonav.core.tiles.position import check_rule
-
-    made = Localizer(
+def _localizer(
+    options: argparse.Namespace, opened: "orthonav.MapFile", accept: "Acceptance"
+) -> "orthonav.Localizer":
+    """The localizer of a map; raises `UsageError` where the criterion does not fit it."""
+    registered = options.position == "registered"
+    made = orthonav.Localizer(
         opened,
-        registration=options.registration == "on",
-        position=check_rule(options.position),
+        registration=registered,
+        position="peak" if registered else options.position,
         plan=search_plan(options),
     )
     if made.registration is not None and accept.criterion == "lowe_ratio":
-        raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
-    if made.registration is None and options.registration == "on":
+        raise UsageError("--accept lowe_ratio compares tiles: it needs --position peak or best")
+    if made.registration is None and registered:
         log.warning("the map has no registration layer: positions are at tile level")
     return made
 
 
 def _on_atlas(options: argparse.Namespace) -> None:
     """Localize on an atlas without a prior; a fix needs the agreement of several views."""
-    require_extras("localize --atlas")
-    from orthonav.core.errors import VariantError
+    require_extras("localize ATLAS")
     from orthonav.core.flight.fixes import FlightDigest, Identity
     from orthonav.ground.atlas.catalog import Atlas
     from orthonav.ground.atlas.locate import AtlasLocator
     from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
     from orthonav.ground.recordings.export import export_all, export_of
 
-    asked = [
-        name
-        for name in (
-            *("track", "smooth", "mount", "as_flown", "require_signed", "not_before", "lag"),
-            *("dem", "dem_datum"),
-        )
-        if getattr(options, name) not in (None, False)
-    ]
-    asked += ["position"] if options.position != "peak" else []
-    if asked or options.registration == "off":
-        named = ", ".join(f"--{name.replace('_', '-')}" for name in asked) or "--registration off"
-        raise VariantError(f"{named} needs a map: cut one out of the atlas (orthonav atlas cut)")
+    of_maps = (
+        *("track", "smooth", "mount", "as_flown", "require_signed", "not_before"),
+        *("dem", "dem_datum"),
+    )
+    asked = [name for name in of_maps if getattr(options, name)]
+    asked += ["position"] * (options.position != "registered")
+    if asked:
+        named = ", ".join(f"--{name.replace('_', '-')}" for name in asked)
+        raise UsageError(f"{named} needs a map: cut one out of the atlas (orthonav atlas cut)")
     accept = acceptance(options)
     if accept.criterion == "lowe_ratio":
-        raise VariantError("--accept lowe_ratio needs a map and --registration off")
+        raise UsageError("--accept lowe_ratio needs a map and --position peak or best")
     exports = [export_of(each) for each in options.export]
     flight = open_source(options.flight, options)
     say_assumed_heights(flight, advice="cut a map with terrain out of the atlas")
@@ -250,15 +231,12 @@ def _on_atlas(options: argparse.Namespace) -> None:
 
 def _print_summary(
     options: argparse.Namespace,
-    results: "list[ViewResult]",
+    results: "list[orthonav.ViewResult]",
     accept: "Acceptance",
     advice: Sequence[str] = (),
     tried: Sequence[dict[str, Any]] = (),
 ) -> None:
     """Print, on stderr where an output is stdout, how many views have positions and why not."""
-    from orthonav.core.files import is_stdout
-    from orthonav.core.flight.fixes import result_to_json
-    from orthonav.core.records import Fix
     from orthonav.ground.recordings.setups import Counts
 
     counts, out = Counts.of(results), options.out
@@ -280,13 +258,13 @@ def _print_summary(
         "setups": list(tried),
     }
     if out is None:
-        plain["positions"] = [json.loads(result_to_json(result)) for result in results]
+        plain["positions"] = [result.to_dict() for result in results]
     with beside(out, *exported):
         if options.json:
             print_json(plain)
             return
         others = "above the alert limit" if options.alert_limit_m else "of low confidence"
-        fixes = [each.outcome for each in results if isinstance(each.outcome, Fix)]
+        fixes = [each.outcome for each in results if isinstance(each.outcome, orthonav.Fix)]
         infinite = sum(math.isinf(each.protection_level_m(accept.risk)) for each in fixes)
         doubt = f" ({infinite} infinite: place in doubt)" * bool(options.alert_limit_m)
         named = ", ".join(f"{reason} {count}" for reason, count in counts.reasons)
@@ -313,8 +291,8 @@ class SetupAdvice:
         self,
         options: argparse.Namespace,
         flight: "Recording",
-        localizer: "Localizer",
-        corrected: "Callable[[Telemetry], Telemetry]",
+        localizer: "orthonav.Localizer",
+        corrected: "Callable[[orthonav.Telemetry], orthonav.Telemetry]",
     ) -> None:
         from orthonav.ground.recordings.setups import LowConfidenceViews
 
@@ -333,19 +311,17 @@ class SetupAdvice:
             yield view
 
     def advice(
-        self, results: "Sequence[ViewResult]", accept: "Acceptance"
+        self, results: "Sequence[orthonav.ViewResult]", accept: "Acceptance"
     ) -> "tuple[list[str], list[dict[str, Any]]]":
         """Sentences on what to check, and the configurations that were tried as JSON values.
 
         Both are empty where enough views are confident.
         """
-        from orthonav.core.geo.headings import RADIANS, seem_radians
         from orthonav.core.localize.confidence import Acceptance
-        from orthonav.core.records import CONFIDENT
         from orthonav.ground.recordings.setups import Counts, setup_text
 
         if math.isfinite(accept.alert_limit_m):  # a high level is no sign of a wrong setup
-            accept = Acceptance("confidence", CONFIDENT)
+            accept = Acceptance("confidence", orthonav.CONFIDENT)
             results = [accept.judged(each) for each in results]
         counts, known = Counts.of(results), self._options.heading == "known"
         lines = [RADIANS] if known and seem_radians(self._yaw_deg) else []
@@ -357,7 +333,7 @@ class SetupAdvice:
             silent = f"no fix states the criterion {accept.criterion}, so none can be confident; "
             silent += "build the map from a larger or more varied area, or give --accept "
             return [*lines, f"{silent}peak_ratio:1.3"], []
-        if not self._low.views or not self._options.diagnosis:
+        if not self._low.views or self._options.quiet:
             return lines, []
         end_s = time.monotonic() + BUDGET_S
         try:
@@ -378,7 +354,7 @@ class SetupAdvice:
 
         reporter(self._options)(
             "few views are confident: trying other configurations on some of them for up to "
-            f"{BUDGET_S:.0f} s (Ctrl-C or --no-diagnosis skips this)"
+            f"{BUDGET_S:.0f} s (Ctrl-C or --quiet skips this)"
         )
         return try_setups(
             self._localizer,
@@ -397,7 +373,6 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
     Logs a warning where options or the map differ from those of the flight. Raises `FlightError`
     for invalid logged options.
     """
-    from orthonav.core.errors import FlightError
     from orthonav.core.flight.mount import read_mount
     from orthonav.core.mapfile.signature import map_digest
     from orthonav.ground.recordings import LoggedFlight
@@ -406,7 +381,7 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
     mount: Mount | None = read_mount(options.mount) if options.mount else None
     if not isinstance(flight, LoggedFlight):
         if options.as_flown:
-            raise FlightError(f"--as-flown needs a flight log: {flight.path}")
+            raise UsageError(f"--as-flown needs a flight log: {flight.path}")
         return mount
     logged = flight.session.get("map")
     logged = logged if isinstance(logged, dict) else {}
@@ -437,21 +412,19 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
 
 
 def _check_destination(options: argparse.Namespace) -> None:
-    """Raise `VariantError` where positions have no place to go, or share it with the summary."""
-    from orthonav.core.errors import VariantError
-    from orthonav.core.files import is_stdout
+    """Raise `UsageError` where positions have no place to go, or share it with the summary."""
     from orthonav.ground.recordings.photos import is_photo
 
     if options.out is not None and is_stdout(options.out) and options.json:
-        raise VariantError("--out - and --json both write to stdout: give one of them")
+        raise UsageError("--out - and --json both write to stdout: give one of them")
     if options.out is None:
         named = [path for path in options.flight if not path.is_file() or not is_photo(path)]
         if named and all(path.exists() for path in named):
-            raise VariantError("give --out FILE, or --out - for stdout")
+            raise UsageError("give --out FILE, or --out - for stdout")
 
 
 def _write_positions(
-    options: argparse.Namespace, results: "Sequence[ViewResult]", identity: "Identity"
+    options: argparse.Namespace, results: "Sequence[orthonav.ViewResult]", identity: "Identity"
 ) -> None:
     """Write one line of JSON per view to the file or to stdout, or print them for people."""
     from orthonav.core.flight.fixes import write_results
@@ -463,11 +436,9 @@ def _write_positions(
             print(_position_text(result, options.alert_limit_m))
 
 
-def _position_text(result: "ViewResult", alert_limit_m: float | None) -> str:
-    from orthonav.core.records import Fix
-
+def _position_text(result: "orthonav.ViewResult", alert_limit_m: float | None) -> str:
     outcome = result.outcome
-    if isinstance(outcome, Fix):
+    if isinstance(outcome, orthonav.Fix):
         lines = _lines(outcome, result, alert_limit_m)
     else:
         hints = {
@@ -480,7 +451,9 @@ def _position_text(result: "ViewResult", alert_limit_m: float | None) -> str:
     return "\n".join([result.frame, *(f"  {name:<11}{text}" for name, text in lines.items())])
 
 
-def _lines(fix: "Fix", result: "ViewResult", alert_limit_m: float | None) -> dict[str, str]:
+def _lines(
+    fix: "orthonav.Fix", result: "orthonav.ViewResult", alert_limit_m: float | None
+) -> dict[str, str]:
     east_m, north_m = (math.sqrt(float(fix.cov_en_m2[i, i])) for i in (0, 1))
     level_m = fix.protection_level_m(result.risk)
     level = f"{level_m:.0f} m"

@@ -7,11 +7,12 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import orthonav
 from orthonav.cli.common import add_options, print_json
+from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
 
 if TYPE_CHECKING:
-    from orthonav.core.flight import FlightFolder, FlightView
-    from orthonav.core.geo.camera import Camera
+    from orthonav.core.flight import FlightView
     from orthonav.core.mapfile.terrain import TerrainLayer
 
 EXAMPLE = "fixes.jsonl 0001.jpg 640 480 --flight flight"
@@ -37,23 +38,20 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import FlightError
-    from orthonav.core.flight import open_flight
-    from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, read_results
+    from orthonav.core.flight.fixes import Identity, flight_digest, read_identity
     from orthonav.core.flight.mount import read_mount
-    from orthonav.core.records import Fix
     from orthonav.ground.recordings.pixel import ellipse_95, locate_pixel
 
-    results = {each.frame: each for each in read_results(options.fixes)}
+    results = {each.frame: each for each in orthonav.read_results(options.fixes)}
     if options.frame not in results and Path(options.frame).name in results:
         options.frame = Path(options.frame).name  # the path of an image
     result = results.get(options.frame)
     if result is None:
         raise FlightError(f"there is no view {options.frame!r}: {options.fixes}")
     fix = result.outcome
-    if not isinstance(fix, Fix):
+    if not isinstance(fix, orthonav.Fix):
         raise FlightError(f"view {options.frame!r} has no position ({fix.reason})")
-    flight = open_flight(options.flight, images_needed=False)
+    flight = orthonav.open_flight(options.flight, images_needed=False)
     view = next((each for each in flight.views if each.frame == options.frame), None)
     if view is None:
         raise FlightError(f"there is no view {options.frame!r}: {options.flight}")
@@ -67,7 +65,8 @@ def run(options: argparse.Namespace) -> None:
         log.warning("fixes are of %s: %s", other, options.fixes)
     turned = _is_turned(view.path)
     found = locate_pixel(_camera(flight, view), telemetry, fix, (options.x, options.y), terrain)
-    height_m = found.height_m if _is_above_sea(terrain) else math.nan
+    is_above_sea = terrain is not None and terrain.info.is_above_sea
+    height_m = found.height_m if is_above_sea else math.nan
     ellipse = ellipse_95(found.cov_en_m2)
     plain = {
         "lat_deg": round(found.lat_deg, 9),
@@ -94,7 +93,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _is_turned(path: Path) -> bool:
-    from orthonav.core.errors import OrthonavError
     from orthonav.ground.recordings.exif import read_photo
 
     turned = False
@@ -105,10 +103,8 @@ def _is_turned(path: Path) -> bool:
     return turned
 
 
-def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
+def _camera(flight: "orthonav.FlightFolder", view: "FlightView") -> "orthonav.Camera":
     """The camera at the size of the image of a view; as calibrated where that cannot be read."""
-    from orthonav.core.errors import FlightError, MissingFileError
-
     try:
         height_px, width_px = view.grey().shape
     except (FlightError, MissingFileError):
@@ -116,16 +112,10 @@ def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
     return flight.camera.fitted(width_px, height_px)
 
 
-def _is_above_sea(terrain: "TerrainLayer | None") -> bool:
-    return terrain is not None and terrain.info.is_above_sea
-
-
 def _terrain(path: Path) -> "tuple[TerrainLayer, str]":
-    from orthonav.core.errors import FlightError
-    from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
 
-    opened = open_map(path)
+    opened = orthonav.open_map(path)
     terrain = TerrainLayer.of(opened)
     if terrain is None:
         raise FlightError(f"the map has no terrain: {path}")

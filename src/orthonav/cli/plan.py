@@ -4,20 +4,21 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import orthonav
 from orthonav.cli.common import add_area, add_options, beside, counted, print_json
 from orthonav.cli.source import dem_of
+from orthonav.core.errors import AreaError, UsageError
+from orthonav.core.files import write_text
+from orthonav.ground import planning
+
+if TYPE_CHECKING:
+    from orthonav.ground.imagery.terrain import Dem
 
 EXAMPLE = "--route route.kml --agl-m 120"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
     *("--out", "--json"),
 )
-MAX_SHOWN = 12  # sheets and legs named in the text
-
-if TYPE_CHECKING:
-    from orthonav.ground.planning.area import Area, Extent
-    from orthonav.ground.planning.route import Route
-    from orthonav.ground.planning.spacing import ViewPlan
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -31,55 +32,36 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import RouteError
-    from orthonav.core.files import write_text
-    from orthonav.ground.planning.area import Area
-    from orthonav.ground.planning.route import read_route, to_geojson
-    from orthonav.ground.planning.sheets import sheets_of_route
-    from orthonav.ground.planning.spacing import (
-        default_band_m,
-        profile,
-        terrain_cautions,
-        view_cautions,
-    )
-
-    route = read_route(options.route) if options.route else None
+    route = planning.read_route(options.route) if options.route else None
     if route is None and (options.band_m is not None or options.dem or options.out):
-        raise RouteError("--band-m, --dem and --out need a route (--route)")
+        raise UsageError("--band-m, --dem and --out need a route (--route)")
     if options.speed_mps is not None and not 0 < options.speed_mps < 10_000:
-        raise RouteError(f"speed_mps must be above 0, got {options.speed_mps}")
+        raise UsageError(f"speed_mps must be above 0, got {options.speed_mps}")
     dem = dem_of(options, route)
     view = _view(options, route, dem)
-    cautions, legs = [], []
-    sheets: list[Route | Extent]
-    if route is None:
-        sheets = [options.bounds]
-    else:
-        if options.band_m is None:
-            options.band_m = default_band_m(0.0 if view is None else view.side_m)
-        sheets = [*sheets_of_route(route, options.band_m)]
-    areas = [
-        Area.from_bounds(sheet)
-        if isinstance(sheet, tuple)
-        else Area.from_route(sheet, options.band_m)
-        for sheet in sheets
-    ]
     gsd_m, tile_px = _map_of(options, view)
-    if view is not None:
-        cautions += view_cautions(view, gsd_m, tile_px)
+    cautions = [] if view is None else planning.view_cautions(view, gsd_m, tile_px)
+    legs, sheets = [], []
+    areas = [planning.Area.from_bounds(options.bounds)] if route is None else []
+    if route is not None:
+        if options.band_m is None:
+            options.band_m = planning.default_band_m(0.0 if view is None else view.side_m)
+        sheets = planning.sheets_of_route(route, options.band_m)
+        areas = [planning.Area.from_route(sheet, options.band_m) for sheet in sheets]
     if route is not None and dem is not None:
         agl_m, view_m = (options.agl_m, 0.0) if view is None else (view.agl_m, view.short_m)
-        legs = profile(route, route.bands_m(options.band_m) or (), agl_m, view_m, dem)
-        cautions += terrain_cautions(legs)
+        bands_m = route.bands_m(options.band_m) or ()
+        legs = planning.profile(route, bands_m, agl_m, view_m, dem)
+        cautions += planning.terrain_cautions(legs)
     plain: dict[str, Any] = {
         "route": None if route is None else _route_plain(route, options),
         "view": None if view is None else _view_plain(view, gsd_m, options.speed_mps),
-        "map": _map_plain(options.overlap, areas, sheets, gsd_m, tile_px),
+        "map": _map_plain(options, areas, sheets, gsd_m, tile_px),
         "terrain": None if dem is None else [vars(leg) for leg in legs],
         "cautions": [vars(each) for each in cautions],
     }
     if options.out is not None:
-        write_text(options.out, to_geojson([x for x in sheets if not isinstance(x, tuple)]))
+        write_text(options.out, planning.to_geojson(sheets))
         plain["out"] = str(options.out)
     with beside(options.out):
         if options.json:
@@ -88,29 +70,24 @@ def run(options: argparse.Namespace) -> None:
             print(plan_text(plain))
 
 
-def _view(options: argparse.Namespace, route: "Route | None", dem: Any) -> "ViewPlan | None":
-    from orthonav.core.errors import CameraError
-    from orthonav.core.geo.camera_files import read_camera_file
-    from orthonav.ground.planning.spacing import DEFAULT_CAMERA, ViewPlan, flown_agl_m
-
+def _view(
+    options: argparse.Namespace, route: "planning.Route | None", dem: "Dem | None"
+) -> "planning.ViewPlan | None":
     agl_m = options.agl_m
     if agl_m is None and route is not None:
-        agl_m = min(flown_agl_m(route, dem), default=None)
+        agl_m = min(planning.flown_agl_m(route, dem), default=None)
     if agl_m is None and options.camera is None:
         return None
     if agl_m is None:
-        raise CameraError(
+        raise UsageError(
             "--camera needs a height above ground: give --agl-m, or a route with heights (above "
             "ground; with --dem also above the sea or above home)"
         )
-    camera = read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA
-    return ViewPlan.of(camera, agl_m)
+    own = None if options.camera is None else orthonav.Camera.from_file(options.camera)
+    return planning.ViewPlan.of(own or planning.DEFAULT_CAMERA, agl_m)
 
 
-def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float, int]:
-    from orthonav.core.errors import AreaError
-    from orthonav.ground.planning.spacing import suited_map, suited_tile_px
-
+def _map_of(options: argparse.Namespace, view: "planning.ViewPlan | None") -> tuple[float, int]:
     if view is None and options.gsd_m is None:
         raise AreaError(
             "the ground resolution of the map is unknown; give --agl-m, a route with heights "
@@ -118,16 +95,14 @@ def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float
         )
     if view is None:
         return options.gsd_m, 256 if options.tile_px is None else options.tile_px
-    gsd_m, tile_px = suited_map(view)
+    gsd_m, tile_px = planning.suited_map(view)
     if options.gsd_m is not None:
-        gsd_m, tile_px = options.gsd_m, suited_tile_px(view, options.gsd_m)
+        gsd_m, tile_px = options.gsd_m, planning.suited_tile_px(view, options.gsd_m)
     return gsd_m, tile_px if options.tile_px is None else options.tile_px
 
 
-def _route_plain(route: "Route", options: argparse.Namespace) -> dict[str, Any]:
-    from orthonav.ground.planning.route import leg_lengths_m
-
-    length_m, speed_mps = float(leg_lengths_m(route).sum()), options.speed_mps
+def _route_plain(route: "planning.Route", options: argparse.Namespace) -> dict[str, Any]:
+    length_m, speed_mps = float(planning.leg_lengths_m(route).sum()), options.speed_mps
     frames = {each.frame for each in route.heights if each is not None}
     return {
         "name": route.name,
@@ -140,7 +115,7 @@ def _route_plain(route: "Route", options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _view_plain(view: "ViewPlan", gsd_m: float, speed_mps: float | None) -> dict[str, Any]:
+def _view_plain(view: "planning.ViewPlan", gsd_m: float, speed_mps: float | None) -> dict[str, Any]:
     return {
         "agl_m": round(view.agl_m, 2),
         "width_m": round(view.width_m, 2),
@@ -153,19 +128,16 @@ def _view_plain(view: "ViewPlan", gsd_m: float, speed_mps: float | None) -> dict
 
 
 def _map_plain(
-    overlap: float,
-    areas: "list[Area]",
-    sheets: "list[Route | Extent]",
+    options: argparse.Namespace,
+    areas: "list[planning.Area]",
+    sheets: "list[planning.Route]",
     gsd_m: float,
     tile_px: int,
 ) -> dict[str, Any]:
-    from orthonav.ground.planning.spacing import estimate_map
-
-    sizes = {"gsd_m": gsd_m, "tile_px": tile_px, "overlap": overlap}
-    made = [
-        estimate_map(area, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap, maps=len(areas))
-        for area in areas
-    ]
+    sizes: dict[str, Any] = {"gsd_m": gsd_m, "tile_px": tile_px, "overlap": options.overlap}
+    made = [planning.estimate_map(area, **sizes, maps=len(areas)) for area in areas]
+    names = [sheet.name for sheet in sheets] or [None]
+    bounds_deg = [round(x, 6) for x in options.bounds] if options.bounds else None
     return {
         **sizes,
         "tile_m": round(gsd_m * tile_px, 3),
@@ -176,12 +148,12 @@ def _map_plain(
         "build_minutes": round(sum(each.build_s for each in made) / 60, 1),
         "sheets": [
             {
-                "name": None if isinstance(sheet, tuple) else sheet.name,
-                "bounds_deg": [round(x, 6) for x in sheet] if isinstance(sheet, tuple) else None,
+                "name": name,
+                "bounds_deg": bounds_deg,
                 "area_km2": round(each.area_km2, 3),
                 "map_mb": [round(size, 2) for size in each.map_mb],
             }
-            for sheet, each in zip(sheets, made, strict=True)
+            for name, each in zip(names, made, strict=True)
         ],
     }
 
@@ -202,20 +174,24 @@ def plan_text(plain: dict[str, Any]) -> str:
     rows += _map_rows(plain["map"], plain)
     if plain["terrain"] is not None:
         rows.append(("terrain", "leg  length m   ground m      above ground m  relief in a view"))
-        for leg in plain["terrain"][:MAX_SHOWN]:
-            ground = "{:.0f}..{:.0f}".format(*leg["ground_m"])
-            over = "{:.0f}..{:.0f}".format(*leg["agl_m"])
-            text = f"{leg['leg']:>3}  {leg['length_m']:>8.0f}   {ground:<12}  {over:<14}"
-            rows.append(("", f"{text}  {leg['relief']:.1%}"))
-        rows += _more(plain["terrain"])
+        rows += _some([_leg_text(leg) for leg in plain["terrain"]])
     rows += [("caution", caution["text"]) for caution in plain["cautions"]]
     if "out" in plain:
         rows.append(("written", "to stdout" if plain["out"] == "-" else plain["out"]))
     return "\n".join(f"{name:<9}{text}" for name, text in rows)
 
 
-def _more(rows: list[Any]) -> list[tuple[str, str]]:
-    return [("", f"and {len(rows) - MAX_SHOWN} more (--json)")] if len(rows) > MAX_SHOWN else []
+def _some(texts: list[str]) -> list[tuple[str, str]]:
+    """At most 12 rows, and how many more there are."""
+    more = [f"and {len(texts) - 12} more (--json)"] if len(texts) > 12 else []
+    return [("", text) for text in (*texts[:12], *more)]
+
+
+def _leg_text(leg: dict[str, Any]) -> str:
+    ground = "{:.0f}..{:.0f}".format(*leg["ground_m"])
+    over = "{:.0f}..{:.0f}".format(*leg["agl_m"])
+    text = f"{leg['leg']:>3}  {leg['length_m']:>8.0f}   {ground:<12}  {over:<14}"
+    return f"{text}  {leg['relief']:.1%}"
 
 
 def _route_text(route: dict[str, Any]) -> str:
@@ -254,11 +230,8 @@ def _map_rows(made: dict[str, Any], plain: dict[str, Any]) -> list[tuple[str, st
         return rows
     rows.append(("sheets", f"{len(sheets)}: a map holds one sheet; build one map per sheet"))
     out = plain.get("out", "-")
-    if plain["route"] is not None and out == "-":
+    if out == "-":
         rows.append(("", "write the sheets with --out FILE"))
-    for sheet in sheets[:MAX_SHOWN]:
-        where = f"--route {'FILE' if out == '-' else out}#{sheet['name']}"
-        if sheet["bounds_deg"] is not None:
-            where = f"--bounds={','.join(f'{each:.8g}' for each in sheet['bounds_deg'])}"
-        rows.append(("", f"{where}  {sheet['area_km2']:,.0f} km2"))
-    return rows + _more(sheets)
+    file = "FILE" if out == "-" else out
+    named = [f"--route {file}#{each['name']}  {each['area_km2']:,.0f} km2" for each in sheets]
+    return rows + _some(named)

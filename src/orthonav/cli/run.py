@@ -11,14 +11,11 @@ from pathlib import Path
 
 from orthonav.cli.common import add_options, progress, run_command, say, watched
 from orthonav.cli.source import add_source, dem_of, source_options
+from orthonav.core.errors import MissingFileError, OutputError
+from orthonav.core.files import write_text
 
 EXAMPLE = "DCIM --map ortho.tif --dem dem.tif"
 EVERYDAY = ("--out", "--dem", "--camera", "--fov-deg", "--telemetry", "--agl-m", "--heading")
-MAP, FIXES, TRUTH, REPORT = "area.onav", "fixes.jsonl", "truth.csv", "report"
-MARGIN_M = 300.0
-"""Ground beside the recorded positions that belongs to the map, beyond the height of the views."""
-MAX_STEP_S = 5.0  # views farther apart in time are localized one by one
-UNKNOWN_AGL_M = 1000.0  # where only altitudes are known
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -35,36 +32,34 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import MissingFileError, OutputError
-    from orthonav.core.files import write_text
-
     out, area, source = options.out, options.map, vars(source_options(options))
-    ours = {MAP, f"{MAP}.work", FIXES, TRUTH, REPORT}
+    fixes, positions, report = out / "fixes.jsonl", out / "truth.csv", out / "report"
+    ours = {"area.onav", "area.onav.work", fixes.name, positions.name, report.name}
     if foreign := {each.name for each in out.glob("[!.]*")} - ours:
         raise OutputError(f"output folder holds what no run wrote ({min(foreign)}): {out}")
     if not area.exists():
         raise MissingFileError(f"orthophoto or map does not exist: {area}")
     dem_of(options)
     truth, band_m, tracked, kind = _recorded(options)
-    write_text(out / TRUTH, truth)
+    write_text(positions, truth)
     terrain = {name: getattr(options, name) for name in ("dem", "dem_datum")}
     if area.suffix.lower() != ".onav":
-        area = out / MAP
-        around = ("--route", out / TRUTH, "--band-m", band_m) if band_m else ()
+        area = out / "area.onav"
+        around = ("--route", positions, "--band-m", band_m) if band_m else ()
         say(options, f"building the map; after an interrupt --map {area} uses it, once it is there")
         run_command(options, "build", "--ortho", options.map, "--out", area, *around, **terrain)
         terrain = dict.fromkeys(terrain)
     say(options, f"localizing the views on {area}")
-    placed = (*["--track"] * tracked, "--heading", options.heading, "--out", out / FIXES)
+    placed = (*["--track"] * tracked, "--heading", options.heading, "--out", fixes)
     print(run_command(options, "localize", area, *options.flight, *placed, **source | terrain))
     if band_m:
-        compared = ("--truth", out / TRUTH, "--map", area, "--report", out / REPORT)
-        print(run_command(options, "evaluate", out / FIXES, *compared), end="")
-        print(f"open it: {(out / REPORT / 'index.html').resolve().as_uri()}")
+        compared = ("--truth", positions, "--map", area, "--report", report)
+        print(run_command(options, "evaluate", fixes, *compared), end="")
+        print(f"open it: {(report / 'index.html').resolve().as_uri()}")
     else:
         print("no positions were recorded to compare with: there is no report")
     if kind in ("flight", "photos") and len(options.flight) == 1:
-        words = ["orthonav", "view", out / FIXES, "--map", area, "--flight", options.flight[0]]
+        words = ["orthonav", "view", fixes, "--map", area, "--flight", options.flight[0]]
         print(f"step through the views: {shlex.join(map(str, words))}")
 
 
@@ -81,11 +76,12 @@ def _recorded(options: argparse.Namespace) -> tuple[str, float, bool, str]:
     with progress(options) as shown:
         for view in watched(found.views, found.expected, "positions", shown):
             agl_m = view.telemetry.agl_m
-            most_m = max(most_m, agl_m if math.isfinite(agl_m) else UNKNOWN_AGL_M)
+            most_m = max(most_m, agl_m if math.isfinite(agl_m) else 1000.0)  # only altitudes
             times_ns.append(view.telemetry.time_ns)
             if view.truth_latlon_deg is not None:
                 writer.writerow((view.frame, *(f"{each:.8f}" for each in view.truth_latlon_deg)))
                 count += 1
     steps_s = [(after - before) / 1e9 for before, after in pairwise(times_ns)]
-    tracked = bool(steps_s) and statistics.median(steps_s) <= MAX_STEP_S
-    return text.getvalue(), 2 * (MARGIN_M + most_m) if count else 0.0, tracked, found.kind
+    tracked = bool(steps_s) and statistics.median(steps_s) <= 5
+    margin_m = 300 + most_m  # ground beside the positions that belongs to the map
+    return text.getvalue(), 2 * margin_m if count else 0.0, tracked, found.kind

@@ -17,7 +17,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import MapFileError
+    from orthonav.core.errors import UsageError
     from orthonav.core.mapfile.signature import PRIVATE_NAME, PUBLIC_NAME, new_key, sign_map
 
     key = options.key
@@ -28,4 +28,4 @@ def run(options: argparse.Namespace) -> None:
     if options.map is not None:
         print(f"written to {sign_map(options.map, key, options.serial)}")
     elif options.key is not None:
-        raise MapFileError("--key needs a map to sign: orthonav sign MAP.onav --key private.pem")
+        raise UsageError("--key needs a map to sign: orthonav sign MAP.onav --key private.pem")

@@ -4,14 +4,15 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from orthonav.cli.common import add_options, counted, given, print_json, progress
+import orthonav
+from orthonav.cli.common import add_options, counted, given, print_json, progress, within
 from orthonav.cli.source import dem_of
+from orthonav.ground import planning
 
 EXAMPLE = "--ortho other-year.tif --route route.kml --agl-m 120 --out flight"
 EVERYDAY = (
-    *("--route", "--random", "--agl-m", "--spacing-m", "--airspeed-mps", "--camera"),
-    *("--yaw-std-deg", "--agl-std", "--mount-std-deg", "--horizon-std-deg", "--prior-std-m"),
-    *("--seed", "--json"),
+    *("--route", "--random", "--agl-m", "--spacing-m", "--speed-mps", "--camera"),
+    *("--yaw-std-deg", "--agl-std", "--unreported-tilt-deg", "--prior-std-m", "--seed", "--json"),
 )
 
 
@@ -20,16 +21,15 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_options(where, "--route")
     text = "fly N views at random positions and headings"
     where.add_argument("--random", type=int, metavar="N", help=text)
-    add_options(
-        parser, "--ortho", "--camera", "--dem", "--surface", "--dem-datum", "--agl-m", "--json"
-    )
+    add_options(parser, "--ortho", "--camera", "--dem", "--surface", "--dem-datum", "--agl-m")
+    add_options(parser, "--json")
     add_options(parser, "--seed", default=0)
     parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR", help="to write")
+    add_options(parser, "--speed-mps", default=25.0, help="ground speed (default 25)")
     number = partial(parser.add_argument, type=float)
     text = "angle by which the camera looks ahead of straight down, 0 to 65; reported (default 0)"
     number("--camera-pitch-deg", default=0.0, help=text)
     number("--spacing-m", help="distance between views on a route (default: flown in one second)")
-    number("--airspeed-mps", default=25.0, help="airspeed (default 25)")
     text = "radius of the arcs at the corners of the route (default 0: sharp corners)"
     number("--turn-radius-m", default=0.0, help=text)
     text = "write gnss.csv of a GNSS receiver along the route: good, step, drag, drift, frozen, "
@@ -44,47 +44,44 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     number("--yaw-std-deg", default=0.0, help="reported heading (default 0)")
     text = "reported height, as a fraction of it (default 0)"
     number("--agl-std", default=0.0, metavar="FRACTION", help=text)
+    text = "unreported pitch and roll, of the camera mount (constant in a flight) and of the "
+    text += "autopilot's horizon (on a route it changes within 15 s) each (default 1)"
+    number("--unreported-tilt-deg", type=within(0, 20), default=1.0, metavar="DEG", help=text)
     text = "reported pitch and roll from view to view, which the telemetry states as tilt_std_deg "
-    text += "(default 0: it states nothing where the two below are not 0)"
+    text += "(default 0: it states nothing where there is unreported tilt)"
     number("--tilt-std-deg", default=0.0, help=text)
     number("--prior-std-m", help="prior position, per axis (default: no prior is reported)")
     text = "scale (a fraction) and direction (rad) of the reported velocity (default: not reported)"
     number("--velocity-drift", metavar="FRACTION", help=text)
-    text = "unreported pitch and roll of the camera mount, constant in a flight (default 1)"
-    number("--mount-std-deg", default=1.0, help=text)
-    text = "unreported pitch and roll of the autopilot's horizon; on a route it changes within "
-    number("--horizon-std-deg", default=1.0, help=f"{text}15 s (default 1)")
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.imagery.terrain import open_dem
-    from orthonav.ground.planning.route import read_route
-    from orthonav.ground.simulate.flight import (
-        DEFAULT_CAMERA,
-        Errors,
-        SimulateRequest,
-        simulate_flight,
-    )
+    from orthonav.ground.simulate.flight import Errors
     from orthonav.ground.simulate.receiver import receiver_of
 
     dem = dem_of(options)
     surface = [open_dem(path, options.dem_datum) for path in options.surface]
     for each in (*surface, *([] if dem is None else [dem])):
         each.require_datum("heights of simulated flights are above the sea")
+    tilt_deg = options.unreported_tilt_deg
+    own = None if options.camera is None else orthonav.Camera.from_file(options.camera)
     more = {
         "orthos": options.ortho,
-        "route": read_route(options.route) if options.route else None,
-        "camera": read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA,
-        "errors": Errors(**given(options, Errors)),
+        "route": planning.read_route(options.route) if options.route else None,
+        "airspeed_mps": options.speed_mps,
+        "camera": own or planning.DEFAULT_CAMERA,
+        "errors": Errors(
+            **given(options, Errors), mount_std_deg=tilt_deg, horizon_std_deg=tilt_deg
+        ),
         "terrain": dem,
         "surface": surface,
         "terrain_posting_m": 1.0 if dem is None else dem.gsd_m,
         "gnss": receiver_of(options.receiver) if options.receiver else None,
     }
-    request = SimulateRequest(**given(options, SimulateRequest) | more)
+    request = orthonav.SimulateRequest(**given(options, orthonav.SimulateRequest) | more)
     with progress(options) as shown:
-        views = simulate_flight(request, lambda share: shown("simulate", share))
+        views = orthonav.simulate_flight(request, lambda share: shown("simulate", share))
     if options.json:
         print_json({"flight": str(options.out), "views": views})
     else:

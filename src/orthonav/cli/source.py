@@ -6,8 +6,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import orthonav
 from orthonav.cli.common import add_options, given, watched
-from orthonav.core.errors import FlightError, ImageryError
+from orthonav.core.errors import FlightError, ImageryError, MissingExtraError, UsageError
+from orthonav.core.geo.swapped import swapped_hint
+from orthonav.ground import planning
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -16,16 +19,11 @@ if TYPE_CHECKING:
     from orthonav.core.flight.heights import Array, FlownHeights, Undulation
     from orthonav.core.flight.recording import RecordedView
     from orthonav.core.geo.ground import TerrainHeights
-    from orthonav.core.localize import Localizer
     from orthonav.core.localize.confidence import Acceptance
-    from orthonav.core.mapfile import MapFile
-    from orthonav.core.records import ViewResult
     from orthonav.ground.imagery.terrain import Dem
-    from orthonav.ground.planning.route import Route
     from orthonav.ground.recordings import Recording, SourceOptions, SourceView
     from orthonav.onboard.run import Locator
 
-AREA_POINTS = 48  # positions along a side of a map at which its terrain is averaged
 FAR_M = 1000.0
 """A recorded position farther from the map causes a warning: GNSS and logs err by less."""
 log = logging.getLogger(__name__)
@@ -42,8 +40,6 @@ def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     """Add the options; see docs/flights.md."""
     group = parser.add_argument_group("reading the recording")
     add = group.add_argument
-    kinds = ("flight", "photos", "video", "ros")
-    add("--kind", choices=kinds, help="kind of the recording (default: detected by content)")
     text = "log to join by time: PX4 .ulg, ArduPilot .bin or .tlog, DJI .srt, .csv; or a .csv of "
     add("--telemetry", type=Path, metavar="LOG", help=f"{text}images by file name")
     text = "offset that is added to the times of images to get times of the log (default 0)"
@@ -55,8 +51,6 @@ def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     add("--topic", type=topic, action="append", default=[], help=text, **names)
     text = "views per second taken from a recording: of a video (default 1)"
     add("--rate-hz", type=float, default=1.0, help=text)
-    text = "longer side of the sensor of photographs, for the focal length"
-    add("--sensor-width-mm", type=float, metavar="MM", help=text)
     text = "field of view across the width of the images, where the camera is not known"
     add("--fov-deg", type=float, help=text)
     add_options(group, "--agl-m", help="height above ground of all views, not the recorded one")
@@ -70,12 +64,12 @@ def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     add("--prior-std-m", type=float, help=f"{text}prior (default: no prior)")
 
 
-def distance_from_map(latlon_deg: tuple[float, float], localizer: "Localizer") -> tuple[float, str]:
+def distance_from_map(
+    latlon_deg: tuple[float, float], localizer: "orthonav.Localizer"
+) -> tuple[float, str]:
     """Distance of a position from the map (m, 0 on the map), and a hint where swapped latitude and
     longitude explain it, else an empty text."""
     import numpy as np
-
-    from orthonav.core.geo.swapped import swapped_hint
 
     grid, frame = localizer.grid, localizer.sheet.frame
     low, high = np.reshape(grid.extent_en_m, (2, 2))
@@ -88,7 +82,7 @@ def distance_from_map(latlon_deg: tuple[float, float], localizer: "Localizer") -
     return beyond_m(*latlon_deg), hint
 
 
-def far_from_map(view: "SourceView", localizer: "Localizer") -> tuple[float, str] | None:
+def far_from_map(view: "SourceView", localizer: "orthonav.Localizer") -> tuple[float, str] | None:
     """`distance_from_map` of the recorded position of a view or of its prior, the farther one; None
     without a position."""
     prior, recorded = view.telemetry.prior, view.truth_latlon_deg
@@ -102,7 +96,7 @@ def far_text(what: str, far_m: float, hint: str) -> str:
     return f"{what} {far_m / 1000:,.0f} km from the map; check the map and the positions{hint}"
 
 
-def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
+def warn_if_far_from_map(flight: "Recording", localizer: "orthonav.Localizer") -> None:
     view = next(iter(flight.views), None)
     found = None if view is None else far_from_map(view, localizer)
     if found is not None and found[0] > FAR_M:
@@ -121,25 +115,29 @@ def open_source(
 ) -> "Recording":
     """The open recording of the command line; its warnings are logged. `over_terrain`: whether a
     terrain turns its heights into heights above ground."""
+    return open_recording(path, source_options(options, over_terrain=over_terrain))
+
+
+def open_recording(path: Path | list[Path], how: "SourceOptions") -> "Recording":
+    """The open recording; its choices and warnings are logged."""
     from orthonav.ground.recordings import open_source
 
-    recording = open_source(path, source_options(options, over_terrain=over_terrain))
+    recording = open_source(path, how)
     for said in (*recording.choices, *recording.warnings):
         log.warning("%s", said)
     return recording
 
 
-def dem_of(options: argparse.Namespace, route: "Route | None" = None) -> "Dem | None":
+def dem_of(options: argparse.Namespace, route: "planning.Route | None" = None) -> "Dem | None":
     """The terrain of `--dem`; at least one waypoint of the route lies in it."""
     if options.dem is None:
         if options.dem_datum is not None and not getattr(options, "surface", None):
-            raise FlightError("--dem-datum needs a terrain model: give --dem too")
+            raise UsageError("--dem-datum needs a terrain model: give --dem too")
         return None
     if getattr(options, "ground_alt_m", None) is not None:
-        raise FlightError("--ground-alt-m assumes level ground: give it or --dem")
+        raise UsageError("--ground-alt-m assumes level ground: give it or --dem")
     if hasattr(options, "fov_deg") and options.agl_m is not None:  # of a recording, not of a plan
-        raise FlightError("--agl-m is the height above ground of the views: give it or --dem")
-    from orthonav.core.geo.swapped import swapped_hint
+        raise UsageError("--agl-m is the height above ground of the views: give it or --dem")
     from orthonav.ground.imagery.terrain import open_dem
 
     dem = open_dem(options.dem, options.dem_datum)
@@ -151,14 +149,14 @@ def dem_of(options: argparse.Namespace, route: "Route | None" = None) -> "Dem | 
     return dem
 
 
-def is_above_sea(route: "Route") -> bool:
+def is_above_sea(route: "planning.Route") -> bool:
     """Whether heights of a route, or of its take-off, count from the sea."""
     frames = {each.frame for each in route.heights if each is not None}
     return "amsl" in frames or ("home" in frames and route.home_amsl_m is not None)
 
 
 def map_heights(
-    opened: "MapFile",
+    opened: "orthonav.MapFile",
     terrain: "TerrainHeights | None" = None,
     *,
     take_off: tuple[float, float, float] | None = None,
@@ -186,21 +184,22 @@ def map_heights(
     )
 
 
-def _area_deg(opened: "MapFile") -> "tuple[Array, Array]":
+def _area_deg(opened: "orthonav.MapFile") -> "tuple[Array, Array]":
+    """Positions spread over a map, at which its terrain is averaged."""
     import numpy as np
 
     sheet = opened.manifest.sheets[0]
     grid = sheet.grid
-    half_m = grid.tile_m / 2
+    half_m, points = grid.tile_m / 2, 48
     east, north = np.meshgrid(
-        grid.west_m + np.linspace(half_m, grid.width_px * grid.gsd_m - half_m, AREA_POINTS),
-        grid.north_m - np.linspace(half_m, grid.height_px * grid.gsd_m - half_m, AREA_POINTS),
+        grid.west_m + np.linspace(half_m, grid.width_px * grid.gsd_m - half_m, points),
+        grid.north_m - np.linspace(half_m, grid.height_px * grid.gsd_m - half_m, points),
     )
     return sheet.frame.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
 
 
 def flight_heights(
-    options: argparse.Namespace, opened: "MapFile", flight: "Recording", dem: "Dem | None"
+    options: argparse.Namespace, opened: "orthonav.MapFile", flight: "Recording", dem: "Dem | None"
 ) -> "FlownHeights | None":
     """Heights above ground of the views of a recorded flight; None without a terrain. What is
     assumed about heights is logged once."""
@@ -257,8 +256,6 @@ def say_assumed_heights(
 def geoid_for(flight: "Recording") -> "Undulation | None":
     """The geoid, where the height above the ellipsoid is known and that above the sea is not. Where
     it is needed and missing, a warning says what to install."""
-    from orthonav.core.errors import MissingExtraError
-
     first = next(iter(flight.views), None)
     if first is None or first.telemetry.hae_m is None or first.telemetry.amsl_m is not None:
         return None
@@ -280,8 +277,8 @@ def located(
     shown: "Progress",
     accept: "Acceptance | None" = None,
     heights: "FlownHeights | None" = None,
-    take: "Callable[[ViewResult], None]" = lambda result: None,
-) -> "list[ViewResult]":
+    take: "Callable[[orthonav.ViewResult], None]" = lambda result: None,
+) -> "list[orthonav.ViewResult]":
     """Results of the views of a recording; `take` gets each."""
     from orthonav.ground.recordings.localize import localize_flight
 

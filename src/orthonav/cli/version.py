@@ -28,7 +28,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "atlas build --cluster": ("cluster",),
     "build --edges onnx": ("neural",),
     "localize, fly: a map with a neural encoder or with onnx edges": ("neural",),
-    "localize --atlas": ("atlas",),
+    "localize ATLAS": ("atlas",),
     "localize, fly --require-signed": ("signing",),
     "localize, import, calibrate: photographs, ROS, logs": ("flights",),
     "fly --autopilot, --log": ("autopilot",),

@@ -13,6 +13,10 @@ class MissingFileError(OrthonavError, FileNotFoundError):
     """A file or folder that was named does not exist or cannot be read."""
 
 
+class UsageError(OrthonavError, ValueError):
+    """An impossible value was asked for, or values that do not fit together."""
+
+
 class ArgumentError(OrthonavError, TypeError, ValueError):
     """An argument of another type, or a number out of range, was given to a function."""
 
@@ -54,14 +58,14 @@ class StoppedError(CameraError):
 
 
 class CheckError(OrthonavError, ValueError):
-    """A check was asked for under conditions that cannot be: a share above 1, a negative seed."""
+    """A check cannot be made: the heights of its route are not those above ground, or near 0."""
 
 
 class WorkerError(OrthonavError, RuntimeError):
     """A process that was to do part of the work ended on its own: killed, or out of memory."""
 
 
-class VariantError(OrthonavError, ValueError):
+class VariantError(UsageError):
     """An unknown method, representation or parameter was named, or its value is impossible."""
 
 

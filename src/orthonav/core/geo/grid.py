@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, UsageError
 
 MAX_TILE_PX = 4096
 
@@ -40,14 +40,14 @@ class TileGrid:
     ) -> "TileGrid":
         """Over west, south, east, north (m); `overlap` of neighbours, 0.875 and 0.995 in Table 1.
 
-        The stride is rounded to whole pixels. Raises `AreaError`."""
+        The stride is rounded to whole pixels. Raises `AreaError` or `UsageError`."""
         west, south, east, north = extent_en_m
         if not (np.isfinite(gsd_m) and gsd_m > 0):
-            raise AreaError(f"gsd_m must be above 0 m per pixel, got {gsd_m}")
+            raise UsageError(f"gsd_m must be above 0 m per pixel, got {gsd_m}")
         if not 16 <= tile_px <= MAX_TILE_PX:
-            raise AreaError(f"tiles must be 16 to {MAX_TILE_PX} px across, got {tile_px}")
+            raise UsageError(f"tiles must be 16 to {MAX_TILE_PX} px across, got {tile_px}")
         if not 0 <= overlap < 1:
-            raise AreaError(f"overlap must be at least 0 and below 1, got {overlap}")
+            raise UsageError(f"overlap must be at least 0 and below 1, got {overlap}")
         if not (np.isfinite(extent_en_m).all() and east >= west and north >= south):
             raise AreaError(
                 f"area is empty or not finite: west, south, east, north {extent_en_m} m"

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import OutputError
+from orthonav.core.errors import OutputError, UsageError
 from orthonav.core.files import replacing, write_text
 from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.manifest import SheetInfo
@@ -27,7 +27,7 @@ def write_preview(opened: MapFile, path: Path) -> None:
     Raises `OutputError` for another ending, `MapFileError` where the map is damaged."""
     path = Path(path)
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
-        raise OutputError(f"preview must be a .png or .tif file: {path}")
+        raise UsageError(f"preview must be a .png or .tif file: {path}")
     grey, px_m, sheet = _picture(opened, MAX_PX)
     done, data = cv2.imencode(path.suffix.lower(), grey)
     if not done:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import UsageError
 
 MICRO = 32  # along one side of a tile
 
@@ -23,7 +23,7 @@ class CellLayout:
     def for_tiles(cls, tile_px: int, stride_px: int) -> "CellLayout":
         """Raises `AreaError` if none serves all tiles."""
         if tile_px % MICRO:
-            raise AreaError(f"tile_px must be a multiple of {MICRO} px, got {tile_px}")
+            raise UsageError(f"tile_px must be a multiple of {MICRO} px, got {tile_px}")
         micro_px = tile_px // MICRO
         return cls(micro_px, math.gcd(micro_px, stride_px))
 

@@ -7,17 +7,16 @@ weighted by scores above the lowest (after Couturier and Akhloufi, 2021). *peak*
 the best tile and its neighbours: a third of the error (`python -m benchmarks --only compare`)."""
 
 from collections.abc import Iterator
-from typing import Literal, get_args
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import MapFileError, VariantError
+from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
 
 PositionRule = Literal["peak", "best", "neighbours", "weighted"]
-RULES: tuple[PositionRule, ...] = get_args(PositionRule)
 STEPS_EN = ((1, 0), (0, 1))
 
 
@@ -98,13 +97,6 @@ def find(sorted_values: NDArray[np.intp], value: int) -> int | None:
 def _score(scores: NDArray[np.float32], rows: NDArray[np.intp] | None, tile: int | None) -> float:
     at = tile if tile is None or rows is None else find(rows, tile)
     return float("nan") if at is None else float(scores[at])
-
-
-def check_rule(rule: str) -> PositionRule:
-    for known in RULES:
-        if rule == known:
-            return known
-    raise VariantError(f"unknown rule of position '{rule}'; known are: {', '.join(RULES)}")
 
 
 def offset_en_m(

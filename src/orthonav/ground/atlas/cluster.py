@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from orthonav.core.cores import usable_cores
-from orthonav.core.errors import OrthonavError, WorkerError
+from orthonav.core.errors import OrthonavError, UsageError, WorkerError
 from orthonav.core.extras import needed
 
 Item = TypeVar("Item")
@@ -58,7 +58,7 @@ class RayRunner:
 
     def __init__(self, address: str | None = None, workers: int | None = None) -> None:
         if workers is not None and workers < 1:
-            raise WorkerError(f"workers must be 1 or more, got {workers}")
+            raise UsageError(f"workers must be 1 or more, got {workers}")
         self._address, self._workers = address, workers
         self._ray: Any = None
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import CheckError
+from orthonav.core.errors import UsageError
 from orthonav.core.files import with_paths
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
@@ -121,9 +121,9 @@ class CheckRequest:
         with_paths(self, "map_path", "other_date")
         if self.camera_kind not in CAMERA_KINDS:
             kinds = ", ".join(CAMERA_KINDS)
-            raise CheckError(f"camera_kind must be {kinds}, got '{self.camera_kind:.40}'")
+            raise UsageError(f"camera_kind must be {kinds}, got '{self.camera_kind:.40}'")
         if self.camera_kind != "colour" and self.other_date is not None:
-            raise CheckError("--camera-kind is for checks without --other-date, which shows it")
+            raise UsageError("--camera-kind is for checks without --other-date, which shows it")
         limits: dict[str, tuple[float | None, float, float, str]] = {
             "agl_m": (self.agl_m, 1.0, 50_000.0, " m"),
             "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, " deg"),
@@ -143,7 +143,7 @@ class CheckRequest:
         }
         for name, (value, low, high, unit) in limits.items():
             if value is not None and not low <= value <= high:
-                raise CheckError(f"{name} must be {low:g} to {high:g}{unit}, got {value}")
+                raise UsageError(f"{name} must be {low:g} to {high:g}{unit}, got {value}")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from orthonav.core.errors import FetchError
+from orthonav.core.errors import FetchError, UsageError
 from orthonav.ground.fetch.urls import KEY, Secret, checked_url, holds_key, origin_of, shown
 
 DEFAULT_GSD_M = 0.5
@@ -225,12 +225,12 @@ def parse_source(
         provenance = Provenance(shown(rest), options.layer or "", date, licence, attribution)
         return SourceSpec(head, rest, options, provenance, _secrets(rest, key_env))
     if head.lower() in ("http", "https", "file"):
-        raise FetchError(
+        raise UsageError(
             f"--source: write the protocol before the address ({'|'.join(PROTOCOLS)}:ADDRESS): "
             f"{shown(text)}"
         )
     if head not in presets():
-        raise FetchError(
+        raise UsageError(
             f"--source: unknown service '{head}'; available: {listed(list(presets()), head, 40)}"
         )
     preset = presets()[head]
@@ -256,7 +256,7 @@ def parse_source(
 def check_date(text: str) -> None:
     """Raise `FetchError` unless a date is YYYY[-MM[-DD]], or two with a slash between."""
     if not all(_DATE.fullmatch(part) for part in text.split("/", 1)):
-        raise FetchError(f"date must be YYYY, YYYY-MM or YYYY-MM-DD, or two with /, got '{text}'")
+        raise UsageError(f"date must be YYYY, YYYY-MM or YYYY-MM-DD, or two with /, got '{text}'")
 
 
 def _preset(name: str, values: dict[str, Any]) -> Preset:

@@ -24,7 +24,7 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from orthonav import __version__
-from orthonav.core.errors import FetchError, OutputError
+from orthonav.core.errors import FetchError, OutputError, UsageError
 from orthonav.core.files import Progress, no_progress, not_written, replacing
 from orthonav.ground.fetch.files import cog_source, stac_source
 from orthonav.ground.fetch.grid import Selection, select
@@ -199,7 +199,7 @@ def fetch_heights(request: FetchRequest, progress: Progress = no_progress) -> Fe
 
 def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, CostEstimate]:
     if not (math.isfinite(request.margin_m) and request.margin_m >= 0):
-        raise FetchError(f"margin must be 0 m or more, got {request.margin_m}")
+        raise UsageError(f"margin must be 0 m or more, got {request.margin_m}")
     source = open_cells(web, request.spec, request.area, request.margin_m)
     selection = select(source.grid, request.area, request.margin_m)
     height, width = selection.shape_px
@@ -232,7 +232,7 @@ def open_cells(web: Web, spec: SourceSpec, area: Area, margin_m: float) -> CellS
 
 def _check_out(out: Path) -> None:
     if out.suffix.lower() not in (".tif", ".tiff"):
-        raise FetchError(f"--out must be a .tif file, got: {out}")
+        raise UsageError(f"--out must be a .tif file, got: {out}")
     if out.exists() and not out.is_file():
         raise OutputError(f"cannot write over a folder or a device: {out}")
 

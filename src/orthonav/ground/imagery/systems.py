@@ -25,7 +25,7 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 from rasterio.warp import transform as transform_coordinates
 
-from orthonav.core.errors import ImageryError
+from orthonav.core.errors import ImageryError, UsageError
 from orthonav.core.geo.frames import WGS84_A_M, distances_m
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def plate_shift_m(crs: str, lat_deg: float, lon_deg: float, year: float) -> floa
 def at_epoch(sources: "Sequence[Source]", year: float) -> "list[Source]":
     """The sources, those of one system moved by one distance to where WGS 84 has them."""
     if not 1980 <= year <= 2100:
-        raise ImageryError(f"epoch must be a year from 1980 to 2100, got {year}")
+        raise UsageError(f"epoch must be a year from 1980 to 2100, got {year}")
     lat, lon = np.concatenate([each.outline_latlon_deg for each in sources]).mean(axis=0).tolist()
     shifts = {each.crs: plate_shift_deg(each.crs, lat, lon, year) for each in sources}
     if not any(shifts.values()):

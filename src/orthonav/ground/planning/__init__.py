@@ -1,1 +1,5 @@
-"""Plans: areas, routes and their file formats, sheets, spacing of tiles, terrain along a route."""
+"""Routes, search bands, sheets, and what suits a camera and a height."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

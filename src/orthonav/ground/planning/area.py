@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, UsageError
 from orthonav.core.extras import needed
 from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.core.geo.swapped import swapped_bounds_hint
@@ -32,7 +32,7 @@ class Area:
         west, south, east, north = unwrapped(bounds_deg)
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
             hint = swapped_bounds_hint((west, south, east, north))
-            raise AreaError(
+            raise UsageError(
                 "bounds must be west,south,east,north in degrees, at most 10 degrees across"
                 f"{hint}, got {','.join(map(str, bounds_deg))}"
             )
@@ -58,10 +58,10 @@ class Area:
         """Search band around `route`, `band_m` metres wide for legs without a width of their
         own."""
         if band_m is not None and not (np.isfinite(band_m) and band_m > 0):
-            raise AreaError(f"band_m must be wider than 0 m, got {band_m}")
+            raise UsageError(f"band_m must be wider than 0 m, got {band_m}")
         bands_m = route.bands_m(band_m)
         if bands_m is None:
-            raise AreaError("the route has no search band; give its width in metres (--band-m)")
+            raise UsageError("the route has no search band; give its width in metres (--band-m)")
         lat_lon = np.array(route.waypoints)
         box = cls.from_outline(lat_lon[:, 0], lat_lon[:, 1])
         line = route.points_en_m(box.frame)
@@ -114,7 +114,7 @@ def unwrapped(bounds_deg: Extent) -> Extent:
     if west > east + 180:  # as in GeoJSON (RFC 7946, 5.2)
         east += 360
     if not (np.isfinite(bounds_deg).all() and west < east <= west + 360 and south < north):
-        raise AreaError(
+        raise UsageError(
             "bounds must be west,south,east,north in degrees with west < east and south < north, "
             f"got {','.join(map(str, bounds_deg))}"
         )
@@ -123,9 +123,9 @@ def unwrapped(bounds_deg: Extent) -> Extent:
 
 def require_one_area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> None:
     if route is not None and bounds_deg is not None:
-        raise AreaError("give either a route with a search band or bounds, not both")
+        raise UsageError("give either a route with a search band or bounds, not both")
     if route is None and band_m is not None:
-        raise AreaError("a search band needs a route (--route)")
+        raise UsageError("a search band needs a route (--route)")
 
 
 def _checked(extent: Extent) -> Extent:

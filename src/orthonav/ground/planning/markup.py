@@ -27,17 +27,7 @@ from orthonav.ground.planning.record import (
 )
 
 MAX_ELEMENTS = 1_000_000
-MAX_DEPTH = 100
 MAX_KML_BYTES = 20_000_000
-MAX_MEMBERS = 10_000
-_KML_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
-"""With other altitude modes, or none, the altitude is ignored, as KML specifies."""
-_END = struct.Struct("<4s4H2LH")
-_WPML_FRAMES: dict[str, HeightFrame] = {  # by `executeHeightMode`
-    "relativeToStartPoint": "home",
-    "WGS84": "hae",
-    "realTimeFollowSurface": "agl",
-}
 _Place = tuple[float, float, Height | None]
 log = logging.getLogger(__name__)
 
@@ -82,9 +72,9 @@ class _Builder(TreeBuilder):
     def start(self, tag: str, attributes: dict[str, str]) -> Element:
         self._count += 1
         self._depth += 1
-        if self._count > MAX_ELEMENTS or self._depth > MAX_DEPTH:
+        if self._count > MAX_ELEMENTS or self._depth > 100:
             raise RouteError(
-                f"{self._kind} file has more than {MAX_ELEMENTS:,} elements or {MAX_DEPTH} levels"
+                f"{self._kind} file has more than {MAX_ELEMENTS:,} elements or 100 levels"
             )
         return super().start(tag.rpartition(":")[2], attributes)
 
@@ -178,8 +168,14 @@ def _kml_routes(mark: Element) -> list[Route]:
     return [_route(places, text_of(mark, "name"))] if places else []
 
 
+def _kml_frame(element: Element) -> HeightFrame | None:
+    """With other altitude modes, or none, the altitude is ignored, as KML specifies."""
+    frames: dict[str | None, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
+    return frames.get(text_of(element, "altitudeMode"))
+
+
 def _line(element: Element) -> Iterator[_Place]:
-    frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
+    frame = _kml_frame(element)
     text = re.sub(r"\s+", " ", text_of(element, "coordinates") or "")  # linear, unlike \s*,\s*
     text = text.replace(" ,", ",").replace(", ", ",")
     for number, found in enumerate(re.finditer(r"\S+", text), 1):
@@ -188,7 +184,7 @@ def _line(element: Element) -> Iterator[_Place]:
 
 
 def _track(element: Element) -> Iterator[_Place]:
-    frame = _KML_FRAMES.get(text_of(element, "altitudeMode") or "")
+    frame = _kml_frame(element)
     for coordinates in element.iter("coord"):
         text = (coordinates.text or "").strip()
         if text:  # the schema allows gaps
@@ -204,12 +200,12 @@ def _kml_place(values: list[str], frame: HeightFrame | None, text: str) -> _Plac
 
 
 def _check_archive(data: bytes) -> None:
-    at = data.rfind(b"PK\x05\x06")
-    if at < 0 or len(data) - at < _END.size:
+    end, at = struct.Struct("<4s4H2LH"), data.rfind(b"PK\x05\x06")
+    if at < 0 or len(data) - at < end.size:
         raise RouteError("KMZ is not a complete zip archive (its end is missing)")
-    members = _END.unpack_from(data, at)[4]
-    if members > MAX_MEMBERS or data[max(0, at - 20) : at].startswith(b"PK\x06\x07"):
-        raise RouteError(f"KMZ has more than {MAX_MEMBERS:,} members")
+    members = end.unpack_from(data, at)[4]
+    if members > 10_000 or data[max(0, at - 20) : at].startswith(b"PK\x06\x07"):
+        raise RouteError("KMZ has more than 10,000 members")
 
 
 def read_wpml(data: bytes) -> list[Route]:
@@ -223,11 +219,14 @@ def read_wpml(data: bytes) -> list[Route]:
 
 def _waylines(folder: Element) -> Iterator[Route]:
     mode = text_of(folder, "executeHeightMode")
-    if mode is not None and mode not in _WPML_FRAMES:
-        raise RouteError(
-            f"WPML executeHeightMode must be {', '.join(_WPML_FRAMES)}, got {mode!r:.60}"
-        )
-    frame = None if mode is None else _WPML_FRAMES[mode]
+    frames: dict[str, HeightFrame] = {
+        "relativeToStartPoint": "home",
+        "WGS84": "hae",
+        "realTimeFollowSurface": "agl",
+    }
+    if mode is not None and mode not in frames:
+        raise RouteError(f"WPML executeHeightMode must be {', '.join(frames)}, got {mode!r:.60}")
+    frame = None if mode is None else frames[mode]
     marks = folder.findall("Placemark[Point]")
     require_few_waypoints(len(marks))
     marks.sort(key=lambda mark: parsed(text_of(mark, "index") or "", "WPML index"))

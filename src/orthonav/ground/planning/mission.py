@@ -16,6 +16,7 @@ import itertools
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Any
 
 from orthonav.core.errors import RouteError
@@ -25,22 +26,39 @@ from orthonav.ground.planning.record import (
     HeightFrame,
     Route,
     decoded,
+    listed,
     number,
     number_or_none,
     parsed,
     require_few_waypoints,
 )
 
-MAX_NAMED = 12
 log = logging.getLogger(__name__)
 
-WAYPOINT, RETURN_HOME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND = 16, 20, 21, 22, 84, 85
-_CIRCLES = (17, 18, 19, 31, 34)
-_ARC, _SPLINE, _PLACE, _REPOSITION = 36, 82, 94, 192
-_OF_USERS = range(31000, 31005)
+
+class Command(IntEnum):
+    """Commands of MAV_CMD that a route treats by name."""
+
+    WAYPOINT = 16
+    RETURN_HOME = 20
+    LAND = 21
+    TAKEOFF = 22
+    VTOL_TAKEOFF = 84
+
+
+class Frame(IntEnum):
+    """Frames of MAV_FRAME, the reference of a height."""
+
+    ABOVE_SEA = 0
+    ABOVE_HOME = 3
+    ABOVE_TERRAIN = 10
+
+
 FLOWN = {  # commands with a position that the aircraft flies to
-    *(WAYPOINT, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND),
-    *(*_CIRCLES, _ARC, _SPLINE, _PLACE, _REPOSITION, *_OF_USERS),
+    *(16, 21, 22, 84, 85),  # waypoints, take-off and landing
+    *(17, 18, 19, 31, 34),  # circles
+    *(36, 82, 94, 192),  # arc, spline, place of a payload, reposition
+    *range(31000, 31005),  # waypoints of users
 }
 _NOT_FLOWN = {
     *(80, 83, 92, 93, 95),  # regions of interest, delays
@@ -53,14 +71,6 @@ _NOT_FLOWN = {
 }
 """Commands that do not change the route, although some state a position, or use its numbers for
 something else."""
-_HEIGHT_FRAMES: dict[int, HeightFrame] = {
-    0: "amsl",
-    5: "amsl",
-    3: "home",
-    6: "home",
-    10: "agl",
-    11: "agl",
-}
 
 
 @dataclass(frozen=True)
@@ -87,18 +97,18 @@ def route_of(items: Iterable[MissionItem], home: MissionItem | None) -> Route:
     left_out: list[str] = []
     remaining = iter(items)
     for item in remaining:
-        if item.command == RETURN_HOME:
+        if item.command == Command.RETURN_HOME:
             if home is not None:
                 stops.append(replace(home, height_m=None))
             break
         if item.command in FLOWN and _has_place(item):
             stops.append(item)
-        elif item.command in (TAKEOFF, VTOL_TAKEOFF) and home is not None:
+        elif item.command in (Command.TAKEOFF, Command.VTOL_TAKEOFF) and home is not None:
             stops.append(replace(home, height_m=None))
         elif _is_lost(item):
             left_out.append(_named(item))
     left_out += [f"{_named(item)} after the return" for item in remaining if _is_lost(item)]
-    named = ", ".join(left_out[:MAX_NAMED]) + (", .." if len(left_out) > MAX_NAMED else "")
+    named = listed(left_out, 12)
     if not stops:
         held = f"; left out are {named}" if left_out else ""
         raise RouteError(f"mission holds no waypoint with a position{held}")
@@ -133,20 +143,14 @@ def _named(item: MissionItem) -> str:
 
 
 def _height(item: MissionItem) -> Height | None:
-    if item.frame not in _HEIGHT_FRAMES:
+    frames: dict[int, HeightFrame] = {0: "amsl", 5: "amsl", 3: "home", 6: "home"}
+    frames |= {10: "agl", 11: "agl"}
+    if item.frame not in frames:
         raise RouteError(
             f"mission has a waypoint in MAV_FRAME {item.frame}; expected a global one "
-            f"({', '.join(map(str, sorted(_HEIGHT_FRAMES)))})"
+            f"({', '.join(map(str, sorted(frames)))})"
         )
-    return None if item.height_m is None else Height(item.height_m, _HEIGHT_FRAMES[item.frame])
-
-
-_AMSL, _ABOVE_HOME, _TERRAIN = 0, 3, 10
-_FRAME_OF_MODE = {1: _ABOVE_HOME, 2: _AMSL, 3: _TERRAIN, 4: _TERRAIN}
-"""MAV_FRAME of QGroundControl's altitude modes; 3 is its own sum of terrain and a height."""
-_ABOVE_TERRAIN_MODE = 3
-_TRANSECTS = ("survey", "CorridorScan")
-_LANDINGS = ("fwLandingPattern", "vtolLandingPattern")
+    return None if item.height_m is None else Height(item.height_m, frames[item.frame])
 
 
 def plan_route(plain: dict[str, Any]) -> Route:
@@ -165,16 +169,16 @@ def _plan_home(raw: Any) -> MissionItem | None:
     if lat == 0 and lon == 0:
         return None
     height_m = number_or_none(raw[2] if len(raw) > 2 else None, "height of home")
-    return MissionItem(WAYPOINT, 0, lat, lon, height_m)
+    return MissionItem(Command.WAYPOINT, Frame.ABOVE_SEA, lat, lon, height_m)
 
 
 def _plan_items(raw: dict[str, Any], index: int) -> list[MissionItem]:
     where, name = f"item {index + 1} of the plan", raw.get("complexItemType")
     if raw["type"] == "SimpleItem":
         return [_simple(raw, index + 1, where)]
-    if name in _TRANSECTS:
+    if name in ("survey", "CorridorScan"):
         return _transects(raw, index, f"{where} ({name})")
-    if name in _LANDINGS:
+    if name in ("fwLandingPattern", "vtolLandingPattern"):
         return _landing(raw, f"{where} ({name})")
     raise RouteError(
         f"{where} is a {name or raw['type']!r:.40}: only surveys, corridor scans and landing "
@@ -188,8 +192,9 @@ def _simple(raw: dict[str, Any], item: int, where: str) -> MissionItem:
     place = params[4:7] if len(params) >= 7 else raw["coordinate"]
     command, frame = (int(number(raw.get(key), f"{where}: {key}")) for key in ("command", "frame"))
     lat, lon, height = (number_or_none(value, f"{where}: params") for value in place[:3])
-    if raw.get("AltitudeMode") == _ABOVE_TERRAIN_MODE:
-        frame, height = _TERRAIN, number_or_none(raw.get("Altitude"), f"{where}: Altitude")
+    if raw.get("AltitudeMode") == 3:  # QGroundControl's own sum of terrain and a height
+        frame = Frame.ABOVE_TERRAIN
+        height = number_or_none(raw.get("Altitude"), f"{where}: Altitude")
     return MissionItem(command, frame, lat, lon, height, item)
 
 
@@ -205,7 +210,7 @@ def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]
     width_m = number_or_none(raw.get("CorridorWidth"), f"{where}: CorridorWidth") or None
     return [
         MissionItem(
-            *(WAYPOINT, frame, *_latlon(point, f"{where}: VisualTransectPoints"), height_m),
+            *(Command.WAYPOINT, frame, *_latlon(point, f"{where}: VisualTransectPoints"), height_m),
             pattern=index,
             band_m=width_m,
         )
@@ -217,20 +222,21 @@ def _survey_height(
     camera: dict[str, Any], inner: dict[str, Any], where: str
 ) -> tuple[int, float | None]:
     height_m = number_or_none(camera.get("DistanceToSurface"), f"{where}: DistanceToSurface")
-    mode = camera.get("DistanceMode")
-    if mode in _FRAME_OF_MODE:
-        return _FRAME_OF_MODE[mode], height_m
-    if inner.get("FollowTerrain") is True:
-        return _TERRAIN, height_m
-    return (_ABOVE_HOME if camera.get("DistanceToSurfaceRelative", True) else _AMSL), height_m
+    mode = camera.get("DistanceMode")  # an altitude mode of QGroundControl
+    if mode not in (1, 2, 3, 4):  # an older file
+        relative = camera.get("DistanceToSurfaceRelative", True)
+        mode = 3 if inner.get("FollowTerrain") is True else 1 if relative else 2
+    frames = {1: Frame.ABOVE_HOME, 2: Frame.ABOVE_SEA}
+    return frames.get(mode, Frame.ABOVE_TERRAIN), height_m
 
 
 def _landing(raw: dict[str, Any], where: str) -> list[MissionItem]:
     approach = raw.get("landingApproachCoordinate", raw.get("loiterCoordinate"))
     relative = raw.get("altitudesAreRelative", raw.get("landingAltitudeRelative", True))
-    frame = _ABOVE_HOME if relative else _AMSL
+    frame = Frame.ABOVE_HOME if relative else Frame.ABOVE_SEA
     items = []
-    ends: list[tuple[int, Any]] = [(WAYPOINT, approach), (LAND, raw.get("landCoordinate"))]
+    land: Any = raw.get("landCoordinate")
+    ends = [(Command.WAYPOINT, approach), (Command.LAND, land)]
     for command, point in ends:
         lat, lon = _latlon(point, where)
         height = number_or_none(next(iter(point[2:]), None), where)
@@ -242,13 +248,8 @@ def _latlon(point: Any, what: str) -> tuple[float, float]:
     return number(point[0], what), number(point[1], what)
 
 
-_COLUMNS = 12
-_MAGIC = b"QGC WPL"
-_HOMES = (0, WAYPOINT, 179)  # commands of the home position: none, a waypoint, or one that sets it
-
-
 def is_wpl(data: bytes) -> bool:
-    return data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(_MAGIC)
+    return data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"QGC WPL")
 
 
 def read_wpl(data: bytes) -> list[Route]:
@@ -263,10 +264,12 @@ def read_wpl(data: bytes) -> list[Route]:
         items = list(_wpl_items(lines))
     except TableError as error:
         raise RouteError(f"waypoint file cannot be read ({error})") from error
-    if version[2] == "120" or not items or items[0].number or items[0].command not in _HOMES:
+    sets_home = 179
+    homes = (0, Command.WAYPOINT, sets_home)
+    if version[2] == "120" or not items or items[0].number or items[0].command not in homes:
         return [route_of(items, None)]
     first, *rest = items
-    if first.frame != 0 and first.command == WAYPOINT and _has_place(first):
+    if first.frame != 0 and first.command == Command.WAYPOINT and _has_place(first):
         said = "item 0 is flown to, as it is in frame %d: a home position is in 0"
         log.warning(said, first.frame)
         return [route_of(items, replace(first, height_m=None))]  # not above the sea
@@ -283,10 +286,8 @@ def _wpl_items(lines: Iterator[str]) -> Iterator[MissionItem]:
 
 
 def _wpl_item(values: list[str], line: int) -> MissionItem:
-    if len(values) != _COLUMNS:
-        raise RouteError(
-            f"line {line} of the waypoint file has {len(values)} values, expected {_COLUMNS}"
-        )
+    if len(values) != 12:
+        raise RouteError(f"line {line} of the waypoint file has {len(values)} values, expected 12")
     item, frame, command = (_whole(values[index], line) for index in (0, 2, 3))
     lat_deg, lon_deg, height_m = (
         parsed(values[index], f"line {line}, column {index + 1}") for index in (8, 9, 10)

@@ -2,20 +2,18 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import RouteError
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.core.geo.swapped import swapped_hint
 
 HeightFrame = Literal["agl", "home", "amsl", "hae"]
-HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl", "hae")
-MAX_HEIGHT_M = 100_000.0  # sanity limit: the edge of space
-MAX_BAND_M = 50_000.0  # width of the largest sheet
 MAX_WAYPOINTS = 100_000  # sanity limit against files that exhaust memory
 
 
@@ -37,14 +35,11 @@ class Height:
     frame: HeightFrame | None = None
 
     def __post_init__(self) -> None:
-        if not abs(self.height_m) <= MAX_HEIGHT_M:
-            raise RouteError(
-                f"height of a waypoint must be within {MAX_HEIGHT_M:,.0f} m, got {self.height_m}"
-            )
-        if self.frame is not None and self.frame not in HEIGHT_FRAMES:
-            raise RouteError(
-                f"height reference must be {', '.join(HEIGHT_FRAMES)}, got {self.frame!r:.40}"
-            )
+        if not abs(self.height_m) <= 100_000:  # the edge of space
+            raise RouteError(f"height of a waypoint must be within 100,000 m, got {self.height_m}")
+        if self.frame is not None and self.frame not in get_args(HeightFrame):
+            known = ", ".join(get_args(HeightFrame))
+            raise RouteError(f"height reference must be {known}, got {self.frame!r:.40}")
 
 
 @dataclass(frozen=True)
@@ -77,10 +72,10 @@ class Route:
         if self.leg_bands_m and len(self.leg_bands_m) != self.legs:
             raise RouteError(f"route has {len(self.leg_bands_m)} bands for {self.legs} legs")
         for band_m in self.leg_bands_m:
-            if band_m is not None and not 0 < band_m <= MAX_BAND_M:
+            if band_m is not None and not 0 < band_m <= MAX_SHEET_M:
                 raise RouteError(
-                    f"search band of a leg must be wider than 0 and at most {MAX_BAND_M:,.0f} m, "
-                    f"got {band_m}"
+                    "search band of a leg must be wider than 0 and at most as wide as a sheet, "
+                    f"{MAX_SHEET_M:,.0f} m, got {band_m}"
                 )
 
     @property
@@ -110,6 +105,10 @@ class Route:
         )
 
 
+def listed(names: Sequence[str], most: int) -> str:
+    return ", ".join(names[:most]) + (", .." if len(names) > most else "")
+
+
 def number(value: Any, what: str) -> float:
     if type(value) not in (int, float) or not math.isfinite(value):
         raise RouteError(f"{what} must be a number, got {value!r:.80}")
@@ -125,8 +124,8 @@ def number_or_none(value: Any, what: str) -> float | None:
 def parsed(text: str, what: str) -> float:
     try:
         value = float(text)
-    except ValueError as error:
-        raise RouteError(f"{what} must be a number, got {text!r:.80}") from error
+    except ValueError:
+        value = math.nan
     if not math.isfinite(value):
         raise RouteError(f"{what} must be a number, got {text!r:.80}")
     return value
@@ -140,7 +139,7 @@ def decoded(data: bytes) -> str:
     except UnicodeDecodeError as error:
         raise RouteError(
             "route file is not UTF-8 text; check that its suffix matches its format"
-        ) from (error)
+        ) from error
 
 
 def json_object(data: bytes) -> dict[str, Any]:

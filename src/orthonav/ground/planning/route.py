@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import MissingFileError, RouteError, described, lfs_pointer
-from orthonav.core.extras import needed
 from orthonav.core.geo.frames import distances_m
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
 from orthonav.ground.planning.markup import read_gpx, read_kml, read_kmz, read_wpml
@@ -25,6 +24,7 @@ from orthonav.ground.planning.record import (
     Route,
     decoded,
     json_object,
+    listed,
     number,
     number_or_none,
     parsed,
@@ -35,26 +35,22 @@ __all__ = [
     "Height",
     "Route",
     "along_polyline_en_m",
-    "distance_to_polyline_m",
     "leg_lengths_m",
     "read_route",
 ]
 
 Array = NDArray[np.float64]
 MAX_ROUTE_BYTES = 20_000_000  # twice 100,000 waypoints; JSON and XML take 20 times in memory
-MAX_LISTED = 20
 _BROKEN = (
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError),
     csv.Error,
 )
 
-"""Properties of a GeoJSON feature (RFC 7946): `name`; `band_m`, a number or a list with one per leg
-(null: the default); `height_frame`, above what the third coordinate is ("agl", "home", "amsl",
-"hae"; the RFC's ellipsoid is hardly ever meant, so without it that is taken as not said);
-`home_amsl_m`."""
-
 
 def _routes_of(plain: dict[str, Any]) -> list[Route]:
+    """Lines of GeoJSON (RFC 7946) with the properties `name`; `band_m`, a number or a list with one
+    per leg (null: the default); `height_frame`, above what the third coordinate is (the RFC's
+    ellipsoid is hardly ever meant, so without it that is unknown); `home_amsl_m`."""
     if crs := plain.get("crs"):  # of GeoJSON before RFC 7946
         properties = crs.get("properties", {}) if isinstance(crs, dict) else {}
         name = str(properties.get("name") or properties.get("href") or crs)
@@ -148,8 +144,6 @@ def _geometries(node: Any) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
         yield item, properties
 
 
-_LAT = ("lat_deg", "lat", "latitude", "latitude_deg")
-_LON = ("lon_deg", "lon", "lng", "long", "longitude", "longitude_deg")
 _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
     ("agl", ("agl_m", "agl", "altitude_agl_m", "altitudeagl")),
     ("home", ("home_m", "height_above_home_m")),
@@ -157,10 +151,7 @@ _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
     ("hae", ("hae_m",)),
     (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
 )
-_MODES = ("altitudemode", "altitude_mode")  # columns of Litchi
-_FRAME_OF_MODE: dict[float | None, HeightFrame] = {0: "home", 1: "agl"}
 _UNIT = re.compile(r"(?<!\s)\s*[(\[]\s*([a-z]+)\.?\s*[)\]]$")  # as in altitude(m)
-_METRES = {"m": 1.0, "meter": 1.0, "meters": 1.0, "ft": 0.3048, "feet": 0.3048}
 _Values = Callable[[str], list[float | None]]
 
 
@@ -178,7 +169,8 @@ def _read_delimited(data: bytes) -> list[Route]:
             require_few_waypoints(len(rows))
     except TableError as error:
         raise RouteError(f"route table cannot be read ({error})") from error
-    lat, lon = (next(filter(names.get, aliases), None) for aliases in (_LAT, _LON))
+    lat = _first(names, "lat_deg", "lat", "latitude", "latitude_deg")
+    lon = _first(names, "lon_deg", "lon", "lng", "long", "longitude", "longitude_deg")
     if lat is None or lon is None:
         raise RouteError(
             "route CSV needs the columns lat_deg,lon_deg (or lat,lon or latitude,longitude), got "
@@ -200,27 +192,40 @@ def _read_delimited(data: bytes) -> list[Route]:
     return [Route(waypoints, _heights(names, values), tuple(bands[:-1] if bands[1:] else bands))]
 
 
+def _first(names: dict[str, str], *aliases: str) -> str | None:
+    """The first alias that is a column."""
+    return next((each for each in aliases if each in names), None)
+
+
 def _heights(names: dict[str, str], values: _Values) -> tuple[Height | None, ...]:
     known = ((frame, name) for frame, aliases in _HEIGHTS for name in aliases if name in names)
     frame, name = next(known, (None, None))
     if name is None:
         return ()
-    unit = _UNIT.search(names[name].strip().lower())
-    if unit is not None and unit[1] not in _METRES:
-        raise RouteError(f"heights must be in m or ft, got the column {names[name]!r:.60}")
-    factor = 1.0 if unit is None else _METRES[unit[1]]
+    factor = _metres(names[name])
     heights = values(name)
     frames = [frame] * len(heights)
-    mode = next((each for each in _MODES if each in names), None)
+    mode = _first(names, "altitudemode", "altitude_mode")  # of Litchi
     if frame is None and mode is not None:
         modes = values(mode)
         if not {None, 0, 1}.issuperset(modes):
             raise RouteError(f"{names[mode]} must be 0 (above take-off) or 1 (above ground)")
-        frames = [_FRAME_OF_MODE.get(mode) for mode in modes]
+        of_modes: dict[float | None, HeightFrame] = {0: "home", 1: "agl"}
+        frames = [of_modes.get(each) for each in modes]
     return tuple(
         None if height is None else Height(factor * height, each)
         for height, each in zip(heights, frames, strict=True)
     )
+
+
+def _metres(column: str) -> float:
+    """The unit that the name of a column states, in metres; metres without one."""
+    unit = _UNIT.search(column.strip().lower())
+    if unit is None or unit[1] in ("m", "meter", "meters"):
+        return 1.0
+    if unit[1] in ("ft", "feet"):
+        return 0.3048
+    raise RouteError(f"heights must be in m or ft, got the column {column!r:.60}")
 
 
 def _read_json(data: bytes) -> list[Route]:
@@ -313,24 +318,14 @@ def _chosen(found: list[Route], name: str) -> Route:
 
 
 def _listed(found: list[Route]) -> str:
-    shown = [
-        f"{number} {route.name!r:.60}" if route.name else f"{number} (no name)"
-        for number, route in enumerate(found[:MAX_LISTED], 1)
-    ]
-    return ", ".join(shown) + (", .." if len(found) > MAX_LISTED else "")
+    named = (f"{route.name!r:.60}" if route.name else "(no name)" for route in found)
+    return listed([f"{number} {name}" for number, name in enumerate(named, 1)], 20)
 
 
 def leg_lengths_m(route: Route) -> Array:
     """Length in metres of each leg of a route, along the ellipsoid; `[0]` for one waypoint."""
     places = np.array(route.waypoints)
     return distances_m(places[:-1], places[1:]) if len(places) > 1 else np.zeros(1)
-
-
-def distance_to_polyline_m(points_en_m: Array, line_en_m: Array) -> Array:
-    """Shortest distance in metres of `(N, 2)` points to a polyline of `(M, 2)` vertices, M >= 1."""
-    shapely = needed("shapely", "geo", "a route")
-    line = shapely.linestrings(np.concatenate([line_en_m, line_en_m[-1:]]))
-    return np.asarray(shapely.distance(line, shapely.points(points_en_m)))
 
 
 def along_polyline_en_m(line_en_m: Array, spacing_m: float) -> tuple[Array, Array]:

@@ -11,19 +11,18 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError
+from orthonav.core.errors import AreaError, UsageError
 from orthonav.core.geo.frames import MAX_SHEET_M
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.ground.planning.area import Area, Extent
 from orthonav.ground.planning.route import Array, Height, Route, leg_lengths_m
 
 MAX_ROUTE_SHEETS = 500  # more than once around the Earth with bands of less than 10 km
-_MERIDIAN_DEGREE_M = 111_695.0  # longest degree of latitude, at a pole (WGS84)
-_PARALLEL_DEGREE_M = 111_320.0  # degree of longitude at the equator (WGS84)
 
 
 def _fits(route: Route, band_m: float | None) -> bool:
@@ -122,30 +121,29 @@ def _route_too_long(sheets: str) -> AreaError:
     )
 
 
-LARGEST_SIDE_M = 0.9 * MAX_SHEET_M  # boxes are wider than sheets: meridians converge
-SMALLEST_SIDE_M = 200.0
-_NAME = re.compile(r"r([0-9]{6})c([0-9]{6})")
-
-
 @dataclass(frozen=True)
 class WorldSheets:
     side_m: float
+    MIN_SIDE_M: ClassVar = 200.0
+    MAX_SIDE_M: ClassVar = 0.9 * MAX_SHEET_M  # boxes are wider than sheets: meridians converge
 
     def __post_init__(self) -> None:
-        if not SMALLEST_SIDE_M <= self.side_m <= LARGEST_SIDE_M:
-            raise AreaError(
-                f"sheet_km must be {SMALLEST_SIDE_M / 1000:g} to {LARGEST_SIDE_M / 1000:g}, "
+        if not self.MIN_SIDE_M <= self.side_m <= self.MAX_SIDE_M:
+            raise UsageError(
+                f"sheet_km must be {self.MIN_SIDE_M / 1000:g} to {self.MAX_SIDE_M / 1000:g}, "
                 f"got {self.side_m / 1000:g}"
             )
 
     @property
     def rows(self) -> int:
-        return math.ceil(180 * _MERIDIAN_DEGREE_M / self.side_m)
+        longest_degree_m = 111_695.0  # of latitude, at a pole (WGS 84)
+        return math.ceil(180 * longest_degree_m / self.side_m)
 
     def cols(self, row: int) -> int:
         south, north = self._parallels(row)
         widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
-        around_m = 360 * _PARALLEL_DEGREE_M * math.cos(math.radians(widest))
+        equator_degree_m = 111_320.0  # of longitude (WGS 84)
+        around_m = 360 * equator_degree_m * math.cos(math.radians(widest))
         return max(1, math.ceil(around_m / self.side_m))
 
     def name_at(self, lat_deg: float, lon_deg: float) -> str:
@@ -158,7 +156,7 @@ class WorldSheets:
         return _named(row, min(cols - 1, int(turned / 360 * cols)))
 
     def bounds_deg(self, name: str) -> Extent:
-        match = _NAME.fullmatch(name)
+        match = re.fullmatch(r"r([0-9]{6})c([0-9]{6})", name)
         row, col = (int(part) for part in match.groups()) if match else (-1, -1)
         if not (0 <= row < self.rows and 0 <= col < self.cols(row)):
             raise AreaError(f"no sheet of {self.side_m / 1000:g} km is named {name!r:.40}")
@@ -173,7 +171,7 @@ class WorldSheets:
         if west > east:
             east += 360
         if not (math.isfinite(west + south + east + north) and south <= north and west <= east):
-            raise AreaError(
+            raise UsageError(
                 "bounds must be west,south,east,north in degrees with west < east and "
                 f"south < north, got {','.join(map(str, bounds_deg))}"
             )

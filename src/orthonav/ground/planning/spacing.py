@@ -16,26 +16,38 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import TerrainHeights
 from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.record import listed
 from orthonav.ground.planning.route import Route, leg_lengths_m
 
-TILE_SIZES_PX = (256, 128, 64)  # to choose from; 256 is the default of `build`
-GOOD_VIEW_PX = 144.0  # size of a view in map pixels at which registration ends
-LEAST_VIEW_PX = 24.0
-LEAST_TILE_SHARE = 0.4
-MOST_COARSER = 4.0  # the localizer refuses views beyond these three limits: too_small, too_coarse
-FINEST_IMAGERY_M = 0.2  # open orthophotos of whole countries are rarely finer (BD ORTHO: 0.2 m)
-LOW_VIEW_M = 100.0  # below this a single field or wood can fill the view
-MOST_RELIEF = 0.05  # within a view, as a fraction of the height: the std of reported heights
-VIEW_OVERLAP = 0.6  # usual forward overlap of aerial photography
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)  # 65 by 51 deg
 DEFAULT_PRIOR_STD_M = 150.0  # about 5 km of dead reckoning with an error of 3 %
-BAND_PRIORS = 4.0  # width of a band that is not given: two deviations of the prior to each side
 MIN_BAND_VIEWS = 0.5  # a band is checked at least so many sides of a view wide
-_NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)  # mantissas of round ground resolutions
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlanLimits:
+    """Where advice changes and cautions begin."""
+
+    good_view_px: float = 144.0  # size of a view in map pixels at which registration ends
+    min_view_px: float = 24.0  # the localizer refuses smaller views: too_small
+    min_tile_share: float = 0.4  # tile search refuses views that cover less of a tile
+    max_coarser: float = 4.0  # map pixels a pixel of the view; refused beyond: too_coarse
+    finest_imagery_m: float = 0.2  # orthophotos of whole countries are rarely finer (BD ORTHO)
+    low_view_m: float = 100.0  # below this a single field or wood can fill the view
+    max_relief: float = 0.05  # within a view, a fraction of the height: std of reported heights
+    view_overlap: float = 0.6  # usual forward overlap of aerial photography
+    landing_m: float = 30.0  # above ground, below which the aircraft takes off or lands
+    max_below_ground_m: float = 2.0  # tolerance for errors of the terrain model
+    tile_sizes_px: tuple[int, ...] = (256, 128, 64)  # to choose from; `build` defaults to 256
+
+
+LIMITS = PlanLimits()
 
 
 def default_band_m(view_m: float, prior_std_m: float | None = DEFAULT_PRIOR_STD_M) -> float:
-    priors = BAND_PRIORS * (view_m if prior_std_m is None else prior_std_m)
+    """Width of a band that is not given: two deviations of the prior to each side."""
+    priors = 4 * (view_m if prior_std_m is None else prior_std_m)
     return max(priors, MIN_BAND_VIEWS * view_m)
 
 
@@ -73,7 +85,7 @@ class ViewPlan:
 
     @property
     def spacing_m(self) -> float:
-        return (1 - VIEW_OVERLAP) * self.short_m
+        return (1 - LIMITS.view_overlap) * self.short_m
 
     def tile_share(self, tile_m: float) -> float:
         return min(self.width_m, tile_m) * min(self.height_m, tile_m) / tile_m**2
@@ -85,25 +97,26 @@ class ViewPlan:
 
 def suited_map(view: ViewPlan) -> tuple[float, int]:
     """The coarsest round resolution (m) at which the view covers a whole tile, and the widest tile
-    (px) for which this is neither finer than the view nor than `FINEST_IMAGERY_M`."""
-    finest_m = max(FINEST_IMAGERY_M, view.gsd_m)
-    for tile_px in TILE_SIZES_PX:
-        gsd_m = _nice_below(view.short_m / tile_px)
+    (px) for which this is neither finer than the view nor than imagery usually is."""
+    finest_m = max(LIMITS.finest_imagery_m, view.gsd_m)
+    for tile_px in LIMITS.tile_sizes_px:
+        gsd_m = _round_below(view.short_m / tile_px)
         if gsd_m >= finest_m:
             return gsd_m, tile_px
-    return float(f"{finest_m:.3g}"), TILE_SIZES_PX[-1]
+    return float(f"{finest_m:.3g}"), LIMITS.tile_sizes_px[-1]
 
 
 def suited_tile_px(view: ViewPlan, gsd_m: float) -> int:
-    return next(
-        (px for px in TILE_SIZES_PX if px * gsd_m <= view.short_m * 1.001), TILE_SIZES_PX[-1]
-    )
+    sizes = LIMITS.tile_sizes_px
+    return next((px for px in sizes if px * gsd_m <= view.short_m * 1.001), sizes[-1])
 
 
-def _nice_below(value: float) -> float:
+def _round_below(value: float) -> float:
+    """The largest round ground resolution up to a value."""
+    mantissas = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
     power = 10.0 ** math.floor(math.log10(value) + 1e-9)
-    nice = max(each for each in _NICE if each * power <= value * (1 + 1e-9))
-    return float(f"{nice * power:.3g}")
+    largest = max(each for each in mantissas if each * power <= value * (1 + 1e-9))
+    return float(f"{largest * power:.3g}")
 
 
 def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
@@ -112,41 +125,30 @@ def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
     across = f"a view is {across_px:.0f} map pixels across"
     covers = f"a view covers {share:.0%} of a tile"
     found = []
-    if view.short_m < LOW_VIEW_M:
+    if view.short_m < LIMITS.low_view_m:
         text = (
             f"a view is only {view.short_m:.0f} m across: over forest or one large field it shows "
             "no lasting structure, and relief displacement of trees and houses is large; fly higher"
         )
         found.append(Caution("low", text))
-    if coarser > MOST_COARSER:
+    if coarser > LIMITS.max_coarser:
         text = (
             f"a pixel of the view covers {coarser:.1f} pixels of the map: refused (too_coarse); "
             "build coarser, or fly lower"
         )
         found.append(Caution("too_coarse", text))
-    if across_px < LEAST_VIEW_PX:
-        text = f"{across}: refused below {LEAST_VIEW_PX:.0f}; build finer, or fly higher"
+    if across_px < LIMITS.min_view_px:
+        text = f"{across}: refused below {LIMITS.min_view_px:.0f}; build finer, or fly higher"
         found.append(Caution("too_small", text))
-    elif across_px < GOOD_VIEW_PX * 0.999:
-        text = f"{across}, fewer than {GOOD_VIEW_PX:.0f}; build finer, or fly higher"
+    elif across_px < LIMITS.good_view_px * 0.999:
+        text = f"{across}, fewer than {LIMITS.good_view_px:.0f}; build finer, or fly higher"
         found.append(Caution("few_pixels", text))
-    if share < LEAST_TILE_SHARE:
-        text = f"{covers}: tile search refuses below {LEAST_TILE_SHARE:.0%}; use smaller tiles"
+    if share < LIMITS.min_tile_share:
+        text = f"{covers}: tile search refuses below {LIMITS.min_tile_share:.0%}; use smaller tiles"
         found.append(Caution("tile_too_large", text))
     elif share < 0.999:
         found.append(Caution("part_of_tile", f"{covers} of {tile_m:.0f} m; best is a whole tile"))
     return found
-
-
-TILE_BYTES = 273.0  # embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles
-LAYER_BYTES_PER_PX = 0.15, 0.35  # of real imagery, docs/map-format.md
-BUILD_FIXED_S = 40.0
-BUILD_S_PER_MPX = 0.5
-"""Measured with one worker on a core of an AMD EPYC, generated landscape, 1 m, default build: 179 s
-for a corridor of 284 million pixels (`benchmarks.corridor` at d63ac91), 47 s for 4 million on a
-shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
-_MOST_POINTS = 200_000
-_LEAST_POINTS = 2_500  # points sampled: a standard error of the fraction of 0.1 % to 1 %
 
 
 @dataclass(frozen=True)
@@ -167,13 +169,16 @@ def estimate_map(
     gsd_m: float,
     tile_px: int,
     overlap: float,
-    registration: bool = True,
     maps: int = 1,
 ) -> MapEstimate:
     """Tiles are counted if that is cheap, else estimated from a sample (within 2 %), which is
-    smaller where this is one of many `maps`. Imagery is assumed everywhere."""
+    smaller where this is one of many `maps`. Imagery is assumed everywhere.
+
+    Bytes: docs/benchmarks.md (4.26 MB for 15,601 tiles) and docs/map-format.md. Time: one worker on
+    a core of an AMD EPYC, 1 m, 179 s for a corridor of 284 million pixels; 40 s calibrate the
+    confidence."""
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
-    room = max(_LEAST_POINTS, _MOST_POINTS // maps)
+    room = max(2_500, 200_000 // maps)  # points: a standard error of 0.1 % to 1 %
     border_m = (grid.tile_m - grid.stride_m) / 2
     reach_m = grid.stride_m * math.sqrt(0.5)
     tiles = round(
@@ -181,14 +186,14 @@ def estimate_map(
     )
     size_px = grid.height_px, grid.width_px
     pixels = math.prod(size_px) * _share(area, grid, 0.0, grid.tile_m / 2, size_px, room)
-    layer = [pixels * each / 1e6 if registration else 0.0 for each in LAYER_BYTES_PER_PX]
-    embeddings = tiles * TILE_BYTES / 1e6
+    low_mb, high_mb = (pixels * per_px / 1e6 for per_px in (0.15, 0.35))
+    embeddings_mb = tiles * 273 / 1e6
     return MapEstimate(
         area_km2=tiles * grid.stride_m**2 / 1e6,
         imagery_km2=pixels * gsd_m**2 / 1e6,
         tiles=tiles,
-        map_mb=(embeddings + layer[0], embeddings + layer[1]),
-        build_s=BUILD_FIXED_S + BUILD_S_PER_MPX * pixels / 1e6,
+        map_mb=(embeddings_mb + low_mb, embeddings_mb + high_mb),
+        build_s=40 + 0.5 * pixels / 1e6,
     )
 
 
@@ -215,18 +220,10 @@ def _share(
     return float(area.contains(points, margin_m).mean())
 
 
-Array = NDArray[np.float64]
-MAX_POSITIONS = 2000  # sampled positions along a route at most
-LANDING_M = 30.0  # above ground, below which the aircraft takes off or lands
-_BELOW_GROUND_M = 2.0  # tolerance for errors of the terrain model
-_ACROSS = (0.0, -0.5, 0.5)
-_VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
-
-
 @dataclass(frozen=True)
 class LegProfile:
     """`relief`: largest difference of terrain height within a view centred on the leg or on an edge
-    of its search band, as a fraction of the height above ground; 0 below `LANDING_M`."""
+    of its search band, as a fraction of the height above ground; 0 near the ground."""
 
     leg: int  # number, from 1
     length_m: float  # its length
@@ -244,7 +241,7 @@ def profile(
 ) -> list[LegProfile]:
     """Height above ground and relief of each leg. `bands_m`: search bands of the legs. `agl_m`:
     constant height above ground for legs without known heights. `view_m`: width of a view."""
-    spacing_m = max(view_m / 2, float(leg_lengths_m(route).sum()) / MAX_POSITIONS, 1.0)
+    spacing_m = max(view_m / 2, float(leg_lengths_m(route).sum()) / 2000, 1.0)
     home_m = route.home_amsl_m
     if home_m is None:
         first = np.array([route.waypoints[0]])
@@ -263,7 +260,7 @@ def flown_agl_m(route: Route, terrain: TerrainHeights | None) -> list[float]:
     if heights and len(planned) < len(heights) and terrain is not None:
         legs = profile(route, (0.0,) * route.legs, None, 0.0, terrain)
         planned = [height for leg in legs for height in leg.agl_m]
-    return [height for height in planned if height >= LANDING_M]
+    return [height for height in planned if height >= LIMITS.landing_m]
 
 
 def _leg(
@@ -284,11 +281,13 @@ def _leg(
     across = np.array([along[1], -along[0]])
     shares = np.linspace(0, 1, math.ceil(length_m / spacing_m) + 1)
     places = start + shares[:, None] * (end - start)
-    centres = places[:, None, :] + np.array(_ACROSS)[:, None] * band_m * across
-    seen = centres[:, :, None, :] + np.array(_VIEW) * view_m
+    band = np.array([0.0, -0.5, 0.5])  # the line and both edges of the band
+    view = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)])
+    centres = places[:, None, :] + band[:, None] * band_m * across
+    seen = centres[:, :, None, :] + view * view_m
     lat, lon = frame.latlon_from_en(seen)
     heights = terrain(lat.ravel(), lon.ravel()).reshape(lat.shape)
-    middle = heights[..., len(_VIEW) // 2]
+    middle = heights[..., len(view) // 2]
     if holes := float(np.isnan(middle[:, 0]).mean()):
         raise RouteError(
             f"the terrain has no height for {holes:.0%} of leg {leg + 1} of the route (a hole, or "
@@ -300,7 +299,7 @@ def _leg(
     over = flown - middle[:, 0]
     known = np.isfinite(heights).all(axis=-1)
     clear = flown[:, None] - middle
-    judged = known & (clear >= LANDING_M)
+    judged = known & (clear >= LIMITS.landing_m)
     relief = np.ptp(np.where(judged[..., None], heights, 0), axis=-1) / np.where(judged, clear, 1)
     return LegProfile(
         leg + 1,
@@ -331,8 +330,8 @@ def _flown_amsl_m(
 
 def terrain_cautions(legs: list[LegProfile]) -> list[Caution]:
     found = []
-    low = [leg for leg in legs if leg.agl_m[0] < -_BELOW_GROUND_M]
-    steep = [leg for leg in legs if leg.relief > MOST_RELIEF and leg not in low]
+    low = [leg for leg in legs if leg.agl_m[0] < -LIMITS.max_below_ground_m]
+    steep = [leg for leg in legs if leg.relief > LIMITS.max_relief and leg not in low]
     if low:
         hint = "heights of one may be in feet, or of another datum"
         found.append(Caution("ground", f"{_named(low)} would pass below the terrain: {hint}"))
@@ -340,12 +339,12 @@ def terrain_cautions(legs: list[LegProfile]) -> list[Caution]:
         most = max(leg.relief for leg in steep)
         text = (
             f"relief within a view is up to {most:.0%} of the height on {_named(steep)}; "
-            f"above {MOST_RELIEF:.0%} it distorts the view"
+            f"above {LIMITS.max_relief:.0%} it distorts the view"
         )
         found.append(Caution("relief", text))
     return found
 
 
 def _named(legs: list[LegProfile]) -> str:
-    shown = ", ".join(str(leg.leg) for leg in legs[:10]) + (", .." if len(legs) > 10 else "")
+    shown = listed([str(leg.leg) for leg in legs], 10)
     return f"leg {shown}" if len(legs) == 1 else f"legs {shown}"

@@ -127,7 +127,7 @@ def _found(
 ) -> FocalLength | None:
     if sensor_width_mm is not None and optics.focal_mm > 0:
         px = optics.focal_mm / sensor_width_mm * max(width_px, height_px)
-        return FocalLength(px, _GIVEN_STD, "EXIF and --sensor-width-mm")
+        return FocalLength(px, _GIVEN_STD, "EXIF and the width of the sensor")
     sensor = _SENSORS.get((optics.make.upper(), optics.model.upper()))
     if sensor is not None and (known := _of_sensor(sensor, optics, width_px, height_px)):
         return known

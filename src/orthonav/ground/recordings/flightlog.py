@@ -363,8 +363,6 @@ log = logging.getLogger(__name__)
 LOCALIZE_CHOICES = {
     "heading": ("known", "unknown"),
     "prior": ("telemetry", "none"),
-    "registration": ("on", "off"),
-    "position": ("peak", "best", "neighbours", "weighted"),
 }
 """Options of localize that a log may state, and their values."""
 

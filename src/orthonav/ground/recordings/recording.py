@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import FlightError, UsageError
 from orthonav.core.files import with_paths
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
 from orthonav.core.flight.telemetry_track import RecordedTrack, measured
@@ -39,7 +39,7 @@ _ROUNDED = (
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a recording is read. Raises `FlightError` for invalid values."""
+    """How a recording is read. Raises `UsageError` for invalid values."""
 
     kind: str | None = None  # one of `KINDS`; None: detected by content
     camera: Path | None = None  # camera file; None: the recording's own camera
@@ -72,21 +72,21 @@ class SourceOptions:
         for name in ("rate_hz", "prior_std_m", "sensor_width_mm", "agl_m", "fov_deg"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
-                raise FlightError(f"{name} must be above 0, got {value}")
+                raise UsageError(f"{name} must be above 0, got {value}")
         if self.fov_deg is not None and self.fov_deg > MAX_FOV_DEG:
-            raise FlightError(f"fov_deg must be at most {MAX_FOV_DEG:g}, got {self.fov_deg:g}")
+            raise UsageError(f"fov_deg must be at most {MAX_FOV_DEG:g}, got {self.fov_deg:g}")
         if self.fov_deg is not None and self.camera is not None:
-            raise FlightError("give a camera file or a field of view, not both")
+            raise UsageError("give a camera file or a field of view, not both")
         if self.agl_m is not None and self.ground_alt_m is not None:
-            raise FlightError("give a height above ground or an altitude of the ground, not both")
+            raise UsageError("give a height above ground or an altitude of the ground, not both")
         numbers = (self.time_offset_s, *self.mount_deg, self.ground_alt_m or 0.0)
         if not all(math.isfinite(number) for number in numbers):
-            raise FlightError("give finite numbers as time offset, mount and ground altitude")
+            raise UsageError("give finite numbers as time offset, mount and ground altitude")
         if self.kind is not None and self.kind not in KINDS:
-            raise FlightError(f"kind must be one of {', '.join(KINDS)}, got '{self.kind}'")
+            raise UsageError(f"kind must be one of {', '.join(KINDS)}, got '{self.kind}'")
         unknown = [role for role in self.topics if role not in ROLES]
         if unknown:
-            raise FlightError(f"give topics of {', '.join(ROLES)}, got '{unknown[0]}'")
+            raise UsageError(f"give topics of {', '.join(ROLES)}, got '{unknown[0]}'")
 
     @property
     def time_offset_ns(self) -> int:

@@ -6,12 +6,12 @@ height; the telemetry differs from these by the requested errors."""
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError, CameraError, FlightError
+from orthonav.core.errors import AreaError, CameraError, FlightError, UsageError
 from orthonav.core.files import GivenPath, replacing_folder, with_paths
 from orthonav.core.flight.folder import FlightWriter
 from orthonav.core.flight.gnss import FILE as GNSS_FILE
@@ -48,45 +48,32 @@ from orthonav.ground.simulate.receiver import Good, samples_of, solutions
 from orthonav.ground.simulate.render import Clouds, Raster, ViewEffects, degraded, render_view
 
 MAX_VIEWS = 1_000_000  # sanity limit
-TRIES_PER_VIEW = 400  # suffices if 2 % of random positions are covered by imagery
-MAX_PITCH_DEG = 65.0
-MARGIN_PX = 4  # margin of the ground window: radius of the bicubic kernel, and rounding
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of the telemetry, and motion of the camera. All default to none.
+    """Errors of the telemetry, and motion of the camera; none by default.
 
-    Standard deviations, drawn independently for every view; the telemetry reports them:
+    Standard deviations of reported values are drawn for every view, and the telemetry states them;
+    it states neither biases nor unreported tilt."""
 
-    `prior_std_m`: reported prior position, metres per axis, 0..1e6; None reports no prior.
-
-    Constant biases, which the reported standard deviations do not include:
-
-    `pitch_bias_deg`, `roll_bias_deg`: unreported tilt of the camera mount, degrees, -20..20.
-
-    Standard deviations of unreported tilt, pitch and roll each, degrees, 0..20:
-
-    `horizon_std_deg`: error of the reported attitude; along a route it is correlated in time
-    (`attitude.HORIZON_TIME_S`), at random positions it is independent.
-
-    `velocity_drift`: standard deviation of the scale (a share) and direction (rad) of the reported
-    velocity, 0..0.5, see `motion.drifting`; None reports no velocity.
-    """
-
-    yaw_std_deg: float = 0.0  # reported heading, degrees, 0..180
-    agl_std: float = 0.0  # reported height, as a fraction of it, 0..0.5
-    tilt_std_deg: float = 0.0  # reported pitch and roll, degrees, 0..20
-    attitude_std_deg: float = 0.0  # true pitch and roll (which are reported), degrees, 0..20
-    prior_std_m: float | None = None
-    yaw_bias_deg: float = 0.0  # reported minus true heading, degrees, -180..180
-    agl_bias: float = 0.0  # reported minus true height, as a fraction of it, -0.5..0.5
-    pitch_bias_deg: float = 0.0
+    yaw_std_deg: float = 0.0  # reported heading, 0..180
+    agl_std: float = 0.0  # reported height, a fraction of it, 0..0.5
+    tilt_std_deg: float = 0.0  # reported pitch and roll, 0..20
+    attitude_std_deg: float = 0.0  # true pitch and roll, which are reported, 0..20
+    prior_std_m: float | None = None  # reported prior position, per axis, 0..1e6; None: no prior
+    yaw_bias_deg: float = 0.0  # reported minus true heading, -180..180
+    agl_bias: float = 0.0  # reported minus true height, a fraction of it, -0.5..0.5
+    pitch_bias_deg: float = 0.0  # unreported tilt of the camera mount, -20..20
     roll_bias_deg: float = 0.0
     velocity_drift: float | None = None
-    mount_std_deg: float = 0.0  # of the camera mount, drawn once a flight and added to its bias
+    """Standard deviation of scale (a share) and direction (rad) of the reported velocity, 0..0.5,
+    see `motion.drifting`; None: no velocity is reported."""
+    mount_std_deg: float = 0.0  # unreported tilt of the mount, drawn once a flight, 0..20
     horizon_std_deg: float = 0.0
+    """Unreported tilt of the horizon, 0..20: independent at random positions, along a route
+    correlated over `motion.HORIZON_TIME_S`."""
 
     def __post_init__(self) -> None:
         limits = {"agl": 0.5, "prior": 1e6, "velocity": 0.5, "yaw": 180.0}  # tilt: 20 deg
@@ -96,7 +83,7 @@ class Errors:
             if value is not None and not least <= value <= limit:
                 whole = {"agl": "the height", "velocity": "the velocity"}.get(name.split("_")[0])
                 hint = f" (a fraction of {whole}: 0.05 is 5 %)" if whole else ""
-                raise FlightError(f"{name} must be {least:g} to {limit:g}, got {value}{hint}")
+                raise UsageError(f"{name} must be {least:g} to {limit:g}, got {value}{hint}")
 
     def mount_deg(self, seed: int) -> Array:
         """Unreported pitch and roll (2,) of the camera in the aircraft."""
@@ -113,44 +100,33 @@ class Errors:
         return self.tilt_std_deg
 
 
-NO_ERRORS = Errors()
-USUAL_EFFECTS = ViewEffects()
-
-
 @dataclass(frozen=True)
 class SimulateRequest:
-    """Parameters of a simulated flight.
-
-    `route`: route to fly; or `random`: number of random positions, 1 to 1e6. One of the two.
-    `agl_m`: height above ground, 1..50,000 m; None: the shorter side of the image covers 256 pixels
-    of the orthophoto. On a route over a terrain it is the height above the ground at the first
-    view, and the altitude is constant. `spacing_m`: distance between views on a route; None: flown
-    in one second. `camera`: intrinsics; `errors`: of the telemetry; `effects`: image degradation.
-    `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot. `terrain`:
-    heights of the ground or surface above mean sea level. Views are then true perspectives of it,
-    and the telemetry reports heights above sea level and, on a route, above the first view, and no
-    measured one above ground. `surface`: models with houses and trees, which views then show;
-    heights above ground count from `terrain`, or else from their lower envelope.
-    `camera_pitch_deg`: angle by which the camera looks ahead of straight down, 0..65; reported.
-    """
+    """Parameters of a simulated flight: along `route`, or at `random` positions, one of the two."""
 
     orthos: Sequence[GivenPath]  # orthophotos to fly over; earlier ones take precedence
     out: GivenPath  # flight folder to write
     route: Route | None = None
-    random: int | None = None
+    random: int | None = None  # number of positions, 1..1e6
     agl_m: float | None = None
-    spacing_m: float | None = None
+    """Height above ground, 1..50,000 m; on a route over a terrain that at the first view, and the
+    altitude is constant. None: the shorter side of a view covers 256 pixels of the orthophoto."""
+    spacing_m: float | None = None  # between views on a route; None: flown in one second
     airspeed_mps: float = 25.0
     camera: Camera = DEFAULT_CAMERA
-    errors: Errors = NO_ERRORS
-    effects: ViewEffects = USUAL_EFFECTS
+    errors: Errors = field(default_factory=Errors)
+    effects: ViewEffects = field(default_factory=ViewEffects)
     seed: int = 0  # of all random draws, 0 or more; equal requests give equal bytes
-    turn_radius_m: float = 0.0
+    turn_radius_m: float = 0.0  # of the corners of a route, 0..100,000; 0 turns on the spot
     clouds: Callable[[int, int], Clouds] | None = None  # by the number of views and the seed
     terrain: TerrainHeights | None = None
+    """Heights above mean sea level. Views are then true perspectives, and the telemetry reports
+    heights above sea level and, on a route, above the first view, but none above ground."""
     terrain_posting_m: float = 5.0  # resolution of the terrain, if there is no surface
-    surface: Sequence[Dem] = ()  # earlier ones take precedence; above sea, as the terrain
-    camera_pitch_deg: float = 0.0
+    surface: Sequence[Dem] = ()
+    """Models with houses and trees, which views show, above sea; earlier ones take precedence.
+    Heights above ground count from `terrain`, or else from their lower envelope."""
+    camera_pitch_deg: float = 0.0  # ahead of straight down, 0..65; reported
     gnss: Good | None = None  # receiver whose solutions are written to `gnss.csv`; only on a route
 
     def __post_init__(self) -> None:
@@ -194,8 +170,8 @@ def simulate_flight(
 ) -> int:
     """Write a flight folder to `request.out`, complete or not at all; returns the number of views.
 
-    Raises `FlightError` on impossible parameters, `AreaError` if no view fits into the imagery or
-    the route leaves it, and as `Mosaic.open` does.
+    Raises `UsageError` on impossible parameters, `FlightError` where a view would be too low,
+    `AreaError` if no view fits into the imagery or the route leaves it, and as `Mosaic.open` does.
     """
     _check(request)
     mosaic = Mosaic.open(request.orthos)
@@ -253,19 +229,19 @@ def simulate_flight(
 
 def _check(request: SimulateRequest) -> None:
     if (request.route is None) == (request.random is None):
-        raise FlightError("give either a route or a number of random positions")
+        raise UsageError("give either a route or a number of random positions")
     limits: dict[str, tuple[float | None, float, float]] = {
         "random": (request.random, 1, MAX_VIEWS),
         "agl_m": (request.agl_m, 1, 50_000),
         "seed": (request.seed, 0, math.inf),
         "turn_radius_m": (request.turn_radius_m, 0, 100_000),
-        "camera_pitch_deg": (request.camera_pitch_deg, 0, MAX_PITCH_DEG),
+        "camera_pitch_deg": (request.camera_pitch_deg, 0, 65),
     }
     for what, (value, least, most) in limits.items():
         if value is not None and not least <= value <= most:
-            raise FlightError(f"{what} must be {least:,} to {most:,g}, got {value}")
+            raise UsageError(f"{what} must be {least:,} to {most:,g}, got {value}")
     if request.clouds and request.camera_pitch_deg:
-        raise FlightError("clouds are simulated below cameras that look straight down only")
+        raise UsageError("clouds are simulated below cameras that look straight down only")
     on_a_route = {
         "turn_radius_m": request.turn_radius_m > 0,
         "velocity_drift": request.errors.velocity_drift is not None,
@@ -273,7 +249,7 @@ def _check(request: SimulateRequest) -> None:
     }
     given = [name for name, value in on_a_route.items() if value]
     if request.route is None and given:
-        raise FlightError(f"{', '.join(given)}: only along a route, not at random positions")
+        raise UsageError(f"{', '.join(given)}: only along a route, not at random positions")
 
 
 def _require_above(surface: Raster, poses: Sequence[_Pose]) -> None:
@@ -312,7 +288,7 @@ def _poses(
     for number in range(count):
         tilt_deg = horizon[number], mount_deg
         rng = np.random.default_rng([request.seed, 0, number])
-        for _ in range(TRIES_PER_VIEW):
+        for _ in range(400):  # suffices if imagery covers 2 % of random positions
             place = rng.uniform([west, south], [east, north])
             yaw_deg = rng.uniform(0, 360)
             pose = _tilted(request, rng, place, yaw_deg, agl_m, number * 1.0, tilt_deg)
@@ -378,11 +354,11 @@ def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
     airspeed_mps = request.airspeed_mps
     spacing_m = airspeed_mps if request.spacing_m is None else request.spacing_m
     if not (0 < spacing_m < math.inf and 0 < airspeed_mps < math.inf):
-        raise FlightError("spacing_m must be above 0, and the airspeed too")
+        raise UsageError("spacing_m must be above 0, and the airspeed too")
     line = rounded(line_en_m, request.turn_radius_m) if request.turn_radius_m else line_en_m
     length_m = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
     if length_m / spacing_m > MAX_VIEWS:
-        raise FlightError(
+        raise UsageError(
             f"route of {length_m / 1000:,.1f} km with a view every {spacing_m:g} m has more than "
             f"{MAX_VIEWS:,} views; increase the distance between views"
         )
@@ -439,9 +415,9 @@ def _picture(
     if surface is not None:
         above_m = pose.agl_m if pose.amsl_m is None else pose.amsl_m
         position = np.array([*pose.position_en_m, above_m])
-        picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m, MARGIN_PX)
+        picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m)
         return degraded(picture, request.effects, rng, cover)
-    rgb, corner_en_m = ground.window(_corners_en_m(camera, pose), MARGIN_PX)
+    rgb, corner_en_m = ground.window(_corners_en_m(camera, pose))
     corner = corner_en_m - pose.position_en_m
     return render_view(camera, attitude, rgb, corner, ground.gsd_m, request.effects, rng, cover)
 

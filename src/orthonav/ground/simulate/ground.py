@@ -22,10 +22,6 @@ from orthonav.ground.simulate.render import Raster, coloured, met, rays_enu
 COVERAGE_PX = 1024  # size of the coverage mask; bounds its memory for any imagery
 MAX_NODES = 4000  # heights along a side of the area, at most; bounds their memory
 READ_ROWS = 64
-FARTHEST = 12.0  # ground farther away than so many heights above it is not rendered: it is sky
-NEAR = 3.0  # ground nearer than so many heights must be covered by imagery
-MANY_PX = 500_000  # of larger pictures every second ray is followed
-BORDER = 9
 Array = NDArray[np.float64]
 
 
@@ -90,9 +86,10 @@ class GroundImagery:
     gsd_m: float  # metres per pixel
     mirror_en_m: tuple[float, float, float, float] | None = None  # box to mirror at its sides
 
-    def window(self, corners_en_m: Array, margin_px: int) -> tuple[NDArray[np.uint8], Array]:
+    def window(self, corners_en_m: Array) -> tuple[NDArray[np.uint8], Array]:
         """Pixels (H, W, 3) of the box around points (N, 2), and the position (2,) of their corner.
         Ground without imagery is mirrored, where a box for this is given."""
+        margin_px = 4  # radius of the bicubic kernel, and rounding
         cols = (corners_en_m[:, 0] - self.west_m) / self.gsd_m
         rows = (self.north_m - corners_en_m[:, 1]) / self.gsd_m
         left, top = math.floor(cols.min()) - margin_px, math.floor(rows.min()) - margin_px
@@ -214,15 +211,14 @@ def seen_over(
     attitude_deg: tuple[float, float, float],
     position_m: Array,
     agl_m: float,
-    margin_px: int,
 ) -> NDArray[np.uint8]:
-    """The picture (H, W, 3) of a camera at `position_m` (3,) over a surface."""
-    every = 2 if camera.width_px * camera.height_px > MANY_PX else 1
-    if camera.width_px % every or camera.height_px % every:
-        every = 1
+    """The picture (H, W, 3) of a camera at `position_m` (3,) over a surface. Of large pictures
+    every second ray is followed; ground farther away than 12 heights is sky."""
+    large = camera.width_px * camera.height_px > 500_000
+    every = 2 if large and camera.width_px % 2 == camera.height_px % 2 == 0 else 1
     followed = camera.resized(camera.width_px // every, camera.height_px // every)
     ground = met(surface, rays_enu(followed, attitude_deg, 1), position_m)
-    ground[np.linalg.norm(ground - position_m, axis=-1) > FARTHEST * agl_m] = np.nan
+    ground[np.linalg.norm(ground - position_m, axis=-1) > 12 * agl_m] = np.nan
     if every > 1:
         size = camera.width_px, camera.height_px
         ground = np.asarray(cv2.resize(ground, size, interpolation=cv2.INTER_LINEAR))
@@ -230,7 +226,7 @@ def seen_over(
     if not len(seen):
         raise AreaError("a camera sees no ground")
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
-    rgb, corner = imagery.window(np.array([low, high]), margin_px)
+    rgb, corner = imagery.window(np.array([low, high]))
     raster = Raster(rgb, float(corner[0]), float(corner[1]), imagery.gsd_m)
     return coloured(raster, ground, camera, position_m)
 
@@ -239,11 +235,11 @@ def near_ground_en_m(
     camera: Camera, attitude_deg: tuple[float, float, float], agl_m: float
 ) -> Array | None:
     """Outline (N, 2), metres from the camera, of the level ground seen that is near enough to need
-    imagery; None without any."""
-    sides = [np.linspace(0, side, BORDER) for side in (camera.width_px, camera.height_px)]
+    imagery, within 3 heights; None without any."""
+    sides = [np.linspace(0, side, 9) for side in (camera.width_px, camera.height_px)]
     px = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     ground = ground_en_m(camera, px, *attitude_deg, agl_m)
-    near = ground[np.hypot(*ground.T) <= NEAR * agl_m]  # not where it is NaN
+    near = ground[np.hypot(*ground.T) <= 3 * agl_m]  # not where it is NaN
     if len(near) < 3:
         return None
     return np.asarray(cv2.convexHull(near.astype(np.float32))[:, 0], np.float64)

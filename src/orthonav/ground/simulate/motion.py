@@ -9,9 +9,6 @@ from numpy.typing import NDArray
 from orthonav.core.geo.camera import attitude_of, enu_from_camera
 from orthonav.ground.planning.route import along_polyline_en_m
 
-DRIFT_TIME_S = 300.0  # time constant of the odometry error, which hardly changes within a minute
-ARC_STEP_DEG = 2.0  # angle between the points of an arc
-SHARPEST_DEG = 179.0  # sharper corners are flown as turns on the spot
 HORIZON_TIME_S = 15.0  # errors of real autopilots change within 10 to 30 s
 Array = NDArray[np.float64]
 
@@ -46,8 +43,8 @@ def gauss_markov(step: float, count: int, rng: np.random.Generator) -> Array:
 def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Generator) -> Array:
     """Velocities (N, 2) as reported by odometry whose scale (a share) and direction (rad) err with
     the standard deviation `drift`."""
-    step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
-    off = drift * gauss_markov(step_s / DRIFT_TIME_S, len(times_s), rng)
+    constant_s = 300.0  # it hardly changes within a minute
+    off = drift * gauss_markov(_step_s(times_s) / constant_s, len(times_s), rng)
     cos, sin = np.cos(off[:, 1]), np.sin(off[:, 1])
     east, north = velocities.T
     turned = np.stack([cos * east + sin * north, cos * north - sin * east], axis=1)
@@ -73,12 +70,13 @@ def _arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
         return corner[None]
     into, out = legs / lengths[:, None]
     turn = math.atan2(into[0] * out[1] - into[1] * out[0], float(into @ out))
-    if not 1e-6 < abs(turn) < math.radians(SHARPEST_DEG):
+    if not 1e-6 < abs(turn) < math.radians(179):  # sharper ones are flown on the spot
         return corner[None]
     tangent_m = min(radius_m * math.tan(abs(turn) / 2), float(lengths.min()) / 2)
     radius_m = tangent_m / math.tan(abs(turn) / 2)
     left = np.array([-into[1], into[0]]) * math.copysign(1.0, turn)
-    angles = np.linspace(0, abs(turn), 2 + int(math.degrees(abs(turn)) / ARC_STEP_DEG))[:, None]
+    every_2_deg = 2 + int(math.degrees(abs(turn)) / 2)
+    angles = np.linspace(0, abs(turn), every_2_deg)[:, None]
     start = corner - tangent_m * into
     return np.asarray(start + radius_m * (np.sin(angles) * into + (1 - np.cos(angles)) * left))
 
@@ -100,8 +98,11 @@ def direction(course_deg: float) -> Array:
 def horizon_errors(std_deg: float, times_s: Array, rng: np.random.Generator) -> Array:
     """True minus reported pitch and roll (N, 2) along a route, deg, at evenly spaced times (N,). A
     first-order Gauss-Markov process of this standard deviation."""
-    step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
-    return std_deg * gauss_markov(step_s / HORIZON_TIME_S, len(times_s), rng)
+    return std_deg * gauss_markov(_step_s(times_s) / HORIZON_TIME_S, len(times_s), rng)
+
+
+def _step_s(times_s: Array) -> float:
+    return float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
 
 
 def camera_attitude(

@@ -8,30 +8,34 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import UsageError
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.variants import Table, Variant, make_variant
 from orthonav.ground.simulate.motion import direction, gauss_markov
 
 RATE_HZ = 5.0  # rate of solutions: the default of autopilots
-ERROR_STD_M, ERROR_TAU_S = 2.0, 180.0  # slowly varying, per axis: ionosphere, orbits
-NOISE_STD_M = 0.3  # noise per axis from solution to solution
-MULTIPATH_PER_HOUR, MULTIPATH_M, MULTIPATH_S = 20.0, 6.0, (5.0, 60.0)
-"""Rate, largest size and duration of steps by multipath."""
-VELOCITY_NOISE_MPS, VELOCITY_DRIFT_MPS, VELOCITY_TAU_S = 0.05, 0.08, 60.0
-"""Noise and slowly varying error of the Doppler velocity per axis."""
-LATENCY_S = 0.12  # age of a solution at its timestamp, of which the receiver does not know
-STATED_STD_M = 1.5  # less than its error, as receivers do
-SATELLITES = 16
-_LIMITS = {  # largest values of a receiver's fields; the least is 0
-    "std_m": 100.0,
-    "at_s": 1e9,
-    "metres": 1e6,
-    "mps": 1e3,
-    **dict.fromkeys(("over_s", "every_s", "for_s"), 1e9),
-}
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ReceiverErrors:
+    """Errors of a receiver without a fault; its slowly varying one is `Good.std_m`."""
+
+    slow_s: float = 180.0  # time constant of the slow error: ionosphere, orbits
+    noise_std_m: float = 0.3  # per axis from solution to solution
+    multipath_per_hour: float = 20.0
+    max_multipath_m: float = 6.0
+    multipath_s: tuple[float, float] = (5.0, 60.0)  # least and longest duration
+    velocity_noise_mps: float = 0.05  # of the Doppler velocity, per axis
+    velocity_drift_mps: float = 0.08  # its slowly varying error
+    velocity_drift_s: float = 60.0  # time constant of that
+    latency_s: float = 0.12  # age of a solution at its timestamp, unknown to the receiver
+    stated_std_m: float = 1.5  # less than its error, as receivers do
+    satellites: int = 16
+
+
+ERRORS = ReceiverErrors()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +53,15 @@ class GnssTrack:
 class Good:
     """A receiver without a fault; `std_m` is that of its slowly varying error per axis."""
 
-    std_m: float = ERROR_STD_M
+    std_m: float = 2.0
 
     def __post_init__(self) -> None:
-        for name, most in _LIMITS.items():
+        limits = {"std_m": 100.0, "at_s": 1e9, "metres": 1e6, "mps": 1e3}
+        limits |= dict.fromkeys(("over_s", "every_s", "for_s"), 1e9)
+        for name, most in limits.items():
             value = getattr(self, name, 0.0)
             if not 0 <= value <= most:
-                raise FlightError(f"GNSS receiver: {name} must be 0 to {most:g}, got {value:g}")
+                raise UsageError(f"GNSS receiver: {name} must be 0 to {most:g}, got {value:g}")
 
     def _with_fault(self, track: GnssTrack) -> GnssTrack:
         return track
@@ -179,22 +185,24 @@ def solutions(
     end_s = float(times_s[-1])
     count = int((end_s - times_s[0]) * rate_hz) + 1
     times = times_s[0] + np.arange(count) / rate_hz
-    place = _interpolated(times - LATENCY_S, times_s, places_en_m)
-    before = _interpolated(times - LATENCY_S - 0.5, times_s, places_en_m)
-    after = _interpolated(times - LATENCY_S + 0.5, times_s, places_en_m)
+    before, place, after = (
+        _interpolated(times - ERRORS.latency_s + off_s, times_s, places_en_m)
+        for off_s in (-0.5, 0.0, 0.5)
+    )
     step_s = 1 / rate_hz
-    slow = receiver.std_m * gauss_markov(step_s / ERROR_TAU_S, count, rng)
-    place = place + slow + _multipath(times, rng) + rng.normal(0, NOISE_STD_M, (count, 2))
-    velocity = after - before + rng.normal(0, VELOCITY_NOISE_MPS, (count, 2))
-    velocity += VELOCITY_DRIFT_MPS * gauss_markov(step_s / VELOCITY_TAU_S, count, rng)
+    slow = receiver.std_m * gauss_markov(step_s / ERRORS.slow_s, count, rng)
+    place = place + slow + _multipath(times, rng) + rng.normal(0, ERRORS.noise_std_m, (count, 2))
+    velocity = after - before + rng.normal(0, ERRORS.velocity_noise_mps, (count, 2))
+    drift = gauss_markov(step_s / ERRORS.velocity_drift_s, count, rng)
+    velocity += ERRORS.velocity_drift_mps * drift
     good = GnssTrack(
         times,
         times.copy(),
         place,
         velocity,
         np.full(count, 3),
-        np.full(count, STATED_STD_M),
-        np.full(count, SATELLITES),
+        np.full(count, ERRORS.stated_std_m),
+        np.full(count, ERRORS.satellites),
     )
     return receiver._with_fault(good)
 
@@ -219,10 +227,10 @@ def samples_of(track: GnssTrack, frame: LocalFrame) -> Iterator[GnssSample]:
 def _multipath(times: Array, rng: np.random.Generator) -> Array:
     off = np.zeros((len(times), 2))
     hours = (times[-1] - times[0]) / 3600
-    for _ in range(rng.poisson(MULTIPATH_PER_HOUR * hours)):
+    for _ in range(rng.poisson(ERRORS.multipath_per_hour * hours)):
         begin = rng.uniform(times[0], times[-1])
-        during = (times >= begin) & (times < begin + rng.uniform(*MULTIPATH_S))
-        off[during] += rng.uniform(0, MULTIPATH_M) * direction(rng.uniform(0, 360))
+        during = (times >= begin) & (times < begin + rng.uniform(*ERRORS.multipath_s))
+        off[during] += rng.uniform(0, ERRORS.max_multipath_m) * direction(rng.uniform(0, 360))
     return off
 
 

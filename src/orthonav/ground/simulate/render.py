@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import UsageError
 from orthonav.core.geo.camera import (
     Camera,
     camera_from_en,
@@ -22,11 +22,7 @@ from orthonav.core.geo.camera import (
     undistort,
 )
 
-STRIDE_PX = 1.0  # steps along a ray, in pixels of the heights
-HALVINGS = 8  # halvings of the step in which a ray meets the ground
-MAX_STEPS = 4000
-MAX_HALVED = 5  # imagery is averaged down to 1/32 at most where a pixel sees much ground
-SKY = 200.0  # grey level where a ray meets no ground
+MAX_STEPS = 4000  # along a ray, each about a pixel of the heights
 Array = NDArray[np.float64]
 
 
@@ -57,9 +53,9 @@ class ViewEffects:
         limits = {"exposure_std": 1.0, "blur_px": 50.0, "noise_std": 128.0}
         for name, limit in limits.items():
             if not 0 <= getattr(self, name) <= limit:
-                raise FlightError(f"{name} must be 0 to {limit:g}, got {getattr(self, name)}")
+                raise UsageError(f"{name} must be 0 to {limit:g}, got {getattr(self, name)}")
         if not 1 <= self.jpeg_quality <= 100:
-            raise FlightError(f"JPEG quality must be 1 to 100, got {self.jpeg_quality}")
+            raise UsageError(f"JPEG quality must be 1 to 100, got {self.jpeg_quality}")
 
 
 def render_view(
@@ -203,7 +199,7 @@ def met(heights: Raster, rays: Array, position_m: Array) -> Array:
     near = np.maximum((position_m[2] - high - 0.1) / down, 0.0)
     far = (position_m[2] - low + 0.1) / down
     with np.errstate(invalid="ignore"):
-        steps = np.ceil((far - near) * along / (STRIDE_PX * heights.pixel_m))
+        steps = np.ceil((far - near) * along / heights.pixel_m)
     steps = np.clip(np.nan_to_num(steps), 1, MAX_STEPS)
     step = (far - near) / steps
 
@@ -223,7 +219,7 @@ def met(heights: Raster, rays: Array, position_m: Array) -> Array:
         left = left[~hit & (number < steps[left])]
     hits = np.flatnonzero(found)
     first, last, there = before[hits], before[hits] + step[hits], flat[hits]
-    for _ in range(HALVINGS):
+    for _ in range(8):  # halvings of the step in which a ray meets the ground
         middle = (first + last) / 2
         hit = below(middle, there)
         first, last = np.where(hit, first, middle), np.where(hit, middle, last)
@@ -253,9 +249,10 @@ def coloured(
     imagery: Raster, ground_m: Array, camera: Camera, position_m: Array
 ) -> NDArray[np.uint8]:
     """The picture (H, W) or (H, W, C) of ground points (h, w, 3), of one or more rays a pixel.
-    Where a ray stands for more than a pixel of the imagery, this is averaged."""
-    level = np.minimum(halved_for(ground_m, camera, position_m, imagery.pixel_m), MAX_HALVED)
-    values = np.full((*ground_m.shape[:2], *imagery.values.shape[2:]), SKY)
+    Where a ray stands for more than a pixel of the imagery, this is averaged, down to 1/32 at most.
+    The sky has the grey level 200."""
+    level = np.minimum(halved_for(ground_m, camera, position_m, imagery.pixel_m), 5)
+    values = np.full((*ground_m.shape[:2], *imagery.values.shape[2:]), 200.0)
     for number in range(int(level.max(initial=-1)) + 1):
         if number:
             imagery = imagery.halved()

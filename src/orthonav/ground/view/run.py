@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
+from orthonav.core.errors import FlightError, MissingFileError, OrthonavError, UsageError
 from orthonav.core.files import with_paths
 from orthonav.core.flight import read_truth
 from orthonav.core.flight.fixes import STATES, flight_digest
@@ -367,7 +367,7 @@ def open_run(request: ViewRequest) -> Run:
     Raises an `OrthonavError` where a given file is missing or damaged.
     """
     if not 0 < request.radius_m < 1e7:
-        raise FlightError(f"radius_m must be above 0, got {request.radius_m}")
+        raise UsageError(f"radius_m must be above 0, got {request.radius_m}")
     opened = open_map(request.map_path)
     sheet = SheetImagery(opened)
     feed = _feed(request)
