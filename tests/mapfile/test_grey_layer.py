@@ -134,10 +134,9 @@ def test_threads_may_share_it(opened):
             grey = layer.read(0, row, col, 40, 40)[0]
             wanted = expected[row : row + 40, col : col + 40]
             np.testing.assert_array_equal(grey[: wanted.shape[0], : wanted.shape[1]], wanted)
-        return layer._cache.held_bytes
 
     with ThreadPoolExecutor(4) as pool:
-        assert max(pool.map(check, range(4))) <= 4 * CHUNK_PX**2
+        list(pool.map(check, range(4)))
 
 
 def test_a_map_without_a_layer(tmp_path):

@@ -1,8 +1,8 @@
 """The terrain layer of a map: what was encoded is read, and nothing damaged is believed."""
 
-import zlib
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -116,17 +116,21 @@ def test_any_heights_come_back(rows, cols, seed, holes):
     np.testing.assert_allclose(found, heights, atol=0.051)
 
 
-SIZE = CHUNK * CHUNK
+def png(values):
+    return cv2.imencode(".png", values)[1].tobytes()
+
+
+SIDES = CHUNK, CHUNK
+NOISE = png(np.random.default_rng(0).integers(1, 500, SIDES).astype(np.uint16))
 DAMAGED = {
-    "not compressed": b"\0" * 40,
-    "too short": zlib.compress(bytes(2 * SIZE - 1)),
-    "between": zlib.compress(bytes(2 * SIZE + 1)),
-    "too long": zlib.compress(bytes(2 * SIZE + SIZE // 8 + 1)),
-    "a bomb": zlib.compress(bytes(10**8)),
-    "more after it": zlib.compress(bytes(2 * SIZE)) + b"x",
-    "cut": zlib.compress(np.random.default_rng(0).bytes(2 * SIZE))[:-9],
-    "many bytes": bytes(4 * SIZE + 2000),
-    "too high": zlib.compress(b"\xfe" * SIZE + b"\xff" * SIZE),
+    "not a PNG": b"\0" * 40,
+    "another size": png(np.ones((CHUNK, CHUNK + 1), np.uint16)),
+    "a claim of gigabytes": NOISE[:16] + b"\0\0\xff\xff" * 2 + NOISE[24:],
+    "8 bits": png(np.ones(SIDES, np.uint8)),
+    "colours": png(np.ones((*SIDES, 3), np.uint16)),
+    "cut": NOISE[:-60],
+    "many bytes": NOISE + bytes(4 * CHUNK * CHUNK + 2000),
+    "too high": png(np.full(SIDES, 65_535, np.uint16)),
 }
 
 
@@ -165,6 +169,11 @@ def test_impossible_layers_are_refused(tmp_path, change):
     path = write(tmp_path / "a.onav", info=replace(INFO, **change))
     with pytest.raises(MapFileError, match="impossible terrain layer"):
         open_map(path)
+
+
+def test_heights_of_another_codec_are_named():
+    with pytest.raises(MapFileError, match="heights as delta-zlib, png is read; build it again"):
+        TerrainInfo.from_plain(INFO.to_plain() | {"codec": "delta-zlib"})
 
 
 def test_what_the_source_was_like_is_optional(tmp_path):
