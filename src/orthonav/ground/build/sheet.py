@@ -382,7 +382,6 @@ class SheetReader:
         workers = usable_cores() if workers is None else workers
         if not represent.TABLE[self._recipe["name"]].flies:
             workers = 1  # one network in memory, which uses threads itself
-
         raster = self.mosaic.grid_sheet(self.area.frame, self.grid, threads=1)
         work = functools.partial(self._read_block, raster, cache)
         with (
@@ -404,7 +403,7 @@ class SheetReader:
         """Cache in `work`, or, if there are many blocks, beside the map; else None."""
         if work is None and len(self._jobs) < MIN_CACHED_BLOCKS:
             return None
-        folder = out.with_name(f"{out.name}.work") if work is None else work / out.name
+        folder = work / f"blocks-{out.name}" if work else out.with_name(f"{out.name}.work")
         return BlockCache(folder, self._request())
 
     @property

@@ -20,7 +20,6 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.dtypes import dtype_rev, typename_fwd
 from rasterio.enums import Resampling
-from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 from rasterio.windows import Window
@@ -467,14 +466,8 @@ class SheetRaster:
         stretch = self._mosaic.stretches[lattice.members[0]]
         picture = _in_colours(values if stretch is None else stretch.apply(values), colours)
         _fill_holes(picture, mask)
-        try:
-            warped = self._resampled(lattice, picture, transform, target, shape, True)
-            warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
-        except RasterioError as error:
-            raise ImageryError(
-                "orthophoto does not fit its coordinate system; assign the correct one (for "
-                f"example: gdal_edit.py -a_srs EPSG:2154 FILE): {lattice.first.path}"
-            ) from error
+        warped = self._resampled(lattice, picture, transform, target, shape, True)
+        warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
         return warped, warped_mask[..., 0]
 
     def _resampled(
@@ -496,19 +489,27 @@ class SheetRaster:
         # GDAL treats a raster that starts at exactly (0, 0) with pixels of 1 m, as a window in the
         # middle of a sheet may, as one without georeference.
         origin_m = 1_000_000.0
-        reproject(
-            bands,
-            out,
-            src_transform=transform,
-            src_crs=first.system,
-            dst_transform=Affine.translation(origin_m, origin_m) * target,
-            dst_crs=f"{self._frame.proj4} +x_0={origin_m} +y_0={origin_m}",
-            resampling=Resampling.cubic if is_picture else Resampling.bilinear,
-            num_threads=self._threads,
-            warp_mem_limit=64,
-            XSCALE=scale,
-            YSCALE=scale,
-        )
+        try:
+            reproject(
+                bands,
+                out,
+                src_transform=transform,
+                src_crs=first.system,
+                dst_transform=Affine.translation(origin_m, origin_m) * target,
+                dst_crs=f"{self._frame.proj4} +x_0={origin_m} +y_0={origin_m}",
+                resampling=Resampling.cubic if is_picture else Resampling.bilinear,
+                num_threads=self._threads,
+                warp_mem_limit=64,
+                XSCALE=scale,
+                YSCALE=scale,
+            )
+        except MemoryError:
+            raise
+        except Exception as error:  # rasterio exports no class of the errors of GDAL it raises here
+            raise ImageryError(
+                "orthophoto does not fit its coordinate system; assign the correct one (for "
+                f"example: gdal_edit.py -a_srs EPSG:2154 FILE): {first.path}"
+            ) from error
         return np.ascontiguousarray(out.transpose(1, 2, 0))
 
     def _source_window(
