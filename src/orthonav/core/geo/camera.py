@@ -68,9 +68,8 @@ class Camera:
     def _impossible(self) -> str:
         mask, size = self.mask, (self.width_px, self.height_px)
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
-        allowed, names = (0, 4, 5), "k1,k2,p1,p2[,k3]"
-        if self.model == "fisheye":
-            allowed, names = (0, 4), "k1,k2,k3,k4"
+        is_fisheye = self.model == "fisheye"
+        names = "k1,k2,k3,k4" if is_fisheye else "k1,k2,p1,p2[,k3]"
         if not all(1 <= side <= 65_535 and side == int(side) for side in size):
             return "width_px and height_px must be whole, 1 to 65535"
         if mask is not None and (mask.dtype != np.uint8 or mask.shape != size[::-1]):
@@ -84,7 +83,7 @@ class Camera:
             return "focal_std must be a fraction, 0 to 0.5"
         if self.model not in ("brown", "fisheye"):
             return f"model must be brown or fisheye, got '{self.model}'"
-        known = len(self.distortion) in allowed
+        known = len(self.distortion) in ((0, 4) if is_fisheye else (0, 4, 5))
         return "" if known else f"distortion of a {self.model} lens must be empty or {names}"
 
     def plausible(self) -> "Camera":

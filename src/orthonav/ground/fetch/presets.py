@@ -194,7 +194,7 @@ def _preset(name: str, values: dict[str, Any]) -> Preset:
     layers: dict[str, PresetLayer] = {}
     for entry in values.get("layers", [{"id": CURRENT}]):
         for year in map(str, entry.get("years", [""])):
-            filled = {
+            filled: dict[str, Any] = {
                 key: value.replace("{year}", year) if isinstance(value, str) else value
                 for key, value in entry.items()
                 if key != "years"
