@@ -41,7 +41,7 @@ from orthonav.ground.fetch.service import (
 from orthonav.ground.fetch.urls import TOKEN, Secret, checked_url, linked, origin_of, shown
 from orthonav.ground.fetch.web import Web
 from orthonav.ground.imagery.mosaic import WHOLLY_VALID
-from orthonav.ground.imagery.source import GDAL_ERRORS, quiet
+from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 
 MAX_ITEMS = 500  # files of one fetch: an open dataset each, per thread
@@ -122,7 +122,9 @@ def _opened(web: Web, url: str, level: int | None = None) -> Iterator[Any]:
             rasterio.open(path, driver="GTiff", **options) as file,
         ):
             yield file
-    except GDAL_ERRORS as error:
+    except (FetchError, MemoryError):
+        raise
+    except Exception as error:  # whatever GDAL raises may quote the address with its key
         reason = web.redacted(reason_of(error)[0])
         raise FetchError(f"not a GeoTIFF that can be read ({reason}): {shown(url)}") from None
 

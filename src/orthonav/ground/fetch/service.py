@@ -23,7 +23,6 @@ from orthonav.ground.fetch.grid import CellGrid, Selection
 from orthonav.ground.fetch.presets import HEIGHTS_FORMAT, Provenance, SourceSpec
 from orthonav.ground.fetch.urls import checked_url, shown
 from orthonav.ground.fetch.web import TIMEOUTS_S, USER_AGENT, Web, is_temporary
-from orthonav.ground.imagery.source import GDAL_ERRORS
 
 GDAL_OPTIONS = {
     "GDAL_HTTP_CONNECTTIMEOUT": TIMEOUTS_S[0],
@@ -149,7 +148,9 @@ def _read(web: Web, description: str, window: Window, where: str) -> NDArray[Any
         try:
             with rasterio.Env(**GDAL_OPTIONS), rasterio.open(description) as dataset:
                 return np.asarray(dataset.read(window=window))
-        except GDAL_ERRORS as error:
+        except MemoryError:
+            raise
+        except Exception as error:  # whatever GDAL raises may quote the address with its key
             reason, is_worth_it = reason_of(error)
         if not is_worth_it:
             break

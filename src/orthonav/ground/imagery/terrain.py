@@ -259,7 +259,9 @@ class Dem:
                 ) as warped,
             ):
                 return self._metres(warped.read(1, masked=True))
-        except GDAL_ERRORS as error:
+        except MemoryError:
+            raise
+        except Exception as error:  # rasterio exports no class of the errors of GDAL it raises here
             raise unreadable(self.path, error, "terrain file") from error
 
     def _above_sea(self, heights: Array, lat_deg: Array, lon_deg: Array) -> Array:
