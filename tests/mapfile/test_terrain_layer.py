@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from maps import arrays, manifest
 
@@ -13,6 +13,7 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.mapfile import open_map, terrain, write_map
 from orthonav.core.mapfile.manifest import SheetInfo, TerrainInfo
+from orthonav.core.mapfile.reader import blob_parts
 from orthonav.core.mapfile.terrain import (
     TerrainLayer,
     decode_terrain,
@@ -47,18 +48,13 @@ def chunks(heights):
     ]
 
 
-def parts_of(blobs):
-    ends = np.cumsum([0, *map(len, blobs)]).astype(np.int64)
-    return {DATA: np.frombuffer(b"".join(blobs), np.uint8), OFFSETS: ends}
-
-
 def with_terrain(info=INFO):
     plain = manifest()
     return replace(plain, sheets=(replace(plain.sheets[0], terrain=info),))
 
 
 def write(path, blobs=None, info=INFO, **parts):
-    found = parts_of(chunks(samples()) if blobs is None else blobs)
+    found = blob_parts(DATA, OFFSETS, chunks(samples()) if blobs is None else blobs)
     write_map(path, with_terrain(info), {**arrays(), **found, **parts})
     return path
 
@@ -142,6 +138,17 @@ def test_a_damaged_chunk_is_an_error(tmp_path, name):
     assert np.isfinite(layer.at_en_m([-40.0, 30.0]))
     with pytest.raises(MapFileError, match=r"terrain layer is damaged \(chunk 1, 3: .*a\.onav"):
         layer.at_en_m([240.0, 0.0])
+
+
+@settings(max_examples=200)
+@given(st.integers(0, len(NOISE)), st.integers(0, 9), st.binary(max_size=9))
+def test_whatever_is_done_to_a_chunk_only_our_errors_come_out(at, removed, added):
+    changed = NOISE[:at] + added + NOISE[at + removed :]
+    try:
+        found = decode_terrain(np.frombuffer(changed, np.uint8), SIDES, INFO)
+    except MapFileError:
+        return
+    assert found.shape == SIDES
 
 
 @pytest.mark.parametrize(
