@@ -240,19 +240,9 @@ class Manifest:
 
     def to_json(self) -> str:
         """Canonical, with the SHA-256 of everything else in `manifest_sha256`."""
-        plain = {
-            "format": FORMAT,
-            "schema": SCHEMA,
-            "created_by": self.created_by,
-            "recipe": self.recipe,
-            "sheets": [sheet.to_plain() for sheet in self.sheets],
-            "imagery": list(self.imagery),
-            "view": self.view,
-            "confidence": self.confidence,
-            "radius_m": self.radius_m,
-            "registration": self.registration,
-            "parts": self.parts,
-        }
+        sheets = [sheet.to_plain() for sheet in self.sheets]
+        plain = vars(self) | {"format": FORMAT, "schema": SCHEMA, "sheets": sheets}
+        del plain["sha256"]
         return _canonical({**plain, "manifest_sha256": _digest(plain)})
 
     @classmethod
