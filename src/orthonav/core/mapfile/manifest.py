@@ -242,7 +242,7 @@ class Manifest:
         """Canonical, with the SHA-256 of everything else in `manifest_sha256`."""
         sheets = [sheet.to_plain() for sheet in self.sheets]
         plain = vars(self) | {"format": FORMAT, "schema": SCHEMA, "sheets": sheets}
-        del plain["sha256"]
+        plain.pop("sha256", None)  # set only where one was read
         return _canonical({**plain, "manifest_sha256": _digest(plain)})
 
     @classmethod
