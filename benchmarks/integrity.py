@@ -39,7 +39,6 @@ from orthonav.core.localize.confidence import (
     features_of,
 )
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.build.calibrate import LEAST
 from orthonav.ground.evaluate.statistics import calibrate, upper_bound
 
 NAME = "integrity"
@@ -122,7 +121,7 @@ def fit_judge(features: Array, right: Mask) -> RegisteredConfidence:
         fits = expit(parameters[0] + scaled[:, :-ALONE] @ weights[:-ALONE])
         alone = expit(parameters[1] + scaled[:, -ALONE:] @ weights[-ALONE:])
         product = fits * alone
-        both = np.clip(product, LEAST, 1 - LEAST)
+        both = np.clip(product, 1e-9, 1 - 1e-9)
         value = -np.log(np.where(right, both, 1 - both)).mean()
         # A limited loss has no slope: with one, searches along a line would fail.
         slope = np.where(right, -1.0, both / (1 - both)) * (both == product) / len(right)

@@ -28,8 +28,8 @@ def test_a_service_and_its_layers_are_complete(name, monkeypatch):
     assert all(presets()[each].datum for each in (preset.terrain, preset.surface) if each)
     coarsest_m = 1 if preset.datum is None else 30
     for id_, layer in preset.layers.items():
-        assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= coarsest_m, id_
-        assert layer.options.layer or (preset.protocol == "stac" and layer.options.collection), id_
+        assert "{" not in f"{layer}" and 0.05 <= layer.finest_m <= coarsest_m, id_
+        assert layer.options.layer, id_
         assert layer.options.empty in (None, "black", "white"), id_
         assert (layer.options.max_zoom or 22) <= 22, id_
         assert (layer.date is None) == (id_ == CURRENT) or layer.date.partition("/")[0] in id_
@@ -74,11 +74,36 @@ def test_unknown_names_list_the_known_ones():
 
 
 def test_options_of_the_user_take_precedence():
-    terms = {"date": "2021-07", "licence": "mine", "attribution": "me"}
     asked = ImageryOptions(style="other", crs="EPSG:2154", gsd_m=1.0)
-    spec = parse_source("ign:2021", asked, **terms)
+    spec = parse_source("ign:2021", asked, date="2021-07")
     assert (spec.options.style, spec.options.crs, spec.options.gsd_m) == ("other", "EPSG:2154", 1)
-    assert {name: getattr(spec.provenance, name) for name in terms} == terms
+    assert spec.provenance.date == "2021-07"
+
+
+def test_rows_of_an_own_table_replace_those_of_the_same_name(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('[ign]\nprotocol = "wms"\nurl = "https://a.example/"\ncrs = "EPSG:2154"')
+    spec = parse_source("ign", ImageryOptions(), own=path)
+    assert spec.options.crs == "EPSG:2154" and spec.provenance.licence is None
+    assert parse_source("pdok", ImageryOptions(), own=path).protocol == "wmts"
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("[a", "cannot be used"),
+        ("a = 1", "cannot be used"),
+        ('[a]\nurl = "https://a/"', "protocol"),
+        ('[a]\nprotocol = "ftp"\nurl = "https://a/"', "protocol of a must be one of wmts"),
+        ('[a]\nprotocol = "wms"\nurl = "https://a/"\nlair = "b"', "lair"),
+        ('[a]\nprotocol = "wms"\nurl = "file:///etc/passwd"', "only http"),
+    ],
+)
+def test_unusable_tables_are_errors(tmp_path, text, words):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(FetchError, match=words):
+        parse_source("a", ImageryOptions(), own=path)
 
 
 def test_keys_come_from_the_environment_only(monkeypatch):

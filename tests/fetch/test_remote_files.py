@@ -162,7 +162,7 @@ def test_an_interface_with_a_search_in_pages(take, placed, catalogue):
     with servers.serving(servers.searching(catalogue, url, asked_for)) as server:
         url.append(server.url)
         time = "2021-01-01T00:00:00Z/2021-12-31T23:59:59Z"
-        result, path = take(f"stac:{server.url}/api/", gsd_m=None, time=time, collection="dop")
+        result, path = take(f"stac:{server.url}/api/", gsd_m=None, time=time, layer="dop")
     assert placed(path) > 0.2 and result.estimate.provenance.date == "2021-06-15/2021-06-16"
     assert terrain.tags(path)["ACQUISITION_DATE"] == "2021-06-15"
     assert len(asked_for) == 2
@@ -234,7 +234,7 @@ def test_a_terrain_preset_is_fetched_with_its_datum(catalogue, tmp_path, monkeyp
             url=f"{server.url}/api/", token_url=f"{server.url}/api/token",
         )  # fmt: skip
         monkeypatch.setattr(
-            "orthonav.ground.fetch.presets.presets", lambda: {"copernicus-dem": known}
+            "orthonav.ground.fetch.presets.presets", lambda *_: {"copernicus-dem": known}
         )
         spec = parse_source("copernicus-dem", ImageryOptions())
         area = Area.from_bounds(terrain.bounds(300))

@@ -18,6 +18,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile import layer as layer_module
 from orthonav.core.mapfile.layer import ChunkTable, part_names
+from orthonav.core.mapfile.reader import blob_parts
 from orthonav.ground.build.layer import GreyLayerWriter
 
 SHAPE, CHUNK_PX = (150, 210), 64
@@ -134,10 +135,9 @@ def test_threads_may_share_it(opened):
             grey = layer.read(0, row, col, 40, 40)[0]
             wanted = expected[row : row + 40, col : col + 40]
             np.testing.assert_array_equal(grey[: wanted.shape[0], : wanted.shape[1]], wanted)
-        return layer._cache.held_bytes
 
     with ThreadPoolExecutor(4) as pool:
-        assert max(pool.map(check, range(4))) <= 4 * CHUNK_PX**2
+        list(pool.map(check, range(4)))
 
 
 def test_a_map_without_a_layer(tmp_path):
@@ -245,9 +245,7 @@ def with_chunk(parts, number, **blobs):
         kind = {"jpeg": "", "mask": "mask_"}[name]
         all_blobs = blobs_of(parts, kind)
         all_blobs[number] = blob
-        ends = np.cumsum([0, *map(len, all_blobs)], dtype=np.int64)
-        changed[NAMES[f"{kind}bytes"]] = np.frombuffer(b"".join(all_blobs), dtype=np.uint8)
-        changed[NAMES[f"{kind}offsets"]] = ends
+        changed |= blob_parts(NAMES[f"{kind}bytes"], NAMES[f"{kind}offsets"], all_blobs)
     return changed
 
 

@@ -22,10 +22,10 @@ from orthonav.core.errors import (
     VariantError,
 )
 from orthonav.core.mapfile import open_map, signature, write_map
+from orthonav.core.mapfile.reader import map_digest
 from orthonav.core.mapfile.signature import (
     MAX_SERIAL,
     key_id,
-    map_digest,
     new_key,
     require_signature,
     sign_map,

@@ -1,11 +1,11 @@
 """The terrain layer of a map: what was encoded is read, and nothing damaged is believed."""
 
-import zlib
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from maps import arrays, manifest
 
@@ -13,6 +13,7 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.mapfile import open_map, terrain, write_map
 from orthonav.core.mapfile.manifest import SheetInfo, TerrainInfo
+from orthonav.core.mapfile.reader import blob_parts
 from orthonav.core.mapfile.terrain import (
     TerrainLayer,
     decode_terrain,
@@ -47,18 +48,13 @@ def chunks(heights):
     ]
 
 
-def parts_of(blobs):
-    ends = np.cumsum([0, *map(len, blobs)]).astype(np.int64)
-    return {DATA: np.frombuffer(b"".join(blobs), np.uint8), OFFSETS: ends}
-
-
 def with_terrain(info=INFO):
     plain = manifest()
     return replace(plain, sheets=(replace(plain.sheets[0], terrain=info),))
 
 
 def write(path, blobs=None, info=INFO, **parts):
-    found = parts_of(chunks(samples()) if blobs is None else blobs)
+    found = blob_parts(DATA, OFFSETS, chunks(samples()) if blobs is None else blobs)
     write_map(path, with_terrain(info), {**arrays(), **found, **parts})
     return path
 
@@ -116,17 +112,21 @@ def test_any_heights_come_back(rows, cols, seed, holes):
     np.testing.assert_allclose(found, heights, atol=0.051)
 
 
-SIZE = CHUNK * CHUNK
+def png(values):
+    return cv2.imencode(".png", values)[1].tobytes()
+
+
+SIDES = CHUNK, CHUNK
+NOISE = png(np.random.default_rng(0).integers(1, 500, SIDES).astype(np.uint16))
 DAMAGED = {
-    "not compressed": b"\0" * 40,
-    "too short": zlib.compress(bytes(2 * SIZE - 1)),
-    "between": zlib.compress(bytes(2 * SIZE + 1)),
-    "too long": zlib.compress(bytes(2 * SIZE + SIZE // 8 + 1)),
-    "a bomb": zlib.compress(bytes(10**8)),
-    "more after it": zlib.compress(bytes(2 * SIZE)) + b"x",
-    "cut": zlib.compress(np.random.default_rng(0).bytes(2 * SIZE))[:-9],
-    "many bytes": bytes(4 * SIZE + 2000),
-    "too high": zlib.compress(b"\xfe" * SIZE + b"\xff" * SIZE),
+    "not a PNG": b"\0" * 40,
+    "another size": png(np.ones((CHUNK, CHUNK + 1), np.uint16)),
+    "a claim of gigabytes": NOISE[:16] + b"\0\0\xff\xff" * 2 + NOISE[24:],
+    "8 bits": png(np.ones(SIDES, np.uint8)),
+    "colours": png(np.ones((*SIDES, 3), np.uint16)),
+    "cut": NOISE[:-60],
+    "many bytes": NOISE + bytes(4 * CHUNK * CHUNK + 2000),
+    "too high": png(np.full(SIDES, 65_535, np.uint16)),
 }
 
 
@@ -138,6 +138,17 @@ def test_a_damaged_chunk_is_an_error(tmp_path, name):
     assert np.isfinite(layer.at_en_m([-40.0, 30.0]))
     with pytest.raises(MapFileError, match=r"terrain layer is damaged \(chunk 1, 3: .*a\.onav"):
         layer.at_en_m([240.0, 0.0])
+
+
+@settings(max_examples=200)
+@given(st.integers(0, len(NOISE)), st.integers(0, 9), st.binary(max_size=9))
+def test_whatever_is_done_to_a_chunk_only_our_errors_come_out(at, removed, added):
+    changed = NOISE[:at] + added + NOISE[at + removed :]
+    try:
+        found = decode_terrain(np.frombuffer(changed, np.uint8), SIDES, INFO)
+    except MapFileError:
+        return
+    assert found.shape == SIDES
 
 
 @pytest.mark.parametrize(
@@ -165,6 +176,11 @@ def test_impossible_layers_are_refused(tmp_path, change):
     path = write(tmp_path / "a.onav", info=replace(INFO, **change))
     with pytest.raises(MapFileError, match="impossible terrain layer"):
         open_map(path)
+
+
+def test_heights_of_another_codec_are_named():
+    with pytest.raises(MapFileError, match="heights as delta-zlib, png is read; build it again"):
+        TerrainInfo.from_plain(INFO.to_plain() | {"codec": "delta-zlib"})
 
 
 def test_what_the_source_was_like_is_optional(tmp_path):

@@ -15,7 +15,7 @@ from orthonav.core.localize.confidence import LogisticConfidence, RegisteredConf
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.calibrate import RADIUS_STRIDES
+from orthonav.ground.build.calibrate import CALIBRATION
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
@@ -171,7 +171,7 @@ def test_the_manifest(small_ortho, tmp_path):
     manifest = open_map(request.out).manifest
     assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
     assert manifest.imagery[0]["date"] == "2019-06" and manifest.imagery[0]["name"] == "2019-06.tif"
-    assert manifest.radius_m == RADIUS_STRIDES * manifest.sheets[0].grid.stride_m
+    assert manifest.radius_m == CALIBRATION.radius_strides * manifest.sheets[0].grid.stride_m
     stages = ["imagery", "learn", "calibrate", "calibrate registration"]
     assert list(dict.fromkeys(stage for stage, _ in calls)) == stages
     assert all(0 <= share <= 1 for _, share in calls) and calls[-1] == (stages[-1], 1.0)

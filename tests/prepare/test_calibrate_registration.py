@@ -10,7 +10,7 @@ from helpers import textured
 from orthonav.core.localize.confidence import USUAL_CONFIDENCE
 from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.build.calibrate import FLOOR_PX
+from orthonav.ground.build.calibrate import CALIBRATION
 
 GREY = textured((240, 240), 11)
 
@@ -42,7 +42,7 @@ def test_a_second_date_sets_the_floor_of_a_map(small):
 def test_a_uniform_map_has_the_usual_confidence(small):
     plain = small(np.full((200, 200), 99, np.uint8))
     assert plain["confidence"] == USUAL_CONFIDENCE.to_plain()
-    assert plain["position_floor_px"] == FLOOR_PX
+    assert plain["position_floor_px"] == CALIBRATION.floor_px
 
 
 @pytest.mark.long
@@ -51,5 +51,5 @@ def test_a_uniform_map_has_the_usual_confidence(small):
 )
 def test_a_second_date_without_the_ground_sets_no_floor(small, caplog, other, warns):
     with caplog.at_level(logging.WARNING):
-        assert small(GREY[20:220, 20:220], other)["position_floor_px"] == FLOOR_PX
+        assert small(GREY[20:220, 20:220], other)["position_floor_px"] == CALIBRATION.floor_px
     assert ("other dates" in caplog.text) == warns

@@ -34,7 +34,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.core.mapfile.signature import map_digest
+from orthonav.core.mapfile.reader import map_digest
 from orthonav.core.records import Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings import SourceOptions, open_source, source_kind

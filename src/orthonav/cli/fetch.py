@@ -20,21 +20,21 @@ from orthonav.cli.version import require_extras
 from orthonav.core.errors import FetchError, UsageError
 
 if TYPE_CHECKING:
-    from orthonav.ground.fetch.presets import ImageryOptions
     from orthonav.ground.fetch.run import CostEstimate, FetchRequest, FetchResult
 
 log = logging.getLogger(__name__)
 EXAMPLE = "--route route.kml --source ign --out ortho.tif"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
-    *("--layer", "--time", "--date", "--key-env", "--cache", "--no-terrain", "--with-surface"),
-    "--json",
+    *("--layer", "--time", "--date", "--no-terrain", "--with-surface", "--json"),
 )
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    text = "a service by name, such as ign:2021, or wmts|wms|wcs|xyz|tms|stac|cog:https://..."
+    text = "a service by name, such as ign:2021, or wmts|wms|wcs|xyz|stac|cog:https://..."
     parser.add_argument("--source", metavar="NAME[:YEAR]|PROTOCOL:ADDRESS", help=text)
+    text = "table of services of your own, as in docs/imagery.md"
+    parser.add_argument("--services", type=Path, metavar="FILE.toml", help=text)
     parser.add_argument("--list", action="store_true", help="list the services known by name")
     parser.add_argument("--out", type=Path, metavar="ORTHO.tif", help="GeoTIFF to write")
     text = "omit the terrain model that is written beside the imagery, as ORTHO_dem.tif"
@@ -48,66 +48,29 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_area(group)
     text = "width of the margin that is fetched around the area (default 200)"
     group.add_argument("--margin-m", type=float, default=200.0, help=text)
-    _add_imagery(parser)
-
-    add = parser.add_argument_group("output file").add_argument
-    add("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
-    add("--licence", help="licence of the imagery")
-    add("--attribution", help="attribution that the licence requires")
-    formats = ("jpeg", "deflate")
-    text = "compression of the GeoTIFF (default jpeg)"
-    add("--compress", choices=formats, default="jpeg", help=text)
-    add("--quality", type=int, default=90, help="quality of JPEG, 1 to 100 (default 90)")
-
-    group = parser.add_argument_group("requests")
-    add_options(group, "--allow-holes")
-    add = group.add_argument
-    add("--key-env", metavar="VARIABLE", help="environment variable with the key for {key}")
-    add("--parallel", type=int, default=4, help="most requests at the same time (default 4)")
-    text = "most repetitions of a failed request (default 5)"
-    add("--retries", type=int, default=5, help=text)
-    text = "refuse to fetch more tiles than this (default 50000)"
-    add("--max-tiles", type=int, default=50_000, help=text)
-    text = "refuse to fetch more than this (default 4000)"
-    add("--max-mb", type=float, default=4000.0, help=text)
-    text = "folder that stores fetched tiles (default: beside --out, removed at the end)"
-    add("--cache", type=Path, metavar="DIR", help=text)
-
-
-def _add_imagery(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("imagery")
     text = "ground resolution, metres per pixel: the service's next finer one, or exactly this "
     text += "from a WMS (default 0.5; the files' own from stac and cog)"
     add_options(group, "--gsd-m", help=text)
     add = group.add_argument
-    add("--zoom", help="zoom level or tile matrix instead of --gsd-m")
-    add("--layer", help="layer of the service")
-    add("--style", help="style of the layer")
-    add("--format", help="media type, such as image/jpeg or image/png")
-    add("--crs", type=str.upper, help="coordinate system, such as EPSG:2154, if there is a choice")
-    add("--matrix-set", help="tile matrix set of a WMTS")
+    add("--layer", help="layer of the service, coverage of a WCS, or collection of a STAC")
     add("--time", help="ISO 8601 time, or interval A/B of a STAC")
-    versions = ("1.1.1", "1.3.0")
-    text = "version of WMS (default 1.3.0)"
-    add("--wms-version", dest="version", choices=versions, help=text)
-    text = "width of the service's tiles (xyz, tms) or images (wms)"
-    add("--service-tile-px", dest="tile_px", type=int, help=text)
-    add("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
-    add("--collection", help="collection of a STAC")
-    add("--asset", help="asset of each STAC item")
-    add_options(group, "--bands", help="bands of the files, such as 1,2,3 (stac, cog)")
-    text = "colour of missing imagery: large patches of exactly this colour are masked"
-    add("--nodata-colour", dest="empty", choices=("black", "white"), help=text)
+    add("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
+    add("--key-env", metavar="VARIABLE", help="environment variable with the key for {key}")
+    text = "compression of the GeoTIFF (default jpeg)"
+    add("--compress", choices=("jpeg", "deflate"), default="jpeg", help=text)
+    add_options(group, "--allow-holes")
+    text = "refuse to fetch more than this (default 2000)"
+    add("--max-mb", type=float, default=2000.0, help=text)
 
 
 def run(options: argparse.Namespace) -> None:
     if options.list:
-        _print_presets(options.json)
+        _print_presets(options)
         return
     if options.source is None or (options.out is None and not options.dry_run):
         raise UsageError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
-    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
     from orthonav.ground.fetch.run import estimate_fetch, fetch, holds_heights
 
     request = _request(options)
@@ -122,8 +85,6 @@ def run(options: argparse.Namespace) -> None:
     for kind, name in names.items():
         if name is not None and imagery:
             found |= _heights(options, request, kind, name)
-    if _falls_back(options, names) and imagery and not found:
-        found = _heights(options, request, "terrain", DEFAULT_TERRAIN)
     if options.json:
         more: dict[str, object] = dict.fromkeys(names)
         more |= {kind: {"out": str(out), **got.describe()} for kind, (out, got) in found.items()}
@@ -140,29 +101,21 @@ def _heights_presets(options: argparse.Namespace) -> dict[str, str | None]:
     """Presets of the heights that are fetched too, by kind; None where there are none."""
     from orthonav.ground.fetch.presets import DEFAULT_TERRAIN, surface_preset, terrain_preset
 
-    surface = surface_preset(options.source) if options.surface else None
-    terrain = terrain_preset(options.source) if options.terrain else None
+    asked = options.source, options.services
+    surface = surface_preset(*asked) if options.surface else None
+    terrain = terrain_preset(*asked) if options.terrain else None
     if surface is not None and terrain == DEFAULT_TERRAIN:
         terrain = None  # it includes trees and houses: the lower envelope of the surface is better
     return {"terrain": terrain, "surface": surface}
 
 
-def _falls_back(options: argparse.Namespace, names: dict[str, str | None]) -> bool:
-    """Whether the default terrain is fetched where the surface cannot be had."""
-    return bool(options.terrain and names["surface"] and names["terrain"] is None)
-
-
 def _print_estimate(
     options: argparse.Namespace, estimate: "CostEstimate", names: dict[str, str | None]
 ) -> None:
-    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
-
     if options.json:
         print_json(vars(estimate) | {"provenance": vars(estimate.provenance), **names})
     else:
         more = "".join(f", and {kind} from {name}" for kind, name in names.items() if name)
-        if _falls_back(options, names):
-            more += f" (terrain from {DEFAULT_TERRAIN} where that cannot be had)"
         print(f"would fetch {estimate.text()}{more}")
 
 
@@ -171,12 +124,13 @@ def _heights(
 ) -> "dict[str, tuple[Path, FetchResult]]":
     """Nothing, with a warning, where they cannot be had: the imagery is kept."""
     from orthonav.core.errors import AreaError, OutputError
-    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
+    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN, ImageryOptions, parse_source
     from orthonav.ground.fetch.run import fetch_heights, heights_request
 
     say(options, f"fetching the {kind} of {name}")
     try:
-        request = heights_request(imagery, kind, name)
+        spec = parse_source(name, ImageryOptions(), own=options.services)
+        request = heights_request(imagery, kind, spec)
         with progress(options) as shown:
             return {kind: (request.out, fetch_heights(request, shown))}
     except (FetchError, AreaError, OutputError) as error:
@@ -202,29 +156,19 @@ def _build_line(options: argparse.Namespace, heights: dict[str, Path]) -> str:
 
 
 def _request(options: argparse.Namespace) -> "FetchRequest":
-    from orthonav.ground.fetch.presets import parse_source
+    from orthonav.ground.fetch.presets import ImageryOptions, parse_source
     from orthonav.ground.fetch.run import FetchRequest
-    from orthonav.ground.fetch.web import RequestLimits
-
-    if not (1 <= options.parallel <= 16 and 1 <= options.quality <= 100 and options.retries >= 0):
-        raise UsageError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
-    terms = ("date", "licence", "attribution", "key_env")
-    named = {name: getattr(options, name) for name in terms}
-    more = {
-        "spec": parse_source(options.source, _imagery(options), **named),
-        "area": area_of(options),
-        "out": options.out or Path("none.tif"),
-        "limits": RequestLimits(parallel=options.parallel, attempts=options.retries + 1),
-    }
-    return FetchRequest(**given(options, FetchRequest) | more)
-
-
-def _imagery(options: argparse.Namespace) -> "ImageryOptions":
-    from orthonav.ground.fetch.presets import ImageryOptions
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise UsageError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
-    return ImageryOptions(**given(options, ImageryOptions))
+    named = {"date": options.date, "key_env": options.key_env, "own": options.services}
+    asked = ImageryOptions(**given(options, ImageryOptions))
+    more = {
+        "spec": parse_source(options.source, asked, **named),
+        "area": area_of(options),
+        "out": options.out or Path("none.tif"),
+    }
+    return FetchRequest(**given(options, FetchRequest) | more)
 
 
 def _summary(out: Path, result: "FetchResult") -> str:
@@ -243,13 +187,14 @@ def _summary(out: Path, result: "FetchResult") -> str:
     return "\n".join(f"{name:<12}{value}" for name, value in lines.items() if value)
 
 
-def _print_presets(as_json: bool) -> None:
+def _print_presets(options: argparse.Namespace) -> None:
     from orthonav.ground.fetch.presets import presets
 
-    if as_json:
-        print_json([asdict(preset) for preset in presets().values()])
+    known = presets(options.services).values()
+    if options.json:
+        print_json([asdict(preset) for preset in known])
         return
-    for preset in presets().values():
+    for preset in known:
         print(f"{preset.name}: {preset.title} ({preset.country})")
         print(f"  {', '.join(preset.layers)}")
         print(f"  {preset.licence}; {preset.attribution}")

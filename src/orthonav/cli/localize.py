@@ -374,7 +374,7 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
     for invalid logged options.
     """
     from orthonav.core.flight.mount import read_mount
-    from orthonav.core.mapfile.signature import map_digest
+    from orthonav.core.mapfile.reader import map_digest
     from orthonav.ground.recordings import LoggedFlight
     from orthonav.ground.recordings.flightlog import LOCALIZE_CHOICES, logged_options
 

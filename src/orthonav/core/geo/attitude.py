@@ -9,14 +9,11 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthonav.core.geo.camera import enu_from_camera
+from orthonav.core.geo.camera import ENU_FROM_NED, enu_from_camera
 
 Array = NDArray[np.float64]
 Angles = tuple[float, float, float]
 
-_ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
-# A gimbal's axes look ahead, right, down; a camera's x, y, z are right, down, ahead.
-_GIMBAL_FROM_CAMERA = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
 LOOKS_DOWN = (0.0, 0.0, 0.0)
 
@@ -88,12 +85,14 @@ def enu_from_gimbal_camera(yaw_pitch_roll_deg: ArrayLike) -> Array:
     """Of gimbal angles as DJI and Autel define them.
 
     At 0, 0, 0 the camera looks ahead; at pitch -90 down, the top of the image at yaw plus roll."""
-    return np.asarray(_ENU_FROM_NED @ ned_from_angles(yaw_pitch_roll_deg) @ _GIMBAL_FROM_CAMERA)
+    # A gimbal's axes look ahead, right, down; a camera's x, y, z are right, down, ahead.
+    gimbal_from_camera = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    return np.asarray(ENU_FROM_NED @ ned_from_angles(yaw_pitch_roll_deg) @ gimbal_from_camera)
 
 
 def enu_from_body_camera(ned_from_frd: Array, mount_deg: Angles = LOOKS_DOWN) -> Array:
     """`mount_deg`: yaw, pitch, roll in the body: 0 looks down, top forward; pitch 90 ahead."""
-    return np.asarray(_ENU_FROM_NED @ ned_from_frd @ _frd_from_camera(mount_deg))
+    return np.asarray(ENU_FROM_NED @ ned_from_frd @ _frd_from_camera(mount_deg))
 
 
 def enu_from_ros_camera(enu_from_flu: Array, mount_deg: Angles) -> Array:
@@ -106,12 +105,12 @@ def ned_wxyz_from_ros(wxyz: ArrayLike) -> Array | None:
     rotations, _ = rotations_of_wxyz(np.asarray(wxyz, dtype=np.float64).reshape(1, 4))
     if not len(rotations):
         return None
-    return wxyz_of_matrices(_ENU_FROM_NED.T @ rotations[0] @ _FRD_FROM_FLU)
+    return wxyz_of_matrices(ENU_FROM_NED.T @ rotations[0] @ _FRD_FROM_FLU)
 
 
 def ros_xyzw_from_ned(ned_from_frd: Array) -> Array:
     """x, y, z, w from forward-left-up to east-north-up: the inverse."""
-    enu_from_flu = _ENU_FROM_NED @ ned_from_frd @ _FRD_FROM_FLU
+    enu_from_flu = ENU_FROM_NED @ ned_from_frd @ _FRD_FROM_FLU
     return np.roll(wxyz_of_matrices(enu_from_flu), -1)
 
 
@@ -125,4 +124,4 @@ def rotations_of_wxyz(wxyz: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _frd_from_camera(mount_deg: Angles) -> Array:
-    return np.asarray(_ENU_FROM_NED.T @ enu_from_camera(*mount_deg))
+    return np.asarray(ENU_FROM_NED.T @ enu_from_camera(*mount_deg))

@@ -25,21 +25,8 @@ from orthonav.core.errors import CameraError
 from orthonav.core.files import StrPath
 
 Array = NDArray[np.float64]
-MAX_DIMENSION_PX = 65_535
-MAX_FOCAL_STD = 0.5
 FOV_STD = 0.05  # of the focal length by a stated field of view, relative
-MAX_OFF_MIDDLE = 0.1  # of the principal point, as a share of a side
-MAX_SKEW = 1e-3  # of the focal length
-MIN_FOCAL, MAX_FOCAL = 0.3, 20.0  # over a side
-MIN_FOV_DEG = 2.9  # that of 20 widths; 2.9 radians are 166 deg
-MAX_OBLONG = 0.05  # of pixels
-_STEPS = 50
-_CLOSE = 1e-9
-_EXACT = 1e-14
-_BROWN = (0, 4, 5), "k1,k2,p1,p2[,k3]"
-_HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-_BODY_FROM_CAMERA = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-_ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
 
 @dataclass(frozen=True)
@@ -81,9 +68,10 @@ class Camera:
     def _impossible(self) -> str:
         mask, size = self.mask, (self.width_px, self.height_px)
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
-        allowed, names = ((0, 4), "k1,k2,k3,k4") if self.model == "fisheye" else _BROWN
-        if not all(1 <= side <= MAX_DIMENSION_PX and side == int(side) for side in size):
-            return f"width_px and height_px must be whole, 1 to {MAX_DIMENSION_PX}"
+        is_fisheye = self.model == "fisheye"
+        names = "k1,k2,k3,k4" if is_fisheye else "k1,k2,p1,p2[,k3]"
+        if not all(1 <= side <= 65_535 and side == int(side) for side in size):
+            return "width_px and height_px must be whole, 1 to 65535"
         if mask is not None and (mask.dtype != np.uint8 or mask.shape != size[::-1]):
             got = f"got {mask.dtype} of {mask.shape[::-1]}"
             return f"mask must be uint8 of {size}, as Camera.masked makes it, {got}"
@@ -91,11 +79,11 @@ class Camera:
             return "has a value that is not finite"
         if self.fx_px <= 0 or self.fy_px <= 0:
             return "focal length must be above 0 px"
-        if not 0 <= self.focal_std <= MAX_FOCAL_STD:
-            return f"focal_std must be a fraction, 0 to {MAX_FOCAL_STD}"
+        if not 0 <= self.focal_std <= 0.5:
+            return "focal_std must be a fraction, 0 to 0.5"
         if self.model not in ("brown", "fisheye"):
             return f"model must be brown or fisheye, got '{self.model}'"
-        known = len(self.distortion) in allowed
+        known = len(self.distortion) in ((0, 4) if is_fisheye else (0, 4, 5))
         return "" if known else f"distortion of a {self.model} lens must be empty or {names}"
 
     def plausible(self) -> "Camera":
@@ -111,13 +99,13 @@ class Camera:
         apart = abs(fx / fy - 1)
         if self.unusual:
             return ""
-        if max(fx / wide, fy / high) < MIN_FOCAL or min(fx / wide, fy / high) > MAX_FOCAL:
-            far = f"focal length {fx:g} px is {fx / wide:.2g} widths, expected {MIN_FOCAL:g} to "
-            return far + f'{MAX_FOCAL:g} ("unusual": true states another one)'
-        if off > MAX_OFF_MIDDLE:
+        if max(fx / wide, fy / high) < 0.3 or min(fx / wide, fy / high) > 20:
+            far = f"focal length {fx:g} px is {fx / wide:.2g} widths, expected 0.3 to 20 "
+            return far + '("unusual": true states another one)'
+        if off > 0.1:
             middle = f"principal point {self.cx_px:g}, {self.cy_px:g} px is {off:.0%} of a side "
             return middle + 'from the middle ("unusual": true states a crop or a shifted lens)'
-        if apart > MAX_OBLONG + 2 / min(wide, high):  # sides are rounded
+        if apart > 0.05 + 2 / min(wide, high):  # sides are rounded
             differ = f"focal lengths {fx:g} and {fy:g} px differ by {apart:.0%} "
             return differ + '("unusual": true states pixels that are not square)'
         return ""
@@ -131,11 +119,10 @@ class Camera:
         It is that across the width of the picture; with `diagonal` that from corner to corner, as
         makers of cameras often state it. Stated fields of view are often those of the lens or of
         another mode: good to 5 %. Raises `CameraError`."""
-        if isinstance(fov_deg, str) or fov_deg is None or not MIN_FOV_DEG <= fov_deg < 180:
+        # 2.9 deg is that of a focal length of 20 widths; 2.9 radians are 166 deg.
+        if isinstance(fov_deg, str) or fov_deg is None or not 2.9 <= fov_deg < 180:
             turned = f"; {math.degrees(fov_deg):.1f} if these are radians" if fov_deg > 0 else ""
-            raise CameraError(
-                f"field of view must be {MIN_FOV_DEG} to 180 deg, got {fov_deg:g}{turned}"
-            )
+            raise CameraError(f"field of view must be 2.9 to 180 deg, got {fov_deg:g}{turned}")
         across_px = math.hypot(width_px, height_px) if diagonal else width_px
         focal_px = across_px / 2 / math.tan(math.radians(fov_deg) / 2)
         middle_px = width_px / 2, height_px / 2
@@ -167,7 +154,7 @@ class Camera:
                 f"{k[2, 0]:g}, {k[2, 1]:g}, {k[2, 2]:g}), as MATLAB writes it; transpose it, and "
                 "subtract 1 from cx and cy if they are MATLAB's, which counts pixels from 1"
             )
-        if abs(k[0, 1]) > MAX_SKEW * abs(k[0, 0]) or k[1, 0] or k[2].tolist() != [0, 0, 1]:
+        if abs(k[0, 1]) > 1e-3 * abs(k[0, 0]) or k[1, 0] or k[2].tolist() != [0, 0, 1]:
             raise CameraError(
                 f"camera matrix must be fx 0 cx, 0 fy cy, 0 0 1, without skew, got {k.tolist()}"
             )
@@ -280,7 +267,8 @@ def attitude_of(enu_from_camera: Array) -> tuple[float, float, float]:
     """Heading (0..360), pitch and roll in degrees: the inverse of `enu_from_camera`.
 
     At a pitch of +-90 only heading plus or minus roll is determined; the roll is then 0."""
-    yaw, pitch, roll = angles_of_ned(_ENU_FROM_NED.T @ enu_from_camera @ _BODY_FROM_CAMERA.T)
+    body_from_camera = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    yaw, pitch, roll = angles_of_ned(ENU_FROM_NED.T @ enu_from_camera @ body_from_camera.T)
     return math.degrees(yaw) % 360 % 360, math.degrees(pitch), math.degrees(roll)
 
 
@@ -303,7 +291,8 @@ def camera_from_en(yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: flo
 
 def counted_from_centres(homography: Array) -> Array:
     """A pixel-is-area homography (3, 3) for OpenCV, which counts from the first pixel's centre."""
-    return np.asarray(np.linalg.inv(_HALF_PIXEL) @ homography @ _HALF_PIXEL)
+    half_pixel = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    return np.asarray(np.linalg.inv(half_pixel) @ homography @ half_pixel)
 
 
 def axis_on_ground_en_m(
@@ -367,23 +356,17 @@ def footprint_en_m(
 def ground_en_m(
     camera: Camera, px: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
 ) -> Array:
-    """Flat ground (N, 2), m from below the camera, at image points (N, 2); NaN above it."""
-    return met_by_rays_en_m(camera_rays(camera, px), yaw_deg, pitch_deg, roll_deg, agl_m)
+    """Flat ground (N, 2), m from below the camera, at image points (N, 2); NaN at or above the
+    horizon and beyond the lens model."""
+    enu = camera_rays(camera, px) @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
+    down = np.where(enu[:, 2:3] < -1e-9, -enu[:, 2:3], np.nan)
+    return np.asarray(enu[:, :2] * (agl_m / down))
 
 
 def camera_rays(camera: Camera, px: Array) -> Array:
     """Rays (N, 3), 1 along the optical axis, of image points (N, 2); NaN beyond the lens model."""
     plane = (px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
     return np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
-
-
-def met_by_rays_en_m(
-    rays: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
-) -> Array:
-    """Flat ground (N, 2), m from below the camera; NaN for rays at or above the horizon."""
-    enu = rays @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
-    down = np.where(enu[:, 2:3] < -1e-9, -enu[:, 2:3], np.nan)
-    return np.asarray(enu[:, :2] * (agl_m / down))
 
 
 def _brown_distort(distortion: tuple[float, ...], xy: Array) -> Array:
@@ -398,7 +381,7 @@ def _brown_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
     k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
     ideal = np.array(xy, dtype=np.float64)
     with np.errstate(all="ignore"):
-        for _ in range(_STEPS):
+        for _ in range(50):
             x, y = ideal[..., 0], ideal[..., 1]
             r2 = x * x + y * y
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -407,7 +390,7 @@ def _brown_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
             dxy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
             dyy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
             error = _brown(distortion, ideal) - xy
-            if np.abs(error).max(initial=0.0) < _EXACT:
+            if np.abs(error).max(initial=0.0) < 1e-14:
                 break  # NaN never converges: points beyond the lens take all steps
             step = np.stack(
                 [
@@ -417,7 +400,7 @@ def _brown_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
                 axis=-1,
             )
             ideal = ideal - step / (dxx * dyy - dxy * dxy)[..., None]
-        found = np.abs(_brown(distortion, ideal) - xy).max(axis=-1) < _CLOSE
+        found = np.abs(_brown(distortion, ideal) - xy).max(axis=-1) < 1e-9
         found &= (ideal**2).sum(axis=-1) < _fold_r2(k1, k2, k3)
     ideal[~found] = np.nan
     return ideal
@@ -440,14 +423,14 @@ def _fisheye_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
     low, high = np.zeros_like(radius), np.full_like(radius, end)
     angle = np.clip(radius, 0.0, 0.9 * end)
     with np.errstate(all="ignore"):
-        for _ in range(_STEPS):  # Newton's method inside a bracket: far out the slope may vanish
+        for _ in range(50):  # Newton's method inside a bracket: far out the slope may vanish
             error = polynomial(angle) - radius
-            if np.abs(error).max(initial=0.0) < _EXACT:
+            if np.abs(error).max(initial=0.0) < 1e-14:
                 break
             low, high = np.where(error < 0, angle, low), np.where(error >= 0, angle, high)
             newton = angle - error / slope(angle)
             angle = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
-        found = (np.abs(polynomial(angle) - radius) < _CLOSE) & (angle < end)
+        found = (np.abs(polynomial(angle) - radius) < 1e-9) & (angle < end)
         scale = np.where(radius > 1e-12, np.tan(angle) / np.maximum(radius, 1e-12), 1.0)
     return np.asarray(xy * np.where(found, scale, np.nan)[..., None])
 

@@ -16,15 +16,7 @@ from orthonav.core.flight.folder import camera_from_plain
 from orthonav.core.geo.camera import Camera
 from orthonav.core.guard import needed
 
-MAX_BYTES = 1_000_000
-MAX_EVENTS = 20_000
-MAX_DEPTH = 20
-MAX_VALUE_CHARS = 10_000
-MAX_OPENINGS = 5000
-_OPENCV_HEADER = "%YAML:1.0"
-_CHAIN = re.compile(r"^cam\d+\s*:", re.MULTILINE)
-_BROWN = ("", "brown", "plumb_bob", "rational_polynomial", "radtan", "none")
-_FISHEYE = ("equidistant", "fisheye")
+OPENCV_HEADER = "%YAML:1.0"
 _READ = (
     "expected flight.json, or a camera of OpenCV (camera_matrix, image_width, .. as YAML, XML or "
     "JSON), ROS (camera_matrix, distortion_coefficients, ..) or Kalibr (intrinsics, resolution, ..)"
@@ -33,17 +25,6 @@ _UNREAD = {  # programs by what their files hold
     "COLMAP": re.compile(r"^ *\d+ [A-Z_]+ \d+ \d+( [\d.e+-]+)+ *$", re.M),
     "Metashape": re.compile(r"<(calibration|document)\b"),
 }
-_BROKEN = (
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    IndexError,
-    RecursionError,
-)
-# Whatever opens a level for OpenCV, -- and a:b: included; a minus before a number does not.
-_OPENING = re.compile(r"[\[{<:]|-(?![\d.])")
 
 
 def read_camera_file(path: Path) -> Camera:
@@ -53,8 +34,8 @@ def read_camera_file(path: Path) -> Camera:
     `MissingExtraError`."""
     path, name = _name_apart(Path(path))
     path = require_file(path, "camera file")
-    if path.stat().st_size > MAX_BYTES:
-        raise CameraError(f"camera file is larger than {MAX_BYTES // 10**6} MB: {path}")
+    if path.stat().st_size > 1_000_000:
+        raise CameraError(f"camera file is larger than 1 MB: {path}")
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
@@ -65,18 +46,25 @@ def read_camera_file(path: Path) -> Camera:
             raise CameraError(f"camera files of {program} are not read; {_READ}: {path}")
     try:
         # Kalibr chains may begin with OpenCV's header, which is not YAML.
-        chain = _CHAIN.search(text) is not None
+        chain = re.search(r"^cam\d+\s*:", text, re.MULTILINE) is not None
         if name is not None and not chain:
             raise CameraError(f"file is not a Kalibr chain; give it without #{name:.60}")
-        if not chain and (text.startswith(_OPENCV_HEADER) or "opencv-matrix" in text):
+        if not chain and (text.startswith(OPENCV_HEADER) or "opencv-matrix" in text):
             return _plain(_opencv(text))
         if text.lstrip().startswith("{"):
             plain = json.loads(text)
             return camera_from_plain(plain["camera"]) if "camera" in plain else _plain(plain)
-        return _plain(_yaml(text.removeprefix(_OPENCV_HEADER)), name)
+        return _plain(_yaml(text.removeprefix(OPENCV_HEADER)), name)
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
-    except _BROKEN as error:
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ) as error:
         found = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
         raise CameraError(f"{_READ}; {found}: {path}") from error
 
@@ -103,9 +91,9 @@ def camera_from_numbers(
 ) -> Camera:
     """`matrix`: 9 numbers, row by row."""
     numbers = tuple(float(number) for number in distortion)
-    if model in _FISHEYE:
+    if model in ("equidistant", "fisheye"):
         ours = "fisheye"
-    elif model in _BROWN:
+    elif model in ("", "brown", "plumb_bob", "rational_polynomial", "radtan", "none"):
         ours = "brown"
         if any(numbers[5:]):
             raise CameraError(
@@ -123,7 +111,7 @@ def _yaml(text: str) -> Any:
         yaml = needed("yaml", "camera files in YAML")
     except MissingExtraError:
         with contextlib.suppress(CameraError):  # OpenCV reads most of what ROS and Kalibr write
-            return _opencv(f"{_OPENCV_HEADER}\n---\n{text}")
+            return _opencv(f"{OPENCV_HEADER}\n---\n{text}")
         raise
     try:
         _check_events(yaml, text)
@@ -134,7 +122,7 @@ def _yaml(text: str) -> Any:
 
 def _check_events(yaml: Any, text: str) -> None:
     """Refuses YAML whose aliases, nesting or numbers with colons could exhaust memory or time."""
-    depth = 0
+    depth, most_parts, most_levels, most_chars = 0, 20_000, 20, 10_000
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
         if getattr(event, "anchor", None) is not None:
             raise CameraError("camera file has anchors or aliases: write the values out")
@@ -142,11 +130,11 @@ def _check_events(yaml: Any, text: str) -> None:
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
-        long = isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_VALUE_CHARS
-        if depth > MAX_DEPTH or count > MAX_EVENTS or long:
+        long = isinstance(event, yaml.ScalarEvent) and len(event.value) > most_chars
+        if depth > most_levels or count > most_parts or long:
             raise CameraError(
-                f"camera file has more than {MAX_EVENTS} parts, {MAX_DEPTH} levels or "
-                f"{MAX_VALUE_CHARS} characters in one value"
+                f"camera file has more than {most_parts} parts, {most_levels} levels or "
+                f"{most_chars} characters in one value"
             )
 
 
@@ -193,9 +181,10 @@ def _kalibr(plain: Mapping[str, Any]) -> Camera:
 
 
 def _opencv(text: str) -> Any:
-    # OpenCV crashes where nesting is deeper than the stack.
-    if sum(1 for _ in _OPENING.finditer(text)) > MAX_OPENINGS:
-        raise CameraError(f"camera file has more than {MAX_OPENINGS} parts")
+    # OpenCV crashes where nesting is deeper than the stack. Whatever opens a level for it counts,
+    # -- and a:b: included; a minus before a number does not.
+    if len(re.findall(r"[\[{<:]|-(?![\d.])", text)) > 5000:
+        raise CameraError("camera file has more than 5000 parts")
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
         try:

@@ -65,7 +65,7 @@ class LocalFrame:
         east, north = enu[..., 0], enu[..., 1]
         chord = np.sqrt(np.sum(enu**2, axis=-1))
         azimuth = np.arctan2(east, north)
-        diameter = 2 * self._section_radius_m(azimuth)
+        diameter = 2 * _section_radius_m(np.radians(self.lat_deg), azimuth)
         distance = diameter * np.arcsin(np.minimum(chord / diameter, 1.0))
         return np.stack([distance * np.sin(azimuth), distance * np.cos(azimuth)], axis=-1)
 
@@ -75,7 +75,7 @@ class LocalFrame:
         east, north = positions[..., 0], positions[..., 1]
         distance = np.hypot(east, north)
         azimuth = np.arctan2(east, north)
-        diameter = 2 * self._section_radius_m(azimuth)
+        diameter = 2 * _section_radius_m(np.radians(self.lat_deg), azimuth)
         dip = distance / diameter
         chord = diameter * np.sin(dip)
         level = chord * np.cos(dip)
@@ -83,14 +83,6 @@ class LocalFrame:
             [level * np.sin(azimuth), level * np.cos(azimuth), -chord * np.sin(dip)], axis=-1
         )
         return _latlon_from_ecef(enu @ self._enu_from_ecef + self._origin_ecef)
-
-    def _section_radius_m(self, azimuth: Array) -> Array:
-        """Euler's formula."""
-        sin2 = np.sin(np.radians(self.lat_deg)) ** 2
-        prime = WGS84_A_M / np.sqrt(1 - WGS84_E2 * sin2)
-        meridian = prime * (1 - WGS84_E2) / (1 - WGS84_E2 * sin2)
-        radius = 1 / (np.cos(azimuth) ** 2 / meridian + np.sin(azimuth) ** 2 / prime)
-        return np.asarray(radius)
 
     @cached_property
     def _origin_ecef(self) -> Array:
@@ -115,14 +107,19 @@ def distances_m(from_latlon_deg: ArrayLike, to_latlon_deg: ArrayLike) -> Array:
     end = np.radians(np.asarray(to_latlon_deg, dtype=np.float64).reshape(-1, 2))
     chord = _ecef(end[:, 0], end[:, 1]) - _ecef(start[:, 0], start[:, 1])
     lat = (start[:, 0] + end[:, 0]) / 2
+    turn = (end[:, 1] - start[:, 1] + np.pi) % (2 * np.pi) - np.pi
+    azimuth = np.arctan2(turn * np.cos(lat), end[:, 0] - start[:, 0])
+    radius = _section_radius_m(lat, azimuth)
+    half = np.linalg.norm(chord, axis=1) / (2 * radius)
+    return np.asarray(2 * radius * np.arcsin(np.minimum(half, 1.0)))
+
+
+def _section_radius_m(lat: ArrayLike, azimuth: Array) -> Array:
+    """Of a normal section of the ellipsoid, by Euler's formula; angles in radians."""
     sin2 = np.sin(lat) ** 2
     prime = WGS84_A_M / np.sqrt(1 - WGS84_E2 * sin2)
     meridian = prime * (1 - WGS84_E2) / (1 - WGS84_E2 * sin2)
-    turn = (end[:, 1] - start[:, 1] + np.pi) % (2 * np.pi) - np.pi
-    azimuth = np.arctan2(turn * np.cos(lat), end[:, 0] - start[:, 0])
-    radius = 1 / (np.cos(azimuth) ** 2 / meridian + np.sin(azimuth) ** 2 / prime)
-    half = np.linalg.norm(chord, axis=1) / (2 * radius)
-    return np.asarray(2 * radius * np.arcsin(np.minimum(half, 1.0)))
+    return np.asarray(1 / (np.cos(azimuth) ** 2 / meridian + np.sin(azimuth) ** 2 / prime))
 
 
 def _ecef(lat: ArrayLike, lon: ArrayLike) -> Array:

@@ -1,7 +1,7 @@
 """Heights of the ground as a function of positions, and their mean and spread over an area."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +18,6 @@ RELIEF_SLOPES = {"level": 0.01, "rolling": 0.05, "hills": 0.12}
 """RMS gradient of ground whose heights are unknown, by what a map says of it."""
 DEFAULT_RELIEF = "rolling"
 SIGHT_STEPS = 512
-DEEPEST_M = 1000.0
-_RINGS = 5
 
 
 @dataclass(frozen=True)
@@ -92,13 +90,25 @@ def bilinear(
     return np.asarray(heights if all_inside else np.where(inside, heights, np.nan))
 
 
+def bilinear_of(heights: Array, col: Array, row: Array) -> Array:
+    """As `bilinear`, of samples (rows, cols)."""
+    return bilinear(lambda rows, cols: heights[rows, cols], heights.shape, col, row)
+
+
+def by_value(keys: NDArray[np.intp]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Each value of `keys` (N,), and the indices of those that have it."""
+    order = np.argsort(keys, kind="stable")
+    found, starts = np.unique(keys[order], return_index=True)
+    return zip(found.tolist(), np.split(order, starts[1:]), strict=False)
+
+
 def sight_on_ground(slope_en: Array, height_m: float, ground_m: Callable[[Array], Array]) -> Array:
     """Metres east and north (2,) where a line of sight first meets the ground, else NaN.
 
     `slope_en` (2,): its run per metre of descent. `ground_m`: heights at (N, 2) east and north of
-    the camera, over the same level as `height_m`, down to `DEEPEST_M` below."""
+    the camera, over the same level as `height_m`, down to 1000 m below."""
     below_m = float(ground_m(np.zeros((1, 2)))[0])
-    drops = np.linspace(0.0, height_m - below_m + DEEPEST_M, SIGHT_STEPS)
+    drops = np.linspace(0.0, height_m - below_m + 1000.0, SIGHT_STEPS)
     above = height_m - drops - ground_m(drops[:, None] * slope_en)
     reached = np.flatnonzero(above <= 0)
     if not reached.size or reached[0] == 0 or not np.isfinite(above[: reached[0]]).all():
@@ -110,10 +120,10 @@ def sight_on_ground(slope_en: Array, height_m: float, ground_m: Callable[[Array]
 
 def _disc() -> Array:
     """Points (N, 2) spread evenly over the unit disc, its centre first."""
-    points = [(0.0, 0.0)]
-    for ring in range(1, _RINGS + 1):
+    points, rings = [(0.0, 0.0)], 5
+    for ring in range(1, rings + 1):
         # Rings of equal area per point: the radius is that of the middle of each ring.
-        radius = ring / (_RINGS + 0.5)
+        radius = ring / (rings + 0.5)
         turns = np.arange(6 * ring) * (2 * math.pi / (6 * ring)) + ring
         points += list(zip(radius * np.cos(turns), radius * np.sin(turns), strict=True))
     return np.array(points)

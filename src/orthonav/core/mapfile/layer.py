@@ -4,7 +4,9 @@ Only the chunks (JPEG and mask) that a window touches are decoded. Maps are untr
 every length, size and offset is checked before it is used."""
 
 import zlib
+from functools import lru_cache, partial
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,16 +14,10 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError
 from orthonav.core.mapfile.manifest import GreyInfo
-from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
+from orthonav.core.mapfile.reader import Blobs, MapFile
 
 CACHE_BYTES = 64 * 2**20  # 64 km2 at 1 m without masks
 MAX_PREVIEW_PX = 384
-MAX_CHUNK_BYTES_PER_PX = 4
-_CHUNK_HEADER_BYTES = 4096
-_SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
-_START_OF_FRAME = 0xC0  # Baseline JPEG: decoding takes one pass over the pixels
-_BEFORE_FRAME = (0xE0, 0xDB, 0xC4)  # APP0, quantization tables, Huffman tables
-_DECODE = int(cv2.IMREAD_GRAYSCALE) | int(cv2.IMREAD_IGNORE_ORIENTATION)
 
 Chunk = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 """Grey (H, W), 0 where not valid, and valid (H, W) or None where all is; read-only."""
@@ -78,7 +74,8 @@ class GreyLayer:
         names = part_names(sheet)
         self._jpegs = Blobs(opened, names["bytes"], names["offsets"], self._table.count)
         self._masks = Blobs(opened, names["mask_bytes"], names["mask_offsets"], self._table.count)
-        self._cache = ByteCache[int, Chunk](cache_bytes, _bytes_of)
+        decode = partial(_read_chunk, self._jpegs, self._masks, self._table, self._path)
+        self._decoded = lru_cache(cache_bytes // info.chunk_px**2)(decode)
 
     @classmethod
     def of(
@@ -108,8 +105,8 @@ class GreyLayer:
         grey = np.zeros((height, width), dtype=np.uint8)
         valid = np.zeros((height, width), dtype=bool)
         side = self._table.chunk_px
-        for top, bottom in _cuts(row, row + height, rows, side):
-            for left, right in _cuts(col, col + width, cols, side):
+        for top, bottom in cuts(row, row + height, rows, side):
+            for left, right in cuts(col, col + width, cols, side):
                 chunk = self._chunk(level, top // side, left // side)
                 if chunk is None:
                     continue
@@ -133,25 +130,34 @@ class GreyLayer:
         return self._jpegs.blob(self._table.number(level, chunk_row, chunk_col)).tobytes()
 
     def _chunk(self, level: int, chunk_row: int, chunk_col: int) -> Chunk | None:
-        """From the cache or decoded; None if no pixel is valid."""
+        """None if no pixel is valid."""
         number = self._table.number(level, chunk_row, chunk_col)
         if self._jpegs.is_empty(number) and self._masks.is_empty(number):
             return None
-        chunk = self._cache.get(number)
-        if chunk is None:
-            jpeg, mask = self._jpegs.blob(number), self._masks.blob(number)
-            try:
-                chunk = decode_chunk(jpeg, mask, self._table.shape(level, chunk_row, chunk_col))
-            except MapFileError as error:
-                where = f"level {level}, chunk {chunk_row}, {chunk_col}"
-                raise MapFileError(
-                    f"map's registration layer is damaged ({where}: {error}): {self._path}"
-                ) from error
-            self._cache.put(number, chunk)
-        return chunk
+        return self._decoded(level, chunk_row, chunk_col)
 
 
-def _cuts(first: int, last: int, size: int, side: int) -> list[tuple[int, int]]:
+def _read_chunk(
+    jpegs: Blobs,
+    masks: Blobs,
+    table: ChunkTable,
+    path: Path,
+    level: int,
+    chunk_row: int,
+    chunk_col: int,
+) -> Chunk:
+    number = table.number(level, chunk_row, chunk_col)
+    jpeg, mask = jpegs.blob(number), masks.blob(number)
+    try:
+        return decode_chunk(jpeg, mask, table.shape(level, chunk_row, chunk_col))
+    except MapFileError as error:
+        where = f"level {level}, chunk {chunk_row}, {chunk_col}"
+        raise MapFileError(
+            f"map's registration layer is damaged ({where}: {error}): {path}"
+        ) from error
+
+
+def cuts(first: int, last: int, size: int, side: int) -> list[tuple[int, int]]:
     """[first, last) within [0, size), divided at multiples of `side`."""
     first, last = max(first, 0), min(last, size)
     edges = [first, *range((first // side + 1) * side, last, side), last]
@@ -171,8 +177,7 @@ def decode_chunk(jpeg: NDArray[np.uint8], mask: NDArray[np.uint8], shape: tuple[
 
 def _decode_grey(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
     height, width = shape
-    limit = MAX_CHUNK_BYTES_PER_PX * height * width + _CHUNK_HEADER_BYTES
-    if jpeg.size > limit:
+    if jpeg.size > 4 * height * width + 4096:
         raise MapFileError(f"{jpeg.size} bytes for {height} x {width} px")
     found = jpeg_frame(jpeg.tobytes())
     if found != (8, height, width, 1):
@@ -181,7 +186,7 @@ def _decode_grey(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
         )
         raise MapFileError(f"a grey JPEG of {height} x {width} px was expected, got {got}")
     try:
-        grey = cv2.imdecode(jpeg, _DECODE)
+        grey = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise MapFileError(f"JPEG cannot be decoded ({error.err})") from error
     if grey is None or grey.shape != shape or grey.dtype != np.uint8:
@@ -190,16 +195,17 @@ def _decode_grey(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
 
 
 def jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
-    """Bits, rows, columns and channels of a baseline JPEG; None for other data."""
-    if not (data.startswith(_SOI) and data.endswith(_EOI)):
+    """Bits, rows, columns and channels of a baseline JPEG, whose decoding takes one pass; None for
+    other data, and for segments other than APP0 and tables of quantization and Huffman codes."""
+    if not (data.startswith(b"\xff\xd8") and data.endswith(b"\xff\xd9")):
         return None
-    at = len(_SOI)
+    at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
-        if marker == _START_OF_FRAME and at + 10 <= len(data):
+        if marker == 0xC0 and at + 10 <= len(data):
             rows, cols = (int.from_bytes(data[at + k : at + k + 2], "big") for k in (5, 7))
             return data[at + 4], rows, cols, data[at + 9]
-        if marker not in _BEFORE_FRAME or length < 2:
+        if marker not in (0xE0, 0xDB, 0xC4) or length < 2:
             return None
         at += 2 + length
     return None
@@ -228,7 +234,3 @@ def _decode_mask(mask: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
         raise MapFileError(f"mask must have {expected} bytes")
     bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8), count=size)
     return bits.reshape(shape).astype(np.bool_)
-
-
-def _bytes_of(chunk: Chunk) -> int:
-    return chunk[0].nbytes + (0 if chunk[1] is None else chunk[1].nbytes)

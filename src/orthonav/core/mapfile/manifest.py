@@ -13,50 +13,51 @@ from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M, RELIEF_SLOPES
 
 FORMAT = "orthonav-map"
 SCHEMA = 1
-MAX_MANIFEST_BYTES = 8 * 2**20
-MAX_SHEETS = 10_000
 MAX_LEVELS = 10
-MIN_CHUNK_PX, MAX_CHUNK_PX = 16, 1024
-MAX_TOP_PX = 8192
-"""Of the coarsest level, read as a whole: ten levels of the largest sheet at 5 cm. Usually 64."""
-CODEC = "jpeg"
-TERRAIN_CODEC = "delta-zlib"
-MAX_CODE = 65_535  # of heights above the lowest one of a layer
-MIN_POSTING_M, MAX_POSTING_M = 0.25, 1000.0
-UNKNOWN_DATUM = "unknown"
-MIN_SOURCE_POSTING_M, MAX_SOURCE_POSTING_M = 0.01, 100_000.0
-MAX_ROUGHNESS_M = 1000.0
+MAX_CODE = 65_534  # of heights above the lowest one of a layer
 MAX_NAME = 200
-MAX_DIGITS = 20  # more than any number needs, few enough for a float
-MIN_HEADING_STEP_DEG = 0.5
-"""Finer than any method needs; every heading tried takes an image in memory."""
+UNKNOWN_DATUM = "unknown"
+
+
+def _within(least: float, most: float) -> dict[str, tuple[float, float]]:
+    """For the metadata of a field: its least and greatest value."""
+    return {"range": (least, most)}
+
+
+def _are_within(info: Any) -> bool:
+    """Whether all fields of a record are within their ranges, or None."""
+    ranged = [each for each in fields(info) if "range" in each.metadata]
+    values = [(getattr(info, each.name), *each.metadata["range"]) for each in ranged]
+    return all(value is None or least <= value <= most for value, least, most in values)
+
+
+def clamped(record: type, name: str, value: float) -> float:
+    """The nearest value that a field of a record may have."""
+    (least, most) = next(each.metadata["range"] for each in fields(record) if each.name == name)
+    return float(min(max(value, least), most))
 
 
 @dataclass(frozen=True)
 class GreyInfo:
-    """A grey pyramid in square chunks.
+    """A grey pyramid in square chunks."""
 
-    `chunk_px`: even, 16 to 1024. `levels`: 1 to 10. `quality`: of JPEG, 1 to 100, less for noise.
-    `valid_px`: pixels of the finest level with imagery."""
-
-    chunk_px: int
-    levels: int
-    quality: int
-    valid_px: int
+    chunk_px: int = field(metadata=_within(16, 1024))  # even
+    levels: int = field(metadata=_within(1, MAX_LEVELS))
+    quality: int = field(metadata=_within(1, 100))  # of JPEG; less for noise
+    valid_px: int  # pixels of the finest level with imagery
 
     def to_plain(self) -> dict[str, Any]:
-        return {"codec": CODEC, **vars(self)}
+        return {"codec": "jpeg", **vars(self)}
 
     @classmethod
     def from_plain(cls, plain: Any, grid: TileGrid) -> "GreyInfo":
         info = cls(**_fields(cls, plain))
         sane = (
-            _get(plain, "codec", str) == CODEC
-            and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
+            _get(plain, "codec", str) == "jpeg"
+            and _are_within(info)
             and info.chunk_px % 2 == 0
-            and 1 <= info.levels <= MAX_LEVELS
-            and 1 <= info.quality <= 100
-            and max(grid.height_px, grid.width_px) <= MAX_TOP_PX << (info.levels - 1)
+            # The coarsest level is read as a whole: ten levels of the largest sheet at 5 cm.
+            and max(grid.height_px, grid.width_px) <= 8192 << (info.levels - 1)
             and 0 <= info.valid_px <= grid.height_px * grid.width_px
         )
         if not sane:
@@ -67,31 +68,26 @@ class GreyInfo:
 @dataclass(frozen=True)
 class TerrainInfo:
     """Heights at samples in the sheet's plane: of the ground above mean sea level, or of a surface
-    above that ground.
+    above that ground. Heights over `UNKNOWN_DATUM` can only be compared with each other."""
 
-    `west_m`, `north_m`: outer north-west corner, half a posting from sample (0, 0). `posting_m`:
-    0.25 to 1000. `chunk_px`: samples, 16 to 1024. `low_m`, `high_m`: least and greatest height,
-    -500 to 9000. `unit_m`: per step, 0.01 to 10. `known`: samples with a height. `name`, `datum`:
-    of the source; heights over `UNKNOWN_DATUM` can only be compared with each other.
-
-    `source_posting_m`: of the source, 0.01 to 100,000; None in older maps: `posting_m`.
-    `roughness_m`: root mean square difference of the heights of the source from those of the layer,
-    0 to 1000; None where the source is not finer."""
-
-    west_m: float
-    north_m: float
-    posting_m: float
+    west_m: float = field(metadata=_within(-4 * MAX_SHEET_M, 4 * MAX_SHEET_M))
+    north_m: float = field(metadata=_within(-4 * MAX_SHEET_M, 4 * MAX_SHEET_M))
+    """Outer north-west corner, half a posting from sample (0, 0)."""
+    posting_m: float = field(metadata=_within(0.25, 1000.0))
     rows: int
     cols: int
-    chunk_px: int
-    low_m: float
-    high_m: float
-    unit_m: float
-    known: int
-    name: str
+    chunk_px: int = field(metadata=_within(16, 1024))  # samples along a side of a chunk
+    low_m: float = field(metadata=_within(LOWEST_M, HIGHEST_M))  # least height ..
+    high_m: float = field(metadata=_within(LOWEST_M, HIGHEST_M))  # .. and greatest
+    unit_m: float = field(metadata=_within(0.01, 10.0))  # height per step
+    known: int  # samples with a height
+    name: str  # of the source
     datum: str
-    source_posting_m: float | None = None
-    roughness_m: float | None = None
+    source_posting_m: float | None = field(default=None, metadata=_within(0.01, 100_000.0))
+    """Of the source; None: `posting_m`."""
+    roughness_m: float | None = field(default=None, metadata=_within(0.0, 1000.0))
+    """Root mean square difference of the heights of the source from those of the layer; None where
+    the source is not finer."""
 
     @property
     def is_above_sea(self) -> bool:
@@ -103,26 +99,21 @@ class TerrainInfo:
 
     def to_plain(self) -> dict[str, Any]:
         known = {name: value for name, value in vars(self).items() if value is not None}
-        return {"codec": TERRAIN_CODEC, **known}
+        return {"codec": "png", **known}
 
     @classmethod
     def from_plain(cls, plain: Any) -> "TerrainInfo":
         info = cls(**_fields(cls, plain))
-        most = 4 * MAX_SHEET_M
-        source_m, roughness_m = info.source_posting_m, info.roughness_m
+        codec = _get(plain, "codec", str)
+        if codec != "png":
+            raise MapFileError(f"map has heights as {codec:.20}, png is read; build it again")
         sane = (
-            _get(plain, "codec", str) == TERRAIN_CODEC
-            and MIN_POSTING_M <= info.posting_m <= MAX_POSTING_M
-            and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
+            _are_within(info)
             and min(info.rows, info.cols) >= 1
-            and max(info.rows, info.cols) * info.posting_m <= most
-            and max(abs(info.west_m), abs(info.north_m)) <= most
-            and LOWEST_M <= info.low_m <= info.high_m <= HIGHEST_M
-            and 0.01 <= info.unit_m <= 10
+            and max(info.rows, info.cols) * info.posting_m <= 4 * MAX_SHEET_M
+            and info.low_m <= info.high_m
             and (info.high_m - info.low_m) / info.unit_m <= MAX_CODE + 0.5
             and 0 <= info.known <= info.rows * info.cols
-            and (source_m is None or MIN_SOURCE_POSTING_M <= source_m <= MAX_SOURCE_POSTING_M)
-            and (roughness_m is None or 0 <= roughness_m <= MAX_ROUGHNESS_M)
         )
         if not sane:
             raise MapFileError(f"map has an impossible terrain layer: {plain!r:.300}")
@@ -132,16 +123,16 @@ class TerrainInfo:
 @dataclass(frozen=True)
 class Lean:
     """How houses and trees lean in an orthophoto that is no true one: displaced by metres `east`
-    and `north` per metre of height, within 1; `std`: per axis, 0 to 1."""
+    and `north` per metre of height; `std`: per axis."""
 
-    east: float
-    north: float
-    std: float
+    east: float = field(metadata=_within(-1, 1))
+    north: float = field(metadata=_within(-1, 1))
+    std: float = field(metadata=_within(0, 1))
 
     @classmethod
     def from_plain(cls, plain: Any) -> "Lean":
         lean = cls(**_fields(cls, plain))
-        if not (max(abs(lean.east), abs(lean.north)) <= 1 and 0 <= lean.std <= 1):
+        if not _are_within(lean):
             raise MapFileError(f"map has an impossible lean of its houses: {plain!r:.300}")
         return lean
 
@@ -163,12 +154,14 @@ class SheetInfo:
     lean: Lean | None = None
 
     def to_plain(self) -> dict[str, Any]:
-        heights = {"terrain": self.terrain, "surface": self.surface}
-        relief = {} if self.relief is None else {"relief": self.relief}
+        optional = {
+            "terrain": self.terrain and self.terrain.to_plain(),
+            "surface": self.surface and self.surface.to_plain(),
+            "relief": self.relief,
+            "lean": self.lean and vars(self.lean),
+        }
         return {
-            **{name: info.to_plain() for name, info in heights.items() if info is not None},
-            **relief,
-            **({} if self.lean is None else {"lean": vars(self.lean)}),
+            **{name: plain for name, plain in optional.items() if plain is not None},
             "origin_lat_deg": self.frame.lat_deg,
             "origin_lon_deg": self.frame.lon_deg,
             "grid": vars(self.grid),
@@ -197,22 +190,25 @@ class SheetInfo:
             frame = LocalFrame(_number(plain, "origin_lat_deg"), _number(plain, "origin_lon_deg"))
         except AreaError as error:
             raise MapFileError(f"map has an impossible sheet origin: {error}") from error
-        layer = plain.get("grey")
-        grey = None if layer is None else GreyInfo.from_plain(layer, grid)
-        terrain, surface = (
-            None if plain.get(name) is None else TerrainInfo.from_plain(plain[name])
-            for name in ("terrain", "surface")
+        known = {name: each for name, each in plain.items() if each is not None}
+        info = cls(
+            frame,
+            grid,
+            tiles,
+            _number(plain, "area_km2"),
+            grey=GreyInfo.from_plain(known["grey"], grid) if "grey" in known else None,
+            terrain=TerrainInfo.from_plain(known["terrain"]) if "terrain" in known else None,
+            relief=_get(known, "relief", str) if "relief" in known else None,
+            surface=TerrainInfo.from_plain(known["surface"]) if "surface" in known else None,
+            lean=Lean.from_plain(known["lean"]) if "lean" in known else None,
         )
-        if surface is not None and terrain is None:
+        if info.surface is not None and info.terrain is None:
             raise MapFileError("map has a surface without the terrain that it stands on")
-        relief = None if plain.get("relief") is None else _get(plain, "relief", str)
-        if relief is not None and relief not in RELIEF_SLOPES:
-            raise MapFileError(f"map has an unknown relief: {relief!r:.80}")
-        area_km2 = _number(plain, "area_km2")
-        lean = None if plain.get("lean") is None else Lean.from_plain(plain["lean"])
-        if lean is not None and surface is None:
+        if info.relief is not None and info.relief not in RELIEF_SLOPES:
+            raise MapFileError(f"map has an unknown relief: {info.relief!r:.80}")
+        if info.lean is not None and info.surface is None:
             raise MapFileError("map has a lean of its houses without a surface")
-        return cls(frame, grid, tiles, area_km2, grey, terrain, relief, surface, lean)
+        return info
 
 
 @dataclass(frozen=True)
@@ -244,26 +240,16 @@ class Manifest:
 
     def to_json(self) -> str:
         """Canonical, with the SHA-256 of everything else in `manifest_sha256`."""
-        plain = {
-            "format": FORMAT,
-            "schema": SCHEMA,
-            "created_by": self.created_by,
-            "recipe": self.recipe,
-            "sheets": [sheet.to_plain() for sheet in self.sheets],
-            "imagery": list(self.imagery),
-            "view": self.view,
-            "confidence": self.confidence,
-            "radius_m": self.radius_m,
-            "registration": self.registration,
-            "parts": self.parts,
-        }
+        sheets = [sheet.to_plain() for sheet in self.sheets]
+        plain = vars(self) | {"format": FORMAT, "schema": SCHEMA, "sheets": sheets}
+        plain.pop("sha256", None)  # set only where one was read
         return _canonical({**plain, "manifest_sha256": _digest(plain)})
 
     @classmethod
     def from_json(cls, text: str) -> "Manifest":
         """Raises `MapFileError` or `MapVersionError`."""
-        if len(text) > MAX_MANIFEST_BYTES:
-            raise MapFileError(f"manifest of the map is larger than {MAX_MANIFEST_BYTES} bytes")
+        if len(text) > 8 * 2**20:
+            raise MapFileError("manifest of the map is larger than 8 MiB")
         try:
             plain = json.loads(text, parse_int=_integer)
         except (ValueError, RecursionError) as error:
@@ -283,8 +269,8 @@ class Manifest:
         if schema < 1 or altered:
             raise MapFileError("manifest of the map was altered (checksum does not match)")
         sheets = _get(plain, "sheets", list)
-        if not 1 <= len(sheets) <= MAX_SHEETS:
-            raise MapFileError(f"map must have 1 to {MAX_SHEETS} sheets, has {len(sheets)}")
+        if not 1 <= len(sheets) <= 10_000:
+            raise MapFileError(f"map must have 1 to 10000 sheets, has {len(sheets)}")
         confidence, registration = plain.get("confidence"), plain.get("registration")
         manifest = cls(
             recipe=_get(plain, "recipe", dict),
@@ -302,18 +288,18 @@ class Manifest:
 
 
 def _view(plain: Any) -> dict[str, Any]:
-    """A fine heading step would exhaust memory."""
+    """Every heading tried takes an image in memory: a finer step would exhaust it."""
     view: dict[str, Any] = _get(plain, "view", dict)
-    if not MIN_HEADING_STEP_DEG <= _number(view, "heading_step_deg") <= 360:
+    if not 0.5 <= _number(view, "heading_step_deg") <= 360:
         raise MapFileError(
-            f"manifest of the map: heading_step_deg must be {MIN_HEADING_STEP_DEG} to 360, "
+            "manifest of the map: heading_step_deg must be 0.5 to 360, "
             f"got {view['heading_step_deg']!r:.80}"
         )
     return view
 
 
 def _integer(text: str) -> int:
-    if len(text) > MAX_DIGITS:
+    if len(text) > 20:  # more digits than any number needs, few enough for a float
         raise ValueError(f"a number has {len(text)} digits")
     return int(text)
 

@@ -10,13 +10,12 @@ import hashlib
 import json
 import os
 import re
-import threading
 import weakref
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeGuard, TypeVar
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,20 +27,9 @@ from orthonav.core.files import StrPath, replacing, require_file
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile.manifest import Manifest
 
-MAX_HEADER_BYTES = 16 * 2**20
-MIN_FILE_BYTES = 10
+METADATA_KEY = "orthonav"
 BLOCK_BYTES = 16 * 2**10  # unit of verification of ranges, about one chunk (docs/map-format.md)
-_BLOCK_DIGEST_BYTES = 16
-_PIECE_BYTES = 64 * BLOCK_BYTES
-_IN_RANGES = re.compile(r"sheet\d+/(grey/(mask_)?|(terrain|surface)/)bytes")
-"""Parts that are read in ranges: the largest of a map."""
-_DTYPES: dict[str, type[np.generic]] = {
-    "F16": np.float16,
-    "F32": np.float32,
-    "U8": np.uint8,
-    "I32": np.int32,
-    "I64": np.int64,
-}
+DIGEST_BYTES = 16  # of a block
 
 
 @dataclass(frozen=True)
@@ -89,8 +77,7 @@ class MapParts(Mapping[str, NDArray[Any]]):
         end = -(-last // BLOCK_BYTES)
         start = begin * BLOCK_BYTES
         data = self._read(part.first + start, min(end * BLOCK_BYTES, part.nbytes) - start)
-        size = _BLOCK_DIGEST_BYTES
-        if _block_digests(data) != part.blocks[begin * size : end * size]:
+        if _block_digests(data) != part.blocks[begin * DIGEST_BYTES : end * DIGEST_BYTES]:
             raise self._changed(f"part {name} was rewritten")
         return data[first - start : last - start]
 
@@ -237,6 +224,12 @@ class Blobs:
         return np.frombuffer(self._opened.range(self._name, first, last), dtype=np.uint8)
 
 
+def blob_parts(data: str, offsets: str, blobs: Sequence[bytes]) -> dict[str, NDArray[Any]]:
+    """Two parts of a map from which `Blobs` reads these byte strings."""
+    ends = np.cumsum([0, *map(len, blobs)], dtype=np.int64)
+    return {data: np.frombuffer(b"".join(blobs), np.uint8), offsets: ends}
+
+
 class _OpenFile:
     """Closed when the object is collected."""
 
@@ -270,31 +263,49 @@ def open_map(path: StrPath, manifest_sha256: str | None = None) -> MapFile:
     The container is safetensors, parsed here because arrays are read on demand and every length is
     checked before it is used."""
     path = require_file(path, "map")
-    try:
-        opened = _OpenFile(path)
-        if opened.size < MIN_FILE_BYTES:
-            raise MapFileError(f"not an orthonav map, only {opened.size} bytes")
-        header, start = _header(opened)
-        metadata = header.pop("__metadata__", None)
-        if not isinstance(metadata, dict) or not isinstance(metadata.get(METADATA_KEY), str):
-            raise MapFileError("not an orthonav map")
-        manifest = Manifest.from_json(metadata[METADATA_KEY])
+    with _errors_named(path):
+        opened, start, header, manifest = _opened(path)
         if manifest_sha256 not in (None, manifest.sha256):
             raise MapFileError("map was replaced after its signature was checked; try again")
         parts = _parts(opened, start, header, manifest)
+    return MapFile(path, opened.size, manifest, MapParts(path, opened, parts))
+
+
+def map_digest(path: StrPath) -> str:
+    """SHA-256 of the manifest of a map, hexadecimal, by its header only. Raises as `open_map`."""
+    path = require_file(path, "map")
+    with _errors_named(path):
+        return _opened(path)[3].sha256
+
+
+@contextmanager
+def _errors_named(path: Path) -> Iterator[None]:
+    try:
+        yield
     except MapFileError as error:
         raise type(error)(f"{error}: {path}") from error
     except OSError as error:
         raise MissingFileError(f"map cannot be read ({error.strerror}): {path}") from error
     except (OverflowError, RecursionError) as error:  # crafted: excessive numbers or nesting
         raise MapFileError(f"map is damaged ({error}): {path}") from error
-    return MapFile(path, opened.size, manifest, MapParts(path, opened, parts))
+
+
+def _opened(path: Path) -> tuple[_OpenFile, int, dict[str, Any], Manifest]:
+    """The file, where its arrays begin, their entries in the header, and the manifest."""
+    opened = _OpenFile(path)
+    if opened.size < 10:
+        raise MapFileError(f"not an orthonav map, only {opened.size} bytes")
+    header, start = _header(opened)
+    metadata = header.pop("__metadata__", None)
+    if not isinstance(metadata, dict) or not isinstance(metadata.get(METADATA_KEY), str):
+        raise MapFileError("not an orthonav map")
+    return opened, start, header, Manifest.from_json(metadata[METADATA_KEY])
 
 
 def _header(opened: _OpenFile) -> tuple[dict[str, Any], int]:
     head = opened.read(0, 9)
     length = int.from_bytes(head[:8], "little")
-    if length > MAX_HEADER_BYTES or head[8:] != b"{":
+    if length > 16 * 2**20 or head[8:] != b"{":
         raise MapFileError("not an orthonav map; `orthonav build` makes one from orthophotos")
     data = opened.read(8, length)
     if len(data) != length:
@@ -343,7 +354,14 @@ def _part(
     opened: _OpenFile, first: int, length: int, name: str, entry: dict[str, Any], manifest: Manifest
 ) -> _Part:
     described = manifest.parts[name]
-    dtype = _DTYPES.get(str(entry.get("dtype")))
+    dtypes: dict[str, type[np.generic]] = {
+        "F16": np.float16,
+        "F32": np.float32,
+        "U8": np.uint8,
+        "I32": np.int32,
+        "I64": np.int64,
+    }
+    dtype = dtypes.get(str(entry.get("dtype")))
     shape: Any = entry.get("shape")
     if dtype is None or not _is_integers(shape):
         raise MapFileError(f"map is damaged (part {name})")
@@ -358,7 +376,9 @@ def _part(
         np.broadcast_to(np.zeros((), dtype=dtype), shape)
     except ValueError as error:  # an empty part can claim any shape
         raise MapFileError(f"map is damaged (part {name}: {error})") from error
-    digest, blocks = _digests(opened, first, length, blocks=bool(_IN_RANGES.fullmatch(name)))
+    # The largest parts of a map are read in ranges.
+    is_in_ranges = re.fullmatch(r"sheet\d+/(grey/(mask_)?|(terrain|surface)/)bytes", name)
+    digest, blocks = _digests(opened, first, length, blocks=is_in_ranges is not None)
     if digest != described.get("sha256"):
         raise MapFileError(f"map was altered (checksum of part {name} does not match)")
     return _Part(dtype, tuple(shape), first, length, digest, blocks)
@@ -367,8 +387,9 @@ def _part(
 def _digests(opened: _OpenFile, first: int, length: int, *, blocks: bool) -> tuple[str, bytes]:
     """SHA-256 (hexadecimal), and digests of the blocks where asked for."""
     whole, of_blocks = hashlib.sha256(), bytearray()
-    for at in range(first, first + length, _PIECE_BYTES):
-        piece = opened.read(at, min(_PIECE_BYTES, first + length - at))
+    step = 64 * BLOCK_BYTES
+    for at in range(first, first + length, step):
+        piece = opened.read(at, min(step, first + length - at))
         whole.update(piece)
         if blocks:
             of_blocks += _block_digests(piece)
@@ -379,42 +400,9 @@ def _block_digests(data: bytes) -> bytes:
     """Concatenated; BLAKE2b is fast without SHA instructions."""
     view = memoryview(data)
     return b"".join(
-        hashlib.blake2b(view[at : at + BLOCK_BYTES], digest_size=_BLOCK_DIGEST_BYTES).digest()
+        hashlib.blake2b(view[at : at + BLOCK_BYTES], digest_size=DIGEST_BYTES).digest()
         for at in range(0, len(data), BLOCK_BYTES)
     )
-
-
-Key = TypeVar("Key", bound=Hashable)
-Value = TypeVar("Value")
-
-
-class ByteCache(Generic[Key, Value]):
-    """The values used last, of at most `limit_bytes` in all by `size_of`; threads may share it."""
-
-    def __init__(self, limit_bytes: int, size_of: Callable[[Value], int]) -> None:
-        self._limit_bytes, self._size_of = limit_bytes, size_of
-        self._values: OrderedDict[Key, Value] = OrderedDict()
-        self._lock = threading.Lock()
-        self.held_bytes = 0
-
-    def get(self, key: Key) -> Value | None:
-        with self._lock:
-            if key in self._values:
-                self._values.move_to_end(key)
-            return self._values.get(key)
-
-    def put(self, key: Key, value: Value) -> None:
-        """Hold a value unless the key is held; a value larger than the limit empties the cache."""
-        with self._lock:
-            if key in self._values:
-                return
-            self._values[key] = value
-            self.held_bytes += self._size_of(value)
-            while self.held_bytes > self._limit_bytes:
-                self.held_bytes -= self._size_of(self._values.popitem(last=False)[1])
-
-
-METADATA_KEY = "orthonav"
 
 
 def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]) -> Manifest:

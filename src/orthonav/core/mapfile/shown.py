@@ -15,9 +15,6 @@ from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 
-MAX_PX = 4096
-OUTLINE_PX = 1024
-_FINER = 4  # outlines run through the middles of pixels, which are made so many times finer
 Grey = NDArray[np.uint8]
 
 
@@ -28,7 +25,7 @@ def write_preview(opened: MapFile, path: Path) -> None:
     path = Path(path)
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
         raise UsageError(f"preview must be a .png or .tif file: {path}")
-    grey, px_m, sheet = _picture(opened, MAX_PX)
+    grey, px_m, sheet = _picture(opened, 4096)
     done, data = cv2.imencode(path.suffix.lower(), grey)
     if not done:
         raise OutputError(f"the picture cannot be encoded: {path}")
@@ -39,18 +36,18 @@ def write_preview(opened: MapFile, path: Path) -> None:
 
 def footprint_geojson(opened: MapFile) -> str:
     """The area with imagery as GeoJSON (RFC 7946); without a layer the rectangle of the tiles."""
-    grey, px_m, sheet = _picture(opened, OUTLINE_PX)
-    shown = (grey > 0).astype(np.uint8)
-    fine = shown.repeat(_FINER, axis=0).repeat(_FINER, axis=1)
+    grey, px_m, sheet = _picture(opened, 1024)
+    shown, finer = (grey > 0).astype(np.uint8), 4  # outlines run through the middles of pixels
+    fine = shown.repeat(finer, axis=0).repeat(finer, axis=1)
     lines, nesting = cv2.findContours(fine, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     parts: dict[int, list[Any]] = {}
     for holes in (False, True):
         for number, line in enumerate(lines):
             around = int(nesting[0, number, 3])  # the line that this is a hole of; -1: none
-            simple = cv2.approxPolyDP(line, _FINER, True)[:, 0]
+            simple = cv2.approxPolyDP(line, finer, True)[:, 0]
             if len(simple) < 3 or (around >= 0) != holes or (holes and around not in parts):
                 continue
-            ring = _ring(simple, px_m / _FINER, sheet, outer=not holes)
+            ring = _ring(simple, px_m / finer, sheet, outer=not holes)
             parts.setdefault(around if holes else number, []).append(ring)
     several = list(parts.values())
     geometry = {"type": "MultiPolygon", "coordinates": several}

@@ -6,10 +6,12 @@ header only. Serial number and time are signed too, so that older maps can be re
 import base64
 import binascii
 import contextlib
+import functools
 import hashlib
 import json
 import os
 import re
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,8 +26,7 @@ from orthonav.core.errors import (
 )
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import replacing, require_file, write_text
-from orthonav.core.mapfile.manifest import MAX_MANIFEST_BYTES, Manifest
-from orthonav.core.mapfile.reader import MAX_HEADER_BYTES, METADATA_KEY, MIN_FILE_BYTES, open_map
+from orthonav.core.mapfile.reader import map_digest, open_map
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import (
@@ -33,15 +34,11 @@ if TYPE_CHECKING:
         Ed25519PublicKey,
     )
 
-SCHEMA = 2
-FORMAT = "orthonav-signature"
-ALGORITHM = "ed25519"
-MAX_SIGNATURE_BYTES = 4096
-MAX_KEY_BYTES = 4096
+KIND = {"format": "orthonav-signature", "schema": 2, "algorithm": "ed25519"}
+MAX_BYTES = 4096  # of a signature, and of a key
 PRIVATE_NAME, PUBLIC_NAME = "private.pem", "public.pem"
 MAX_SERIAL = 2**53 - 1  # largest integer that every JSON reader keeps exact
 _TIME = "%Y-%m-%dT%H:%M:%SZ"
-_DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -57,37 +54,14 @@ class Signature:
     def message(self) -> bytes:
         """The signed bytes; their beginning separates them from other uses of the key."""
         text = (
-            f"orthonav map, schema {SCHEMA}, serial {self.serial}, signed {self.signed_utc}, "
-            f"manifest sha256 {self.manifest_sha256}"
+            f"orthonav map, schema {KIND['schema']}, serial {self.serial}, "
+            f"signed {self.signed_utc}, manifest sha256 {self.manifest_sha256}"
         )
         return text.encode("ascii")
 
 
 def signature_path(path: Path) -> Path:
     return Path(path).with_name(Path(path).name + ".sig")
-
-
-def map_digest(path: Path) -> str:
-    """Of the manifest, hexadecimal, by the header only.
-
-    Raises `MissingFileError`, `MapFileError` or `MapVersionError`."""
-    path = require_file(path, "map")
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(8)
-            length = int.from_bytes(head, "little")
-            if len(head) < 8 or length > MAX_HEADER_BYTES or length + 8 < MIN_FILE_BYTES:
-                raise MapFileError(f"not an orthonav map: {path}")
-            text = json.loads(stream.read(length))["__metadata__"][METADATA_KEY]
-            if not isinstance(text, str) or len(text) > MAX_MANIFEST_BYTES:
-                raise ValueError("manifest")
-            return Manifest.from_json(text).sha256
-    except MapFileError as error:
-        raise type(error)(str(error) if str(path) in str(error) else f"{error}: {path}") from error
-    except OSError as error:
-        raise MissingFileError(f"map cannot be read ({error.strerror}): {path}") from error
-    except (ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
-        raise MapFileError(f"not an orthonav map, or damaged: {path}") from error
 
 
 def new_key(folder: Path) -> str:
@@ -137,13 +111,8 @@ def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
     private = _private_key(key)
     digest = open_map(path).manifest.sha256
     made = Signature(key_id(private.public_key()), digest, serial, now.strftime(_TIME))
-    plain = {
-        "format": FORMAT,
-        "schema": SCHEMA,
-        "algorithm": ALGORITHM,
-        **asdict(made),
-        "signature": base64.b64encode(private.sign(made.message)).decode(),
-    }
+    encoded = base64.b64encode(private.sign(made.message)).decode()
+    plain = {**KIND, **asdict(made), "signature": encoded}
     out = signature_path(path)
     with replacing(out) as temporary:
         temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="ascii")
@@ -206,21 +175,20 @@ def _signature(path: Path) -> tuple[Signature, str]:
         raise MapFileError(f"map is not signed, there is no {file.name}: {path}")
     try:
         with file.open("rb") as stream:
-            data = stream.read(MAX_SIGNATURE_BYTES + 1)
-        if len(data) > MAX_SIGNATURE_BYTES:
-            raise ValueError(f"it is larger than {MAX_SIGNATURE_BYTES} bytes")
+            data = stream.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise ValueError(f"it is larger than {MAX_BYTES} bytes")
         plain = json.loads(data)
-        schema = plain["schema"]
-        if plain["format"] != FORMAT or type(schema) is not int:
+        schema, algorithm = plain["schema"], plain["algorithm"]
+        if plain["format"] != KIND["format"] or type(schema) is not int:
             raise ValueError("not an orthonav signature")
-        if schema != SCHEMA or plain["algorithm"] != ALGORITHM:
-            raise ValueError(
-                f"schema {schema}, algorithm {plain['algorithm']!r:.20}; update orthonav"
-            )
+        if (schema, algorithm) != (KIND["schema"], KIND["algorithm"]):
+            raise ValueError(f"schema {schema}, algorithm {algorithm!r:.20}; update orthonav")
         texts = plain["key_id"], plain["manifest_sha256"], plain["signature"]
         if not all(isinstance(text, str) and text.isascii() for text in texts):
             raise ValueError("a field is invalid")
-        if not re.fullmatch(r"[0-9a-f]{16}", texts[0]) or not _DIGEST.fullmatch(texts[1]):
+        hexadecimal = zip(texts, (16, 64), strict=False)
+        if not all(re.fullmatch(rf"[0-9a-f]{{{count}}}", text) for text, count in hexadecimal):
             raise ValueError("its key or digest is invalid")
         serial, signed_utc = plain["serial"], plain["signed_utc"]
         if type(serial) is not int or not 0 <= serial <= MAX_SERIAL:
@@ -236,29 +204,26 @@ def _signature(path: Path) -> tuple[Signature, str]:
 
 def _private_key(path: Path) -> "Ed25519PrivateKey":
     _, serialization, ed25519 = _crypto()
-    data = _key_bytes(path, "private key")
-    try:
-        key = serialization.load_pem_private_key(data, password=None)
-    except TypeError as error:  # raised for a key with a passphrase
-        raise MapFileError(f"private key has a passphrase; give one without: {path}") from error
-    except Exception as error:
-        raise MapFileError(f"not a private key in PEM: {path}") from error
-    found: Ed25519PrivateKey = _of_kind(key, ed25519.Ed25519PrivateKey, "private", path)
+    load = functools.partial(serialization.load_pem_private_key, password=None)
+    found: Ed25519PrivateKey = _key(load, ed25519.Ed25519PrivateKey, "private", path)
     return found
 
 
 def _public_key(path: Path) -> "Ed25519PublicKey":
     _, serialization, ed25519 = _crypto()
-    data = _key_bytes(path, "public key")
-    try:
-        key = serialization.load_pem_public_key(data)
-    except Exception as error:
-        raise MapFileError(f"not a public key in PEM: {path}") from error
-    found: Ed25519PublicKey = _of_kind(key, ed25519.Ed25519PublicKey, "public", path)
+    load = serialization.load_pem_public_key
+    found: Ed25519PublicKey = _key(load, ed25519.Ed25519PublicKey, "public", path)
     return found
 
 
-def _of_kind(key: Any, kind: type, name: str, path: Path) -> Any:
+def _key(load: Callable[[bytes], Any], kind: type, name: str, path: Path) -> Any:
+    data = _key_bytes(path, f"{name} key")
+    try:
+        key = load(data)
+    except TypeError as error:  # raised for a key with a passphrase
+        raise MapFileError(f"{name} key has a passphrase; give one without: {path}") from error
+    except Exception as error:
+        raise MapFileError(f"not a {name} key in PEM: {path}") from error
     if not isinstance(key, kind):
         raise MapFileError(f"expected an Ed25519 {name} key, got another kind: {path}")
     return key
@@ -267,7 +232,7 @@ def _of_kind(key: Any, kind: type, name: str, path: Path) -> Any:
 def _key_bytes(path: Path, what: str) -> bytes:
     try:
         with require_file(path, what).open("rb") as stream:
-            return stream.read(MAX_KEY_BYTES)
+            return stream.read(MAX_BYTES)
     except OSError as error:
         if isinstance(error, MissingFileError):
             raise

@@ -1,25 +1,24 @@
 """The layers of heights of a map (`docs/map-format.md`): the terrain, and the surface above it.
 
-Untrusted, so every length is checked."""
+A chunk is a grey PNG of 16 bits. Untrusted, so its size is checked before it is decoded."""
 
-import zlib
+from functools import lru_cache, partial
 from itertools import product
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.geo.ground import bilinear
-from orthonav.core.mapfile.layer import ChunkTable
+from orthonav.core.geo.ground import bilinear, by_value
+from orthonav.core.mapfile.layer import ChunkTable, cuts
 from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
-from orthonav.core.mapfile.reader import Blobs, ByteCache, MapFile
+from orthonav.core.mapfile.reader import Blobs, MapFile
 
-CACHE_BYTES = 16 * 2**20  # 400 km2 of terrain every 10 m, 4 km2 of surface every 1 m
 FEW_CHUNKS, FEW_SAMPLES = 16, 2**18  # that are read as one part, as those under a view
 TERRAIN, SURFACE = "terrain", "surface"
-_MAX_BYTES_PER_SAMPLE = 4
-_CHUNK_HEADER_BYTES = 1024
 Array = NDArray[np.float64]
 Heights = NDArray[np.float32]
 
@@ -37,12 +36,13 @@ class TerrainLayer:
     def __init__(
         self, opened: MapFile, sheet: int, info: TerrainInfo, layer: str = TERRAIN
     ) -> None:
-        self.info, self._layer = info, layer
+        self.info = info
         self.frame: LocalFrame = opened.manifest.sheets[sheet].frame
-        self._path = opened.path
         self._table = ChunkTable(info.rows, info.cols, 1, info.chunk_px)
         self._blobs = Blobs(opened, *terrain_part_names(sheet, layer), self._table.count)
-        self._cache = ByteCache[int, Heights](CACHE_BYTES, _bytes_of)
+        decode = partial(_read_chunk, self._blobs, self._table, info, layer, opened.path)
+        # 400 km2 of terrain every 10 m, 4 km2 of surface every 1 m.
+        self._decoded = lru_cache(2**22 // info.chunk_px**2)(decode)
 
     @classmethod
     def of(cls, opened: MapFile, sheet: int = 0, layer: str = TERRAIN) -> "TerrainLayer | None":
@@ -79,22 +79,18 @@ class TerrainLayer:
             firsts.append(int(low))
             ends.append(min(int(high) + 2, count))
         (top, left), (bottom, right) = firsts, ends
-        chunk_rows, chunk_cols = (
-            range(first // side, (end - 1) // side + 1)
-            for first, end in zip(firsts, ends, strict=True)
-        )
-        samples, chunks = (bottom - top) * (right - left), len(chunk_rows) * len(chunk_cols)
+        row_cuts = cuts(top, bottom, info.rows, side)
+        col_cuts = cuts(left, right, info.cols, side)
+        samples, chunks = (bottom - top) * (right - left), len(row_cuts) * len(col_cuts)
         if samples > FEW_SAMPLES or chunks > FEW_CHUNKS:
             return None
         part = np.full((bottom - top, right - left), np.nan)
-        for chunk_row, chunk_col in product(chunk_rows, chunk_cols):
-            heights = self._chunk(chunk_row, chunk_col)
+        for (row_0, row_1), (col_0, col_1) in product(row_cuts, col_cuts):
+            heights = self._chunk(row_0 // side, col_0 // side)
             if heights is not None:
-                row_0, col_0 = chunk_row * side, chunk_col * side
-                here = heights[max(top - row_0, 0) :, max(left - col_0, 0) :]
-                into = part[max(row_0 - top, 0) :, max(col_0 - left, 0) :]
-                rows, cols = (min(sides) for sides in zip(here.shape, into.shape, strict=True))
-                into[:rows, :cols] = here[:rows, :cols]
+                y, x = row_0 % side, col_0 % side
+                inside = heights[y : y + row_1 - row_0, x : x + col_1 - col_0]
+                part[row_0 - top : row_1 - top, col_0 - left : col_1 - left] = inside
         return part, top, left
 
     def _samples(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Array:
@@ -102,62 +98,55 @@ class TerrainLayer:
         chunk_rows, chunk_cols = rows // side, cols // side
         found = np.full(rows.shape, np.nan)
         across = int(chunk_cols.max(initial=0)) + 1
-        keys = (chunk_rows * across + chunk_cols).ravel()
-        order = np.argsort(keys, kind="stable")
-        ends = np.append(np.flatnonzero(np.diff(keys[order])) + 1, len(order))
-        for here in np.split(order, ends[:-1]) if len(order) else []:
-            chunk_row, chunk_col = divmod(int(keys[here[0]]), across)
-            heights = self._chunk(chunk_row, chunk_col)
+        for key, here in by_value((chunk_rows * across + chunk_cols).ravel()):
+            heights = self._chunk(*divmod(key, across))
             if heights is not None:
                 row, col = (each.ravel()[here] % side for each in (rows, cols))
                 found.ravel()[here] = heights[row, col]
         return found
 
     def _chunk(self, chunk_row: int, chunk_col: int) -> Heights | None:
-        """From the cache or decoded; None if it has no height."""
-        number = self._table.number(0, chunk_row, chunk_col)
-        if self._blobs.is_empty(number):
+        """None if it has no height."""
+        if self._blobs.is_empty(self._table.number(0, chunk_row, chunk_col)):
             return None
-        found = self._cache.get(number)
-        if found is None:
-            shape = self._table.shape(0, chunk_row, chunk_col)
-            try:
-                found = decode_terrain(self._blobs.blob(number), shape, self.info)
-            except MapFileError as error:
-                raise MapFileError(
-                    f"map's {self._layer} layer is damaged (chunk {chunk_row}, {chunk_col}: "
-                    f"{error}): {self._path}"
-                ) from error
-            self._cache.put(number, found)
-        return found
+        return self._decoded(chunk_row, chunk_col)
+
+
+def _read_chunk(
+    blobs: Blobs,
+    table: ChunkTable,
+    info: TerrainInfo,
+    layer: str,
+    path: Path,
+    chunk_row: int,
+    chunk_col: int,
+) -> Heights:
+    data = blobs.blob(table.number(0, chunk_row, chunk_col))
+    try:
+        return decode_terrain(data, table.shape(0, chunk_row, chunk_col), info)
+    except MapFileError as error:
+        where = f"chunk {chunk_row}, {chunk_col}"
+        raise MapFileError(f"map's {layer} layer is damaged ({where}: {error}): {path}") from error
 
 
 def decode_terrain(data: NDArray[np.uint8], shape: tuple[int, int], info: TerrainInfo) -> Heights:
     """NaN where unknown. Raises `MapFileError`."""
-    size = shape[0] * shape[1]
-    if data.size > _MAX_BYTES_PER_SAMPLE * size + _CHUNK_HEADER_BYTES:
-        raise MapFileError(f"{data.size} bytes for {shape[0]} x {shape[1]} samples")
-    whole, masked = 2 * size, 2 * size + -(-size // 8)
-    stream = zlib.decompressobj()
+    rows, cols = shape
+    if data.size > 4 * rows * cols + 1024:
+        raise MapFileError(f"{data.size} bytes for {rows} x {cols} samples")
+    head = _png_head(rows, cols)
+    if data[: len(head)].tobytes() != head:
+        raise MapFileError(f"a grey PNG of 16 bits, {rows} x {cols} px, was expected")
     try:
-        plain = stream.decompress(data.tobytes(), masked + 1)
-    except zlib.error as error:
-        raise MapFileError(f"it cannot be decompressed ({error})") from error
-    if len(plain) not in (whole, masked) or not stream.eof or stream.unused_data:
-        raise MapFileError(f"it must have {whole} or {masked} bytes")
-    planes = np.frombuffer(plain, np.uint8)
-    folded = planes[:size].astype(np.uint16) | planes[size:whole].astype(np.uint16) << 8
-    steps = (folded >> 1) ^ -(folded & 1)
-    codes = np.cumsum(steps.reshape(shape), axis=0, dtype=np.uint16)
-    codes = np.cumsum(codes, axis=1, dtype=np.uint16)
-    known = np.ones(shape, np.bool_)
-    if len(plain) == masked:
-        bits = np.unpackbits(planes[whole:], count=size)
-        known = bits.reshape(shape).astype(np.bool_)
-    heights = info.low_m + info.unit_m * codes.astype(np.float64)
-    if (heights[known] > info.high_m + info.unit_m).any():
+        values = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise MapFileError(f"PNG cannot be decoded ({error.err})") from error
+    if values is None or values.shape != shape or values.dtype != np.uint16:
+        raise MapFileError("PNG cannot be decoded")
+    heights = info.low_m + info.unit_m * (values.astype(np.float64) - 1)
+    if (heights > info.high_m + info.unit_m).any():
         raise MapFileError(f"it has heights above {info.high_m:g} m")
-    found = np.where(known, heights, np.nan).astype(np.float32)
+    found = np.where(values > 0, heights, np.nan).astype(np.float32)
     found.flags.writeable = False
     return found
 
@@ -167,17 +156,13 @@ def encode_terrain(heights: Heights, info: TerrainInfo) -> bytes:
     known = np.isfinite(heights)
     if not known.any():
         return b""
-    filled = np.where(known, heights, heights[known].mean()).astype(np.float64)
-    codes = np.rint((filled - info.low_m) / info.unit_m).clip(0, MAX_CODE).astype(np.uint16)
-    down = np.diff(codes, axis=0, prepend=np.uint16(0))
-    steps = np.diff(down, axis=1, prepend=np.uint16(0))
-    folded = (steps << 1) ^ (0 - (steps >> 15)).astype(np.uint16)
-    planes = [(folded & 255).astype(np.uint8), (folded >> 8).astype(np.uint8)]
-    plain = b"".join(plane.tobytes() for plane in planes)
-    if not known.all():
-        plain += np.packbits(known).tobytes()
-    return zlib.compress(plain, 9)
+    steps = (np.where(known, heights, info.low_m).astype(np.float64) - info.low_m) / info.unit_m
+    codes = np.rint(steps).clip(0, MAX_CODE).astype(np.uint16)
+    values = np.where(known, codes + 1, 0).astype(np.uint16)
+    return cv2.imencode(".png", values, [int(cv2.IMWRITE_PNG_COMPRESSION), 9])[1].tobytes()
 
 
-def _bytes_of(heights: Heights) -> int:
-    return heights.nbytes
+def _png_head(rows: int, cols: int) -> bytes:
+    """The first bytes of a grey PNG of 16 bits."""
+    size = cols.to_bytes(4, "big") + rows.to_bytes(4, "big")
+    return b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + size + b"\x10\0"

@@ -13,7 +13,6 @@ import json
 import logging
 import math
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -61,7 +60,6 @@ from orthonav.ground.build.layer import (
 )
 from orthonav.ground.build.sheet import (
     MIN_TILE_VALID_SHARE,
-    PREVIEW_PX,
     Block,
     Preview,
     blocks_of_area,
@@ -468,7 +466,7 @@ def _cut_heights(
     posting_m = min(info.posting_m for info in infos)
     names, datums = sorted({info.name for info in infos}), sorted({info.datum for info in infos})
 
-    def sampled(west_m: float, north_m: float, rows: int, cols: int) -> Array:
+    def sampled(west_m: float, north_m: float, posting_m: float, rows: int, cols: int) -> Array:
         row, col = np.mgrid[:rows, :cols] + 0.5
         points = np.stack([west_m + col * posting_m, north_m - row * posting_m], axis=-1)
         return _heights(layers, *area.frame.latlon_from_en(points))
@@ -564,12 +562,12 @@ class _MapCutter:
         height, width = grid.height_px, grid.width_px
         self.cells = CellSheet(layout, height, width, representation.channels)
         self.layer = GreyLayerWriter(height, width)
-        self.preview = Preview(grid, PREVIEW_PX)
+        self.preview = Preview(grid)
 
     def read(self, progress: Progress, workers: int) -> None:
         blocks = blocks_of_area(self.area, self.grid, self._layout)
         with one_opencv_thread():
-            made = in_order(blocks, lambda: nullcontext(self._made), workers)
+            made = in_order(self._made, blocks, workers)
             for done, parts in enumerate(made):
                 self._take(blocks[done], parts)
                 progress("imagery", (done + 1) / len(blocks))

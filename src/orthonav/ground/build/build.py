@@ -31,10 +31,8 @@ from orthonav.core.tiles.network import TripletRecipe
 from orthonav.core.tiles.whitened import WhitenedRecipe, learn
 from orthonav.core.variants import make_variant, variant_recipe
 from orthonav.ground.build.calibrate import (
+    CALIBRATION,
     CROPS,
-    FLOOR_PX,
-    HEADING_STEP_DEG,
-    RADIUS_STRIDES,
     Crop,
     CropSampler,
     TileCalibration,
@@ -63,68 +61,48 @@ MAX_CALIBRATION_VIEWS = 2 * CROPS
 
 @dataclass(frozen=True)
 class BuildRequest:
-    """Parameters of a build. With neither `bounds_deg` nor `route`, all of the imagery is mapped.
+    """Parameters of a build; with neither `bounds_deg` nor `route` of all of the imagery."""
 
-    - `orthos`: orthophotos; earlier ones take precedence. At least one.
-    - `out`: map file to write.
-    - `bounds_deg`: area as west, south, east, north, degrees.
-    - `route`: route whose search band is the area.
-    - `band_m`: width of the search band for legs without a width of their own, metres, above 0.
-    - `gsd_m`: ground resolution, metres per pixel, above 0; None: that of the finest orthophoto.
-    - `tile_px`: width of a tile, pixels, 16 to 4096.
-    - `overlap`: of neighbouring tiles, as a fraction of their width, 0 to below 1.
-    - `method`: embedding, `name:field=value,..`, a row of `embed.TABLE`.
-    - `edges`: image representation, a row of `represent.TABLE`; None: the default of the method.
-    - `seed`: of all random draws, 0 or more; equal requests give equal bytes.
-    - `registration`: whether the map carries the grey layer that locates views below tile size.
-    - `other_dates`: orthophotos of the same area at other dates, from which the confidence is
-      calibrated, and a triplet network learns. They do not become part of the map.
-    - `calibration_views`: mirrored views, and views of other dates, that are located, 1 to 384.
-    - `work`: folder of blocks and checkpoints of networks, from which an interrupted build
-      resumes; None: blocks of a large map in `OUT.work` until it is written.
-    - `workers`: threads that read the imagery and make batches for a network, 1 to 64.
-    - `device`: where a network is learnt, "auto" (a GPU if there is one), "cpu" or "cuda".
-    - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
-    - `surface`: surface models with houses and trees; earlier ones take precedence. Without `dem`
-      their lower envelope is the terrain.
-    - `dem_datum`: what heights of both count from, where the file does not state it
-      (`orthonav.ground.imagery.terrain.OPTION`).
-    - `dem_needed`: whether an area in which a model has no height is refused.
-    - `relief`: what the land is like where there is no terrain, a key of
-      `orthonav.core.geo.ground.RELIEF_SLOPES`; None: not stated. Not with `dem` or `surface`.
-    - `bands`: that are used, one or three, from 1, such as near infrared; None: colours, or the
-      first.
-    - `true_ortho`: houses stand upright in the orthophotos; else how far they lean is estimated.
-    - `cells`: whether the map carries the cell means from which new tiles are embedded without
-      imagery, for sheets of an atlas; method gradient only.
-    """
-
-    orthos: Sequence[GivenPath]
-    out: GivenPath
-    bounds_deg: Extent | None = None
-    route: Route | None = None
-    band_m: float | None = None
-    gsd_m: float | None = None
-    tile_px: int = 256
-    overlap: float = 0.875
-    method: str = "gradient"
-    edges: str | None = None
-    seed: int = 0
-    registration: bool = True
+    orthos: Sequence[GivenPath]  # at least one; earlier ones take precedence
+    out: GivenPath  # map file to write
+    bounds_deg: Extent | None = None  # area as west, south, east, north
+    route: Route | None = None  # whose search band is the area
+    band_m: float | None = None  # width of the band for legs without a width of their own
+    gsd_m: float | None = None  # metres per pixel; None: that of the finest orthophoto
+    tile_px: int = 256  # width of a tile, 16 to 4096
+    overlap: float = 0.875  # of neighbouring tiles, as a fraction of their width, 0 to below 1
+    method: str = "gradient"  # embedding, `name:field=value,..`, a row of `embed.TABLE`
+    edges: str | None = None  # a row of `represent.TABLE`; None: the default of the method
+    seed: int = 0  # of all random draws; equal requests give equal bytes
+    registration: bool = True  # whether it carries the grey layer that locates below tile size
     other_dates: Sequence[GivenPath] = ()
+    """Orthophotos of the same area at other dates, from which the confidence is calibrated, and a
+    triplet network learns. They do not become part of the map."""
     calibration_views: int = 24
+    """Mirrored views, and views of other dates, that are located, 1 to 384."""
     work: GivenPath | None = None
-    workers: int | None = None
-    dem: GivenPath | None = None
+    """Folder of blocks and checkpoints of networks, from which an interrupted build resumes; None:
+    blocks of a large map in `OUT.work` until it is written."""
+    workers: int | None = None  # threads, 1 to 64; None: one per core
+    dem: GivenPath | None = None  # terrain model; None: the map has no terrain layer
     surface: Sequence[GivenPath] = ()
+    """Surface models with houses and trees; earlier ones take precedence. Without `dem` their lower
+    envelope is the terrain."""
     true_ortho: bool = False
+    """Houses stand upright in the orthophotos; else how far they lean is estimated."""
     bands: tuple[int, ...] | None = None
+    """That are used, one or three, from 1; None: colours, or the first."""
     dem_datum: str | None = None
-    dem_needed: bool = True
+    """What heights count from, where the files do not state it (`imagery.terrain.OPTION`)."""
+    dem_needed: bool = True  # whether an area in which a model has no height is refused
     relief: str | None = None
-    epoch: float | None = None
-    device: str = "auto"
+    """What the land is like where there is no terrain, a key of `RELIEF_SLOPES`; None: not stated.
+    Not with `dem` or `surface`."""
+    epoch: float | None = None  # decimal year of positions that drift with a plate
+    device: str = "auto"  # where a network is learnt; or "cpu", "cuda"
     cells: bool = False
+    """Whether it carries the cell means from which new tiles are embedded without imagery, for
+    sheets of an atlas; method gradient only."""
 
     def __post_init__(self) -> None:
         if isinstance(self.orthos, str | os.PathLike):
@@ -351,12 +329,12 @@ def _manifest(
         sheets=(info,),
         imagery=sheet.mosaic.describe(),
         view={
-            "heading_step_deg": HEADING_STEP_DEG,
+            "heading_step_deg": CALIBRATION.heading_step_deg,
             "min_valid_share": MIN_VIEW_VALID_SHARE,
             "position_std_m": calibration.position_std_m,
         },
         confidence=calibration.confidence.to_plain(),
-        radius_m=RADIUS_STRIDES * sheet.grid.stride_m,
+        radius_m=CALIBRATION.radius_strides * sheet.grid.stride_m,
         created_by=f"orthonav {__version__}",
     )
 
@@ -372,7 +350,7 @@ def _registration(
     """Its record in the manifest, calibrated on the map as it will be written."""
     request, sheet = inputs.request, inputs.sheet
     radius_m = max(RADIUS_PX * sheet.grid.gsd_m, MIN_RADIUS_M)
-    unfitted = {"confidence": None, "radius_m": radius_m, "position_floor_px": FLOOR_PX}
+    unfitted = {"confidence": None, "radius_m": radius_m, "position_floor_px": CALIBRATION.floor_px}
     localizer = RegistrationLocalizer.of_map(
         MapFile(request.out, 0, replace(manifest, registration=unfitted), arrays),
         TileProposer.of(tiles, embedder, sheet.representation),

@@ -84,29 +84,55 @@ def _smooth(rng: np.random.Generator, size: int, cells: int) -> NDArray[np.float
 
 
 CROPS = 192
-"""Views searched; seconds per map."""
-SLOW_CROPS = 32
-"""The same for representations that take minutes per view."""
-CROP_TILES = 1.5
-"""A rotated tile fits into it."""
-SMALL_TILES = 2.5
-"""Sheets less wide whose border is not all imagery have few crops of that width."""
-HEADING_STD_DEG = 5.0
-SCALE_STD = 0.05
-"""Errors of heading and height: those of the benchmarks."""
-MAX_REPLACED = 0.65
-MIRRORED_WEIGHT = 0.25
-"""A flight sees fewer places outside the map than inside."""
-PASTED_SHARE = 0.25
-"""Of replacements by another position of the map; the others are mirrored."""
-HEADING_STEP_DEG = 6.0
-"""Spacing of the headings that tile matching tries."""
-RADIUS_STRIDES = 0.75
-"""A fix is correct if its error is below this many strides."""
-MIN_VALID = 0.9
-"""Least fraction of valid pixels in a crop, where there are too few whole ones."""
-ENOUGH_CROPS = 48
-MIN_RIGHT = 10
+"""Views searched by tile matching; seconds per map."""
+ENOUGH_RIGHT = 10
+"""Correct views, below which nothing is learnt from them."""
+
+
+@dataclass(frozen=True)
+class CalibrationParameters:
+    slow_crops: int = 32
+    """Views searched with representations that take minutes per view."""
+    crop_tiles: float = 1.5
+    """Width of crops in tiles: a rotated tile fits into it."""
+    small_tiles: float = 2.5
+    """Sheets less wide whose border is not all imagery have few crops of that width."""
+    enough_crops: int = 48
+    """Whole crops, below which others of at least `min_valid` are used too."""
+    min_valid: float = 0.9
+    """Least fraction of valid pixels of a crop."""
+    heading_std_deg: float = 5.0
+    scale_std: float = 0.05
+    """Errors of heading and height: those of the benchmarks."""
+    heading_step_deg: float = 6.0
+    """Spacing of the headings that tile matching tries."""
+    pasted_share: float = 0.25
+    """Of replacements by another position of the map; the others are mirrored."""
+    mirrored_weight: float = 0.25
+    """A flight sees fewer places outside the map than inside."""
+    radius_strides: float = 0.75
+    """A fix is correct if its error is below this many strides."""
+    floor_px: float = 0.6
+    """Usual standard deviation per axis between orthophotos of two dates."""
+    floor_limits_px: tuple[float, float] = (0.25, 3.0)
+    min_negatives: int = 5
+    """Mirrored views from which on the scores of chance are their medians."""
+    usual_fine: float = 1.45
+    """Ratio by which one more level raises the score of a chance match: prior, .."""
+    usual_fine_views: float = 8.0
+    """.. and its weight."""
+    whole_px: int = 6144
+    searched_px: int = 4096
+    """Maps larger than a square of the first are searched in a square of the second for each view:
+    on a map of 50 x 5 km a full search took 7 GB and minutes per view, and too few views were found
+    for a fit (4 of 24 on 10 x 5 km; 9 of 24 in the square)."""
+    ridge: float = 3e-2
+    """Weight of the usual bias of registered views."""
+    tile_ridge: float = 1e-3
+    """Only against weights without bound where right and wrong separate fully."""
+
+
+CALIBRATION = CalibrationParameters()
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +157,8 @@ class CropSampler:
         """`sheet_px`: shorter side of the sheet; on a small one crops are no larger than tiles."""
         self._rng = np.random.default_rng([seed, 1])
         self._tile_px = tile_px
-        is_small = sheet_px < SMALL_TILES * tile_px
-        self.size_px = tile_px if is_small else round(tile_px * CROP_TILES)
+        is_small = sheet_px < CALIBRATION.small_tiles * tile_px
+        self.size_px = tile_px if is_small else round(tile_px * CALIBRATION.crop_tiles)
         self._whole: list[Crop] = []
         self._partial: list[Crop] = []
 
@@ -158,7 +184,7 @@ class CropSampler:
             part = np.s_[row : row + size, col : col + size]
             crop, inside = grey[part], valid[part]
             share = inside.mean()
-            if share >= MIN_VALID and crop[inside].std() > 1:
+            if share >= CALIBRATION.min_valid and crop[inside].std() > 1:
                 crops[len(found)] = np.where(inside, crop, crop[inside].mean().round())
                 found.append((row, col, share == 1))
         return crops[: len(found)], np.array(found, np.intp).reshape(-1, 3)
@@ -175,7 +201,7 @@ class CropSampler:
 
     @property
     def crops(self) -> list[Crop]:
-        missing = max(ENOUGH_CROPS - len(self._whole), 0)
+        missing = max(CALIBRATION.enough_crops - len(self._whole), 0)
         return self._whole + self._partial[:missing]
 
     def _crop_px(self, height: int, width: int) -> int:
@@ -196,12 +222,12 @@ def calibrate(
     known."""
     grid, sampled = tiles.grid, sampler.crops
     rng = np.random.default_rng([len(sampled), 2])
-    most = min(CROPS, SLOW_CROPS) if slow else CROPS
+    most = min(CROPS, CALIBRATION.slow_crops) if slow else CROPS
     crops = [sampled[i] for i in rng.permutation(len(sampled))[:most]]
     features, errors, mirrored = [], [], []
     for done, crop in enumerate(crops):
         other = crops[int(rng.integers(len(crops)))].grey
-        if rng.random() > PASTED_SHARE:
+        if rng.random() > CALIBRATION.pasted_share:
             other = other[:, ::-1]
         for mirror in (False, True):
             picture = crop.grey[:, ::-1] if mirror else crop.grey
@@ -231,10 +257,10 @@ def _tile_calibration(
     grid: TileGrid,
     usual: LogisticConfidence | None,
 ) -> TileCalibration:
-    near = np.hypot(*errors_en_m.T) <= RADIUS_STRIDES * grid.stride_m
+    near = np.hypot(*errors_en_m.T) <= CALIBRATION.radius_strides * grid.stride_m
     right = near & ~mirrored
-    weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
-    if right.sum() < MIN_RIGHT:
+    weight = np.where(mirrored, CALIBRATION.mirrored_weight, 1.0)
+    if right.sum() < 10:
         return TileCalibration(fit_few(features, right, weight, usual), grid.stride_m)
     confidence = LogisticConfidence(*fit_weights(features, right, weight))
     std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
@@ -248,7 +274,7 @@ def changed_picture(
     size = grey.shape[0]
     other = np.asarray(cv2.resize(other, (size, size)), dtype=np.uint8)
     mask = _smooth(rng, size, 8)
-    replaced = mask < np.quantile(mask, rng.uniform(0, MAX_REPLACED))
+    replaced = mask < np.quantile(mask, rng.uniform(0, 0.65))
     picture = np.where(replaced, other, grey).astype(np.float32) / 255
     picture = np.power(picture, rng.uniform(0.6, 1.7)) * rng.uniform(0.5, 1.3)
     blurred = np.asarray(cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.3, 1.4))))
@@ -264,39 +290,19 @@ def _queries(
     embedder: ViewEmbedder,
 ) -> NDArray[np.float32]:
     """Embeddings (3, D) of the centre of an image at the headings that the localizer tries."""
-    heading = rng.normal(0, HEADING_STD_DEG)
-    scale = float(np.exp(rng.normal(0, SCALE_STD)))
+    heading = rng.normal(0, CALIBRATION.heading_std_deg)
+    scale = float(np.exp(rng.normal(0, CALIBRATION.scale_std)))
     size, middle = grid.tile_px, (picture.shape[0] - 1) / 2
     inside = np.ones(picture.shape, dtype=np.uint8)
     queries = []
-    for step in (-HEADING_STEP_DEG, 0.0, HEADING_STEP_DEG):
+    step_deg = CALIBRATION.heading_step_deg
+    for step in (-step_deg, 0.0, step_deg):
         matrix = cv2.getRotationMatrix2D((middle, middle), heading + step, scale)
         matrix[:, 2] -= middle - (size - 1) / 2
         view = np.asarray(cv2.warpAffine(picture, matrix, (size, size)), dtype=np.uint8)
         valid = np.asarray(cv2.warpAffine(inside, matrix, (size, size)) > 0, dtype=np.bool_)
         queries.append(embedder.view(representation(view, valid), valid))
     return np.stack(queries)
-
-
-FOCAL_PX = 1000.0
-"""Any value: views have the resolution of the map, and only the ratio to the height matters."""
-SIDES = (0.55, 1.0)
-"""Long side of a view, from and to, in tiles; the short side is three quarters of it."""
-ENOUGH_RIGHT = 10
-"""Correct views of another date, below which nothing is learnt from it."""
-FLOOR_PX = 0.6
-"""Usual standard deviation per axis between orthophotos of two dates."""
-FLOOR_LIMITS_PX = (0.25, 3.0)
-MIN_NEGATIVES = 5
-"""Mirrored views from which on the scores of chance are their medians."""
-WHOLE_PX, SEARCHED_PX = 6144, 4096
-"""Maps larger than a square of the first are searched in a square of the second for each view: on
-a map of 50 x 5 km a full search took 7 GB and minutes per view, and too few views were found for a
-fit (4 of 24 on 10 x 5 km; 9 of 24 in the square)."""
-FALLBACK_CHANCE = 40.0
-"""Score of a chance match if no negative has one."""
-USUAL_FINE, USUAL_FINE_VIEWS = 1.45, 8.0
-"""Ratio by which one more level raises the score of a chance match: prior, and its weight."""
 
 
 @dataclass(frozen=True)
@@ -363,19 +369,20 @@ def _placed(
 def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Crop) -> Prior | None:
     """On a large map, limits the search to a square with the crop in its middle half."""
     grid = localizer.grid
-    if grid.height_px * grid.width_px <= WHOLE_PX**2:
+    if grid.height_px * grid.width_px <= CALIBRATION.whole_px**2:
         return None
-    col, row = np.array([crop.col_px, crop.row_px]) + rng.uniform(-0.25, 0.25, 2) * SEARCHED_PX
+    side_px = CALIBRATION.searched_px
+    col, row = np.array([crop.col_px, crop.row_px]) + rng.uniform(-0.25, 0.25, 2) * side_px
     place = np.array([grid.west_m + col * grid.gsd_m, grid.north_m - row * grid.gsd_m])
     lat, lon = localizer.sheet.frame.latlon_from_en(place)
-    return Prior(float(lat), float(lon), SEARCHED_PX / 2 * grid.gsd_m / PRIOR_SIGMAS)
+    return Prior(float(lat), float(lon), side_px / 2 * grid.gsd_m / PRIOR_SIGMAS)
 
 
 def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) -> View:
     """A vertical view of the middle of a picture, with errors of heading and height."""
     size = picture.shape[0]
     longest = min(grid.tile_px, int(size / 1.27))  # its diagonal fits into the picture
-    width = max(16, round(longest * rng.uniform(*SIDES)))
+    width = max(16, round(longest * rng.uniform(0.55, 1.0)))
     height = max(12, round(width * 0.75))
     yaw_deg = rng.uniform(0, 360)
     linear = rotation(math.radians(yaw_deg))
@@ -383,18 +390,19 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     matrix = np.column_stack([linear, move])
     view = cv2.warpAffine(picture, matrix, (width, height), flags=flags)
-    agl_m = FOCAL_PX * grid.gsd_m
-    reported_m = agl_m * max(0.5, 1 + rng.normal(0, SCALE_STD))
+    focal_px = 1000.0  # any: the view has the resolution of the map
+    agl_m = focal_px * grid.gsd_m
+    reported_m = agl_m * max(0.5, 1 + rng.normal(0, CALIBRATION.scale_std))
     telemetry = Telemetry(
         time_ns=0,
-        yaw_deg=yaw_deg + rng.normal(0, HEADING_STD_DEG),
+        yaw_deg=yaw_deg + rng.normal(0, CALIBRATION.heading_std_deg),
         pitch_deg=0.0,
         roll_deg=0.0,
         agl_m=reported_m,
-        yaw_std_deg=HEADING_STD_DEG,
-        agl_std_m=SCALE_STD * reported_m,
+        yaw_std_deg=CALIBRATION.heading_std_deg,
+        agl_std_m=CALIBRATION.scale_std * reported_m,
     )
-    camera = Camera(width, height, FOCAL_PX, FOCAL_PX, width / 2, height / 2)
+    camera = Camera(width, height, focal_px, focal_px, width / 2, height / 2)
     return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
 
 
@@ -402,15 +410,16 @@ def _registration_calibration(
     outcomes: Sequence[_Outcome], radius_px: float
 ) -> RegistrationCalibration:
     negatives = [each.evidence for each in outcomes if each.mirrored]
-    chances = _chances(negatives) if len(negatives) >= MIN_NEGATIVES else USUAL_CHANCES
-    confidence, floor_px = RegisteredConfidence.usual(chances), FLOOR_PX
+    chances = _chances(negatives) if len(negatives) >= CALIBRATION.min_negatives else USUAL_CHANCES
+    confidence, floor_px = RegisteredConfidence.usual(chances), CALIBRATION.floor_px
     errors_px = np.array([np.hypot(*each.error_px) for each in outcomes])
     mirrored = np.array([each.mirrored for each in outcomes], np.bool_)
     right = ~mirrored & (errors_px <= radius_px)
     if right.sum() >= ENOUGH_RIGHT:
         # From the median: Rayleigh's is 1.1774 standard deviations.
         spread = float(np.median(errors_px[right])) / 1.1774
-        floor_px = min(max(spread, FLOOR_LIMITS_PX[0]), FLOOR_LIMITS_PX[1])
+        low_px, high_px = CALIBRATION.floor_limits_px
+        floor_px = min(max(spread, low_px), high_px)
         # Without a mirrored view nothing would show what a wrong place looks like.
         if negatives:
             confidence = fit_registered([each.evidence for each in outcomes], right, chances)
@@ -422,7 +431,7 @@ def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
     look = _median(negatives, "look")
     both = [each for each in negatives if math.isfinite(each["detail_ratio"])]
     total = look + USUAL_CHANCES.total - USUAL_CHANCES.look
-    if len(both) >= MIN_NEGATIVES:
+    if len(both) >= CALIBRATION.min_negatives:
         total = _median(both, "strength")
     return Chances(total, look, _fine_chance(negatives, total))
 
@@ -430,27 +439,16 @@ def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
 def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float:
     """Score of a chance match with one more level, shrunk towards the usual value."""
     known = sum(math.isfinite(each["fine"]) for each in evidence)
-    usual = USUAL_FINE * total
+    usual = CALIBRATION.usual_fine * total
     if not known:
         return usual
-    share = known / (known + USUAL_FINE_VIEWS)
+    share = known / (known + CALIBRATION.usual_fine_views)
     return math.exp(share * math.log(_median(evidence, "fine")) + (1 - share) * math.log(usual))
 
 
 def _median(evidence: Sequence[Mapping[str, float]], name: str) -> float:
     values = [each[name] for each in evidence if math.isfinite(each[name])]
-    return max(float(np.median(values)), 1.0) if values else FALLBACK_CHANCE
-
-
-RIDGE = 3e-2
-"""Weight of the usual bias."""
-MAX_SHIFT = 5.0
-LEAST = 1e-9
-"""Keeps the loss finite."""
-TILE_RIDGE = 1e-3
-"""Only against weights without bound where right and wrong separate fully."""
-FEW_RIGHT, FEW = 0.5, 5.0
-"""Trials, right ones and all, added to those of a map without a usual confidence."""
+    return max(float(np.median(values)), 1.0) if values else 40.0
 
 
 def fit_registered(
@@ -465,10 +463,10 @@ def fit_registered(
 
     def loss(shift: float) -> float:
         model = shifted(shift)
-        said = np.clip([model.of(each) for each in features], LEAST, 1 - LEAST)
-        return float(RIDGE * shift**2 - np.log(np.where(right, said, 1 - said)).mean())
+        said = np.clip([model.of(each) for each in features], 1e-9, 1 - 1e-9)
+        return float(CALIBRATION.ridge * shift**2 - np.log(np.where(right, said, 1 - said)).mean())
 
-    return shifted(float(minimize_scalar(loss, bounds=(-MAX_SHIFT, MAX_SHIFT)).x))
+    return shifted(float(minimize_scalar(loss, bounds=(-5.0, 5.0)).x))
 
 
 def fit_few(
@@ -482,8 +480,9 @@ def fit_few(
     Without one, or without any trial, the fraction of right trials, whatever the evidence.
     """
     if usual is None or len(features) == 0:
-        share = (sample_weight @ right + FEW_RIGHT) / (sample_weight.sum() + FEW)
-        return LogisticConfidence(logit(float(share), TILE_RIDGE), (0.0,) * len(TILE_FEATURES))
+        share = (sample_weight @ right + 0.5) / (sample_weight.sum() + 5.0)
+        bias = logit(float(share), CALIBRATION.tile_ridge)
+        return LogisticConfidence(bias, (0.0,) * len(TILE_FEATURES))
     known = features @ np.array(usual.weights) + usual.bias
     sign = np.where(right, 1.0, -1.0)
 
@@ -499,7 +498,7 @@ def fit_weights(
     features: NDArray[np.float64],
     right: NDArray[np.bool_],
     sample_weight: NDArray[np.float64],
-    ridge: float = TILE_RIDGE,
+    ridge: float = CALIBRATION.tile_ridge,
 ) -> tuple[float, tuple[float, ...]]:
     """Bias and weights (at least 0) of a logistic regression with a slight ridge.
 

@@ -32,29 +32,19 @@ log = logging.getLogger(__name__)
 
 EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe
 Encoder = NetworkEmbedder | WordsEmbedder
-LEARNT_WITH = {
-    "autoencoder": ("torch", "onnx", "onnxruntime"),
-    "caevl": ("torch", "onnx", "onnxruntime"),
-    "triplet": ("torch", "onnx", "onnxruntime"),
-    "bovw": ("faiss",),
-}
-"""Modules of the extra "train"."""
-USUAL_EDGES = {"autoencoder": "canny", "caevl": "canny", "triplet": "gray", "bovw": "gray"}
-LOCAL_FIELDS = ("weights", "cache")
-CHECKED_TILES, SAME = 32, 4e-3
-"""Tiles on which a device is compared with flight, and the largest difference, relative to the
-largest value: four times that of float16."""
 
 
 def usual_edges(method: str) -> str:
-    name = method.partition(":")[0]
-    return USUAL_EDGES.get(name, "gradient")
+    edges = {"autoencoder": "canny", "caevl": "canny", "triplet": "gray", "bovw": "gray"}
+    return edges.get(method.partition(":")[0], "gradient")
 
 
 def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderRecipe:
     """One-channel images are whitened on finer cells by default."""
     name, _, parameters = method.partition(":")
-    absent = [each for each in LEARNT_WITH.get(name, ()) if find_spec(each) is None]
+    network = ("torch", "onnx", "onnxruntime")
+    learnt_with = {"autoencoder": network, "caevl": network, "triplet": network, "bovw": ("faiss",)}
+    absent = [each for each in learnt_with.get(name, ()) if find_spec(each) is None]
     if absent:
         gone = ", ".join(absent)
         raise MissingExtraError(f"--method {name} needs {gone}: {pip_line('train')}")
@@ -84,14 +74,11 @@ def check_device(name: str) -> None:
 def stored_representation(representation: Any) -> dict[str, Any]:
     """For a manifest: without local paths and devices."""
     recipe = variant_recipe(represent.TABLE, representation)
-    return {name: "" if name in LOCAL_FIELDS else value for name, value in recipe.items()}
+    local = ("weights", "cache")
+    return {name: "" if name in local else value for name, value in recipe.items()}
 
 
-BATCH_TILES = 64
 MAX_WORD_TILES = 2000
-MOST_REPLACED, MOST_MIXED = 0.35, 0.4
-"""Change of the positives of a triplet, weaker than in calibration: with the stronger change a
-network learned a third as much in its first 300 batches."""
 
 
 def learn_encoder(
@@ -159,10 +146,11 @@ def learn_encoder(
 def _require_as_in_flight(
     embedder: NetworkEmbedder, tiles: SheetTiles, embedded: NDArray[np.float16]
 ) -> None:
-    some = np.unique(np.linspace(0, len(tiles) - 1, CHECKED_TILES).astype(np.intp))
+    """On 32 tiles, up to four times the precision of float16."""
+    some = np.unique(np.linspace(0, len(tiles) - 1, 32).astype(np.intp))
     flown, found = embedder.views(tiles.batch(some)), embedded[some].astype(np.float32)
     away = float(np.abs(flown - found).max())
-    if away > SAME * max(float(np.abs(flown).max()), 1e-6):
+    if away > 4e-3 * max(float(np.abs(flown).max()), 1e-6):
         raise VariantError(
             f"the device embeds tiles otherwise than the encoder in flight, by {away:.2g}; "
             "learn with --device cpu"
@@ -177,7 +165,9 @@ def _changed_tiles(
     def positive(rng: np.random.Generator, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
         # Mirrored, so that it does not occur on the map.
         negative = tiles.grey_tile(int(rng.integers(len(tiles))))[:, ::-1]
-        made = changed(rng, grey, negative, most_replaced=MOST_REPLACED, most_mixed=MOST_MIXED)
+        # Weaker than in calibration: with the stronger change a network learned a third as much
+        # in its first 300 batches.
+        made = changed(rng, grey, negative, most_replaced=0.35, most_mixed=0.4)
         return np.asarray(representation(made, np.ones(made.shape, np.bool_)), np.float32)
 
     return positive
@@ -188,8 +178,8 @@ def _embedded(
 ) -> NDArray[np.float16]:
     """Embeddings (N, D) of all tiles; `embed` takes indices of some."""
     parts = []
-    for start in range(0, len(tiles), BATCH_TILES):
-        indices = np.arange(start, min(start + BATCH_TILES, len(tiles)))
+    for start in range(0, len(tiles), 64):
+        indices = np.arange(start, min(start + 64, len(tiles)))
         parts.append(embed(indices).astype(np.float16))
         progress("embed", (int(indices[-1]) + 1) / len(tiles))
     out = np.concatenate(parts)

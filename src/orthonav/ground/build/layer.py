@@ -10,7 +10,7 @@ float16: the rounding error is at most 0.4 % of the largest.
 import logging
 import math
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -22,22 +22,19 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import AreaError, ImageryError, MapFileError
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.geo.ground import bilinear
+from orthonav.core.geo.ground import bilinear_of
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.mapfile.layer import ChunkTable, part_names
 from orthonav.core.mapfile.manifest import (
     MAX_CODE,
     MAX_LEVELS,
     MAX_NAME,
-    MAX_POSTING_M,
-    MAX_ROUGHNESS_M,
-    MAX_SOURCE_POSTING_M,
-    MIN_SOURCE_POSTING_M,
     GreyInfo,
     Lean,
     TerrainInfo,
+    clamped,
 )
-from orthonav.core.mapfile.reader import MapFile
+from orthonav.core.mapfile.reader import MapFile, blob_parts
 from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, encode_terrain, terrain_part_names
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
@@ -48,22 +45,17 @@ from orthonav.ground.planning.area import Area
 
 CHUNK_PX = 256
 """A view touches few chunks, and each decodes in 0.1 to 0.2 ms (docs/map-format.md)."""
-COARSEST_PX = 64
-"""Levels are added until the larger side is at most this."""
 QUALITY = 70
 """Registration peaks are within 1 % of those of uncompressed imagery (docs/map-format.md)."""
-COARSER_QUALITIES = (50, 30)
-"""For chunks of noise, so that the size of a map is bounded."""
 MAX_BYTES_PER_PX = 0.5
-_HEADER_BYTES = 512
+"""Of a chunk: those of noise have a lower quality, so that the size of a map is bounded."""
 Parts = dict[str, NDArray[Any]]
 
 
 def level_count(height_px: int, width_px: int) -> int:
-    levels = 1
-    while max(height_px, width_px) > COARSEST_PX << (levels - 1) and levels < MAX_LEVELS:
-        levels += 1
-    return levels
+    """Levels are added until the larger side is at most 64 px."""
+    halvings = max(0, math.ceil(math.log2(max(height_px, width_px) / 64)))
+    return min(1 + halvings, MAX_LEVELS)
 
 
 def halved(
@@ -119,15 +111,12 @@ class GreyLayerWriter:
         for level, pending in enumerate(self._pending):
             for place in sorted(pending):
                 self._complete(level, place)
-        empty = (b"", b"")
-        chunks = [self._encoded.get(number, empty) for number in range(self._table.count)]
+        chunks = [self._encoded.get(number, (b"", b"")) for number in range(self._table.count)]
         names = part_names(0)
         parts: Parts = {}
         for index, kind in enumerate(("", "mask_")):
-            blobs = [chunk[index] for chunk in chunks]
-            ends = np.cumsum([0, *map(len, blobs)], dtype=np.int64)
-            parts[names[f"{kind}bytes"]] = np.frombuffer(b"".join(blobs), dtype=np.uint8)
-            parts[names[f"{kind}offsets"]] = ends
+            data, offsets = names[f"{kind}bytes"], names[f"{kind}offsets"]
+            parts |= blob_parts(data, offsets, [chunk[index] for chunk in chunks])
         return GreyInfo(self._chunk_px, self._levels, QUALITY, self._valid_px), parts
 
     def _add(
@@ -176,35 +165,32 @@ def encode_chunk(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[byt
 
 def _jpeg(grey: NDArray[np.uint8]) -> bytes:
     encoded = b""
-    for quality in (QUALITY, *COARSER_QUALITIES):
+    for quality in (QUALITY, 50, 30):
         options = [int(cv2.IMWRITE_JPEG_QUALITY), quality, int(cv2.IMWRITE_JPEG_OPTIMIZE), 1]
         encoded = cv2.imencode(".jpg", grey, options)[1].tobytes()
-        if len(encoded) <= MAX_BYTES_PER_PX * grey.size + _HEADER_BYTES:
+        if len(encoded) <= MAX_BYTES_PER_PX * grey.size + 512:
             break
     return encoded
 
 
 CODES, SCALE, VALID = (f"sheet0/cells/{kind}" for kind in ("codes", "scale", "valid"))
-MIDDLE, LEVELS = 128, 127
-WHOLE = 255
-_ROWS_AT_ONCE = 256
-_SMALLEST = float(np.finfo(np.float16).tiny)
 
 
 def cell_parts(cells: CellSheet) -> Parts:
-    """Valid shares only where not all are 1."""
-    codes = np.full(cells.means.shape, MIDDLE, dtype=np.uint8)
+    """Codes from 1 to 255, 128 standing for 0; valid shares only where not all are 1."""
+    codes = np.full(cells.means.shape, 128, dtype=np.uint8)
     scale = np.zeros(cells.valid.shape, dtype=np.float16)
     valid = np.zeros(cells.valid.shape, dtype=np.uint8)
-    for first in range(0, len(codes), _ROWS_AT_ONCE):
-        rows = slice(first, first + _ROWS_AT_ONCE)
+    smallest = float(np.finfo(np.float16).tiny)
+    for first in range(0, len(codes), 256):
+        rows = slice(first, first + 256)
         means = cells.means[rows]
-        scale[rows] = np.abs(means).max(axis=2) / LEVELS
-        unit = np.maximum(scale[rows].astype(np.float32), _SMALLEST)[..., None]
-        codes[rows] = np.clip(np.rint(means / unit) + MIDDLE, MIDDLE - LEVELS, WHOLE)
-        valid[rows] = cells.valid[rows] * WHOLE + 1e-3  # truncated: only complete cells get 255
+        scale[rows] = np.abs(means).max(axis=2) / 127
+        unit = np.maximum(scale[rows].astype(np.float32), smallest)[..., None]
+        codes[rows] = np.clip(np.rint(means / unit) + 128, 1, 255)
+        valid[rows] = cells.valid[rows] * 255 + 1e-3  # truncated: only complete cells get 255
     parts: Parts = {CODES: codes, SCALE: scale}
-    return parts if (valid == WHOLE).all() else {**parts, VALID: valid}
+    return parts if (valid == 255).all() else {**parts, VALID: valid}
 
 
 class StoredCells:
@@ -242,31 +228,18 @@ class StoredCells:
         part = np.s_[top:bottom, left:right]
         inside = np.s_[top - row : bottom - row, left - col : right - col]
         scale = self._scale[part].astype(np.float32)
-        means[inside] = (self._codes[part].astype(np.float32) - MIDDLE) * scale[..., None]
+        means[inside] = (self._codes[part].astype(np.float32) - 128) * scale[..., None]
         share[inside] = 1.0
         if self._valid is not None:
-            share[inside] = self._valid[part] / np.float32(WHOLE)
+            share[inside] = self._valid[part] / np.float32(255)
         return means, share
 
 
 POSTING_M = 10.0
 """Distance of samples; that of the terrain model where it is coarser."""
 TERRAIN_CHUNK_PX = 128
-UNIT_M = 0.1
-SURFACE_POSTING_M, SURFACE_UNIT_M = 1.0, 0.25
-"""Of houses and trees above the terrain: half the 2 m at which views are rectified."""
-ENVELOPE_POSTING_M, WIDEST_M = 2.0, 40.0
-"""Of the lower envelope that stands for bare earth, without narrower houses and trees."""
-LOW_PERCENT, OFFSET_SAMPLES, MOST_OFF_M, MAX_DATUM_M = 5, 256, 10.0, 120.0
-"""At least this percentage of a surface is bare ground; samples across the area that show it; its
-largest height above a terrain of the same datum, and of any."""
 MAX_SURFACE_M = 3.0
 """Coarsest surface model: wider samples do not show houses."""
-ROUGH_SQUARES, ROUGH_POSTINGS, MAX_FINER = 4, 16, 8
-"""Squares per side of the area in which roughness is measured, their width in postings, and the
-most samples of the source across a posting."""
-HeightSampler = Callable[[float, float, int, int], NDArray[np.float64]]
-"""Heights above mean sea level of rows and columns of samples from a north-west corner, metres."""
 log = logging.getLogger(__name__)
 
 
@@ -288,12 +261,9 @@ def terrain_of_dem(
     dem: Dem, area: Area, grid: TileGrid, *, needed: bool = True
 ) -> TerrainParts | None:
     """None where the model has no height in the area; `AreaError` if it is `needed`."""
-    posting_m = min(max(POSTING_M, rounded_gsd_m(dem.gsd_m)), MAX_POSTING_M)
-
-    def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
-        return dem.in_plane(area.frame, west_m, north_m, posting_m, rows, cols)
-
-    made = terrain_parts(area, grid, posting_m, dem.path.name, dem.datum.name, sampled)
+    posting_m = clamped(TerrainInfo, "posting_m", max(POSTING_M, rounded_gsd_m(dem.gsd_m)))
+    heights = partial(dem.in_plane, area.frame)
+    made = terrain_parts(area, grid, posting_m, dem.path.name, dem.datum.name, heights)
     if made is None and needed:
         raise _no_height("terrain", area, dem)
     return None if made is None else made._replace(info=_with_source(made.info, dem, area))
@@ -339,17 +309,18 @@ class Surface:
 
     def above_m(self, dem: Dem) -> float:
         """Height of bare ground above that of a terrain model, where the datum of either is not
-        known. Raises `ImageryError` for more than can be, as with other units."""
+        known: at least 5 % of a surface are bare. Raises `ImageryError` for more than can be, as
+        with other units."""
         known = all(each.datum.is_known for each in (dem, *self.models))
         west, south, east, north = self.area.extent_en_m
-        posting_m = max(east - west, north - south) / OFFSET_SAMPLES
+        posting_m = max(east - west, north - south) / 256
         rows, cols = (max(round(side / posting_m), 1) for side in (north - south, east - west))
         off_m = self.sampled(west, north, posting_m, rows, cols)
         off_m -= dem.in_plane(self.area.frame, west, north, posting_m, rows, cols)
         if not np.isfinite(off_m).any():
             return 0.0
-        low_m = float(np.nanpercentile(off_m, LOW_PERCENT))
-        if abs(low_m) > (MOST_OFF_M if known else MAX_DATUM_M):
+        low_m = float(np.nanpercentile(off_m, 5))
+        if abs(low_m) > (10.0 if known else 120.0):
             raise ImageryError(
                 f"bare ground of the surface lies {low_m:.0f} m above the terrain: check unit and "
                 f"vertical datum of {self.name} and {dem.path.name}"
@@ -362,11 +333,11 @@ class Surface:
     def envelope(
         self, west_m: float, north_m: float, posting_m: float, rows: int, cols: int
     ) -> NDArray[np.float64]:
-        """The same of bare earth: the surface without what is narrower than `WIDEST_M`, by a
+        """The same of bare earth: the surface without what is narrower than 40 m, by a
         morphological opening."""
-        fine = round(posting_m / max(ENVELOPE_POSTING_M, self.gsd_m))
+        fine = round(posting_m / max(2.0, self.gsd_m))
         fine_m = posting_m / fine
-        side = 2 * math.ceil(WIDEST_M / fine_m / 2) + 1
+        side = 2 * math.ceil(40.0 / fine_m / 2) + 1
         shape = rows * fine + 2 * side, cols * fine + 2 * side
         corner = west_m - side * fine_m, north_m + side * fine_m
         heights = self.sampled(*corner, fine_m, *shape).astype(np.float32)
@@ -415,24 +386,22 @@ def height_layers(
         return HeightLayers(terrain, None)
     surface = Surface(models, area)
     if dem is None:
-        terrain, ground = _bare_earth(surface, area, grid), surface.envelope
+        ground: PlaneSampler = surface.envelope
+        terrain = terrain_parts(area, grid, POSTING_M, surface.name, surface.datum, ground)
     else:
         ground = partial(_raised, dem, area, surface.above_m(dem))
     made = lean = None
     if terrain is not None:
         above = partial(_above, surface, ground, terrain.info)
         lean = TRUE_ORTHO if imagery is None else visible_lean(imagery, above, area)
-        made = _surface_parts(surface, as_shown(above, lean or TRUE_ORTHO), area, grid)
+        # Every metre, half the 2 m at which views are rectified.
+        posting_m = max(1.0, rounded_gsd_m(surface.gsd_m))
+        shown = as_shown(above, lean or TRUE_ORTHO)
+        place = area, grid, posting_m, surface.name, "terrain"
+        made = terrain_parts(*place, shown, layer=SURFACE, unit_m=0.25)
     if made is None and needed:
         raise _no_height("surface", area, models[0])
     return HeightLayers(terrain, made, lean)
-
-
-def _bare_earth(surface: Surface, area: Area, grid: TileGrid) -> TerrainParts | None:
-    def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
-        return surface.envelope(west_m, north_m, POSTING_M, rows, cols)
-
-    return terrain_parts(area, grid, POSTING_M, surface.name, surface.datum, sampled)
 
 
 def _raised(dem: Dem, area: Area, by_m: float, *window: Any) -> NDArray[np.float64]:
@@ -458,31 +427,19 @@ def _above(
     size = math.ceil(float(row.max())) - top + 2, math.ceil(float(col.max())) - left + 2
     corner = info.west_m + left * info.posting_m, info.north_m - top * info.posting_m
     below = ground(*corner, info.posting_m, *size)
-    return heights - bilinear(lambda r, c: below[r, c], below.shape, col - left, row - top)
-
-
-def _surface_parts(
-    surface: Surface, above: PlaneSampler, area: Area, grid: TileGrid
-) -> TerrainParts | None:
-    posting_m = max(SURFACE_POSTING_M, rounded_gsd_m(surface.gsd_m))
-
-    def sampled(west_m: float, north_m: float, rows: int, cols: int) -> NDArray[np.float64]:
-        return above(west_m, north_m, posting_m, rows, cols)
-
-    name, datum, unit_m = surface.name, "terrain", SURFACE_UNIT_M
-    return terrain_parts(area, grid, posting_m, name, datum, sampled, layer=SURFACE, unit_m=unit_m)
+    return heights - bilinear_of(below, col - left, row - top)
 
 
 def _with_source(info: TerrainInfo, dem: Dem, area: Area) -> TerrainInfo:
-    source_m = min(max(rounded_gsd_m(dem.gsd_m), MIN_SOURCE_POSTING_M), MAX_SOURCE_POSTING_M)
+    source_m = clamped(TerrainInfo, "source_posting_m", rounded_gsd_m(dem.gsd_m))
     return replace(info, source_posting_m=source_m, roughness_m=_roughness_m(info, dem, area))
 
 
 def _roughness_m(info: TerrainInfo, dem: Dem, area: Area) -> float | None:
     """RMS difference of the heights of the source from those of the layer; None where the source is
-    not finer."""
-    finer = min(round(info.posting_m / dem.gsd_m), MAX_FINER)
-    side = min(ROUGH_POSTINGS, info.rows, info.cols)
+    not finer. In 4 squares of 16 postings along each side, each of at most 8 samples."""
+    finer = min(round(info.posting_m / dem.gsd_m), 8)
+    side = min(16, info.rows, info.cols)
     if finer < 2 or side < 3:
         return None
     squares = []
@@ -499,7 +456,7 @@ def _roughness_m(info: TerrainInfo, dem: Dem, area: Area) -> float | None:
     found = np.concatenate(squares) if squares else np.empty(0)
     if not found.size:
         return None
-    return round(min(float(np.sqrt(found.mean())), MAX_ROUGHNESS_M), 3)
+    return round(clamped(TerrainInfo, "roughness_m", float(np.sqrt(found.mean()))), 3)
 
 
 def _off_means_m(fine: NDArray[np.float64], finer: int) -> NDArray[np.float64]:
@@ -509,13 +466,12 @@ def _off_means_m(fine: NDArray[np.float64], finer: int) -> NDArray[np.float64]:
     means = fine.reshape(side, finer, side, finer).mean(axis=(1, 3))
     at = (np.arange(len(fine)) + 0.5) / finer - 0.5
     col, row = np.meshgrid(at, at)
-    between = bilinear(lambda rows, cols: np.asarray(means[rows, cols]), means.shape, col, row)
-    return np.asarray((fine - between)[finer:-finer, finer:-finer])
+    return np.asarray((fine - bilinear_of(means, col, row))[finer:-finer, finer:-finer])
 
 
 def _firsts(count: int, side: int) -> list[int]:
     """Where squares of `side` samples begin, one in the middle of each equal part."""
-    number = min(ROUGH_SQUARES, count // side)
+    number = min(4, count // side)
     return [round((k + 0.5) * count / number - side / 2) for k in range(number)]
 
 
@@ -525,10 +481,10 @@ def terrain_parts(
     posting_m: float,
     name: str,
     datum: str,
-    sampled: HeightSampler,
+    sampled: PlaneSampler,
     *,
     layer: str = TERRAIN,
-    unit_m: float = UNIT_M,
+    unit_m: float = 0.1,
 ) -> TerrainParts | None:
     """None where the source has no height; smaller holes stay holes, and a warning names them."""
     west_m, north_m = grid.west_m - posting_m, grid.north_m + posting_m
@@ -547,7 +503,7 @@ def terrain_parts(
         reach_m = math.hypot(*shape) / 2 * posting_m + grid.tile_m + grid.stride_m
         if area.route is not None and not area.contains(np.array([middle]), reach_m)[0]:
             continue  # too far from the route for any view
-        heights = sampled(west, north, *shape).astype(np.float32)
+        heights = sampled(west, north, posting_m, *shape).astype(np.float32)
         row, col = np.mgrid[: shape[0], : shape[1]] + 0.5
         points = np.stack([west + col * posting_m, north - row * posting_m], axis=-1)
         here = area.contains(points.reshape(-1, 2)).reshape(shape)
@@ -578,6 +534,4 @@ def terrain_parts(
         encode_terrain(found[number], info) if number in found else b""
         for number in range(table.count)
     ]
-    data, offsets = terrain_part_names(0, layer)
-    ends = np.cumsum([0, *map(len, blobs)]).astype(np.int64)
-    return TerrainParts(info, {data: np.frombuffer(b"".join(blobs), np.uint8), offsets: ends})
+    return TerrainParts(info, blob_parts(*terrain_part_names(0, layer), blobs))

@@ -17,14 +17,11 @@ from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 
 TRUE_ORTHO = Lean(0.0, 0.0, 0.0)
-MOST, STEP = 0.5, 0.05
-"""Largest lean per axis that is looked for, and the steps, whose half is the least error."""
-POSTING_M, WINDOW_PX, WINDOWS = 0.5, 600, 3  # where it is looked for; along both sides of the area
+STEP = 0.05
+"""Of the leans per axis that are looked for; half of it is the least error."""
+POSTING_M = 0.5  # where it is looked for
 HIGHEST_M = 100.0
-EDGE_M, LEAST_EDGES = 2.0, 2000  # least height of an edge, and number of pixels on edges
-VISIBLE, OVER_UPRIGHT = 1.3, 1.1
-"""Least score over the median of all leans, and over that of upright houses. By generated towns and
-a real wooded valley: 1.4 to 1.9, and 1.15 to 1.4 where they lean by 0.15 or more."""
+MIN_EDGES = 2000  # pixels on edges of houses
 Array = NDArray[np.float64]
 PlaneSampler = Callable[[float, float, float, int, int], Array]
 """Takes the arguments of `Dem.in_plane`, without the plane: west and north of a corner, posting,
@@ -36,15 +33,15 @@ def visible_lean(imagery: Mosaic, above: PlaneSampler, area: Area) -> Lean | Non
     or where windows differ as much as leans that are not known.
 
     Shadows end along displaced edges too, but on two sides of a house only."""
-    leans = np.arange(-MOST, MOST + STEP / 2, STEP)
+    leans = np.arange(-0.5, 0.5 + STEP / 2, STEP)
     total, edges, alone = np.zeros((len(leans), len(leans))), 0, []
     for grey, high in _windows(imagery, above, area):
         strength, count = _fits(grey, high, leans)
         total += strength
         edges += count
-        if count >= LEAST_EDGES and (best := _best(strength, leans)) is not None:
+        if count >= MIN_EDGES and (best := _best(strength, leans)) is not None:
             alone.append(best)
-    found = _best(total, leans) if edges >= LEAST_EDGES else None
+    found = _best(total, leans) if edges >= MIN_EDGES else None
     if found is None:
         return None
     spread = max((max(abs(e - found[0]), abs(n - found[1])) for e, n in alone), default=0.0)
@@ -54,13 +51,16 @@ def visible_lean(imagery: Mosaic, above: PlaneSampler, area: Area) -> Lean | Non
 
 
 def _best(strength: Array, leans: Array) -> tuple[float, float] | None:
-    """East and north, of sums of `_fits`."""
+    """East and north, of sums of `_fits`; None where the best is less than 1.3 of the median.
+
+    The best must also be 1.1 of that of upright houses. In generated towns and a real wooded valley
+    it is 1.4 to 1.9 of the first, and 1.15 to 1.4 of the second where they lean by 0.15 or more."""
     scores, upright = cv2.blur(strength, (3, 3)), len(leans) // 2
     row, col = divmod(int(scores.argmax()), len(leans))
-    if scores[row, col] < OVER_UPRIGHT * scores[upright, upright]:
+    if scores[row, col] < 1.1 * scores[upright, upright]:
         row = col = upright
     at_rim = {row, col} & {0, len(leans) - 1}
-    if at_rim or not scores[row, col] > VISIBLE * float(np.median(scores)):
+    if at_rim or not scores[row, col] > 1.3 * float(np.median(scores)):
         return None
     east, north = (round(float(leans[each]), 2) + 0.0 for each in (col, row))  # no -0.0
     return east, north
@@ -69,14 +69,15 @@ def _best(strength: Array, leans: Array) -> tuple[float, float] | None:
 def _windows(
     imagery: Mosaic, above: PlaneSampler, area: Area
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Grey and heights (H, W), NaN where unknown, of windows spread over the area."""
+    """Grey and heights (H, W), NaN where unknown, of windows spread over the area: at most three
+    of 600 px along each side."""
     west, south, east, north = area.extent_en_m
     sides_m = np.array([east - west, north - south])
-    cols, rows = (min(round(side / POSTING_M), WINDOW_PX) for side in sides_m.tolist())
+    cols, rows = (min(round(side / POSTING_M), 600) for side in sides_m.tolist())
     if min(rows, cols) < 2:
         return
     left_m = sides_m - np.array([cols, rows]) * POSTING_M
-    counts = np.minimum(np.ceil(sides_m / (WINDOW_PX * POSTING_M)), WINDOWS).astype(int)
+    counts = np.minimum(np.ceil(sides_m / (600 * POSTING_M)), 3).astype(int)
     for down, right in product(_spread(counts[1]), _spread(counts[0])):
         corner = west + right * left_m[0], north - down * left_m[1]
         high = above(*corner, POSTING_M, rows, cols)
@@ -105,8 +106,8 @@ def _fits(grey: NDArray[np.float32], high: NDArray[np.float32], leans: Array) ->
     size = np.hypot(right, up)
     usual = cv2.blur(size, (31, 31)) + 0.2 * float(size.mean()) + 1e-6
     low = cv2.erode(np.nan_to_num(high, nan=np.inf), np.ones((3, 3), np.uint8))
-    # The upper side of edges.
-    rows, cols = np.nonzero((high - low > EDGE_M) & np.isfinite(grey))
+    # The upper side of edges that are higher than 2 m.
+    rows, cols = np.nonzero((high - low > 2.0) & np.isfinite(grey))
     across_right, across_up = (np.nan_to_num(each)[rows, cols] for each in _gradients(high))
     steep = np.maximum(np.hypot(across_right, across_up), 1e-6)
     moved_px = high[rows, cols] / POSTING_M

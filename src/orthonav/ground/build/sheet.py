@@ -1,23 +1,22 @@
 """Reading a sheet: from blocks of imagery to cell means, crops and the registration layer.
 
-Several threads read blocks, each with its own datasets; results are collected in the order of the
+Several threads read blocks; results are collected in the order of the
 blocks, so the map is the same for any number of threads. The result of a block is a dictionary of
 arrays, one file in a cache from which an interrupted build resumes.
 """
 
 import contextlib
+import functools
 import hashlib
 import json
 import logging
 import math
-import queue
-import re
-import threading
+import shutil
 import zipfile
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,6 +31,7 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import AreaError, VariantError
 from orthonav.core.files import Progress, no_progress, replacing
 from orthonav.core.geo.grid import TileGrid
+from orthonav.core.mapfile.layer import MAX_PREVIEW_PX
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
 from orthonav.core.tiles.represent import Gray
@@ -46,60 +46,32 @@ from orthonav.research.tiles import SheetTiles
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
-Worker = AbstractContextManager[Callable[[Item], Made]]
-_Jobs = queue.SimpleQueue[tuple[Future[Made], Item] | None]
 AHEAD = 2
 """Finished results that may wait for a slower one."""
 
 
 def in_order(
-    items: Sequence[Item], opened: Callable[[], Worker[Item, Made]], workers: int
-) -> Iterator[Made]:
-    """Results of a worker for each item, in the order of the items, at most `workers + AHEAD`
-    ahead.
+    work: Callable[[Item], Made], items: Sequence[Item], workers: int
+) -> Generator[Made, None, None]:
+    """Results of `work` in the order of the items, at most `workers + AHEAD` ahead.
 
-    `opened` opens the worker of each thread. The first error, in the order of the items, is raised.
-    """
+    The first error, in that order, is raised. No thread runs once this is closed."""
     workers = min(workers, len(items))
     if workers <= 1:
-        with opened() as work:
-            yield from map(work, items)
+        yield from map(work, items)
         return
-    todo: _Jobs[Made, Item] = queue.SimpleQueue()
-    threads = [
-        threading.Thread(target=_serve, args=(todo, opened), daemon=True) for _ in range(workers)
-    ]
     waiting: deque[Future[Made]] = deque()
-    try:
-        for thread in threads:
-            thread.start()
-        for item in items:
-            waiting.append(Future())
-            todo.put((waiting[-1], item))
-            if len(waiting) >= workers + AHEAD:
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if len(waiting) >= workers + AHEAD:
+                    yield waiting.popleft().result()
+            while waiting:
                 yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        for result in waiting:
-            result.cancel()
-        for _ in threads:
-            todo.put(None)
-        for thread in threads:
-            thread.join()
-
-
-def _serve(todo: _Jobs[Made, Item], opened: Callable[[], Worker[Item, Made]]) -> None:
-    with ExitStack() as stack:
-        work = None
-        while (job := todo.get()) is not None:
-            result, item = job
-            if result.set_running_or_notify_cancel():
-                try:
-                    work = work or stack.enter_context(opened())
-                    result.set_result(work(item))
-                except BaseException as error:
-                    result.set_exception(error)
+        finally:
+            for result in waiting:
+                result.cancel()
 
 
 @dataclass(frozen=True)
@@ -151,8 +123,10 @@ def blocks_of(area: Area, grid: TileGrid, side_px: int) -> list[Block]:
 
 
 class Preview:
-    def __init__(self, grid: TileGrid, across_px: int) -> None:
-        self._scale = min(1.0, across_px / max(grid.width_px, grid.height_px))
+    """The picture of a sheet that the map carries, as small as its format allows."""
+
+    def __init__(self, grid: TileGrid) -> None:
+        self._scale = min(1.0, MAX_PREVIEW_PX / max(grid.width_px, grid.height_px))
         height, width = grid.height_px * self._scale, grid.width_px * self._scale
         self._grey = np.zeros((max(1, round(height)), max(1, round(width))), np.uint8)
 
@@ -184,7 +158,6 @@ log = logging.getLogger(__name__)
 
 MIN_TILE_VALID_SHARE = 0.5
 """No view can match most tiles with less imagery."""
-_TILES_AT_ONCE = 2**17
 
 
 def grid_of(
@@ -221,7 +194,7 @@ def _whole_cells(tile_px: int, overlap: float) -> float:
 def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
     """Grid rows and columns (N, 2) of the tiles in the area that have imagery."""
     reach_m = grid.stride_m * np.sqrt(0.5)
-    step = max(1, _TILES_AT_ONCE // grid.cols)
+    step = max(1, 2**17 // grid.cols)
     found = []
     for first in range(0, grid.rows, step):  # a few rows at a time: the box may be mostly empty
         rows, cols = np.mgrid[first : min(first + step, grid.rows), : grid.cols]
@@ -321,8 +294,6 @@ def read_pictures(
 
 BLOCK_PX = 1024
 """Least width: a few MB of memory per thread."""
-PREVIEW_PX = 384
-"""Limit of the map format."""
 MIN_CACHED_BLOCKS = 16
 """Smaller builds do not cache blocks by default: they are quickly rebuilt."""
 
@@ -330,9 +301,6 @@ MIN_CACHED_BLOCKS = 16
 def digest(values: Any) -> str:
     text = json.dumps(values, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-_BLOCK = re.compile(r"\.?r\d+-c\d+-[0-9a-f]+\.npz(\..*)?$")
 
 
 class BlockCache:
@@ -343,14 +311,11 @@ class BlockCache:
 
     def __init__(self, folder: Path, request: str) -> None:
         """`request`: digest of everything that determines the blocks; removes other blocks."""
-        self._folder, self._request = folder, request
-        found = 0
-        for path in self._blocks():
-            if request in path.name and not path.name.startswith("."):
-                found += 1
-            else:
-                path.unlink()
-        if found:
+        self._folder, self._blocks = folder, folder / f"blocks-{request}"
+        for other in folder.glob("blocks-*"):
+            if other != self._blocks:
+                shutil.rmtree(other)
+        if found := len(list(self._blocks.glob("*.npz"))):
             log.warning("resuming: %d blocks are cached in %s", found, folder)
 
     def load(self, block: "Block") -> Parts | None:
@@ -371,16 +336,12 @@ class BlockCache:
 
     def discard(self) -> None:
         """Remove all blocks, and the folder unless it holds something else."""
-        for path in self._blocks():
-            path.unlink()
+        shutil.rmtree(self._blocks, ignore_errors=True)
         with contextlib.suppress(OSError):
             self._folder.rmdir()
 
-    def _blocks(self) -> list[Path]:
-        return [path for path in self._folder.glob("*.npz") if _BLOCK.match(path.name)]
-
     def _path(self, block: "Block") -> Path:
-        return self._folder / f"r{block.row}-c{block.col}-{self._request}.npz"
+        return self._blocks / f"r{block.row}-c{block.col}.npz"
 
 
 Job = tuple[Block, NDArray[np.intp]]
@@ -406,7 +367,7 @@ class SheetReader:
         height, width = grid.height_px, grid.width_px
         self._layout = layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
         self.cells = CellSheet(layout, height, width, representation.channels)
-        self.preview = Preview(grid, PREVIEW_PX)
+        self.preview = Preview(grid)
         self.layer = GreyLayerWriter(height, width) if registration else None
         self.pictures = pictures
         # Cells that begin in a block may end beyond it, within the margin.
@@ -421,14 +382,15 @@ class SheetReader:
         workers = usable_cores() if workers is None else workers
         if not represent.TABLE[self._recipe["name"]].flies:
             workers = 1  # one network in memory, which uses threads itself
-
-        @contextmanager
-        def opened() -> Iterator[Callable[[Job], Parts]]:
-            with self.mosaic.grid_sheet(self.area.frame, self.grid, threads=1) as raster:
-                yield lambda job: self._read_block(raster, job, cache)
-
-        with one_opencv_thread(), quiet():
-            for done, parts in enumerate(in_order(self._jobs, opened, workers)):
+        raster = self.mosaic.grid_sheet(self.area.frame, self.grid, threads=1)
+        work = functools.partial(self._read_block, raster, cache)
+        with (
+            one_opencv_thread(),
+            quiet(),
+            raster,
+            contextlib.closing(in_order(work, self._jobs, workers)) as made,
+        ):
+            for done, parts in enumerate(made):
                 if parts:
                     self._take(self._jobs[done][0], parts)
                 progress("imagery", (done + 1) / len(self._jobs))
@@ -441,8 +403,7 @@ class SheetReader:
         """Cache in `work`, or, if there are many blocks, beside the map; else None."""
         if work is None and len(self._jobs) < MIN_CACHED_BLOCKS:
             return None
-        name = f"blocks-{out.name}"
-        folder = out.with_name(f"{out.name}.work") if work is None else work / name
+        folder = work / f"blocks-{out.name}" if work else out.with_name(f"{out.name}.work")
         return BlockCache(folder, self._request())
 
     @property
@@ -461,7 +422,7 @@ class SheetReader:
             jobs.append((block, self.sampler.places(outer.height, outer.width, share)))
         return jobs
 
-    def _read_block(self, raster: SheetRaster, job: Job, cache: BlockCache | None) -> Parts:
+    def _read_block(self, raster: SheetRaster, cache: BlockCache | None, job: Job) -> Parts:
         block, places = job
         cached = None if cache is None else cache.load(block)
         if cached is not None:
@@ -505,7 +466,7 @@ class SheetReader:
             "represent": self._recipe,
             "area": repr(self.area),
             "grid": vars(self.grid),
-            "layout": [vars(self._layout), self._margin_px, PREVIEW_PX, CHUNK_PX],
+            "layout": [vars(self._layout), self._margin_px, MAX_PREVIEW_PX, CHUNK_PX],
             "jobs": [[*block.window, places.tolist()] for block, places in self._jobs],
             "crop_px": self.sampler.size_px,
             "parts": [self.layer is not None, self.pictures is not None],

@@ -24,11 +24,11 @@ from orthonav.core.errors import FetchError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.fetch.grid import CellGrid, Selection, mean_scale
 from orthonav.ground.fetch.presets import (
-    GSD_TOLERANCE,
     ImageryOptions,
     SourceSpec,
     choose,
     finest_fitting,
+    is_fine_enough,
     listed,
 )
 from orthonav.ground.fetch.service import (
@@ -41,19 +41,14 @@ from orthonav.ground.fetch.service import (
 from orthonav.ground.fetch.urls import TOKEN, Secret, checked_url, linked, origin_of, shown
 from orthonav.ground.fetch.web import Web
 from orthonav.ground.imagery.mosaic import WHOLLY_VALID
-from orthonav.ground.imagery.source import GDAL_ERRORS, quiet
+from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 
 MAX_ITEMS = 500  # files of one fetch: an open dataset each, per thread
-PAGE = 100  # items per page; APIs allow at least this many
 MAX_PAGES = 200
-_USUAL_ASSETS = ("visual", "image", "ortho", "data", "rgb")
-_TIFF = re.compile(r"image/(tiff|vnd\.stac\.geotiff)|\.tiff?$", re.IGNORECASE)
 CELL_PX = 512  # GDAL's block size for COG, so a cell is usually one block
 MAX_BLOCK_BYTES = 64 * 2**20
 """Largest block, unpacked: one of a tiled file has at most a few megabytes."""
-_PACKED_SHARE = 0.35  # size of a usual JPEG block relative to its pixels, for the estimate
-_DTYPES = ("uint8", "uint16", "int16", "float32")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +99,8 @@ def cog_source(web: Web, spec: SourceSpec, area: Area, urls: list[str]) -> CellS
 
         return read
 
-    cell_bytes = CELL_PX**2 * np.dtype(first.dtype).itemsize * len(bands) * _PACKED_SHARE
+    # A usual JPEG block takes 0.35 of its pixels.
+    cell_bytes = CELL_PX**2 * np.dtype(first.dtype).itemsize * len(bands) * 0.35
     return CellSource(spec.provenance, grid, len(bands), first.dtype, cell_bytes, reader)
 
 
@@ -126,7 +122,9 @@ def _opened(web: Web, url: str, level: int | None = None) -> Iterator[Any]:
             rasterio.open(path, driver="GTiff", **options) as file,
         ):
             yield file
-    except GDAL_ERRORS as error:
+    except (FetchError, MemoryError):
+        raise
+    except Exception as error:  # whatever GDAL raises may quote the address with its key
         reason = web.redacted(reason_of(error)[0])
         raise FetchError(f"not a GeoTIFF that can be read ({reason}): {shown(url)}") from None
 
@@ -147,7 +145,7 @@ def _inspect(web: Web, url: str, options: ImageryOptions, frame: LocalFrame) -> 
         if transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
             raise FetchError(f"file is rotated or not georeferenced: {shown(url)}")
         dtype = str(dataset.dtypes[0])
-        if dtype not in _DTYPES:
+        if dtype not in ("uint8", "uint16", "int16", "float32"):
             raise FetchError(f"file has unsupported pixels ({dtype}): {shown(url)}")
         # Neither packed nor unpacked may a block exhaust memory: an untiled file is one huge block.
         block_px = max(height * width for height, width in dataset.block_shapes)
@@ -229,9 +227,9 @@ def _found(
     corners = [(west, south), (west, north), (east, south), (east, north)]
     lat, lon = area.frame.latlon_from_en(corners)
     box = [float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())]
-    query: Any = {"bbox": box, "limit": PAGE}
+    query: Any = {"bbox": box, "limit": 100}  # per page: APIs allow at least as many
     query |= {"datetime": spec.options.time} if spec.options.time else {}
-    query |= {"collections": [spec.options.collection]} if spec.options.collection else {}
+    query |= {"collections": [spec.options.layer]} if spec.options.layer else {}
     search = _link(web.get_json(spec.url), "search")
     if search is None:
         raise FetchError(f"not a STAC API with a search: {spec.url}")
@@ -274,23 +272,26 @@ def _item(feature: dict[str, Any], where: str, options: ImageryOptions) -> tuple
 
 
 def _asset(assets: dict[str, dict[str, Any]], options: ImageryOptions, name: str) -> str:
-    """The asset requested, else the only GeoTIFF, or the coarsest that is fine enough."""
+    """The asset requested, else the GeoTIFF of a usual name, the only one, or the coarsest that is
+    fine enough."""
     if options.asset is not None:
         return choose(list(assets), options.asset, f"item {name} has no asset")
+    kinds = re.compile(r"image/(tiff|vnd\.stac\.geotiff)|\.tiff?$", re.IGNORECASE)
     tiffs = {
         key: float(asset.get("gsd") or asset.get("eo:gsd") or 0)
         for key, asset in assets.items()
-        if _TIFF.search(str(asset.get("type") or asset.get("href")).partition("?")[0])
+        if kinds.search(str(asset.get("type") or asset.get("href")).partition("?")[0])
         and not {"thumbnail", "metadata", "overview"} & set(asset.get("roles") or [])
     }
     if not tiffs:
         raise FetchError(f"item {name} has no GeoTIFF; available: {listed(list(assets))}")
-    usual = [key for key in _USUAL_ASSETS if key in tiffs]
-    if usual:
-        return usual[0]
-    fitting = [
-        key for key, gsd_m in tiffs.items() if 0 < gsd_m <= options.wanted_gsd_m * GSD_TOLERANCE
-    ]
+    for usual in ("visual", "image", "ortho", "data", "rgb"):
+        if usual in tiffs:
+            return usual
+    wanted_m = options.wanted_gsd_m
+    fitting = {
+        key: gsd_m for key, gsd_m in tiffs.items() if gsd_m > 0 and is_fine_enough(gsd_m, wanted_m)
+    }
     if len(tiffs) > 1 and not fitting:
-        raise FetchError(f"choose one with --asset; item {name} has {listed(list(tiffs))}")
+        raise FetchError(f"item {name} has {listed(list(tiffs))}; name one in a table (--services)")
     return max(fitting or tiffs, key=lambda key: tiffs[key])

@@ -16,12 +16,7 @@ from orthonav.core.errors import AreaError, FetchError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.planning.area import Area
 
-MERCATOR_HALF_M = math.pi * 6378137.0
-"""Half the width of the square of EPSG:3857, metres of that projection."""
-MAX_CANDIDATES = 40_000_000
-"""Cells of the box around an area that are examined: some hundred megabytes at one row a time."""
 log = logging.getLogger(__name__)
-_ROUND = 1.02  # allowance for the change of scale across an area
 
 
 @dataclass(frozen=True)
@@ -86,14 +81,14 @@ def select(grid: CellGrid, area: Area, margin_m: float) -> Selection:
         row0, col0 = max(row0, grid.limits[0]), max(col0, grid.limits[1])
         row1, col1 = min(row1, grid.limits[2]), min(col1, grid.limits[3])
     rows, cols = range(row0, row1 + 1), np.arange(col0, col1 + 1, dtype=np.int64)
-    if len(rows) * len(cols) > MAX_CANDIDATES:
+    if len(rows) * len(cols) > 40_000_000:  # some hundred megabytes at one row a time
         raise AreaError(
             f"area is {len(rows)} x {len(cols)} cells of this service, more than can be planned; "
             "ask for coarser pixels (--gsd-m) or a part of the area"
         )
     scale = ground_scale(grid.crs, area.frame)
     across, down = grid.cell_w_px * grid.res_x, grid.cell_h_px * grid.res_y
-    half_m = _ROUND * math.hypot(across * scale[0], down * scale[1]) / 2
+    half_m = 1.02 * math.hypot(across * scale[0], down * scale[1]) / 2  # scale changes across it
     x = grid.west + (cols + 0.5) * across
     chosen = []
     for row in rows:

@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from multiprocessing.pool import ThreadPool
@@ -28,20 +28,16 @@ from orthonav.core.errors import FetchError, OutputError, UsageError
 from orthonav.core.files import Progress, no_progress, not_written, replacing
 from orthonav.ground.fetch.files import cog_source, stac_source
 from orthonav.ground.fetch.grid import Selection, select
-from orthonav.ground.fetch.presets import ImageryOptions, Provenance, SourceSpec, parse_source
+from orthonav.ground.fetch.presets import Provenance, SourceSpec
 from orthonav.ground.fetch.service import CellPixels, CellReader, CellSource
 from orthonav.ground.fetch.tiles import wcs_cells, wms_cells, wmts_tiles, xyz_tiles
 from orthonav.ground.fetch.web import RequestLimits, Web
 from orthonav.ground.planning.area import Area
 
-_SECONDS_PER_TILE = 0.3  # usual latency of a tile service; an assumption for the estimate
-_BYTES_PER_SECOND = 3e6  # usual throughput of a connection; an assumption for the estimate
-_OURS = re.compile(r"[0-9a-f]|mosaic-\w+")  # names in a cache that GDAL and this program make
 BESIDE = {"terrain": ("dem", 1000.0), "surface": ("dsm", 0.0)}
 """Heights fetched beside imagery: end of the file's name, and metres beyond the imagery, as a view
 from 450 m sees so far 65 deg off nadir; a surface is used below the imagery only."""
 GIVE_UP_AFTER = 20  # failed cells in a row after which the service counts as down
-_BATCH_PER_THREAD = 8  # cells that may wait in memory until they are written
 log = logging.getLogger(__name__)
 
 
@@ -53,13 +49,15 @@ class FetchRequest:
     area: Area
     out: Path  # the GeoTIFF, .tif or .tiff
     margin_m: float = 200.0  # fetched beyond the area, as tiles of a map reach beyond its border
-    compress: str = "jpeg"  # or deflate
-    quality: int = 90  # of JPEG, 1 to 100
-    cache: Path | None = None  # folder of tiles; None: beside `out`, removed at the end
-    max_tiles: int = 50_000  # a fetch of more is refused before it starts
-    max_mb: float = 4000.0  # likewise, as estimated
+    compress: str = "jpeg"  # of quality 90, or deflate
+    max_mb: float = 2000.0  # a fetch of more, as estimated, is refused before it starts
     allow_holes: bool = False  # whether the file is written although tiles failed
     limits: RequestLimits = field(default_factory=RequestLimits)
+
+    @property
+    def cache(self) -> Path:
+        """Folder of the tiles, from which an interrupted fetch resumes."""
+        return self.out.resolve().with_name(f"{self.out.name}.tiles")
 
 
 @dataclass(frozen=True)
@@ -132,42 +130,48 @@ def fetch(
     same request resumes), `AreaError` where the area lies outside the service's coverage,
     `OutputError` where the file cannot be written.
     """
-    _check_out(request.out)
-    cache = request.cache or request.out.resolve().with_name(f"{request.out.name}.tiles")
+    if request.out.suffix.lower() not in (".tif", ".tiff"):
+        raise FetchError(f"--out must be a .tif file, got: {request.out}")
+    if request.out.exists() and not request.out.is_file():
+        raise OutputError(f"cannot write over a folder or a device: {request.out}")
     with Web(request.limits, request.spec.secrets) as web:
         source, selection, estimate = _planned(web, request)
-        limits = {
-            f"--max-tiles {request.max_tiles}": estimate.tiles > request.max_tiles,
-            f"--max-mb {request.max_mb:g}": estimate.megabytes > request.max_mb,
-        }
-        for limit in (name for name, exceeded in limits.items() if exceeded):
+        if estimate.megabytes > request.max_mb:
             raise FetchError(
-                f"this would fetch {estimate.text()}: more than {limit}; choose coarser pixels "
-                "(--gsd-m), a part of the area, or raise the limit"
+                f"this would fetch {estimate.text()}: more than --max-mb {request.max_mb:g}; "
+                "choose coarser pixels (--gsd-m), a part of the area, or raise the limit"
             )
         started(estimate)
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(prefix="mosaic-", dir=cache) as folder:
-                read = source.reader(web, selection, cache)
-                result = FetchResult(estimate)
-                _write_mosaic(request, source, selection, read, Path(folder), result, progress)
-        except FetchError as error:
-            if any(cache.iterdir()):
-                stored = f"fetched tiles are stored, rerun the command to resume: {cache}"
-                raise FetchError(f"{error}; {stored}") from None
-            cache.rmdir()
-            raise
-        except OutputError:
-            raise
-        except OSError as error:
-            raise not_written(error, cache) from error
-    if request.cache is None and all(_OURS.fullmatch(path.name) for path in cache.iterdir()):
-        shutil.rmtree(cache, ignore_errors=True)
+        result = FetchResult(estimate)
+        with _tiles_in(request.cache) as folder:
+            read = source.reader(web, selection, request.cache)
+            _write_mosaic(request, source, selection, read, folder, result, progress)
     if result.holes():
         log.warning("of %d tiles: %s; masked in the file", estimate.tiles, result.holes())
     result.size_bytes = request.out.stat().st_size
     return result
+
+
+@contextmanager
+def _tiles_in(cache: Path) -> Iterator[Path]:
+    """A temporary folder within that of the tiles, which is kept after an error if it has some."""
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="mosaic-", dir=cache) as folder:
+            yield Path(folder)
+    except FetchError as error:
+        if not any(cache.iterdir()):
+            cache.rmdir()
+            raise
+        stored = f"fetched tiles are stored, rerun the command to resume: {cache}"
+        raise FetchError(f"{error}; {stored}") from None
+    except OutputError:
+        raise
+    except OSError as error:
+        raise not_written(error, cache) from error
+    # GDAL and this program make only such names.
+    if all(re.fullmatch(r"[0-9a-f]|mosaic-\w+", path.name) for path in cache.iterdir()):
+        shutil.rmtree(cache, ignore_errors=True)
 
 
 def holds_heights(path: Path) -> bool:
@@ -176,12 +180,12 @@ def holds_heights(path: Path) -> bool:
         return bool(data.count == 1 and data.dtypes[0].startswith(("float", "int")))
 
 
-def heights_request(request: FetchRequest, kind: str, name: str) -> FetchRequest:
-    """The request for heights of a preset, beside the imagery of another; `kind` as in `BESIDE`."""
+def heights_request(request: FetchRequest, kind: str, spec: SourceSpec) -> FetchRequest:
+    """The request for heights of a source, beside imagery of another; `kind` as in `BESIDE`."""
     end, beyond_m = BESIDE[kind]
     return replace(
         request,
-        spec=parse_source(name, ImageryOptions()),
+        spec=spec,
         out=request.out.with_name(f"{request.out.stem}_{end}{request.out.suffix}"),
         margin_m=request.margin_m + beyond_m,
     )
@@ -205,7 +209,8 @@ def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, Co
     height, width = selection.shape_px
     tiles = len(selection.cells)
     size = tiles * source.cell_bytes
-    seconds = max(tiles * _SECONDS_PER_TILE / request.limits.parallel, size / _BYTES_PER_SECOND)
+    # Assumed: a usual latency of 0.3 s, and a connection of 3 MB per second.
+    seconds = max(tiles * 0.3 / request.limits.parallel, size / 3e6)
     estimate = CostEstimate(
         tiles, selection.gsd_m, width, height, size / 1e6, seconds / 60, source.provenance
     )
@@ -217,24 +222,15 @@ def open_cells(web: Web, spec: SourceSpec, area: Area, margin_m: float) -> CellS
 
     Raises `FetchError` with the available choices where it has no such layer, style, zoom or time.
     """
-    if spec.protocol == "wmts":
-        return wmts_tiles(web, spec, area)
-    if spec.protocol == "wms":
-        return wms_cells(web, spec, area)
-    if spec.protocol == "wcs":
-        return wcs_cells(web, spec, area)
-    if spec.protocol in ("xyz", "tms"):
-        return xyz_tiles(spec, area)
-    if spec.protocol == "cog":
-        return cog_source(web, spec, area, [spec.url])
-    return stac_source(web, spec, area, margin_m)
-
-
-def _check_out(out: Path) -> None:
-    if out.suffix.lower() not in (".tif", ".tiff"):
-        raise UsageError(f"--out must be a .tif file, got: {out}")
-    if out.exists() and not out.is_file():
-        raise OutputError(f"cannot write over a folder or a device: {out}")
+    by_protocol: dict[str, Callable[[], CellSource]] = {
+        "wmts": lambda: wmts_tiles(web, spec, area),
+        "wms": lambda: wms_cells(web, spec, area),
+        "wcs": lambda: wcs_cells(web, spec, area),
+        "xyz": lambda: xyz_tiles(spec, area),
+        "cog": lambda: cog_source(web, spec, area, [spec.url]),
+        "stac": lambda: stac_source(web, spec, area, margin_m),
+    }
+    return by_protocol[spec.protocol]()
 
 
 def _write_mosaic(
@@ -326,7 +322,7 @@ def _read_cells(
         except FetchError as error:
             return cell, error
 
-    cells, batch = selection.cells.tolist(), parallel * _BATCH_PER_THREAD
+    cells, batch = selection.cells.tolist(), parallel * 8  # that may wait until they are written
     # Its threads are daemons and are not joined. Those of `ThreadPoolExecutor` would delay the
     # end of the program after an error or an interrupt until the last server has answered.
     with ThreadPool(parallel) as pool:
@@ -374,7 +370,7 @@ def _pack(raw: Path, out: Path, request: FetchRequest) -> None:
     with rasterio.open(raw) as written:
         bytes_only = set(written.dtypes) == {"uint8"} and written.count in (1, 3)
         if request.compress == "jpeg" and bytes_only:
-            options |= {"COMPRESS": "JPEG", "QUALITY": request.quality, "PREDICTOR": "NO"}
+            options |= {"COMPRESS": "JPEG", "QUALITY": 90, "PREDICTOR": "NO"}
         rasterio.shutil.copy(raw, out, driver="COG", **options)
         with rasterio.open(out) as packed:
             for name in ("shape", "transform", "crs", "count"):

@@ -5,7 +5,7 @@ and what comes is told apart: imagery, a gap that the service reports, or an err
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,25 +22,18 @@ from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M
 from orthonav.ground.fetch.grid import CellGrid, Selection
 from orthonav.ground.fetch.presets import HEIGHTS_FORMAT, Provenance, SourceSpec
 from orthonav.ground.fetch.urls import checked_url, shown
-from orthonav.ground.fetch.web import CONNECT_S, READ_S, USER_AGENT, Web, is_temporary
-from orthonav.ground.imagery.source import GDAL_ERRORS
+from orthonav.ground.fetch.web import TIMEOUTS_S, USER_AGENT, Web, is_temporary
 
 GDAL_OPTIONS = {
-    "GDAL_HTTP_CONNECTTIMEOUT": CONNECT_S,
-    "GDAL_HTTP_LOW_SPEED_TIME": READ_S,
+    "GDAL_HTTP_CONNECTTIMEOUT": TIMEOUTS_S[0],
+    "GDAL_HTTP_LOW_SPEED_TIME": TIMEOUTS_S[1],
     "GDAL_HTTP_LOW_SPEED_LIMIT": 1,
     "GDAL_HTTP_USERAGENT": USER_AGENT,
     "GDAL_ERROR_ON_LIBJPEG_WARNING": True,  # half a JPEG would be grey in its lower half
     "GDAL_CACHEMAX": 64 * 2**20,
 }
-TIMEOUT_S = 120
 MIN_EMPTY_PX = 4096
 """Smallest patch of the empty colour that is masked, 64 x 64 px: larger than a roof or shadow."""
-_EMPTY_COLOURS = {"black": 0, "white": 255}
-_BYTES_PER_PX = {"image/jpeg": 0.35, "image/webp": 0.25, "image/png": 1.9, HEIGHTS_FORMAT: 4.0}
-"""Size of usual tiles of orthophotos relative to their pixels, for the estimate."""
-_FOR_EVER = {"Expires": 2**31 - 1, "CleanTimeout": 0}
-"""GDAL would remove every file of the folder that is older than a week."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +68,6 @@ class CellSource:
     reader: Callable[[Web, Selection, Path], CellReader]
 
 
-NO_HEIGHT_M = -32768
-
-
 def service_source(
     spec: SourceSpec,
     grid: CellGrid,
@@ -94,64 +84,62 @@ def service_source(
     """
     address, heights = service["ServerUrl"], format_ == HEIGHTS_FORMAT
     checked_url(re.sub(r"\$?\{[^{}]*\}", "0", address))
-    is_tiled = service["name"] in ("TMS", "VirtualEarth")
+    is_tiled = service["name"] == "TMS"
     width, height = grid.cell_w_px, grid.cell_h_px
 
     def reader(web: Web, selection: Selection, cache: Path) -> CellReader:
         (row0, col0), (rows_px, cols_px) = selection.first, selection.shape_px
         west, north = grid.transform(row0, col0) * (0, 0)
-        tile_row = rows_px // height - 2**level + row0 if from_south else row0
+        first_row = rows_px // height - 2**level + row0 if from_south else row0
+        tile = {"TileLevel": level, "TileX": col0, "TileY": first_row} if is_tiled else {}
+        window = {
+            "UpperLeftX": repr(west),
+            "UpperLeftY": repr(north),
+            "LowerRightX": repr(west + cols_px * grid.res_x),
+            "LowerRightY": repr(north - rows_px * grid.res_y),
+            "SizeX": cols_px,
+            "SizeY": rows_px,
+            "YOrigin": "bottom" if from_south else "top",
+            **tile,
+        }
+        more = {
+            "Projection": grid.crs,
+            "BandsCount": 1 if heights else 4,
+            "DataType": "Float32" if heights else "Byte",
+            "BlockSizeX": width,
+            "BlockSizeY": height,
+            "OverviewCount": 0,
+            "ZeroBlockHttpCodes": "204,404,410" if is_tiled else "204",
+            "Timeout": 120,
+            "UserAgent": USER_AGENT,
+        }
+        # By default GDAL removes every file of the folder that is older than a week.
+        kept = {"Path": cache, "Unique": False, "Expires": 2**31 - 1, "CleanTimeout": 0}
         # Blocks without content are filled with it, and `_heights` refuses it.
-        no_data = {f'DataValues NoData="{NO_HEIGHT_M}"': None} if heights else {}
-        description = _xml(
-            "GDAL_WMS",
-            {
-                "Service": service | {"ServerUrl": web.with_keys(address)},
-                "DataWindow": {
-                    "UpperLeftX": repr(west),
-                    "UpperLeftY": repr(north),
-                    "LowerRightX": repr(west + cols_px * grid.res_x),
-                    "LowerRightY": repr(north - rows_px * grid.res_y),
-                    "SizeX": cols_px,
-                    "SizeY": rows_px,
-                    **({"TileLevel": level, "TileX": col0, "TileY": tile_row} if is_tiled else {}),
-                    "YOrigin": "bottom" if from_south else "top",
-                },
-                "Projection": grid.crs,
-                "BandsCount": 1 if heights else 4,
-                **no_data,
-                "DataType": "Float32" if heights else "Byte",
-                "BlockSizeX": width,
-                "BlockSizeY": height,
-                "OverviewCount": 0,
-                "ZeroBlockHttpCodes": "204,404,410" if is_tiled else "204",
-                "Timeout": TIMEOUT_S,
-                "UserAgent": USER_AGENT,
-                "Cache": {"Path": cache, "Unique": False} | _FOR_EVER,
-            },
+        no_data = '<DataValues NoData="-32768"/>' if heights else ""
+        description = (
+            f"<GDAL_WMS><Service>{_xml(service | {'ServerUrl': web.with_keys(address)})}</Service>"
+            f"<DataWindow>{_xml(window)}</DataWindow>{_xml(more)}{no_data}"
+            f"<Cache>{_xml(kept)}</Cache></GDAL_WMS>"
         )
 
         def read(row: int, col: int) -> CellPixels:
-            window = Window((col - col0) * width, (row - row0) * height, width, height)
+            cell = Window((col - col0) * width, (row - row0) * height, width, height)
             where = f"{shown(address.replace('$', ''))} (row {row}, column {col})"
-            pixels = _read(web, description, window, where)
+            pixels = _read(web, description, cell, where)
             return _heights(pixels) if heights else _imagery(pixels, spec.options.empty)
 
         return read
 
-    size = width * height * _BYTES_PER_PX.get(format_, 1.0)
+    # Size of usual tiles of orthophotos, for the estimate.
+    bytes_per_px = {"image/jpeg": 0.35, "image/webp": 0.25, "image/png": 1.9, HEIGHTS_FORMAT: 4.0}
+    size = width * height * bytes_per_px.get(format_, 1.0)
     bands, dtype = (1, "float32") if heights else (3, "uint8")
     return CellSource(spec.provenance, grid, bands, dtype, size, reader)
 
 
-def _xml(tag: str, content: Any) -> str:
-    if content is None:
-        return f"<{tag}/>"
-    if isinstance(content, dict):
-        inner = "".join(_xml(name, value) for name, value in content.items())
-    else:
-        inner = escape(str(content))
-    return f"<{tag}>{inner}</{tag}>"
+def _xml(elements: Mapping[str, object]) -> str:
+    return "".join(f"<{tag}>{escape(str(value))}</{tag}>" for tag, value in elements.items())
 
 
 def _read(web: Web, description: str, window: Window, where: str) -> NDArray[Any]:
@@ -160,7 +148,9 @@ def _read(web: Web, description: str, window: Window, where: str) -> NDArray[Any
         try:
             with rasterio.Env(**GDAL_OPTIONS), rasterio.open(description) as dataset:
                 return np.asarray(dataset.read(window=window))
-        except GDAL_ERRORS as error:
+        except MemoryError:
+            raise
+        except Exception as error:  # whatever GDAL raises may quote the address with its key
             reason, is_worth_it = reason_of(error)
         if not is_worth_it:
             break
@@ -201,7 +191,7 @@ def _imagery(pixels: NDArray[np.uint8], empty: str | None) -> CellPixels:
     """Red, green, blue and validity; `empty` is the colour of which large patches are invalid."""
     valid = pixels[3] > 0
     if empty is not None:
-        pure = (pixels[:3] == _EMPTY_COLOURS[empty]).all(axis=0).astype(np.uint8)
+        pure = (pixels[:3] == (0 if empty == "black" else 255)).all(axis=0).astype(np.uint8)
         if int(pure.sum()) >= MIN_EMPTY_PX:
             _, labels, stats, _ = cv2.connectedComponentsWithStats(pure, connectivity=4)
             large = stats[:, cv2.CC_STAT_AREA] >= MIN_EMPTY_PX

@@ -1,5 +1,5 @@
-"""Tiles and images of services: by address template (XYZ, TMS), WMTS 1.0.0, WMS 1.1.1 and 1.3.0,
-and heights of WCS 1.0.0.
+"""Tiles and images of services: by address template (XYZ), WMTS 1.0.0, WMS 1.1.1 and 1.3.0, and
+heights of WCS 1.0.0.
 
 Tiles of a WMTS (OGC 07-057r7) are read by address template, as those of XYZ: GDAL's own driver of
 WMTS takes the default time only, and resolutions as they are rounded in the document.
@@ -12,9 +12,8 @@ from urllib.parse import quote
 from xml.etree.ElementTree import Element
 
 from orthonav.core.errors import FetchError
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.frames import WGS84_A_M, LocalFrame
 from orthonav.ground.fetch.grid import (
-    MERCATOR_HALF_M,
     CellGrid,
     epsg_name,
     ground_scale,
@@ -24,10 +23,10 @@ from orthonav.ground.fetch.grid import (
 )
 from orthonav.ground.fetch.presets import (
     HEIGHTS_FORMAT,
-    TERRAIN_GSD_M,
     ImageryOptions,
     SourceSpec,
     choose,
+    choose_crs,
     choose_format,
     choose_layer,
     finest_fitting,
@@ -37,61 +36,42 @@ from orthonav.ground.fetch.urls import linked, with_query
 from orthonav.ground.fetch.web import Web, texts
 from orthonav.ground.planning.area import Area
 
+MERCATOR_HALF_M = math.pi * WGS84_A_M
+"""Half the width of the square of EPSG:3857, metres of that projection."""
 MAX_ZOOM = 24  # finest zoom level, 9 mm per pixel at the equator: finer than any orthophoto
-_PARTS = {"z", "x", "y", "-y", "q", "s", "r", "key"}
-PIXEL_M = 0.28e-3  # width of the standardized pixel of scale denominators (OGC 07-057r7, 6.1)
-METRES_PER_DEGREE = 6378137.0 * math.pi / 180
-"""At the equator of WGS84, as scale denominators are defined (OGC 07-057r7, 6.1)."""
 MAX_TILE_PX = 4096  # largest tile that is accepted; usual ones have 256 or 512 px
-CELL_PX = 1024  # width of the images requested: services render several per second at this size
-_VERSIONS = ("1.3.0", "1.1.1")
 
 
 def xyz_tiles(spec: SourceSpec, area: Area) -> CellSource:
     """The tiles of a template with `{z}/{x}/{y}` in Web Mercator, as web maps use them.
 
-    `{-y}` counts rows from the south, as `{y}` of a TMS does; `{q}` is a quadkey, `{s}` one of the
-    hosts a, b and c (a is taken), `{r}` the `@2x` of tiles of 512 px. Raises `FetchError`.
+    `{-y}` counts rows from the south. Tiles are 256 px wide, with `@2x` in the template 512. Raises
+    `FetchError`.
     """
     template, options = spec.url, spec.options
-    parts = set(re.findall(r"\{([^{}]*)\}", template))
-    if parts - _PARTS or not (({"z", "x"} <= parts and parts & {"y", "-y"}) or "q" in parts):
+    parts = set(re.findall(r"\{([^{}]*)\}", template)) - {"key"}
+    if parts not in ({"z", "x", "y"}, {"z", "x", "-y"}):
         raise FetchError(
-            "template needs {z}, {x} and {y} (or {-y}), or {q}, and may hold {s}, {r} and {key}; "
+            "template needs {z}, {x} and {y} (or {-y}), and may hold {key}; "
             f"got: {template[:200]}"
         )
-    tile_px = options.tile_px or (512 if "{r}" in template or "@2x" in template else 256)
-    if not 64 <= tile_px <= 4096:
-        raise FetchError(f"tiles must be 64 to 4096 px wide, got {tile_px}")
+    tile_px = options.tile_px or (512 if "@2x" in template else 256)
+    if not 64 <= tile_px <= MAX_TILE_PX:
+        raise FetchError(f"tiles must be 64 to {MAX_TILE_PX} px wide, got {tile_px}")
     high = min(MAX_ZOOM, options.max_zoom or MAX_ZOOM)
     resolutions = [2 * MERCATOR_HALF_M / tile_px / 2.0**zoom for zoom in range(high + 1)]
-    if options.zoom is None:
-        scale = mean_scale("EPSG:3857", area.frame)
-        gsds_m = [res * scale for res in resolutions]
-        zoom = finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom 0 to {high}")
-    elif options.zoom.isdecimal() and int(options.zoom) <= high:
-        zoom = int(options.zoom)
-    else:
-        raise FetchError(f"no zoom {options.zoom}; available: 0 to {high}")
+    scale = mean_scale("EPSG:3857", area.frame)
+    gsds_m = [res * scale for res in resolutions]
+    zoom = finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom 0 to {high}")
     half, last, res = MERCATOR_HALF_M, 2**zoom - 1, resolutions[zoom]
     grid = CellGrid("EPSG:3857", -half, half, res, res, tile_px, tile_px, (0, 0, last, last))
-    values = {
-        "{z}": str(zoom),
-        "{x}": "${x}",
-        "{y}": "${y}",
-        "{-y}": "${y}",
-        "{q}": "${quadkey}",
-        "{s}": "a",
-        "{r}": "@2x" if tile_px == 512 else "",
-    }
-    for part, value in values.items():
-        template = template.replace(part, value)
-    service = {"name": "VirtualEarth" if "q" in parts else "TMS", "ServerUrl": template}
+    for part, value in (("z", str(zoom)), ("x", "${x}"), ("y", "${y}"), ("-y", "${y}")):
+        template = template.replace(f"{{{part}}}", value)
     path = template.partition("?")[0].lower()
     formats = {".png": "image/png", ".webp": "image/webp"}
     format_ = next((kind for end, kind in formats.items() if path.endswith(end)), "image/jpeg")
-    from_south = spec.protocol == "tms" or "-y" in parts
-    return service_source(spec, grid, format_, service, zoom, from_south=from_south)
+    service = {"name": "TMS", "ServerUrl": template}
+    return service_source(spec, grid, format_, service, zoom, from_south="-y" in parts)
 
 
 def wmts_tiles(web: Web, spec: SourceSpec, area: Area) -> CellSource:
@@ -109,7 +89,7 @@ def wmts_tiles(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     formats = list(filter(None, dict.fromkeys([*texts(layer, "Format"), *templates])))
     format_ = choose_format(formats, options, f"layer {name}")
     set_name, grids = _grids(root, layer, name, options)
-    matrix = _chosen_zoom(grids, name, options, area.frame)
+    matrix = _zoom(grids, options, area.frame)
     values = {
         "Layer": name,
         "Style": _style(layer, name, options),
@@ -120,14 +100,9 @@ def wmts_tiles(web: Web, spec: SourceSpec, area: Area) -> CellSource:
         "TileCol": "${x}",
         **_dimensions(layer, name, options),
     }
-    template = templates.get(format_)
+    template = templates.get(format_) or _kvp_template(root, list(values))
     if template is None:
-        kvp_url = _kvp_url(root)
-        if kvp_url is None:
-            raise FetchError(f"service offers no tiles of {name} as {format_}: {url}")
-        request = {"SERVICE": "WMTS", "REQUEST": "GetTile", "VERSION": "1.0.0"}
-        fields = {field.upper(): f"{{{field}}}" for field in values}
-        template = with_query(kvp_url, request | fields)
+        raise FetchError(f"service offers no tiles of {name} as {format_}: {url}")
     template = linked(url, template)
     for field, value in values.items():
         part = re.compile(rf"\{{{re.escape(field)}\}}", re.IGNORECASE)
@@ -162,40 +137,40 @@ def _dimensions(layer: Element, name: str, options: ImageryOptions) -> dict[str,
     return found
 
 
-def _kvp_url(root: Element) -> str | None:
+def _kvp_template(root: Element, names: list[str]) -> str | None:
+    """Address with these parameters in its query, where the service takes them there."""
     for method in root.iterfind("OperationsMetadata/Operation[@name='GetTile']/DCP/HTTP/Get"):
         encodings = texts(method, "Constraint[@name='GetEncoding']/AllowedValues/Value")
-        if not encodings or "KVP" in encodings:
-            return method.get("href")
+        address = method.get("href")
+        if address is not None and (not encodings or "KVP" in encodings):
+            request = {"SERVICE": "WMTS", "REQUEST": "GetTile", "VERSION": "1.0.0"}
+            return with_query(address, request | {name.upper(): f"{{{name}}}" for name in names})
     return None
 
 
 def _grids(
     root: Element, layer: Element, name: str, options: ImageryOptions
 ) -> tuple[str, dict[str, CellGrid]]:
+    """Name of the first tile matrix set in the coordinate system, and its grids by matrix."""
     known = {name: each for each in root.iterfind("Contents/TileMatrixSet") for name in _id(each)}
-    links = {}
-    by_crs: dict[str, str] = {}
+    by_crs: dict[str, tuple[str, Element]] = {}
     for link in layer.iterfind("TileMatrixSetLink"):
         for set_name in texts(link, "TileMatrixSet"):
             with suppress(FetchError, KeyError, IndexError):
                 crs = epsg_name(texts(known[set_name], "SupportedCRS")[0])
-                links[set_name] = link
-                by_crs.setdefault(crs, set_name)
-    if not links:
+                by_crs.setdefault(crs, (set_name, link))
+    if not by_crs:
         raise FetchError(f"layer {name} has no grid that can be read")
-    if options.matrix_set is not None:
-        set_name = choose(list(links), options.matrix_set, f"layer {name} has no grid")
-    else:
-        wanted = options.crs or ("EPSG:3857" if "EPSG:3857" in by_crs else None)
-        set_name = by_crs[choose(list(by_crs), wanted, f"layer {name} does not come in")]
-    limits = texts(links[set_name], "TileMatrixSetLimits/TileMatrixLimits/TileMatrix")
+    set_name, link = by_crs[choose_crs(list(by_crs), options.crs, f"layer {name}")]
+    limits = texts(link, "TileMatrixSetLimits/TileMatrixLimits/TileMatrix")
     finest = math.inf if options.max_zoom is None else options.max_zoom
     crs_name = texts(known[set_name], "SupportedCRS")[0]
     grids = {}
     for element in known[set_name].iterfind("TileMatrix"):
         for zoom in _id(element):
-            if zoom in limits or (not limits and (_number(zoom) or 0) <= finest):
+            number = zoom.rpartition(":")[2]  # EPSG:3857:07 is zoom 7
+            level = int(number) if number.isdecimal() else 0
+            if zoom in limits or (not limits and level <= finest):
                 try:
                     grids[zoom] = _grid(element, crs_name)
                 except (ValueError, IndexError, OverflowError):
@@ -218,8 +193,11 @@ def _grid(matrix: Element, crs_name: str) -> CellGrid:
         is_swapped &= crs_name.startswith(("urn:", "http"))
     west, north = (second, first) if is_swapped else (first, second)
     width, height = (_whole(matrix, tag) for tag in ("TileWidth", "TileHeight"))
-    unit_m = METRES_PER_DEGREE if known.is_geographic else known.axis_info[0].unit_conversion_factor
-    res = float(texts(matrix, "ScaleDenominator")[0]) * PIXEL_M / unit_m
+    # Of pixels of 0.28 mm, with degrees as long as at the equator (OGC 07-057r7, 6.1).
+    unit_m = MERCATOR_HALF_M / 180
+    if not known.is_geographic:
+        unit_m = known.axis_info[0].unit_conversion_factor
+    res = float(texts(matrix, "ScaleDenominator")[0]) * 0.28e-3 / unit_m
     if not (res > 0 and 0 < width <= MAX_TILE_PX and 0 < height <= MAX_TILE_PX):
         raise ValueError("impossible size")
     if crs == "EPSG:3857" and max(abs(west + MERCATOR_HALF_M), abs(north - MERCATOR_HALF_M)) < 1:
@@ -235,25 +213,12 @@ def _whole(element: Element, tag: str) -> int:
     return int(texts(element, tag)[0])
 
 
-def _chosen_zoom(
-    grids: dict[str, CellGrid], name: str, options: ImageryOptions, frame: LocalFrame
-) -> str:
+def _zoom(grids: dict[str, CellGrid], options: ImageryOptions, frame: LocalFrame) -> str:
     scale = mean_scale(next(iter(grids.values())).crs, frame)
     gsds_m = [scale * grid.res_x for grid in grids.values()]
     named = zip(grids, gsds_m, strict=True)
     levels = ", ".join(f"{zoom} ({gsd_m:.3g} m)" for zoom, gsd_m in named)
-    if options.zoom is None:
-        return list(grids)[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {levels}")]
-    for zoom in grids:
-        if options.zoom == zoom or _number(options.zoom) == _number(zoom) is not None:
-            return zoom
-    raise FetchError(f"layer {name} has no zoom {options.zoom}; available: {levels}")
-
-
-def _number(zoom: str) -> int | None:
-    """The number of a zoom level: EPSG:3857:07 is zoom 7."""
-    number = zoom.rpartition(":")[2]
-    return int(number) if number.isdecimal() else None
+    return list(grids)[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {levels}")]
 
 
 def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
@@ -265,11 +230,10 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     url, options, frame = spec.url, spec.options, area.frame
     if options.time is not None:
         raise FetchError(f"times of a WMS cannot be chosen, --time was {options.time}")
-    wanted = options.version or _VERSIONS[0]
-    url = with_query(url, {"SERVICE": "WMS", "REQUEST": "GetCapabilities", "VERSION": wanted})
+    url = with_query(url, {"SERVICE": "WMS", "REQUEST": "GetCapabilities", "VERSION": "1.3.0"})
     root = web.get_xml(url)
     version = root.get("version", "")
-    if version not in _VERSIONS:
+    if version not in ("1.3.0", "1.1.1"):
         found = version or root.tag
         raise FetchError(f"supported versions of WMS are 1.1.1 and 1.3.0, got '{found}': {url}")
     get_map = root.find("Capability/Request/GetMap")
@@ -283,8 +247,7 @@ def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     if options.style is not None:
         choose(styles, options.style, f"layer {name} has no style")
     names = _crs_names([crs for each in chain for crs in texts(each, "CRS") + texts(each, "SRS")])
-    wanted_crs = options.crs or ("EPSG:3857" if "EPSG:3857" in names else None)
-    crs = choose(list(names), wanted_crs, f"layer {name} does not come in")
+    crs = choose_crs(list(names), options.crs, f"layer {name}")
     format_ = choose_format(texts(get_map, "Format"), options, "service")
     service = {
         "name": "WMS",
@@ -312,7 +275,8 @@ def wcs_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     query = {"SERVICE": "WCS", "VERSION": "1.0.0"}
     query |= {} if options.layer is None else {"COVERAGE": options.layer}
     root = web.get_xml(with_query(url, query | {"REQUEST": "DescribeCoverage"}))
-    layers = {name: each for each in root.iterfind("CoverageOffering") for name in _name(each)}
+    offerings = root.iterfind("CoverageOffering")
+    layers = {name: each for each in offerings for name in texts(each, "name")[:1]}
     name = choose_layer(list(layers), options.layer, url)
     tags = ("supportedCRSs/nativeCRSs", "supportedCRSs/requestResponseCRSs")
     names = _crs_names([crs for tag in tags for crs in texts(layers[name], tag)])
@@ -336,20 +300,20 @@ def wcs_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     return service_source(spec, grid, HEIGHTS_FORMAT, service)
 
 
-def _name(element: Element) -> list[str]:
-    return texts(element, "name")[:1]
-
-
 def _any_box(crs: str, format_: str, options: ImageryOptions, frame: LocalFrame) -> CellGrid:
-    """The grid of a service that renders any box at any resolution."""
-    gsd_m, cell_px = options.wanted_gsd_m, options.tile_px or CELL_PX
+    """The grid of a service that renders any box at any resolution.
+
+    Services render several images of 1024 px per second. Heights come every 5 m where none is
+    requested: half the posting of a map's terrain."""
+    gsd_m, cell_px = options.wanted_gsd_m, options.tile_px or 1024
     if format_ == HEIGHTS_FORMAT and options.gsd_m is None:
-        gsd_m = TERRAIN_GSD_M
+        gsd_m = 5.0
     res_x, res_y = (gsd_m / scale for scale in ground_scale(crs, frame))
     return CellGrid(crs, 0.0, 0.0, res_x, res_y, cell_px, cell_px)
 
 
 def _wms_layers(root: Element) -> dict[str, list[Element]]:
+    """Each layer, by name, with the layers that it lies in."""
     found: dict[str, list[Element]] = {}
     stack = [[layer] for layer in root.findall("Capability/Layer")]
     while stack:
@@ -361,11 +325,10 @@ def _wms_layers(root: Element) -> dict[str, list[Element]]:
 
 
 def _crs_names(options: list[str]) -> dict[str, str]:
+    """The service's names of coordinate systems by EPSG:CODE."""
     crs: dict[str, str] = {}
     for option in (name for text in options for name in text.split()):
-        try:
+        with suppress(FetchError):
             epsg = epsg_name(option)
-        except FetchError:
-            continue
-        crs[epsg] = option if option == epsg else crs.get(epsg, option)
+            crs[epsg] = option if option == epsg else crs.get(epsg, option)
     return crs

@@ -19,7 +19,7 @@ from orthonav.core.errors import FetchError
 from orthonav.ground.fetch.urls import KEY, Secret, checked_url, origin_of, shown
 
 USER_AGENT = f"orthonav/{__version__} (fetches orthophotos for one area; +orthonav fetch)"
-CONNECT_S, READ_S = 10.0, 30.0
+TIMEOUTS_S = 10.0, 30.0  # to connect, and between two parts of an answer
 MAX_DOCUMENT_BYTES = 64 * 2**20
 """The capabilities of a national service list a thousand layers in some ten megabytes."""
 log = logging.getLogger(__name__)
@@ -111,12 +111,12 @@ class Web:
         `FetchError`.
         """
         method, failure = "GET" if json is None else "POST", ""
-        url_sent, timeout = self.with_keys(checked_url(url)), (CONNECT_S, READ_S)
+        url_sent = self.with_keys(checked_url(url))
         for attempt in range(self.limits.attempts):
             self.limits.pause(attempt)
             try:
                 with self._session.request(
-                    method, url_sent, json=json, stream=True, timeout=timeout
+                    method, url_sent, json=json, stream=True, timeout=TIMEOUTS_S
                 ) as response:
                     status = response.status_code
                     if status != 200:

@@ -5,8 +5,8 @@ first. Resampled one by one, they would leave a line of invalid pixels between n
 """
 
 import math
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, groupby
@@ -18,12 +18,10 @@ import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio._err import CPLE_BaseError
 from rasterio.dtypes import dtype_rev, typename_fwd
 from rasterio.enums import Resampling
 from rasterio.transform import Affine
 from rasterio.warp import reproject
-from rasterio.warp import transform as transform_coordinates
 from rasterio.windows import Window
 
 from orthonav.core.cores import usable_cores
@@ -39,25 +37,12 @@ from orthonav.ground.imagery.source import (
     sources_in,
     unreadable,
 )
-from orthonav.ground.imagery.systems import at_epoch
+from orthonav.ground.imagery.systems import at_epoch, converted
 from orthonav.ground.planning.area import outline
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
 WHOLLY_VALID = 250
 """Interpolated mask (0..255) from which a pixel is valid: no invalid neighbour."""
-_FALSE_ORIGIN_M = 1_000_000.0
-"""Added to the sheet's coordinates for GDAL: it treats a raster that starts at exactly (0, 0) with
-pixels of 1 m, as a window in the middle of a sheet may, as one without georeference."""
-_MARGIN_PX = 4
-"""Pixels read around a window: cubic interpolation needs two; the others cover rounding."""
-_REACH_PX = 7
-"""Width of the box whose mean fills the edge of holes: beyond the reach of cubic weights."""
-SAMPLE_PX = 512
-"""Side of the decimated image that percentiles are computed from."""
-SAMPLED_SOURCES = 12
-STRIP_PX = 4 * 2**20
-MAX_OFF_PX = 0.05
-"""Largest deviation of a tile from the lattice: far below the error of orthophotos."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +83,7 @@ class Lattice:
         right = min(-(-(window.col_off + window.width) // factor) * factor, width)
         bottom = min(-(-(window.row_off + window.height) // factor) * factor, height)
         # GDAL reads band by band: decoded tiles must stay in its cache
-        step = max(1, STRIP_PX // (factor * (right - left))) * factor
+        step = max(1, 4 * 2**20 // (factor * (right - left))) * factor
         strips = [
             self._read(dataset, Window(left, row, right - left, min(step, bottom - row)), factor)
             for row in range(top, bottom, step)
@@ -210,7 +195,8 @@ def _lattice(members: list[int], sources: list[Source]) -> Lattice:
 
 
 def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:
-    """Columns and rows from corner to corner; None where no lattice fits."""
+    """Columns and rows from corner to corner; None where no lattice fits to 0.05 pixels, which is
+    far below the error of orthophotos."""
     kinds = {(each.crs, len(each.bands), each.is_indexed, each.dtype) for each in (first, other)}
     if len(kinds) > 1:
         return None
@@ -222,7 +208,7 @@ def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:
     unit = min(np.hypot(t.a, t.d), np.hypot(t.b, t.e))
     stretch_px = np.abs(skew[[0, 1, 3, 4]]).max() * longest / unit
     off_px = max(abs(col - offset[0]), abs(row - offset[1])) + stretch_px
-    return offset if off_px <= MAX_OFF_PX else None
+    return offset if off_px <= 0.05 else None
 
 
 @dataclass(frozen=True)
@@ -245,7 +231,7 @@ def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None,
             alike.setdefault(kind, []).append(index)
     found: list[ContrastStretch | None] = [None] * len(sources)
     for members in alike.values():
-        some = members[:: max(1, -(-len(members) // SAMPLED_SOURCES))]
+        some = members[:: max(1, -(-len(members) // 12))]
         values = np.concatenate([_valid_values(sources[index]) for index in some])
         if values.size == 0:
             raise ImageryError("orthophotos have no valid pixel (all nodata)")
@@ -256,10 +242,11 @@ def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None,
 
 
 def _valid_values(source: Source) -> NDArray[Any]:
+    """Of all bands, decimated to at most 512 x 512 px."""
     (lattice,) = lattices_of([source])
     try:
         with quiet(), lattice.open(np.ones(1, np.bool_)) as data:
-            shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
+            shape = (min(512, data.height), min(512, data.width))
             pixels = data.read(out_shape=(data.count, *shape))
             valid = data.dataset_mask(out_shape=shape) > 0
     except GDAL_ERRORS as error:
@@ -369,7 +356,9 @@ class Pixels:
 
 
 class SheetRaster:
-    """Belongs to the thread that enters it; start other threads than the main one in `quiet`."""
+    """A mosaic in the pixels of a sheet; a context manager.
+
+    Threads may share it, each with datasets of its own; start those in `quiet`."""
 
     def __init__(
         self,
@@ -389,17 +378,15 @@ class SheetRaster:
         self._threads = threads or usable_cores()
         self.width_px, self.height_px = width_px, height_px
         self._boxes_px = self._boxes()
-        self._opened: dict[int, Any] = {}
-        self._env = ExitStack()
+        self._opened: dict[tuple[int, int], Any] = {}
 
     def __enter__(self) -> "SheetRaster":
-        options = GDAL_OPTIONS | {"GDAL_NUM_THREADS": str(self._threads)}
-        self._env.enter_context(quiet())
-        self._env.enter_context(rasterio.Env(**options))
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._env.close()
+        for dataset in self._opened.values():
+            dataset.close()
+        self._opened.clear()
 
     def read(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
         """Pixels of a window; outside all imagery they are 0 and invalid."""
@@ -413,6 +400,12 @@ class SheetRaster:
         self, window: Window, colours: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Values (H, W, colours) and valid (H, W); earlier lattices cover later ones."""
+        with quiet(), rasterio.Env(**GDAL_OPTIONS, GDAL_NUM_THREADS=str(self._threads)):
+            return self._laid_over(window, colours)
+
+    def _laid_over(
+        self, window: Window, colours: int
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         shape = window.height, window.width
         out = np.zeros((*shape, colours), np.uint8)
         valid = np.zeros(shape, np.bool_)
@@ -473,14 +466,8 @@ class SheetRaster:
         stretch = self._mosaic.stretches[lattice.members[0]]
         picture = _in_colours(values if stretch is None else stretch.apply(values), colours)
         _fill_holes(picture, mask)
-        try:
-            warped = self._resampled(lattice, picture, transform, target, shape, True)
-            warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
-        except CPLE_BaseError as error:
-            raise ImageryError(
-                "orthophoto does not fit its coordinate system; assign the correct one (for "
-                f"example: gdal_edit.py -a_srs EPSG:2154 FILE): {lattice.first.path}"
-            ) from error
+        warped = self._resampled(lattice, picture, transform, target, shape, True)
+        warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
         return warped, warped_mask[..., 0]
 
     def _resampled(
@@ -499,19 +486,30 @@ class SheetRaster:
         # blur narrow windows of a rotated source.
         scale = first.gsd_m * math.sqrt(abs(transform.determinant / first.transform.determinant))
         scale = min(1.0, scale / self._gsd_m)
-        reproject(
-            bands,
-            out,
-            src_transform=transform,
-            src_crs=first.system,
-            dst_transform=Affine.translation(_FALSE_ORIGIN_M, _FALSE_ORIGIN_M) * target,
-            dst_crs=f"{self._frame.proj4} +x_0={_FALSE_ORIGIN_M} +y_0={_FALSE_ORIGIN_M}",
-            resampling=Resampling.cubic if is_picture else Resampling.bilinear,
-            num_threads=self._threads,
-            warp_mem_limit=64,
-            XSCALE=scale,
-            YSCALE=scale,
-        )
+        # GDAL treats a raster that starts at exactly (0, 0) with pixels of 1 m, as a window in the
+        # middle of a sheet may, as one without georeference.
+        origin_m = 1_000_000.0
+        try:
+            reproject(
+                bands,
+                out,
+                src_transform=transform,
+                src_crs=first.system,
+                dst_transform=Affine.translation(origin_m, origin_m) * target,
+                dst_crs=f"{self._frame.proj4} +x_0={origin_m} +y_0={origin_m}",
+                resampling=Resampling.cubic if is_picture else Resampling.bilinear,
+                num_threads=self._threads,
+                warp_mem_limit=64,
+                XSCALE=scale,
+                YSCALE=scale,
+            )
+        except MemoryError:
+            raise
+        except Exception as error:  # rasterio exports no class of the errors of GDAL it raises here
+            raise ImageryError(
+                "orthophoto does not fit its coordinate system; assign the correct one (for "
+                f"example: gdal_edit.py -a_srs EPSG:2154 FILE): {first.path}"
+            ) from error
         return np.ascontiguousarray(out.transpose(1, 2, 0))
 
     def _source_window(
@@ -520,11 +518,12 @@ class SheetRaster:
         """Pixels of a lattice that a window needs; None for none."""
         east, north = target * outline((0, 0, shape[1], shape[0]), 8).T
         lat, lon = self._frame.latlon_from_en(np.stack([east, north], axis=1))
-        x, y = transform_coordinates("EPSG:4326", lattice.first.system, lon, lat)[:2]
-        col, row = ~lattice.transform * (np.asarray(x), np.asarray(y))
+        x, y = converted("EPSG:4326", lattice.first.system, lon, lat)
+        col, row = ~lattice.transform * (x, y)
         if not (np.isfinite(col).all() and np.isfinite(row).all()):
             return None
-        margin = _MARGIN_PX * max(1.0, self._gsd_m / lattice.first.gsd_m)
+        # Cubic interpolation needs two pixels around the window; the others cover rounding.
+        margin = 4 * max(1.0, self._gsd_m / lattice.first.gsd_m)
         low = np.floor([col.min() - margin, row.min() - margin]).astype(int)
         high = np.floor([col.max() + margin, row.max() + margin]).astype(int) + 1
         left, top = np.maximum(low, 0).tolist()
@@ -534,11 +533,10 @@ class SheetRaster:
         return Window(left, top, right - left, bottom - top)
 
     def _dataset(self, lattice: Lattice) -> Any:
-        key = lattice.members[0]
+        key = threading.get_ident(), lattice.members[0]
         if key not in self._opened:
             near = self._near(0, 0, self.width_px, self.height_px)
-            opened = lattice.open(near[list(lattice.members)])
-            self._opened[key] = self._env.enter_context(opened)
+            self._opened[key] = lattice.open(near[list(lattice.members)])
         return self._opened[key]
 
     def _boxes(self) -> NDArray[np.int64]:
@@ -566,7 +564,7 @@ def _fill_holes(bands: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
     known = (mask > 0).astype(np.float32)
     if known.all() or not known.any():
         return
-    size = (_REACH_PX, _REACH_PX)
+    size = (7, 7)  # beyond the reach of cubic weights
     weight = np.asarray(cv2.blur(known, size, borderType=cv2.BORDER_CONSTANT))
     filled = (known == 0) & (weight > 0)
     for band in bands:

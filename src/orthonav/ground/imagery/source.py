@@ -27,7 +27,6 @@ from orthonav.ground.planning.area import outline
 
 try:
     import rasterio
-    from rasterio._err import CPLE_BaseError
     from rasterio.crs import CRS
     from rasterio.enums import ColorInterp, MaskFlags
     from rasterio.errors import (
@@ -37,79 +36,58 @@ try:
         RasterioError,
     )
     from rasterio.transform import Affine
-    from rasterio.warp import transform as transform_coordinates
     from rasterio.windows import Window
 
-    from orthonav.ground.imagery.systems import accuracy_of
+    from orthonav.ground.imagery.systems import accuracy_of, converted
 except ImportError as error:
     raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
-GDAL_ERRORS = RasterioError, CPLE_BaseError, UnicodeDecodeError
+GDAL_ERRORS = RasterioError, UnicodeDecodeError
 """Of damaged files; the last of names that are no text."""
-ALPHA_SAMPLE_PX, OVERVIEW_PX = 64, 512
-MAX_PARTLY_CLEAR = 0.05
-"""Largest fraction of partly transparent pixels of a mask: its resampled edges."""
-MIN_VALUES, MAX_FLAT = 16, 3
-"""In a grey picture; masks, classes and quality layers hold fewer. One colour, by compression."""
-HEIGHT_TYPES = ("float32", "float64", "int16", "int32")
-OPENED_AT_ONCE, MAX_NAMED = 8, 5
-TERMS = {
-    "attribution": ("ORTHONAV_ATTRIBUTION", "TIFFTAG_COPYRIGHT"),
-    "licence": ("ORTHONAV_LICENCE",),
-    "source": ("ORTHONAV_SOURCE",),
-    "layer": ("ORTHONAV_LAYER",),
-    "dates": ("ORTHONAV_DATES",),
-}
-"""Tags of a file that are copied into the map, by their key there."""
-MAX_TERM = 300
+MIN_VALUES = 16
+"""In a grey picture; masks, classes and quality layers hold fewer."""
 RASTERS = {".tif", ".tiff", ".jp2", ".j2k", ".vrt", ".mbtiles", ".gpkg", ".img"}
 RASTERS |= {".png", ".jpg", ".jpeg", ".webp"}
-_SMALL_PICTURE = re.compile(
-    r"(?:^|[-_. ])(?:thumb(?:nail)?|quicklook|preview|browse|overview|assemblage|mask|msk|alpha)s?"
-    r"(?:[-_. ]|$)",
-    re.IGNORECASE,
-)
-_LAYER = re.compile(
-    r"(?:^|[-_. ])(hill-?shade|shaded[-_ ]?relief|aot|wvp|scl|fmask|udm2?|bqa|qa60|"
-    r"qa(?:[-_](?:pixel|radsat|aerosol))?)(?:[-_. ]|$)",
-    re.IGNORECASE,
-)
 log = logging.getLogger(__name__)
+
+
+def _word(words: str) -> re.Pattern[str]:
+    """One of some words in the name of a file."""
+    return re.compile(rf"(?:^|[-_. ])({words})(?:[-_. ]|$)", re.IGNORECASE)
+
+
+SMALL_PICTURE = _word(
+    "(?:thumb(?:nail)?|quicklook|preview|browse|overview|assemblage|mask|msk|alpha)s?"
+)
+LAYER = _word(
+    "hill-?shade|shaded[-_ ]?relief|aot|wvp|scl|fmask|udm2?|bqa|qa60|"
+    "qa(?:[-_](?:pixel|radsat|aerosol))?"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
     path: Path
-    bands: tuple[int, ...]
-    """Bands that are used, from 1: one for grey, three for red, green, blue."""
+    bands: tuple[int, ...]  # that are used, from 1: one for grey, three for red, green, blue
     dtype: str
     width_px: int
     height_px: int
     crs: str
-    system: Any
-    """Of rasterio."""
-    is_named: bool
-    """The system was taken from names or a .prj because the file has none."""
-    transform: Affine
-    """From column, row to coordinates."""
-    gsd_m: float
-    """At the centre."""
-    outline_latlon_deg: NDArray[np.float64]
-    """The border (N, 2)."""
-    date: str | None
-    """Of acquisition, YYYY[-MM[-DD]]."""
+    system: Any  # of rasterio
+    is_named: bool  # the system was taken from names or a .prj because the file has none
+    transform: Affine  # from column, row to coordinates
+    gsd_m: float  # at the centre
+    outline_latlon_deg: NDArray[np.float64]  # the border (N, 2)
+    date: str | None  # of acquisition, YYYY[-MM[-DD]]
     masks: tuple[str, ...] = ()
     """Bands that tell where it is valid, as GDAL's VRT names them; empty where it is everywhere."""
     is_indexed: bool = False
     """The only band holds numbers of colours, and is used for red, green and blue."""
-    folder: Path | None = None
-    """Given by the user."""
-    stamp: tuple[tuple[str, int, int], ...] = ()
-    """Path, size and modification time in ns of its files."""
+    folder: Path | None = None  # given by the user
+    stamp: tuple[tuple[str, int, int], ...] = ()  # path, size and time in ns of its files
     terms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     accuracy_m: float | None = None
-    caution: str = ""
-    """Of its coordinate system, by `accuracy_of`."""
+    caution: str = ""  # of its coordinate system, by `accuracy_of`
 
     def describe(self) -> dict[str, Any]:
         return {
@@ -143,7 +121,7 @@ def sources_in(folder: Path, bands: tuple[int, ...] | None = None) -> list[Sourc
     by_kind: dict[str, list[Path]] = {}
     for path in sorted(paths):
         kind = path.suffix.lower() or path.name
-        if kind in RASTERS and _SMALL_PICTURE.search(path.stem):
+        if kind in RASTERS and SMALL_PICTURE.search(path.stem):
             kind = "thumbnails, overviews or masks, by their names"
         by_kind.setdefault(kind, []).append(path)
     if not RASTERS.isdisjoint(by_kind.keys() - {".vrt"}):
@@ -207,7 +185,7 @@ def open_sources(
     """Inspect orthophotos, several at a time; in a `folder` of the user, skip other rasters.
 
     `bands`: that are used, one or three, from 1; None: the colours, or the first."""
-    with quiet(), ThreadPoolExecutor(OPENED_AT_ONCE) as pool:
+    with quiet(), ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda path: _opened(Path(path), folder, bands), paths))
     sources = [each for each in found if isinstance(each, Source)]
     unfit = [each for each in found if isinstance(each, UnfitError)]
@@ -217,7 +195,7 @@ def open_sources(
         several = f"{len(unfit)} rasters are no orthophotos; " if len(unfit) > 1 else ""
         raise ImageryError(f"{several}{unfit[0]}")
     if unfit:
-        names = ", ".join(str(each).rpartition(": ")[2] for each in unfit[:MAX_NAMED])
+        names = ", ".join(str(each).rpartition(": ")[2] for each in unfit[:5])
         log.warning("skipped %d rasters that are not orthophotos (-v: why): %s", len(unfit), names)
     named = Counter(source.crs for source in sources if source.is_named)
     for system, count in named.items():
@@ -263,7 +241,8 @@ def _inspect(
     else:
         _check_bands(path, dataset, bands)
     alone = dataset.count == 1 or not asked
-    if alone and len(bands) == 1 and dataset.dtypes[bands[0] - 1] in HEIGHT_TYPES:
+    signed = ("float32", "float64", "int16", "int32")
+    if alone and len(bands) == 1 and dataset.dtypes[bands[0] - 1] in signed:
         raise UnfitError(
             f"raster of one band of {dataset.dtypes[0]} may hold heights; an orthophoto has bands "
             f"of 8 or 16 bits without a sign: {path}"
@@ -323,19 +302,19 @@ def _require_picture(path: Path, dataset: Any) -> None:
         return
     values = np.unique(_sampled(dataset, 1, valid=True))
     if 0 < len(values) < MIN_VALUES:  # all windows may lie on water
-        shape = min(dataset.height, OVERVIEW_PX), min(dataset.width, OVERVIEW_PX)
+        shape = min(dataset.height, 512), min(dataset.width, 512)
         values = np.unique(dataset.read(1, out_shape=shape, masked=True).compressed())
-    named = _LAYER.search(path.stem)
+    named = LAYER.search(path.stem)
     if named or _are_codes(values):
         why = f"by its name ({named[1]})" if named else f"of {len(values)} values where sampled"
         raise LayerError(f"raster is a mask or another layer, not a picture, {why}: {path}")
 
 
 def _are_codes(values: NDArray[Any]) -> bool:
-    """Whether grey levels are those of a mask, of classes or of one colour; haze and snow have few
-    too, next to each other."""
+    """Whether grey levels are those of a mask, of classes or of one colour, which compression makes
+    up to three; haze and snow have few too, next to each other."""
     few = 0 < len(values) < MIN_VALUES
-    alone = few and (len(values) <= MAX_FLAT or float(values[-1]) < MIN_VALUES)
+    alone = few and (len(values) <= 3 or float(values[-1]) < MIN_VALUES)
     return alone or (few and float(values[-1]) - float(values[0]) > 4 * len(values))
 
 
@@ -373,12 +352,12 @@ def unwarped(path: Path, dataset: Any) -> str | None:
 
 def _terms(tags: Mapping[str, str]) -> Mapping[str, str]:
     """As `orthonav fetch` writes them, else the copyright."""
-    found = {}
-    for key, names in TERMS.items():
-        text = next((tags[name].strip() for name in names if tags.get(name, "").strip()), "")
-        if text:
-            found[key] = " ".join(text.split())[:MAX_TERM]
-    return MappingProxyType(found)
+    keys = ("attribution", "licence", "source", "layer", "dates")
+    found = {key: " ".join(tags.get(f"ORTHONAV_{key.upper()}", "").split()) for key in keys}
+    found["attribution"] = found["attribution"] or " ".join(
+        tags.get("TIFFTAG_COPYRIGHT", "").split()
+    )
+    return MappingProxyType({key: text[:300] for key, text in found.items() if text})
 
 
 def _names_of(path: Path, folder: Path | None) -> list[str]:
@@ -456,7 +435,7 @@ def _masks(path: Path, dataset: Any, bands: tuple[int, ...]) -> tuple[str, ...]:
 
 def _sampled(dataset: Any, band: int, *, valid: bool = False) -> NDArray[Any]:
     """Values in windows all over a file: decimated reads may decode the whole file."""
-    side = ALPHA_SAMPLE_PX
+    side = 64
     cols = np.linspace(0, max(0, dataset.width - side), 4).astype(int).tolist()
     rows = np.linspace(0, max(0, dataset.height - side), 4).astype(int).tolist()
     windows = [
@@ -469,10 +448,11 @@ def _sampled(dataset: Any, band: int, *, valid: bool = False) -> NDArray[Any]:
 
 
 def _is_mask(path: Path, dataset: Any) -> bool:
-    """GDAL marks the fourth of four bands by default; a mask has few values between its ends."""
+    """GDAL marks the fourth of four bands by default; a mask has few values between its ends, those
+    of resampled edges."""
     values = _sampled(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1)
     partly = float(((values != 0) & (values != values.max())).mean())
-    if partly <= MAX_PARTLY_CLEAR:
+    if partly <= 0.05:
         return True
     log.info(
         "alpha band is not a mask (%.0f %% of it is neither transparent nor opaque); ignored: %s",
@@ -486,11 +466,7 @@ def outline_of(path: Path, dataset: Any, system: Any) -> NDArray[np.float64]:
     """The border (N, 2), degrees."""
     box = 0, 0, dataset.width, dataset.height
     x, y = dataset.transform * outline(box, 20).T  # as many as rasterio's `transform_bounds`
-    try:
-        lon, lat = transform_coordinates(system, "EPSG:4326", x, y)[:2]
-    except CPLE_BaseError:  # a local or engineering system
-        lon = lat = np.full(len(x), np.nan)
-    latlon = np.stack([np.asarray(lat, dtype=float), np.asarray(lon, dtype=float)], axis=1)
+    latlon = np.stack(converted(system, "EPSG:4326", x, y)[::-1], axis=1)
     if not np.isfinite(latlon).all() or np.abs(latlon[:, 0]).max() > 90:
         raise ImageryError(
             "orthophoto's border cannot be converted to latitude, longitude: x of "
@@ -510,8 +486,8 @@ def ground_m(dataset: Any, system: Any) -> float:
     """The ground resolution, m: root of the area of the central pixel."""
     col = dataset.width / 2 + np.array([0, 1, 0])
     row = dataset.height / 2 + np.array([0, 0, 1])
-    lon, lat = transform_coordinates(system, "EPSG:4326", *(dataset.transform * (col, row)))[:2]
-    corner = LocalFrame(lat[0], lon[0]).en_from_latlon(np.array(lat), np.array(lon))
+    lon, lat = converted(system, "EPSG:4326", *(dataset.transform * (col, row)))
+    corner = LocalFrame(float(lat[0]), float(lon[0])).en_from_latlon(lat, lon)
     right, down = corner[1] - corner[0], corner[2] - corner[0]
     return float(np.sqrt(abs(right[0] * down[1] - right[1] * down[0])))
 
@@ -538,14 +514,17 @@ def unreadable(path: Path, error: Exception, what: str = "orthophoto") -> Imager
     return ImageryError(f"{what} cannot be read ({line}): {path}")
 
 
-_TAGS = ("TIFFTAG_DATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "DATE")
-_DATE = re.compile(  # not 2000x2000, nor 2000px
+DATE = re.compile(  # not 2000x2000, nor 2000px
     r"(?<!\d)(?<!\dx)(19\d\d|20[0-3]\d)"
     r"(?:[-_]?(0[1-9]|1[0-2])(?:[-_]?(0[1-9]|[12]\d|3[01]))?)?"
     r"(?![\dx]|[-_ ]?px)",
     re.IGNORECASE,
 )
-_IGN_SYSTEMS = {
+IGN_DATE = re.compile(
+    # A tile of BD ORTHO: department, year, kilometres east and north, ..; a package of it.
+    r"^[0-9][0-9AB]{1,2}-((?:19|20)\d\d)-\d{4}-\d{4}-|_D\d?\d[0-9AB](?:_|-)((?:19|20)\d\d)(?![0-9])"
+)
+IGN_SYSTEMS = {
     "LAMB93": "EPSG:2154",
     "LA93": "EPSG:2154",
     "RGAF09UTM20": "EPSG:5490",
@@ -555,23 +534,22 @@ _IGN_SYSTEMS = {
     "RGSPM06U21": "EPSG:4467",
 }
 """In names of packages, folders and tiles of IGN (France)."""
-_IGN_SYSTEM = re.compile(rf"(?<![A-Za-z0-9])({'|'.join(_IGN_SYSTEMS)})(?![A-Za-z0-9])")
-_IGN_TILE = re.compile(r"^[0-9][0-9AB]{1,2}-((?:19|20)\d\d)-\d{4}-\d{4}-")
-"""Of BD ORTHO: department, year, kilometres east and north, and more."""
-_IGN_PACKAGE = re.compile(r"_D\d?\d[0-9AB](?:_|-)((?:19|20)\d\d)(?![0-9])")
 
 
 def date_of(tags: dict[str, str], names: Iterable[str]) -> str | None:
     """YYYY[-MM[-DD]]; from IGN's names only the year, which numbers of other meaning follow."""
-    tagged = [str(tags[tag]).replace(":", "-") for tag in _TAGS if tag in tags]
+    known = ("TIFFTAG_DATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "DATE")
+    tagged = [str(tags[tag]).replace(":", "-") for tag in known if tag in tags]
     for text in (*tagged, *names):
-        if years := _IGN_TILE.search(text) or _IGN_PACKAGE.search(text):
-            return years.group(1)
-        if found := _DATE.search(text):
+        if year := IGN_DATE.search(text):
+            return year.group(1) or year.group(2)
+        if found := DATE.search(text):
             return "-".join(part for part in found.groups() if part)
     return None
 
 
 def system_of(names: Iterable[str]) -> str | None:
-    found = next(filter(None, map(_IGN_SYSTEM.search, names)), None)
-    return None if found is None else _IGN_SYSTEMS[found.group(1)]
+    """The coordinate system that a name of IGN states."""
+    named = re.compile(rf"(?<![A-Za-z0-9])({'|'.join(IGN_SYSTEMS)})(?![A-Za-z0-9])")
+    found = next(filter(None, map(named.search, names)), None)
+    return None if found is None else IGN_SYSTEMS[found.group(1)]

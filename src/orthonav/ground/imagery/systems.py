@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyproj
 import rasterio
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pyproj.aoi import AreaOfInterest
 from pyproj.transformer import TransformerGroup
 from rasterio.crs import CRS
@@ -31,9 +31,7 @@ from orthonav.core.geo.frames import WGS84_A_M, distances_m
 if TYPE_CHECKING:
     from orthonav.ground.imagery.source import Source
 
-MAX_ACCURACY_M = 2.0
-"""Above it a transformation is worth a warning."""
-_FRAMES = (
+FRAMES = (
     (r"NAD83(?!\((?:PA|MA)11)", "EPSG:6318"),
     (r"ETRS89|ETRF|RGF93|SWEREF99|EUREF|IGNF", "EPSG:4258"),
     (r"GDA94", "EPSG:4283"),
@@ -41,6 +39,19 @@ _FRAMES = (
 )
 """Geographic systems for which PROJ knows the motion, by names of those that agree to decimetres.
 """
+
+
+def converted(
+    source: Any, target: Any, x: ArrayLike, y: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates in another system, by rasterio's PROJ; NaN where there are none.
+
+    In degrees the longitude comes first."""
+    try:
+        found = transform_coordinates(source, target, np.ravel(x), np.ravel(y))[:2]
+    except Exception:  # rasterio exports no class of the errors of GDAL that it raises here
+        return np.full(np.size(x), np.nan), np.full(np.size(x), np.nan)
+    return np.asarray(found[0], np.float64), np.asarray(found[1], np.float64)
 
 
 def accuracy_of(
@@ -63,7 +74,7 @@ def _accuracy(wkt: str, lat_deg: float, lon_deg: float) -> tuple[float | None, s
         return None, ""
     system = pyproj.CRS.from_wkt(wkt).to_2d()
     # rasterio has a PROJ of its own, with other grids: which operation gives what it gives?
-    x, y = transform_coordinates("EPSG:4326", CRS.from_wkt(wkt), [lon_deg], [lat_deg])[:2]
+    x, y = converted("EPSG:4326", CRS.from_wkt(wkt), lon_deg, lat_deg)
     box: Any = AreaOfInterest(lon_deg - 0.1, lat_deg - 0.1, lon_deg + 0.1, lat_deg + 0.1)
     for area in (box, None):  # None: it uses some beyond their area of use
         group = TransformerGroup(system, "EPSG:4326", always_xy=True, area_of_interest=area)
@@ -87,7 +98,7 @@ def _accuracy(wkt: str, lat_deg: float, lon_deg: float) -> tuple[float | None, s
     if used.accuracy < 0:
         return None, f"the file states how to convert {named} to WGS 84, but not how accurately"
     accuracy_m = round(float(used.accuracy + off_m.min()), 1)
-    if accuracy_m <= MAX_ACCURACY_M:
+    if accuracy_m <= 2.0:
         return accuracy_m, ""
     said = f"{named} is converted to WGS 84 with an accuracy of {accuracy_m:g} m only"
     return accuracy_m, said + _better(group, accuracy_m)
@@ -141,7 +152,7 @@ def _moved(
     source: "Source", shift_deg: tuple[float, float], lat_deg: float, lon_deg: float, year: float
 ) -> "Source":
     lon, lat = [lon_deg, lon_deg + shift_deg[1]], [lat_deg, lat_deg + shift_deg[0]]
-    x, y = transform_coordinates("EPSG:4326", source.system, lon, lat)[:2]
+    x, y = converted("EPSG:4326", source.system, lon, lat)
     return replace(
         source,
         transform=Affine.translation(x[1] - x[0], y[1] - y[0]) * source.transform,
@@ -157,4 +168,4 @@ def _plate_frame(crs: str) -> str | None:
     with suppress(pyproj.exceptions.CRSError):  # a WKT that was cut
         system = pyproj.CRS.from_user_input(crs)
         crs = (system.geodetic_crs or system).name
-    return next((code for pattern, code in _FRAMES if re.search(pattern, crs)), None)
+    return next((code for pattern, code in FRAMES if re.search(pattern, crs)), None)

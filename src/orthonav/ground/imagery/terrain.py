@@ -3,7 +3,7 @@
 import functools
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from orthonav.core.errors import ImageryError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import require_file
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M, bilinear
+from orthonav.core.geo.ground import HIGHEST_M, LOWEST_M, bilinear_of, by_value
 from orthonav.core.mapfile.manifest import UNKNOWN_DATUM
 
 try:
@@ -43,18 +43,14 @@ except ImportError as error:
     raise missing_extra("reading terrain", "geo", "rasterio", error) from error
 
 Array = NDArray[np.float64]
-BLOCK_PX = 256
-SAMPLE_PX = 512
-"""Side of the overview from which units are judged."""
-COAST_M = 20.0  # heights of 0 beside no lower ground than this are doubted
 DATUM_TAG = "ORTHONAV_VERTICAL_DATUM"
 """In files that `orthonav fetch` wrote."""
-_UNITS = {
+UNITS_M = {
     "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
     "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "international foot": 0.3048,
     "us-ft": 1200 / 3937, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937,
 }  # fmt: skip
-_OPTIONS = {"GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 64 * 2**20}
+GDAL_OPTIONS = {"GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 64 * 2**20}
 NAMED = {"egm96": "EPSG:5773", "egm2008": "EPSG:3855", "msl": "EPSG:5714"}
 ELLIPSOID = "ellipsoid"
 OPTION = f"--dem-datum {'|'.join((*NAMED, ELLIPSOID))}|EPSG:NUMBER"
@@ -180,15 +176,24 @@ class Dem:
         lat, lon = np.asarray(lat_deg, np.float64), np.asarray(lon_deg, np.float64)
         col, row = self._pixels(lat.ravel(), lon.ravel())
         found = np.full(col.shape, np.nan)
-        inside = (col >= 0) & (col <= self._data.width) & (row >= 0) & (row <= self._data.height)
-        for some, left, top, heights in self._blocks_of(col, row, inside):
-            found[some] = bilinear(
-                lambda rows, cols, heights=heights: heights[rows, cols],  # type: ignore[misc]
-                heights.shape,
-                col[some] - left - 0.5,
-                row[some] - top - 0.5,
-            )
+        wide, high, side = self._data.width, self._data.height, 256
+        inside = np.flatnonzero((col >= 0) & (col <= wide) & (row >= 0) & (row <= high))
+        across = wide // side + 1
+        blocks = row[inside] // side * across + col[inside] // side
+        for block, some in by_value(blocks.astype(np.intp)):
+            corner = block % across * side, block // across * side
+            left, top = (max(0, at - 1) for at in corner)
+            right, bottom = min(corner[0] + side + 1, wide), min(corner[1] + side + 1, high)
+            heights = self._read(Window(left, top, right - left, bottom - top))
+            here = inside[some]
+            found[here] = bilinear_of(heights, col[here] - left - 0.5, row[here] - top - 0.5)
         return self._above_sea(found.reshape(lat.shape), lat, lon)
+
+    def _read(self, window: Window) -> Array:
+        try:
+            return self._metres(self._data.read(1, window=window, masked=True))
+        except GDAL_ERRORS as error:
+            raise unreadable(self.path, error, "terrain file") from error
 
     def require_datum(self, why: str) -> None:
         """Raise `ImageryError` where heights do not count from the sea. `why`: what needs them."""
@@ -243,7 +248,7 @@ class Dem:
         try:
             with (
                 quiet(),
-                rasterio.Env(**_OPTIONS),
+                rasterio.Env(**GDAL_OPTIONS),
                 WarpedVRT(
                     self._data,
                     src_crs=CRS.from_wkt(self._horizontal.to_wkt()),
@@ -254,7 +259,9 @@ class Dem:
                 ) as warped,
             ):
                 return self._metres(warped.read(1, masked=True))
-        except GDAL_ERRORS as error:
+        except MemoryError:
+            raise
+        except Exception as error:  # rasterio exports no class of the errors of GDAL it raises here
             raise unreadable(self.path, error, "terrain file") from error
 
     def _above_sea(self, heights: Array, lat_deg: Array, lon_deg: Array) -> Array:
@@ -277,33 +284,12 @@ class Dem:
             col, row = ~self._data.transform * (np.asarray(x), np.asarray(y))
         return col, row
 
-    def _blocks_of(
-        self, col: Array, row: Array, inside: NDArray[np.bool_]
-    ) -> Iterator[tuple[NDArray[np.intp], int, int, Array]]:
-        """Positions of each window that holds some, its first column and row, and its heights."""
-        which = np.flatnonzero(inside)
-        across = self._data.width // BLOCK_PX + 1
-        blocks = (row[which] // BLOCK_PX * across + col[which] // BLOCK_PX).astype(np.intp)
-        order = np.argsort(blocks, kind="stable")
-        found, starts = np.unique(blocks[order], return_index=True)
-        for block, some in zip(found.tolist(), np.split(which[order], starts[1:]), strict=False):
-            corner = block % across, block // across
-            left, top = (max(0, at * BLOCK_PX - 1) for at in corner)
-            right, bottom = ((at + 1) * BLOCK_PX + 1 for at in corner)
-            right, bottom = min(right, self._data.width), min(bottom, self._data.height)
-            window = Window(left, top, right - left, bottom - top)
-            try:
-                raw = self._data.read(1, window=window, masked=True)
-            except GDAL_ERRORS as error:
-                raise unreadable(self.path, error, "terrain file") from error
-            yield some, left, top, self._metres(raw)
-
 
 def open_dem(path: Path, datum: str | None = None) -> Dem:
     """`datum`: what heights count from, where the file does not state it (`OPTION`)."""
     path = require_file(Path(path), "terrain file")
     try:
-        with quiet(), rasterio.Env(**_OPTIONS):
+        with quiet(), rasterio.Env(**GDAL_OPTIONS):
             return _inspected(path, rasterio.open(path), datum)
     except GDAL_ERRORS as error:
         raise unreadable(path, error, "terrain file") from error
@@ -331,12 +317,12 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
     in_feet = horizontal.is_projected and axes[0].unit_conversion_factor != 1
     if in_feet and len(axes) < 3 and vertical.unit_m == 1:
         unit = unit or "no unit, and its coordinates in feet"
-    if unit and unit not in _UNITS:
+    if unit and unit not in UNITS_M:
         raise ImageryError(
             f"heights of the terrain file are in {unit:.60}: metres or feet are expected; state "
             f"the unit (gdal_edit.py -units m, or ft): {path}"
         )
-    unit_m = _UNITS.get(unit, vertical.unit_m)
+    unit_m = UNITS_M.get(unit, vertical.unit_m)
     vertical = replace(vertical, unit_m=unit_m)
     _require_heights(path, data, vertical)
     if vertical.above_ellipsoid:
@@ -350,7 +336,7 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
 
 def _require_heights(path: Path, data: Any, datum: VerticalDatum) -> None:
     """Heights that ground can have, beside at most one value that stands for none."""
-    shape = min(data.height, SAMPLE_PX), min(data.width, SAMPLE_PX)
+    shape = min(data.height, 512), min(data.width, 512)
     raw = data.read(1, out_shape=shape, masked=True, resampling=Resampling.nearest)
     values = np.unique(np.ma.compressed(raw).astype(np.float64))
     heights = (values[np.isfinite(values)] * data.scales[0] + data.offsets[0]) * datum.unit_m
@@ -364,7 +350,7 @@ def _require_heights(path: Path, data: Any, datum: VerticalDatum) -> None:
     if not sound.any():
         raise ImageryError(f"terrain file holds no height: {path}")
     ground = heights[sound & (heights != 0)]
-    if (heights == 0).any() and ground.size and ground.min() > COAST_M:
+    if (heights == 0).any() and ground.size and ground.min() > 20.0:  # m: no coast
         log.warning(
             "heights of 0 beside others from %.0f m on are taken as heights; if they are holes, "
             "say so (gdal_edit.py -a_nodata 0): %s",
