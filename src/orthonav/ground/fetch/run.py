@@ -131,7 +131,7 @@ def fetch(
     `OutputError` where the file cannot be written.
     """
     if request.out.suffix.lower() not in (".tif", ".tiff"):
-        raise FetchError(f"--out must be a .tif file, got: {request.out}")
+        raise UsageError(f"--out must be a .tif file, got: {request.out}")
     if request.out.exists() and not request.out.is_file():
         raise OutputError(f"cannot write over a folder or a device: {request.out}")
     with Web(request.limits, request.spec.secrets) as web:
