@@ -257,7 +257,7 @@ def read_capabilities(path: Path) -> None:
 
 
 PORTS: list[int] = []
-TARGETS = ("/", "/api/run", "/views/1/view.png", "/tiles/0/0/0", "/api/news?generation=1&views=2")
+TARGETS = ("/", "/api/run", "/views/1/view.png", "/tiles/0/0/0", "/api/views")
 
 
 def make_requests(root: Path) -> list[Path]:

@@ -6,7 +6,6 @@ screen can show; unknown values are None.
 
 import logging
 import math
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
+from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.files import with_paths
 from orthonav.core.flight import read_truth
 from orthonav.core.flight.fixes import STATES, flight_digest
@@ -33,7 +32,7 @@ from orthonav.ground.evaluate.metrics import (
     protection_levels_m,
     warn_of_another_run,
 )
-from orthonav.ground.recordings import Recording, SourceOptions, open_source
+from orthonav.ground.recordings import SourceOptions, open_source
 from orthonav.ground.recordings.flightlog import is_flight_log
 from orthonav.ground.recordings.opening import source_kind
 from orthonav.ground.report import to_plain
@@ -48,13 +47,12 @@ from orthonav.ground.report.imagery import (
     shrunk_px,
     window_of,
 )
-from orthonav.ground.view.feed import Batch, LineFeed, LogReader, Shot
 from orthonav.ground.view.perspective import map_in_view
+from orthonav.ground.view.recorded import LoggedRun, Recorded, RecordedImages, Shot, read_lines
 
 Array = NDArray[np.float64]
 LatLon = tuple[float, float]
-Feed = LineFeed | LogReader
-FAR_AWAY_PX = 1e9
+Images = LoggedRun | RecordedImages
 RAW_PX = 640
 log = logging.getLogger(__name__)
 
@@ -68,7 +66,6 @@ class ViewRequest:
     truth: Path | None = None
     mount: Path | None = None
     radius_m: float = 15.0
-    live: bool = False
     source: SourceOptions = field(default_factory=partial(SourceOptions, skip_bad_images=True))
     """How `flight` is read, where it is no flight log."""
 
@@ -86,42 +83,23 @@ class Run:
     def __init__(
         self,
         labels: dict[str, Any],
-        feed: Feed,
-        images: "LogReader | RecordedImages | None",
+        recorded: Recorded,
+        images: Images | None,
         sheet: SheetImagery,
         truth: Mapping[str, LatLon],
         radius_m: float,
         mount: Mount | None = None,
         second: Mapping[str, ViewResult] | None = None,
     ) -> None:
-        """Read what exists. `labels`: names of the files for the page, and whether it is `live`.
-        `mount`: None: that of the flight log, where the feed is one. `second`: results of another
-        run of the same flight by frame, to compare.
-
-        Raises what the feed raises, and `FlightError` for an empty run.
-        """
-        self._mount = mount
-        self.labels, self.sheet = labels, sheet
-        self._feed, self._images = feed, images
-        self._truth, self._radius_m, self._second = truth, radius_m, second
-        self._lock = threading.Lock()
-        self._generation = 1
-        self._results: list[ViewResult] = []
-        self._health: list[dict[str, Any]] = []
-        self._columns: dict[str, list[Any]] = {}
-        self.problems: list[str] = []
-        self._trouble = ""
-        self._take(feed.poll())
-        if not self._results and not labels["live"]:
-            reason = f": {self.problems[0]}" if self.problems else ""
-            raise FlightError(f"run has no views{reason}: {labels['name']}")
-
-    @property
-    def count(self) -> int:
-        return len(self._results)
+        """`labels`: names of the files for the page. `mount`: None: that of a flight log. `second`:
+        results of another run of the same flight by frame, to compare."""
+        self.labels, self.sheet, self.recorded = labels, sheet, recorded
+        self._images, self._mount = images, mount or recorded.mount
+        self._truth, self._radius_m, self._second = truth, radius_m, second or {}
+        self._columns = columns_of(recorded.results, truth, sheet, radius_m, second)
 
     def any_known(self, column: str) -> bool:
-        return any(value is not None for value in self._columns.get(column, ()))
+        return any(value is not None for value in self._columns[column])
 
     def summary(self) -> dict[str, Any]:
         return {
@@ -132,20 +110,14 @@ class Run:
             "sheet": self.sheet.plain(),
         }
 
-    def news(self, generation: int, views: int, health: int) -> dict[str, Any]:
-        """What is new after so many views and lines of health; all for another `generation`."""
-        with self._lock:
-            self._refresh()
-            if generation != self._generation:
-                views, health = 0, 0
-            return {
-                "generation": self._generation,
-                "first": views,
-                "count": len(self._results),
-                "columns": {name: each[views:] for name, each in self._columns.items()},
-                "health": self._health[health:],
-                "problems": [*self.problems, *([self._trouble] if self._trouble else [])],
-            }
+    def views(self) -> dict[str, Any]:
+        """All views as columns, and what else was recorded."""
+        recorded = self.recorded
+        return {
+            "columns": self._columns,
+            "health": recorded.health,
+            "problems": recorded.problems,
+        }
 
     def detail(self, index: int) -> dict[str, Any]:
         result = self._result(index)
@@ -159,7 +131,7 @@ class Run:
         }
         if isinstance(outcome, NoFix):
             found |= {"reason": outcome.reason, "detail": outcome.detail}
-        other = (self._second or {}).get(result.frame)
+        other = self._second.get(result.frame)
         places = {
             "": _place(outcome),
             "second_": None if other is None else _place(other.outcome),
@@ -206,10 +178,9 @@ class Run:
         return png(*map_in_view(self.sheet, shot.camera.resized(*size_px), telemetry, at_en_m))
 
     def _result(self, index: int) -> ViewResult:
-        with self._lock:
-            if not 0 <= index < len(self._results):
-                raise IndexError(f"no view {index}")
-            return self._results[index]
+        if not 0 <= index < len(self.recorded.results):
+            raise IndexError(f"no view {index}")
+        return self.recorded.results[index]
 
     def _shot(self, result: ViewResult) -> Shot:
         if self._images is None:
@@ -219,51 +190,21 @@ class Run:
     def _placed(self, result: ViewResult) -> tuple[Shot, Telemetry, GroundWindow]:
         """A view without the errors of its mount, the telemetry corrected by its fix, and the
         ground that it shows."""
-        shot, mount = self._shot(result), self._mount
-        if mount is None and isinstance(self._feed, LogReader):
-            mount = self._feed.mount
-        if mount is not None:
-            shot = replace(shot, telemetry=mount.corrected(shot.telemetry))
+        shot = self._shot(result)
+        if self._mount is not None:
+            shot = replace(shot, telemetry=self._mount.corrected(shot.telemetry))
         telemetry = as_fixed(shot.telemetry, result)
         return shot, telemetry, window_of(telemetry, shot.camera, self.sheet.grid.gsd_m)
-
-    def _refresh(self) -> None:
-        if not self.labels["live"]:
-            return
-        try:
-            if isinstance(self._images, LogReader) and self._images is not self._feed:
-                self._images.poll()
-            self._take(self._feed.poll())
-            self._trouble = ""
-        except (OrthonavError, OSError) as error:
-            self._trouble = " ".join(str(error).split())
-
-    def _take(self, batch: Batch) -> None:
-        if batch.restarted:
-            self._generation += 1
-            self._results, self._health, self._columns = [], [], {}
-        self.problems += batch.problems
-        self._health += [{"view": before, **plain} for before, plain in batch.health]
-        if not batch.results:
-            return
-        self._results += batch.results
-        began_ns = self._results[0].time_ns
-        made = columns_of(
-            batch.results, began_ns, self._truth, self.sheet, self._radius_m, self._second
-        )
-        for name, values in made.items():
-            self._columns.setdefault(name, []).extend(values)
 
 
 def columns_of(
     results: Sequence[ViewResult],
-    first_ns: int,
     truth: Mapping[str, LatLon],
     sheet: SheetImagery,
     radius_m: float,
     second: Mapping[str, ViewResult] | None = None,
 ) -> dict[str, list[Any]]:
-    """The columns of `results`, in order; times count from `first_ns`.
+    """The columns of `results`, in order; times count from the first one.
 
     `frame`: name; `t`: time in seconds; `ms`: processing time.
     `x`, `y`, `tx`, `ty`: fix and true position in pixels of the sheet.
@@ -297,7 +238,7 @@ def columns_of(
 
     columns: dict[str, list[Any]] = {
         "frame": [r.frame for r in results],
-        "t": to_plain([(r.time_ns - first_ns) / 1e9 for r in results], 3),
+        "t": to_plain([(r.time_ns - results[0].time_ns) / 1e9 for r in results], 3),
         **_drawn(("x", "y"), fix_en_m, sheet),
         **_drawn(("tx", "ty"), truth_en_m, sheet),
         **_drawn(("gx", "gy"), gnss_en_m, sheet),
@@ -350,7 +291,7 @@ def _places(latlon_deg: Sequence[LatLon | None], sheet: SheetImagery) -> Array:
 
 def _drawn(names: tuple[str, str], en_m: Array, sheet: SheetImagery) -> dict[str, list[Any]]:
     px = sheet.px_from_en(en_m)
-    px[~(np.abs(px) < FAR_AWAY_PX).all(axis=1)] = math.nan
+    px[~(np.abs(px) < 1e9).all(axis=1)] = math.nan  # no place on a screen
     return {name: to_plain(each, 2) for name, each in zip(names, px.T, strict=True)}
 
 
@@ -362,16 +303,17 @@ def _ellipses(fixes: Sequence[Fix | None]) -> Array:
 
 
 def open_run(request: ViewRequest) -> Run:
-    """The run, read as far as it exists; problems are logged.
+    """The run; problems are logged.
 
-    Raises an `OrthonavError` where a given file is missing or damaged.
+    Raises an `OrthonavError` where a given file is missing or damaged, or the run is empty.
     """
     if not 0 < request.radius_m < 1e7:
         raise FlightError(f"radius_m must be above 0, got {request.radius_m}")
     opened = open_map(request.map_path)
     sheet = SheetImagery(opened)
-    feed = _feed(request)
-    images = _images(request, feed)
+    recorded = _read(request.run)
+    second = None if request.second is None else _read(request.second)
+    images = _images(request, recorded)
     truth, truth_name = _truth(request, images)
     if truth:
         centre = sheet.frame.lat_deg, sheet.frame.lon_deg
@@ -381,73 +323,41 @@ def open_run(request: ViewRequest) -> Run:
         "map_name": request.map_path.name,
         "images": "" if images is None else (request.flight or request.run).name,
         "truth": truth_name,
-        "live": request.live,
         "second": request.second.name if request.second else "",
     }
     mount = None if request.mount is None else read_mount(request.mount)
-    second = _second(request)
-    run = Run(labels, feed, images, sheet, truth, request.radius_m, mount, second)
-    for problem in run.problems:
-        log.warning("%s", problem)
-    _warn(request, opened, run, feed, images)
+    others = None if second is None else {result.frame: result for result in second.results}
+    run = Run(labels, recorded, images, sheet, truth, request.radius_m, mount, others)
+    _warn(request, opened, run, images)
     return run
 
 
 def is_log(path: Path) -> bool:
-    """Whether this names a flight log, which need not exist yet."""
+    """Whether this names a flight log, perhaps by the name given to `--log`."""
     return is_flight_log(path) if path.exists() else path.suffix == ".mcap"
 
 
-def _feed(request: ViewRequest) -> Feed:
-    path = request.run
-    if request.live and not path.exists() and not path.parent.is_dir():
-        raise MissingFileError(f"folder of the run does not exist: {path.parent}")
-    if is_log(path) or (request.live and path.is_dir()):
-        return LogReader(path, live=request.live)
-    if path.is_dir():
+def _read(path: Path) -> Recorded:
+    if path.is_dir() and not is_log(path):
         raise FlightError(f"expected fixes.jsonl or a flight log, got a folder without one: {path}")
-    return LineFeed(path, live=request.live)
-
-
-def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
-    if request.second is None:
-        return None
-    batch = _feed(replace(request, run=request.second, live=False)).poll()
-    for problem in batch.problems:
+    found = LoggedRun(path) if is_log(path) else read_lines(path)
+    for problem in found.problems:
         log.warning("%s", problem)
-    if not batch.results:
-        raise FlightError(f"run has no views: {request.second}")
-    return {result.frame: result for result in batch.results}
+    if not found.results:
+        reason = f": {found.problems[0]}" if found.problems else ""
+        raise FlightError(f"run has no views{reason}: {path}")
+    return found
 
 
-class RecordedImages:
-    """Images of a flight folder or of photographs, with what is known of their positions."""
-
-    def __init__(self, recording: Recording) -> None:
-        self.camera, self.views = recording.camera, {each.frame: each for each in recording.views}
-        places = ((name, view.truth_latlon_deg) for name, view in self.views.items())
-        self.truth = {name: place for name, place in places if place is not None}
-        for said in (*recording.choices, *recording.warnings):
-            log.warning("%s", said)
-
-    def shot(self, frame: str) -> Shot:
-        view = self.views.get(frame)
-        if view is None:
-            raise FlightError("this view is not in the flight")
-        return Shot(view.telemetry, self.camera, view.grey)
-
-
-def _images(request: ViewRequest, feed: Feed) -> LogReader | RecordedImages | None:
+def _images(request: ViewRequest, recorded: Recorded) -> Images | None:
     path = request.flight
     if path is None:
-        return feed if isinstance(feed, LogReader) else None
-    if not path.exists() and not request.live:
-        raise MissingFileError(f"flight does not exist: {path}")
+        return recorded if isinstance(recorded, LoggedRun) else None
     if is_log(path):
-        reader = LogReader(path, live=request.live)
-        reader.poll()
-        return reader
-    if path.exists() and (request.source.kind or source_kind(path)) in ("video", "ros"):
+        return LoggedRun(path)
+    if not path.exists():
+        raise MissingFileError(f"flight does not exist: {path}")
+    if (request.source.kind or source_kind(path)) in ("video", "ros"):
         raise FlightError(
             "images of a video or of ROS messages are decoded one after the other only; convert "
             f"it with `orthonav import` and give that flight folder: {path}"
@@ -455,9 +365,7 @@ def _images(request: ViewRequest, feed: Feed) -> LogReader | RecordedImages | No
     return RecordedImages(open_source(path, request.source))
 
 
-def _truth(
-    request: ViewRequest, images: LogReader | RecordedImages | None
-) -> tuple[Mapping[str, LatLon], str]:
+def _truth(request: ViewRequest, images: Images | None) -> tuple[Mapping[str, LatLon], str]:
     if request.truth is not None:
         return read_truth(request.truth), request.truth.name
     if isinstance(images, RecordedImages) and images.truth and request.flight is not None:
@@ -465,22 +373,14 @@ def _truth(
     return {}, ""
 
 
-def _warn(
-    request: ViewRequest,
-    opened: MapFile,
-    run: Run,
-    feed: Feed,
-    images: LogReader | RecordedImages | None,
-) -> None:
+def _warn(request: ViewRequest, opened: MapFile, run: Run, images: Images | None) -> None:
     sha256 = flight_digest(images.views.values()) if isinstance(images, RecordedImages) else None
-    flown = feed.session.get("map") if isinstance(feed, LogReader) else None
+    flown = run.recorded.session.get("map")
     if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
         log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
     for path in filter(None, (request.run, request.second)):
         if path.is_file() and not is_log(path):
             warn_of_another_run(path, opened, request.flight, sha256)
-    if not run.count:
-        return
     if run.labels["truth"] and not run.any_known("tx"):
         log.warning("no view of the run has a true position in %s", run.labels["truth"])
     if request.second is not None and not run.any_known("x2"):
