@@ -100,7 +100,7 @@ def along_of(cells, waypoints, step_m=25.0):
 def flown(along, conditions=CONDITIONS, scenes_std=0.8, false_fixes=0):
     """Flights along the route."""
     shifts, rng = scene_shifts(scenes_std), np.random.default_rng(1)
-    return simulated(along.distance_m, along, conditions, shifts, false_fixes, rng)
+    return simulated(along, conditions, shifts, false_fixes, rng)
 
 
 def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", route="", **changed):

@@ -16,9 +16,9 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile import open_map
 from orthonav.ground.check import run as check_run
+from orthonav.ground.check.layers import check_to_plain
 from orthonav.ground.check.records import CheckRequest, Verdict, Word
 from orthonav.ground.check.run import check_map
-from orthonav.ground.check.write.plain import to_json
 from orthonav.ground.planning.route import Route
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
@@ -205,7 +205,7 @@ def test_odd_routes(checked, frame, points, changed):
     assert np.isfinite(along.probability).all() and (result.flights.protection_m > 0).all()
     assert (along.across_low <= along.probability).all()
     assert cells.probability.size < 300_000
-    json.loads(to_json(result))
+    json.dumps(check_to_plain(result), allow_nan=False)
 
 
 def test_views_that_fit_on_no_map(checked, frame):

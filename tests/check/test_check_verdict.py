@@ -1,6 +1,5 @@
 """Go, marginal or no-go: every rule alone, and figures that agree with the verdict."""
 
-import json
 import math
 import re
 from dataclasses import replace
@@ -12,7 +11,8 @@ from made_check import CONDITIONS, flown
 
 from orthonav.core.errors import CheckError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.check.findings import AVAILABILITY, FIXES, OUTAGE_S, Findings, verdict_of
+from orthonav.ground.check.findings import RULES, Findings, verdict_of
+from orthonav.ground.check.layers import check_to_plain
 from orthonav.ground.check.records import (
     Along,
     CheckRequest,
@@ -20,8 +20,7 @@ from orthonav.ground.check.records import (
     Range,
     Word,
 )
-from orthonav.ground.check.write.plain import to_json
-from orthonav.ground.check.write.wording import text
+from orthonav.ground.check.wording import text
 
 ZEROS = np.zeros(201)
 ALONG = Along(
@@ -176,7 +175,7 @@ def test_nothing_contradicts_the_verdict(probability, limit_m, scenes_std, word)
     result = replace(
         result, conditions=conditions, along=along, flights=found, outages=(), verdict=verdict
     )
-    plain = json.loads(to_json(replace(result, mean=found.probability)))
+    plain = check_to_plain(replace(result, mean=found.probability))
     flown_in, points = plain["flights"], plain["route"]["points"]
     assert plain["summary"]["mean_probability"] == pytest.approx(
         flown_in["probability"]["median"], abs=1e-3
@@ -185,8 +184,8 @@ def test_nothing_contradicts_the_verdict(probability, limit_m, scenes_std, word)
     mean = np.average(points["available"], weights=lengths_m)
     low, high = (flown_in["availability"][end] for end in ("low", "high"))
     assert low - 0.05 <= mean <= high + 0.05
-    meets = low >= AVAILABILITY.go and flown_in["outage_s"]["high"] <= OUTAGE_S.go
-    meets = meets and flown_in["probability"]["low"] >= FIXES.go
+    meets = low >= RULES.availability.go and flown_in["outage_s"]["high"] <= RULES.outage_s.go
+    meets = meets and flown_in["probability"]["low"] >= RULES.fixes.go
     assert (verdict.word is GO) == meets
     said = text(result)
     assert ("can be flown" in said) == (verdict.word is GO)
@@ -232,7 +231,7 @@ def test_a_rare_risk_has_no_availability():
     result = made_check.made_check(LocalFrame(48.0, 2.0), cells, ALONG.points_en_m[[0, -1]])
     result = replace(result, conditions=RARE, along=ALONG, flights=found, outages=())
     assert "-  availability: at a risk of 1e-05 too few" in text(result)
-    plain = json.loads(to_json(result))
+    plain = check_to_plain(result)
     assert plain["flights"]["availability"] == {"median": None, "low": None, "high": None}
 
 

@@ -31,39 +31,14 @@ from orthonav.core.records import NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
 from orthonav.core.register.template import Levels
 from orthonav.core.register.window import GreyPyramid
-from orthonav.ground.check.ageing import MARGIN_PX, another_year, default_model, displaced, features
+from orthonav.ground.check.ageing import MARGIN_PX, another_year, displaced, reported_persistence
 from orthonav.ground.check.records import CheckRequest, Conditions
 from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 
-EVERY_PX, PERSISTENCE_LEVELS = 8, 3
-"""Persistence is computed every so many pixels, at so many levels: coarser detail lasts alike."""
 MIN_VALID = 0.3
 """Views that see less of the map than this fraction are skipped: the localizer refuses them."""
-_DONOR_DRAWS = 12
-
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]
-
-
-def reported_persistence(grey: Grey, gsd_m: float, first: int = 0) -> list[NDArray[np.float32]]:
-    """Persistence maps (H, W) of a picture at its own resolution, half of it, and a quarter.
-
-    Resolutions finer than that of level `first` repeat its values.
-    """
-    model = default_model()
-    found: list[NDArray[np.float32]] = []
-    picture = grey
-    height, width = grey.shape
-    for level in range(PERSISTENCE_LEVELS):
-        if level >= first:
-            coarse = model(features(picture, gsd_m * 2**level, max(EVERY_PX >> level, 1)))
-            full = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
-            found.append(np.asarray(full, np.float32))
-        half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        picture = np.asarray(half, np.uint8)
-        if min(picture.shape) < 2 * MARGIN_PX and found:
-            break
-    return [found[0]] * first + found
 
 
 def crop_around(
@@ -94,7 +69,7 @@ def crop_around(
 def mirrored_donor(rng: np.random.Generator, layer: GreyPyramid, size: int, level: int) -> Grey:
     """Mirrored ground (size, size) of a random place, so that it matches no place."""
     rows, cols = layer.shape(level)
-    for _ in range(_DONOR_DRAWS):
+    for _ in range(12):
         row = int(rng.integers(0, max(rows - size, 1)))
         col = int(rng.integers(0, max(cols - size, 1)))
         grey, valid = layer.read(level, row, col, size, size)
@@ -154,12 +129,6 @@ def view_of(
         tilt_std_deg=conditions.tilt_std_deg,
     )
     return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
-
-
-AT_ONCE = 2
-"""Trials that a worker takes at a time: up to two seconds of work."""
-RELIEF_CELL_M = 15.0
-"""Distance over which the height of objects changes: a house or a group of trees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +210,7 @@ def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[Trial | Non
     only the parent handles it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return pool.map(_work, jobs, chunksize=AT_ONCE)
+        return pool.map(_work, jobs, chunksize=2)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -353,7 +322,7 @@ class Trier:
             picture = another_year(rng, picture, donor, maps)
         if request.relief_m > 0:
             rim_px = request.relief_m * size / 2 / conditions.agl_m
-            picture = displaced(rng, picture, rim_px, RELIEF_CELL_M / gsd_m)
+            picture = displaced(rng, picture, rim_px, 15.0 / gsd_m)  # a house, a group of trees
         view = view_of(rng, request, conditions, picture, gsd_m)
         return self._placed(rng, place, view, expected)
 
