@@ -23,7 +23,6 @@ from orthonav.ground.evaluate.tables import (
     runs_to_json,
     summary,
     text,
-    track_rows,
 )
 from orthonav.ground.evaluate.track import (
     TrackMetrics,
@@ -230,8 +229,8 @@ def test_odd_tracks_are_measured(errors, states, named) -> None:
     assert track is not None
     flight = FlightReport("odd", comparison, measure(comparison), track=track)
     json.dumps(runs_to_json([flight]), allow_nan=False)
-    for shown in (summary(flight), "".join(said for _, said in track_rows(track))):
-        assert "nan" not in shown.lower() and "inf" not in shown.lower()
+    shown = summary(flight).lower()
+    assert "nan" not in shown and "inf" not in shown
 
 
 def test_states_count_without_a_truth_and_errors_only_with_one() -> None:

@@ -11,22 +11,21 @@ number), at most the radius of the evaluation. Undefined figures are NaN.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from orthonav.core.extras import needed
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 N_BINS = 10
-NEES_LEVELS = (0.5, 0.9, 0.99)
 RPE_DISTANCE_M = 100.0
 """The shortest segment of the KITTI odometry benchmark (Geiger et al., CVPR 2012)."""
-_LEAST_INDEPENDENCE = 1e-12  # of east and north, 1 - rho^2: below it a covariance is singular
-_ASYMMETRY = 1e-6  # fraction of the largest element that two mirrored ones may differ by
-_Z95 = 1.959963984540054  # two-sided 95 % of a normal distribution
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,10 @@ def percentile(values: FloatArray, percent: float) -> float:
     return float(np.percentile(finite, percent)) if finite.size else math.nan
 
 
+def _stats() -> Any:
+    return needed("scipy.stats", "geo", "evaluating fixes")
+
+
 def wilson(part: int, whole: int) -> tuple[float, float]:
     """The 95 % interval of a share, given `part` of `whole`; NaN for a `whole` of 0.
 
@@ -62,12 +65,8 @@ def wilson(part: int, whole: int) -> tuple[float, float]:
     """
     if not whole:
         return math.nan, math.nan
-    seen, square = part / whole, _Z95**2 / whole
-    middle = (seen + square / 2) / (1 + square)
-    half = math.sqrt(square * (seen * (1 - seen) + square / 4)) / (1 + square)
-    low = 0.0 if part == 0 else max(middle - half, 0.0)
-    high = 1.0 if part == whole else min(middle + half, 1.0)
-    return low, high
+    low, high = _stats().binomtest(part, whole).proportion_ci(method="wilson")
+    return float(low), float(high)
 
 
 def upper_bound(part: int, whole: int) -> float:
@@ -78,26 +77,8 @@ def upper_bound(part: int, whole: int) -> float:
     """
     if not whole:
         return math.nan
-    if part == whole:
-        return 1.0
-    counts = np.arange(1, part + 1)
-    logs = np.concatenate([[0.0], np.cumsum(np.log((whole - counts + 1) / counts))])
-    ks = np.arange(part + 1)
-
-    def chance_of_more(rate: float) -> float:
-        return 1 - float(
-            np.exp(logs + ks * math.log(rate) + (whole - ks) * math.log1p(-rate)).sum()
-        )
-
-    return root(chance_of_more, 0.95, 1.0)
-
-
-def root(rising: Callable[[float], float], value: float, largest: float) -> float:
-    """Where a function that rises from 0 to `largest` takes a value, by bisection."""
-    low, high = 0.0, largest
-    while low < (middle := (low + high) / 2) < high:
-        low, high = (middle, high) if rising(middle) < value else (low, middle)
-    return high
+    counted = _stats().binomtest(part, whole, alternative="less")
+    return float(counted.proportion_ci(method="exact").high)
 
 
 def frozen(values: FloatArray | Sequence[float]) -> FloatArray:
@@ -253,7 +234,7 @@ class CovarianceConsistency:
     `n_without`: right fixes without covariance, or with null values in it; `n_unusable`: with one
     that is singular, not positive definite or not symmetric.
     `nees` (K,): normalized estimation error squared e^T C^-1 e of the others, ascending.
-    `within`: for each of `NEES_LEVELS` the fraction of `nees` inside its bound.
+    `within`: for 0.5, 0.9 and 0.99 the fraction of `nees` inside its bound.
     """
 
     n_right: int
@@ -331,7 +312,7 @@ def check_covariance(
         nees=frozen(nees),
         nees_mean=mean(nees),
         nees_median=float(np.median(nees)) if nees.size else math.nan,
-        within={level: share_of(nees <= nees_bound(level)) for level in NEES_LEVELS},
+        within={level: share_of(nees <= nees_bound(level)) for level in (0.5, 0.9, 0.99)},
     )
 
 
@@ -340,12 +321,12 @@ def is_covariance(cov_en_m2: FloatArray) -> BoolArray:
     east, north = cov_en_m2[:, 0, 0], cov_en_m2[:, 1, 1]
     with np.errstate(all="ignore"):
         largest = np.maximum(east, north)
-        even = np.abs(cov_en_m2[:, 0, 1] - cov_en_m2[:, 1, 0]) <= _ASYMMETRY * largest
+        symmetric = np.abs(cov_en_m2[:, 0, 1] - cov_en_m2[:, 1, 0]) <= 1e-6 * largest
         independence = 1.0 - _correlation(cov_en_m2) ** 2
         usable: BoolArray = (
             np.isfinite(cov_en_m2).all(axis=(1, 2))
             & ((east > 0.0) & (north > 0.0))
-            & (even & (independence > _LEAST_INDEPENDENCE))
+            & (symmetric & (independence > 1e-12))
         )
     return usable
 
@@ -373,16 +354,8 @@ def nees_mean_bounds(n: float) -> tuple[float, float]:
     """
     if not n > 0:
         return math.nan, math.nan
-    wide = 20 * math.sqrt(n) + 40  # the series has converged, and 97.5 % are below
-    logs = np.cumsum(np.log(n + np.arange(1, math.ceil(wide + wide) + math.ceil(n))))
-    powers = np.arange(len(logs) + 1)
-    logs = np.concatenate([[0.0], logs]) + math.lgamma(n + 1)
-
-    def share_below(half: float) -> float:  # the incomplete gamma function, by its series
-        return float(np.exp((n + powers) * math.log(half) - half - logs).sum())
-
-    low, high = (2 / n * root(share_below, p, n + wide) for p in (0.025, 0.975))
-    return low, high
+    low, high = _stats().chi2.ppf([0.025, 0.975], 2 * n) / n
+    return float(low), float(high)
 
 
 def _correlation(cov_en_m2: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from orthonav.core.flight.fixes import STATES
 from orthonav.core.flight.gnss import biases_of, fault_of, gnss_of
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.evaluate.metrics import FAR_M, Comparison
+from orthonav.ground.evaluate.metrics import FAR_M, Comparison, places_en_m
 from orthonav.ground.evaluate.statistics import (
     BoolArray,
     FloatArray,
@@ -343,11 +343,7 @@ def measure_gnss(comparison: Comparison, results: Sequence[ViewResult]) -> GnssM
     places = [gnss_of(each) for each in evidence]
     if not any(places):
         return None
-    frame = LocalFrame(comparison.lat_deg, comparison.lon_deg)
-    en_m = np.full((len(places), 2), np.nan)
-    for i, place in enumerate(places):
-        if place is not None:
-            en_m[i] = frame.en_from_latlon(*place)
+    en_m = places_en_m(LocalFrame(comparison.lat_deg, comparison.lon_deg), places)
     return GnssMetrics(
         seconds_since_first(comparison.time_ns),
         frozen(np.hypot(*(en_m - comparison.truth_en_m).T)),
