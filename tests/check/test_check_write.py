@@ -5,7 +5,6 @@ import json
 import math
 import os
 import shutil
-import sys
 from dataclasses import replace
 
 import made_check
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from made_check import EVIL, FILES, made_cells, small_route
 
-from orthonav.core.errors import MissingExtraError, OutputError
+from orthonav.core.errors import OutputError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.layers import check_to_plain, features
 from orthonav.ground.check.records import CELL_VALUES
@@ -198,21 +197,6 @@ def test_a_full_disk_leaves_the_old_check(folder, opened, frame, monkeypatch, at
         write_check(small_route(frame), opened, folder)
     assert tree(folder) == before
     assert [path.name for path in folder.parent.iterdir()] == ["check"]
-
-
-@pytest.mark.parametrize(
-    ("module", "extra"),
-    [
-        *[("shapely", "geo"), ("rasterio", "geo"), ("xstatic", "web")],
-        *[("jinja2", "report")],
-    ],
-)
-def test_missing_extras_are_reported_before_any_work(module, extra, tmp_path, monkeypatch):
-    for name in [name for name in sys.modules if name.split(".")[0] == module]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingExtraError, match=rf"orthonav\[{extra}\]"):
-        require_free(tmp_path / "check")
 
 
 # Text

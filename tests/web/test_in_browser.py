@@ -14,7 +14,7 @@ from small_run import CHUNK_PX, NO_FIX, PLACES_EN_M, WRONG, name, result, servin
 
 from orthonav.core.flight.fixes import write_results
 from orthonav.core.records import Fix
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 
 pytestmark = pytest.mark.long
 
@@ -109,7 +109,7 @@ def test_two_runs_enlarged_images_and_coordinates(visit, small, tmp_path):
     guess = replace(result(WRONG), frame=name(COUNT - 1), accepted=False)
     write_results(second, [*(result(i) for i in range(WRONG)), guess])
     request = ViewRequest(small.fixes, small.map_path, second=second, flight=small.flight)
-    with serving(open_run(request)) as started:
+    with serving(Run(request)) as started:
         page = visit(started)
         page.pictured(0)
         assert "second run: tracked.jsonl" in page.locator("#legend").inner_text()
@@ -191,7 +191,7 @@ def test_texts_of_the_time_line_keep_apart_on_every_screen(visit, small, tmp_pat
             outcome = replace(each.outcome, lat_deg=each.outcome.lat_deg + off_deg)
             found[i] = replace(each, outcome=outcome)
     write_results(fixes, found)
-    run = open_run(ViewRequest(fixes, small.map_path, flight=small.flight))
+    run = Run(ViewRequest(fixes, small.map_path, flight=small.flight))
     with serving(run) as server:
         page = visit(server, viewport={"width": width, "height": 844})
         page.context.add_init_script(WRITTEN)

@@ -12,7 +12,7 @@ from orthonav.core.flight.fixes import result_to_json
 from orthonav.core.records import Telemetry
 from orthonav.ground.view import recorded
 from orthonav.ground.view.recorded import LoggedRun, read_lines
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 from orthonav.onboard.log import FlightLog
 
 HEALTH = {"health": "DEGRADED", "reasons": ["searching"], "utc_s": 1.5, "counts": {"taken": 3}}
@@ -97,14 +97,14 @@ def test_a_log_that_is_deleted_while_it_is_shown(tmp_path):
 
 def test_images_of_a_log_for_fixes_of_a_file(tmp_path, small):
     write_log(tmp_path, range(2))
-    run = open_run(ViewRequest(small.fixes, small.map_path, flight=tmp_path))
+    run = Run(ViewRequest(small.fixes, small.map_path, flight=tmp_path))
     assert "window" in run.detail(0)
     assert run.detail(5)["why_no_window"] == "this view is not in the log"
 
 
 def test_an_invalid_mount_of_a_log_is_reported(tmp_path, small):
     write_log(tmp_path, range(2), mount={})
-    run = open_run(ViewRequest(tmp_path, small.map_path))
+    run = Run(ViewRequest(tmp_path, small.map_path))
     assert len(run.recorded.results) == 2 and "invalid mount" in run.recorded.problems[0]
 
 

@@ -22,7 +22,7 @@ from small_run import (
 )
 
 from orthonav.core.errors import MissingExtraError, OutputError
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 from orthonav.ground.view.server import Pages, Server, is_loopback, load_assets
 
 
@@ -184,7 +184,7 @@ def test_without_leaflet_it_says_what_to_install(monkeypatch):
 
 def test_a_map_without_layer_shows_its_preview(small, tmp_path):
     path = write_small_map(tmp_path / "plain.onav", layer=False)
-    run = open_run(ViewRequest(small.fixes, path, flight=small.flight))
+    run = Run(ViewRequest(small.fixes, path, flight=small.flight))
     pages = Pages(run, {})
     assert json.loads(pages.answer("/api/run").data)["sheet"]["tiles"] is None
     assert pages.answer("/preview.jpg").media_type == "image/jpeg"

@@ -10,7 +10,7 @@ import pytest
 from small_run import NO_FIX, WRONG, result
 
 from orthonav.core.flight.fixes import Identity, write_results
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 
 
 def refused(done, *words, code=1):
@@ -35,7 +35,7 @@ def test_a_second_run_is_compared_by_frame(small, run, served, tmp_path):
     second = tmp_path / "tracked.jsonl"
     write_results(second, [result(0), result(NO_FIX), result(WRONG)])
     request = ViewRequest(small.fixes, small.map_path, second=second, flight=small.flight)
-    opened = open_run(request)
+    opened = Run(request)
     columns = opened.views()["columns"]
     known = [columns["err"][i] if i in (0, WRONG) else None for i in range(len(columns["err"]))]
     assert columns["err2"] == known and columns["confident2"][0] == columns["confident"][0]

@@ -35,12 +35,12 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.ground.view.run import ViewRequest, open_run
+    from orthonav.ground.view.run import Run, ViewRequest
     from orthonav.ground.view.server import Pages, Server, load_assets
 
     source = source_options(options, skip_bad_images=True)
     request = ViewRequest(**given(options, ViewRequest), map_path=options.map, source=source)
-    pages = Pages(open_run(request), load_assets())
+    pages = Pages(Run(request), load_assets())
     server = Server(pages, options.port)
     with server:
         _announce(server, options)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from orthonav.core.errors import OutputError
-from orthonav.core.extras import needed
 from orthonav.core.files import replacing, replacing_folder, write_text
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.ground.check.layers import FORMAT, check_to_plain, tif_bytes, to_geojson, writable
@@ -30,7 +29,6 @@ from orthonav.ground.report.imagery import Box, Grey, Mask, SheetImagery, webp
 from orthonav.ground.report.page import (
     data_url,
     joined_scripts,
-    leaflet_files,
     load_leaflet,
     render,
     static_text,
@@ -59,7 +57,7 @@ def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
 
 
 def require_free(out: Path) -> None:
-    """Raise what `write_check` would raise about the folder and missing extras, before any work."""
+    """Raise what `write_check` would raise about the folder, before any work."""
     out = Path(out)
     if out.is_dir():
         foreign = _foreign(out)
@@ -70,9 +68,6 @@ def require_free(out: Path) -> None:
             )
     elif out.exists() or out.is_symlink():
         raise OutputError(f"output folder is a file: {out}")
-    leaflet_files("leaflet.js", "leaflet.css")
-    for module, extra in {"rasterio": "geo", "shapely": "geo", "jinja2": "report"}.items():
-        needed(module, extra, "writing a check")
 
 
 def _foreign(folder: Path) -> str | None:

@@ -22,14 +22,18 @@ from orthonav.core.files import with_paths
 from orthonav.core.flight import read_truth
 from orthonav.core.flight.fixes import STATES, flight_digest
 from orthonav.core.flight.gnss import fault_of, gnss_of
-from orthonav.core.flight.mount import Mount, read_mount
+from orthonav.core.flight.mount import read_mount
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult, error_ellipse
 from orthonav.ground.evaluate.metrics import (
     FAR_M,
+    LatLon,
     check_truth,
+    place_of,
+    places_en_m,
     protection_levels_m,
+    reason_of,
     warn_of_another_run,
 )
 from orthonav.ground.recordings import SourceOptions, open_source
@@ -51,7 +55,6 @@ from orthonav.ground.view.perspective import map_in_view
 from orthonav.ground.view.recorded import LoggedRun, Recorded, RecordedImages, Shot, read_lines
 
 Array = NDArray[np.float64]
-LatLon = tuple[float, float]
 Images = LoggedRun | RecordedImages
 RAW_PX = 640
 log = logging.getLogger(__name__)
@@ -80,32 +83,58 @@ class Run:
     there is no image or position.
     """
 
-    def __init__(
-        self,
-        labels: dict[str, Any],
-        recorded: Recorded,
-        images: Images | None,
-        sheet: SheetImagery,
-        truth: Mapping[str, LatLon],
-        radius_m: float,
-        mount: Mount | None = None,
-        second: Mapping[str, ViewResult] | None = None,
-    ) -> None:
-        """`labels`: names of the files for the page. `mount`: None: that of a flight log. `second`:
-        results of another run of the same flight by frame, to compare."""
-        self.labels, self.sheet, self.recorded = labels, sheet, recorded
-        self._images, self._mount = images, mount or recorded.mount
-        self._truth, self._radius_m, self._second = truth, radius_m, second or {}
-        self._columns = columns_of(recorded.results, truth, sheet, radius_m, second)
+    def __init__(self, request: ViewRequest) -> None:
+        """Reads the run and logs its problems.
+
+        Raises an `OrthonavError` where a given file is missing or damaged, or the run is empty.
+        """
+        if not 0 < request.radius_m < 1e7:
+            raise FlightError(f"radius_m must be above 0, got {request.radius_m}")
+        opened = open_map(request.map_path)
+        self.request, self.sheet = request, SheetImagery(opened)
+        self.recorded = _read(request.run)
+        second = None if request.second is None else _read(request.second).results
+        self._second = None if second is None else {result.frame: result for result in second}
+        self._images = _images(request, self.recorded)
+        self._mount = self.recorded.mount if request.mount is None else read_mount(request.mount)
+        self._truth, self.truth_name = _truth(request, self._images)
+        if self._truth:
+            centre = self.sheet.frame.lat_deg, self.sheet.frame.lon_deg
+            check_truth(self._truth, (), centre, Path(self.truth_name))
+        self._columns = columns_of(
+            self.recorded.results, self._truth, self.sheet, request.radius_m, self._second
+        )
+        self._warn(opened)
+
+    def _warn(self, opened: MapFile) -> None:
+        request, images, sha256 = self.request, self._images, None
+        if isinstance(images, RecordedImages):
+            sha256 = flight_digest(images.views.values())
+        flown = self.recorded.session.get("map")
+        if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
+            name = flown.get("name")
+            log.warning("the flight used another map (%.80s): %s", name, request.map_path)
+        for path in filter(None, (request.run, request.second)):
+            if path.is_file() and not is_log(path):
+                warn_of_another_run(path, opened, request.flight, sha256)
+        if self.truth_name and not self.any_known("tx"):
+            log.warning("no view of the run has a true position in %s", self.truth_name)
+        if request.second is not None and not self.any_known("x2"):
+            log.warning("no view has a position in the second run: %s", request.second)
 
     def any_known(self, column: str) -> bool:
         return any(value is not None for value in self._columns[column])
 
     def summary(self) -> dict[str, Any]:
+        request, images = self.request, self._images
         return {
-            **self.labels,
+            "name": request.run.name or str(request.run),
+            "map_name": request.map_path.name,
+            "images": "" if images is None else (request.flight or request.run).name,
+            "truth": self.truth_name,
+            "second": request.second.name if request.second else "",
             "version": __version__,
-            "radius_m": self._radius_m,
+            "radius_m": request.radius_m,
             "states": list(STATES),
             "sheet": self.sheet.plain(),
         }
@@ -131,10 +160,10 @@ class Run:
         }
         if isinstance(outcome, NoFix):
             found |= {"reason": outcome.reason, "detail": outcome.detail}
-        other = self._second.get(result.frame)
+        other = (self._second or {}).get(result.frame)
         places = {
-            "": _place(outcome),
-            "second_": None if other is None else _place(other.outcome),
+            "": place_of(outcome),
+            "second_": None if other is None else place_of(other.outcome),
             "true_": self._truth.get(result.frame),
         }
         for name, place in places.items():
@@ -159,7 +188,7 @@ class Run:
 
     def map_png(self, index: int, at: str) -> bytes:
         result = self._result(index)
-        place = self._truth.get(result.frame) if at == "truth" else _place(result.outcome)
+        place = self._truth.get(result.frame) if at == "truth" else place_of(result.outcome)
         if place is None:
             raise FlightError(f"view {result.frame} has no such position: {at}")
         window = self._placed(result)[2]
@@ -169,7 +198,7 @@ class Run:
     def map_in_view_png(self, index: int) -> bytes:
         """The map from the fix, in the picture of the camera, as large as `raw_jpeg`."""
         result = self._result(index)
-        place = _place(result.outcome)
+        place = place_of(result.outcome)
         if place is None:
             raise FlightError(f"view {result.frame} has no fix")
         shot, telemetry, _ = self._placed(result)
@@ -221,9 +250,9 @@ def columns_of(
     `x2`, `y2`, `err2`, `confident2`: the same of the results of a second run, by frame, if given.
     """
     fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
-    fix_en_m = _places([_place(r.outcome) for r in results], sheet)
-    truth_en_m = _places([truth.get(r.frame) for r in results], sheet)
-    gnss_en_m = _places([gnss_of(r.outcome.evidence) for r in results], sheet)
+    fix_en_m = places_en_m(sheet.frame, [place_of(r.outcome) for r in results])
+    truth_en_m = places_en_m(sheet.frame, [truth.get(r.frame) for r in results])
+    gnss_en_m = places_en_m(sheet.frame, [gnss_of(r.outcome.evidence) for r in results])
     error_m = np.hypot(*(fix_en_m - truth_en_m).T)
     radii_m = np.array([math.nan if f is None else f.radius_m for f in fixes], dtype=np.float64)
     trusted = [
@@ -257,36 +286,21 @@ def columns_of(
         "agl": to_plain(stated("agl_m"), 1),
         "ms": to_plain([float(r.latency_ms) for r in results], 1),
         "state": [-1 if r.state is None else STATES.index(r.state) for r in results],
-        "reason": ["" if _place(r.outcome) else _reason(r.outcome) for r in results],
+        "reason": [reason_of(r.outcome) for r in results],
         "confident": [int(r.is_confident) for r in results],
         "wrong": wrong.astype(int).tolist(),
     }
     if second is not None:
         found = [second.get(r.frame) for r in results]
-        second_en_m = _places([None if r is None else _place(r.outcome) for r in found], sheet)
+        second_en_m = places_en_m(
+            sheet.frame, [None if r is None else place_of(r.outcome) for r in found]
+        )
         columns |= {
             **_drawn(("x2", "y2"), second_en_m, sheet),
             "err2": to_plain(np.hypot(*(second_en_m - truth_en_m).T), 4),
             "confident2": [int(r is not None and r.is_confident) for r in found],
         }
     return columns
-
-
-def _place(outcome: Fix | NoFix) -> LatLon | None:
-    return (outcome.lat_deg, outcome.lon_deg) if isinstance(outcome, Fix) else None
-
-
-def _reason(outcome: Fix | NoFix) -> str:
-    return (isinstance(outcome, NoFix) and outcome.reason) or "not_said"
-
-
-def _places(latlon_deg: Sequence[LatLon | None], sheet: SheetImagery) -> Array:
-    en_m = np.full((len(latlon_deg), 2), math.nan)
-    known = [i for i, at in enumerate(latlon_deg) if at and all(map(math.isfinite, at))]
-    if known:
-        lat, lon = np.array([latlon_deg[i] for i in known], dtype=np.float64).T
-        en_m[known] = sheet.frame.en_from_latlon(lat, lon)
-    return en_m
 
 
 def _drawn(names: tuple[str, str], en_m: Array, sheet: SheetImagery) -> dict[str, list[Any]]:
@@ -302,36 +316,6 @@ def _ellipses(fixes: Sequence[Fix | None]) -> Array:
     return np.array(found, np.float64).reshape(-1, 3)
 
 
-def open_run(request: ViewRequest) -> Run:
-    """The run; problems are logged.
-
-    Raises an `OrthonavError` where a given file is missing or damaged, or the run is empty.
-    """
-    if not 0 < request.radius_m < 1e7:
-        raise FlightError(f"radius_m must be above 0, got {request.radius_m}")
-    opened = open_map(request.map_path)
-    sheet = SheetImagery(opened)
-    recorded = _read(request.run)
-    second = None if request.second is None else _read(request.second)
-    images = _images(request, recorded)
-    truth, truth_name = _truth(request, images)
-    if truth:
-        centre = sheet.frame.lat_deg, sheet.frame.lon_deg
-        check_truth(truth, (), centre, Path(truth_name))
-    labels = {
-        "name": request.run.name or str(request.run),
-        "map_name": request.map_path.name,
-        "images": "" if images is None else (request.flight or request.run).name,
-        "truth": truth_name,
-        "second": request.second.name if request.second else "",
-    }
-    mount = None if request.mount is None else read_mount(request.mount)
-    others = None if second is None else {result.frame: result for result in second.results}
-    run = Run(labels, recorded, images, sheet, truth, request.radius_m, mount, others)
-    _warn(request, opened, run, images)
-    return run
-
-
 def is_log(path: Path) -> bool:
     """Whether this names a flight log, perhaps by the name given to `--log`."""
     return is_flight_log(path) if path.exists() else path.suffix == ".mcap"
@@ -341,11 +325,11 @@ def _read(path: Path) -> Recorded:
     if path.is_dir() and not is_log(path):
         raise FlightError(f"expected fixes.jsonl or a flight log, got a folder without one: {path}")
     found = LoggedRun(path) if is_log(path) else read_lines(path)
-    for problem in found.problems:
-        log.warning("%s", problem)
     if not found.results:
         reason = f": {found.problems[0]}" if found.problems else ""
         raise FlightError(f"run has no views{reason}: {path}")
+    for problem in found.problems:
+        log.warning("%s", problem)
     return found
 
 
@@ -371,17 +355,3 @@ def _truth(request: ViewRequest, images: Images | None) -> tuple[Mapping[str, La
     if isinstance(images, RecordedImages) and images.truth and request.flight is not None:
         return images.truth, request.flight.name
     return {}, ""
-
-
-def _warn(request: ViewRequest, opened: MapFile, run: Run, images: Images | None) -> None:
-    sha256 = flight_digest(images.views.values()) if isinstance(images, RecordedImages) else None
-    flown = run.recorded.session.get("map")
-    if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
-        log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
-    for path in filter(None, (request.run, request.second)):
-        if path.is_file() and not is_log(path):
-            warn_of_another_run(path, opened, request.flight, sha256)
-    if run.labels["truth"] and not run.any_known("tx"):
-        log.warning("no view of the run has a true position in %s", run.labels["truth"])
-    if request.second is not None and not run.any_known("x2"):
-        log.warning("no view has a position in the second run: %s", request.second)
