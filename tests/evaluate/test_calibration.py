@@ -8,10 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from orthonav.core.flight.fixes import result_from_json, result_to_json
+from orthonav.core.flight.fixes import result_to_json
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.evaluate.metrics import Comparison, compare, measure
 from orthonav.ground.evaluate.statistics import (
     N_BINS,
     ConfidenceCalibration,
@@ -20,7 +19,6 @@ from orthonav.ground.evaluate.statistics import (
     is_covariance,
     normalized_squared,
 )
-from orthonav.ground.evaluate.tables import metrics_to_json
 
 RADIUS_M = 20.0
 RIGHT_M, WRONG_M = 3.0, 300.0
@@ -149,55 +147,6 @@ def test_no_covariance_leaves_nothing_defined() -> None:
 
 
 CENTRE = LocalFrame(48.0, -4.5)
-
-
-def flown(
-    offsets_en_m: list[tuple[float, float]],
-    confidence: float | None = 0.9,
-    cov_en_m2: list[list[float]] | None = None,
-    radius_m: float = RADIUS_M,
-) -> Comparison:
-    """Fixes off by `offsets_en_m`, written to a line and read again; null stands for unknown."""
-    truth, results = {}, []
-    for i, offset in enumerate(offsets_en_m):
-        truth[f"{i}.jpg"] = (48.0, -4.5)
-        lat, lon = CENTRE.latlon_from_en(np.array(offset))
-        fix = Fix(float(lat), float(lon), np.eye(2), 0.5, radius_m, 0.0, 100.0)
-        line = json.loads(result_to_json(ViewResult(f"{i}.jpg", i, fix, 10.0)))
-        line |= {"confidence": confidence, "cov_en_m2": cov_en_m2}
-        results.append(result_from_json(json.dumps(line)))
-    return compare(truth, results, CENTRE)
-
-
-OFFSETS = [(3.0, 4.0), (0.0, 30.0), (40.0, 0.0), (500.0, 0.0)]
-
-
-def test_json_names_and_keeps_what_was_there() -> None:
-    metrics = measure(flown(OFFSETS, 0.9, [[25.0, 0.0], [0.0, 25.0]]))
-    values = json.loads(json.dumps(metrics_to_json(metrics), allow_nan=False))
-    row = next(r for r in values["criteria"] if (r["name"], r["threshold"]) == ("confidence", 0.9))
-    assert row == {
-        "name": "confidence",
-        "threshold": 0.9,
-        "share_accepted": 1.0,
-        "accuracy": 0.25,
-        "n_accepted": 4,
-        "n_right": 1,
-        "share_of_right_accepted": 1.0,
-        "n_wrong_by_35m": 2,
-        "wrong_by_35m": 0.5,
-    }
-    assert values["calibration"]["ece"] == pytest.approx(0.65)
-    assert values["calibration"]["brier"] == pytest.approx((0.01 + 3 * 0.81) / 4)
-    names = ("mean_confidence", "share_right", "right_low", "right_high")
-    empty = {"lower": 0.0, "upper": 0.1, "n_fixes": 0, **dict.fromkeys(names)}
-    assert values["calibration"]["bins"][0] == empty
-    assert values["calibration"]["bins"][9]["n_fixes"] == 4
-    covariance = values["covariance"]
-    assert (covariance["n_right"], covariance["n_nees"]) == (1, 1)
-    assert covariance["nees_mean"] == pytest.approx(1.0, rel=1e-3)
-    shares = [covariance[f"nees_within_{level}"] for level in (50, 90, 99)]
-    assert shares == [1.0, 1.0, 1.0]
 
 
 def test_the_command_compares_several_runs(tmp_path, run) -> None:

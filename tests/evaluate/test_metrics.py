@@ -17,7 +17,7 @@ from orthonav.ground.evaluate.metrics import (
     worst_views,
 )
 from orthonav.ground.evaluate.statistics import standard_figures, upper_bound
-from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, summary, verdict
+from orthonav.ground.evaluate.tables import FlightReport, metrics_to_json, verdict
 
 CENTRE = LocalFrame(48.0, -4.5)
 TRUTH_EN_M = {"a": (0.0, 0.0), "b": (100.0, 0.0), "c": (200.0, 50.0), "d": (300.0, 50.0)}
@@ -215,21 +215,6 @@ def test_an_image_that_was_dropped_counts_as_an_outage_up_to_the_next_view() -> 
     for ends in (results[:2], results[1:]):
         cut = measure(compare(truth_of(TRUTH_EN_M), ends), 15.0, 35.0).integrity
         assert cut is not None and math.isnan(cut.outage.seconds_s + cut.availability_of_time)
-
-
-def test_availability_is_the_word_of_the_alert_limit_alone() -> None:
-    """Fixes are confident by their own criterion, whatever the alert limit of the evaluation."""
-    results = [placed(name, i, 1.0, 3.0, 0.99) for i, name in enumerate("abcd")]
-    results = [replace(each, accepted=True) for each in results]
-    comparison = compare(truth_of(TRUTH_EN_M), results)
-    flight = FlightReport("f", comparison, measure(comparison, 15.0, 35.0))
-    said = summary(flight)
-    assert "views with a confident fix: 100.0 % (" in said
-    assert [line for line in said.splitlines() if "availab" in line] == [
-        "available at the alert limit of 35 m: 0.0 % of views, 0.0 % of the time; longest outage "
-        "3.0 s, 312 m",
-        "available and beyond the alert limit of 35 m: none of 0",
-    ]
 
 
 def test_fixes_of_earlier_files_are_judged_by_their_confidence() -> None:

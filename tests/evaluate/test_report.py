@@ -2,21 +2,18 @@
 
 import itertools
 import json
-import math
 import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from html_page import Page
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, NoFix, ViewResult
-from orthonav.ground.evaluate import report
 from orthonav.ground.evaluate.metrics import compare, measure
 from orthonav.ground.evaluate.report import write_report
 from orthonav.ground.evaluate.tables import (
@@ -82,29 +79,6 @@ def test_the_page_needs_nothing_from_outside_and_is_reproducible(tmp_path: Path,
     assert first == second
 
 
-@pytest.mark.long
-def test_figures_follow_dark_mode_and_keep_legible_on_a_phone(tmp_path: Path, coarse) -> None:
-    """A figure scrolls in its box: its text of 10 points is not made smaller than 11 pixels."""
-    from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
-
-    if chromium() is None:
-        pytest.skip(HOW_TO_GET_ONE)
-    path = write_report(tmp_path / "report", [made_flight(40)])
-    with started() as browser:
-        for scheme, least, most in (("light", 250, 255), ("dark", 0, 40)):
-            looks = {"color_scheme": scheme, "viewport": {"width": 390, "height": 844}}
-            page = browser.new_page(**looks)
-            page.goto(path.as_uri())
-            figure = page.locator("figure img").first
-            natural_px = float(figure.get_attribute("width") or 0)
-            box = figure.bounding_box()
-            assert box is not None and box["width"] > 0.7 * natural_px
-            assert page.evaluate("document.documentElement.scrollWidth") == 390
-            shot = np.frombuffer(figure.screenshot(), np.uint8)
-            corner = cv2.imdecode(shot, cv2.IMREAD_COLOR)[10:30, 10:30]
-            assert least <= corner.min() and corner.max() <= most, scheme
-
-
 def test_the_page_holds_metrics_and_provenance(tmp_path: Path, no_plots) -> None:
     flight = made_flight(50)
     made_from = {"map": "brest.onav", "imagery": "ortho.tif", "command": "orthonav evaluate"}
@@ -134,18 +108,6 @@ def test_protection_levels_are_drawn_where_they_are_known(tmp_path: Path, no_plo
     assert "<h3>Integrity</h3>" in html and "available at the alert limit of 35 m" in html
     counted = f"{np.isfinite(levels_m).sum()} of {fixes.sum()} fixes at a risk of 0.001"
     assert f"{counted}; the level of the others is infinite" in html
-
-
-def test_a_stanford_diagram_without_any_level_has_axes_that_can_be_read(monkeypatch) -> None:
-    from matplotlib.figure import Figure
-
-    monkeypatch.setattr(report, "draw_axes", lambda size_in, draw: draw)
-    comparison = replace(made_flight(30).comparison, protection_levels_m=np.full(30, np.inf))
-    for limit_m in (35.0, math.nan):
-        axes = Figure().add_subplot()
-        report.stanford_picture(comparison, limit_m)(axes)
-        for low, high in (axes.get_xlim(), axes.get_ylim()):
-            assert low < 1 < 10 < high
 
 
 def test_several_runs_have_a_row_and_files_of_their_own(tmp_path: Path, no_plots) -> None:

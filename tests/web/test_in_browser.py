@@ -13,7 +13,6 @@ from playwright.sync_api import expect
 from small_run import CHUNK_PX, NO_FIX, PLACES_EN_M, WRONG, name, result, serving
 
 from orthonav.core.flight.fixes import write_results
-from orthonav.core.records import Fix
 from orthonav.ground.view.run import Run, ViewRequest
 
 pytestmark = pytest.mark.long
@@ -168,42 +167,6 @@ def test_stepping_by_keys_is_seen_and_announced(page):
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "true")
     page.chosen(COUNT - 1, COUNT)  # plays to the end and stops
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
-
-
-WRITTEN = """
-window.written = [];
-const fill = CanvasRenderingContext2D.prototype.fillText;
-CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
-  if (this.canvas.parentElement?.id === "chart") window.written.push([text, x, y]);
-  fill.call(this, text, x, y);
-};
-"""
-
-
-@pytest.mark.parametrize("width", [390, 1400])
-def test_texts_of_the_time_line_keep_apart_on_every_screen(visit, small, tmp_path, width):
-    """Errors of 0.1 m to 1 km: a text at each power of ten would touch the next."""
-    fixes = tmp_path / "fixes.jsonl"
-    found = [result(i) for i in range(COUNT)]
-    for i, each in enumerate(found):
-        if isinstance(each.outcome, Fix):
-            off_deg = 10.0 ** (i - 1) / 111_000
-            outcome = replace(each.outcome, lat_deg=each.outcome.lat_deg + off_deg)
-            found[i] = replace(each, outcome=outcome)
-    write_results(fixes, found)
-    run = Run(ViewRequest(fixes, small.map_path, flight=small.flight))
-    with serving(run) as server:
-        page = visit(server, viewport={"width": width, "height": 844})
-        page.context.add_init_script(WRITTEN)
-        page.again()
-        page.chosen(0, COUNT)
-        page.until(lambda: page.js("written.length"))
-        at = {text: (x, y) for text, x, y in page.js("written")}
-        assert "localized in" in page.locator("#sentence").inner_text()
-    rows = sorted(y for text, (x, y) in at.items() if text and x < 50 and text != "state")
-    assert len(rows) >= 4 and np.diff(rows).min() >= 12
-    error = next(at[text] for text in at if text.startswith("error") and "line: 15 m" in text)
-    assert error[1] < rows[0] and at["state"][1] - at["confidence"][1] > 50
 
 
 def test_by_the_rules_of_axe(page):
