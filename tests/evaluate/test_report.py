@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -77,6 +78,29 @@ def test_the_page_needs_nothing_from_outside_and_is_reproducible(tmp_path: Path,
         for name in ("report", "again")
     )
     assert first == second
+
+
+@pytest.mark.long
+def test_figures_follow_dark_mode_and_keep_legible_on_a_phone(tmp_path: Path, coarse) -> None:
+    """A figure scrolls in its box: its text of 10 points is not made smaller than 11 pixels."""
+    from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
+
+    if chromium() is None:
+        pytest.skip(HOW_TO_GET_ONE)
+    path = write_report(tmp_path / "report", [made_flight(40)])
+    with started() as browser:
+        for scheme, least, most in (("light", 250, 255), ("dark", 0, 40)):
+            looks = {"color_scheme": scheme, "viewport": {"width": 390, "height": 844}}
+            page = browser.new_page(**looks)
+            page.goto(path.as_uri())
+            figure = page.locator("figure img").first
+            natural_px = float(figure.get_attribute("width") or 0)
+            box = figure.bounding_box()
+            assert box is not None and box["width"] > 0.7 * natural_px
+            assert page.evaluate("document.documentElement.scrollWidth") == 390
+            shot = np.frombuffer(figure.screenshot(), np.uint8)
+            corner = cv2.imdecode(shot, cv2.IMREAD_COLOR)[10:30, 10:30]
+            assert least <= corner.min() and corner.max() <= most, scheme
 
 
 def test_the_page_holds_metrics_and_provenance(tmp_path: Path, no_plots) -> None:

@@ -233,22 +233,7 @@ def columns_of(
     radius_m: float,
     second: Mapping[str, ViewResult] | None = None,
 ) -> dict[str, list[Any]]:
-    """The columns of `results`, in order; times count from the first one.
-
-    `frame`: name; `t`: time in seconds; `ms`: processing time.
-    `x`, `y`, `tx`, `ty`: fix and true position in pixels of the sheet.
-    `gx`, `gy`, `gerr`, `gdiff`: GNSS in pixels of the sheet, its error, and its distance from the
-    fix in metres; `gfault`: reason of the GNSS monitor, "" without one.
-    `err`: error in metres; `conf`, `radius`: confidence and radius (m) that the fix states;
-    `level`: its protection level (m) at `risk`.
-    `a`, `b`, `turn`: axes of one standard deviation (m), and the angle of the longer one in degrees
-    counter-clockwise from east.
-    `head`, `agl`: heading (deg) and height (m).
-    `state`: number in `STATES`, -1 without one; `reason`: "" for a fix.
-    `confident`: 1 if confident, 0 for a best guess or no fix.
-    `wrong`: 1 if tracking or confident, with an error above 35 m, `radius_m` and its own radius.
-    `x2`, `y2`, `err2`, `confident2`: the same of the results of a second run, by frame, if given.
-    """
+    """The columns of `results`, in order; `second`: of another run, by frame."""
     fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
     fix_en_m = places_en_m(sheet.frame, [place_of(r.outcome) for r in results])
     truth_en_m = places_en_m(sheet.frame, [truth.get(r.frame) for r in results])
@@ -268,26 +253,31 @@ def columns_of(
     columns: dict[str, list[Any]] = {
         "frame": [r.frame for r in results],
         "t": to_plain([(r.time_ns - results[0].time_ns) / 1e9 for r in results], 3),
+        "ms": to_plain([float(r.latency_ms) for r in results], 1),  # processing time
+        # Fix, true position and GNSS in pixels of the sheet.
         **_drawn(("x", "y"), fix_en_m, sheet),
         **_drawn(("tx", "ty"), truth_en_m, sheet),
         **_drawn(("gx", "gy"), gnss_en_m, sheet),
+        # Errors of fix and GNSS, and their distance, metres; reason of the GNSS monitor.
+        "err": to_plain(error_m, 4),
         "gerr": to_plain(np.hypot(*(gnss_en_m - truth_en_m).T), 2),
         "gdiff": to_plain(np.hypot(*(gnss_en_m - fix_en_m).T), 2),
         "gfault": [fault_of(r.outcome.evidence) for r in results],
-        "err": to_plain(error_m, 4),
+        # As the fix states it: confidence, its radius (m), protection level (m) at a risk.
         "conf": to_plain(stated("confidence"), 4),
         "radius": to_plain(radii_m, 1),
         "level": to_plain(protection_levels_m(results), 1),
         "risk": [r.risk for r in results],
+        # Axes of one standard deviation (m); angle of the longer one, counter-clockwise from east.
         "a": to_plain(major_m, 2),
         "b": to_plain(minor_m, 2),
         "turn": to_plain((90.0 - direction_deg) % 180.0, 1),
         "head": to_plain(stated("heading_deg"), 1),
         "agl": to_plain(stated("agl_m"), 1),
-        "ms": to_plain([float(r.latency_ms) for r in results], 1),
         "state": [-1 if r.state is None else STATES.index(r.state) for r in results],
-        "reason": [reason_of(r.outcome) for r in results],
+        "reason": [reason_of(r.outcome) for r in results],  # "" for a fix
         "confident": [int(r.is_confident) for r in results],
+        # Tracking or confident, with an error above 35 m, `radius_m` and its own radius.
         "wrong": wrong.astype(int).tolist(),
     }
     if second is not None:
