@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import made_trials
 import numpy as np
 import pytest
+from made_check import area_of
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.integrity import protection_level_m
@@ -14,18 +15,10 @@ from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.findings import likely_outages, predicted_along
 from orthonav.ground.check.flights import scene_shifts, simulated
 from orthonav.ground.check.records import Along
-from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Route
 
 FRAME = LocalFrame(46.0, 3.0)
 SIDE_M = 100.0
 CONDITIONS = replace(made_trials.CONDITIONS, width_m=SIDE_M, height_m=SIDE_M)
-
-
-def area_of(points_en_m, bands_m=()):
-    lat, lon = FRAME.latlon_from_en(np.array(points_en_m, float))
-    route = Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
-    return Area(FRAME, (-5000.0, -5000.0, 5000.0, 5000.0), route, 200.0)
 
 
 def predicted(probability, error_m):
@@ -52,7 +45,7 @@ def test_the_worst_over_the_width_of_every_leg():
         ((100, 200), 0.9, 0.1),
         ((90, 90), 0.9, 0.9),
     ):
-        area = area_of([[0, 0], [1000, 0], [1000, 800]], bands)
+        area = area_of(FRAME, [[0, 0], [1000, 0], [1000, 800]], bands)
         along = predicted_along(area, CONDITIONS, predict)
         late = along.distance_m > 1400
         assert (along.across_low[early] == first).all() and (along.across_low[late] == last).all()
@@ -60,10 +53,10 @@ def test_the_worst_over_the_width_of_every_leg():
 
 
 def test_the_route_ends_at_its_last_waypoint():
-    along = predicted_along(area_of([[0, 0], [100, 0], [100, 60]]), CONDITIONS, even)
+    along = predicted_along(area_of(FRAME, [[0, 0], [100, 0], [100, 60]]), CONDITIONS, even)
     assert along.distance_m == pytest.approx([0, 25, 50, 75, 100, 125, 150, 160], abs=1e-3)
     np.testing.assert_allclose(along.points_en_m[-1], [100, 60], atol=0.01)
-    whole = predicted_along(area_of([[0, 0], [100, 0]]), CONDITIONS, even)
+    whole = predicted_along(area_of(FRAME, [[0, 0], [100, 0]]), CONDITIONS, even)
     assert len(whole.distance_m) in (5, 6)
 
 

@@ -97,7 +97,7 @@ def test_right_covariance_is_consistent_and_a_halved_one_is_not() -> None:
     errors = random.multivariate_normal([0.0, 0.0], cov, 20_000)
     own_m = np.full(len(errors), 100.0)
     good = check_covariance(errors, np.tile(cov, (len(errors), 1, 1)), own_m, 15.0)
-    assert good.n_right == good.nees.size == 20_000
+    assert good.n == good.nees.size == 20_000
     assert good.nees_mean == pytest.approx(2.0, abs=0.05)
     assert good.nees_median == pytest.approx(2 * math.log(2), abs=0.05)
     assert all(share == pytest.approx(level, abs=0.01) for level, share in good.within.items())
@@ -111,7 +111,7 @@ def test_only_right_fixes_count() -> None:
     own_m = np.array([10.0, 10.0, 10.0, math.nan])
     cov = np.tile(25.0 * np.eye(2), (4, 1, 1))
     found = check_covariance(errors, cov, own_m, 15.0)
-    assert (found.n_right, found.nees.tolist()) == (1, [1.0])
+    assert (found.n, found.nees.tolist()) == (1, [1.0])
     assert check_covariance(errors, cov, own_m, 25.0).nees.tolist() == [1.0, 16.0]
 
 
@@ -132,18 +132,18 @@ def test_an_invalid_covariance_is_counted_and_left_out(rows: list[list[float]]) 
     cov = np.array([rows, np.eye(2)])
     assert is_covariance(cov).tolist() == [False, True]
     found = check_covariance(np.ones((2, 2)), cov, np.full(2, RADIUS_M), 15.0)
-    assert (found.n_right, found.n_unusable, found.n_without) == (2, 1, 0)
+    assert (found.n, found.n_unusable, found.n_without) == (2, 1, 0)
     assert found.nees.tolist() == [2.0]
 
 
 def test_no_covariance_leaves_nothing_defined() -> None:
     cov = np.full((3, 2, 2), math.nan)
     found = check_covariance(np.ones((3, 2)), cov, np.full(3, RADIUS_M), 15.0)
-    assert (found.n_right, found.n_without, found.n_unusable, found.nees.size) == (3, 3, 0, 0)
+    assert (found.n, found.n_without, found.n_unusable, found.nees.size) == (3, 3, 0, 0)
     figures = (found.nees_mean, found.nees_median, *found.within.values())
     assert all(map(math.isnan, figures))
     nothing = check_covariance(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0), 15.0)
-    assert nothing.n_right == 0 and math.isnan(nothing.nees_mean)
+    assert nothing.n == 0 and math.isnan(nothing.nees_mean)
 
 
 CENTRE = LocalFrame(48.0, -4.5)

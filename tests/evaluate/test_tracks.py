@@ -195,7 +195,7 @@ def test_standing_still_has_no_course_and_dense_views_have_one() -> None:
     track = tracked(
         [(3.0, 1.0)] * 16, "tracking", displacement_en_m=np.stack([east, 0 * east], axis=1)
     )
-    assert track.along.n_views == 10
+    assert track.along.n == 10
     random = np.random.default_rng(0)
     dense = np.stack([np.arange(400) * 0.2, random.normal(0.0, 0.1, 400)], axis=1)
     course = course_en(dense)

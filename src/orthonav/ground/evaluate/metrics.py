@@ -27,7 +27,7 @@ from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.statistics import (
     BoolArray,
     ConfidenceCalibration,
-    CovarianceConsistency,
+    Consistency,
     FloatArray,
     Longest,
     StandardFigures,
@@ -193,7 +193,7 @@ class Metrics:
     reasons: Mapping[str, int]
     criteria: tuple[CriterionRow, ...]
     calibration: ConfidenceCalibration
-    consistency: CovarianceConsistency
+    consistency: Consistency
     standard: StandardFigures
     of_confident: StandardFigures
     integrity: Integrity | None = None

@@ -22,7 +22,7 @@ from orthonav.ground.evaluate.statistics import (
 from orthonav.ground.evaluate.tables import (
     FlightReport,
     confidence_text,
-    covariance_text,
+    consistency_text,
     criteria_table,
     integrity_rows,
     runs_table,
@@ -155,7 +155,7 @@ def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
         "standard": standard_table(metrics),
         "criteria": criteria_table(metrics),
         "confidence": confidence_text(metrics),
-        "covariance": covariance_text(metrics.consistency),
+        "covariance": consistency_text(metrics.consistency, "correct fixes"),
         "integrity": integrity_rows(metrics),
     }
 

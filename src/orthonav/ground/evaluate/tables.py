@@ -10,15 +10,15 @@ from orthonav.core.flight.gnss import BIASES
 from orthonav.ground.evaluate.metrics import FAR_M, Comparison, Metrics, radius_key
 from orthonav.ground.evaluate.statistics import (
     RPE_DISTANCE_M,
-    CovarianceConsistency,
+    Consistency,
+    ErrorStatistics,
     FloatArray,
     Longest,
     nees_bound,
-    nees_mean_bounds,
     percentile,
     share,
 )
-from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
+from orthonav.ground.evaluate.track import GnssMetrics, TrackMetrics
 from orthonav.ground.report import aligned, measure_text, percent_text, to_plain
 from orthonav.ground.report.drawing import Background
 
@@ -53,11 +53,17 @@ def metrics_to_json(metrics: Metrics) -> Plain:
     for name, prefix in (("acc_at_m", ""), ("acc_fixes_at_m", "fixes_")):
         shares = plain.pop(name)
         plain |= {f"{prefix}{radius_key(radius_m)}": each for radius_m, each in shares.items()}
-    covariance = plain.pop("consistency")
-    within = {f"nees_within_{100 * p:g}": each for p, each in covariance.pop("within").items()}
-    n_nees = len(covariance.pop("nees"))
-    plain["covariance"] = {**covariance, "n_nees": n_nees, **within}
+    plain["covariance"] = _consistency_to_json(metrics.consistency)
+    del plain["consistency"]
     return plain
+
+
+def _consistency_to_json(found: Consistency) -> Plain:
+    plain: Plain = to_plain(found)
+    within = plain.pop("within").items()
+    plain |= {f"nees_within_{100 * level:g}": each for level, each in within}
+    plain["n_nees"] = len(plain.pop("nees"))
+    return {**plain, "verdict": found.verdict or None}
 
 
 def runs_to_json(runs: Sequence[FlightReport]) -> Plain:
@@ -72,7 +78,7 @@ def runs_to_json(runs: Sequence[FlightReport]) -> Plain:
 def track_to_json(track: TrackMetrics) -> Plain:
     plain: Plain = to_plain({name: each for name, each in vars(track).items() if name != "series"})
     plain["first_view"] = plain["first_view"] and int(plain["first_view"])
-    plain["consistency"]["verdict"] = plain["consistency"]["verdict"] or None
+    plain["consistency"] = _consistency_to_json(track.consistency)
     after = plain["after"]
     after |= {radius_key(r): share for r, share in after.pop("acc_at_m").items()}
     names = ("seconds_s", "sigma_m", "bound_95_m", "along_m", "across_m")
@@ -153,7 +159,7 @@ def summary(flight: FlightReport) -> str:
         *("", *_lines(standard_table(whole))),
         *("", *_lines(criteria_table(whole)), ""),
         f"confidence: {confidence_text(whole)}",
-        f"covariance: {covariance_text(whole.consistency)}",
+        f"covariance: {consistency_text(whole.consistency, 'correct fixes')}",
         *(f"{name}: {text}" for name, text in integrity_rows(whole)),
     ]
     if flight.track is not None:
@@ -206,38 +212,34 @@ def _bounded(part: int, whole: int, upper_95: float) -> str:
     )
 
 
-def covariance_verdict(consistency: CovarianceConsistency) -> str:
-    if not consistency.nees.size:
+def covariance_verdict(found: Consistency) -> str:
+    if not found.nees.size:
         return "Whether covariances are right is unknown: no correct fix states one."
-    return f"Covariances are {_judged(consistency)}."
+    return f"Covariances are {_judged(found)}."
 
 
-def covariance_text(consistency: CovarianceConsistency) -> str:
-    if not consistency.n_right:
-        return "unknown, no fix is correct"
-    counts = ((consistency.n_without, "without one"), (consistency.n_unusable, "unusable"))
-    left_out = ", ".join(f"{count} {kind}" for count, kind in counts if count)
-    if not consistency.nees.size:
-        return f"unknown; of {consistency.n_right} correct fixes {left_out}"
-    levels = " / ".join(f"{100 * level:g}" for level in consistency.within)
-    within = " / ".join(f"{100 * share:.1f}" for share in consistency.within.values())
+def consistency_text(found: Consistency, what: str) -> str:
+    """`what`: the fixes or views that were judged."""
+    counts = ((found.n_without, "without one"), (found.n_unusable, "unusable"))
+    left_out = "".join(f"; {count} {kind}" for count, kind in counts if count)
+    if not found.nees.size:
+        return f"unknown: {found.n} {what}{left_out}"
+    levels = " / ".join(f"{100 * level:g}" for level in found.within)
+    within = " / ".join(f"{100 * share:.1f}" for share in found.within.values())
     return (
-        f"{_judged(consistency)}; "
-        f"NEES of {consistency.nees.size} correct fixes has mean {consistency.nees_mean:.3g} "
-        f"(2 expected), median {consistency.nees_median:.3g} ({nees_bound(0.5):.2f} expected); "
-        f"{within} % within the bounds of {levels} %" + (f"; {left_out}" if left_out else "")
+        f"{_judged(found)}; NEES of {found.nees.size} {what} has mean {found.nees_mean:.3g} "
+        f"(2 expected; 95 % interval {found.low:.2f} to {found.high:.2f} for "
+        f"{found.n_effective:.0f} independent ones), median {found.nees_median:.3g} "
+        f"({nees_bound(0.5):.2f} expected); {within} % within the bounds of {levels} %{left_out}"
     )
 
 
-def _judged(consistency: CovarianceConsistency) -> str:
-    return nees_text(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))
-
-
-def nees_text(nees: float, low: float, high: float) -> str:
-    times = f"errors are {math.sqrt(nees / 2):.1f} times as large as stated"
-    if nees > high:
-        return f"too small: {times}"
-    return f"conservative: {times}" if nees < low else "consistent with the errors"
+def _judged(found: Consistency) -> str:
+    times = f"errors are {math.sqrt(found.nees_mean / 2):.1f} times as large as stated"
+    return {
+        "over-confident": f"too small: {times}",
+        "under-confident": f"conservative: {times}",
+    }.get(found.verdict, "consistent with the errors")
 
 
 # Tables.
@@ -305,60 +307,40 @@ def _track_rows(track: TrackMetrics) -> list[tuple[str, str]]:
     after, errors, found = track.after, "unknown", "never"
     if math.isfinite(track.first_view):
         first = f"view {track.first_view:.0f} of {track.n_views}"
-        found = f"{first}, {_unit(track.first_s, 's')} after the first"
+        found = f"{first}, {measure_text(track.first_s, ' s')} after the first"
     if after.n_views:
         within = ", ".join(f"{percent_text(s)} within {r:g} m" for r, s in after.acc_at_m.items())
-        errors = (
-            f"median {_unit(after.error_median_m, 'm')}, 95 % {_unit(after.error_p95_m, 'm')}, "
-            f"largest {_unit(after.error_max_m, 'm')}; of {after.n_views} views {within}"
-        )
+        values = (after.error_median_m, after.error_p95_m, after.error_max_m)
+        median, p95, most = (measure_text(value, " m") for value in values)
+        errors = f"median {median}, 95 % {p95}, largest {most}; of {after.n_views} views {within}"
     by_view = ", ".join(f"{name} {percent_text(track.share_of_views[name])}" for name in STATES)
     by_time = ", ".join(percent_text(track.share_of_time[name]) for name in STATES)
     lost = f"lost {track.n_lost} time{'s' * (track.n_lost != 1)}"
-    without, after_first = (
-        f"{_unit(each.seconds_s, 's')}, {_unit(each.path_m, 'm')}"
-        for each in (track.low_confidence, track.low_confidence_after)
+    without, after_first = map(_stretch_text, (track.low_confidence, track.low_confidence_after))
+    wrong = (
+        f"{track.n_false_locks} times, the longest "
+        f"{measure_text(track.false_lock_longest_s, ' s')}; {track.n_confident_wrong} confident or "
+        f"tracking views, each off by more than {_far_text(track.far_m)}"
     )
+    gaps = f"{without}; from the first confirmed fix on {after_first}"
     return [
         ("first confirmed fix", found),
         ("errors from then on", errors),
         ("states", f"{by_view} of views; {by_time} of the time; {lost}"),
-        (
-            "longest without a confident fix",
-            f"{without}; from the first confirmed fix on {after_first}",
-        ),
-        (
-            "on wrong positions",
-            f"{track.n_false_locks} times, the longest {_unit(track.false_lock_longest_s, 's')}; "
-            f"{track.n_confident_wrong} confident or tracking views, each off by more than "
-            f"{_far_text(track.far_m)}",
-        ),
+        ("longest without a confident fix", gaps),
+        ("on wrong positions", wrong),
         ("ahead of the ground truth", spread_text(track.along)),
         ("right of the ground truth", spread_text(track.across)),
-        ("covariance", track_consistency_text(track.consistency)),
+        ("covariance", consistency_text(track.consistency, "tracking views")),
     ]
 
 
-def track_consistency_text(found: TrackConsistency) -> str:
-    if not found.n_views:
-        return "unknown, no tracking view has a usable one and a true position"
-    left_out = f"; {found.n_left_out} without a usable one" if found.n_left_out else ""
-    return (
-        f"{nees_text(found.nees_mean, found.effective_low, found.effective_high)}; "
-        f"NEES of {found.n_views} tracking views has mean {found.nees_mean:.3g} "
-        f"(2 expected; 95 % interval {found.effective_low:.2f} to {found.effective_high:.2f} for "
-        f"{found.n_effective:.0f} effective views, as errors are correlated); "
-        f"{percent_text(found.nees_within_95)} below {nees_bound(0.95):.2f} (95 % expected)"
-        f"{left_out}"
-    )
-
-
-def spread_text(spread: Spread) -> str:
-    if not spread.n_views:
+def spread_text(errors: ErrorStatistics) -> str:
+    if not errors.n:
         return "unknown"
     return (
-        f"mean {spread.mean_m:+.1f} m, standard deviation {spread.std_m:.1f} m, "
-        f"RMSE {spread.rmse_m:.1f} m of {spread.n_views} tracking views"
+        f"mean {errors.mean_m:+.1f} m, standard deviation {errors.std_m:.1f} m, "
+        f"RMSE {errors.rmse_m:.1f} m of {errors.n} tracking views"
     )
 
 
@@ -387,7 +369,3 @@ def gnss_rows(found: GnssMetrics) -> list[tuple[str, str]]:
 def percentiles_text(values: FloatArray) -> str:
     median, p95, most = (measure_text(percentile(values, q), " m") for q in (50, 95, 100))
     return f"median {median}, 95 % {p95}, largest {most}"
-
-
-def _unit(value: float, unit: str) -> str:
-    return f"{value:.1f} {unit}" if math.isfinite(value) else f"- {unit}"
