@@ -123,19 +123,6 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     )
 
 
-def _notes(metrics: Metrics) -> list[str]:
-    notes = []
-    if metrics.n_without_truth:
-        notes.append(f"{metrics.n_without_truth} results have no true position and are left out.")
-    if metrics.n_without_result:
-        notes.append(
-            f"{metrics.n_without_result} true positions have no result: views without a fix."
-        )
-    if not metrics.n_fixes:
-        notes.append("No view has a fix, so errors are not defined.")
-    return notes
-
-
 def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
     metrics = flight.metrics
     return {
@@ -143,7 +130,7 @@ def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
         "verdict": verdict(metrics),
         "verdict_kind": "bad" if metrics.n_confident_wrong else "good" * (metrics.n_confident > 0),
         "cards": _cards(metrics),
-        "notes": _notes(metrics),
+        "n_without_truth": metrics.n_without_truth,
         "view_command": flight.view_command,
         "figures": [
             Figure(f"{prefix}{name}", f"{flight.name}: {alt}", caption, drawing)
