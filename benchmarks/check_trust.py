@@ -37,7 +37,7 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix
 from orthonav.ground.check.estimate import LEARNT, PLAIN, Recalibration
-from orthonav.ground.check.findings import FIXES, uncertainty
+from orthonav.ground.check.findings import RULES, uncertainty
 from orthonav.ground.check.flights import scene_shifts, shifted
 from orthonav.ground.check.records import CheckRequest, Range
 from orthonav.ground.check.run import check_map
@@ -91,7 +91,7 @@ class Outcome:
     def is_go(self, by: Recalibration) -> bool:
         """Whether a check of nothing else would say *go*."""
         mean, prior_px = self.mean(by), PRIOR_PX if self.prior else math.inf
-        return mean.low >= FIXES.go and not uncertainty(mean, self.side_px, prior_px)
+        return mean.low >= RULES.fixes.go and not uncertainty(mean, self.side_px, prior_px)
 
     def mean(self, by: Recalibration) -> Range:
         """Of the predicted shares, with its interval, as a check states it."""
@@ -248,13 +248,13 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
     )
     above = [each for each in found if each.right]
     gone = [each for each in above if each.is_go(by[each.scene])]
-    bad = [each for each in gone if np.mean(each.right) < FIXES.go]
+    bad = [each for each in gone if np.mean(each.right) < RULES.fixes.go]
     notes = (
         f"heading sd 10 deg, height sd 10 %, prior {PRIOR_PX:g} px or none; "
         f"{options.views} views over the later date each, those beside the map left out, checks of "
         f"effort {EFFORT:g} (40 to 75 trials); recalibrated by the other scenes",
         f"go by the mean chance alone: {len(gone)} of {len(above)}, of which {len(bad)} measured "
-        f"below {FIXES.go:g}",
+        f"below {RULES.fixes.go:g}",
     )
     return [
         Table("Checks and what came out", header, rows, notes),

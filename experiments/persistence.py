@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from orthonav.core.register.channels import FINE, channels_of
 from orthonav.ground.check.ageing import (
-    MODEL,
     PATCH_PX,
     PersistenceModel,
     features,
@@ -31,7 +30,7 @@ GSD_M = (0.25, 0.5, 1.0, 2.0, 4.0)
 SIDE_PX = 1024
 LEVELS = 2
 RIDGE = 3e-3
-OUT = Path(__file__).parents[1] / "src" / "orthonav" / "ground" / "check" / MODEL
+OUT = Path(__file__).parents[1] / "src" / "orthonav" / "ground" / "check" / "persistence.json"
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ import pytest
 from lab.demo_imagery import write_terrain
 
 from orthonav.cli import build, demo, main
+from orthonav.ground.check.run import TrialNumbers
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def small_demo(area, monkeypatch, tmp_path_factory):
     monkeypatch.setattr(demo, "WAYPOINTS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 200.0)
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
-    monkeypatch.setattr("orthonav.ground.check.run.FEWEST_TRIALS", 24)
+    monkeypatch.setattr("orthonav.ground.check.run.TRIALS", TrialNumbers(fewest=24))
     monkeypatch.setattr("orthonav.ground.check.run.usable_cores", lambda: 1)
     monkeypatch.setattr("orthonav.ground.report.drawing.DPI", 30)
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)

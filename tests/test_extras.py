@@ -52,7 +52,7 @@ AREA = "--bounds=3.0,46.0,3.01,46.01"
 CORE_COMMANDS = {
     "info MAP": None,
     f"plan --camera CAMERA --agl-m 270 {AREA}": None,
-    "evaluate FIXES --truth FLIGHT/truth.csv": None,
+    "evaluate FIXES --truth FLIGHT/truth.csv": "geo",
     "demo --out new": "geo,report,web",
     "simulate --ortho MAP --random 3 --out new": "geo",
     f"fetch {AREA} --source ign:2021 --out new.tif": "fetch",
@@ -72,7 +72,6 @@ CORE_COMMANDS = {
     "fly MAP FLIGHT --autopilot udpin:127.0.0.1:0 --dry-run": "autopilot",
     "fly MAP FLIGHT --recorded-telemetry --log new.mcap": "autopilot",
     "fly MAP --ros2 --dry-run": "flights",
-    "evaluate FIXES --truth FLIGHT/truth.csv --report new": "report",
     "view FIXES --map MAP --no-browser": "web",
 }
 """Commands of a core-only install, and the extras that the answer names; None: it works."""

@@ -40,7 +40,7 @@ from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.route import read_route
 from orthonav.ground.recordings import SourceOptions, open_source
 from orthonav.ground.recordings.logs import read_log
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 from orthonav.ground.view.server import Pages, Server, load_assets
 from orthonav.onboard import state
 from orthonav.onboard.link import AutopilotLink
@@ -257,13 +257,13 @@ def read_capabilities(path: Path) -> None:
 
 
 PORTS: list[int] = []
-TARGETS = ("/", "/api/run", "/views/1/view.png", "/tiles/0/0/0", "/api/news?generation=1&views=2")
+TARGETS = ("/", "/api/run", "/views/1/view.png", "/tiles/0/0/0", "/api/views")
 
 
 def make_requests(root: Path) -> list[Path]:
     flight, area = small_run.write_small_flight(root / "flight"), root / "area.onav"
     small_run.write_small_map(area)
-    opened = open_run(ViewRequest(*make_fixes(root), area, flight=flight))
+    opened = Run(ViewRequest(*make_fixes(root), area, flight=flight))
     server = Server(Pages(opened, load_assets()))
     PORTS.append(server.port)
     threading.Thread(target=server.serve_forever, daemon=True).start()

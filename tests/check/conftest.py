@@ -43,8 +43,8 @@ def half_blank(made_once):
 
 
 @pytest.fixture(scope="module")
-def opened(map_path):
-    return open_map(map_path)
+def opened(half_blank):
+    return open_map(half_blank.map)
 
 
 @pytest.fixture(scope="module")

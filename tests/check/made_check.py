@@ -15,6 +15,8 @@ from orthonav.ground.check.records import (
     Verdict,
     Word,
 )
+from orthonav.ground.planning.area import Area
+from orthonav.ground.planning.route import Route
 
 FILES = {"index.html", "check.json", "check.tif", "check.geojson"}
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
@@ -41,6 +43,18 @@ NO_GO = Verdict(
         Reason("mean", "The mean probability is high.", Word.GO),
     ),
 )
+
+
+def route_of(frame, points_en_m, bands_m=()):
+    lat, lon = frame.latlon_from_en(np.array(points_en_m, float))
+    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
+
+
+def area_of(frame, points_en_m, bands_m=(), band_m=200.0):
+    """The bands of the legs between points."""
+    points, half = np.array(points_en_m, float), max(bands_m or (band_m,)) / 2
+    extent = (*(points.min(axis=0) - half), *(points.max(axis=0) + half))
+    return Area(frame, extent, route_of(frame, points, bands_m), 2 * half)
 
 
 def made_cells(rows, cols, side_m, seed=1, west_m=None, north_m=None):
@@ -100,7 +114,7 @@ def along_of(cells, waypoints, step_m=25.0):
 def flown(along, conditions=CONDITIONS, scenes_std=0.8, false_fixes=0):
     """Flights along the route."""
     shifts, rng = scene_shifts(scenes_std), np.random.default_rng(1)
-    return simulated(along.distance_m, along, conditions, shifts, false_fixes, rng)
+    return simulated(along, conditions, shifts, false_fixes, rng)
 
 
 def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", route="", **changed):

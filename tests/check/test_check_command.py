@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
+from made_check import route_of
 from made_trials import lost, right
 
 from helpers import write_dem
@@ -14,29 +15,13 @@ from orthonav.cli import main
 from orthonav.core.errors import AreaError, CameraError, UsageError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.mapfile import open_map
 from orthonav.ground.check import run as check_run
+from orthonav.ground.check.layers import check_to_plain
 from orthonav.ground.check.records import CheckRequest, Verdict, Word
 from orthonav.ground.check.run import check_map
-from orthonav.ground.check.write.plain import to_json
 from orthonav.ground.planning.route import Route
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
-
-
-@pytest.fixture(scope="module")
-def opened(half_blank):
-    return open_map(half_blank.map)
-
-
-@pytest.fixture(scope="module")
-def frame(opened):
-    return opened.manifest.sheets[0].frame
-
-
-def route_of(frame, points_en_m, bands_m=()):
-    lat, lon = frame.latlon_from_en(np.array(points_en_m, float))
-    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
 
 
 def halves(cells):
@@ -205,7 +190,7 @@ def test_odd_routes(checked, frame, points, changed):
     assert np.isfinite(along.probability).all() and (result.flights.protection_m > 0).all()
     assert (along.across_low <= along.probability).all()
     assert cells.probability.size < 300_000
-    json.loads(to_json(result))
+    json.dumps(check_to_plain(result), allow_nan=False)
 
 
 def test_views_that_fit_on_no_map(checked, frame):

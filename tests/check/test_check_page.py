@@ -13,9 +13,9 @@ import pytest
 from made_check import EVIL, FILES, small_route
 
 from html_page import Page
+from orthonav.ground.check.layers import check_to_plain
 from orthonav.ground.check.records import CELL_VALUES
 from orthonav.ground.check.write import write_check
-from orthonav.ground.check.write.plain import check_to_plain
 
 KINDS = {"tiny", "small_route", "nearly_empty", "evil"}
 

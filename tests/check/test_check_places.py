@@ -4,18 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from made_check import area_of
 
 from orthonav.core.errors import AreaError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.check.cells import CellGrid
-from orthonav.ground.check.run import (
-    BATCH,
-    MapCoverage,
-    checked_m2,
-    trial_places,
-)
-from orthonav.ground.planning.area import Area
-from orthonav.ground.planning.route import Route
+from orthonav.ground.check.cells import CellGrid, MapCoverage, checked_m2, trial_places
 
 FRAME = LocalFrame(46.0, 3.0)
 
@@ -25,16 +18,6 @@ def covering(west_m, north_m, pixel_m, valid):
 
 
 WHOLE = covering(-1000.0, 1000.0, 2.0, np.ones((1000, 1000), np.bool_))
-
-
-def area_of(points_en_m, bands_m):
-    """The bands of the legs between points, in the plane of `FRAME`."""
-    points = np.array(points_en_m, float)
-    lat, lon = FRAME.latlon_from_en(points)
-    route = Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
-    half = max(bands_m) / 2
-    (west, south), (east, north) = points.min(axis=0) - half, points.max(axis=0) + half
-    return Area(FRAME, (west, south, east, north), route, 2 * half)
 
 
 @pytest.mark.parametrize(
@@ -49,19 +32,19 @@ def area_of(points_en_m, bands_m):
     ids=["one waypoint", "thin", "thin and slanting", "a band per leg", "half beyond the map"],
 )
 def test_ground_of_a_band(points, bands, expected_m2):
-    area = area_of(points, bands)
+    area = area_of(FRAME, points, bands)
     assert checked_m2(WHOLE, area) == pytest.approx(expected_m2, rel=0.1)
 
 
 def test_a_band_outside_the_map_is_refused():
     with pytest.raises(AreaError, match=r"does not touch the map, \d\.\d km from it"):
-        checked_m2(WHOLE, area_of([[5000, 0], [6000, 0]], [300.0]))
+        checked_m2(WHOLE, area_of(FRAME, [[5000, 0], [6000, 0]], [300.0]))
     holes = covering(-1000.0, 1000.0, 2.0, np.zeros((1000, 1000), np.bool_))
     with pytest.raises(AreaError, match="no imagery"):
-        checked_m2(holes, area_of([[0, 0], [100, 0]], [300.0]))
+        checked_m2(holes, area_of(FRAME, [[0, 0], [100, 0]], [300.0]))
 
 
-def places(area=None, coverage=WHOLE, count=BATCH, seed=1):
+def places(area=None, coverage=WHOLE, count=32, seed=1):
     extent = coverage.extent_en_m if area is None else area.extent_en_m
     rng, wanted_m2 = np.random.default_rng(seed), checked_m2(coverage, area)
     return trial_places(coverage, area, extent, wanted_m2, count, rng)
@@ -72,8 +55,8 @@ def test_places_lie_in_the_band_and_on_the_map(band_m):
     valid = np.ones((1000, 1000), np.bool_)
     valid[400:600, 300:700] = False
     coverage = covering(-1000.0, 1000.0, 2.0, valid)
-    area = area_of([[-1500, -900], [900, 800]], [band_m])
+    area = area_of(FRAME, [[-1500, -900], [900, 800]], [band_m])
     found = places(area, coverage)
-    assert BATCH / 2 < len(found) <= BATCH
+    assert 16 < len(found) <= 32
     assert area.contains(found).all() and coverage.covers(found).all()
     assert np.ptp(found, axis=0) == pytest.approx([1900, 1350], rel=0.25)  # over all of it

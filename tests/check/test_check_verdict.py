@@ -1,6 +1,5 @@
 """Go, marginal or no-go: every rule alone, and figures that agree with the verdict."""
 
-import json
 import math
 import re
 from dataclasses import replace
@@ -12,7 +11,8 @@ from made_check import CONDITIONS, flown
 
 from orthonav.core.errors import UsageError
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.ground.check.findings import AVAILABILITY, FIXES, OUTAGE_S, Findings, verdict_of
+from orthonav.ground.check.findings import RULES, Findings, verdict_of
+from orthonav.ground.check.layers import check_to_plain
 from orthonav.ground.check.records import (
     Along,
     CheckRequest,
@@ -20,8 +20,7 @@ from orthonav.ground.check.records import (
     Range,
     Word,
 )
-from orthonav.ground.check.write.plain import to_json
-from orthonav.ground.check.write.wording import text
+from orthonav.ground.check.wording import text
 
 ZEROS = np.zeros(201)
 ALONG = Along(
@@ -129,21 +128,6 @@ def test_every_rule(findings, code, word):
     assert found is (word or found)
 
 
-def said(**findings):
-    return " ".join(each.text for each in verdict_of(Findings(**FINE | findings)).reasons)
-
-
-def test_houses_and_trees_are_named_with_their_remedy():
-    assert "has no surface here" in said(unknown=1.0) and "--surface" not in said(unknown=1.0)
-    low = said(unknown=1.0, conditions=LOW)
-    assert "displaced by up to 7.7 % of a view" in low and "build the map with --surface" in low
-    assert "92, 83 and 83 % of views 132, 88 and 55 m wide were confident (docs" in low
-    known = said(objects=0.25, unknown=0.02, conditions=replace(LOW, camera_pitch_deg=45.0))
-    assert "more at 25.0 % of the places; it does not know them at 2.0 %." in known
-    assert "92, 67 and 50 %" in known and "confident, 45 deg ahead" in known
-    assert "--surface" not in known
-
-
 def test_houses_are_displaced_by_the_tangent_of_the_angle():
     """8 m by 8 m at 45 deg off nadir; and no farther than 80 deg."""
     square = replace(CONDITIONS, width_m=100.0, height_m=100.0, agl_m=50.0)
@@ -176,7 +160,7 @@ def test_nothing_contradicts_the_verdict(probability, limit_m, scenes_std, word)
     result = replace(
         result, conditions=conditions, along=along, flights=found, outages=(), verdict=verdict
     )
-    plain = json.loads(to_json(replace(result, mean=found.probability)))
+    plain = check_to_plain(replace(result, mean=found.probability))
     flown_in, points = plain["flights"], plain["route"]["points"]
     assert plain["summary"]["mean_probability"] == pytest.approx(
         flown_in["probability"]["median"], abs=1e-3
@@ -185,43 +169,14 @@ def test_nothing_contradicts_the_verdict(probability, limit_m, scenes_std, word)
     mean = np.average(points["available"], weights=lengths_m)
     low, high = (flown_in["availability"][end] for end in ("low", "high"))
     assert low - 0.05 <= mean <= high + 0.05
-    meets = low >= AVAILABILITY.go and flown_in["outage_s"]["high"] <= OUTAGE_S.go
-    meets = meets and flown_in["probability"]["low"] >= FIXES.go
+    meets = low >= RULES.availability.go and flown_in["outage_s"]["high"] <= RULES.outage_s.go
+    meets = meets and flown_in["probability"]["low"] >= RULES.fixes.go
     assert (verdict.word is GO) == meets
     said = text(result)
     assert ("can be flown" in said) == (verdict.word is GO)
     shown, low, high = re.search(r"(\d+ %)  availability \((\d+) % to (\d+) %", said).groups()
     reason = next(each.text for each in verdict.reasons if each.code == "availability")
     assert f"{shown} ({low} % to {high} %)" in reason
-
-
-def test_a_figure_has_one_form():
-    """Reasons and key figures, with an outage below 100 m and one above two minutes."""
-    outage = dict(outage_m=Range(5360, 74.84, 9000), outage_s=Range(268, 3.7, 450))
-    rare = dict(availability=Range(0.97, 0.83, 0.996), false_fix=Range(0.002, 0, 0.009))
-    found = replace(FLOWN, **outage, **rare)
-    verdict = verdict_of(Findings(**FINE | dict(flights=found)))
-    cells = made_check.made_cells(4, 4, 50.0)
-    result = made_check.made_check(LocalFrame(48.0, 2.0), cells, ALONG.points_en_m[[0, -1]])
-    said = text(replace(result, flights=found, verdict=verdict)).replace("\n      ", " ")
-    assert "  !   Longest outage: 4:28 min (4 s to 7:30 min), 5360 m" in said
-    assert "; GO up to 60 s, NO-GO above 10:00 min, at the upper end.\n" in said
-    assert "  ok  Mean probability" in said
-    assert "; GO from 60 %, NO-GO below 20 %, at the lower end.\n" in said
-    for shown in (
-        "4:28 min (4 s to 7:30 min), 5360 m (74.8 m to 9000 m)",
-        "97 % (83 % to 99 %)",
-        "0.2 % (0.0 % to 0.9 %)",
-    ):
-        value, rest = shown.split(" (", 1)
-        assert shown in said and re.search(rf"{value}  .* \({re.escape(rest)}", said)
-    assert said.count("confident fix beyond 35 m") == 2
-    assert said.count("40 m (the default)") == 2
-
-
-def test_without_a_route_level_and_limit_are_shown():
-    result = made_check.tiny(LocalFrame(48.0, 2.0))
-    assert re.search(r"m  protection level right after .* alert limit: 40 m", text(result))
 
 
 def test_a_rare_risk_has_no_availability():
@@ -232,7 +187,7 @@ def test_a_rare_risk_has_no_availability():
     result = made_check.made_check(LocalFrame(48.0, 2.0), cells, ALONG.points_en_m[[0, -1]])
     result = replace(result, conditions=RARE, along=ALONG, flights=found, outages=())
     assert "-  availability: at a risk of 1e-05 too few" in text(result)
-    plain = json.loads(to_json(result))
+    plain = check_to_plain(result)
     assert plain["flights"]["availability"] == {"median": None, "low": None, "high": None}
 
 

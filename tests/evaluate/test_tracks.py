@@ -23,7 +23,6 @@ from orthonav.ground.evaluate.tables import (
     runs_to_json,
     summary,
     text,
-    track_rows,
 )
 from orthonav.ground.evaluate.track import (
     TrackMetrics,
@@ -196,7 +195,7 @@ def test_standing_still_has_no_course_and_dense_views_have_one() -> None:
     track = tracked(
         [(3.0, 1.0)] * 16, "tracking", displacement_en_m=np.stack([east, 0 * east], axis=1)
     )
-    assert track.along.n_views == 10
+    assert track.along.n == 10
     random = np.random.default_rng(0)
     dense = np.stack([np.arange(400) * 0.2, random.normal(0.0, 0.1, 400)], axis=1)
     course = course_en(dense)
@@ -230,8 +229,8 @@ def test_odd_tracks_are_measured(errors, states, named) -> None:
     assert track is not None
     flight = FlightReport("odd", comparison, measure(comparison), track=track)
     json.dumps(runs_to_json([flight]), allow_nan=False)
-    for shown in (summary(flight), "".join(said for _, said in track_rows(track))):
-        assert "nan" not in shown.lower() and "inf" not in shown.lower()
+    shown = summary(flight).lower()
+    assert "nan" not in shown and "inf" not in shown
 
 
 def test_states_count_without_a_truth_and_errors_only_with_one() -> None:

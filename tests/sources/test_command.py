@@ -22,7 +22,7 @@ from orthonav.ground.recordings.recording import (
     LEVEL_GROUND_IN_GAPS,
     SourceOptions,
 )
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 
 DATA = Path(__file__).parents[1] / "data"
 MAP = DATA / "golden_v1.onav"
@@ -246,10 +246,10 @@ def test_what_was_localized_is_evaluated_and_viewed_as_it_is(run, tmp_path, came
     request = ViewRequest(fixes, MAP, flight=source, source=options)
     if kind != "photos":
         with pytest.raises(FlightError, match="convert it with `orthonav import`"):
-            open_run(request)
+            Run(request)
         return
-    opened = open_run(request)
-    assert opened.labels["truth"] == "p" and opened.any_known("err") and opened.raw_jpeg(0)
+    opened = Run(request)
+    assert opened.truth_name == "p" and opened.any_known("err") and opened.raw_jpeg(0)
     photographs(source)
     none = run("evaluate", fixes, "--flight", source)
     assert none.code == 1 and "no positions were recorded; give --truth" in none.err

@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "localizer"))  # blots.py: the k
 from small_run import PLACES_EN_M, Small, result, serving, write_small_flight, write_small_map
 
 from orthonav.core.flight.fixes import write_results
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 
 
 @pytest.fixture(scope="session")
@@ -30,7 +30,7 @@ def small(made_once):
 @pytest.fixture(scope="session")
 def opened(small):
     """The run, opened with its flight and truth."""
-    return open_run(ViewRequest(small.fixes, small.map_path, flight=small.flight))
+    return Run(ViewRequest(small.fixes, small.map_path, flight=small.flight))
 
 
 @pytest.fixture(scope="session")

@@ -127,9 +127,9 @@ class Small:
 
 
 @contextmanager
-def serving(run, **where):
+def serving(run):
     """A server of a run on a port of its own."""
-    with Server(Pages(run, load_assets()), **where) as server:
+    with Server(Pages(run, load_assets())) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
         try:

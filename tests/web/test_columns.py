@@ -29,7 +29,7 @@ def view(number, gnss_en_m, fault):
 def test_the_protection_level_is_that_of_the_risk_of_the_run():
     sure = view(0, None, 0.0)
     sure = replace(sure, outcome=replace(sure.outcome, place_probability=0.9999), risk=0.01)
-    columns = columns_of([sure, view(1, None, 0.0)], 0, {}, SHEET, 15.0)
+    columns = columns_of([sure, view(1, None, 0.0)], {}, SHEET, 15.0)
     level_m = sure.outcome.protection_level_m(0.01)
     assert columns["level"] == [pytest.approx(level_m, abs=0.1), None]  # none at 0.95
     assert columns["risk"] == [0.01, 1e-3]
@@ -40,7 +40,7 @@ def test_gnss_is_shown_beside_the_fix():
     results = [view(0, (3.0, 4.0), 0.0), view(1, (30.0, 40.0), drift), view(2, None, 0.0)]
     at = FRAME.latlon_from_en([0.0, 4.0])
     truth = {"0": (float(at[0]), float(at[1]))}
-    columns = columns_of(results, 0, truth, SHEET, 15.0)
+    columns = columns_of(results, truth, SHEET, 15.0)
     assert columns["gdiff"] == [5.0, 50.0, None]
     assert columns["gerr"] == [3.0, None, None]
     assert columns["gfault"] == ["", "gnss_drift", ""]

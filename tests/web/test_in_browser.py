@@ -10,11 +10,10 @@ from axe_playwright_python.sync_playwright import Axe
 from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
 from browsing import LAPTOP, Visit, painted
 from playwright.sync_api import expect
-from small_run import CHUNK_PX, GSD_M, NO_FIX, PLACES_EN_M, WRONG, name, result, serving
+from small_run import CHUNK_PX, NO_FIX, PLACES_EN_M, WRONG, name, result, serving
 
-from orthonav.core.flight.fixes import result_to_json, write_results
-from orthonav.core.records import Fix
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.core.flight.fixes import write_results
+from orthonav.ground.view.run import Run, ViewRequest
 
 pytestmark = pytest.mark.long
 
@@ -65,7 +64,7 @@ def page(laptop):
 
 @pytest.fixture(scope="module")
 def columns(opened):
-    return opened.news(0, 0, 0)["columns"]
+    return opened.views()["columns"]
 
 
 def show_wrong(page):
@@ -109,7 +108,7 @@ def test_two_runs_enlarged_images_and_coordinates(visit, small, tmp_path):
     guess = replace(result(WRONG), frame=name(COUNT - 1), accepted=False)
     write_results(second, [*(result(i) for i in range(WRONG)), guess])
     request = ViewRequest(small.fixes, small.map_path, second=second, flight=small.flight)
-    with serving(open_run(request)) as started:
+    with serving(Run(request)) as started:
         page = visit(started)
         page.pictured(0)
         assert "second run: tracked.jsonl" in page.locator("#legend").inner_text()
@@ -170,42 +169,6 @@ def test_stepping_by_keys_is_seen_and_announced(page):
     expect(page.locator("#play")).to_have_attribute("aria-pressed", "false")
 
 
-WRITTEN = """
-window.written = [];
-const fill = CanvasRenderingContext2D.prototype.fillText;
-CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
-  if (this.canvas.parentElement?.id === "chart") window.written.push([text, x, y]);
-  fill.call(this, text, x, y);
-};
-"""
-
-
-@pytest.mark.parametrize("width", [390, 1400])
-def test_texts_of_the_time_line_keep_apart_on_every_screen(visit, small, tmp_path, width):
-    """Errors of 0.1 m to 1 km: a text at each power of ten would touch the next."""
-    fixes = tmp_path / "fixes.jsonl"
-    found = [result(i) for i in range(COUNT)]
-    for i, each in enumerate(found):
-        if isinstance(each.outcome, Fix):
-            off_deg = 10.0 ** (i - 1) / 111_000
-            outcome = replace(each.outcome, lat_deg=each.outcome.lat_deg + off_deg)
-            found[i] = replace(each, outcome=outcome)
-    write_results(fixes, found)
-    run = open_run(ViewRequest(fixes, small.map_path, flight=small.flight))
-    with serving(run) as server:
-        page = visit(server, viewport={"width": width, "height": 844})
-        page.context.add_init_script(WRITTEN)
-        page.again()
-        page.chosen(0, COUNT)
-        page.until(lambda: page.js("written.length"))
-        at = {text: (x, y) for text, x, y in page.js("written")}
-        assert "localized in" in page.locator("#sentence").inner_text()
-    rows = sorted(y for text, (x, y) in at.items() if text and x < 50 and text != "state")
-    assert len(rows) >= 4 and np.diff(rows).min() >= 12
-    error = next(at[text] for text in at if text.startswith("error") and "line: 15 m" in text)
-    assert error[1] < rows[0] and at["state"][1] - at["confidence"][1] > 50
-
-
 def test_by_the_rules_of_axe(page):
     """Names, contrast, landmarks and the rest of axe-core, with a bad view and with help."""
     show_wrong(page)
@@ -228,48 +191,3 @@ def axe_finds(page, only=None):
         for each in found["violations"]
         for node in each["nodes"]
     ]
-
-
-def test_a_run_is_followed_from_before_its_beginning(visit, small, tmp_path):
-    """New views appear; the newest is followed until another is selected, and again on demand."""
-    fixes = tmp_path / "live.jsonl"
-    lines = [result_to_json(result(i)) + "\n" for i in range(COUNT)]
-    run = open_run(ViewRequest(fixes, small.map_path, flight=small.flight, live=True))
-    with serving(run) as server:
-        page = visit(server)
-        live = page.locator("#live")
-        expect(live).to_have_text("live: waiting for the first view")
-        fixes.write_text(lines[0] + lines[1])
-        page.chosen(1, 2)
-        expect(live).to_have_text("live")
-        expect(page.locator("#newest")).to_be_checked()
-        with fixes.open("a") as out:
-            out.write('{"health": "DEGRADED", "reasons": ["searching"]}\n' + lines[2])
-        page.chosen(2, 3)
-        expect(page.locator("#health-now")).to_have_text("health DEGRADED: searching")
-        page.settled()
-        place = page.on_screen(((PLACES_EN_M[2][0] + 180) / GSD_M, (160 - 30) / GSD_M), CHUNK_PX)
-        assert painted(page.picture(), page.colour("strong"), place, 14) > 60  # its ring
-        page.keyboard.press("Home")
-        expect(page.locator("#newest")).not_to_be_checked()
-        with fixes.open("a") as out:
-            out.write(lines[3])
-        expect(page.locator("#shown-count")).to_have_text("4 views")
-        page.locator("#newest").check()
-        page.chosen(3, 4)
-        page.keyboard.press("Home")
-        page.pictured(0)  # else the images of view 3 may be those from before
-        page.keyboard.press("End")
-        expect(page.locator("#newest")).to_be_checked()
-        page.pictured(3)
-        fixes.write_text(lines[4])  # started over
-        page.chosen(0, 1)
-        expect(page.locator("#sentence")).to_contain_text("no fix: blank")
-        page.pictured(0)
-        expect(page.locator("#figure-fix")).to_be_hidden()
-        page.settled()
-        fixes.write_text("")
-        expect(live).to_have_text("live: waiting for the first view")
-        expect(page.locator("#chosen-name")).to_have_text("No view yet")
-        expect(page.locator("#compare")).to_be_hidden()
-        assert page.locator("#sentence").inner_text() == ""

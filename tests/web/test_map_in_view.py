@@ -16,7 +16,7 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import Telemetry
 from orthonav.ground.report.imagery import SheetImagery
 from orthonav.ground.view.perspective import map_in_view
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 from orthonav.ground.view.server import Pages
 
 LENS = replace(CAMERA, distortion=(-0.1, 0.02, 0.001, -0.001))
@@ -108,9 +108,7 @@ def test_the_sky_and_what_the_map_does_not_know_are_blank(town):
 
 def served(small, tmp_path, results, map_path=None):
     write_results(tmp_path / "new.jsonl", results)
-    return open_run(
-        ViewRequest(tmp_path / "new.jsonl", map_path or small.map_path, flight=small.flight)
-    )
+    return Run(ViewRequest(tmp_path / "new.jsonl", map_path or small.map_path, flight=small.flight))
 
 
 def fetched(run, name):

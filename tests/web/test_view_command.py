@@ -10,7 +10,7 @@ import pytest
 from small_run import NO_FIX, WRONG, result
 
 from orthonav.core.flight.fixes import Identity, write_results
-from orthonav.ground.view.run import ViewRequest, open_run
+from orthonav.ground.view.run import Run, ViewRequest
 
 
 def refused(done, *words, code=1):
@@ -35,8 +35,8 @@ def test_a_second_run_is_compared_by_frame(small, run, served, tmp_path):
     second = tmp_path / "tracked.jsonl"
     write_results(second, [result(0), result(NO_FIX), result(WRONG)])
     request = ViewRequest(small.fixes, small.map_path, second=second, flight=small.flight)
-    opened = open_run(request)
-    columns = opened.news(0, 0, 0)["columns"]
+    opened = Run(request)
+    columns = opened.views()["columns"]
     known = [columns["err"][i] if i in (0, WRONG) else None for i in range(len(columns["err"]))]
     assert columns["err2"] == known and columns["confident2"][0] == columns["confident"][0]
     assert opened.summary()["second"] == "tracked.jsonl"
@@ -47,11 +47,6 @@ def test_a_second_run_is_compared_by_frame(small, run, served, tmp_path):
     done = run("view", small.fixes, second, "--map", small.map_path)
     assert done.code == 0 and "no view has a position in the second run" in done.err
     assert "fixes are of another map (00000000)" in done.err
-
-
-def test_a_public_address_is_warned_about(run, small, served):
-    done = run("view", small.fixes, "--map", small.map_path, "--host", "0.0.0.0")
-    assert done.code == 0 and "anyone who can reach this computer" in done.err
 
 
 def test_missing_and_damaged_files_are_reported_at_start(run, small, served, tmp_path):
@@ -66,9 +61,6 @@ def test_missing_and_damaged_files_are_reported_at_start(run, small, served, tmp
     refused(run("view", fixes, "--map", area, "--truth", tmp_path / "none.csv"), "truth does not")
     refused(run("view", fixes, "--map", area, "--mount", fixes), "not a mount file")
     refused(run("view", fixes, "--map", area, "--radius-m", "-1"), "--radius-m must be", code=2)
-    refused(run("view", fixes, "--map", area, "--host", "192.0.2.1"), "cannot listen")
-    far = tmp_path / "none" / "live.jsonl"
-    refused(run("view", far, "--map", area, "--live"), "folder of the run does not exist")
     empty = tmp_path / "empty.jsonl"
     empty.write_text("{}\n")
     refused(run("view", empty, "--map", area), "run has no views", "line 1")

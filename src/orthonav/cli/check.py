@@ -1,11 +1,8 @@
 """`orthonav check`: predict before take-off where views will be localized along a route."""
 
 import argparse
-import json
-import logging
 import shlex
 import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,11 +16,8 @@ EXAMPLE = "area.onav --route route.kml --agl-m 120 --out check"
 EVERYDAY = (
     *("--route", "--band-m", "--other-date", "--camera-kind", "--camera", "--agl-m"),
     *("--dem", "--alert-limit-m", "--yaw-std-deg", "--heading", "--prior-std-m", "--prior"),
-    *("--quick", "--json"),
+    *("--effort", "--json"),
 )
-FIRST_SHARE = 0.03
-"""Fraction of the trials from which their duration is estimated."""
-log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from orthonav.ground.check.records import CheckedInputs, CheckRequest
@@ -51,10 +45,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     _add_errors(parser.add_argument_group("camera, telemetry and motion"))
     group = parser.add_argument_group("trials")
     text = "factor on the number of trials (default 1), which end when more would not change the "
-    text += "answer"
+    text += "answer; 0.25: a quick check"
     group.add_argument("--effort", type=float, default=1.0, metavar="FACTOR", help=text)
-    text = "fewer trials, as --effort 0.25"
-    group.add_argument("--quick", dest="effort", action="store_const", const=0.25, help=text)
     add_options(group, "--workers")
 
 
@@ -85,42 +77,22 @@ def _add_errors(group: argparse._ActionsContainer) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from orthonav.ground.check.layers import check_to_plain
     from orthonav.ground.check.run import check_map
+    from orthonav.ground.check.wording import text
     from orthonav.ground.check.write import require_free, write_check
-    from orthonav.ground.check.write.plain import to_json
-    from orthonav.ground.check.write.wording import text
 
     require_free(options.out)
     request = _request(options)
     with progress(options) as shown:
-        told = options.quiet or sys.stderr.isatty()
-        result, opened = check_map(request, shown if told else _Lines())
+        result, opened = check_map(request, shown)
     page = write_check(result, opened, options.out)
     if options.json:
-        print_json(json.loads(to_json(result)))
+        print_json(check_to_plain(result))
     else:
         print(text(result))
         print(f"\nreport: {page}")
     return result.verdict.word.exit_code
-
-
-class _Lines:
-    """Says on stderr how long the check will take, and every 10 s how far it is."""
-
-    def __init__(self) -> None:
-        self._first: tuple[float, float] | None = None
-        self._next_s = 0.0
-
-    def __call__(self, stage: str, share: float) -> None:
-        now_s = time.monotonic()
-        if self._first is None:  # the start of the workers tells nothing
-            self._first, self._next_s = (now_s, share), now_s + 4
-        done = share - self._first[1]
-        if now_s < self._next_s or done < FIRST_SHARE or share >= 1:
-            return
-        left_s = (now_s - self._first[0]) * (1 - share) / done
-        print(f"{stage}: {100 * share:.0f} %, about {left_s:.0f} s left", file=sys.stderr)
-        self._next_s = now_s + 10
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":

@@ -147,16 +147,17 @@ def _write_report(
     out: Path, flights: "list[FlightReport]", opened: "orthonav.MapFile | None"
 ) -> None:
     from orthonav.cli.info import imagery_text, recipe_text
-    from orthonav.ground.evaluate.report import MadeFrom, write_report
+    from orthonav.ground.evaluate.report import write_report
 
-    made_from = MadeFrom(
-        map_name=opened.path.name if opened else "",
-        recipe=recipe_text(opened.manifest.recipe) if opened else "",
-        imagery=imagery_text(opened.manifest.imagery) if opened else "",
-        flight=", ".join(flight.name for flight in flights),
-        command=" ".join(["orthonav", *sys.argv[1:]]),
-        version=orthonav.__version__,
-    )
+    manifest = opened.manifest if opened else None
+    made_from = {
+        "map": opened.path.name if opened else "",
+        "recipe": recipe_text(manifest.recipe) if manifest else "",
+        "imagery": imagery_text(manifest.imagery) if manifest else "",
+        "flight": ", ".join(flight.name for flight in flights),
+        "command": " ".join(["orthonav", *sys.argv[1:]]),
+        "orthonav": orthonav.__version__,
+    }
     write_report(out, flights, made_from)
 
 

@@ -16,6 +16,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "fetch --source": ("fetch",),
     "build": ("geo",),
     "check": ("geo", "report", "web"),
+    "evaluate": ("geo",),
     "atlas": ("geo",),
     "sign": ("signing",),
     "verify": ("signing",),
@@ -33,7 +34,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "localize, import, calibrate: photographs, ROS, logs": ("flights",),
     "fly --autopilot, --log": ("autopilot",),
     "fly --ros2": ("ros2",),
-    "evaluate --report": ("report",),
+    "evaluate --report": ("geo", "report"),
     "run, as all others: words completed by the shell": ("completion",),
 }
 """Extras by command, or by command with an option or an input."""

@@ -1,7 +1,6 @@
 """`orthonav view`: a run in the browser."""
 
 import argparse
-import logging
 import os
 import sys
 from pathlib import Path
@@ -13,10 +12,8 @@ from orthonav.cli.source import add_source, source_options
 if TYPE_CHECKING:
     from orthonav.ground.view.server import Server
 
-log = logging.getLogger(__name__)
 EXAMPLE = "fixes.jsonl --map area.onav --flight flight"
-EVERYDAY = ("--flight", "--truth", "--live")
-LOOPBACK = "127.0.0.1"
+EVERYDAY = ("--flight", "--truth")
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -31,24 +28,20 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "ground truth: the true positions (default: those that --flight has, if any)"
     add("--truth", type=Path, metavar="truth.csv", help=text)
     add_options(parser, "--mount", "--radius-m")
-    text = "the run is in progress: show new views as they arrive; the file need not exist yet"
-    add("--live", action="store_true", help=text)
     add("--port", type=_port, default=0, help="port of the server (default: any free port)")
-    text = f"address to listen on (default {LOOPBACK}: this computer only)"
-    add("--host", default=LOOPBACK, help=text)
     text = "print the address without opening a browser"
     add("--no-browser", action="store_true", help=text)
     add_source(parser, dem=False)
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.ground.view.run import ViewRequest, open_run
+    from orthonav.ground.view.run import Run, ViewRequest
     from orthonav.ground.view.server import Pages, Server, load_assets
 
     source = source_options(options, skip_bad_images=True)
     request = ViewRequest(**given(options, ViewRequest), map_path=options.map, source=source)
-    pages = Pages(open_run(request), load_assets())
-    server = Server(pages, options.host, options.port)
+    pages = Pages(Run(request), load_assets())
+    server = Server(pages, options.port)
     with server:
         _announce(server, options)
         try:
@@ -58,11 +51,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _announce(server: "Server", options: argparse.Namespace) -> None:
-    if not server.only_loopback:
-        log.warning(
-            "listening at %s: anyone who can reach this computer over the network can see this run",
-            options.host,
-        )
     address = server.url()
     print(f"{address}  (Ctrl-C ends)", flush=True)
     # Without a screen a text browser would cover the output.

@@ -24,13 +24,6 @@ PATCH_PX = 24
 """Side of the window over which persistence is averaged, in pixels of its level."""
 MARGIN_PX = 40
 """How far a grey level influences the features, about: patch, window and blur."""
-MIN_PERSISTENCE, MAX_PERSISTENCE = 0.005, 0.95
-"""Limits of predictions: the range of the training data."""
-_TENSORS = ((1.0, 11), (1.0, 21), (2.0, 29))
-"""Blur before the gradient (standard deviation) and window of the structure tensor, in pixels."""
-_BROAD_PX, _BROADER_PX = 7, 29
-"""Boxes between which medium detail lies."""
-MODEL = "persistence.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +35,10 @@ class PersistenceModel:
     weights: NDArray[np.float64]
 
     def __call__(self, features: Array) -> Array:
-        """Expected correlation of gradients (..) with those of another year, 0 to 1."""
+        """Expected correlation of gradients (..) with those of another year, 0.005 to 0.95: the
+        range of the training data."""
         predicted = terms((features - self.mean) / self.spread) @ self.weights
-        return np.asarray(np.clip(predicted, MIN_PERSISTENCE, MAX_PERSISTENCE), dtype=np.float32)
+        return np.asarray(np.clip(predicted, 0.005, 0.95), dtype=np.float32)
 
     def to_plain(self) -> dict[str, Any]:
         return {name: [float(f"{x:.6g}") for x in value] for name, value in vars(self).items()}
@@ -52,10 +46,32 @@ class PersistenceModel:
 
 @cache
 def default_model() -> PersistenceModel:
-    text = resources.files(__package__).joinpath(MODEL).read_text(encoding="utf-8")
-    return PersistenceModel(
-        **{name: np.array(values, np.float64) for name, values in json.loads(text)["model"].items()}
-    )
+    path = resources.files(__package__).joinpath("persistence.json")
+    model = json.loads(path.read_text(encoding="utf-8"))["model"]
+    return PersistenceModel(**{name: np.array(each, np.float64) for name, each in model.items()})
+
+
+def reported_persistence(
+    grey: NDArray[np.uint8], gsd_m: float, first: int = 0
+) -> list[NDArray[np.float32]]:
+    """Persistence maps (H, W) of a picture at its own resolution, half of it, and a quarter.
+
+    Coarser detail lasts alike.
+
+    Resolutions finer than that of level `first` repeat its values.
+    """
+    model, picture = default_model(), grey
+    found: list[NDArray[np.float32]] = []
+    for level in range(3):
+        if level >= first:
+            coarse = model(features(picture, gsd_m * 2**level, max(8 >> level, 1)))
+            full = cv2.resize(coarse, grey.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            found.append(np.asarray(full, np.float32))
+        half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        picture = np.asarray(half, np.uint8)
+        if min(picture.shape) < 2 * MARGIN_PX and found:
+            break
+    return [found[0]] * first + found
 
 
 def terms(scaled: NDArray[Any]) -> NDArray[Any]:
@@ -67,7 +83,7 @@ def terms(scaled: NDArray[Any]) -> NDArray[Any]:
     return np.stack([ones, *(scaled[..., i] for i in range(count)), *products], axis=-1)
 
 
-def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int = 8) -> Array:
+def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int) -> Array:
     """Features (h, w, F) of grey (H, W) every `every_px` pixels, starting at half of that.
 
     Each is a mean over `PATCH_PX`: coherence of gradients, their energy, fine and medium detail,
@@ -75,10 +91,10 @@ def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int = 8) -> Array:
     """
     picture = grey.astype(np.float32)
     found = []
-    for blur, side_px in _TENSORS:
+    for blur, side_px in ((1.0, 11), (1.0, 21), (2.0, 29)):
         agreement, energy = _structure(picture, blur, side_px)
         found += [_mean(agreement), np.log(_mean(energy) + np.float32(1e-2))]
-    broad, broader = (cv2.blur(picture, (side, side)) for side in (_BROAD_PX, _BROADER_PX))
+    broad, broader = (cv2.blur(picture, (side, side)) for side in (7, 29))
     found += [
         np.log(_mean(np.abs(a - b)) + np.float32(0.1))
         for a, b in ((picture, broad), (broad, broader))
@@ -92,7 +108,8 @@ def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int = 8) -> Array:
 
 
 def _structure(picture: Array, blur: float, side_px: int) -> tuple[Array, Array]:
-    """Coherence (0..1) and energy (H, W) of the structure tensor."""
+    """Coherence (0..1) and energy (H, W) of the structure tensor in windows of `side_px`; `blur`:
+    standard deviation before the gradient, pixels."""
     smooth = cv2.GaussianBlur(picture, (0, 0), blur)
     east, south = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
 
@@ -109,14 +126,9 @@ def _mean(values: Any) -> Array:
     return np.asarray(cv2.blur(values, (PATCH_PX, PATCH_PX)), dtype=np.float32)
 
 
-_SIDES_PX = (3, 7, 15, 55)
-"""Box filters that separate bands of detail: as wide as Gaussians of 1, 2, 4 and 16 pixels."""
-_WINDOWS_PX = (9, 13, 19, 33)
-"""Windows in which the strength of each band is measured: about three times its scale."""
-_LEVEL_OF_BAND = (0, 0, 1, 2)
-"""Level of the persistence map that applies to each band."""
-_STRENGTHS = (0.2, 5.0)
-"""Limits of the gain that brings donor detail to the strength of the ground's own."""
+BANDS = ((3, 9, 0), (7, 13, 0), (15, 19, 1), (55, 33, 2))
+"""Of each band of detail: side of the box filter below it (as wide as Gaussians of 1, 2, 4 and 16
+pixels), window in which its strength is measured, and the level of persistence that applies."""
 FIELD, VIEW = 0.2, 0.08
 """Standard deviations of the logarithm of persistence from field to field and view to view.
 
@@ -124,8 +136,6 @@ Chosen on generated landscapes (seeds 11 to 13, views 100, 160 and 240 pixels ac
 are 0.06 below what is measured there; a shift of all logarithms by 0.1 halves that and makes
 predictions of real imagery too high.
 """
-MAX_SHARE = 0.95
-"""Largest fraction of its own detail that ground keeps: no two dates are identical."""
 
 
 def another_year(
@@ -153,12 +163,12 @@ def another_year(
     # About a fifth of the area inverts its contrast, as on generated and on real ground.
     gain = np.where(_uniform(rng, size, 5) > rng.uniform(0.6, 0.85), -gain, gain)
     detail = np.zeros_like(light)
-    bands = zip(own, other, _WINDOWS_PX, _LEVEL_OF_BAND, strict=True)
-    for mine, theirs, window_px, level in bands:
+    for mine, theirs, (_, window_px, level) in zip(own, other, BANDS, strict=True):
         expected = persistence[min(level, len(persistence) - 1)]
-        # Doubled angles of mixed gradients correlate as the square of the own share.
-        share = np.sqrt(np.clip(expected * factor, 0.0, MAX_SHARE))
-        strength = np.clip(_strength(mine, window_px) / _strength(theirs, window_px), *_STRENGTHS)
+        # Doubled angles of mixed gradients correlate as the square of the own share; no two dates
+        # are identical.
+        share = np.sqrt(np.clip(expected * factor, 0.0, 0.95))
+        strength = np.clip(_strength(mine, window_px) / _strength(theirs, window_px), 0.2, 5.0)
         detail += gain * (share * mine + np.sqrt(1 - share**2) * strength * theirs)
     light = light + 30 * (_uniform(rng, size, 4) - 0.5)
     tone = np.power(np.clip(light + detail, 0, 255) / 255, rng.uniform(0.75, 1.35))
@@ -191,7 +201,7 @@ def _bands(grey: NDArray[np.uint8]) -> tuple[list[Array], Array]:
     """Detail of each scale (S, S), finest first, and the remaining low frequencies."""
     rest = grey.astype(np.float32)
     bands = []
-    for side in _SIDES_PX:
+    for side, _, _ in BANDS:
         blurred = np.asarray(cv2.blur(rest, (side, side)), np.float32)
         bands.append(rest - blurred)
         rest = blurred

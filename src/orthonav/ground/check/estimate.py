@@ -2,7 +2,7 @@
 
 Nearby trials, weighted by distance, are joined with a logistic regression over all trials of the
 map (on persistence and on the part of a view that the map covers) as a beta distribution, in which
-the regression counts as `PRIOR_TRIALS` trials. Trials show the map's own imagery with simulated
+the regression counts as some trials. Trials show the map's own imagery with simulated
 ageing; real ground changes more or less than that. A recalibration, fitted to real scenes of two
 dates (`python -m benchmarks.check_trust --fit`), turns rates of trials into predicted ones.
 """
@@ -21,18 +21,16 @@ if TYPE_CHECKING:
     from orthonav.ground.check.trials import Trial
 
 Array = NDArray[np.float64]
-FULL_VIEW_PX = 256.0
-"""Views of so many pixels of the map across need no correction for their width."""
-LEAST, MOST = 0.01, 0.99
-"""Limits of predictions: no check is more certain of fixes, or of their absence."""
+INTERVAL = (0.1, 0.9)
+"""Ends of the 80 % interval."""
 
 
 @dataclass(frozen=True)
 class Recalibration:
     """Logit of the predicted rate: `shift` + `slope` times that of trials + corrections.
 
-    `narrow`: for every halving of the width of a view below `FULL_VIEW_PX`; `no_prior`: without a
-    prior position; `std`: standard deviation of the logit from scene to scene, and `std_narrow`
+    `narrow`: for every halving of the width of a view below 256 pixels; `no_prior`: without a prior
+    position; `std`: standard deviation of the logit from scene to scene, and `std_narrow`
     what every such halving adds to it, both 0 or more.
     """
 
@@ -46,7 +44,7 @@ class Recalibration:
     def __call__(self, share: Array, view_px: float, has_prior: bool) -> Array:
         """Predicted rates (N,) from those of trials, for views `view_px` pixels of the map."""
         added = self.shift + self.narrow * _octaves(view_px) + self.no_prior * (not has_prior)
-        return np.asarray(np.clip(expit(self.slope * logit(share) + added), LEAST, MOST))
+        return _held(expit(self.slope * logit(share) + added))
 
     def std_of(self, view_px: float) -> float:
         """Standard deviation of the logit from scene to scene for views of this width."""
@@ -59,13 +57,18 @@ class Recalibration:
 
 
 def _octaves(view_px: float) -> float:
-    """Halvings of the width of a view from `FULL_VIEW_PX` to `view_px`."""
-    return max(0.0, math.log2(FULL_VIEW_PX / max(view_px, 1.0)))
+    """Halvings of the width of a view from 256 pixels of the map to `view_px`."""
+    return max(0.0, math.log2(256.0 / max(view_px, 1.0)))
+
+
+def _held(share: Array) -> Array:
+    """Between 0.01 and 0.99: no check is more certain of fixes, or of their absence."""
+    return np.asarray(np.clip(share, 0.01, 0.99))
 
 
 def logit(share: Array) -> Array:
-    """Logarithm of the odds of rates, which are held between `LEAST` and `MOST`."""
-    held = np.clip(share, LEAST, MOST)
+    """Logarithm of the odds of rates, which are held off 0 and 1."""
+    held = _held(share)
     return np.asarray(np.log(held / (1 - held)))
 
 
@@ -88,31 +91,31 @@ Assumptions: *other* rests on one flight, a drone over two satellite maps (-0.6,
 four real and two rendered pairs, *thermal* on rendered ones only (docs/check.md)."""
 
 
-# Chosen on generated landscapes by the calibration error of `benchmarks.prediction` at d63ac91.
-PRIOR_TRIALS = 3.0
-BANDWIDTH_VIEWS = 0.4
-"""Standard deviation of the distance weights, in sides of a view."""
-BANDWIDTH_SPACINGS = 0.9
-"""Lower limit of that deviation, in distances between trials."""
-OTHER_DATE_WEIGHT = 3.0
-"""Weight of a trial with imagery of a second date, which needs no simulated ageing."""
-SAME_COVERAGE = 0.12
-"""Standard deviation of the weights over the fraction of a view that the map covers."""
-INTERVAL, INTERVAL_SIGMAS = (0.1, 0.9), 1.2816
-"""Ends of the 80 % interval, and the same in standard deviations of a normal distribution."""
-JEFFREYS = 0.3
-"""Pseudo-counts of good and bad trials that keep the interval off 0 and 1."""
-MIN_WEIGHT, WIDER = 0.05, 4.0
-"""Where nearby trials weigh less than this, the bandwidth is so many times as wide."""
-MIN_REGRESSION = 20
-"""Fewer trials than this do not support a regression."""
-RIDGE = 1e-2
-MOST_STATED = 2.0
-"""An error counts as at most so many times what its covariance states."""
-UNSEEN_WRONG, UNSEEN_TRIALS = 0.06, 500.0
-"""False fixes that are presumed in so many trials more: of 30,013 views, half of them of other
-ground, none was available and beyond the alert limit (docs/benchmarks.md, integrity)."""
-_PAIRS_AT_ONCE = 2**20
+@dataclass(frozen=True)
+class Pooling:
+    """How trials are pooled. Without a source: chosen on generated landscapes by the calibration
+    error of predictions."""
+
+    prior_trials: float = 3.0  # that the regression counts as
+    bandwidth_views: float = 0.4  # standard deviation of the distance weights, in sides of a view,
+    bandwidth_spacings: float = 0.9  # and at least, in distances between trials
+    same_coverage: float = 0.12
+    """Standard deviation of the weights over the fraction of a view that the map covers."""
+    min_weight: float = 0.05  # where nearby trials weigh less,
+    wider: float = 4.0  # the bandwidth is so many times as wide
+    other_date: float = 3.0
+    """Weight of a trial with imagery of a second date, which needs no simulated ageing."""
+    jeffreys: float = 0.3  # pseudo-counts of good and bad trials: the interval is off 0 and 1
+    min_regression: int = 20  # fewer trials do not support a regression
+    ridge: float = 1e-2
+    max_stated: float = 2.0  # an error counts as at most so many times what its covariance states
+    unseen_wrong: float = 0.06
+    """False fixes that are presumed in `unseen_trials` more: of 30,013 views, half of them of other
+    ground, none was available and beyond the alert limit (docs/benchmarks.md, integrity)."""
+    unseen_trials: float = 500.0
+
+
+POOLING = Pooling()
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,11 +161,13 @@ class Predictor:
         # they do not count twice.
         errors = np.array([(each.error_m, each.stated_m) for each in every], np.float64)
         error, stated = errors.reshape(-1, 2).T
-        self._error = np.fmin(np.fmax(error, stated), MOST_STATED * stated)
+        self._error = np.fmin(np.fmax(error, stated), POOLING.max_stated * stated)
         self.right = np.array([each.right for each in every], np.bool_)
         self.wrong = np.array([each.wrong for each in every], np.bool_)
-        self._weight = np.array([1.0] * len(trials) + [OTHER_DATE_WEIGHT] * len(other_date))
-        self._bandwidth_m = max(BANDWIDTH_VIEWS * view_side_m, BANDWIDTH_SPACINGS * spacing_m)
+        self._weight = np.array([1.0] * len(trials) + [POOLING.other_date] * len(other_date))
+        self._bandwidth_m = max(
+            POOLING.bandwidth_views * view_side_m, POOLING.bandwidth_spacings * spacing_m
+        )
         self._least_error_m = least_error_m
         self._coverage_at, self._coverage = coverage, coverage(self._points)
         self._persistence = self._persistence_of(trials, other_date)
@@ -191,14 +196,14 @@ class Predictor:
         """Probability (N,) of each trial by regression on persistence and coverage."""
         # n of n trials do not prove a probability of 1.
         mean = (self.right @ self._weight + 0.5) / (self._weight.sum() + 1)
-        if self.right.all() or not self.right.any() or len(self.right) < MIN_REGRESSION:
+        if self.right.all() or not self.right.any() or len(self.right) < POOLING.min_regression:
             return np.full(len(self.right), float(mean))
         regressors = np.stack([np.log(self._persistence), self._coverage], axis=1)
-        bias, slopes = fit_weights(regressors, self.right, self._weight, RIDGE)
+        bias, slopes = fit_weights(regressors, self.right, self._weight, POOLING.ridge)
         return expit(bias + regressors @ slopes)
 
     def at(self, points_en_m: Array) -> Prediction:
-        chunk = max(1, _PAIRS_AT_ONCE // max(len(self._points), 1))
+        chunk = max(1, 2**20 // max(len(self._points), 1))  # limits memory
         starts = range(0, max(len(points_en_m), 1), chunk)
         parts = [vars(self._part(points_en_m[start : start + chunk])) for start in starts]
         return Prediction(*(np.concatenate([part[name] for part in parts]) for name in parts[0]))
@@ -206,35 +211,34 @@ class Predictor:
     def _part(self, points: Array) -> Prediction:
         from scipy.stats import beta
 
+        prior = POOLING.prior_trials
         near = self._weights(points, self._bandwidth_m)
         total = near.sum(axis=1)
         # Far from all trials the closest few still tell the kind of ground.
-        wide = self._weights(points, WIDER * self._bandwidth_m) + 1e-12
-        kind = np.where((total > MIN_WEIGHT)[:, None], near, wide)
+        wide = self._weights(points, POOLING.wider * self._bandwidth_m) + 1e-12
+        kind = np.where((total > POOLING.min_weight)[:, None], near, wide)
         kind /= kind.sum(axis=1, keepdims=True)
         expected = np.clip(kind @ self._expected, 0.0, 1.0)  # rounding
-        good = PRIOR_TRIALS * expected + near @ self.right
-        bad = PRIOR_TRIALS * (1 - expected) + near @ ~self.right
+        good = prior * expected + near @ self.right
+        bad = prior * (1 - expected) + near @ ~self.right
         probability = good / (good + bad)
         # A trial of the second date counts more for the rate, but is one trial.
-        alone = (near @ (1 / self._weight) + PRIOR_TRIALS) / (total + PRIOR_TRIALS)
-        counts = good * alone + JEFFREYS, bad * alone + JEFFREYS
+        alone = (near @ (1 / self._weight) + prior) / (total + prior)
+        counts = good * alone + POOLING.jeffreys, bad * alone + POOLING.jeffreys
         low, high = (beta.ppf(end, *counts) for end in INTERVAL)
         probability, low, high = (self._recalibrated(each) for each in (probability, low, high))
-        years = INTERVAL_SIGMAS * self.scenes_std
+        years = 1.2816 * self.scenes_std  # 80 % of a normal distribution
         squares = np.where(self.right, np.nan_to_num(self._error) ** 2, 0.0)
         overall = float(squares.sum() / self.right.sum()) if self.right.any() else math.nan
-        square_error = (near @ squares + PRIOR_TRIALS * overall) / (
-            near @ self.right + PRIOR_TRIALS
-        )
+        square_error = (near @ squares + prior * overall) / (near @ self.right + prior)
         overall_wrong = float(np.average(self.wrong, weights=self._weight))
-        unseen_wrong = UNSEEN_WRONG / (float(self._weight.sum()) + UNSEEN_TRIALS)
+        unseen = POOLING.unseen_wrong / (float(self._weight.sum()) + POOLING.unseen_trials)
         return Prediction(
             probability=probability,
             low=np.minimum(_widened(probability, low, -years), probability),
             high=np.maximum(_widened(probability, high, years), probability),
             error_m=np.sqrt(square_error + self._least_error_m**2),
-            wrong=np.minimum((near @ self.wrong + overall_wrong) / (total + 1.0) + unseen_wrong, 1),
+            wrong=np.minimum((near @ self.wrong + overall_wrong) / (total + 1.0) + unseen, 1),
             persistence=kind @ self._persistence,
         )
 
@@ -242,12 +246,11 @@ class Predictor:
         """Weights (N, K) of the trials by distance and by similarity of coverage."""
         square = ((points[:, None] - self._points[None]) ** 2).sum(axis=-1)
         off = self._coverage_at(points)[:, None] - self._coverage[None]
-        square += (off * self._bandwidth_m / SAME_COVERAGE) ** 2
+        square += (off * self._bandwidth_m / POOLING.same_coverage) ** 2
         return np.asarray(np.exp(-square / (2 * bandwidth_m**2)) * self._weight)
 
 
 def _widened(middle: Array, end: Array, by_logit: float) -> Array:
     """`end` of an interval moved outwards by the deviation between years, independent of it."""
-
     off = np.hypot(logit(end) - logit(middle), by_logit)
     return expit(logit(middle) + np.sign(by_logit) * off)

@@ -5,6 +5,7 @@ docs/check.md lists the rules of the verdict.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.records import (
-    LEAST_RISK,
+    MIN_RISK,
     OBJECT_M,
     Along,
     Conditions,
@@ -28,14 +29,6 @@ from orthonav.ground.planning.route import along_polyline_en_m
 from orthonav.ground.report import metres_text, percent_text, probability_text, seconds_text
 
 Array = NDArray[np.float64]
-LIKELY_OUTAGE = 0.5
-"""Fraction of the flights with an available position below which there is an outage."""
-POINTS_PER_VIEW = 4.0
-"""Points along the route per side of a view, as many as cells."""
-MAX_POINTS = 4000
-_REACHED = 1e-6
-"""A shorter rest of the route, as a fraction of the distance between points, is none."""
-ACROSS = 5
 
 
 def predicted_along(
@@ -50,10 +43,10 @@ def predicted_along(
     line = area.route.points_en_m(area.frame)
     ends_m = np.cumsum(np.hypot(*np.diff(line, axis=0).T))
     length_m = float(ends_m[-1]) if len(ends_m) else 0.0
-    step_m = max(conditions.side_m / POINTS_PER_VIEW, length_m / MAX_POINTS)
-    points, course_deg = along_polyline_en_m(line, max(step_m, 1e-6))
+    step_m = max(conditions.side_m / 4, length_m / 4000, 1e-6)  # as many points as cells
+    points, course_deg = along_polyline_en_m(line, step_m)
     distance_m = np.minimum(np.arange(len(points)) * step_m, length_m)
-    if length_m - distance_m[-1] > _REACHED * step_m:  # the last waypoint
+    if length_m - distance_m[-1] > 1e-6 * step_m:  # the last waypoint
         points, distance_m = np.vstack([points, line[-1]]), np.append(distance_m, length_m)
         course_deg = np.append(course_deg, np.degrees(np.arctan2(*(line[-1] - points[-2]))) % 360)
     middle = predict(points)
@@ -61,7 +54,7 @@ def predicted_along(
     across = np.stack([np.cos(course), -np.sin(course)], axis=1)
     leg = np.minimum(np.searchsorted(ends_m, distance_m), len(bands_m) - 1)
     across *= np.asarray(bands_m, np.float64)[leg, None]
-    shares = np.linspace(-0.5, 0.5, ACROSS)
+    shares = np.linspace(-0.5, 0.5, 5)
     lowest = np.min([predict(points + share * across).probability for share in shares], axis=0)
     return Along(
         distance_m=distance_m,
@@ -74,7 +67,7 @@ def predicted_along(
 def likely_outages(along: Along, flights: Flights, conditions: Conditions) -> tuple[Outage, ...]:
     """Stretches of at least half a side of a view where most flights have no available position."""
     available = flights.available
-    out = np.concatenate([[False], available < LIKELY_OUTAGE, [False]]).astype(int)
+    out = np.concatenate([[False], available < 0.5, [False]]).astype(int)
     last = len(available) - 1
     found = []
     for first, end in np.flatnonzero(np.diff(out)).reshape(-1, 2):
@@ -94,7 +87,8 @@ def likely_outages(along: Along, flights: Flights, conditions: Conditions) -> tu
     return tuple(found)
 
 
-class Threshold(NamedTuple):
+@dataclass(frozen=True)
+class Threshold:
     """GO up to `go`, NO-GO beyond `no_go`, both at the cautious end of the interval.
 
     Where more is better `go` is the larger one.
@@ -117,37 +111,39 @@ class Threshold(NamedTuple):
         return f"; GO {good} {go}, NO-GO {bad} {no_go}, at the {end} end"
 
 
-# A planner's judgement, not a measurement.
-FIXES = Threshold(0.6, 0.2)
-"""Mean chance of a fix per view."""
-AVAILABILITY = Threshold(0.8, 0.5)
-"""Fraction of the route with a protection level within the alert limit."""
-OUTAGE_S = Threshold(60.0, 600.0)
-"""Longest outage."""
-FALSE_FIX = Threshold(0.01, 0.1)
-"""Probability of a false fix on the route."""
-WRONG = Threshold(0.005, 0.02)
-"""Fraction of trials that were false fixes, without a route; at least two."""
-OUTSIDE = Threshold(0.005, 0.1)
-"""Fraction of the route outside the map."""
-MOST_UNCERTAIN = 0.5
-"""Width of the interval of the mean chance beyond which the map alone cannot tell."""
-NARROW_PX, WIDE_PRIOR_PX = 140.0, 100.0
-"""Views narrower than this (root of their area), searched for more widely than in a prior of this
-standard deviation: a second date has to show that they are found (docs/check.md)."""
-MANY_PLACES = 0.1
-"""Fraction of the places from which houses and trees count."""
-DISPLACED = 0.03
-"""Displacement of houses and trees, a fraction of a view, from which it is named: a view is
-registered at about as many pixels from any height. At 4 % (from 120 m, 65 deg wide) a surface made
-positions over ten times as accurate (docs/benchmarks.md); 3 % is 155 m, and 470 m 30 deg ahead."""
-NARROW_M, OBLIQUE_DEG = 110.0, 15.0
-"""Views narrower than this (root of their area) were confident over towns as often as `TOWNS` says,
-of 132, 88 and 55 m, 0 and 45 deg ahead: at 45 deg less often than GO asks for (docs/benchmarks.md).
-"""
-TOWNS = "92, 83 and 83 %", "92, 67 and 50 %"
-MIN_WRONG = 2
-_ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
+@dataclass(frozen=True)
+class Rules:
+    """Thresholds of the verdict: a planner's judgement, not a measurement."""
+
+    fixes: Threshold = Threshold(0.6, 0.2)  # mean chance of a fix per view
+    availability: Threshold = Threshold(0.8, 0.5)
+    """Fraction of the route with a protection level within the alert limit."""
+    outage_s: Threshold = Threshold(60.0, 600.0)  # longest outage
+    false_fix: Threshold = Threshold(0.01, 0.1)  # probability of a false fix on the route
+    wrong: Threshold = Threshold(0.005, 0.02)
+    """Fraction of trials that were false fixes, without a route; at least `min_wrong`."""
+    min_wrong: int = 2
+    outside: Threshold = Threshold(0.005, 0.1)  # fraction of the route outside the map
+    max_uncertain: float = 0.5
+    """Width of the interval of the mean chance beyond which the map alone cannot tell."""
+    narrow_px: float = 140.0
+    """Views narrower than this (root of their area), searched for more widely than in a prior of
+    `wide_prior_px` (standard deviation): a second date has to show that they are found
+    (docs/check.md)."""
+    wide_prior_px: float = 100.0
+    many_places: float = 0.1  # fraction of the places from which houses and trees count
+    displaced: float = 0.03
+    """Displacement of houses and trees, a fraction of a view, from which it is named: a view is
+    registered at about as many pixels from any height. At 4 % (from 120 m, 65 deg wide) a surface
+    made positions over ten times as accurate (docs/benchmarks.md); 3 % is 155 m, and 470 m 30 deg
+    ahead."""
+    narrow_m: float = 110.0
+    """Narrower views (root of their area) were confident over generated towns as often as the
+    finding says: at 45 deg less often than GO asks for (docs/benchmarks.md)."""
+    oblique_deg: float = 15.0
+
+
+RULES = Rules()
 
 
 class Findings(NamedTuple):
@@ -190,17 +186,17 @@ def verdict_of(found: Findings) -> Verdict:
         text = f"The map alone cannot tell how often views of {found.view_px:.0f} map pixels are "
         text += f"localized: {why}. A second date (--other-date) would help."
         reasons += [Reason("uncertain", text, Word.MARGINAL)]
-    reasons += [_objects(found), *_oblique(found.conditions), *_thermal(found.conditions)]
-    reasons.sort(key=lambda reason: _ORDER.index(reason.word))
+    reasons += [_objects(found), *_camera(found.conditions)]
+    reasons.sort(key=lambda reason: -reason.word.exit_code)
     return Verdict(reasons[0].word, tuple(reasons))
 
 
 def uncertainty(mean: Range, view_px: float, prior_px: float) -> str:
     """Why the map alone does not support a GO; empty where it does."""
-    if mean.high - mean.low > MOST_UNCERTAIN:
+    if mean.high - mean.low > RULES.max_uncertain:
         return "the interval is too wide"
-    if view_px < NARROW_PX and prior_px > WIDE_PRIOR_PX:
-        return f"they are narrow, and no prior is within {WIDE_PRIOR_PX:.0f} pixels"
+    if view_px < RULES.narrow_px and prior_px > RULES.wide_prior_px:
+        return f"they are narrow, and no prior is within {RULES.wide_prior_px:.0f} pixels"
     return ""
 
 
@@ -228,33 +224,33 @@ def _objects(found: Findings) -> Reason:
     if conditions.relief_m == 0:  # said to be none
         unknown = 0.0
     share = conditions.displaced_share
-    if unknown > MANY_PLACES and share > DISPLACED:
+    if unknown > RULES.many_places and share > RULES.displaced:
         code = "no_surface"
         text += f" One of {OBJECT_M:g} m is displaced by up to {percent_text(share)} of a view, "
         text += "and positions among them are less accurate: build the map with --surface "
         text += "(docs/terrain.md)."
-    if conditions.side_m < NARROW_M and found.objects + unknown > MANY_PLACES:
-        code, oblique = "houses", conditions.camera_pitch_deg >= OBLIQUE_DEG
-        text += f" Views are narrower than {NARROW_M:g} m: over generated towns, with a surface, "
-        text += f"{TOWNS[oblique]} of views 132, 88 and 55 m wide were confident"
-        text += ", 45 deg ahead" * oblique + " (docs/benchmarks.md); among houses the prediction "
-        text += "may be too high."
+    if conditions.side_m < RULES.narrow_m and found.objects + unknown > RULES.many_places:
+        code, towns = "houses", ("92, 83 and 83 %", "")
+        if conditions.camera_pitch_deg >= RULES.oblique_deg:
+            towns = ("92, 67 and 50 %", ", 45 deg ahead")
+        text += f" Views are narrower than {RULES.narrow_m:g} m: over generated towns, with a "
+        text += f"surface, {towns[0]} of views 132, 88 and 55 m wide were confident{towns[1]} "
+        text += "(docs/benchmarks.md); among houses the prediction may be too high."
     return Reason(code, text, Word.MARGINAL if code == "houses" else Word.GO)
 
 
-def _thermal(conditions: Conditions) -> list[Reason]:
-    if conditions.camera_kind != "thermal":
-        return []
-    text = "No flight with a thermal camera over a map was seen: the prediction rests on rendered "
-    text += "views."
-    return [Reason("thermal", text, Word.MARGINAL)]
-
-
-def _oblique(conditions: Conditions) -> list[Reason]:
-    ahead_deg = conditions.camera_pitch_deg
-    text = f"Trial views look straight down, this camera looks {ahead_deg:g} deg ahead: how often "
-    text += "its views are localized is not predicted; try simulate --camera-pitch-deg."
-    return [Reason("oblique", text, Word.MARGINAL)] if ahead_deg >= OBLIQUE_DEG else []
+def _camera(conditions: Conditions) -> list[Reason]:
+    """What trial views do not show of the camera."""
+    reasons, ahead_deg = [], conditions.camera_pitch_deg
+    if ahead_deg >= RULES.oblique_deg:
+        text = f"Trial views look straight down, this camera looks {ahead_deg:g} deg ahead: how "
+        text += "often its views are localized is not predicted; try simulate --camera-pitch-deg."
+        reasons.append(Reason("oblique", text, Word.MARGINAL))
+    if conditions.camera_kind == "thermal":
+        text = "No flight with a thermal camera over a map was seen: the prediction rests on "
+        text += "rendered views."
+        reasons.append(Reason("thermal", text, Word.MARGINAL))
+    return reasons
 
 
 def _trust(found: Findings) -> list[Reason]:
@@ -264,24 +260,28 @@ def _trust(found: Findings) -> list[Reason]:
     if found.flights is not None:
         return []
     fraction = found.wrong / max(found.trials, 1)
-    word = WRONG.word(_exact(fraction))
+    word = RULES.wrong.word(_exact(fraction))
+    if word is Word.GO or found.wrong < RULES.min_wrong:
+        return []
     text = f"Confident fixes beyond {metres_text(found.conditions.radius_m)}: {found.wrong} of "
-    text += f"{found.trials} trial views. Limits: {100 * WRONG.go:g} %, NO-GO above "
-    text += f"{100 * WRONG.no_go:g} %."
-    return [Reason("wrong", text, word)] if found.wrong >= MIN_WRONG and word is not Word.GO else []
+    text += f"{found.trials} trial views. {_limits(RULES.wrong)}"
+    return [Reason("wrong", text, word)]
+
+
+def _limits(threshold: Threshold) -> str:
+    return f"Limits: {100 * threshold.go:g} %, NO-GO above {100 * threshold.no_go:g} %."
 
 
 def _mean(mean: Range, where: str) -> Reason:
-    word = FIXES.word(mean)
+    word = RULES.fixes.word(mean)
     text = f"Mean probability of a confident, correct fix per view {where}: "
-    text += range_text(mean, probability_text) + FIXES.text(probability_text)
+    text += range_text(mean, probability_text) + RULES.fixes.text(probability_text)
     return Reason("fixes" if word is Word.GO else "few_fixes", f"{text}.", word)
 
 
 def _outside(fraction: float) -> list[Reason]:
-    word = OUTSIDE.word(_exact(fraction))
-    text = f"{percent_text(fraction)} of the route is outside the map. Limits: "
-    text += f"{100 * OUTSIDE.go:g} %, NO-GO above {100 * OUTSIDE.no_go:g} %."
+    word = RULES.outside.word(_exact(fraction))
+    text = f"{percent_text(fraction)} of the route is outside the map. {_limits(RULES.outside)}"
     return [] if word is Word.GO else [Reason("outside_map", text, word)]
 
 
@@ -291,7 +291,7 @@ def _available(found: Findings) -> list[Reason]:
     if not conditions.states_level:
         text = f"At a risk of {conditions.risk:g} too few positions have a protection level: the "
         text += "probability that their place is wrong is often higher. Availability is predicted "
-        return [Reason("risk", f"{text}for risks from {LEAST_RISK:g} on.", Word.MARGINAL)]
+        return [Reason("risk", f"{text}for risks from {MIN_RISK:g} on.", Word.MARGINAL)]
     limit_m, limit = conditions.alert_limit_m, conditions.limit_text
     level = "unknown: no trial view was localized"
     if math.isfinite(after_m.median):
@@ -303,17 +303,18 @@ def _available(found: Findings) -> list[Reason]:
         return [Reason("availability", text, Word.NO_GO if after_m.low > limit_m else word)]
     text = f"Availability, the fraction of the route with a protection level within {limit}: "
     text += range_text(flights.availability, probability_text)
-    text += AVAILABILITY.text(probability_text)
-    word = AVAILABILITY.word(flights.availability)
+    text += RULES.availability.text(probability_text)
+    word = RULES.availability.word(flights.availability)
     if word is not Word.GO and after_m.median > limit_m:
         text += f". Protection level right after a fix: {level}"
     reasons = [Reason("availability", f"{text}.", word)]
     text = f"Longest outage: {range_text(flights.outage_s, seconds_text)}, "
-    text += f"{range_text(flights.outage_m, metres_text)}{OUTAGE_S.text(seconds_text)}."
-    return [*reasons, Reason("outage", text, OUTAGE_S.word(flights.outage_s))]
+    text += f"{range_text(flights.outage_m, metres_text)}{RULES.outage_s.text(seconds_text)}."
+    return [*reasons, Reason("outage", text, RULES.outage_s.word(flights.outage_s))]
 
 
 def _false_fix(flights: Flights, conditions: Conditions) -> Reason:
+    figure, limits = flights.false_fix, RULES.false_fix.text(percent_text)
     text = f"Probability of a confident fix beyond {metres_text(conditions.radius_m)} on this "
-    text += f"route: {range_text(flights.false_fix, percent_text)}{FALSE_FIX.text(percent_text)}."
-    return Reason("wrong", text, FALSE_FIX.word(flights.false_fix))
+    text += f"route: {range_text(figure, percent_text)}{limits}."
+    return Reason("wrong", text, RULES.false_fix.word(figure))

@@ -14,18 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.integrity import protection_level_m
-from orthonav.ground.check.estimate import INTERVAL, Prediction, expit, logit
-from orthonav.ground.check.records import Conditions, Flights, Range
+from orthonav.ground.check.estimate import INTERVAL, expit, logit
+from orthonav.ground.check.records import Along, Conditions, Flights, Range
 
 Array = NDArray[np.float64]
-FLIGHTS = 400
-DRAWS_PER_VIEW = 2.0
-"""Draws per side of a view: views that overlap by more than half are hardly independent."""
 CORRELATION = 0.5
 """Of the latent normal values of neighbouring draws, whose views share half of their ground."""
-ROUNDING = 1e-9
-TAIL = 0.05
-"""Probability of an error beyond the stated position error of 95 %."""
 
 
 def level_m(error_m: Array | float, risk: float) -> Array:
@@ -47,51 +41,48 @@ def shifted(probability: Array, shifts: Array) -> Array:
 
 
 def scene_shifts(std: float) -> Array:
-    """Shifts of the logit (F,), equally likely."""
+    """Shifts of the logit (F,), equally likely, one a flight."""
     from scipy.special import ndtri
 
-    return np.asarray(std * ndtri((np.arange(FLIGHTS) + 0.5) / FLIGHTS))
+    return np.asarray(std * ndtri((np.arange(400) + 0.5) / 400))
 
 
 def simulated(
-    distance_m: Array,
-    found: Prediction,
+    along: Along,
     conditions: Conditions,
     shifts: Array,
     false_fixes: float,
     rng: np.random.Generator,
 ) -> Flights:
-    """Flights past points (N,) of a route with these predictions; the first position is a fix.
+    """Flights along a route; the first position is a fix.
 
     `shifts` (F,): of the logit of the chances, one a flight. `false_fixes`: number of trials that
     were false fixes, from which the uncertainty of the rate follows (gamma distribution).
     """
     from scipy.special import ndtri
 
-    length_m = float(distance_m[-1])
-    step_m = conditions.side_m / DRAWS_PER_VIEW
-    stops_m = np.arange(int(length_m / step_m + ROUNDING) + 1) * step_m
-    known = np.isfinite(found.error_m)
-    usual_m = float(found.error_m[known].mean()) if known.any() else np.inf
-    error_m = np.interp(stops_m, distance_m, np.where(known, found.error_m, usual_m))
-    chances = shifted(np.interp(stops_m, distance_m, found.probability), shifts)
+    distance_m, rounding = along.distance_m, 1e-9
+    step_m = conditions.side_m / 2  # views that overlap by more are hardly independent
+    stops_m = np.arange(int(distance_m[-1] / step_m + rounding) + 1) * step_m
+    known = np.isfinite(along.error_m)
+    usual_m = float(along.error_m[known].mean()) if known.any() else np.inf
+    error_m = np.interp(stops_m, distance_m, np.where(known, along.error_m, usual_m))
+    chances = shifted(np.interp(stops_m, distance_m, along.probability), shifts)
     fixed = _gauss_markov(rng, chances.shape) < ndtri(chances)
     fixed[:, 0] = True
     numbers = np.where(fixed, np.arange(len(stops_m)), 0)
-    before = np.minimum(np.floor(distance_m / step_m + ROUNDING), len(stops_m) - 1).astype(int)
+    before = np.minimum(np.floor(distance_m / step_m + rounding), len(stops_m) - 1).astype(int)
     last = np.maximum.accumulate(numbers, axis=1)[:, before]
     since_m = np.maximum(distance_m - stops_m[last] - step_m, 0.0)
     errors_m = np.hypot(error_m[last], conditions.drift * since_m)
     levels_m = level_m(errors_m, conditions.risk)
     # Past that the flight coasts: nothing confirms its place (core/track/mixture.py).
-    levels_m[since_m > ROUNDING] = np.inf
+    levels_m[since_m > rounding] = np.inf
     available = levels_m <= conditions.alert_limit_m
-    # Each point stands for the route half-way to its neighbours.
-    lengths_m = np.gradient(distance_m) if length_m > 0 else np.ones(1)
-    lengths_m[[0, -1]] /= 2 if length_m > 0 else 1
-    outage_m = _longest(available, lengths_m) if length_m > 0 else np.zeros(len(shifts))
+    lengths_m = along.lengths_m
+    outage_m = _longest(available, lengths_m) if distance_m[-1] > 0 else np.zeros(len(shifts))
     shape = false_fixes + 0.5
-    wrong = np.interp(stops_m, distance_m, found.wrong).clip(0, 1)
+    wrong = np.interp(stops_m, distance_m, along.wrong).clip(0, 1)
     rates = wrong * rng.gamma(shape, 1 / shape, (len(shifts), 1))
     flights = Flights(
         count=len(shifts),
@@ -99,7 +90,7 @@ def simulated(
         availability=Range.of(available @ lengths_m / lengths_m.sum()),
         outage_m=Range.of(outage_m),
         outage_s=Range.of(outage_m / conditions.speed_mps),
-        error_95_m=Range.of(level_m(errors_m.max(axis=1), TAIL)),
+        error_95_m=Range.of(level_m(errors_m.max(axis=1), 0.05)),
         false_fix=Range.of(1 - np.exp(-rates.sum(axis=1))),
         available=available.mean(axis=0),
         protection_m=np.quantile(levels_m, 0.5, axis=0, method="nearest"),

@@ -1,11 +1,10 @@
 """The records of a check: what is asked and assumed, predictions, findings and the verdict.
 
-`orthonav.ground.check.run` computes them and `orthonav.ground.check.write` writes them. A
-probability refers to one view; NaN means unknown (no imagery, or outside the band of the route).
+A probability refers to one view; NaN means unknown (no imagery, or outside the band of the route).
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,11 +26,9 @@ from orthonav.ground.planning.spacing import DEFAULT_CAMERA, DEFAULT_PRIOR_STD_M
 from orthonav.ground.report import metres_text
 
 Array = NDArray[np.float64]
-LEAST_LIMIT_M, LIMIT_SHARE = 35.0, 0.025
-"""The alert limit that is not given: at least so many metres, and this fraction of the height."""
-OBJECT_M, FARTHEST_OFF = 8.0, math.radians(80.0)
-"""Height of a house or tree, and the farthest off nadir that is considered."""
-LEAST_RISK = round(Model.lost / 10, 6)
+OBJECT_M = 8.0
+"""Height of a house or tree."""
+MIN_RISK = round(Model.lost / 10, 6)
 """At a lower one too few fixes have a protection level: of the belief in other places that returns
 with every view, eight of ten views leave at most a tenth (docs/check.md)."""
 
@@ -66,31 +63,50 @@ class CheckedInputs:
     map_sha256: str = ""
 
 
-@dataclass(frozen=True)
-class CheckRequest:
-    """What to check and under which conditions.
+@dataclass(frozen=True, kw_only=True)
+class Assumptions:
+    """What is assumed of flight and camera.
 
-    `map_path`: map file with a registration layer.
-    `route`: planned route; None: the whole map.
-    `band_m`: width of the band for legs without one; None: derived from the prior.
-    `other_date`: orthophoto of the same ground that the map was not built from.
-    `agl_m`: height above ground, 1 to 50,000 m; None: the shorter side of a view covers one tile.
     `yaw_std_deg`: standard deviation of the reported heading, 0 to 90; None: heading unknown.
     `agl_std`: standard deviation of the reported height, a fraction of it, 0 to 0.5.
     `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
     `accept`: confidence that a fix needs, 0.01 to 0.999.
+    `risk`: allowed probability of an error beyond the alert limit.
     `speed_mps`: ground speed; 20 m/s is the cruise of a small fixed-wing aircraft.
     `drift`: error of dead reckoning per metre flown, 0 to 1; with an airspeed sensor and a known
     wind usually 0.02 to 0.05.
     `relief_m`: standard deviation of the height of houses and trees; 3 m in open country, 0: none.
     `camera_pitch_deg`: how far the camera looks ahead of straight down, 0 to 65; trial views look
     straight down, and findings say what that leaves out.
-    `effort`: factor on the number of trials, 0.05 to 50.
-    `workers`: processes; None: one per core.
-    `alert_limit_m`: largest error that the mission allows; None: 2.5 % of the height, at least 35.
-    `risk`: allowed probability of an error beyond it.
     `tilt_std_deg`: standard deviation of the error of the reported pitch and roll, 0 to 20.
     `camera_kind`: of `CAMERA_KINDS`: how the camera's light differs from that of the map's imagery.
+    """
+
+    yaw_std_deg: float | None = 5.0
+    agl_std: float = 0.05
+    prior_std_m: float | None = DEFAULT_PRIOR_STD_M
+    accept: float = CONFIDENT
+    risk: float = DEFAULT_RISK
+    speed_mps: float = 20.0
+    drift: float = 0.03
+    relief_m: float = 3.0
+    camera_pitch_deg: float = 0.0
+    tilt_std_deg: float = DEFAULT_TILT_STD_DEG
+    camera_kind: str = "colour"
+
+
+@dataclass(frozen=True)
+class CheckRequest(Assumptions):
+    """What to check, under which assumptions.
+
+    `map_path`: map file with a registration layer.
+    `route`: planned route; None: the whole map.
+    `band_m`: width of the band for legs without one; None: derived from the prior.
+    `other_date`: orthophoto of the same ground that the map was not built from.
+    `agl_m`: height above ground, 1 to 50,000 m; None: the shorter side of a view covers one tile.
+    `alert_limit_m`: largest error that the mission allows; None: 2.5 % of the height, at least 35.
+    `effort`: factor on the number of trials, 0.05 to 50.
+    `workers`: processes; None: one per core.
     """
 
     map_path: Path
@@ -99,21 +115,10 @@ class CheckRequest:
     other_date: Path | None = None
     camera: Camera = DEFAULT_CAMERA
     agl_m: float | None = None
-    yaw_std_deg: float | None = 5.0
-    agl_std: float = 0.05
-    prior_std_m: float | None = DEFAULT_PRIOR_STD_M
-    accept: float = CONFIDENT
     alert_limit_m: float | None = None
-    risk: float = DEFAULT_RISK
-    speed_mps: float = 20.0
-    drift: float = 0.03
-    relief_m: float = 3.0
-    camera_pitch_deg: float = 0.0
     effort: float = 1.0
     workers: int | None = None
     seed: int = 1
-    tilt_std_deg: float = DEFAULT_TILT_STD_DEG
-    camera_kind: str = "colour"
     recalibration: Recalibration = LEARNT
     about: CheckedInputs = field(default_factory=CheckedInputs)
 
@@ -124,31 +129,32 @@ class CheckRequest:
             raise UsageError(f"camera_kind must be {kinds}, got '{self.camera_kind:.40}'")
         if self.camera_kind != "colour" and self.other_date is not None:
             raise UsageError("--camera-kind is for checks without --other-date, which shows it")
-        limits: dict[str, tuple[float | None, float, float, str]] = {
-            "agl_m": (self.agl_m, 1.0, 50_000.0, " m"),
-            "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, " deg"),
-            "agl_std": (self.agl_std, 0.0, 0.5, " (a fraction of the height: 0.05 is 5 %)"),
-            "prior_std_m": (self.prior_std_m, 0.0, 1e6, " m"),
-            "accept": (self.accept, 0.01, 0.999, ""),
-            "alert_limit_m": (self.alert_limit_m, *ALERT_LIMITS_M, " m"),
-            "risk": (self.risk, *RISKS, ""),
-            "speed_mps": (self.speed_mps, 0.1, 10_000.0, " m/s"),
-            "drift": (self.drift, 0.0, 1.0, " (metres per metre flown: 0.03 is 3 %)"),
-            "tilt_std_deg": (self.tilt_std_deg, 0.0, 20.0, " deg"),
-            "relief_m": (self.relief_m, 0.0, 1000.0, " m"),
-            "camera_pitch_deg": (self.camera_pitch_deg, 0.0, 65.0, " deg"),
-            "effort": (self.effort, 0.05, 50.0, ""),
-            "workers": (self.workers, 1, 1000, " processes"),
-            "seed": (self.seed, 0, 2**63, ""),
+        limits = {
+            "agl_m": (1.0, 50_000.0, " m"),
+            "yaw_std_deg": (0.0, 90.0, " deg"),
+            "agl_std": (0.0, 0.5, " (a fraction of the height: 0.05 is 5 %)"),
+            "prior_std_m": (0.0, 1e6, " m"),
+            "accept": (0.01, 0.999, ""),
+            "alert_limit_m": (*ALERT_LIMITS_M, " m"),
+            "risk": (*RISKS, ""),
+            "speed_mps": (0.1, 10_000.0, " m/s"),
+            "drift": (0.0, 1.0, " (metres per metre flown: 0.03 is 3 %)"),
+            "tilt_std_deg": (0.0, 20.0, " deg"),
+            "relief_m": (0.0, 1000.0, " m"),
+            "camera_pitch_deg": (0.0, 65.0, " deg"),
+            "effort": (0.05, 50.0, ""),
+            "workers": (1, 1000, " processes"),
+            "seed": (0, 2**63, ""),
         }
-        for name, (value, low, high, unit) in limits.items():
+        for name, (low, high, unit) in limits.items():
+            value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} must be {low:g} to {high:g}{unit}, got {value}")
 
 
-@dataclass(frozen=True)
-class Conditions:
-    """What a check assumes; fields that are not listed are those of `CheckRequest`.
+@dataclass(frozen=True, kw_only=True)
+class Conditions(Assumptions):
+    """The assumptions of a check, and what follows from them for its map and height.
 
     `width_m`, `height_m`: footprint of a vertical view along the rows and columns of the image.
     `radius_m`: largest error of a correct fix. `limit_given`: whether the alert limit was given.
@@ -157,37 +163,21 @@ class Conditions:
     width_m: float
     height_m: float
     agl_m: float
-    yaw_std_deg: float | None
-    agl_std: float
-    prior_std_m: float | None
-    accept: float
     radius_m: float
-    speed_mps: float
-    drift: float
     alert_limit_m: float
     limit_given: bool = False
-    risk: float = DEFAULT_RISK
-    tilt_std_deg: float = 0.0
-    camera_kind: str = "colour"
-    relief_m: float = 3.0
-    camera_pitch_deg: float = 0.0
 
     @classmethod
     def of(cls, request: CheckRequest, agl_m: float, radius_m: float) -> "Conditions":
-        camera = request.camera
-        names = (
-            *("yaw_std_deg", "agl_std", "prior_std_m", "accept", "speed_mps", "drift", "risk"),
-            *("tilt_std_deg", "camera_kind", "relief_m", "camera_pitch_deg"),
-        )
-        given_m = request.alert_limit_m
+        camera, given_m = request.camera, request.alert_limit_m
         return cls(
             width_m=agl_m * camera.width_px / camera.fx_px,
             height_m=agl_m * camera.height_px / camera.fy_px,
             agl_m=agl_m,
             radius_m=radius_m,
-            alert_limit_m=given_m or max(LEAST_LIMIT_M, round(LIMIT_SHARE * agl_m)),
+            alert_limit_m=given_m or max(35.0, round(0.025 * agl_m)),
             limit_given=given_m is not None,
-            **{name: getattr(request, name) for name in names},
+            **{each.name: getattr(request, each.name) for each in fields(Assumptions)},
         )
 
     @property
@@ -200,13 +190,13 @@ class Conditions:
         """Largest displacement of the image of a house or tree, a fraction of `side_m`: its height
         times the tangent of the angle off nadir, at the far rim of a view."""
         rim = math.atan(max(self.width_m, self.height_m) / 2 / self.agl_m)
-        off = min(math.radians(self.camera_pitch_deg) + rim, FARTHEST_OFF)
+        off = min(math.radians(self.camera_pitch_deg) + rim, math.radians(80.0))
         return OBJECT_M * math.tan(off) / self.side_m
 
     @property
     def states_level(self) -> bool:
         """Whether enough fixes have a protection level at this risk."""
-        return self.risk >= LEAST_RISK
+        return self.risk >= MIN_RISK
 
     @property
     def limit_text(self) -> str:
@@ -259,6 +249,16 @@ class Along(Prediction):
     points_en_m: Array
     across_low: Array
 
+    @property
+    def lengths_m(self) -> Array:
+        """Length (N,) of the route that each point represents, half-way to its neighbours; 1 for a
+        route without a length."""
+        if not self.distance_m[-1] > 0:
+            return np.ones(len(self.distance_m))
+        lengths_m = np.gradient(self.distance_m)
+        lengths_m[[0, -1]] /= 2
+        return np.asarray(lengths_m)
+
 
 class Range(NamedTuple):
     """Median and 80 % interval over the flights."""
@@ -275,7 +275,7 @@ class Range(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """What happens along the route in `count` simulated flights. Below `LEAST_RISK` protection
+    """What happens along the route in `count` simulated flights. Below `MIN_RISK` protection
     levels, and what follows from them, are NaN.
 
     `probability`: mean chance of a fix per view.
@@ -369,13 +369,10 @@ def summarize(result: CheckResult) -> dict[str, Any]:
     """
     along, cells, outages = result.along, result.cells, result.outages
     route_m = likely = math.nan
-    if along is None or not len(along.distance_m):
+    if along is None:
         error_m = _rms(cells.error_m, cells.probability)
     else:
-        route_m = float(along.distance_m[-1] - along.distance_m[0])
-        # Length of the route (N,) that each of its points represents.
-        lengths_m = np.gradient(along.distance_m) if route_m else np.ones(len(along.distance_m))
-        lengths_m[[0, -1]] /= 2 if route_m else 1
+        route_m, lengths_m = float(along.distance_m[-1]), along.lengths_m
         likely = float(lengths_m[along.probability >= CONFIDENT].sum() / lengths_m.sum())
         error_m = _rms(along.error_m, lengths_m * along.probability)
     longest = max(outages, key=lambda each: each.length_m, default=None)

@@ -8,21 +8,24 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.cores import usable_cores
 from orthonav.core.errors import AreaError, CameraError, MapFileError
 from orthonav.core.files import Progress, StrPath, no_progress
-from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.ground import MIN_KNOWN
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import MAP_STD_M
-from orthonav.core.register.window import GreyPyramid
-from orthonav.ground.check.cells import CellGrid
+from orthonav.ground.check.cells import (
+    CellGrid,
+    MapCoverage,
+    cell_side_m,
+    checked_m2,
+    trial_places,
+)
 from orthonav.ground.check.estimate import Prediction, Predictor
 from orthonav.ground.check.findings import (
     Findings,
@@ -46,34 +49,29 @@ from orthonav.ground.check.trials import (
     require_overlap,
     run_trials,
 )
-from orthonav.ground.planning.area import Area, Extent
+from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.spacing import MIN_BAND_VIEWS, default_band_m
 
 Array = NDArray[np.float64]
-MIN_VIEWS = 20
-MAX_ASPECT = 8.0
-MIN_COVERED = 0.25
-MAX_CELLS_AROUND = 250_000
-"""Limit of cells in the box around a band, most of them empty."""
-# Limits of work and of what a page can show; the benchmark's maps need no more trials.
-MAX_CELLS = 4000
-CELLS_PER_VIEW = 4.0
-"""Cells per side of a view, unless that gives too many."""
-BATCH, BATCH_SHARE = 32, 0.34
-"""Trials of a batch: at least so many, and this fraction of those before."""
-MIN_TRIALS, MAX_TRIALS = 96, 1500
-TRIALS_PER_VIEW = 0.2
-"""Trials per area of a view that are made in any case."""
-FEWEST_TRIALS = 40
-PRECISE = 0.25
-"""Enough trials: the standard error of the mean chance is this fraction of the deviation from scene
-to scene, and the last batch did not change the verdict."""
-MASK_PX = 2048
-"""The coverage of the map is read at the finest level no larger than this."""
-LOWEST_OBJECT_M, MANY_OBJECTS = 2.5, 0.1
-"""A house or tree is higher; a view shows many where they are at least this fraction of it."""
-_REDRAWS = 6
-_MAX_POINTS = 500_000
+
+
+@dataclass(frozen=True)
+class TrialNumbers:
+    """How many trials are made. Figures at which the benchmark's maps need no more."""
+
+    batch: int = 32  # trials of a batch: at least so many,
+    batch_share: float = 0.34  # and this fraction of those before
+    per_view: float = 0.2  # trials per area of a view that are made in any case,
+    least: int = 96  # at least so many,
+    most: int = 1500  # and at most
+    fewest: int = 40  # at any effort
+    min_found: int = 20  # on the map: fewer say nothing
+    precise: float = 0.25
+    """Enough trials: the standard error of the mean chance is this fraction of the deviation from
+    scene to scene, and the last batch did not change the verdict."""
+
+
+TRIALS = TrialNumbers()
 
 
 def check_map(
@@ -118,15 +116,15 @@ class _Check:
             require_overlap(request.other_date, self.sheet)
         self.extent = self.coverage.extent_en_m if self.area is None else self.area.extent_en_m
         self.checked_m2 = checked_m2(self.coverage, self.area)
-        self.wanted = max(self._limited(0.0), 2 * BATCH)  # the verdict has to hold
+        self.wanted = max(self._limited(0.0), 2 * TRIALS.batch)  # the verdict has to hold
 
     def _require_views(self) -> None:
         footprint = self.conditions.footprint_text
         short_m, long_m = sorted((self.conditions.width_m, self.conditions.height_m))
-        if long_m > MAX_ASPECT * short_m:
+        if long_m > 8 * short_m:
             raise CameraError(
-                f"a view may be at most {MAX_ASPECT:g} times as long as wide, but with this camera "
-                f"{footprint}; check the calibration"
+                f"a view may be at most 8 times as long as wide, but with this camera {footprint}; "
+                "check the calibration"
             )
         if MIN_VALID * (short_m**2 + long_m**2) > self.coverage.area_m2:
             raise AreaError(
@@ -163,11 +161,11 @@ class _Check:
         with closing(trials):
             for count, mine, others in trials:
                 own, other, tried = [*own, *mine], [*other, *others], tried + count
-                if len(own) < MIN_VIEWS:
+                if len(own) < TRIALS.min_found:
                     continue
                 before, predictor = result, self._predictor(own, other)
                 result = self._judged(predictor, own, other)
-                aim = PRECISE * predictor.scenes_std / math.sqrt(request.effort)
+                aim = TRIALS.precise * predictor.scenes_std / math.sqrt(request.effort)
                 self.wanted = self._limited(tried * (predictor.mean_std / aim) ** 2)
                 same = before is not None and before.verdict.word is result.verdict.word
                 if same and tried >= self.wanted:
@@ -191,14 +189,15 @@ class _Check:
 
     def _limited(self, trials: float) -> int:
         """A number of trials within what area and effort ask for."""
-        least = max(MIN_TRIALS, TRIALS_PER_VIEW * self.checked_m2 / self.conditions.side_m**2)
-        ends = (min(least, MAX_TRIALS), MAX_TRIALS)
-        least, most = (max(each * self.request.effort, FEWEST_TRIALS) for each in ends)
+        views = self.checked_m2 / self.conditions.side_m**2
+        ends = (min(max(TRIALS.least, TRIALS.per_view * views), TRIALS.most), TRIALS.most)
+        least, most = (max(each * self.request.effort, TRIALS.fewest) for each in ends)
         return round(min(max(trials, least), most))
 
     def _batch(self, done: int) -> int:
         """Number of trials of the next batch."""
-        return min(max(BATCH, round(BATCH_SHARE * done)), self._limited(math.inf) - done)
+        more = max(TRIALS.batch, round(TRIALS.batch_share * done))
+        return min(more, self._limited(math.inf) - done)
 
     def _batches(self) -> Iterator[Array]:
         """Places of trials, every batch spread over all of the checked area."""
@@ -219,7 +218,7 @@ class _Check:
         known = np.isfinite(cells.probability)
         if along is not None:
             rng = np.random.default_rng([request.seed, 5])
-            flights = simulated(along.distance_m, along, conditions, shifts, wrong, rng)
+            flights = simulated(along, conditions, shifts, wrong, rng)
             outside = float(np.mean(~self.coverage.covers(along.points_en_m)))
         chances = cells.probability[known] if known.any() else np.zeros(1)
         mean = Range.of(shifted(chances, shifts).mean(axis=1))
@@ -291,10 +290,10 @@ class _Check:
         side_m = cell_side_m(around_m2, self.conditions.side_m)
         if self.area is not None:
             side_m = cell_side_m(self.checked_m2, self.conditions.side_m)
-            side_m = max(side_m, math.sqrt(around_m2 / MAX_CELLS_AROUND))
+            side_m = max(side_m, math.sqrt(around_m2 / 250_000))  # most of them empty
         grid = CellGrid.over(self.extent, side_m)
         points = grid.centres_en_m
-        here = covered = self.coverage.seen_share(points, side_m) > MIN_COVERED
+        here = covered = self.coverage.seen_share(points, side_m) > 0.25
         if self.area is not None:
             # A band that is narrower than a cell still crosses cells.
             bands_m = self.area.route.bands_m(None) if self.area.route else None
@@ -310,17 +309,17 @@ class _Check:
         )
 
     def _objects(self, places: Array) -> tuple[float, float]:
-        """Fractions of places (N, 2) whose view shows many houses and trees, and for which the map
-        does not know."""
+        """Fractions of places (N, 2) whose view shows many houses and trees (over a tenth of it,
+        higher than 2.5 m), and for which the map does not know."""
         if self.above_m is None or not len(places):
             return 0.0, 1.0
         side_m, pixels = self.conditions.side_m, self.coverage.pixels
         shown, known = (
             MapCoverage(pixels, each).seen_share(places, side_m)
-            for each in (self.above_m > LOWEST_OBJECT_M, np.isfinite(self.above_m))
+            for each in (self.above_m > 2.5, np.isfinite(self.above_m))
         )
         unknown = known < MIN_KNOWN * self.coverage.seen_share(places, side_m)
-        return float(((shown >= MANY_OBJECTS) & ~unknown).mean()), float(unknown.mean())
+        return float(((shown >= 0.1) & ~unknown).mean()), float(unknown.mean())
 
     def _along(self, predictor: Predictor) -> Along | None:
         if self.area is None:
@@ -329,108 +328,3 @@ class _Check:
         return predicted_along(
             self.area, self.conditions, lambda at: self._predict(predictor, at, covers(at))
         )
-
-
-@dataclass(frozen=True, eq=False)
-class MapCoverage:
-    """Where a map has imagery: `valid` (rows, cols) of the pixels of a raster."""
-
-    pixels: CellGrid
-    valid: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, layer: GreyPyramid, grid: TileGrid) -> "MapCoverage":
-        level = 0
-        while level < layer.levels - 1 and max(layer.shape(level)) > MASK_PX:
-            level += 1
-        rows, cols = layer.shape(level)
-        _, valid = layer.read(level, 0, 0, rows, cols)
-        return cls(CellGrid(grid.west_m, grid.north_m, grid.gsd_m * 2**level, rows, cols), valid)
-
-    def of_each(self, at_en_m: Callable[[Array], Array]) -> Array:
-        """Values (rows, cols) at the pixels, a row at a time."""
-        rows = self.pixels.centres_en_m.reshape(*self.valid.shape, 2)
-        return np.stack([at_en_m(row) for row in rows])
-
-    def covers(self, points_en_m: Array) -> NDArray[np.bool_]:
-        numbers = self.pixels.numbers(points_en_m)
-        return np.asarray((numbers >= 0) & self.valid.ravel()[numbers])
-
-    def seen_share(self, points_en_m: Array, side_m: float) -> Array:
-        """Fraction (N,) of squares of a side around points (N, 2) that the map covers."""
-        side = max(1, round(side_m / self.pixels.side_m))
-        padded = np.pad(self.valid.astype(np.float32), side)
-        share = cv2.blur(padded, (side, side), borderType=cv2.BORDER_CONSTANT)
-        numbers = self.pixels.numbers(points_en_m, side)
-        return np.where(numbers >= 0, np.asarray(share, np.float64).ravel()[numbers], 0.0)
-
-    @property
-    def extent_en_m(self) -> Extent:
-        rows, cols = np.flatnonzero(self.valid.any(axis=1)), np.flatnonzero(self.valid.any(axis=0))
-        if not len(rows):
-            raise AreaError("the map has no imagery; build it again from an orthophoto with data")
-        return (
-            self.pixels.west_m + cols[0] * self.pixels.side_m,
-            self.pixels.north_m - (rows[-1] + 1) * self.pixels.side_m,
-            self.pixels.west_m + (cols[-1] + 1) * self.pixels.side_m,
-            self.pixels.north_m - rows[0] * self.pixels.side_m,
-        )
-
-    @property
-    def area_m2(self) -> float:
-        return float(self.valid.sum()) * self.pixels.side_m**2
-
-
-def checked_m2(coverage: MapCoverage, area: Area | None) -> float:
-    """Area of the map's imagery within `area`, the band of a route; all of it without one.
-
-    Raises `AreaError` where the band does not touch the imagery.
-    """
-    if area is None:
-        return coverage.area_m2
-    west, south, east, north = area.extent_en_m
-    side_m = math.sqrt((east - west) * (north - south) / _MAX_POINTS)
-    points = CellGrid.over(area.extent_en_m, side_m).centres_en_m
-    count = np.count_nonzero(area.contains(points) & coverage.covers(points))
-    if not count:
-        left, below, right, above = coverage.extent_en_m
-        far_m = math.hypot(max(west - right, left - east, 0), max(south - above, below - north, 0))
-        raise AreaError(
-            f"the band of the route does not touch the map, {far_m / 1000:,.1f} km from it; give "
-            "the map of this route, and check that latitude and longitude are not swapped"
-        )
-    return float(count) * side_m**2
-
-
-def cell_side_m(area_m2: float, view_side_m: float) -> float:
-    return max(view_side_m / CELLS_PER_VIEW, math.sqrt(area_m2 / MAX_CELLS))
-
-
-def trial_places(
-    coverage: MapCoverage,
-    area: Area | None,
-    extent: Extent,
-    wanted_m2: float,
-    count: int,
-    rng: np.random.Generator,
-) -> Array:
-    """Some `count` places (N, 2), spread evenly at random over `wanted_m2` of checked imagery."""
-    side_m = math.sqrt(wanted_m2 / count)
-    all_m2 = (extent[2] - extent[0]) * (extent[3] - extent[1])
-    cells = CellGrid.over(extent, max(side_m, math.sqrt(all_m2 / _MAX_POINTS)))
-
-    def usable(points: Array) -> NDArray[np.bool_]:
-        covered = coverage.covers(points)
-        return covered if area is None else covered & area.contains(points)
-
-    points = cells.drawn(rng)
-    good = usable(points)
-    for _ in range(_REDRAWS):  # another point of a cell on the border may be usable
-        again = cells.drawn(rng)
-        better = ~good & usable(again)
-        points[better] = again[better]
-        good |= better
-    found = points[good]
-    if len(found) > count:  # of a band that is narrower than a cell
-        found = found[np.linspace(0, len(found) - 1, count).round().astype(int)]
-    return found

@@ -11,7 +11,6 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
 from multiprocessing import get_context, parent_process
-from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import cv2
@@ -31,39 +30,14 @@ from orthonav.core.records import NoFix, Prior, Telemetry, View
 from orthonav.core.register.pose import rotation
 from orthonav.core.register.template import Levels
 from orthonav.core.register.window import GreyPyramid
-from orthonav.ground.check.ageing import MARGIN_PX, another_year, default_model, displaced, features
+from orthonav.ground.check.ageing import MARGIN_PX, another_year, displaced, reported_persistence
 from orthonav.ground.check.records import CheckRequest, Conditions
 from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster
 
-EVERY_PX, PERSISTENCE_LEVELS = 8, 3
-"""Persistence is computed every so many pixels, at so many levels: coarser detail lasts alike."""
 MIN_VALID = 0.3
 """Views that see less of the map than this fraction are skipped: the localizer refuses them."""
-_DONOR_DRAWS = 12
-
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]
-
-
-def reported_persistence(grey: Grey, gsd_m: float, first: int = 0) -> list[NDArray[np.float32]]:
-    """Persistence maps (H, W) of a picture at its own resolution, half of it, and a quarter.
-
-    Resolutions finer than that of level `first` repeat its values.
-    """
-    model = default_model()
-    found: list[NDArray[np.float32]] = []
-    picture = grey
-    height, width = grey.shape
-    for level in range(PERSISTENCE_LEVELS):
-        if level >= first:
-            coarse = model(features(picture, gsd_m * 2**level, max(EVERY_PX >> level, 1)))
-            full = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
-            found.append(np.asarray(full, np.float32))
-        half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        picture = np.asarray(half, np.uint8)
-        if min(picture.shape) < 2 * MARGIN_PX and found:
-            break
-    return [found[0]] * first + found
 
 
 def crop_around(
@@ -94,7 +68,7 @@ def crop_around(
 def mirrored_donor(rng: np.random.Generator, layer: GreyPyramid, size: int, level: int) -> Grey:
     """Mirrored ground (size, size) of a random place, so that it matches no place."""
     rows, cols = layer.shape(level)
-    for _ in range(_DONOR_DRAWS):
+    for _ in range(12):
         row = int(rng.integers(0, max(rows - size, 1)))
         col = int(rng.integers(0, max(cols - size, 1)))
         grey, valid = layer.read(level, row, col, size, size)
@@ -154,12 +128,6 @@ def view_of(
         tilt_std_deg=conditions.tilt_std_deg,
     )
     return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
-
-
-AT_ONCE = 2
-"""Trials that a worker takes at a time: up to two seconds of work."""
-RELIEF_CELL_M = 15.0
-"""Distance over which the height of objects changes: a house or a group of trees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,8 +190,7 @@ def _runner(request: CheckRequest, conditions: Conditions, workers: int) -> Iter
             yield partial(map, trier)
         return
     context = get_context("spawn")  # forking a process with threads is not safe
-    stop = context.Event()
-    with ProcessPoolExecutor(workers, context, _start_worker, (request, conditions, stop)) as pool:
+    with ProcessPoolExecutor(workers, context, _start_worker, (request, conditions)) as pool:
         try:
             yield partial(_submit, pool)
         except BrokenProcessPool as error:
@@ -232,7 +199,6 @@ def _runner(request: CheckRequest, conditions: Conditions, workers: int) -> Iter
                 "memory; try fewer (--workers)"
             ) from error
         finally:
-            stop.set()  # do not wait for submitted jobs
             pool.shutdown(cancel_futures=True)
 
 
@@ -241,18 +207,17 @@ def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[Trial | Non
     only the parent handles it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return pool.map(_work, jobs, chunksize=AT_ONCE)
+        return pool.map(_work, jobs)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-_stop: Event
 _trier: "Trier"
 
 
-def _start_worker(request: CheckRequest, conditions: Conditions, stop: Event) -> None:
-    global _stop, _trier
-    _stop, _trier = stop, Trier(request, conditions)
+def _start_worker(request: CheckRequest, conditions: Conditions) -> None:
+    global _trier
+    _trier = Trier(request, conditions)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
@@ -266,7 +231,7 @@ def _exit_with_parent() -> None:
 
 
 def _work(job: _Job) -> Trial | None:
-    return None if _stop.is_set() else _trier(job)
+    return _trier(job)
 
 
 def registration_of(opened: MapFile) -> RegistrationLocalizer:
@@ -288,9 +253,32 @@ class Trier:
         self._files.close()
 
     def __call__(self, job: _Job) -> Trial | None:
+        """The trial at a place; None where too little of a view has imagery."""
         second_date, index, east, north = job
-        rng = np.random.default_rng([self._request.seed + second_date, index])
-        return self._trial(rng, second_date, np.array([east, north]))
+        registration, request, conditions = self._registration, self._request, self._conditions
+        rng = np.random.default_rng([request.seed + second_date, index])
+        level = self._level
+        gsd_m = registration.grid.gsd_m * 2**level
+        size = math.ceil(math.hypot(conditions.width_m, conditions.height_m) / gsd_m) + 4
+        read = self._read_other if second_date else self._read_own
+        crop = crop_around(read, registration.grid, np.array([east, north]), size, gsd_m)
+        if crop is None:
+            return None
+        grey, valid, place = crop
+        donor = mirrored_donor(rng, registration.pyramid, size, level)
+        inner = np.s_[MARGIN_PX : MARGIN_PX + size, MARGIN_PX : MARGIN_PX + size]
+        picture = np.where(valid[inner], grey[inner], donor)
+        expected = math.nan
+        if not second_date:
+            found = reported_persistence(grey, gsd_m, self._final_level - level)
+            maps = [each[inner] for each in found]
+            expected = float(np.mean([each.mean() for each in maps[:2]]))
+            picture = another_year(rng, picture, donor, maps)
+        if request.relief_m > 0:
+            rim_px = request.relief_m * size / 2 / conditions.agl_m
+            picture = displaced(rng, picture, rim_px, 15.0 / gsd_m)  # a house, a group of trees
+        view = view_of(rng, request, conditions, picture, gsd_m)
+        return self._placed(rng, place, view, expected)
 
     @cached_property
     def _registration(self) -> RegistrationLocalizer:
@@ -330,32 +318,6 @@ class Trier:
     def _read_other(self, row: int, col: int, side: int) -> tuple[Grey, NDArray[np.bool_]]:
         pixels = self._other.read_grey(col, row, side, side)
         return pixels.grey, pixels.valid
-
-    def _trial(self, rng: np.random.Generator, second_date: bool, en_m: Points) -> Trial | None:
-        registration, request, conditions = self._registration, self._request, self._conditions
-        level = self._level
-        gsd_m = registration.grid.gsd_m * 2**level
-        size = math.ceil(math.hypot(conditions.width_m, conditions.height_m) / gsd_m) + 4
-        read = self._read_other if second_date else self._read_own
-        crop = crop_around(read, registration.grid, en_m, size, gsd_m)
-        if crop is None:
-            return None
-        grey, valid, place = crop
-        donor = mirrored_donor(rng, registration.pyramid, size, level)
-        inner = np.s_[MARGIN_PX : MARGIN_PX + size, MARGIN_PX : MARGIN_PX + size]
-        picture = np.where(valid[inner], grey[inner], donor)
-        expected = math.nan
-        if not second_date:
-            maps = [
-                each[inner] for each in reported_persistence(grey, gsd_m, self._final_level - level)
-            ]
-            expected = float(np.mean([each.mean() for each in maps[:2]]))
-            picture = another_year(rng, picture, donor, maps)
-        if request.relief_m > 0:
-            rim_px = request.relief_m * size / 2 / conditions.agl_m
-            picture = displaced(rng, picture, rim_px, RELIEF_CELL_M / gsd_m)
-        view = view_of(rng, request, conditions, picture, gsd_m)
-        return self._placed(rng, place, view, expected)
 
     def _placed(
         self, rng: np.random.Generator, place_en_m: Points, view: View, expected: float

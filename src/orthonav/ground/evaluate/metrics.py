@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TypeGuard
 
 import numpy as np
@@ -28,7 +27,7 @@ from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.statistics import (
     BoolArray,
     ConfidenceCalibration,
-    CovarianceConsistency,
+    Consistency,
     FloatArray,
     Longest,
     StandardFigures,
@@ -46,24 +45,19 @@ from orthonav.ground.evaluate.statistics import (
     wilson,
 )
 
-Positions = Mapping[str, tuple[float, float]]
-"""Frame name -> (latitude, longitude) in degrees."""
+LatLon = tuple[float, float]
+"""Degrees."""
+Positions = Mapping[str, LatLon]
+"""By frame name."""
 
 FAR_M = 35.0
 """A larger error is wrong by any measure: half a tile of the paper, `wrong_by_35m`."""
-NO_RESULT = "no_result"
 RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
-CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
-    {
-        "lowe_ratio": (1.13,),  # best tile against second best, threshold of the paper
-        "confidence": (0.5, 0.9, 0.99),
-    }
-)
-"""Confidence criterion -> thresholds; a view is accepted if its value is at least that."""
-_OTHER_FLIGHT_M = 50_000.0
-"""A larger median error is none of the method: maps of one sheet are smaller."""
-_SWAPPED_M = 1000.0
-"""Nearer true positions are not examined: latitude and longitude may be nearly equal."""
+CRITERIA = (("lowe_ratio", 1.13), ("confidence", 0.5), ("confidence", 0.9), ("confidence", 0.99))
+"""Confidence criteria and thresholds, the first of the paper (best tile against second best).
+
+A view is accepted if its value is at least the threshold.
+"""
 log = logging.getLogger(__name__)
 
 
@@ -199,7 +193,7 @@ class Metrics:
     reasons: Mapping[str, int]
     criteria: tuple[CriterionRow, ...]
     calibration: ConfidenceCalibration
-    consistency: CovarianceConsistency
+    consistency: Consistency
     standard: StandardFigures
     of_confident: StandardFigures
     integrity: Integrity | None = None
@@ -264,7 +258,7 @@ def check_truth(
         float(np.nanmedian(distances_m(places, expected))) for places in (true, true[:, ::-1])
     )
     far = f"true positions are {far_m / 1000:,.0f} km from {compared} (median)"
-    if far_m > _SWAPPED_M and swapped_m < far_m / 10:
+    if far_m > 1000 and swapped_m < far_m / 10:  # nearer, both may be equal
         raise FlightError(f"{far}; {HINT}: {path}")
     errors_m = distances_m(true, expected)
     wrong = [
@@ -272,7 +266,7 @@ def check_truth(
         for error_m, (fix, _, is_confident) in zip(errors_m, placed, strict=False)
         if is_confident
     ]
-    if far_m > _OTHER_FLIGHT_M:
+    if far_m > 50_000:  # maps of one sheet are smaller
         log.warning("%s; are these of the same flight?: %s", far, path)
     elif 2 * sum(wrong) > len(wrong):  # false fixes are few: rather the truth or the map is wrong
         log.warning(
@@ -323,8 +317,8 @@ def compare(
     before = [missing[result.frame] for result in matched]  # true positions without a result
     is_whole = before[0] == 0 and before[-1] == len(known) - len(matched)
     outcomes = [result.outcome for result in matched]
-    truth_en_m = _local(local, [known[result.frame] for result in matched])
-    fix_en_m = _local(local, [_position(outcome) for outcome in outcomes])
+    truth_en_m = places_en_m(local, [known[result.frame] for result in matched])
+    fix_en_m = places_en_m(local, [place_of(outcome) for outcome in outcomes])
     radii_m = [outcome.radius_m if isinstance(outcome, Fix) else math.nan for outcome in outcomes]
     return Comparison(
         lat_deg=local.lat_deg,
@@ -337,8 +331,8 @@ def compare(
         cov_en_m2=frozen(np.array([_covariance(outcome) for outcome in outcomes])),
         own_radius_m=frozen(radii_m),
         confident=np.array([result.is_confident for result in matched], dtype=np.bool_),
-        criteria={n: frozen([_criterion(each, n) for each in outcomes]) for n in CRITERIA},
-        reasons=tuple(_reason(outcome) for outcome in outcomes),
+        criteria={n: frozen([_criterion(each, n) for each in outcomes]) for n, _ in CRITERIA},
+        reasons=tuple(reason_of(outcome) for outcome in outcomes),
         latency_ms=frozen([result.latency_ms for result in matched]),
         place_probability=frozen(
             [each.place_probability if isinstance(each, Fix) else math.nan for each in outcomes]
@@ -387,7 +381,7 @@ def measure(
     n_wrong = int(np.count_nonzero(comparison.confident_wrong(wrong_above_m)))
     reasons = Counter(reason for reason in comparison.reasons if reason)
     if comparison.n_without_result:
-        reasons[NO_RESULT] += comparison.n_without_result
+        reasons["no_result"] += comparison.n_without_result
     standard, of_confident = (
         standard_figures(comparison.truth_en_m, fix_en_m)
         for fix_en_m in (
@@ -415,9 +409,7 @@ def measure(
         latency_p95_ms=percentile(comparison.latency_ms, 95.0),
         reasons=dict(reasons.most_common()),
         criteria=tuple(
-            _criterion_row(comparison, name, threshold, radius_m)
-            for name, thresholds in CRITERIA.items()
-            for threshold in thresholds
+            _criterion_row(comparison, name, threshold, radius_m) for name, threshold in CRITERIA
         ),
         calibration=calibrate(
             comparison.criteria["confidence"], errors_m, own_radius_m, float(radius_m)
@@ -518,30 +510,37 @@ def _covariance(outcome: Fix | NoFix) -> FloatArray:
     return stated if stated.shape == (2, 2) else np.full((2, 2), np.nan)
 
 
-def _position(outcome: Fix | NoFix) -> tuple[float, float]:
-    return (outcome.lat_deg, outcome.lon_deg) if isinstance(outcome, Fix) else (math.nan, math.nan)
-
-
 def _is_fix(outcome: Fix | NoFix) -> TypeGuard[Fix]:
-    return all(map(math.isfinite, _position(outcome)))
+    return place_of(outcome) is not None
 
 
-def _reason(outcome: Fix | NoFix) -> str:
+def place_of(outcome: Fix | NoFix) -> LatLon | None:
+    if isinstance(outcome, NoFix) or not math.isfinite(outcome.lat_deg + outcome.lon_deg):
+        return None
+    return outcome.lat_deg, outcome.lon_deg
+
+
+def reason_of(outcome: Fix | NoFix) -> str:
+    """Why there is no position; "" for a fix."""
     if isinstance(outcome, NoFix):
         return outcome.reason or "not_said"
     return "" if _is_fix(outcome) else "not_finite"
 
 
 def _criterion(outcome: Fix | NoFix, name: str) -> float:
-    if not isinstance(outcome, Fix) or not _is_fix(outcome):
+    if not _is_fix(outcome):
         return math.nan
     return outcome.confidence if name == "confidence" else outcome.evidence.get(name, math.nan)
 
 
-def _local(local: LocalFrame, positions: Sequence[tuple[float, float]]) -> FloatArray:
-    lat_lon_deg = np.array(positions, dtype=np.float64)
+def places_en_m(local: LocalFrame, places: Sequence[LatLon | None]) -> FloatArray:
+    """(N, 2) metres in the plane of `local`; NaN where a place is None or not finite."""
+    lat_lon_deg = np.full((len(places), 2), np.nan)
+    for i, place in enumerate(places):
+        if place is not None:
+            lat_lon_deg[i] = place
     en_m = np.full(lat_lon_deg.shape, np.nan)
     known = np.isfinite(lat_lon_deg).all(axis=1)
     if known.any():
-        en_m[known] = local.en_from_latlon(lat_lon_deg[known, 0], lat_lon_deg[known, 1])
+        en_m[known] = local.en_from_latlon(*lat_lon_deg[known].T)
     return frozen(en_m)

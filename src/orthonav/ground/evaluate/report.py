@@ -5,8 +5,7 @@ track differ in colour and in mark.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,18 +20,13 @@ from orthonav.ground.evaluate.statistics import (
     seconds_since_first,
 )
 from orthonav.ground.evaluate.tables import (
-    STANDARD_HEADER,
     FlightReport,
     confidence_text,
-    covariance_text,
-    criteria_header,
-    criteria_rows,
-    gnss_rows,
+    consistency_text,
+    criteria_table,
     integrity_rows,
-    percentiles_text,
-    standard_rows,
-    table_header,
-    table_rows,
+    runs_table,
+    standard_table,
     track_rows,
     verdict,
     wrong_bound_text,
@@ -68,29 +62,15 @@ STATE_STYLES = {
     "coasting": ("#56B4E9", "s"),
     "lost": ("#B8558F", "X"),
 }
-_N_WORST = 10
-_SIDE: dict[str, Any] = {"fontsize": 9, "color": "#777777", "style": "italic"}
-_NO_FIX_SHADE = "#EFE6C8"
-
-
-@dataclass(frozen=True)
-class MadeFrom:
-    map_name: str = ""
-    recipe: str = ""
-    imagery: str = ""
-    flight: str = ""
-    command: str = ""
-    version: str = ""
 
 
 def write_report(
-    out_dir: Path,
-    flights: Sequence[FlightReport],
-    made_from: MadeFrom | None = None,
+    out_dir: Path, flights: Sequence[FlightReport], made_from: Mapping[str, str] | None = None
 ) -> Path:
     """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
 
-    Figures are also written beside it. Raises `OutputError`.
+    Figures are also written beside it. `made_from`: names and values for the end of the page.
+    Raises `OutputError`.
     """
     first = flights[0].metrics
     several = len(flights) > 1
@@ -104,15 +84,9 @@ def write_report(
         "kind": "Evaluation of flights",
         "radius": f"{first.radius_m:g} m",
         "wrong_above": f"{first.wrong_above_m:g} m",
-        "table_header": table_header(first),
-        "table_rows": table_rows(flights),
-        "standard_header": STANDARD_HEADER,
-        "criteria_header": criteria_header(first),
+        "runs": runs_table(flights),
         "sections": sections,
-        "made_from": [
-            ("orthonav" if name == "version" else name.removesuffix("_name"), text)
-            for name, text in vars(made_from or MadeFrom()).items()
-        ],
+        "made_from": (made_from or {}).items(),
     }
     page = render("orthonav.ground.evaluate", "report.html", values)
     return write_page(out_dir, page, [each for section in sections for each in section["figures"]])
@@ -121,73 +95,54 @@ def write_report(
 def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     of_confident, of_all = metrics.of_confident, metrics.standard
     low, high = (100 * each for each in metrics.availability_95)
+    views = f"{metrics.n_confident} of {metrics.n_views} views have a confident fix"
+    bound = f" ({wrong_bound_text(metrics)})" * (metrics.n_confident > 0)
+    wrong = f"{metrics.n_confident_wrong} of {metrics.n_confident}"
+    cep = [
+        (
+            measure_text(mine, " m"),
+            f"{name} of confident fixes; {measure_text(all_, ' m')} of all fixes",
+        )
+        for name, mine, all_ in (
+            ("CEP50", of_confident.cep50_m, of_all.cep50_m),
+            ("CEP95", of_confident.cep95_m, of_all.cep95_m),
+        )
+    ]
+    nees = "NEES, mean of correct fixes: 2 expected, more where covariances are too small"
+    gap = f"longest gap without a confident fix, {measure_text(metrics.gap.path_m, ' m')}"
     return (
+        (percent_text(metrics.availability), f"{views} (95 % interval {low:.0f} to {high:.0f} %)"),
         (
-            percent_text(metrics.availability),
-            f"{metrics.n_confident} of {metrics.n_views} views have a confident fix "
-            f"(95 % interval {low:.0f} to {high:.0f} %)",
+            wrong,
+            f"false fixes among confident fixes{bound}",
+            "bad" * (metrics.n_confident_wrong > 0),
         ),
-        (
-            f"{metrics.n_confident_wrong} of {metrics.n_confident}",
-            "false fixes among confident fixes"
-            + f" ({wrong_bound_text(metrics)})" * (metrics.n_confident > 0),
-            "bad" if metrics.n_confident_wrong else "",
-        ),
-        (
-            measure_text(of_confident.cep50_m, " m"),
-            f"CEP50 of confident fixes; {measure_text(of_all.cep50_m, ' m')} of all fixes",
-        ),
-        (
-            measure_text(of_confident.cep95_m, " m"),
-            f"CEP95 of confident fixes; {measure_text(of_all.cep95_m, ' m')} of all fixes",
-        ),
-        (
-            plain_text(metrics.consistency.nees_mean),
-            "NEES, mean of correct fixes: 2 expected, more where covariances are too small",
-        ),
-        (
-            measure_text(metrics.gap.seconds_s, " s"),
-            f"longest gap without a confident fix, {measure_text(metrics.gap.path_m, ' m')}",
-        ),
+        *cep,
+        (plain_text(metrics.consistency.nees_mean), nees),
+        (measure_text(metrics.gap.seconds_s, " s"), gap),
     )
 
 
-def _notes(metrics: Metrics) -> list[str]:
-    notes = []
-    if metrics.n_without_truth:
-        notes.append(f"{metrics.n_without_truth} results have no true position and are left out.")
-    if metrics.n_without_result:
-        notes.append(
-            f"{metrics.n_without_result} true positions have no result: views without a fix."
-        )
-    if not metrics.n_fixes:
-        notes.append("No view has a fix, so errors are not defined.")
-    return notes
-
-
 def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
-    metrics, figures = flight.metrics, _figures(flight)
+    metrics = flight.metrics
     return {
         "name": flight.name,
         "verdict": verdict(metrics),
         "verdict_kind": "bad" if metrics.n_confident_wrong else "good" * (metrics.n_confident > 0),
         "cards": _cards(metrics),
-        "notes": _notes(metrics),
+        "n_without_truth": metrics.n_without_truth,
         "view_command": flight.view_command,
         "figures": [
             Figure(f"{prefix}{name}", f"{flight.name}: {alt}", caption, drawing)
-            for name, alt, caption, drawing in figures
+            for name, alt, caption, drawing in _figures(flight)
         ],
-        "track": (
-            *(track_rows(flight.track) if flight.track else ()),
-            *(gnss_rows(flight.gnss) if flight.gnss else ()),
-        ),
+        "track": track_rows(flight),
         "worst": _worst(flight.comparison, metrics),
         "reasons": [(reason, str(count)) for reason, count in metrics.reasons.items()],
-        "standard": standard_rows(metrics),
-        "criteria": criteria_rows(metrics),
+        "standard": standard_table(metrics),
+        "criteria": criteria_table(metrics),
         "confidence": confidence_text(metrics),
-        "covariance": covariance_text(metrics.consistency),
+        "covariance": consistency_text(metrics.consistency, "correct fixes"),
         "integrity": integrity_rows(metrics),
     }
 
@@ -195,7 +150,7 @@ def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
 def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     wrong = comparison.confident_wrong(metrics.wrong_above_m)
-    for i in worst_views(comparison, _N_WORST, metrics.wrong_above_m):
+    for i in worst_views(comparison, 10, metrics.wrong_above_m):
         east_m, north_m = comparison.fix_en_m[i] - comparison.truth_en_m[i]
         confidence = plain_text(comparison.criteria["confidence"][i])
         rows.append(
@@ -212,55 +167,52 @@ def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
 
 
 def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
-    comparison, metrics, radius_m = flight.comparison, flight.metrics, flight.metrics.radius_m
-    bounds = " Shaded below: 1 sigma and the 95 % bound that the covariance states."
+    """Name, description, caption and drawing of each figure."""
+    comparison, metrics, track = flight.comparison, flight.metrics, flight.track
+    over_time = "Error over time; shaded where there is no fix."
+    if track is not None:
+        over_time += " Shaded below: 1 sigma and the 95 % bound that the covariance states."
+    reliability = (
+        "Fraction of correct fixes over their confidence, with 95 % intervals (Wilson); dashed: "
+        "ideal; orange: the difference. Below: fixes per bin."
+    )
     figures = [
         (
             "map",
-            f"Map of {metrics.n_views} true positions, {metrics.n_confident} confident fixes and "
-            f"{metrics.n_fixes - metrics.n_confident} best guesses",
+            "map of the fixes",
             "Map, north up: each fix is joined to its true position.",
-            map_picture(comparison, radius_m, flight.track, flight.background),
+            map_picture(comparison, metrics.radius_m, track, flight.background),
         ),
         (
             "error-over-time",
-            f"Error of each view over time; {percent_text(metrics.coverage)} have a fix",
-            "Error over time; shaded where there is no fix." + bounds * (flight.track is not None),
-            over_time_picture(comparison, radius_m, flight.track),
+            "error of each view over time",
+            over_time,
+            over_time_picture(comparison, metrics.radius_m, track),
         ),
         (
             "reliability",
-            f"Reliability diagram of confidence: {confidence_text(metrics)}",
-            "Fraction of correct fixes over their confidence, with 95 % intervals (Wilson); "
-            "dashed: ideal; orange: the difference. Below: fixes per bin.",
+            f"reliability diagram of confidence, ECE {plain_text(metrics.calibration.ece)}",
+            reliability,
             reliability_picture(metrics.calibration),
         ),
     ]
     if metrics.integrity is not None:
-        (_, beyond), *_ = integrity_rows(metrics)
-        figures.append(
-            (
-                "stanford",
-                f"Stanford diagram; errors beyond the protection level: {beyond}",
-                f"Stanford diagram: error and protection level of {metrics.integrity.n_levels} of "
-                f"{metrics.n_fixes} fixes at a risk of {metrics.integrity.risk:g}; the level of "
-                "the others is infinite. Below the diagonal the error is beyond the level"
-                + "; dotted: the alert limit" * math.isfinite(metrics.integrity.alert_limit_m)
-                + ".",
-                stanford_picture(comparison, metrics.integrity.alert_limit_m),
-            )
+        limit_m = metrics.integrity.alert_limit_m
+        stanford = (
+            f"Stanford diagram: error and protection level of {metrics.integrity.n_levels} of "
+            f"{metrics.n_fixes} fixes at a risk of {metrics.integrity.risk:g}; the level of the "
+            "others is infinite. Below the diagonal the error is beyond the level"
+            + "; dotted: the alert limit"
+            * math.isfinite(limit_m)
         )
+        picture = stanford_picture(comparison, limit_m)
+        figures.append(("stanford", "Stanford diagram", f"{stanford}.", picture))
     if flight.gnss:
-        figures.append(
-            (
-                "gnss",
-                f"GNSS: {percentiles_text(flight.gnss.errors_m)}; "
-                f"alarms: {len(flight.gnss.alarms)}",
-                "Errors of GNSS and of the map, and the distance between them; shaded while the "
-                "GNSS monitor reports a fault.",
-                gnss_picture(flight.gnss),
-            )
+        gnss = (
+            "Errors of GNSS and of the map, and the distance between them; shaded while the GNSS "
+            "monitor reports a fault."
         )
+        figures.append(("gnss", "errors of GNSS and of the map", gnss, gnss_picture(flight.gnss)))
     return figures
 
 
@@ -356,7 +308,7 @@ def over_time_picture(
         high = max([radius_m * 10, *finite]) * 1.5
         for i, (start, stop) in enumerate(runs(np.isnan(errors_m))):
             label = "no fix" if i == 0 else "_nolegend_"
-            axes.axvspan(edges[start], edges[stop], color=_NO_FIX_SHADE, linewidth=0, label=label)
+            axes.axvspan(edges[start], edges[stop], color="#EFE6C8", linewidth=0, label=label)
         if track is not None:
             for label, bound_m in (
                 ("95 % bound", track.series.bound_95_m),
@@ -389,8 +341,9 @@ def reliability_picture(calibration: ConfidenceCalibration) -> Drawing:
 
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
         above.plot([0, 1], [0, 1], linewidth=1.2, color=GREY, linestyle=(0, (4, 3)))
-        above.text(0.03, 0.96, "under-confident", va="top", **_SIDE)
-        above.text(0.97, 0.04, "over-confident", ha="right", **_SIDE)
+        side: dict[str, Any] = {"fontsize": 9, "color": "#777777", "style": "italic"}
+        above.text(0.03, 0.96, "under-confident", va="top", **side)
+        above.text(0.97, 0.04, "over-confident", ha="right", **side)
         if calibration.n_fixes:
             _draw_bins(above, calibration)
         else:

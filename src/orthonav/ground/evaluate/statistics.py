@@ -13,20 +13,19 @@ number), at most the radius of the evaluation. Undefined figures are NaN.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from orthonav.core.extras import needed
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 N_BINS = 10
-NEES_LEVELS = (0.5, 0.9, 0.99)
 RPE_DISTANCE_M = 100.0
 """The shortest segment of the KITTI odometry benchmark (Geiger et al., CVPR 2012)."""
-_LEAST_INDEPENDENCE = 1e-12  # of east and north, 1 - rho^2: below it a covariance is singular
-_ASYMMETRY = 1e-6  # fraction of the largest element that two mirrored ones may differ by
-_Z95 = 1.959963984540054  # two-sided 95 % of a normal distribution
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,10 @@ def percentile(values: FloatArray, percent: float) -> float:
     return float(np.percentile(finite, percent)) if finite.size else math.nan
 
 
+def _stats() -> Any:
+    return needed("scipy.stats", "geo", "evaluating fixes")
+
+
 def wilson(part: int, whole: int) -> tuple[float, float]:
     """The 95 % interval of a share, given `part` of `whole`; NaN for a `whole` of 0.
 
@@ -62,12 +65,8 @@ def wilson(part: int, whole: int) -> tuple[float, float]:
     """
     if not whole:
         return math.nan, math.nan
-    seen, square = part / whole, _Z95**2 / whole
-    middle = (seen + square / 2) / (1 + square)
-    half = math.sqrt(square * (seen * (1 - seen) + square / 4)) / (1 + square)
-    low = 0.0 if part == 0 else max(middle - half, 0.0)
-    high = 1.0 if part == whole else min(middle + half, 1.0)
-    return low, high
+    low, high = _stats().binomtest(part, whole).proportion_ci(method="wilson")
+    return float(low), float(high)
 
 
 def upper_bound(part: int, whole: int) -> float:
@@ -78,26 +77,8 @@ def upper_bound(part: int, whole: int) -> float:
     """
     if not whole:
         return math.nan
-    if part == whole:
-        return 1.0
-    counts = np.arange(1, part + 1)
-    logs = np.concatenate([[0.0], np.cumsum(np.log((whole - counts + 1) / counts))])
-    ks = np.arange(part + 1)
-
-    def chance_of_more(rate: float) -> float:
-        return 1 - float(
-            np.exp(logs + ks * math.log(rate) + (whole - ks) * math.log1p(-rate)).sum()
-        )
-
-    return root(chance_of_more, 0.95, 1.0)
-
-
-def root(rising: Callable[[float], float], value: float, largest: float) -> float:
-    """Where a function that rises from 0 to `largest` takes a value, by bisection."""
-    low, high = 0.0, largest
-    while low < (middle := (low + high) / 2) < high:
-        low, high = (middle, high) if rising(middle) < value else (low, middle)
-    return high
+    counted = _stats().binomtest(part, whole, alternative="less")
+    return float(counted.proportion_ci(method="exact").high)
 
 
 def frozen(values: FloatArray | Sequence[float]) -> FloatArray:
@@ -142,7 +123,7 @@ def longest(flags: BoolArray, seconds_s: FloatArray, path_m: FloatArray) -> Long
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Statistics of `n` errors in metres, NaN without any; `std_m` divides by `n`, as evo does."""
+    """Statistics of `n` errors (m), perhaps signed; NaN without any. `std_m` divides by `n`."""
 
     n: int
     rmse_m: float
@@ -173,7 +154,6 @@ class StandardFigures:
 def standard_figures(truth_en_m: FloatArray, fix_en_m: FloatArray) -> StandardFigures:
     """Standard figures of positions (N, 2) in metres, NaN where there is no fix."""
     errors_m = np.hypot(*(fix_en_m - truth_en_m).T)
-    errors_m = errors_m[np.isfinite(errors_m)]
     fixes = np.flatnonzero(np.isfinite(fix_en_m).all(axis=1))
     frames, distances = (
         error_statistics(np.hypot(*np.diff((fix_en_m - truth_en_m)[chosen], axis=0).T))
@@ -189,6 +169,8 @@ def standard_figures(truth_en_m: FloatArray, fix_en_m: FloatArray) -> StandardFi
 
 
 def error_statistics(errors_m: FloatArray) -> ErrorStatistics:
+    """Of the finite ones of errors (N,)."""
+    errors_m = errors_m[np.isfinite(errors_m)]
     if not errors_m.size:
         return ErrorStatistics(0, *[math.nan] * 5)
     return ErrorStatistics(
@@ -247,22 +229,36 @@ class ConfidenceCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class CovarianceConsistency:
-    """Agreement of stated covariances with the errors of the right fixes.
+class Consistency:
+    """Agreement of covariances with `n` errors, by the normalized estimation error squared (NEES)
+    e^T C^-1 e: 2 expected, more where covariances are too small.
 
-    `n_without`: right fixes without covariance, or with null values in it; `n_unusable`: with one
-    that is singular, not positive definite or not symmetric.
-    `nees` (K,): normalized estimation error squared e^T C^-1 e of the others, ascending.
-    `within`: for each of `NEES_LEVELS` the fraction of `nees` inside its bound.
+    `n_without`: errors without covariance, or with null values in it; `n_unusable`: with one that
+    is singular, not positive definite or not symmetric. `nees` (K,): of the others, ascending.
+    `within`: fraction of `nees` inside the bounds of these levels.
+    `n_effective`: number of independent errors that they are worth; `low`, `high`: 95 % interval of
+    the mean NEES of so many, which decides the verdict.
     """
 
-    n_right: int
+    n: int
     n_without: int
     n_unusable: int
     nees: FloatArray
     nees_mean: float
     nees_median: float
     within: Mapping[float, float]
+    n_effective: float
+    low: float
+    high: float
+
+    @property
+    def verdict(self) -> str:
+        """ "" without NEES."""
+        if not self.nees.size:
+            return ""
+        if self.nees_mean > self.high:
+            return "over-confident"
+        return "under-confident" if self.nees_mean < self.low else "consistent"
 
 
 def stated_radius_m(own_radius_m: FloatArray, radius_m: float) -> FloatArray:
@@ -308,30 +304,46 @@ def calibrate(
 
 def check_covariance(
     errors_en_m: FloatArray, cov_en_m2: FloatArray, own_radius_m: FloatArray, radius_m: float
-) -> CovarianceConsistency:
+) -> Consistency:
     """Consistency of `cov_en_m2` (N, 2, 2) with `errors_en_m` (N, 2), NaN where there is no fix.
 
     Only right fixes count: the covariance describes a right fix, and the confidence whether a fix
-    is right. If C is the covariance of the right ones, the mean of e^T C^-1 e is 2;
-    if they are Gaussian too, it follows chi-square with 2 degrees of freedom (Bar-Shalom et al.,
-    "Estimation with applications to tracking and navigation", 2001, section 5.4). Larger values
-    mean a covariance that is too small. Where `radius_m` is less than about three standard
-    deviations, right fixes have no tails, and more than 99 % lie inside the outer bound.
+    is right. Where `radius_m` is less than about three standard deviations, right fixes have no
+    tails, and more than 99 % lie inside the outer bound.
     """
     errors_m = np.hypot(errors_en_m[:, 0], errors_en_m[:, 1])
     right = errors_m <= stated_radius_m(own_radius_m, radius_m)  # NaN is never right
-    cov_en_m2 = cov_en_m2[right]
-    without = np.isnan(cov_en_m2).any(axis=(1, 2))
-    usable = is_covariance(cov_en_m2)
-    nees = np.sort(normalized_squared(errors_en_m[right][usable], cov_en_m2[usable]))
-    return CovarianceConsistency(
-        n_right=int(np.count_nonzero(right)),
+    return consistency(errors_en_m[right], cov_en_m2[right])
+
+
+def consistency(
+    errors_en_m: FloatArray,
+    cov_en_m2: FloatArray,
+    effective: Callable[[FloatArray, FloatArray], float] = lambda errors, cov: len(errors),
+) -> Consistency:
+    """Consistency of errors (N, 2) with their covariances (N, 2, 2).
+
+    If C is the covariance of e, the mean of e^T C^-1 e is 2; if they are Gaussian too, it follows
+    chi-square with 2 degrees of freedom (Bar-Shalom et al., "Estimation with applications to
+    tracking and navigation", 2001, section 5.4). `effective`: number of independent errors, of
+    errors and usable covariances.
+    """
+    without = np.isnan(cov_en_m2).any(axis=(1, 2)) | np.isnan(errors_en_m).any(axis=1)
+    usable = is_covariance(cov_en_m2) & ~without
+    used = errors_en_m[usable], cov_en_m2[usable]
+    nees, n_effective = np.sort(normalized_squared(*used)), float(effective(*used))
+    low, high = nees_mean_bounds(n_effective)
+    return Consistency(
+        n=len(errors_en_m),
         n_without=int(np.count_nonzero(without)),
         n_unusable=int(np.count_nonzero(~usable & ~without)),
         nees=frozen(nees),
         nees_mean=mean(nees),
-        nees_median=float(np.median(nees)) if nees.size else math.nan,
-        within={level: share_of(nees <= nees_bound(level)) for level in NEES_LEVELS},
+        nees_median=percentile(nees, 50.0),
+        within={level: share_of(nees <= nees_bound(level)) for level in (0.5, 0.9, 0.95, 0.99)},
+        n_effective=n_effective,
+        low=low,
+        high=high,
     )
 
 
@@ -340,12 +352,12 @@ def is_covariance(cov_en_m2: FloatArray) -> BoolArray:
     east, north = cov_en_m2[:, 0, 0], cov_en_m2[:, 1, 1]
     with np.errstate(all="ignore"):
         largest = np.maximum(east, north)
-        even = np.abs(cov_en_m2[:, 0, 1] - cov_en_m2[:, 1, 0]) <= _ASYMMETRY * largest
+        symmetric = np.abs(cov_en_m2[:, 0, 1] - cov_en_m2[:, 1, 0]) <= 1e-6 * largest
         independence = 1.0 - _correlation(cov_en_m2) ** 2
         usable: BoolArray = (
             np.isfinite(cov_en_m2).all(axis=(1, 2))
             & ((east > 0.0) & (north > 0.0))
-            & (even & (independence > _LEAST_INDEPENDENCE))
+            & (symmetric & (independence > 1e-12))
         )
     return usable
 
@@ -373,16 +385,8 @@ def nees_mean_bounds(n: float) -> tuple[float, float]:
     """
     if not n > 0:
         return math.nan, math.nan
-    wide = 20 * math.sqrt(n) + 40  # the series has converged, and 97.5 % are below
-    logs = np.cumsum(np.log(n + np.arange(1, math.ceil(wide + wide) + math.ceil(n))))
-    powers = np.arange(len(logs) + 1)
-    logs = np.concatenate([[0.0], logs]) + math.lgamma(n + 1)
-
-    def share_below(half: float) -> float:  # the incomplete gamma function, by its series
-        return float(np.exp((n + powers) * math.log(half) - half - logs).sum())
-
-    low, high = (2 / n * root(share_below, p, n + wide) for p in (0.025, 0.975))
-    return low, high
+    low, high = _stats().chi2.ppf([0.025, 0.975], 2 * n) / n
+    return float(low), float(high)
 
 
 def _correlation(cov_en_m2: FloatArray) -> FloatArray:

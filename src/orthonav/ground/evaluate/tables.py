@@ -1,41 +1,31 @@
-"""Figures of evaluated flights as JSON values, as text for a terminal, and as rows for the page."""
+"""Figures of evaluated flights: JSON values, and tables and sentences of terminal and page."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from orthonav.core.flight.fixes import STATES
-from orthonav.core.flight.gnss import BIASES as GNSS_BIASES
+from orthonav.core.flight.gnss import BIASES
 from orthonav.ground.evaluate.metrics import FAR_M, Comparison, Metrics, radius_key
 from orthonav.ground.evaluate.statistics import (
-    NEES_LEVELS,
     RPE_DISTANCE_M,
-    CovarianceConsistency,
+    Consistency,
+    ErrorStatistics,
     FloatArray,
-    StandardFigures,
+    Longest,
     nees_bound,
-    nees_mean_bounds,
     percentile,
     share,
 )
-from orthonav.ground.evaluate.track import GnssMetrics, Spread, TrackConsistency, TrackMetrics
+from orthonav.ground.evaluate.track import GnssMetrics, TrackMetrics
 from orthonav.ground.report import aligned, measure_text, percent_text, to_plain
 from orthonav.ground.report.drawing import Background
 
 Plain = dict[str, Any]
-_COLUMNS = (
-    *("run", "views", "confident", "wrong", "low confidence", "coverage", "right", "of fixes"),
-    *("median m", "95 % m", "max m", "latency ms"),
-)
-STANDARD_HEADER = ("", "fixes", "RMSE m", "mean m", "median m", "std m", "max m", "number")
-LABELS = {"confidence": "confidence", "lowe_ratio": "Lowe's ratio"}
-_EAST, _NORTH, _PITCH, _ROLL, _LATENCY = GNSS_BIASES
-_LEARNT = {
-    "learnt displacement of the map": ((_EAST, 1, "m east"), (_NORTH, 1, "m north")),
-    "learnt error of the mount": ((_PITCH, 2, "deg pitch"), (_ROLL, 2, "deg roll")),
-    "learnt latency": ((_LATENCY, 0, "ms"),),
-}
+Row = tuple[str, ...]
+Table = tuple[Row, list[Row]]
+"""Header and rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,61 +49,21 @@ class FlightReport:
 
 
 def metrics_to_json(metrics: Metrics) -> Plain:
-    same = (
-        *("n_views", "n_fixes", "n_confident", "n_confident_wrong", "wrong_above_m"),
-        *("wrong_upper_95", "availability", "availability_95", "n_without_truth"),
-        *("n_without_result", "radius_m", "coverage"),
-    )
-    confident, standard = metrics.of_confident, metrics.standard
-    found = metrics.consistency
-    plain: Plain = to_plain(
-        {
-            **{name: getattr(metrics, name) for name in same},
-            "n_low_confidence": metrics.n_fixes - metrics.n_confident,
-            "longest_gap_s": metrics.gap.seconds_s,
-            "longest_gap_m": metrics.gap.path_m,
-            "confident_error_median_m": confident.cep50_m,
-            "confident_error_p95_m": confident.cep95_m,
-            "confident_error_max_m": confident.ape.max_m,
-            **{radius_key(r): share for r, share in metrics.acc_at_m.items()},
-            **{f"fixes_{radius_key(r)}": share for r, share in metrics.acc_fixes_at_m.items()},
-            "error_median_m": standard.cep50_m,
-            "error_p95_m": standard.cep95_m,
-            "error_mean_m": standard.ape.mean_m,
-            "error_max_m": standard.ape.max_m,
-            "latency_median_ms": metrics.latency_median_ms,
-            "latency_p95_ms": metrics.latency_p95_ms,
-            "reasons": metrics.reasons,
-            "criteria": metrics.criteria,
-            "standard": _standard_to_json(standard),
-            "standard_of_confident": _standard_to_json(confident),
-            "calibration": metrics.calibration,
-            **({} if metrics.integrity is None else {"integrity": metrics.integrity}),
-            "covariance": {
-                "n_right": found.n_right,
-                "n_nees": found.nees.size,
-                "n_without_covariance": found.n_without,
-                "n_unusable_covariance": found.n_unusable,
-                "nees_mean": found.nees_mean,
-                "nees_median": found.nees_median,
-                **{f"nees_within_{100 * p:g}": share for p, share in found.within.items()},
-            },
-        }
-    )
+    plain: Plain = to_plain(metrics)
+    for name, prefix in (("acc_at_m", ""), ("acc_fixes_at_m", "fixes_")):
+        shares = plain.pop(name)
+        plain |= {f"{prefix}{radius_key(radius_m)}": each for radius_m, each in shares.items()}
+    plain["covariance"] = _consistency_to_json(metrics.consistency)
+    del plain["consistency"]
     return plain
 
 
-def _standard_to_json(standard: StandardFigures) -> Plain:
-    return {
-        "rmse_m": standard.ape.rmse_m,
-        "cep50_m": standard.cep50_m,
-        "cep95_m": standard.cep95_m,
-        "ape": standard.ape,
-        "rpe": [
-            {"delta": 1, "unit": "frames", **asdict(standard.rpe_frames)},
-            {"delta": RPE_DISTANCE_M, "unit": "m", **asdict(standard.rpe_distance)},
-        ],
-    }
+def _consistency_to_json(found: Consistency) -> Plain:
+    plain: Plain = to_plain(found)
+    within = plain.pop("within").items()
+    plain |= {f"nees_within_{100 * level:g}": each for level, each in within}
+    plain["n_nees"] = len(plain.pop("nees"))
+    return {**plain, "verdict": found.verdict or None}
 
 
 def runs_to_json(runs: Sequence[FlightReport]) -> Plain:
@@ -128,7 +78,7 @@ def runs_to_json(runs: Sequence[FlightReport]) -> Plain:
 def track_to_json(track: TrackMetrics) -> Plain:
     plain: Plain = to_plain({name: each for name, each in vars(track).items() if name != "series"})
     plain["first_view"] = plain["first_view"] and int(plain["first_view"])
-    plain["consistency"]["verdict"] = plain["consistency"]["verdict"] or None
+    plain["consistency"] = _consistency_to_json(track.consistency)
     after = plain["after"]
     after |= {radius_key(r): share for r, share in after.pop("acc_at_m").items()}
     names = ("seconds_s", "sigma_m", "bound_95_m", "along_m", "across_m")
@@ -185,7 +135,7 @@ def text(runs: Sequence[FlightReport]) -> str:
     for name, run in zip(names, runs, strict=True):
         judged = covariance_verdict(run.metrics.consistency)
         lines += [f"{name}{verdict(run.metrics)}", f"{name}{judged}"]
-    lines += ["", *aligned([table_header(runs[0].metrics), *table_rows(runs)])]
+    lines += ["", *_lines(runs_table(runs))]
     for name, run in zip(names, runs, strict=True):
         lines += ["", *([name.rstrip()] if name else []), summary(run)]
     return "\n".join(lines)
@@ -195,28 +145,30 @@ def _name(run: FlightReport) -> str:
     return " ".join(run.name.split())
 
 
+def _lines(table: Table) -> list[str]:
+    header, rows = table
+    return aligned([header, *rows])
+
+
 def summary(flight: FlightReport) -> str:
-    whole, rows = flight.metrics, list[tuple[str, str]]()
+    whole = flight.metrics
     low, high = map(percent_text, whole.availability_95)
-    gap = f"{measure_text(whole.gap.seconds_s, ' s')}, {measure_text(whole.gap.path_m, ' m')}"
     lines = [
         f"views with a confident fix: {percent_text(whole.availability)} (95 % interval {low} to "
-        f"{high}); longest gap {gap}",
-        "",
-        *aligned([STANDARD_HEADER, *standard_rows(whole)]),
-        "",
-        *aligned([criteria_header(whole), *criteria_rows(whole)]),
-        "",
+        f"{high}); longest gap {_stretch_text(whole.gap)}",
+        *("", *_lines(standard_table(whole))),
+        *("", *_lines(criteria_table(whole)), ""),
         f"confidence: {confidence_text(whole)}",
-        f"covariance: {covariance_text(whole.consistency)}",
+        f"covariance: {consistency_text(whole.consistency, 'correct fixes')}",
         *(f"{name}: {text}" for name, text in integrity_rows(whole)),
     ]
     if flight.track is not None:
         lines.append("track:")
-        rows += track_rows(flight.track)
-    if flight.gnss is not None:
-        rows += gnss_rows(flight.gnss)
-    return "\n".join([*lines, *(f"  {name}: {text}" for name, text in rows)])
+    return "\n".join([*lines, *(f"  {name}: {text}" for name, text in track_rows(flight))])
+
+
+def _stretch_text(stretch: Longest) -> str:
+    return f"{measure_text(stretch.seconds_s, ' s')}, {measure_text(stretch.path_m, ' m')}"
 
 
 def confidence_text(metrics: Metrics) -> str:
@@ -239,20 +191,17 @@ def integrity_rows(metrics: Metrics) -> list[tuple[str, str]]:
         return []
     beyond = _bounded(found.n_beyond, found.n_levels, found.beyond_upper_95)
     rows = [("errors beyond the protection level", f"{beyond}, at a risk of {found.risk:g}")]
-    if math.isfinite(found.alert_limit_m):
-        views, of_time = map(percent_text, (found.availability, found.availability_of_time))
-        outage = found.outage
-        longest = f"{measure_text(outage.seconds_s, ' s')}, {measure_text(outage.path_m, ' m')}"
-        limit = f"alert limit of {found.alert_limit_m:g} m"
-        false = _bounded(found.n_false, found.n_available, found.false_upper_95)
-        rows += [
-            (
-                f"available at the {limit}",
-                f"{views} of views, {of_time} of the time; longest outage {longest}",
-            ),
-            (f"available and beyond the {limit}", false),
-        ]
-    return rows
+    if not math.isfinite(found.alert_limit_m):
+        return rows
+    views, of_time = map(percent_text, (found.availability, found.availability_of_time))
+    outage = f"longest outage {_stretch_text(found.outage)}"
+    limit = f"alert limit of {found.alert_limit_m:g} m"
+    false = _bounded(found.n_false, found.n_available, found.false_upper_95)
+    return [
+        *rows,
+        (f"available at the {limit}", f"{views} of views, {of_time} of the time; {outage}"),
+        (f"available and beyond the {limit}", false),
+    ]
 
 
 def _bounded(part: int, whole: int, upper_95: float) -> str:
@@ -263,74 +212,60 @@ def _bounded(part: int, whole: int, upper_95: float) -> str:
     )
 
 
-def covariance_verdict(consistency: CovarianceConsistency) -> str:
-    if not consistency.nees.size:
+def covariance_verdict(found: Consistency) -> str:
+    if not found.nees.size:
         return "Whether covariances are right is unknown: no correct fix states one."
-    return f"Covariances are {_judged(consistency)}."
+    return f"Covariances are {_judged(found)}."
 
 
-def covariance_text(consistency: CovarianceConsistency) -> str:
-    if not consistency.n_right:
-        return "unknown, no fix is correct"
-    counts = ((consistency.n_without, "without one"), (consistency.n_unusable, "unusable"))
-    left_out = ", ".join(f"{count} {kind}" for count, kind in counts if count)
-    if not consistency.nees.size:
-        return f"unknown; of {consistency.n_right} correct fixes {left_out}"
+def consistency_text(found: Consistency, what: str) -> str:
+    """`what`: the fixes or views that were judged."""
+    counts = ((found.n_without, "without one"), (found.n_unusable, "unusable"))
+    left_out = "".join(f"; {count} {kind}" for count, kind in counts if count)
+    if not found.nees.size:
+        return f"unknown: {found.n} {what}{left_out}"
+    levels = " / ".join(f"{100 * level:g}" for level in found.within)
+    within = " / ".join(f"{100 * share:.1f}" for share in found.within.values())
     return (
-        f"{_judged(consistency)}; "
-        f"NEES of {consistency.nees.size} correct fixes has mean {consistency.nees_mean:.3g} "
-        f"(2 expected), median {consistency.nees_median:.3g} ({nees_bound(0.5):.2f} expected); "
-        f"{within_text(consistency)}" + (f"; {left_out}" if left_out else "")
+        f"{_judged(found)}; NEES of {found.nees.size} {what} has mean {found.nees_mean:.3g} "
+        f"(2 expected; 95 % interval {found.low:.2f} to {found.high:.2f} for "
+        f"{found.n_effective:.0f} independent ones), median {found.nees_median:.3g} "
+        f"({nees_bound(0.5):.2f} expected); {within} % within the bounds of {levels} %{left_out}"
     )
 
 
-def within_text(consistency: CovarianceConsistency) -> str:
-    levels = " / ".join(f"{100 * level:g}" for level in NEES_LEVELS)
-    found = " / ".join(f"{100 * consistency.within[level]:.1f}" for level in NEES_LEVELS)
-    return f"{found} % within the bounds of {levels} %"
+def _judged(found: Consistency) -> str:
+    times = f"errors are {math.sqrt(found.nees_mean / 2):.1f} times as large as stated"
+    return {
+        "over-confident": f"too small: {times}",
+        "under-confident": f"conservative: {times}",
+    }.get(found.verdict, "consistent with the errors")
 
 
-def _judged(consistency: CovarianceConsistency) -> str:
-    return nees_text(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))
+# Tables.
 
 
-def nees_text(nees: float, low: float, high: float) -> str:
-    times = f"errors are {math.sqrt(nees / 2):.1f} times as large as stated"
-    if nees > high:
-        return f"too small: {times}"
-    return f"conservative: {times}" if nees < low else "consistent with the errors"
+def runs_table(runs: Sequence[FlightReport]) -> Table:
+    right = f"acc@{runs[0].metrics.radius_m:g} m"
+    header = (
+        *("run", "views", "confident", "wrong", "low confidence", "coverage", right, "of fixes"),
+        *("median m", "95 % m", "max m", "latency ms"),
+    )
+    return header, [_run_row(_name(run), run.metrics) for run in runs]
 
 
-# Rows for the page.
+def _run_row(name: str, metrics: Metrics) -> Row:
+    n_low = metrics.n_fixes - metrics.n_confident
+    counts = (metrics.n_views, metrics.n_confident, metrics.n_confident_wrong, n_low)
+    shares = (metrics.coverage, metrics.accuracy, metrics.accuracy_of_fixes)
+    standard = metrics.standard
+    measures = (standard.cep50_m, standard.cep95_m, standard.ape.max_m, metrics.latency_median_ms)
+    return (name, *map(str, counts), *map(percent_text, shares), *map(measure_text, measures))
 
 
-def table_header(whole: Metrics) -> list[str]:
-    return [f"acc@{whole.radius_m:g} m" if name == "right" else name for name in _COLUMNS]
-
-
-def table_rows(runs: Sequence[FlightReport]) -> list[list[str]]:
-    return [
-        [
-            _name(run),
-            str(metrics.n_views),
-            str(metrics.n_confident),
-            str(metrics.n_confident_wrong),
-            str(metrics.n_fixes - metrics.n_confident),
-            percent_text(metrics.coverage),
-            percent_text(metrics.accuracy),
-            percent_text(metrics.accuracy_of_fixes),
-            measure_text(metrics.standard.cep50_m),
-            measure_text(metrics.standard.cep95_m),
-            measure_text(metrics.standard.ape.max_m),
-            measure_text(metrics.latency_median_ms),
-        ]
-        for run in runs
-        for metrics in [run.metrics]
-    ]
-
-
-def standard_rows(metrics: Metrics) -> list[tuple[str, ...]]:
-    return [
+def standard_table(metrics: Metrics) -> Table:
+    header = ("", "fixes", "RMSE m", "mean m", "median m", "std m", "max m", "number")
+    return header, [
         (name, kind, *map(measure_text, list(vars(found).values())[1:]), str(found.n))
         for kind, standard in (("confident", metrics.of_confident), ("all", metrics.standard))
         for name, found in (
@@ -341,16 +276,14 @@ def standard_rows(metrics: Metrics) -> list[tuple[str, ...]]:
     ]
 
 
-def criteria_header(metrics: Metrics) -> tuple[str, ...]:
-    within = f"precision within {metrics.radius_m:g} m"
-    names = ("criterion", "at least", "accepted", "of all views")
-    return (*names, within, "recall", f"wrong by > {FAR_M:g} m")
-
-
-def criteria_rows(metrics: Metrics) -> list[tuple[str, ...]]:
-    return [
+def criteria_table(metrics: Metrics) -> Table:
+    header = (
+        *("criterion", "at least", "accepted", "of all views"),
+        *(f"precision within {metrics.radius_m:g} m", "recall", f"wrong by > {FAR_M:g} m"),
+    )
+    return header, [
         (
-            LABELS[row.name],
+            "Lowe's ratio" if row.name == "lowe_ratio" else row.name,
             f"{row.threshold:g}",
             str(row.n_accepted),
             percent_text(row.share_accepted),
@@ -362,64 +295,52 @@ def criteria_rows(metrics: Metrics) -> list[tuple[str, ...]]:
     ]
 
 
-def track_rows(track: TrackMetrics) -> list[tuple[str, str]]:
+def track_rows(flight: FlightReport) -> list[tuple[str, str]]:
+    """What is said of the track and of GNSS, where there are any."""
+    return [
+        *([] if flight.track is None else _track_rows(flight.track)),
+        *([] if flight.gnss is None else gnss_rows(flight.gnss)),
+    ]
+
+
+def _track_rows(track: TrackMetrics) -> list[tuple[str, str]]:
     after, errors, found = track.after, "unknown", "never"
     if math.isfinite(track.first_view):
         first = f"view {track.first_view:.0f} of {track.n_views}"
-        found = f"{first}, {_unit(track.first_s, 's')} after the first"
+        found = f"{first}, {measure_text(track.first_s, ' s')} after the first"
     if after.n_views:
         within = ", ".join(f"{percent_text(s)} within {r:g} m" for r, s in after.acc_at_m.items())
-        errors = (
-            f"median {_unit(after.error_median_m, 'm')}, 95 % {_unit(after.error_p95_m, 'm')}, "
-            f"largest {_unit(after.error_max_m, 'm')}; of {after.n_views} views {within}"
-        )
+        values = (after.error_median_m, after.error_p95_m, after.error_max_m)
+        median, p95, most = (measure_text(value, " m") for value in values)
+        errors = f"median {median}, 95 % {p95}, largest {most}; of {after.n_views} views {within}"
     by_view = ", ".join(f"{name} {percent_text(track.share_of_views[name])}" for name in STATES)
     by_time = ", ".join(percent_text(track.share_of_time[name]) for name in STATES)
     lost = f"lost {track.n_lost} time{'s' * (track.n_lost != 1)}"
-    without, after_first = (
-        f"{_unit(each.seconds_s, 's')}, {_unit(each.path_m, 'm')}"
-        for each in (track.low_confidence, track.low_confidence_after)
+    without, after_first = map(_stretch_text, (track.low_confidence, track.low_confidence_after))
+    wrong = (
+        f"{track.n_false_locks} times, the longest "
+        f"{measure_text(track.false_lock_longest_s, ' s')}; {track.n_confident_wrong} confident or "
+        f"tracking views, each off by more than {_far_text(track.far_m)}"
     )
+    gaps = f"{without}; from the first confirmed fix on {after_first}"
     return [
         ("first confirmed fix", found),
         ("errors from then on", errors),
         ("states", f"{by_view} of views; {by_time} of the time; {lost}"),
-        (
-            "longest without a confident fix",
-            f"{without}; from the first confirmed fix on {after_first}",
-        ),
-        (
-            "on wrong positions",
-            f"{track.n_false_locks} times, the longest {_unit(track.false_lock_longest_s, 's')}; "
-            f"{track.n_confident_wrong} confident or tracking views, each off by more than "
-            f"{_far_text(track.far_m)}",
-        ),
+        ("longest without a confident fix", gaps),
+        ("on wrong positions", wrong),
         ("ahead of the ground truth", spread_text(track.along)),
         ("right of the ground truth", spread_text(track.across)),
-        ("covariance", track_consistency_text(track.consistency)),
+        ("covariance", consistency_text(track.consistency, "tracking views")),
     ]
 
 
-def track_consistency_text(found: TrackConsistency) -> str:
-    if not found.n_views:
-        return "unknown, no tracking view has a usable one and a true position"
-    left_out = f"; {found.n_left_out} without a usable one" if found.n_left_out else ""
-    return (
-        f"{nees_text(found.nees_mean, found.effective_low, found.effective_high)}; "
-        f"NEES of {found.n_views} tracking views has mean {found.nees_mean:.3g} "
-        f"(2 expected; 95 % interval {found.effective_low:.2f} to {found.effective_high:.2f} for "
-        f"{found.n_effective:.0f} effective views, as errors are correlated); "
-        f"{percent_text(found.nees_within_95)} below {nees_bound(0.95):.2f} (95 % expected)"
-        f"{left_out}"
-    )
-
-
-def spread_text(spread: Spread) -> str:
-    if not spread.n_views:
+def spread_text(errors: ErrorStatistics) -> str:
+    if not errors.n:
         return "unknown"
     return (
-        f"mean {spread.mean_m:+.1f} m, standard deviation {spread.std_m:.1f} m, "
-        f"RMSE {spread.rmse_m:.1f} m of {spread.n_views} tracking views"
+        f"mean {errors.mean_m:+.1f} m, standard deviation {errors.std_m:.1f} m, "
+        f"RMSE {errors.rmse_m:.1f} m of {errors.n} tracking views"
     )
 
 
@@ -430,19 +351,21 @@ def gnss_rows(found: GnssMetrics) -> list[tuple[str, str]]:
         ("difference of GNSS and map", percentiles_text(found.differences_m)),
         ("GNSS alarms", f"{len(named)}{': ' if named else ''}{', '.join(named)}"),
     ]
-    for name, pairs in _LEARNT.items() if found.learnt else ():
-        texts = [
-            f"{found.learnt[key]:.{digits}f} +- {found.learnt[std_key]:.{digits}f} {unit}"
-            for (key, std_key), digits, unit in pairs
-        ]
-        rows.append((name, ", ".join(texts)))
-    return rows
+    if not found.learnt:
+        return rows
+    units = ((1, "m east"), (1, "m north"), (2, "deg pitch"), (2, "deg roll"), (0, "ms"))
+    east, north, pitch, roll, latency = (
+        f"{found.learnt[key]:.{digits}f} +- {found.learnt[std_key]:.{digits}f} {unit}"
+        for (key, std_key), (digits, unit) in zip(BIASES, units, strict=True)
+    )
+    return [
+        *rows,
+        ("learnt displacement of the map", f"{east}, {north}"),
+        ("learnt error of the mount", f"{pitch}, {roll}"),
+        ("learnt latency", latency),
+    ]
 
 
 def percentiles_text(values: FloatArray) -> str:
     median, p95, most = (measure_text(percentile(values, q), " m") for q in (50, 95, 100))
     return f"median {median}, 95 % {p95}, largest {most}"
-
-
-def _unit(value: float, unit: str) -> str:
-    return f"{value:.1f} {unit}" if math.isfinite(value) else f"- {unit}"

@@ -16,19 +16,20 @@ from orthonav.core.flight.fixes import STATES
 from orthonav.core.flight.gnss import biases_of, fault_of, gnss_of
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, ViewResult
-from orthonav.ground.evaluate.metrics import FAR_M, Comparison
+from orthonav.ground.evaluate.metrics import FAR_M, Comparison, places_en_m
 from orthonav.ground.evaluate.statistics import (
     BoolArray,
+    Consistency,
+    ErrorStatistics,
     FloatArray,
     Longest,
+    consistency,
+    error_statistics,
     frozen,
     is_covariance,
     longest,
     longest_stretch,
-    mean,
     nees_bound,
-    nees_mean_bounds,
-    normalized_squared,
     path_so_far_m,
     percentile,
     runs,
@@ -53,36 +54,6 @@ class After:
     error_p95_m: float
     error_max_m: float
     acc_at_m: Mapping[float, float]
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Mean (bias), standard deviation and RMSE of signed errors in metres, over `n_views` views."""
-
-    n_views: int
-    mean_m: float
-    std_m: float
-    rmse_m: float
-
-
-@dataclass(frozen=True)
-class TrackConsistency:
-    """NEES (2 degrees of freedom, 2 expected) of the tracking views.
-
-    `n_left_out`: views without a usable covariance; `nees_within_95`: share below the 95 % bound.
-    `n_effective`: effective number of views, as errors of consecutive views are correlated;
-    `effective_*`: the 95 % interval of the mean of so many independent views, which decides the
-    verdict ("" without views).
-    """
-
-    n_views: int
-    n_left_out: int
-    nees_mean: float
-    nees_within_95: float
-    n_effective: float
-    effective_low: float
-    effective_high: float
-    verdict: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +85,7 @@ class TrackMetrics:
     `low_confidence_after`: the same from the first confirmed fix on.
     `n_confident_wrong`: views that are tracking, or confident, with an error above `far_m` and
     above the radius that the fix states; `n_false_locks`: stretches of such views.
-    `along`, `across`: errors ahead and to the right, of the tracking views.
+    `along`, `across`: signed errors ahead and to the right, of the tracking views.
     """
 
     n_views: int
@@ -130,9 +101,9 @@ class TrackMetrics:
     n_confident_wrong: int
     n_false_locks: int
     false_lock_longest_s: float
-    along: Spread
-    across: Spread
-    consistency: TrackConsistency
+    along: ErrorStatistics
+    across: ErrorStatistics
+    consistency: Consistency
     series: TrackSeries
 
 
@@ -182,8 +153,8 @@ def measure_track(
         n_confident_wrong=int(np.count_nonzero(wrong)),
         n_false_locks=len(runs(wrong)),
         false_lock_longest_s=longest_stretch(wrong, seconds_s[rows]),
-        along=_spread(series.along_m[tracking[rows]]),
-        across=_spread(series.across_m[tracking[rows]]),
+        along=error_statistics(series.along_m[tracking[rows]]),
+        across=error_statistics(series.across_m[tracking[rows]]),
         consistency=check_consistency(
             (comparison.fix_en_m - comparison.truth_en_m)[tracking[rows]],
             comparison.cov_en_m2[tracking[rows]],
@@ -213,30 +184,10 @@ def course_en(truth_en_m: FloatArray) -> FloatArray:
     return course
 
 
-def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> TrackConsistency:
-    """Consistency of errors (N, 2) of consecutive views with their covariances (N, 2, 2).
-
-    n times the mean NEES of n independent views follows chi-square with 2 n degrees of freedom
-    (Bar-Shalom et al., "Estimation with applications to tracking and navigation", 2001, section
-    5.4); for correlated errors the effective number of views replaces n.
-    """
-    usable = is_covariance(cov_en_m2) & np.isfinite(errors_en_m).all(axis=1)
-    errors_en_m, cov_en_m2 = errors_en_m[usable], cov_en_m2[usable]
-    nees = normalized_squared(errors_en_m, cov_en_m2)
-    n_effective = effective_number(_whitened(errors_en_m, cov_en_m2))
-    low, high = nees_mean_bounds(n_effective)
-    found = mean(nees)
-    verdict = "over-confident" if found > high else "consistent"
-    verdict = "under-confident" if found < low else verdict
-    return TrackConsistency(
-        n_views=nees.size,
-        n_left_out=int(np.count_nonzero(~usable)),
-        nees_mean=found,
-        nees_within_95=share_of(nees <= nees_bound(0.95)),
-        n_effective=n_effective,
-        effective_low=low,
-        effective_high=high,
-        verdict=verdict if nees.size else "",
+def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> Consistency:
+    """Consistency of errors (N, 2) of consecutive views, which are correlated."""
+    return consistency(
+        errors_en_m, cov_en_m2, lambda errors, cov: effective_number(_whitened(errors, cov))
     )
 
 
@@ -280,12 +231,6 @@ def _shares(states: NDArray[np.str_], weights: FloatArray) -> Mapping[str, float
     found = {name: float(weights[states == name].sum()) for name in STATES}
     known = whole > 0.0  # not NaN
     return {name: part / whole if known else math.nan for name, part in found.items()}
-
-
-def _spread(errors_m: FloatArray) -> Spread:
-    known = errors_m[np.isfinite(errors_m)]
-    std_m = float(known.std()) if known.size else math.nan
-    return Spread(known.size, mean(known), std_m, math.sqrt(mean(known**2)))
 
 
 def _whitened(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatArray:
@@ -343,11 +288,7 @@ def measure_gnss(comparison: Comparison, results: Sequence[ViewResult]) -> GnssM
     places = [gnss_of(each) for each in evidence]
     if not any(places):
         return None
-    frame = LocalFrame(comparison.lat_deg, comparison.lon_deg)
-    en_m = np.full((len(places), 2), np.nan)
-    for i, place in enumerate(places):
-        if place is not None:
-            en_m[i] = frame.en_from_latlon(*place)
+    en_m = places_en_m(LocalFrame(comparison.lat_deg, comparison.lon_deg), places)
     return GnssMetrics(
         seconds_since_first(comparison.time_ns),
         frozen(np.hypot(*(en_m - comparison.truth_en_m).T)),

@@ -14,8 +14,6 @@ import numpy as np
 
 BY_UNIT = -1
 """Decimals that the last word of a field's name asks for: a centimetre, say."""
-_DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4, "km2": 4}
-_FRACTION_DIGITS = 3
 
 
 def to_plain(value: Any, digits: int | None = None) -> Any:
@@ -43,7 +41,8 @@ def to_plain(value: Any, digits: int | None = None) -> Any:
 def _digits(name: str, digits: int | None) -> int | None:
     if digits != BY_UNIT:
         return digits
-    return _DIGITS.get(name.rpartition("_")[2], _FRACTION_DIGITS)
+    by_unit = {"m": 2, "s": 2, "deg": 7, "km2": 4}
+    return by_unit.get(name.rpartition("_")[2], 3)
 
 
 def percent_text(value: float) -> str:

@@ -8,8 +8,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -24,12 +23,9 @@ if TYPE_CHECKING:
 
 RIGHT, WRONG, TRUTH, GREY, INK = "#0072B2", "#D55E00", "#1A1A1A", "#8C8C8C", "#222222"
 SOFT = "#555555"
-LOW_CONFIDENCE = "#E69F00"
-"""Of best guesses, as confident fixes have the colour `RIGHT`."""
+LOW_CONFIDENCE = "#E69F00"  # of best guesses, as confident fixes have the colour `RIGHT`
 DPI = 220
 """Resolution of the PNG: twice that of a screen, and enough for a paper."""
-MOST_POINTS = 5_000
-"""Lines of more points are rasterized in the SVG, which would be too large to open."""
 OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
 BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
 """Box (`bbox`) that keeps text readable on any background."""
@@ -38,7 +34,7 @@ LEGEND_ABOVE: dict[str, Any] = {
     "bbox_to_anchor": (0.5, 1.0),
     "frameon": False,
 }
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.edgecolor": GREY,
     "axes.labelcolor": INK,
@@ -58,8 +54,7 @@ _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text
     "svg.hashsalt": "orthonav",  # names inside the file are the same every time
 }
-_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_NO_METADATA = {"Date": None, "Creator": None}
+NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True)
@@ -79,50 +74,25 @@ def draw_axes(size_in: tuple[float, float], draw: "Callable[[Axes], None]") -> D
 def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") -> Drawing:
     """A drawing of `size_in` inches; raises `MissingExtraError` without matplotlib."""
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.backends.backend_svg import FigureCanvasSVG
+        import matplotlib
         from matplotlib.figure import Figure
     except ImportError as error:
         raise missing_extra("drawing figures", "report", "matplotlib", error) from error
-    svg = io.StringIO()
-    with _own_style():
-        figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")
-        canvas: Any = FigureCanvasAgg(figure)
-        draw(figure)
-        canvas.draw()
-        png = _png(np.asarray(canvas.buffer_rgba()))
-        figure.set_layout_engine("none")  # PNG and SVG share one layout
-        for line in (line for axes in figure.axes for line in axes.lines):
-            if np.size(line.get_xdata()) > MOST_POINTS:
-                line.set_rasterized(True)
-        # As `savefig`, which draws once more before, for a layout.
-        page: Any = FigureCanvasSVG(figure)
-        page.print_svg(svg, metadata=_NO_METADATA)
-    return Drawing(png, _NOT_XML.sub("\ufffd", svg.getvalue()), size_in)
-
-
-def _png(rgba: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    out = io.BytesIO()
-    image = Image.fromarray(rgba).convert("RGB").quantize(colors=256)
-    image.save(out, format="PNG", compress_level=6, dpi=(DPI, DPI))
-    return out.getvalue()
-
-
-@contextmanager
-def _own_style() -> Iterator[None]:
-    import matplotlib
-
+    png, svg = io.BytesIO(), io.StringIO()
     with matplotlib.rc_context(), warnings.catch_warnings():
         # Characters that the font of the PNG lacks are shown as boxes.
         warnings.filterwarnings("ignore", "Glyph .* missing from")
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
-        yield
-
-
-_BACKGROUND_LEVELS = 15  # few grey levels keep the PNG small
+        matplotlib.rcParams.update(STYLE)
+        figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")
+        draw(figure)
+        figure.savefig(png, format="png")
+        figure.set_layout_engine("none")  # PNG and SVG share one layout
+        for line in (line for axes in figure.axes for line in axes.lines):
+            if np.size(line.get_xdata()) > 5_000:  # as vectors too large to open
+                line.set_rasterized(True)
+        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+    return Drawing(png.getvalue(), NOT_XML.sub("\ufffd", svg.getvalue()), size_in)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +105,11 @@ class Background:
 
 def draw_map(axes: "Axes", box: tuple[float, ...], background: Background | None = None) -> None:
     """The base of a map; `box` is the visible part: west, east, south, north in metres."""
-    if background is not None:  # pale, in few grey levels
-        levels = np.round(background.grey / 255 * _BACKGROUND_LEVELS) / _BACKGROUND_LEVELS
+    if background is not None:  # pale, in few grey levels that keep files small
+        pale = 0.45 + 0.55 * np.round(background.grey / 17) / 15
         looks: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 1, "interpolation": "none"}
         west, south, east, north = background.box
-        axes.imshow(0.45 + 0.55 * levels, extent=(west, east, south, north), **looks)
+        axes.imshow(pale, extent=(west, east, south, north), **looks)
         axes.grid(visible=False)
     axes.set(xlim=box[:2], ylim=box[2:], aspect="equal")
     axes.set(xlabel="east (m)", ylabel="north (m)")
@@ -147,13 +117,11 @@ def draw_map(axes: "Axes", box: tuple[float, ...], background: Background | None
     draw_north(axes)
 
 
-def map_size_in(
-    box: tuple[float, ...], longest_in: float, least_in: tuple[float, float] = (3.0, 3.0)
-) -> tuple[float, float]:
+def map_size_in(box: tuple[float, ...], longest_in: float) -> tuple[float, float]:
     """Width and height in inches of a drawing of `box`, an inch for the axes included."""
     width_m, height_m = box[1] - box[0], box[3] - box[2]
     scale = longest_in / max(width_m, height_m)
-    return max(scale * width_m, least_in[0]) + 1.0, max(scale * height_m, least_in[1]) + 1.0
+    return max(scale * width_m, 3.0) + 1.0, max(scale * height_m, 3.0) + 1.0
 
 
 def draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:

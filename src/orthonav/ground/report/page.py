@@ -21,21 +21,7 @@ from orthonav.core.extras import missing_extra
 from orthonav.core.files import replacing, replacing_folder, write_text
 from orthonav.ground.report.drawing import Drawing
 
-FOLDER = "figures"
 LIST = "orthonav.sha256"
-_LONGEST_NAME = 80
-_PX_PER_IN = 110
-"""Pixels of a page per inch of a drawing: text of 10 points becomes 15 pixels high."""
-_DARK = """
-@media (prefers-color-scheme: dark) {
-#figure_1 { filter: invert(1) hue-rotate(180deg) }
-[clip-path] > image { filter: brightness(.45) invert(1) } }
-"""
-"""Style of a drawing in a page: lightness is inverted in dark mode, imagery only darkened."""
-_MODULE_SYNTAX = re.compile(r"^(?:export |import .*$)", re.MULTILINE)
-_IMAGE = re.compile(r"url\((images/[\w-]+\.png)\)")
-_SOURCE_MAP = re.compile(r"^//# sourceMappingURL=.*$", re.MULTILINE)
-_VML = re.compile(r"behavior:\s*url\(#default#VML\);")  # for Internet Explorer 8
 
 
 @dataclass(frozen=True)
@@ -49,12 +35,19 @@ class Figure:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        width, height = (round(_PX_PER_IN * side) for side in self.drawing.size_in)
+        """Of text of 10 points, which becomes 15 pixels high."""
+        width, height = (round(110 * side) for side in self.drawing.size_in)
         return width, height
 
     @property
     def data_url(self) -> str:
-        svg = self.drawing.svg.replace("</style>", f"{_DARK}</style>", 1)
+        """The SVG; in dark mode lightness is inverted, imagery only darkened."""
+        dark = """
+@media (prefers-color-scheme: dark) {
+#figure_1 { filter: invert(1) hue-rotate(180deg) }
+[clip-path] > image { filter: brightness(.45) invert(1) } }
+"""
+        svg = self.drawing.svg.replace("</style>", f"{dark}</style>", 1)
         return data_url(svg.encode("utf-8"), "image/svg+xml")
 
 
@@ -109,7 +102,7 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> None:
     changed files, or cannot be written.
     """
     lines = []
-    with replacing_folder(Path(folder) / FOLDER, _is_ours) as made:
+    with replacing_folder(Path(folder) / "figures", _is_ours) as made:
         for figure in figures:
             svg = figure.drawing.svg.encode("utf-8")
             for kind, data in (("svg", svg), ("png", figure.drawing.png)):
@@ -142,7 +135,7 @@ def file_names(texts: Sequence[str]) -> list[str]:
     for text in texts:
         plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode("ascii")
         plain = re.sub(r"-+", "-", re.sub(r"[^A-Za-z0-9._]+", "-", plain))
-        base = plain[:_LONGEST_NAME].strip("-._") or "flight"
+        base = plain[:80].strip("-._") or "flight"
         name, count = base, 1
         while name.lower() in taken:
             count += 1
@@ -162,8 +155,8 @@ def joined_scripts(shared: Sequence[str], package: str, own: Sequence[str]) -> s
     A page that is opened from a disk cannot import modules, so `export` and `import` are removed.
     """
     texts = [static_text(name) for name in shared] + [static_text(name, package) for name in own]
-    plain = [_MODULE_SYNTAX.sub("", text) for text in texts]
-    return f'(() => {{\n"use strict";\n{"".join(plain)}}})();'
+    plain = re.sub(r"^(?:export |import .*$)", "", "".join(texts), flags=re.MULTILINE)
+    return f'(() => {{\n"use strict";\n{plain}}})();'
 
 
 def data_url(data: bytes, media_type: str) -> str:
@@ -176,13 +169,16 @@ def _source(text: str) -> str:
 
 
 def load_leaflet() -> tuple[str, str]:
+    """Script and style sheet, images included, without their source map and the rules for Internet
+    Explorer 8."""
     script, style = leaflet_files("leaflet.js", "leaflet.css")
-    css = _IMAGE.sub(
+    css = re.sub(
+        r"url\((images/[\w-]+\.png)\)",
         lambda found: f"url({data_url((style.parent / found[1]).read_bytes(), 'image/png')})",
         style.read_text(encoding="utf-8"),
     )
-    text = _SOURCE_MAP.sub("", script.read_text(encoding="utf-8"))
-    return text.strip(), _VML.sub("", css).strip()
+    text = script.read_text(encoding="utf-8").partition("//# sourceMappingURL")[0]
+    return text.strip(), re.sub(r"behavior:\s*url\(#default#VML\);", "", css).strip()
 
 
 def leaflet_files(*names: str) -> list[Path]:

@@ -6,7 +6,6 @@ screen can show; unknown values are None.
 
 import logging
 import math
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
@@ -18,22 +17,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.core.errors import FlightError, MissingFileError, OrthonavError, UsageError
+from orthonav.core.errors import FlightError, MissingFileError, UsageError
 from orthonav.core.files import with_paths
 from orthonav.core.flight import read_truth
 from orthonav.core.flight.fixes import STATES, flight_digest
 from orthonav.core.flight.gnss import fault_of, gnss_of
-from orthonav.core.flight.mount import Mount, read_mount
+from orthonav.core.flight.mount import read_mount
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult, error_ellipse
 from orthonav.ground.evaluate.metrics import (
     FAR_M,
+    LatLon,
     check_truth,
+    place_of,
+    places_en_m,
     protection_levels_m,
+    reason_of,
     warn_of_another_run,
 )
-from orthonav.ground.recordings import Recording, SourceOptions, open_source
+from orthonav.ground.recordings import SourceOptions, open_source
 from orthonav.ground.recordings.flightlog import is_flight_log
 from orthonav.ground.recordings.opening import source_kind
 from orthonav.ground.report import to_plain
@@ -48,13 +51,11 @@ from orthonav.ground.report.imagery import (
     shrunk_px,
     window_of,
 )
-from orthonav.ground.view.feed import Batch, LineFeed, LogReader, Shot
 from orthonav.ground.view.perspective import map_in_view
+from orthonav.ground.view.recorded import LoggedRun, Recorded, RecordedImages, Shot, read_lines
 
 Array = NDArray[np.float64]
-LatLon = tuple[float, float]
-Feed = LineFeed | LogReader
-FAR_AWAY_PX = 1e9
+Images = LoggedRun | RecordedImages
 RAW_PX = 640
 log = logging.getLogger(__name__)
 
@@ -68,7 +69,6 @@ class ViewRequest:
     truth: Path | None = None
     mount: Path | None = None
     radius_m: float = 15.0
-    live: bool = False
     source: SourceOptions = field(default_factory=partial(SourceOptions, skip_bad_images=True))
     """How `flight` is read, where it is no flight log."""
 
@@ -83,69 +83,70 @@ class Run:
     there is no image or position.
     """
 
-    def __init__(
-        self,
-        labels: dict[str, Any],
-        feed: Feed,
-        images: "LogReader | RecordedImages | None",
-        sheet: SheetImagery,
-        truth: Mapping[str, LatLon],
-        radius_m: float,
-        mount: Mount | None = None,
-        second: Mapping[str, ViewResult] | None = None,
-    ) -> None:
-        """Read what exists. `labels`: names of the files for the page, and whether it is `live`.
-        `mount`: None: that of the flight log, where the feed is one. `second`: results of another
-        run of the same flight by frame, to compare.
+    def __init__(self, request: ViewRequest) -> None:
+        """Reads the run and logs its problems.
 
-        Raises what the feed raises, and `FlightError` for an empty run.
+        Raises an `OrthonavError` where a given file is missing or damaged, or the run is empty.
         """
-        self._mount = mount
-        self.labels, self.sheet = labels, sheet
-        self._feed, self._images = feed, images
-        self._truth, self._radius_m, self._second = truth, radius_m, second
-        self._lock = threading.Lock()
-        self._generation = 1
-        self._results: list[ViewResult] = []
-        self._health: list[dict[str, Any]] = []
-        self._columns: dict[str, list[Any]] = {}
-        self.problems: list[str] = []
-        self._trouble = ""
-        self._take(feed.poll())
-        if not self._results and not labels["live"]:
-            reason = f": {self.problems[0]}" if self.problems else ""
-            raise FlightError(f"run has no views{reason}: {labels['name']}")
+        if not 0 < request.radius_m < 1e7:
+            raise UsageError(f"radius_m must be above 0, got {request.radius_m}")
+        opened = open_map(request.map_path)
+        self.request, self.sheet = request, SheetImagery(opened)
+        self.recorded = _read(request.run)
+        second = None if request.second is None else _read(request.second).results
+        self._second = None if second is None else {result.frame: result for result in second}
+        self._images = _images(request, self.recorded)
+        self._mount = self.recorded.mount if request.mount is None else read_mount(request.mount)
+        self._truth, self.truth_name = _truth(request, self._images)
+        if self._truth:
+            centre = self.sheet.frame.lat_deg, self.sheet.frame.lon_deg
+            check_truth(self._truth, (), centre, Path(self.truth_name))
+        self._columns = columns_of(
+            self.recorded.results, self._truth, self.sheet, request.radius_m, self._second
+        )
+        self._warn(opened)
 
-    @property
-    def count(self) -> int:
-        return len(self._results)
+    def _warn(self, opened: MapFile) -> None:
+        request, images, sha256 = self.request, self._images, None
+        if isinstance(images, RecordedImages):
+            sha256 = flight_digest(images.views.values())
+        flown = self.recorded.session.get("map")
+        if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
+            name = flown.get("name")
+            log.warning("the flight used another map (%.80s): %s", name, request.map_path)
+        for path in filter(None, (request.run, request.second)):
+            if path.is_file() and not is_log(path):
+                warn_of_another_run(path, opened, request.flight, sha256)
+        if self.truth_name and not self.any_known("tx"):
+            log.warning("no view of the run has a true position in %s", self.truth_name)
+        if request.second is not None and not self.any_known("x2"):
+            log.warning("no view has a position in the second run: %s", request.second)
 
     def any_known(self, column: str) -> bool:
-        return any(value is not None for value in self._columns.get(column, ()))
+        return any(value is not None for value in self._columns[column])
 
     def summary(self) -> dict[str, Any]:
+        request, images = self.request, self._images
         return {
-            **self.labels,
+            "name": request.run.name or str(request.run),
+            "map_name": request.map_path.name,
+            "images": "" if images is None else (request.flight or request.run).name,
+            "truth": self.truth_name,
+            "second": request.second.name if request.second else "",
             "version": __version__,
-            "radius_m": self._radius_m,
+            "radius_m": request.radius_m,
             "states": list(STATES),
             "sheet": self.sheet.plain(),
         }
 
-    def news(self, generation: int, views: int, health: int) -> dict[str, Any]:
-        """What is new after so many views and lines of health; all for another `generation`."""
-        with self._lock:
-            self._refresh()
-            if generation != self._generation:
-                views, health = 0, 0
-            return {
-                "generation": self._generation,
-                "first": views,
-                "count": len(self._results),
-                "columns": {name: each[views:] for name, each in self._columns.items()},
-                "health": self._health[health:],
-                "problems": [*self.problems, *([self._trouble] if self._trouble else [])],
-            }
+    def views(self) -> dict[str, Any]:
+        """All views as columns, and what else was recorded."""
+        recorded = self.recorded
+        return {
+            "columns": self._columns,
+            "health": recorded.health,
+            "problems": recorded.problems,
+        }
 
     def detail(self, index: int) -> dict[str, Any]:
         result = self._result(index)
@@ -161,8 +162,8 @@ class Run:
             found |= {"reason": outcome.reason, "detail": outcome.detail}
         other = (self._second or {}).get(result.frame)
         places = {
-            "": _place(outcome),
-            "second_": None if other is None else _place(other.outcome),
+            "": place_of(outcome),
+            "second_": None if other is None else place_of(other.outcome),
             "true_": self._truth.get(result.frame),
         }
         for name, place in places.items():
@@ -187,7 +188,7 @@ class Run:
 
     def map_png(self, index: int, at: str) -> bytes:
         result = self._result(index)
-        place = self._truth.get(result.frame) if at == "truth" else _place(result.outcome)
+        place = self._truth.get(result.frame) if at == "truth" else place_of(result.outcome)
         if place is None:
             raise FlightError(f"view {result.frame} has no such position: {at}")
         window = self._placed(result)[2]
@@ -197,7 +198,7 @@ class Run:
     def map_in_view_png(self, index: int) -> bytes:
         """The map from the fix, in the picture of the camera, as large as `raw_jpeg`."""
         result = self._result(index)
-        place = _place(result.outcome)
+        place = place_of(result.outcome)
         if place is None:
             raise FlightError(f"view {result.frame} has no fix")
         shot, telemetry, _ = self._placed(result)
@@ -206,10 +207,9 @@ class Run:
         return png(*map_in_view(self.sheet, shot.camera.resized(*size_px), telemetry, at_en_m))
 
     def _result(self, index: int) -> ViewResult:
-        with self._lock:
-            if not 0 <= index < len(self._results):
-                raise IndexError(f"no view {index}")
-            return self._results[index]
+        if not 0 <= index < len(self.recorded.results):
+            raise IndexError(f"no view {index}")
+        return self.recorded.results[index]
 
     def _shot(self, result: ViewResult) -> Shot:
         if self._images is None:
@@ -219,70 +219,25 @@ class Run:
     def _placed(self, result: ViewResult) -> tuple[Shot, Telemetry, GroundWindow]:
         """A view without the errors of its mount, the telemetry corrected by its fix, and the
         ground that it shows."""
-        shot, mount = self._shot(result), self._mount
-        if mount is None and isinstance(self._feed, LogReader):
-            mount = self._feed.mount
-        if mount is not None:
-            shot = replace(shot, telemetry=mount.corrected(shot.telemetry))
+        shot = self._shot(result)
+        if self._mount is not None:
+            shot = replace(shot, telemetry=self._mount.corrected(shot.telemetry))
         telemetry = as_fixed(shot.telemetry, result)
         return shot, telemetry, window_of(telemetry, shot.camera, self.sheet.grid.gsd_m)
-
-    def _refresh(self) -> None:
-        if not self.labels["live"]:
-            return
-        try:
-            if isinstance(self._images, LogReader) and self._images is not self._feed:
-                self._images.poll()
-            self._take(self._feed.poll())
-            self._trouble = ""
-        except (OrthonavError, OSError) as error:
-            self._trouble = " ".join(str(error).split())
-
-    def _take(self, batch: Batch) -> None:
-        if batch.restarted:
-            self._generation += 1
-            self._results, self._health, self._columns = [], [], {}
-        self.problems += batch.problems
-        self._health += [{"view": before, **plain} for before, plain in batch.health]
-        if not batch.results:
-            return
-        self._results += batch.results
-        began_ns = self._results[0].time_ns
-        made = columns_of(
-            batch.results, began_ns, self._truth, self.sheet, self._radius_m, self._second
-        )
-        for name, values in made.items():
-            self._columns.setdefault(name, []).extend(values)
 
 
 def columns_of(
     results: Sequence[ViewResult],
-    first_ns: int,
     truth: Mapping[str, LatLon],
     sheet: SheetImagery,
     radius_m: float,
     second: Mapping[str, ViewResult] | None = None,
 ) -> dict[str, list[Any]]:
-    """The columns of `results`, in order; times count from `first_ns`.
-
-    `frame`: name; `t`: time in seconds; `ms`: processing time.
-    `x`, `y`, `tx`, `ty`: fix and true position in pixels of the sheet.
-    `gx`, `gy`, `gerr`, `gdiff`: GNSS in pixels of the sheet, its error, and its distance from the
-    fix in metres; `gfault`: reason of the GNSS monitor, "" without one.
-    `err`: error in metres; `conf`, `radius`: confidence and radius (m) that the fix states;
-    `level`: its protection level (m) at `risk`.
-    `a`, `b`, `turn`: axes of one standard deviation (m), and the angle of the longer one in degrees
-    counter-clockwise from east.
-    `head`, `agl`: heading (deg) and height (m).
-    `state`: number in `STATES`, -1 without one; `reason`: "" for a fix.
-    `confident`: 1 if confident, 0 for a best guess or no fix.
-    `wrong`: 1 if tracking or confident, with an error above 35 m, `radius_m` and its own radius.
-    `x2`, `y2`, `err2`, `confident2`: the same of the results of a second run, by frame, if given.
-    """
+    """The columns of `results`, in order; `second`: of another run, by frame."""
     fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
-    fix_en_m = _places([_place(r.outcome) for r in results], sheet)
-    truth_en_m = _places([truth.get(r.frame) for r in results], sheet)
-    gnss_en_m = _places([gnss_of(r.outcome.evidence) for r in results], sheet)
+    fix_en_m = places_en_m(sheet.frame, [place_of(r.outcome) for r in results])
+    truth_en_m = places_en_m(sheet.frame, [truth.get(r.frame) for r in results])
+    gnss_en_m = places_en_m(sheet.frame, [gnss_of(r.outcome.evidence) for r in results])
     error_m = np.hypot(*(fix_en_m - truth_en_m).T)
     radii_m = np.array([math.nan if f is None else f.radius_m for f in fixes], dtype=np.float64)
     trusted = [
@@ -297,32 +252,39 @@ def columns_of(
 
     columns: dict[str, list[Any]] = {
         "frame": [r.frame for r in results],
-        "t": to_plain([(r.time_ns - first_ns) / 1e9 for r in results], 3),
+        "t": to_plain([(r.time_ns - results[0].time_ns) / 1e9 for r in results], 3),
+        "ms": to_plain([float(r.latency_ms) for r in results], 1),  # processing time
+        # Fix, true position and GNSS in pixels of the sheet.
         **_drawn(("x", "y"), fix_en_m, sheet),
         **_drawn(("tx", "ty"), truth_en_m, sheet),
         **_drawn(("gx", "gy"), gnss_en_m, sheet),
+        # Errors of fix and GNSS, and their distance, metres; reason of the GNSS monitor.
+        "err": to_plain(error_m, 4),
         "gerr": to_plain(np.hypot(*(gnss_en_m - truth_en_m).T), 2),
         "gdiff": to_plain(np.hypot(*(gnss_en_m - fix_en_m).T), 2),
         "gfault": [fault_of(r.outcome.evidence) for r in results],
-        "err": to_plain(error_m, 4),
+        # As the fix states it: confidence, its radius (m), protection level (m) at a risk.
         "conf": to_plain(stated("confidence"), 4),
         "radius": to_plain(radii_m, 1),
         "level": to_plain(protection_levels_m(results), 1),
         "risk": [r.risk for r in results],
+        # Axes of one standard deviation (m); angle of the longer one, counter-clockwise from east.
         "a": to_plain(major_m, 2),
         "b": to_plain(minor_m, 2),
         "turn": to_plain((90.0 - direction_deg) % 180.0, 1),
         "head": to_plain(stated("heading_deg"), 1),
         "agl": to_plain(stated("agl_m"), 1),
-        "ms": to_plain([float(r.latency_ms) for r in results], 1),
         "state": [-1 if r.state is None else STATES.index(r.state) for r in results],
-        "reason": ["" if _place(r.outcome) else _reason(r.outcome) for r in results],
+        "reason": [reason_of(r.outcome) for r in results],  # "" for a fix
         "confident": [int(r.is_confident) for r in results],
+        # Tracking or confident, with an error above 35 m, `radius_m` and its own radius.
         "wrong": wrong.astype(int).tolist(),
     }
     if second is not None:
         found = [second.get(r.frame) for r in results]
-        second_en_m = _places([None if r is None else _place(r.outcome) for r in found], sheet)
+        second_en_m = places_en_m(
+            sheet.frame, [None if r is None else place_of(r.outcome) for r in found]
+        )
         columns |= {
             **_drawn(("x2", "y2"), second_en_m, sheet),
             "err2": to_plain(np.hypot(*(second_en_m - truth_en_m).T), 4),
@@ -331,26 +293,9 @@ def columns_of(
     return columns
 
 
-def _place(outcome: Fix | NoFix) -> LatLon | None:
-    return (outcome.lat_deg, outcome.lon_deg) if isinstance(outcome, Fix) else None
-
-
-def _reason(outcome: Fix | NoFix) -> str:
-    return (isinstance(outcome, NoFix) and outcome.reason) or "not_said"
-
-
-def _places(latlon_deg: Sequence[LatLon | None], sheet: SheetImagery) -> Array:
-    en_m = np.full((len(latlon_deg), 2), math.nan)
-    known = [i for i, at in enumerate(latlon_deg) if at and all(map(math.isfinite, at))]
-    if known:
-        lat, lon = np.array([latlon_deg[i] for i in known], dtype=np.float64).T
-        en_m[known] = sheet.frame.en_from_latlon(lat, lon)
-    return en_m
-
-
 def _drawn(names: tuple[str, str], en_m: Array, sheet: SheetImagery) -> dict[str, list[Any]]:
     px = sheet.px_from_en(en_m)
-    px[~(np.abs(px) < FAR_AWAY_PX).all(axis=1)] = math.nan
+    px[~(np.abs(px) < 1e9).all(axis=1)] = math.nan  # no place on a screen
     return {name: to_plain(each, 2) for name, each in zip(names, px.T, strict=True)}
 
 
@@ -361,93 +306,32 @@ def _ellipses(fixes: Sequence[Fix | None]) -> Array:
     return np.array(found, np.float64).reshape(-1, 3)
 
 
-def open_run(request: ViewRequest) -> Run:
-    """The run, read as far as it exists; problems are logged.
-
-    Raises an `OrthonavError` where a given file is missing or damaged.
-    """
-    if not 0 < request.radius_m < 1e7:
-        raise UsageError(f"radius_m must be above 0, got {request.radius_m}")
-    opened = open_map(request.map_path)
-    sheet = SheetImagery(opened)
-    feed = _feed(request)
-    images = _images(request, feed)
-    truth, truth_name = _truth(request, images)
-    if truth:
-        centre = sheet.frame.lat_deg, sheet.frame.lon_deg
-        check_truth(truth, (), centre, Path(truth_name))
-    labels = {
-        "name": request.run.name or str(request.run),
-        "map_name": request.map_path.name,
-        "images": "" if images is None else (request.flight or request.run).name,
-        "truth": truth_name,
-        "live": request.live,
-        "second": request.second.name if request.second else "",
-    }
-    mount = None if request.mount is None else read_mount(request.mount)
-    second = _second(request)
-    run = Run(labels, feed, images, sheet, truth, request.radius_m, mount, second)
-    for problem in run.problems:
-        log.warning("%s", problem)
-    _warn(request, opened, run, feed, images)
-    return run
-
-
 def is_log(path: Path) -> bool:
-    """Whether this names a flight log, which need not exist yet."""
+    """Whether this names a flight log, perhaps by the name given to `--log`."""
     return is_flight_log(path) if path.exists() else path.suffix == ".mcap"
 
 
-def _feed(request: ViewRequest) -> Feed:
-    path = request.run
-    if request.live and not path.exists() and not path.parent.is_dir():
-        raise MissingFileError(f"folder of the run does not exist: {path.parent}")
-    if is_log(path) or (request.live and path.is_dir()):
-        return LogReader(path, live=request.live)
-    if path.is_dir():
+def _read(path: Path) -> Recorded:
+    if path.is_dir() and not is_log(path):
         raise FlightError(f"expected fixes.jsonl or a flight log, got a folder without one: {path}")
-    return LineFeed(path, live=request.live)
-
-
-def _second(request: ViewRequest) -> Mapping[str, ViewResult] | None:
-    if request.second is None:
-        return None
-    batch = _feed(replace(request, run=request.second, live=False)).poll()
-    for problem in batch.problems:
+    found = LoggedRun(path) if is_log(path) else read_lines(path)
+    if not found.results:
+        reason = f": {found.problems[0]}" if found.problems else ""
+        raise FlightError(f"run has no views{reason}: {path}")
+    for problem in found.problems:
         log.warning("%s", problem)
-    if not batch.results:
-        raise FlightError(f"run has no views: {request.second}")
-    return {result.frame: result for result in batch.results}
+    return found
 
 
-class RecordedImages:
-    """Images of a flight folder or of photographs, with what is known of their positions."""
-
-    def __init__(self, recording: Recording) -> None:
-        self.camera, self.views = recording.camera, {each.frame: each for each in recording.views}
-        places = ((name, view.truth_latlon_deg) for name, view in self.views.items())
-        self.truth = {name: place for name, place in places if place is not None}
-        for said in (*recording.choices, *recording.warnings):
-            log.warning("%s", said)
-
-    def shot(self, frame: str) -> Shot:
-        view = self.views.get(frame)
-        if view is None:
-            raise FlightError("this view is not in the flight")
-        return Shot(view.telemetry, self.camera, view.grey)
-
-
-def _images(request: ViewRequest, feed: Feed) -> LogReader | RecordedImages | None:
+def _images(request: ViewRequest, recorded: Recorded) -> Images | None:
     path = request.flight
     if path is None:
-        return feed if isinstance(feed, LogReader) else None
-    if not path.exists() and not request.live:
-        raise MissingFileError(f"flight does not exist: {path}")
+        return recorded if isinstance(recorded, LoggedRun) else None
     if is_log(path):
-        reader = LogReader(path, live=request.live)
-        reader.poll()
-        return reader
-    if path.exists() and (request.source.kind or source_kind(path)) in ("video", "ros"):
+        return LoggedRun(path)
+    if not path.exists():
+        raise MissingFileError(f"flight does not exist: {path}")
+    if (request.source.kind or source_kind(path)) in ("video", "ros"):
         raise FlightError(
             "images of a video or of ROS messages are decoded one after the other only; convert "
             f"it with `orthonav import` and give that flight folder: {path}"
@@ -455,33 +339,9 @@ def _images(request: ViewRequest, feed: Feed) -> LogReader | RecordedImages | No
     return RecordedImages(open_source(path, request.source))
 
 
-def _truth(
-    request: ViewRequest, images: LogReader | RecordedImages | None
-) -> tuple[Mapping[str, LatLon], str]:
+def _truth(request: ViewRequest, images: Images | None) -> tuple[Mapping[str, LatLon], str]:
     if request.truth is not None:
         return read_truth(request.truth), request.truth.name
     if isinstance(images, RecordedImages) and images.truth and request.flight is not None:
         return images.truth, request.flight.name
     return {}, ""
-
-
-def _warn(
-    request: ViewRequest,
-    opened: MapFile,
-    run: Run,
-    feed: Feed,
-    images: LogReader | RecordedImages | None,
-) -> None:
-    sha256 = flight_digest(images.views.values()) if isinstance(images, RecordedImages) else None
-    flown = feed.session.get("map") if isinstance(feed, LogReader) else None
-    if isinstance(flown, dict) and flown.get("manifest_sha256") != opened.manifest.sha256:
-        log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
-    for path in filter(None, (request.run, request.second)):
-        if path.is_file() and not is_log(path):
-            warn_of_another_run(path, opened, request.flight, sha256)
-    if not run.count:
-        return
-    if run.labels["truth"] and not run.any_known("tx"):
-        log.warning("no view of the run has a true position in %s", run.labels["truth"])
-    if request.second is not None and not run.any_known("x2"):
-        log.warning("no view has a position in the second run: %s", request.second)

@@ -1,15 +1,13 @@
-"""The server of the page: read-only, and by default for this computer only.
+"""The server of the page: read-only, and for this computer only.
 
 There is no password: it listens on the loopback. A web site in the same browser could still try to
 reach it, by DNS rebinding, which the check of the Host header refuses, or by cross-site requests,
 which the check of Sec-Fetch-Site refuses; responses never allow other origins to read them.
 """
 
-import ipaddress
 import json
 import logging
 import re
-import socket
 import socketserver
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,13 +17,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import PurePath
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
 from orthonav.core.errors import FlightError, OrthonavError, OutputError
 from orthonav.ground.report.page import leaflet_files
 from orthonav.ground.view.run import Run
 
-_TYPES = {
+MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -40,13 +37,7 @@ LEAFLET = (
     "images/marker-icon.png",
 )
 SHARED = ("chart.js", "format.js", "plane.js")
-
-
-log = logging.getLogger(__name__)
-TIMEOUT_S = 60.0
-_CACHED = "private, max-age=86400"
-_NOT_CACHED = "no-store"
-_HEADERS = {
+HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'",
@@ -55,6 +46,7 @@ _HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
 }
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -62,7 +54,7 @@ class Response:
     status: HTTPStatus
     data: bytes = b""
     media_type: str = "text/plain; charset=utf-8"
-    cache: str = _NOT_CACHED
+    cache: str = "no-store"
 
 
 def load_assets() -> dict[str, Response]:
@@ -78,9 +70,9 @@ def load_assets() -> dict[str, Response]:
         paths[f"/leaflet/{name}"] = path
     paths["/"] = paths.pop("/static/index.html")
     return {
-        at: Response(HTTPStatus.OK, path.read_bytes(), _TYPES[PurePath(path.name).suffix])
+        at: Response(HTTPStatus.OK, path.read_bytes(), MEDIA_TYPES[PurePath(path.name).suffix])
         for at, path in paths.items()
-        if PurePath(path.name).suffix in _TYPES
+        if PurePath(path.name).suffix in MEDIA_TYPES
     }
 
 
@@ -89,63 +81,50 @@ class Pages:
 
     def __init__(self, run: Run, assets: dict[str, Response]) -> None:
         self._run, self._assets = run, assets
-
         png = partial(Response, HTTPStatus.OK, media_type="image/png")
         raw = partial(Response, HTTPStatus.OK, media_type="image/jpeg")
         number = r"(\d{1,9})"
         view = rf"/api/views/{number}"
         self._routes: dict[str, Callable[..., Response]] = {
-            r"/api/run": lambda query: _json(run.summary()),
-            r"/api/news": self._news,
-            view: lambda i, query: _json(run.detail(int(i))),
-            rf"{view}/view\.png": lambda i, query: png(run.view_png(int(i))),
-            rf"{view}/raw\.jpg": lambda i, query: raw(run.raw_jpeg(int(i))),
-            rf"{view}/map-(fix|truth)\.png": lambda i, at, query: png(run.map_png(int(i), at)),
-            rf"{view}/map-in-view\.png": lambda i, query: png(run.map_in_view_png(int(i))),
+            r"/api/run": lambda: _json(run.summary()),
+            r"/api/views": lambda: _json(run.views()),
+            view: lambda i: _json(run.detail(int(i))),
+            rf"{view}/view\.png": lambda i: png(run.view_png(int(i))),
+            rf"{view}/raw\.jpg": lambda i: raw(run.raw_jpeg(int(i))),
+            rf"{view}/map-(fix|truth)\.png": lambda i, at: png(run.map_png(int(i), at)),
+            rf"{view}/map-in-view\.png": lambda i: png(run.map_in_view_png(int(i))),
             rf"/tiles/{number}/{number}/{number}": self._tile,
             r"/preview\.jpg": self._preview,
         }
 
     def answer(self, target: str) -> Response:
-        try:
-            asked = urlsplit(target)
-        except ValueError:
-            return _error(HTTPStatus.BAD_REQUEST, "not an address")
-        if asked.path in self._assets:
-            return self._assets[asked.path]
+        path = target.partition("?")[0]
+        if path in self._assets:
+            return self._assets[path]
         for pattern, made in self._routes.items():
-            match = re.fullmatch(pattern, asked.path)
+            match = re.fullmatch(pattern, path)
             if match is not None:
-                return self._made(made, match.groups(), asked.query)
+                return self._made(made, match.groups())
         return _error(HTTPStatus.NOT_FOUND, "not found")
 
-    def _made(self, made: Callable[..., Response], parts: tuple[str, ...], query: str) -> Response:
+    def _made(self, made: Callable[..., Response], parts: tuple[str, ...]) -> Response:
         try:
-            return made(*parts, query=query)
+            return made(*parts)
         except (IndexError, FlightError) as error:
             return _error(HTTPStatus.NOT_FOUND, str(error))
         except (OrthonavError, OSError) as error:
             return _error(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
-        except ValueError as error:  # an invalid query
-            return _error(HTTPStatus.BAD_REQUEST, str(error))
 
-    def _news(self, query: str) -> Response:
-        fields = parse_qs(query, max_num_fields=10)
-        asked = [fields.get(name, ["0"])[0] for name in ("generation", "views", "health")]
-        if not all(re.fullmatch(r"\d{1,9}", each) for each in asked):
-            raise ValueError("generation, views and health are numbers")
-        return _json(self._run.news(*map(int, asked)))
-
-    def _tile(self, level: str, col: str, row: str, query: str) -> Response:
+    def _tile(self, level: str, col: str, row: str) -> Response:
         found = self._run.sheet.tile(int(level), int(col), int(row))
         if found is None:
             return Response(HTTPStatus.NO_CONTENT)
-        return Response(HTTPStatus.OK, *found, cache=_CACHED)
+        return Response(HTTPStatus.OK, *found, cache="private, max-age=86400")
 
-    def _preview(self, query: str) -> Response:
+    def _preview(self) -> Response:
         if not self._run.sheet.preview:
             return _error(HTTPStatus.NOT_FOUND, "the map has tiles")
-        return Response(HTTPStatus.OK, self._run.sheet.preview, "image/jpeg", _CACHED)
+        return Response(HTTPStatus.OK, self._run.sheet.preview, "image/jpeg")
 
 
 def _json(plain: Any) -> Response:
@@ -164,59 +143,33 @@ class Server(ThreadingHTTPServer):
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, pages: Pages, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(self, pages: Pages, port: int = 0) -> None:
         """Port 0 is any free port. Raises `OutputError` where it cannot listen."""
         try:
-            address = ipaddress.ip_address(host)
-            self.address_family = socket.AF_INET6 if address.version == 6 else socket.AF_INET
-        except ValueError:
-            pass  # a name
-        self.host_name = host.casefold()
-        try:
-            super().__init__((host, port), partial(Handler, pages))
-        except (OSError, OverflowError, UnicodeError) as error:
+            super().__init__(("127.0.0.1", port), partial(Handler, pages))
+        except (OSError, OverflowError) as error:
             why = getattr(error, "strerror", None) or error
-            raise OutputError(f"cannot listen at {host} port {port} ({why})") from error
-        self.only_loopback = self._address.is_loopback
+            raise OutputError(f"cannot listen at port {port} ({why})") from error
 
     def server_bind(self) -> None:
         """Bind without the library's look-up of the host name, which may use the network."""
         socketserver.TCPServer.server_bind(self)
-        self.server_name, self.server_port = str(self.server_address[0]), self.port
-
-    @property
-    def _address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-        return ipaddress.ip_address(str(self.server_address[0]))
+        self.server_name, self.server_port = "127.0.0.1", self.port
 
     @property
     def port(self) -> int:
         return int(self.server_address[1])
 
     def url(self) -> str:
-        host = "localhost" if self._address.is_unspecified else str(self._address)
-        return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
-
-    def allows(self, host: str) -> bool:
-        """Whether a request may name this host: addresses and `localhost`, no other names.
-
-        On the loopback only its addresses are allowed. Any port, because tunnels change it.
-        """
-        name = _host_name(host)
-        if name in ("localhost", self.host_name):
-            return True
-        try:
-            address = ipaddress.ip_address(name)
-        except ValueError:
-            return False
-        return address.is_loopback or not self.only_loopback
+        return f"http://127.0.0.1:{self.port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         log.debug("request of %s", client_address, exc_info=True)
 
 
-def _host_name(host: str) -> str:
-    match = re.fullmatch(r"\[([0-9a-fA-F:.]+)\](?::\d*)?|([^:\[\]/@\s]+)(?::\d*)?", host)
-    return "" if match is None else (match[1] or match[2]).casefold().rstrip(".")
+def is_loopback(host: str) -> bool:
+    """Whether a Host header names the loopback; at any port, because tunnels change it."""
+    return bool(re.fullmatch(r"(localhost|127\.0\.0\.1|\[::1\])(:\d*)?", host, re.IGNORECASE))
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -224,7 +177,7 @@ class Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version = "orthonav"
     sys_version = ""
-    timeout = TIMEOUT_S
+    timeout = 60.0
 
     def __init__(self, pages: Pages, *arguments: Any) -> None:
         self._pages = pages
@@ -237,7 +190,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def _refused(self) -> Response | None:
         hosts = self.headers.get_all("Host", [])
-        if len(hosts) != 1 or not self.server.allows(hosts[0]):
+        if len(hosts) != 1 or not is_loopback(hosts[0]):
             return _error(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served")
         site = self.headers.get("Sec-Fetch-Site", "none")
         if site not in ("none", "same-origin") and self.path != "/":
@@ -246,7 +199,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def _send(self, reply: Response) -> None:
         self.send_response(reply.status)
-        for name, value in _HEADERS.items():
+        for name, value in HEADERS.items():
             self.send_header(name, value)
         self.send_header("Cache-Control", reply.cache)
         if reply.status != HTTPStatus.NO_CONTENT:

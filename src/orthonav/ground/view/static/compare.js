@@ -67,31 +67,15 @@ export class Compare {
     this.timer = setTimeout(() => this.#load(i), soon ? WAIT_MS : 0);
   }
 
-  /** Shows none. */
-  clear() {
-    clearTimeout(this.timer);
-    this.asked += 1; // pending responses are for a view that is gone
-    this.detail = undefined;
-    this.over?.remove();
-    this.over = null;
-    for (const part of ["compare", "no-compare", "overlay"]) this.find(part).hidden = true;
-    this.find("known").replaceChildren();
-    this.#offer("");
-    this.find("ground").textContent = "";
-    this.find("chosen-name").textContent = "No view yet";
-  }
-
   async #load(i) {
     const asked = ++this.asked;
-    const { generation } = this.store;
     let detail;
     try {
       detail = await getJson(`api/views/${i}`);
     } catch (error) {
       detail = { why_no_window: error.message };
     }
-    // Another was selected meanwhile, or the run started over.
-    if (asked !== this.asked || generation !== this.store.generation) return;
+    if (asked !== this.asked) return; // another was selected meanwhile
     this.detail = detail;
     this.#offer("lat_deg" in detail ? place(detail.lat_deg, detail.lon_deg) : "");
     this.#pictures(i, detail);
@@ -100,7 +84,7 @@ export class Compare {
 
   #pictures(i, detail) {
     this.find("ground").textContent = "";
-    const { generation, columns: c } = this.store;
+    const { columns: c } = this.store;
     const { window } = detail;
     const [placed, taken] = [Number.isFinite(c.x[i]), Number.isFinite(c.tx[i])];
     this.find("compare").hidden = !window;
@@ -118,18 +102,18 @@ export class Compare {
     this.find("compare").classList.toggle("perspective", seen);
     const [url, how, where, at] = seen ? [rawUrl, "as recorded", "seen from the fix", "in-view"]
       : [viewUrl, "rectified, north up", "at the fix", "fix"];
-    this.#image("img-view", url(i, generation), `View ${name}, ${how}`, `view, ${how}`);
+    this.#image("img-view", url(i), `View ${name}, ${how}`, `view, ${how}`);
     this.find("figure-fix").hidden = !placed;
     // Near the fix it would show the same.
     const apart = taken && !seen && !(c.err[i] <= this.store.run.radius_m);
     this.find("figure-truth").hidden = !apart;
     if (placed) {
-      this.#image("img-fix", mapUrl(i, at, generation), `Map ${where}`, `map ${where}`);
-      this.#image("img-over", url(i, generation), "");
+      this.#image("img-fix", mapUrl(i, at), `Map ${where}`, `map ${where}`);
+      this.#image("img-over", url(i), "");
     }
-    if (apart) this.#image("img-truth", mapUrl(i, "truth", generation), "Map at the true position");
+    if (apart) this.#image("img-truth", mapUrl(i, "truth"), "Map at the true position");
     this.#crosses(i, window);
-    this.#layOver(placed ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]], window, viewUrl(i, generation), placed || taken);
+    this.#layOver(placed ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]], window, viewUrl(i), placed || taken);
   }
 
   #image(id, url, alt, caption) {
@@ -146,7 +130,7 @@ export class Compare {
     if (image.hidden) return;
     image.onerror = () => { image.hidden = true; };
     image.alt = "The view as recorded";
-    image.src = rawUrl(i, this.store.generation);
+    image.src = rawUrl(i);
   }
 
   /** Marks the points below the camera, which a tilt moves off the middle. */

@@ -1,6 +1,6 @@
 // The page: creates its parts and connects them.
 
-import { follow, getJson, getNews } from "./api.js";
+import { getJson } from "./api.js";
 import { metres, ratio } from "./format.js";
 import { Course } from "./course.js";
 import { Compare, sentence } from "./compare.js";
@@ -16,8 +16,8 @@ const PLAY_MS = 120;
 const find = (id) => document.getElementById(id);
 
 async function begin() {
-  const run = await getJson("api/run");
-  const store = new Store(run);
+  const [run, views] = await Promise.all([getJson("api/run"), getJson("api/views")]);
+  const store = new Store(run, views);
   document.title = `${run.name} – orthonav view`;
   find("run-name").textContent = run.second ? `${run.name} / ${run.second}` : run.name;
   find("about").textContent = about(run);
@@ -40,28 +40,20 @@ async function begin() {
   tie(parts);
   const play = makePlay(store);
   steps(parts, play);
-  const news = await getNews(0, 0, 0);
-  store.take(news);
-  drawProblems(news.problems);
+  drawProblems(views.problems);
+  find("scrub").max = store.count - 1;
+  parts.course.draw();
+  parts.list.drawChoices();
+  parts.list.draw();
+  parts.health.draw();
+  drawFigures(store);
+  drawLegend(store);
   fitRun(map, store);
-  if (run.live) live(parts);
+  store.select(0);
 }
 
 /** Redraws the parts that an event of the store affects. */
-function tie({ store, map, marks, chosen, compare, course, list, health }) {
-  store.addEventListener("data", ({ detail }) => {
-    find("scrub").max = Math.max(store.count - 1, 0);
-    if (detail.added || detail.restarted) {
-      marks.later();
-      course.draw();
-      list.drawChoices();
-      list.draw();
-      drawFigures(store);
-      drawLegend(store);
-    }
-    health.draw();
-    if (detail.restarted && !store.count) nothing({ chosen, compare, course });
-  });
+function tie({ store, map, marks, chosen, compare, course, list }) {
   store.addEventListener("filter", () => { marks.later(); course.draw(); list.draw(); });
   store.addEventListener("select", ({ detail }) => {
     const i = store.selected;
@@ -72,20 +64,8 @@ function tie({ store, map, marks, chosen, compare, course, list, health }) {
     find("scrub").value = i;
     find("scrub").setAttribute("aria-valuetext", `view ${i + 1}: ${sentence(store, i)}`);
     say(sentence(store, i));
-    if (detail.by !== "newest" && detail.by !== "") find("newest").checked = i === store.count - 1;
-    const byHand = !["", "newest"].includes(detail.by);
-    if (byHand || find("follow-view").checked) bringIntoSight(map, store);
+    if (detail.by) bringIntoSight(map, store);
   });
-}
-
-/** A run that was restarted and has no view yet. */
-function nothing({ chosen, compare, course }) {
-  chosen.draw();
-  compare.clear();
-  course.drawCursor();
-  find("scrub").value = 0;
-  find("scrub").removeAttribute("aria-valuetext");
-  say("");
 }
 
 let pause = 0;
@@ -148,31 +128,9 @@ function steps({ store, map, compare, course }, play) {
   }, document);
 }
 
-/** Follows a run in progress. */
-function live({ store, map }) {
-  for (const id of ["newest-label", "follow-label"]) find(id).hidden = false;
-  find("follow-view").checked = true;
-  const badge = find("live");
-  badge.hidden = false;
-  let fitted = store.count > 0;
-  const lost = (yes) => {
-    badge.className = `badge ${yes ? "bad" : "good"}`;
-    badge.textContent = yes ? "server does not respond" : store.count ? "live" : "live: waiting for the first view";
-  };
-  lost(false);
-  follow(() => [store.generation, store.count, store.health.length], (news) => {
-    store.take(news);
-    drawProblems(news.problems);
-    if (find("newest").checked) store.select(store.count - 1, "newest");
-    if (!fitted && store.count) { fitRun(map, store); fitted = true; }
-  }, lost);
-  if (find("newest").checked) store.select(store.count - 1, "newest");
-}
-
 function drawProblems(problems) {
   find("problems").hidden = !problems.length;
-  const text = problems.join("  ·  ");
-  if (find("problems").textContent !== text) find("problems").textContent = text;
+  find("problems").textContent = problems.join("  ·  ");
 }
 
 function drawFigures(store) {

@@ -1,56 +1,32 @@
-// The views of the run, the selected one, and the filter. Events: "data" (new views, or all replaced),
-// "select", "filter".
+// The views of the run, the selected one, and the filter. Events: "select", "filter".
 
 const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "level", "a", "b", "turn", "head", "agl", "ms",
   "gx", "gy", "gerr", "gdiff", "x2", "y2", "err2"];
 export const CONFIDENT = 0.9;
 
 export class Store extends EventTarget {
-  constructor(run) {
+  /** `run` and `views`: the responses of api/run and api/views. */
+  constructor(run, views) {
     super();
     this.run = run;
-    this.generation = 0;
     this.which = "all";
     this.order = "time";
     this.named = "";
     this.selected = -1;
-    this.clear();
-  }
-
-  clear() {
-    this.count = 0;
+    this.count = views.columns.frame.length;
     this.columns = {};
-    this.health = [];
+    for (const [name, values] of Object.entries(views.columns)) {
+      this.columns[name] = NUMBERS.includes(name) ? values.map((v) => v ?? NaN) : values;
+    }
+    this.health = views.health;
     this.reasons = new Map();
     this.shown = []; // indices in order of time
     this.listed = []; // the same in the order of the list
     this.isShown = [];
     this.rising = true;
     this.stats = { fixes: 0, confident: 0, wrong: 0, right: 0, withTruth: 0, withGnss: 0, gnssAlarms: 0 };
-  }
-
-  /** Takes a response of api/news. */
-  take(news) {
-    const restarted = news.generation !== this.generation;
-    if (restarted) {
-      this.clear();
-      this.generation = news.generation;
-      this.selected = -1;
-    }
-    const added = news.columns.frame?.length ?? 0;
-    for (const [name, values] of Object.entries(news.columns)) {
-      const known = NUMBERS.includes(name) ? values.map((v) => v ?? NaN) : values;
-      const column = (this.columns[name] ??= []);
-      for (const value of known) column.push(value);
-    }
-    this.health.push(...news.health);
-    const first = this.count;
-    this.count += added;
-    for (let i = first; i < this.count; i++) this.#count(i);
-    if (!added && !restarted && !news.health.length) return;
-    if (added || restarted) this.#filter(first);
-    this.dispatchEvent(new CustomEvent("data", { detail: { first, added, restarted } }));
-    if (this.selected < 0 && this.count) this.select(0);
+    for (let i = 0; i < this.count; i++) this.#count(i);
+    this.#filter();
   }
 
   #count(i) {
@@ -112,17 +88,14 @@ export class Store extends EventTarget {
 
   show({ which = this.which, order = this.order, named = this.named }) {
     Object.assign(this, { which, order, named });
-    this.#filter(0);
+    this.#filter();
     this.dispatchEvent(new Event("filter"));
   }
 
-  #filter(first) {
+  #filter() {
     const keep = this.#rule();
-    if (first === 0) [this.shown, this.isShown] = [[], []];
-    for (let i = first; i < this.count; i++) {
-      this.isShown[i] = keep(i);
-      if (this.isShown[i]) this.shown.push(i);
-    }
+    this.isShown = this.columns.frame.map((_, i) => keep(i));
+    this.shown = [...this.isShown.keys()].filter((i) => this.isShown[i]);
     this.listed = this.#ordered();
   }
 

@@ -11,19 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from orthonav.core.errors import OutputError
-from orthonav.core.extras import needed
 from orthonav.core.files import replacing, replacing_folder, write_text
 from orthonav.core.mapfile.reader import MapFile
+from orthonav.ground.check.layers import FORMAT, check_to_plain, tif_bytes, to_geojson, writable
 from orthonav.ground.check.records import CELL_VALUES, Cells, CheckResult
-from orthonav.ground.check.write.plain import (
-    FORMAT,
-    check_to_plain,
-    tif_bytes,
-    to_geojson,
-    to_json,
-    writable,
-)
-from orthonav.ground.check.write.wording import (
+from orthonav.ground.check.wording import (
     OUTAGE_COLUMNS,
     SIMULATED,
     SYMBOLS,
@@ -37,30 +29,13 @@ from orthonav.ground.report.imagery import Box, Grey, Mask, SheetImagery, webp
 from orthonav.ground.report.page import (
     data_url,
     joined_scripts,
-    leaflet_files,
     load_leaflet,
     render,
     static_text,
 )
 
 PAGE, JSON, TIF, GEOJSON = "index.html", "check.json", "check.tif", "check.geojson"
-_SIDECAR = "check.tif.aux.xml"
-"""Written by GIS programs that open the raster."""
-_OURS = {PAGE, JSON, TIF, GEOJSON, _SIDECAR}
-_EXTRAS = {"rasterio": "geo", "shapely": "geo", "jinja2": "report"}
-PACKAGE = "orthonav.ground.check.write"
-_SHARED = ("format.js", "plane.js", "chart.js")
-_SCRIPTS = ("data.js", "map.js", "profile.js", "page.js")
-MAX_ROWS = 200
-LAYERS = ("probability", "low", "error_m", "wrong", "persistence")
-DOWNLOADS = {
-    "check.geojson": "GeoJSON: route, outages, cells",
-    "check.tif": "GeoTIFF: a band per layer of the map",
-    "check.json": "JSON: all results and conditions",
-}
-MAX_SIDE_PX = 1500
-"""Of the image of the map: 0.3 to 1 MB."""
-_MARGIN = 0.04
+PACKAGE = "orthonav.ground.check"
 
 
 def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
@@ -71,7 +46,7 @@ def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
     """
     out = Path(out)
     require_free(out)
-    plain = writable(to_json(result))
+    plain = writable(f"{json.dumps(check_to_plain(result), ensure_ascii=False, allow_nan=False)}\n")
     page = page_of(result, opened, sha256(plain.encode()).hexdigest())
     with replacing_folder(out, is_ours=lambda folder: _foreign(folder) is None) as folder:
         for name, text in ((JSON, plain), (GEOJSON, to_geojson(result)), (PAGE, page)):
@@ -82,7 +57,7 @@ def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
 
 
 def require_free(out: Path) -> None:
-    """Raise what `write_check` would raise about the folder and missing extras, before any work."""
+    """Raise what `write_check` would raise about the folder, before any work."""
     out = Path(out)
     if out.is_dir():
         foreign = _foreign(out)
@@ -93,16 +68,14 @@ def require_free(out: Path) -> None:
             )
     elif out.exists() or out.is_symlink():
         raise OutputError(f"output folder is a file: {out}")
-    leaflet_files("leaflet.js", "leaflet.css")
-    for module, extra in _EXTRAS.items():
-        needed(module, extra, "writing a check")
 
 
 def _foreign(folder: Path) -> str | None:
     """A file of a folder that is not part of a check; None for a check or an empty folder."""
+    ours = {PAGE, JSON, TIF, GEOJSON, f"{TIF}.aux.xml"}  # the last by GIS programs
     try:
         found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
-        odd = [name for name in found if name not in _OURS or (folder / name).is_symlink()]
+        odd = [name for name in found if name not in ours or (folder / name).is_symlink()]
         if odd or not found:
             return next(iter(odd), None)
         plain = json.loads((folder / JSON).read_text(encoding="utf-8"))
@@ -116,7 +89,11 @@ def _foreign(folder: Path) -> str | None:
 def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
     about = result.about
     script, style = load_leaflet()
-    scripts = (script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
+    shared, own = (
+        ("format.js", "plane.js", "chart.js"),
+        ("data.js", "map.js", "profile.js", "page.js"),
+    )
+    scripts = (script, joined_scripts(shared, PACKAGE, own))
     image = webp(*map_image(opened, visible_box(result.cells)))
     values = {
         "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
@@ -126,15 +103,20 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "sentence": verdict_sentence(result),
         "cards": key_figures(result),
         "note": "" if result.second_date else SIMULATED,
-        "layers": {name: CELL_VALUES[name] for name in LAYERS},
+        "layers": {
+            name: CELL_VALUES[name] for name in CELL_VALUES if name not in ("high", "trials")
+        },
         "outage_columns": OUTAGE_COLUMNS,
         "outages": [
             outage_row(number, each) for number, each in enumerate(result.outages, start=1)
         ],
-        "max_rows": MAX_ROWS,
         "radius": metres_text(result.conditions.radius_m),
         "conditions": conditions_text(result.conditions, result.band_m),
-        "downloads": DOWNLOADS,
+        "downloads": {
+            GEOJSON: "GeoJSON: route, outages, waypoints",
+            TIF: "GeoTIFF: a band per layer of the map",
+            JSON: "JSON: all results and conditions",
+        },
         "checked": _checked(result, json_sha256),
         "data": _page_data(result),
         "image": data_url(image, "image/webp"),
@@ -191,7 +173,7 @@ def _page_data(result: CheckResult) -> str:
 def visible_box(cells: Cells) -> Box:
     """West, south, east, north in metres of the cells, with a margin."""
     rows, cols = cells.probability.shape
-    margin_m = _MARGIN * max(rows, cols) * cells.side_m
+    margin_m = 0.04 * max(rows, cols) * cells.side_m
     return (
         cells.west_m - margin_m,
         cells.north_m - rows * cells.side_m - margin_m,
@@ -204,6 +186,8 @@ def map_image(opened: MapFile, box: Box) -> tuple[Grey, Mask]:
     """The imagery of the map within a box, north up, and where there is some."""
     sheet = SheetImagery(opened)
     west, south, east, north = box
-    gsd_m = max(sheet.grid.gsd_m, max(east - west, north - south) / MAX_SIDE_PX)
+    gsd_m = max(
+        sheet.grid.gsd_m, max(east - west, north - south) / 1500
+    )  # an image of 1 MB at most
     size = max(1, round((east - west) / gsd_m)), max(1, round((north - south) / gsd_m))
     return sheet.crop(box, size)

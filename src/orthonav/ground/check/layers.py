@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
-from orthonav.ground.check.cells import lonlat
 from orthonav.ground.check.records import (
     CELL_VALUES,
     Along,
@@ -25,34 +24,17 @@ from orthonav.ground.check.records import (
 )
 from orthonav.ground.report import BY_UNIT, to_plain
 
-FORMAT, VERSION = "orthonav-check", 1
-_LATLON_DIGITS = 7
+FORMAT = "orthonav-check"
 
 Array = NDArray[np.float64]
 Plain = dict[str, Any]
-
-
-RISKS = {"confident": CONFIDENT, "likely": 0.7, "doubtful": 0.5, "unlikely": 0.0}
-"""Classes of places along the route, and the lowest probability of each."""
-
-
-def risk_of(probability: float) -> str:
-    return next((name for name, least in RISKS.items() if probability >= least), "unknown")
-
-
-def to_json(result: CheckResult) -> str:
-    lines = ",\n".join(
-        f"{json.dumps(name)}: {json.dumps(value, ensure_ascii=False, allow_nan=False)}"
-        for name, value in check_to_plain(result).items()
-    )
-    return f"{{\n{lines}\n}}\n"
 
 
 def check_to_plain(result: CheckResult) -> Plain:
     verdict, frame = result.verdict, result.frame
     return {
         "format": FORMAT,
-        "version": VERSION,
+        "version": 1,
         "about": to_plain(result.about),
         "verdict": {**to_plain(verdict), "exit_code": verdict.word.exit_code},
         "conditions": to_plain(result.conditions, 6),
@@ -120,46 +102,34 @@ def _route_to_plain(result: CheckResult) -> Plain | None:
 
 
 def _latlon_deg(frame: LocalFrame, points_en_m: Array) -> list[list[float]]:
-    found: list[list[float]] = to_plain(
-        np.stack(frame.latlon_from_en(points_en_m), axis=1), _LATLON_DIGITS
-    )
+    found: list[list[float]] = to_plain(np.stack(frame.latlon_from_en(points_en_m), axis=1), 7)
     return found
 
 
 def to_geojson(result: CheckResult) -> str:
-    """A FeatureCollection (RFC 7946), one feature per line; `layer` names the kind of each."""
-    lines = ",\n".join(
-        json.dumps(each, ensure_ascii=False, allow_nan=False) for each in features(result)
-    )
-    return f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n'
+    """A FeatureCollection (RFC 7946); `layer` names the kind of each feature."""
+    collection = {"type": "FeatureCollection", "features": list(features(result))}
+    return f"{json.dumps(collection, ensure_ascii=False, allow_nan=False)}\n"
 
 
 def features(result: CheckResult) -> Iterator[Plain]:
+    """Route, outages and waypoints; cells are in the raster."""
     frame, along, flights = result.frame, result.along, result.flights
-    yield from _cell_features(result)
-    if along is not None and flights is not None:
-        yield from _route_features(result, along, flights)
-        for each, properties in zip(result.outages, _stretches(result), strict=True):
-            inside = (along.distance_m >= each.start_m) & (along.distance_m <= each.end_m)
-            yield _feature(frame, "blind", "LineString", along.points_en_m[inside], properties)
-    if result.route_en_m is not None:
-        legs_m = np.hypot(*np.diff(result.route_en_m, axis=0).T)
-        for i, point in enumerate(result.route_en_m):
-            properties = {"number": i + 1, "distance_m": round(float(legs_m[:i].sum()), 2)}
-            yield _feature(frame, "waypoints", "Point", point[None], properties)
-
-
-def _cell_features(result: CheckResult) -> Iterator[Plain]:
-    cells = result.cells
-    known = np.isfinite(cells.probability) | (cells.trials > 0) | np.isfinite(cells.persistence)
-    for row, col in np.argwhere(known).tolist():
-        ring = cells.grid.ring_en_m(row, col)
-        values = to_plain({name: getattr(cells, name)[row, col] for name in CELL_VALUES}, BY_UNIT)
-        yield _feature(result.frame, "cells", "Polygon", ring, {"row": row, "col": col, **values})
+    if along is None or flights is None or result.route_en_m is None:
+        return
+    yield from _route_features(result, along, flights)
+    for each, properties in zip(result.outages, _stretches(result), strict=True):
+        inside = (along.distance_m >= each.start_m) & (along.distance_m <= each.end_m)
+        yield _feature(frame, "blind", "LineString", along.points_en_m[inside], properties)
+    legs_m = np.hypot(*np.diff(result.route_en_m, axis=0).T)
+    for i, point in enumerate(result.route_en_m):
+        properties = {"number": i + 1, "distance_m": round(float(legs_m[:i].sum()), 2)}
+        yield _feature(frame, "waypoints", "Point", point[None], properties)
 
 
 def _route_features(result: CheckResult, along: Along, flights: Flights) -> Iterator[Plain]:
     """A line from each point to the next, with the worse values of the two."""
+    risks = {"confident": CONFIDENT, "likely": 0.7, "doubtful": 0.5, "unlikely": 0.0}
     for i in range(len(along.distance_m) - 1):
         pair = slice(i, i + 2)
         start_m, end_m = (float(value) for value in along.distance_m[pair])
@@ -174,7 +144,7 @@ def _route_features(result: CheckResult, along: Along, flights: Flights) -> Iter
             "error_m": float(along.error_m[pair].max()),
             "available": float(flights.available[pair].min()),
             "protection_m": float(flights.protection_m[pair].max()),
-            "risk": risk_of(probability),
+            "risk": next((name for name, p in risks.items() if probability >= p), "unknown"),
         }
         line = along.points_en_m[pair]
         yield _feature(result.frame, "route", "LineString", line, to_plain(properties, BY_UNIT))
@@ -183,15 +153,10 @@ def _route_features(result: CheckResult, along: Along, flights: Flights) -> Iter
 def _feature(
     frame: LocalFrame, layer: str, kind: str, points_en_m: Array, properties: Plain
 ) -> Plain:
-    """A feature from points (N, 2); without points its geometry is null."""
-    if not len(points_en_m):
-        return _as_feature(layer, None, properties)
-    points = lonlat(frame, points_en_m)
-    coordinates = {"Point": points[0], "Polygon": [points]}.get(kind, points)
-    return _as_feature(layer, {"type": kind, "coordinates": coordinates}, properties)
-
-
-def _as_feature(layer: str, geometry: Plain | None, properties: Plain) -> Plain:
+    lat, lon = frame.latlon_from_en(points_en_m)
+    lon = frame.lon_deg + (lon - frame.lon_deg + 180) % 360 - 180  # no jump at the date line
+    points = np.round(np.stack([lon, lat], axis=-1), 7).tolist()
+    geometry = {"type": kind, "coordinates": points[0] if kind == "Point" else points}
     named = {"layer": layer, **properties}
     return {"type": "Feature", "properties": named, "geometry": geometry}
 
