@@ -17,11 +17,8 @@ from orthonav.core.errors import FlightError, OrthonavError
 from orthonav.core.flight import logged as png_module
 from orthonav.core.flight.fixes import read_results, result_to_json
 from orthonav.core.flight.logged import (
-    HEALTH,
     PROFILE,
-    SESSION,
-    TELEMETRY,
-    VIEW,
+    TOPICS,
     LoggedView,
     lossless_png,
     picture_message,
@@ -93,7 +90,7 @@ def crafted(path, messages, profile=PROFILE, compression=CompressionType.ZSTD):
         ids = {}
         for topic, index, data in messages:
             if topic.name not in ids:
-                ids[topic.name] = writer.register_channel(topic.name, topic.encoding, 0)
+                ids[topic.name] = writer.register_channel(topic.name, "json", 0)
             writer.add_message(ids[topic.name], log_time=0, publish_time=0, sequence=index,
                                data=data)  # fmt: skip
         writer.finish()
@@ -102,17 +99,17 @@ def crafted(path, messages, profile=PROFILE, compression=CompressionType.ZSTD):
 
 def session(**changes):
     plain = {"format": 1, "run": "a", "views": "full", "camera": CAMERA.numbers()}
-    return SESSION, 0, to_json({**plain, **changes})
+    return TOPICS.session, 0, to_json({**plain, **changes})
 
 
 def reported(index=0, frame="a.png", picture="full"):
     view = LoggedView(index, index, frame, telemetry(index), picture)
-    return TELEMETRY, index, telemetry_message(view)
+    return TOPICS.telemetry, index, telemetry_message(view)
 
 
 def shown(index=0, data=None):
     png = lossless_png(picture(index)) if data is None else data
-    return VIEW, index, picture_message(png, "png", 0)
+    return TOPICS.view, index, picture_message(png, "png", 0)
 
 
 # The flight again
@@ -391,7 +388,7 @@ MESSAGES = {
 
 @pytest.mark.parametrize("how", MESSAGES)
 def test_invalid_images_are_rejected(tmp_path, monkeypatch, how):
-    messages = [session(), reported(), (VIEW, 0, MESSAGES[how])]
+    messages = [session(), reported(), (TOPICS.view, 0, MESSAGES[how])]
     (view,) = open_source(crafted(tmp_path / "a.mcap", messages)).views
     if how != "too few rows":  # OpenCV must not even see the others
         monkeypatch.setattr(png_module.cv2, "imdecode", None)
@@ -417,7 +414,7 @@ def test_invalid_telemetry_is_left_out(tmp_path, data):
         session(),
         reported(),
         shown(),
-        (TELEMETRY, 1, data),
+        (TOPICS.telemetry, 1, data),
         reported(2, "c.png"),
         shown(2),
     ]
@@ -442,7 +439,7 @@ def test_invalid_cameras_are_rejected(tmp_path, changes):
         ([session(format=2), reported(), shown()], r"format 2.*update orthonav"),
         ([session(), reported(), shown(), reported(1), shown(1)], "appears twice"),
         ([session(), *(reported(n, f"{n}.png") for n in range(5)), shown()], "more than 3 views"),
-        ([session(), reported(), shown(), *[(HEALTH, 0, b"")] * 60], "more than 3 views"),
+        ([session(), reported(), shown(), *[(TOPICS.health, 0, b"")] * 60], "more than 3 views"),
     ],
 )
 def test_logs_that_cannot_be_read_are_named(tmp_path, monkeypatch, messages, words):

@@ -73,10 +73,10 @@ def test_compressed_images_are_copied(tmp_path, messages, topics):
     recording = open_source(record(tmp_path / "flight", topics, messages))
     import_flight(recording, tmp_path / "out")
     views = open_flight(tmp_path / "out").views
-    assert [view.path.suffix for view in views] == list(suffixes)
+    assert [view.frame[-4:] for view in views] == list(suffixes)
     assert np.array_equal(views[1].grey(), greys[1])
     for view, (_, message) in zip(views, topics["/cam/image_raw/compressed"], strict=True):
-        assert view.path.read_bytes() == message.data.tobytes()
+        assert view.data() == message.data.tobytes()
 
 
 def bayer(rgb, order):
@@ -392,12 +392,11 @@ def test_a_damaged_recording_is_one_error(tmp_path, form, how, capfd):
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
-@pytest.mark.parametrize("packed", [False, True])
-def test_a_recording_that_was_cut_short_is_read_as_far_as_it_goes(tmp_path, compression, packed):
+def test_a_recording_that_was_cut_short_is_read_as_far_as_it_goes(tmp_path, compression):
     messages = Messages()
     path = record(tmp_path / "flight", flight(messages, seconds=20), messages)
     file = next(path.glob("*.mcap"))
-    rewritten(file, compression, chunk_bytes=4000 if packed else 10**7)
+    rewritten(file, compression)
     data = file.read_bytes()
     file.write_bytes(data[: int(0.6 * len(data))])
     recording = open_source(path)
@@ -407,12 +406,12 @@ def test_a_recording_that_was_cut_short_is_read_as_far_as_it_goes(tmp_path, comp
     assert "cut short" in open_source(file).warnings[0]
 
 
-def rewritten(path, compression, chunk_bytes):
+def rewritten(path, compression):
     """The same messages by the writer of MCAP."""
     read = make_reader(BytesIO(path.read_bytes()))
     with path.open("wb") as stream:
         kind = getattr(CompressionType, compression.upper())
-        writer = McapWriter(stream, chunk_size=chunk_bytes, compression=kind)
+        writer = McapWriter(stream, chunk_size=4000, compression=kind)
         writer.start("ros2", "orthonav")
         known = {}
         for schema, channel, message in read.iter_messages():

@@ -67,7 +67,6 @@ def run(options: argparse.Namespace) -> None:
 def _calibrated(options: argparse.Namespace) -> "MountCalibration":
     """The mount by the smoothed track of the flight."""
     from orthonav.core.flight import read_truth
-    from orthonav.core.flight.recording import WithTelemetry
     from orthonav.core.localize import Localizer
     from orthonav.core.mapfile import open_map
     from orthonav.core.records import Prior
@@ -92,7 +91,8 @@ def _calibrated(options: argparse.Namespace) -> "MountCalibration":
         smooth=True,
     )
     views = (
-        WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
+        replace(view, telemetry=replace(view.telemetry, prior=priors.get(view.frame)))
+        for view in flight.views
     )
     heights = flight_heights(options, opened, flight, dem)
     with progress(options) as shown:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import add_options, print_json
 
 if TYPE_CHECKING:
-    from orthonav.core.flight import FlightFolder, FlightView
+    from orthonav.core.flight import FlightFolder, RecordedView
     from orthonav.core.geo.camera import Camera
     from orthonav.core.mapfile.terrain import TerrainLayer
 
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> None:
     other = read_identity(options.fixes).differences(given, options.map, options.flight)
     if other:
         log.warning("fixes are of %s: %s", other, options.fixes)
-    turned = _is_turned(view.path)
+    turned = _is_turned(Path(view.where))
     found = locate_pixel(_camera(flight, view), telemetry, fix, (options.x, options.y), terrain)
     height_m = found.height_m if _is_above_sea(terrain) else math.nan
     ellipse = ellipse_95(found.cov_en_m2)
@@ -105,7 +105,7 @@ def _is_turned(path: Path) -> bool:
     return turned
 
 
-def _camera(flight: "FlightFolder", view: "FlightView") -> "Camera":
+def _camera(flight: "FlightFolder", view: "RecordedView") -> "Camera":
     """The camera at the size of the image of a view; as calibrated where that cannot be read."""
     from orthonav.core.errors import FlightError, MissingFileError
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from orthonav.core.records import ViewResult
     from orthonav.ground.imagery.terrain import Dem
     from orthonav.ground.planning.route import Route
-    from orthonav.ground.recordings import Recording, SourceOptions, SourceView
+    from orthonav.ground.recordings import Recording, SourceOptions
     from orthonav.onboard.run import Locator
 
 AREA_POINTS = 48  # positions along a side of a map at which its terrain is averaged
@@ -88,7 +88,7 @@ def distance_from_map(latlon_deg: tuple[float, float], localizer: "Localizer") -
     return beyond_m(*latlon_deg), hint
 
 
-def far_from_map(view: "SourceView", localizer: "Localizer") -> tuple[float, str] | None:
+def far_from_map(view: "RecordedView", localizer: "Localizer") -> tuple[float, str] | None:
     """`distance_from_map` of the recorded position of a view or of its prior, the farther one; None
     without a position."""
     prior, recorded = view.telemetry.prior, view.truth_latlon_deg

@@ -53,16 +53,7 @@ from orthonav.onboard.messages import mavlink
 
 DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats
 MAVLINK_MAGICS = (0xFE, 0xFD)
-_RANGE_IS_GOOD = 4
-_WANTED = {
-    *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
-    *("GPS2_RAW", "DISTANCE_SENSOR", "RANGEFINDER"),
-}
 ULOG_MAGIC = b"ULog\x01\x12\x35"
-_TOPICS = [
-    *("vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "home_position"),
-    *("vehicle_gps_position", "sensor_gps", "distance_sensor"),
-]
 Columns = dict[str, NDArray[Any]]
 
 
@@ -141,13 +132,10 @@ def _from_dataflash(collected: _Collected, message: Any, time_ns: int) -> None:
     elif kind == "POS":
         collected.above_home.add(time_ns, message.RelHomeAlt)
     elif kind == "RFND":
-        good = getattr(message, "Stat", _RANGE_IS_GOOD) == _RANGE_IS_GOOD
-        for number in ("", "1", "2"):  # numbered up to ArduPilot 3.6
-            if (distance_m := getattr(message, f"Dist{number}", None)) is not None:
-                instance = int(number) - 1 if number else getattr(message, "Instance", 0)
-                down = getattr(message, f"Orient{number}", mavlink.DOWNWARD) == mavlink.DOWNWARD
-                sound = good and down and distance_m > 0
-                _add(collected.distances, f"RFND[{instance}]", sound, time_ns, distance_m)
+        down = getattr(message, "Orient", mavlink.DOWNWARD) == mavlink.DOWNWARD
+        sound = getattr(message, "Stat", 4) == 4 and down and message.Dist > 0  # 4: good
+        name = f"RFND[{getattr(message, 'Instance', 0)}]"
+        _add(collected.distances, name, sound, time_ns, message.Dist)
     else:
         receiver = f"GPS[{message.I}]" if hasattr(message, "I") else kind
         course = math.radians(message.GCrs)
@@ -162,11 +150,15 @@ def read_tlog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     Its first autopilot is read: gimbals and other vehicles send attitudes too.
     """
     mavutil = needed("pymavlink.mavutil", "telemetry logs")
+    wanted = {
+        *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
+        *("GPS2_RAW", "DISTANCE_SENSOR", "RANGEFINDER"),
+    }
     parts: dict[str, _Collected] = {}
     with reading("telemetry log", path, silent=True):
         log = mavutil.mavlogfile(str(path), robust_parsing=True)
         try:
-            while (message := log.recv_match(type=_WANTED)) is not None:
+            while (message := log.recv_match(type=wanted)) is not None:
                 name = f"ATTITUDE[{message.get_srcSystem()}:{message.get_srcComponent()}]"
                 part = parts.setdefault(name, _Collected(mount_deg))
                 _from_tlog(part, message, round(message._timestamp * 1e6) * 1000)
@@ -225,12 +217,16 @@ def _distance_of_tlog(collected: _Collected, kind: str, message: Any, time_ns: i
 def read_ulog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     """The track of a ULog; times are UTC where the log has a GPS fix, else since boot."""
     core = needed("pyulog.core", "PX4 logs")
+    names = [
+        *("vehicle_attitude", "vehicle_local_position", "vehicle_global_position"),
+        *("home_position", "vehicle_gps_position", "sensor_gps", "distance_sensor"),
+    ]
     with reading("PX4 log", path, silent=True), path.open("rb") as whole:
         with mmap.mmap(whole.fileno(), 0, access=mmap.ACCESS_READ) as data:
             end = data.find(ULOG_MAGIC, 1)  # of a log behind it, on a card that was not erased
             stream: Any = whole if end < 0 else io.BytesIO(data[:end])
-        log = core.ULog(stream, _TOPICS)
-        topics: dict[str, dict[str, Columns]] = {name: {} for name in _TOPICS}
+        log = core.ULog(stream, names)
+        topics: dict[str, dict[str, Columns]] = {name: {} for name in names}
         for one in log.data_list:
             topics[one.name][f"{one.name}[{one.multi_id}]"] = one.data
         topics = {name: dict(sorted(each.items())) for name, each in topics.items()}
@@ -359,27 +355,20 @@ def _position(columns: Columns) -> TimeSeries | None:
     return position_series(columns["time_ns"][sound], place[sound])
 
 
-_SRT = re.compile(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->")
 MAX_BYTES = 500_000_000
 _NUMBER = r"([-+]?\d{1,20}(?:\.\d{1,20})?)"  # limited, as the time of a search is
 _TIMES = re.compile(
     r"(?<!\d)(\d{1,9}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d{1,9}):(\d\d):(\d\d)[,.](\d{1,3})"
 )
-_ENDS = (">", "]", ")")  # what blocks end with that are whole, besides the end of a line
-_TAG = re.compile(r"<[^<>]*>")
 _FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
 _GPS = re.compile(
     rf"\b(?:GPS|RTK)\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)"
 )
 _BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
-_HOME = re.compile(r"\bHOME\s*\(")
-_HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
-_GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
 _DIGITAL_ZOOM = re.compile(
     rf"\bd(?:igital)?[_ ]?zoom[a-z_]*\s{{0,9}}(?::\s{{0,9}})?{_NUMBER}", re.IGNORECASE
 )
 SAME_ZOOM = 0.02  # zooms that differ by less, as a fraction, are one
-NEEDED = ("time_s", "pitch_deg", "roll_deg")
 _COLUMNS = {
     "height": ("agl_m",),
     "home": ("home_m",),
@@ -393,11 +382,6 @@ _COLUMNS = {
     "prior": ("prior_lat_deg", "prior_lon_deg", "prior_std_m"),
 }
 """Columns of a table by the series of `RecordedTrack`."""
-_HEIGHTS = ("height", "home", "amsl", "hae")
-UNCLEAR_ORDER = (
-    "subtitles do not show whether GPS(..) begins with the latitude or the longitude: positions "
-    "are left out"
-)
 
 
 def log_kind(path: Path) -> str:
@@ -414,7 +398,7 @@ def log_kind(path: Path) -> str:
     if len(head) > 8 and head[0] == 0 and head[8] in MAVLINK_MAGICS:
         return "tlog"
     text = head.replace(b"\0", b"") if head[:2] in (b"\xff\xfe", b"\xfe\xff") else head
-    if _SRT.search(text):
+    if re.search(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->", text):
         return "srt"
     if b"time_s" in head.partition(b"\n")[0]:
         return "table"
@@ -436,17 +420,14 @@ def read_log(
     kind, sources = log_kind(path), Sources(named or {}, path)
     if unknown := sources.named.keys() - {"image", "camera_info", "attitude", "position", "height"}:
         raise FlightError(f"logs have no sources of {', '.join(unknown)}: {path}")
-    if kind in ("srt", "table") and sources.named.keys() & {"attitude", "position", "height"}:
-        raise FlightError(f"a file of this kind has one source each; omit --topic: {path}")
-    if kind in ("srt", "table") and path.stat().st_size > MAX_BYTES:
-        raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
-    if kind == "ulog":
-        return read_ulog(path, mount_deg, sources)
-    if kind == "dataflash":
-        return read_dataflash(path, mount_deg, sources)
-    if kind == "tlog":
-        return read_tlog(path, mount_deg, sources)
-    return read_srt(path) if kind == "srt" else read_table(path)
+    if kind in ("srt", "table"):
+        if sources.named.keys() & {"attitude", "position", "height"}:
+            raise FlightError(f"a file of this kind has one source each; omit --topic: {path}")
+        if path.stat().st_size > MAX_BYTES:
+            raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
+        return read_srt(path) if kind == "srt" else read_table(path)
+    read = {"ulog": read_ulog, "dataflash": read_dataflash, "tlog": read_tlog}[kind]
+    return read(path, mount_deg, sources)
 
 
 class SubtitleBlock(NamedTuple):
@@ -484,7 +465,13 @@ def read_srt(path: Path) -> RecordedTrack:
         position.add(block.start_ns, block.lat_deg, block.lon_deg, block.alt_m)
         height.add(block.start_ns, block.height_m)
         zoomed.add(block.start_ns, other)
-    warnings = [UNCLEAR_ORDER] * doubtful + [f"{UNRECORDED}: {path}"] * unrecorded
+    warnings = [f"{UNRECORDED}: {path}"] * unrecorded
+    if doubtful:
+        warnings.insert(
+            0,
+            "subtitles do not show whether GPS(..) begins with the latitude or the longitude: "
+            "positions are left out",
+        )
     if any(odd):
         warnings.append(
             f"{sum(odd)} of {len(odd)} subtitles state another zoom than most, the first at "
@@ -530,13 +517,13 @@ def blocks(data: bytes) -> Iterator[SubtitleBlock]:
     text = _decoded(data)
     latitude_first = _latitude_first(text)
     parts = re.split(r"\n\s*\n", text.replace("\r\n", "\n"))
-    if not text.endswith(("\n", *_ENDS)):
+    if not text.endswith(("\n", ">", "]", ")")):
         parts.pop()
     for part in parts:
         times = _TIMES.search(part)
         if times:
             start, end = _ns(times.groups()[:4]), _ns(times.groups()[4:])
-            yield _block(start, end, _TAG.sub(" ", part[times.end() :]), latitude_first)
+            yield _block(start, end, re.sub(r"<[^<>]*>", " ", part[times.end() :]), latitude_first)
 
 
 def _decoded(data: bytes) -> str:
@@ -565,7 +552,7 @@ def _latitude_first(text: str) -> bool | None:
     unit = barometer is not None and bool(barometer[2])
     latitude = any(each[3] for each in found) or unit
     longitude = any(each[2].isdecimal() and not each[3] for each in found)
-    longitude = longitude or _HOME.search(text) is not None
+    longitude = longitude or re.search(r"\bHOME\s*\(", text) is not None
     return None if latitude == longitude else latitude
 
 
@@ -579,9 +566,10 @@ def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> S
             lat, lon = lon, lat
     height = fields.get("rel_alt", _first(_BAROMETER, text))
     if math.isnan(height):
-        height = _first(_HEIGHT, text)
+        height = _first(rf"\bH\s+{_NUMBER}m\b", text)
     pitch, roll, yaw = (fields.get(f"gb_{name}", math.nan) for name in ("pitch", "roll", "yaw"))
-    if gimbal := _GIMBAL.search(text):
+    turns = rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}"
+    if gimbal := re.search(turns, text):
         pitch, roll, yaw = (float(gimbal[i]) for i in (1, 2, 3))
     altitude = fields.get("abs_alt", fields.get("altitude", math.nan))
     if not (abs(lat) <= 90 and abs(lon) <= 360):
@@ -593,8 +581,8 @@ def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> S
     return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll, zoom)
 
 
-def _first(pattern: re.Pattern[str], text: str) -> float:
-    found = pattern.search(text)
+def _first(pattern: str | re.Pattern[str], text: str) -> float:
+    found = re.search(pattern, text)
     return float(found[1]) if found else math.nan
 
 
@@ -609,7 +597,8 @@ def read_table(path: Path) -> RecordedTrack:
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             rows = TableRows(stream)
-            missing = [name for name in NEEDED if name not in rows.columns]
+            required = ("time_s", "pitch_deg", "roll_deg")
+            missing = [name for name in required if name not in rows.columns]
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
             held = [name for name in _COLUMNS if set(_COLUMNS[name]) & set(rows.columns)]
@@ -622,7 +611,7 @@ def read_table(path: Path) -> RecordedTrack:
                 position.add(time_ns, *_table_position(row, rows.line, path), math.nan)
                 for name in held:
                     values = [number_of(row.get(column)) for column in _COLUMNS[name]]
-                    if name in _HEIGHTS:
+                    if name in ("height", "home", "amsl", "hae"):
                         values = [measured(value) for value in values]
                     others[name].add(time_ns, *values)
     except TableError as error:

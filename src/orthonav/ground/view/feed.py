@@ -16,10 +16,7 @@ from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.files import require_file
 from orthonav.core.flight.fixes import is_health, result_from_json
 from orthonav.core.flight.logged import (
-    HEALTH,
-    RESULT,
-    SESSION,
-    TELEMETRY,
+    TOPICS,
     LoggedView,
     camera_of,
     from_json,
@@ -223,19 +220,19 @@ class LogReader:
             batch.problems.append(f"damaged chunks were skipped: {file.path}")
 
     def _take(self, batch: Batch, topic: str, data: bytes) -> None:
-        if topic == TELEMETRY.name:
+        if topic == TOPICS.telemetry.name:
             view = self._content.views[-1]
             self._views.setdefault(view.frame, view)
-        elif topic == SESSION.name:
+        elif topic == TOPICS.session.name:
             self.camera = camera_of(self.session["camera"])
             options = self.session.get("options")
             self.mount = logged_mount(options if isinstance(options, dict) else {})
-        elif topic == RESULT.name:
+        elif topic == TOPICS.result.name:
             batch.results.append(logged_result(data))
             self._results += 1
             if self._results > MAX_VIEWS:
                 raise BrokenLogError(f"flight log holds more than {MAX_VIEWS} results")
-        elif topic == HEALTH.name:
+        elif topic == TOPICS.health.name:
             self._health += 1
             if self._health <= MAX_HEALTH:
                 batch.health.append((self._results, checked_health(from_json(data))))
