@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import AreaError, FlightError, OutputError
-from orthonav.core.flight import FlightWriter, open_flight, read_image, read_truth
+from orthonav.core.flight import FlightWriter, open_flight, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.localize import downsampled, rectify
@@ -181,7 +181,7 @@ def test_the_folder(area, tmp_path, names_in):
         + [f"f/frames/{frame}" for frame in frames]
     )
     assert area.past.name in flight.note and json.loads((tmp_path / "f/flight.json").read_text())
-    assert read_image(flight.views[0].path).shape == (240, 320)
+    assert flight.views[0].grey().shape == (240, 320)
     header = (tmp_path / "f/telemetry.csv").read_text().splitlines()[0]
     assert header == "frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m,tilt_std_deg"
 

@@ -12,6 +12,7 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
+from mcap_bytes import chunk, header, zeros
 
 from orthonav.core.errors import FlightError, OrthonavError
 from orthonav.core.flight import logged as png_module
@@ -310,26 +311,7 @@ def test_whatever_is_done_to_a_log_only_our_errors_come_out(tmp_path_factory, co
 # Made by somebody who means harm
 
 
-def chunk(data, size, kind=b"zstd", crc=0):
-    body = struct.pack("<QQQI", 0, 0, size, crc) + struct.pack("<I", len(kind)) + kind
-    body += struct.pack("<Q", len(data)) + data
-    return b"\x06" + struct.pack("<Q", len(body)) + body
-
-
-def header():
-    body = struct.pack("<I", len(PROFILE)) + PROFILE.encode() + struct.pack("<I", 0)
-    return b"\x89MCAP0\r\n" + b"\x01" + struct.pack("<Q", len(body)) + body
-
-
-def bomb(size):
-    """`size` zeros in a few kilobytes, written in pieces."""
-    writer = zstandard.ZstdCompressor(level=1).compressobj(size=size)
-    piece = bytes(2**20)
-    packed = b"".join(writer.compress(piece) for _ in range(size // len(piece)))
-    return packed + writer.flush()
-
-
-BOMB = bomb(2**29)
+BOMB = zeros(2**29, zstandard.ZstdCompressor(level=1).compressobj(size=2**29))
 BOMBS = {
     "stated": chunk(BOMB, 2**29),
     "stated small": chunk(BOMB, 100),
@@ -346,7 +328,7 @@ BOMBS = {
 @pytest.mark.parametrize("how", BOMBS)
 def test_decompression_bombs_are_rejected(tmp_path, content, how):
     path = tmp_path / "flight_0001.mcap"
-    path.write_bytes(header() + BOMBS[how])
+    path.write_bytes(header(PROFILE.encode()) + BOMBS[how])
     tracemalloc.start()
     with pytest.raises(FlightError, match="no chunk of the flight log is complete"):
         open_source(path)

@@ -2,7 +2,6 @@
 
 import bz2
 import math
-import struct
 import tracemalloc
 from io import BytesIO
 
@@ -15,6 +14,7 @@ from bags import FORMATS, Messages, flight, record
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from mcap_bytes import MAGIC, MB, chunk, header, line, zeros
 from recorders import START_S, camera_file, picture, px4_topics, ulog
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -529,15 +529,6 @@ def test_topics_that_cannot_be_parsed_are_passed_over(tmp_path, messages, kind, 
     assert view.grey().shape == picture().shape
 
 
-MB = 2**20
-
-
-def zeros(size, compressor):
-    """`size` zeros in a few kilobytes, made in pieces."""
-    pieces = [compressor.compress(bytes(MB)) for _ in range(size // MB)]
-    return b"".join(pieces) + compressor.flush()
-
-
 BOMBS = {
     "zstd": zeros(512 * MB, zstandard.ZstdCompressor().compressobj(size=512 * MB)),
     "zstd without a stated size": zeros(512 * MB, zstandard.ZstdCompressor().compressobj()),
@@ -547,14 +538,8 @@ BOMBS = {
 
 def unindexed(path, data, claimed, kind):
     """An MCAP of one chunk, without an index."""
-
-    def line(opcode, body):
-        return bytes([opcode]) + struct.pack("<Q", len(body)) + body
-
-    body = struct.pack("<QQQII", 0, 1, claimed, 0, len(kind)) + kind
-    body += struct.pack("<Q", len(data)) + data
-    magic, head = b"\x89MCAP0\r\n", line(1, b"\4\0\0\0ros2" + bytes(4))
-    path.write_bytes(magic + head + line(6, body) + line(15, bytes(4)) + line(2, bytes(20)) + magic)
+    end = line(15, bytes(4)) + line(2, bytes(20)) + MAGIC
+    path.write_bytes(header(b"ros2") + chunk(data, claimed, kind) + end)
     return path
 
 

@@ -253,13 +253,15 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
     return Telemetry(time_ns, **values, prior=prior, vel_en_mps=velocity)
 
 
-def csv_rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
+def csv_rows(
+    path: Path, needed: tuple[str, ...], most_rows: int = MAX_VIEWS
+) -> Iterator[tuple[int, dict[str, str]]]:
     """Line number and fields of each row of a CSV that must have the columns `needed`."""
     if path.stat().st_size > MAX_TEXT_BYTES:
         raise FlightError(f"file is larger than {MAX_TEXT_BYTES // 10**6} MB: {path}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = TableRows(stream, most_rows=MAX_VIEWS)
+            rows = TableRows(stream, most_rows=most_rows)
             missing = [name for name in needed if name not in rows.columns]
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")

@@ -80,9 +80,8 @@ class LatencySearch:
     @cached_property
     def candidates_s(self) -> Array:
         """Candidates (C,) of the latency."""
-        return np.arange(round((self.most_s - self.least_s) / self.step_s) + 1) * self.step_s + (
-            self.least_s
-        )
+        steps = np.arange(round((self.most_s - self.least_s) / self.step_s) + 1, dtype=np.float64)
+        return np.asarray(steps * self.step_s + self.least_s)
 
 
 SEARCH = LatencySearch()

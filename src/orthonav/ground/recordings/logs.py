@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file
-from orthonav.core.flight.folder import number_of, time_ns_of
+from orthonav.core.flight.folder import csv_rows, number_of, time_ns_of
 from orthonav.core.flight.telemetry_track import (
     RecordedTrack,
     Samples,
@@ -39,7 +39,7 @@ from orthonav.core.geo.attitude import (
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.guard import needed, reading
-from orthonav.core.tables import TableError, TableRows
+from orthonav.core.tables import MAX_ROWS
 from orthonav.core.tilt import (
     ARDUPILOT,
     ASSUMED,
@@ -594,28 +594,19 @@ def read_table(path: Path) -> RecordedTrack:
     """
     attitude, position = Samples(3), Samples(3)
     others = {name: Samples(len(columns)) for name, columns in _COLUMNS.items()}
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = TableRows(stream)
-            required = ("time_s", "pitch_deg", "roll_deg")
-            missing = [name for name in required if name not in rows.columns]
-            if missing:
-                raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
-            held = [name for name in _COLUMNS if set(_COLUMNS[name]) & set(rows.columns)]
-            for row in rows:
-                time_ns = time_ns_of(row["time_s"])
-                if time_ns is None:
-                    raise FlightError(f"line {rows.line}: time_s is not a time: {path}")
-                angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
-                attitude.add(time_ns, *angles)
-                position.add(time_ns, *_table_position(row, rows.line, path), math.nan)
-                for name in held:
-                    values = [number_of(row.get(column)) for column in _COLUMNS[name]]
-                    if name in ("height", "home", "amsl", "hae"):
-                        values = [measured(value) for value in values]
-                    others[name].add(time_ns, *values)
-    except TableError as error:
-        raise FlightError(f"{error}: {path}") from error
+    for line, row in csv_rows(path, ("time_s", "pitch_deg", "roll_deg"), MAX_ROWS):
+        time_ns = time_ns_of(row["time_s"])
+        if time_ns is None:
+            raise FlightError(f"line {line}: time_s is not a time: {path}")
+        angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
+        attitude.add(time_ns, *angles)
+        position.add(time_ns, *_table_position(row, line, path), math.nan)
+        for name, columns in _COLUMNS.items():
+            if not row.keys().isdisjoint(columns):
+                values = [number_of(row.get(column)) for column in columns]
+                if name in ("height", "home", "amsl", "hae"):
+                    values = [measured(value) for value in values]
+                others[name].add(time_ns, *values)
     found: dict[str, Any] = {name: each.series() for name, each in others.items()}
     height = found.pop("height")
     track = RecordedTrack(
@@ -630,7 +621,7 @@ def read_table(path: Path) -> RecordedTrack:
     return track
 
 
-def _table_position(row: Mapping[str, str | None], line: int, path: Path) -> tuple[float, float]:
+def _table_position(row: Mapping[str, str], line: int, path: Path) -> tuple[float, float]:
     lat_deg, lon_deg = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
     prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
     if hint := swapped_hint(lat_deg, lon_deg) or swapped_hint(*prior):
