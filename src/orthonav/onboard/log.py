@@ -98,7 +98,7 @@ class FlightLog:
 
         `map_info`: its `name` and `manifest_sha256`. `max_bytes`: of all files of this name; the
         oldest are deleted. `segment_bytes`: of a file, unless a single chunk is larger. `chunk_s`:
-        the most that a power cut loses. Raises `OutputError`.
+        the most that a power cut loses. Raises `OutputError` or `MissingExtraError`.
         """
         path = Path(path)
         self._folder, self._name = path.parent, path.stem if path.suffix == ".mcap" else path.name
@@ -108,6 +108,7 @@ class FlightLog:
             raise OutputError(f"cannot write ({error.strerror}): {self._folder}") from error
         if not os.access(self._folder, os.W_OK):
             raise OutputError(f"cannot write (no permission): {self._folder}")
+        TOPICS.view.definition()  # a missing package is an error now, not in flight
         self.lost = {"views": 0, "messages": 0}
         self._camera, self._views = camera, views
         self._max_bytes = max_bytes

@@ -254,14 +254,15 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
 
 
 def csv_rows(
-    path: Path, needed: tuple[str, ...], most_rows: int = MAX_VIEWS
+    path: Path, needed: tuple[str, ...], most_rows: int | None = None
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Line number and fields of each row of a CSV that must have the columns `needed`."""
+    """Line number and fields of each row of a CSV that must have the columns `needed`; it has at
+    most `most_rows`, by default `MAX_VIEWS`."""
     if path.stat().st_size > MAX_TEXT_BYTES:
         raise FlightError(f"file is larger than {MAX_TEXT_BYTES // 10**6} MB: {path}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = TableRows(stream, most_rows=most_rows)
+            rows = TableRows(stream, most_rows=most_rows or MAX_VIEWS)
             missing = [name for name in needed if name not in rows.columns]
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")

@@ -99,7 +99,7 @@ def messages(chunk: bytes, channels: dict[int, str]) -> Iterator[LoggedMessage]:
         try:
             if opcode == Opcode.CHANNEL:
                 channel = records.Channel.read(record)
-                channels[channel.id] = channel.topic
+                channels[channel.id] = channel.topic[:1000]  # many long ones would fill the memory
             elif opcode == Opcode.MESSAGE:
                 found = records.Message.read(record, length)
                 topic = channels.get(found.channel_id, "")
