@@ -21,7 +21,7 @@ from recorders import (
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.logs import blocks
+from orthonav.ground.recordings.subtitles import blocks
 
 
 @pytest.fixture
