@@ -59,13 +59,12 @@ class FlownView:
 def views_in(folder: Path) -> Iterator[FlownView]:
     """Views of a flight folder, each read on demand."""
     from orthonav.core.flight import open_flight, read_truth
-    from orthonav.core.flight.folder import read_image
     from orthonav.core.records import View
 
     recorded, truth = open_flight(folder), read_truth(folder / "truth.csv")
     for each in recorded.views:
         if each.frame in truth:
-            view = View(read_image(each.path), recorded.camera, each.telemetry)
+            view = View(each.grey(), recorded.camera, each.telemetry)
             yield FlownView(each.frame, view, truth[each.frame])
 
 

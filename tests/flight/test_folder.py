@@ -67,7 +67,7 @@ def test_round_trip(folder):
     flight = open_flight(folder)
     assert flight.camera == CAMERA and flight.note == "été"
     assert [view.frame for view in flight.views] == ["a.png", "b.jpg", "c.tif"]
-    assert [view.path for view in flight.views] == sorted((folder / "frames").iterdir())
+    assert [Path(view.where) for view in flight.views] == sorted((folder / "frames").iterdir())
     first, second, third = (view.telemetry for view in flight.views)
     assert first == FULL and third.prior is None and third.vel_en_mps == (-3.5, 0.0)
     assert third.time_ns == pytest.approx(3_000_000_001, abs=10)

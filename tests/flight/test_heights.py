@@ -3,12 +3,13 @@
 import logging
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from orthonav.core.flight.heights import (
-    MISMATCH_M,
+    LIMITS,
     FlownHeights,
     GroundHeights,
     TerrainFit,
@@ -145,7 +146,7 @@ def test_heights_that_disagree_are_named_once(caplog):
     start = (*place(0, 0), 5.0)
     heights = flown(take_off=start)
     for _ in range(3):
-        heights.corrected(reported(home_m=100.0, amsl_m=400.0 - MISMATCH_M - 5))
+        heights.corrected(reported(home_m=100.0, amsl_m=400.0 - LIMITS.mismatch_m - 5))
     assert caplog.text.count("differ by 25 m over this terrain") == 1
     caplog.clear()
     flown(take_off=start).corrected(reported(home_m=100.0, amsl_m=405.0))
@@ -207,7 +208,7 @@ def test_what_does_not_fit_is_named_once(terrain, named, caplog):
 
 def test_a_long_flight_is_judged_by_its_latest_views(caplog, monkeypatch):
     """A wrong datum is named once most of them lie on the part of the terrain that has it."""
-    monkeypatch.setattr("orthonav.core.flight.heights.MAX_VIEWS", 40)
+    monkeypatch.setattr("orthonav.core.flight.heights.LIMITS", replace(LIMITS, max_views=40))
 
     def joined(lat, lon):
         return np.where(np.asarray(lon) < 2.005, 200.0, 260.0)

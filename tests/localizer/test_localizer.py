@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from orthonav.core.errors import CameraError
-from orthonav.core.flight import read_image
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -26,7 +25,7 @@ GROUND_M = 420
 @pytest.fixture(scope="module")
 def views(flight):
     """Views of the second date: grey levels and telemetry by frame."""
-    return {view.frame: (read_image(view.path), view.telemetry) for view in flight.views}
+    return {view.frame: (view.grey(), view.telemetry) for view in flight.views}
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from test_flight import PLAIN, SMALL, plane_of, route_of
 
 from helpers import textured
 from orthonav.core.errors import UsageError
-from orthonav.core.flight import open_flight, read_image, read_truth
+from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
@@ -49,7 +49,7 @@ def reported(flight, *fields):
 
 
 def pictures(flight):
-    return [read_image(view.path) for view in flight.views]
+    return [view.grey() for view in flight.views]
 
 
 def test_a_seed_gives_the_numbers_of_earlier_versions(area, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import AreaError, OutputError, UsageError
-from orthonav.core.flight import FlightWriter, open_flight, read_image, read_truth
+from orthonav.core.flight import FlightWriter, open_flight, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.localize import downsampled, rectify
@@ -91,7 +91,7 @@ def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera
     )
     for view in flight.views:
         telemetry = view.telemetry
-        seen = View(read_image(view.path), camera, telemetry)
+        seen = View(view.grey(), camera, telemetry)
         rectified = rectify(downsampled(seen, 1.0), gsd_m=1.0, size_px=SIZE_PX)
         place = plane.frame.en_from_latlon(*truth[view.frame]) + rectified.offset_en_m
         ground = ground_at(area, plane.frame, place)
@@ -181,7 +181,7 @@ def test_the_folder(area, tmp_path, names_in):
         + [f"f/frames/{frame}" for frame in frames]
     )
     assert area.past.name in flight.note and json.loads((tmp_path / "f/flight.json").read_text())
-    assert read_image(flight.views[0].path).shape == (240, 320)
+    assert flight.views[0].grey().shape == (240, 320)
     header = (tmp_path / "f/telemetry.csv").read_text().splitlines()[0]
     assert header == "frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m,tilt_std_deg"
 
@@ -232,7 +232,7 @@ def test_views_keep_off_missing_imagery(make_ortho, tmp_path):
     )
     simulate_flight(request)
     for view in open_flight(tmp_path / "f").views:
-        assert read_image(view.path).min() > 90
+        assert view.grey().min() > 90
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from lab.terrain import seen_view
 from test_flight import FISH, LENS, PLAIN, SEEN
 
 from orthonav.core.errors import UsageError
-from orthonav.core.flight import open_flight, read_image, read_truth
+from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
@@ -74,7 +74,7 @@ def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path):
         assert telemetry.pitch_deg == 60.0 and math.isnan(telemetry.agl_m)
         below = float(terrain(*np.array([[each] for each in truth[flight.views[0].frame]]))[0])
         assert telemetry.amsl_m == pytest.approx(below + 50.0, abs=0.1)
-        pictures[name] = np.stack([read_image(view.path) for view in flight.views]).astype(float)
+        pictures[name] = np.stack([view.grey() for view in flight.views]).astype(float)
     assert (np.abs(pictures["dem"] - pictures["dsm"]) > 15).mean() > 0.005
     with pytest.raises(UsageError, match="camera_pitch_deg must be 0 to 65"):
         simulate_flight(SimulateRequest([ortho], tmp_path / "no", camera_pitch_deg=70.0, **request))

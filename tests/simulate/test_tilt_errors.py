@@ -90,5 +90,5 @@ def test_the_command_tilts_by_default(run, ortho, tmp_path):
         views = open_flight(tmp_path / name).views
         reported = [view.telemetry for view in views]
         assert {(t.pitch_deg, t.roll_deg, t.tilt_std_deg) for t in reported} == {(0, 0, stated)}
-        pictures[name] = [view.path.read_bytes() for view in views]
+        pictures[name] = [view.data() for view in views]
     assert not set(pictures["usual"]) & set(pictures["exact"])

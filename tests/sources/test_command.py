@@ -17,11 +17,7 @@ from orthonav.core.flight import FlightWriter, open_flight, read_image
 from orthonav.core.flight.fixes import read_results
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import Fix, Telemetry
-from orthonav.ground.recordings.recording import (
-    LEVEL_GROUND,
-    LEVEL_GROUND_IN_GAPS,
-    SourceOptions,
-)
+from orthonav.ground.recordings.recording import SourceOptions
 from orthonav.ground.view.run import Run, ViewRequest
 
 DATA = Path(__file__).parents[1] / "data"
@@ -119,7 +115,9 @@ def test_a_source_is_localized_as_its_import_is(run, kind, tmp_path, camera):
     source = MAKERS[kind](tmp_path)
     telemetry = ["--camera", camera]
     code, out, err = run("import", source, "--out", tmp_path / "flight", *telemetry, "--json")
-    warnings = [f"WARNING: {text}\n" for text in (LEVEL_GROUND, LEVEL_GROUND_IN_GAPS)]
+    taken = "is taken from the height above take-off: level ground is assumed"
+    gaps = "", "where none was measured "
+    warnings = [f"WARNING: height above ground {each}{taken}\n" for each in gaps]
     said = [line for line in err.splitlines(keepends=True) if "show 2 of 2 photog" not in line]
     assert code == 0 and "".join(said) in ("", *warnings)
     plain = json.loads(out)

@@ -12,16 +12,14 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
+from mcap_bytes import chunk, header, zeros
 
 from orthonav.core.errors import FlightError, OrthonavError
 from orthonav.core.flight import logged as png_module
 from orthonav.core.flight.fixes import read_results, result_to_json
 from orthonav.core.flight.logged import (
-    HEALTH,
     PROFILE,
-    SESSION,
-    TELEMETRY,
-    VIEW,
+    TOPICS,
     LoggedView,
     lossless_png,
     picture_message,
@@ -93,7 +91,7 @@ def crafted(path, messages, profile=PROFILE, compression=CompressionType.ZSTD):
         ids = {}
         for topic, index, data in messages:
             if topic.name not in ids:
-                ids[topic.name] = writer.register_channel(topic.name, topic.encoding, 0)
+                ids[topic.name] = writer.register_channel(topic.name, "json", 0)
             writer.add_message(ids[topic.name], log_time=0, publish_time=0, sequence=index,
                                data=data)  # fmt: skip
         writer.finish()
@@ -102,17 +100,17 @@ def crafted(path, messages, profile=PROFILE, compression=CompressionType.ZSTD):
 
 def session(**changes):
     plain = {"format": 1, "run": "a", "views": "full", "camera": CAMERA.numbers()}
-    return SESSION, 0, to_json({**plain, **changes})
+    return TOPICS.session, 0, to_json({**plain, **changes})
 
 
 def reported(index=0, frame="a.png", picture="full"):
     view = LoggedView(index, index, frame, telemetry(index), picture)
-    return TELEMETRY, index, telemetry_message(view)
+    return TOPICS.telemetry, index, telemetry_message(view)
 
 
 def shown(index=0, data=None):
     png = lossless_png(picture(index)) if data is None else data
-    return VIEW, index, picture_message(png, "png", 0)
+    return TOPICS.view, index, picture_message(png, "png", 0)
 
 
 # The flight again
@@ -313,26 +311,7 @@ def test_whatever_is_done_to_a_log_only_our_errors_come_out(tmp_path_factory, co
 # Made by somebody who means harm
 
 
-def chunk(data, size, kind=b"zstd", crc=0):
-    body = struct.pack("<QQQI", 0, 0, size, crc) + struct.pack("<I", len(kind)) + kind
-    body += struct.pack("<Q", len(data)) + data
-    return b"\x06" + struct.pack("<Q", len(body)) + body
-
-
-def header():
-    body = struct.pack("<I", len(PROFILE)) + PROFILE.encode() + struct.pack("<I", 0)
-    return b"\x89MCAP0\r\n" + b"\x01" + struct.pack("<Q", len(body)) + body
-
-
-def bomb(size):
-    """`size` zeros in a few kilobytes, written in pieces."""
-    writer = zstandard.ZstdCompressor(level=1).compressobj(size=size)
-    piece = bytes(2**20)
-    packed = b"".join(writer.compress(piece) for _ in range(size // len(piece)))
-    return packed + writer.flush()
-
-
-BOMB = bomb(2**29)
+BOMB = zeros(2**29, zstandard.ZstdCompressor(level=1).compressobj(size=2**29))
 BOMBS = {
     "stated": chunk(BOMB, 2**29),
     "stated small": chunk(BOMB, 100),
@@ -349,7 +328,7 @@ BOMBS = {
 @pytest.mark.parametrize("how", BOMBS)
 def test_decompression_bombs_are_rejected(tmp_path, content, how):
     path = tmp_path / "flight_0001.mcap"
-    path.write_bytes(header() + BOMBS[how])
+    path.write_bytes(header(PROFILE.encode()) + BOMBS[how])
     tracemalloc.start()
     with pytest.raises(FlightError, match="no chunk of the flight log is complete"):
         open_source(path)
@@ -391,7 +370,7 @@ MESSAGES = {
 
 @pytest.mark.parametrize("how", MESSAGES)
 def test_invalid_images_are_rejected(tmp_path, monkeypatch, how):
-    messages = [session(), reported(), (VIEW, 0, MESSAGES[how])]
+    messages = [session(), reported(), (TOPICS.view, 0, MESSAGES[how])]
     (view,) = open_source(crafted(tmp_path / "a.mcap", messages)).views
     if how != "too few rows":  # OpenCV must not even see the others
         monkeypatch.setattr(png_module.cv2, "imdecode", None)
@@ -417,7 +396,7 @@ def test_invalid_telemetry_is_left_out(tmp_path, data):
         session(),
         reported(),
         shown(),
-        (TELEMETRY, 1, data),
+        (TOPICS.telemetry, 1, data),
         reported(2, "c.png"),
         shown(2),
     ]
@@ -442,7 +421,7 @@ def test_invalid_cameras_are_rejected(tmp_path, changes):
         ([session(format=2), reported(), shown()], r"format 2.*update orthonav"),
         ([session(), reported(), shown(), reported(1), shown(1)], "appears twice"),
         ([session(), *(reported(n, f"{n}.png") for n in range(5)), shown()], "more than 3 views"),
-        ([session(), reported(), shown(), *[(HEALTH, 0, b"")] * 60], "more than 3 views"),
+        ([session(), reported(), shown(), *[(TOPICS.health, 0, b"")] * 60], "more than 3 views"),
     ],
 )
 def test_logs_that_cannot_be_read_are_named(tmp_path, monkeypatch, messages, words):

@@ -28,8 +28,9 @@ from recorders import (
 
 from orthonav.ground.recordings import open_source
 from orthonav.ground.recordings.exif import read_photo
-from orthonav.ground.recordings.logs import read_log, read_srt
+from orthonav.ground.recordings.logs import read_log
 from orthonav.ground.recordings.photos import posed
+from orthonav.ground.recordings.subtitles import read_srt
 
 ROOT = Path(__file__).parents[2]
 RECORDINGS = (

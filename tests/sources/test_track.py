@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from orthonav.core.errors import FlightError
+from orthonav.core.flight.recording import RecordedView
 from orthonav.core.flight.telemetry_track import (
     GAP_NS,
     RecordedTrack,
@@ -17,7 +18,6 @@ from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.core.tilt import ARDUPILOT, GIMBAL, MOUNT_STD_DEG, UNSTATED, stated_deg
 from orthonav.ground.recordings.recording import (
     SourceOptions,
-    SourceView,
     warnings_of,
     with_mean_velocities,
 )
@@ -186,7 +186,8 @@ def test_impossible_options_are_refused(change, message):
 
 def seen_at(velocities, *times_s):
     track = RecordedTrack(None, velocity=series(*velocities))
-    views = [SourceView("", track.telemetry(round(t * S)), None, "", lambda: None) for t in times_s]
+    told = (track.telemetry(round(t * S)) for t in times_s)
+    views = [RecordedView("", each, None, "", lambda: None) for each in told]
     return [each.telemetry.vel_en_mps for each in with_mean_velocities(views, track)]
 
 

@@ -21,7 +21,7 @@ from recorders import (
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
-from orthonav.ground.recordings.logs import blocks
+from orthonav.ground.recordings.subtitles import blocks
 
 
 @pytest.fixture
@@ -35,6 +35,14 @@ def recorded(tmp_path):
 
 def options(path, **more):
     return SourceOptions(camera=path.parent / "camera.json", **more)
+
+
+def filmed(folder, texts=None, name="a.mp4", code="mp4v", changed=lambda path: path):
+    """A video of 2 s at 10 frames a second with subtitles and a camera; `changed` alters it."""
+    path = changed(video(folder / name, 20, 10.0, code))
+    subtitles(path.with_suffix(".srt"), texts or [dji_subtitle(n, yaw=n) for n in range(20)])
+    camera_file(folder / "camera.json")
+    return path
 
 
 def test_views_come_at_the_rate_asked_for(recorded):
@@ -55,9 +63,7 @@ def test_views_come_at_the_rate_asked_for(recorded):
 
 @pytest.mark.parametrize("name, code", [("a.mp4", "mp4v"), ("a.avi", "MJPG"), ("a.mov", "mp4v")])
 def test_other_containers(tmp_path, name, code):
-    path = video(tmp_path / name, 20, 10.0, code)
-    subtitles(tmp_path / "a.srt", [dji_subtitle(n) for n in range(20)])
-    camera_file(tmp_path / "camera.json")
+    path = filmed(tmp_path, name=name, code=code)
     views = list(open_source(path, options(path)).views)
     assert [view.telemetry.time_ns for view in views] == [0, 10**9]
     assert np.abs(views[1].grey().astype(int) - picture(10)).mean() < 6
@@ -73,7 +79,7 @@ def test_import(recorded, tmp_path, quality):
         assert written.telemetry == view.telemetry
         off = np.abs(written.grey().astype(int) - view.grey())
         assert off.max() == 0 if quality is None else off.mean() < 3
-        assert written.path.suffix == (".png" if quality is None else ".jpg")
+        assert written.frame.endswith(".png" if quality is None else ".jpg")
 
 
 def test_a_table_beside_the_video(tmp_path):
@@ -161,10 +167,7 @@ def test_doubtful_positions_are_named(recorded):
 
 
 def test_without_gimbal_angles_nothing_is_made_up(tmp_path):
-    path = video(tmp_path / "a.mkv")
-    texts = ["GPS(2.5,46.5,16) BAROMETER:91.9"] * 30
-    subtitles(tmp_path / "a.srt", texts)
-    camera_file(tmp_path / "camera.json")
+    path = filmed(tmp_path, ["GPS(2.5,46.5,16) BAROMETER:91.9"] * 30)
     telemetry = next(open_source(path, options(path)).views).telemetry
     assert telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and telemetry.agl_m == 91.9
     level = next(open_source(path, options(path, looks_down=True)).views).telemetry
@@ -175,9 +178,7 @@ def test_a_gimbal_that_is_0_throughout_was_not_recorded(recorded):
     srt = recorded.with_suffix(".SRT")
     subtitles(srt, [dji_subtitle(n, yaw=0, pitch=0) for n in range(30)])
     recording = open_source(recorded, options(recorded))
-    assert ["of the gimbal are 0 throughout" in each for each in recording.warnings].count(
-        True
-    ) == 1
+    assert sum("of the gimbal are 0 throughout" in each for each in recording.warnings) == 1
     for telemetry in (view.telemetry for view in recording.views):
         assert telemetry.missing() == ["yaw_deg"] and telemetry.tilt_std_deg == 6
         assert (telemetry.pitch_deg, telemetry.roll_deg) == pytest.approx((0, 0), abs=1e-6)
@@ -238,9 +239,7 @@ def test_views_of_another_zoom_are_left_out(recorded):
         texts = [f"{dji_subtitle(n)} [{form.format(4 if n >= 20 else 1)}]" for n in range(30)]
         subtitles(recorded.with_suffix(".SRT"), texts)
         recording = open_source(recorded, options(recorded, rate_hz=2.0))
-        said = (
-            "10 of 30 subtitles state another zoom than most, the first at 2.0 s; views there are"
-        )
+        said = "10 of 30 subtitles state another zoom than most, the first at 2.0 s; views there"
         assert any(said in each for each in recording.warnings)
         assert [view.telemetry.time_ns / 1e9 for view in recording.views] == [0, 0.5, 1, 1.5]
 
@@ -260,11 +259,12 @@ def test_a_digital_zoom_of_the_whole_flight_is_named(recorded):
     assert len(list(recording.views)) == 3
 
 
+SHOWN = [dji_subtitle(n, yaw=n) for n in range(15)]
+
+
 def test_frames_that_edits_hide_are_not_missing(tmp_path):
     """As of a video that was cut without encoding it again; time 0 is the first frame shown."""
-    path = hidden(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), begin_s=0.5, shown_s=1.5)
-    subtitles(tmp_path / "a.srt", [dji_subtitle(n, yaw=n) for n in range(15)])
-    camera_file(tmp_path / "camera.json")
+    path = filmed(tmp_path, SHOWN, changed=lambda path: hidden(path, begin_s=0.5, shown_s=1.5))
     recording = open_source(path, options(path, rate_hz=2.0))
     views = list(recording.views)
     assert recording.expected == 3 and "ends" not in "".join(recording.warnings)
@@ -275,9 +275,7 @@ def test_frames_that_edits_hide_are_not_missing(tmp_path):
 
 
 def test_frames_that_are_missing_besides_the_hidden_ones_are_named(tmp_path):
-    path = hidden(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), begin_s=0.5, shown_s=1.5)
-    subtitles(tmp_path / "a.srt", [dji_subtitle(n) for n in range(15)])
-    camera_file(tmp_path / "camera.json")
+    path = filmed(tmp_path, SHOWN, changed=lambda path: hidden(path, begin_s=0.5, shown_s=1.5))
     data = bytearray(path.read_bytes())
     end = data.index(b"moov") - 4
     begin = (data.index(b"mdat") + end) // 2
@@ -289,9 +287,7 @@ def test_frames_that_are_missing_besides_the_hidden_ones_are_named(tmp_path):
 
 def test_a_clock_that_begins_late_is_named(tmp_path):
     """Time 0 is the first frame."""
-    path = late(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"), by_s=2.5)
-    subtitles(tmp_path / "a.srt", [dji_subtitle(n, yaw=n) for n in range(20)])
-    camera_file(tmp_path / "camera.json")
+    path = filmed(tmp_path, changed=lambda path: late(path, by_s=2.5))
     recording = open_source(path, options(path))
     assert "begins at 2.5 s; time 0 is its first frame" in recording.warnings[0]
     views = list(recording.views)
@@ -307,23 +303,18 @@ def test_the_time_before_the_first_frame_holds_no_missing_frames(recorded):
 
 def test_pixels_that_are_not_square(recorded):
     twice_as_wide(recorded)
-    with pytest.raises(
-        CameraError, match=r"2\.000 times as wide as high, those of the camera 1\.0"
-    ):
+    said = r"2\.000 times as wide as high, those of the camera 1\.0"
+    with pytest.raises(CameraError, match=said):
         open_source(recorded, options(recorded))
     camera_file(recorded.parent / "camera.json", fx_px=30.0, unusual=True)
     assert open_source(recorded, options(recorded)).camera.fx_px == 30
 
 
 def test_a_video_that_players_turn_is_used_as_stored(tmp_path):
-    path = turned(video(tmp_path / "a.mp4", 20, 10.0, "mp4v"))
-    subtitles(tmp_path / "a.srt", [dji_subtitle(n) for n in range(20)])
-    camera_file(tmp_path / "camera.json")
+    path = filmed(tmp_path, changed=turned)
     recording = open_source(path, options(path))
-    assert (
-        "players show the video turned by 180 deg; its frames are used as stored"
-        in recording.warnings[0]
-    )
+    said = "players show the video turned by 180 deg; its frames are used as stored"
+    assert said in recording.warnings[0]
     assert np.abs(next(recording.views).grey().astype(int) - picture(0)).mean() < 6
 
 

@@ -40,13 +40,14 @@ from orthonav.core.files import is_stdout
 from orthonav.core.geo.headings import RADIANS, seem_radians
 
 if TYPE_CHECKING:
+    from orthonav.core.flight import RecordedView
     from orthonav.core.flight.fixes import Identity
     from orthonav.core.flight.mount import Mount
     from orthonav.core.geo.ground import TerrainHeights
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.ground.imagery.terrain import Dem
-    from orthonav.ground.recordings import Recording, SourceView
+    from orthonav.ground.recordings import Recording
     from orthonav.ground.recordings.setups import Tried
 
 EXAMPLE = "area.onav flight --out fixes.jsonl"
@@ -68,7 +69,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "file to write (-: stdout, with the summary on stderr); without it the command prints "
     text += "the positions, if photographs are given one by one"
     add("--out", type=Path, metavar="fixes.jsonl", help=text)
-    text = "write the confident camera positions for other programs too: csv, kml, gpx, tum (a "
+    text = "write the confident camera positions for other programs too: csv, kml, tum (a "
     text += "trajectory for evo) or odm-geo (OpenDroneMap's geo.txt); heights above sea need a "
     text += "terrain; can be repeated"
     add("--export", action="append", default=[], metavar="FORMAT=PATH", help=text)
@@ -302,7 +303,7 @@ class SetupAdvice:
         self._nearest: tuple[float, str] | None = None
         self._yaw_deg: list[float] = []
 
-    def watching(self) -> "Iterator[SourceView]":
+    def watching(self) -> "Iterator[RecordedView]":
         for view in self._low.watching(self._flight.views):
             found = far_from_map(view, self._localizer)
             if found is not None and (self._nearest is None or found < self._nearest):

@@ -12,7 +12,7 @@ from orthonav.cli.common import add_options, print_json
 from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
 
 if TYPE_CHECKING:
-    from orthonav.core.flight import FlightView
+    from orthonav.core.flight import RecordedView
     from orthonav.core.mapfile.terrain import TerrainLayer
 
 EXAMPLE = "fixes.jsonl 0001.jpg 640 480 --flight flight"
@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
     other = read_identity(options.fixes).differences(given, options.map, options.flight)
     if other:
         log.warning("fixes are of %s: %s", other, options.fixes)
-    turned = _is_turned(view.path)
+    turned = _is_turned(Path(view.where))
     found = locate_pixel(_camera(flight, view), telemetry, fix, (options.x, options.y), terrain)
     is_above_sea = terrain is not None and terrain.info.is_above_sea
     height_m = found.height_m if is_above_sea else math.nan
@@ -103,7 +103,7 @@ def _is_turned(path: Path) -> bool:
     return turned
 
 
-def _camera(flight: "orthonav.FlightFolder", view: "FlightView") -> "orthonav.Camera":
+def _camera(flight: "orthonav.FlightFolder", view: "RecordedView") -> "orthonav.Camera":
     """The camera at the size of the image of a view; as calibrated where that cannot be read."""
     try:
         height_px, width_px = view.grey().shape

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from orthonav.core.geo.ground import TerrainHeights
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.ground.imagery.terrain import Dem
-    from orthonav.ground.recordings import Recording, SourceOptions, SourceView
+    from orthonav.ground.recordings import Recording, SourceOptions
     from orthonav.onboard.run import Locator
 
 FAR_M = 1000.0
@@ -82,7 +82,7 @@ def distance_from_map(
     return beyond_m(*latlon_deg), hint
 
 
-def far_from_map(view: "SourceView", localizer: "orthonav.Localizer") -> tuple[float, str] | None:
+def far_from_map(view: "RecordedView", localizer: "orthonav.Localizer") -> tuple[float, str] | None:
     """`distance_from_map` of the recorded position of a view or of its prior, the farther one; None
     without a position."""
     prior, recorded = view.telemetry.prior, view.truth_latlon_deg

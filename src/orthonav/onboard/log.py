@@ -32,28 +32,17 @@ from orthonav import __version__
 from orthonav.core.errors import CameraError, OutputError, described
 from orthonav.core.flight.fixes import result_to_json
 from orthonav.core.flight.logged import (
-    CAMERA,
     FORMAT,
-    GNSS,
-    HEALTH,
     MAX_JSON_BYTES,
     MAX_PICTURE_BYTES,
-    NAVSAT,
-    POSITION,
     PROFILE,
-    RESULT,
-    SESSION,
-    TELEMETRY,
-    THUMBNAIL,
     TOPICS,
-    VIEW,
     LoggedView,
     Message,
     calibration_message,
     lossless_png,
     navsat_message,
     picture_message,
-    position_message,
     telemetry_message,
     to_json,
 )
@@ -109,7 +98,7 @@ class FlightLog:
 
         `map_info`: its `name` and `manifest_sha256`. `max_bytes`: of all files of this name; the
         oldest are deleted. `segment_bytes`: of a file, unless a single chunk is larger. `chunk_s`:
-        the most that a power cut loses. Raises `OutputError`.
+        the most that a power cut loses. Raises `OutputError` or `MissingExtraError`.
         """
         path = Path(path)
         self._folder, self._name = path.parent, path.stem if path.suffix == ".mcap" else path.name
@@ -119,6 +108,7 @@ class FlightLog:
             raise OutputError(f"cannot write ({error.strerror}): {self._folder}") from error
         if not os.access(self._folder, os.W_OK):
             raise OutputError(f"cannot write (no permission): {self._folder}")
+        TOPICS.view.definition()  # a missing package is an error now, not in flight
         self.lost = {"views": 0, "messages": 0}
         self._camera, self._views = camera, views
         self._max_bytes = max_bytes
@@ -204,11 +194,11 @@ class FlightLog:
             self._lose("messages", error)
             return
         time_ns = self._time_ns
-        self._add(lambda: [_message(HEALTH, time_ns, data)], len(data))
+        self._add(lambda: [_message(TOPICS.health, time_ns, data)], len(data))
 
     def gnss(self, time_ns: int, cdr: bytes) -> None:
         # A `sensor_msgs/NavSatFix` (CDR).
-        self._add(lambda: [_message(GNSS, time_ns, cdr)], len(cdr))
+        self._add(lambda: [_message(TOPICS.gnss, time_ns, cdr)], len(cdr))
 
     def close(self) -> None:
         with self._change:
@@ -327,28 +317,29 @@ class FlightLog:
                 log.debug("flight log ends without an index: %s", error)
 
     def _head(self) -> list[Message]:
-        camera = _message(CAMERA, self._time_ns, calibration_message(self._camera, self._time_ns))
+        data = calibration_message(self._camera, self._time_ns)
+        camera = _message(TOPICS.camera, self._time_ns, data)
         return [self._session_message(self._session), camera]
 
     def _session_message(self, session: dict[str, Any]) -> Message:
-        return _message(SESSION, self._time_ns, to_json(session))
+        return _message(TOPICS.session, self._time_ns, to_json(session))
 
 
 def _message(topic: Any, time_ns: int, data: bytes, index: int = 0) -> Message:
-    limit = MAX_PICTURE_BYTES if topic in (VIEW, THUMBNAIL) else MAX_JSON_BYTES
+    limit = MAX_PICTURE_BYTES if topic in (TOPICS.view, TOPICS.thumbnail) else MAX_JSON_BYTES
     if len(data) > limit:
         raise ValueError(f"{len(data)} bytes for {topic.name}")
     return Message(topic, time_ns, data, index)
 
 
 def _telemetry(seen: LoggedView, time_ns: int) -> Message:
-    return _message(TELEMETRY, time_ns, telemetry_message(seen), seen.index)
+    return _message(TOPICS.telemetry, time_ns, telemetry_message(seen), seen.index)
 
 
 def _full(seen: LoggedView, grey: Grey) -> list[Message]:
     time_ns = seen.telemetry.time_ns
     data = picture_message(lossless_png(grey), "png", time_ns)
-    picture = _message(VIEW, time_ns, data, seen.index)
+    picture = _message(TOPICS.view, time_ns, data, seen.index)
     return [_telemetry(replace(seen, picture="full"), time_ns), picture]
 
 
@@ -363,20 +354,20 @@ def _with_thumbnail(seen: LoggedView, small: Grey) -> list[Message]:
     options = [int(cv2.IMWRITE_JPEG_QUALITY), THUMBNAIL_QUALITY]
     done, jpeg = cv2.imencode(".jpg", small, options)
     telemetry = _telemetry(replace(seen, picture="thumbnail" if done else "none"), time_ns)
-    data = picture_message(jpeg.tobytes() if done else b"", "jpeg", time_ns)
-    return [telemetry, _message(THUMBNAIL, time_ns, data, seen.index)] if done else [telemetry]
+    if not done:
+        return [telemetry]
+    data = picture_message(jpeg.tobytes(), "jpeg", time_ns)
+    return [telemetry, _message(TOPICS.thumbnail, time_ns, data, seen.index)]
 
 
 def _result(result: ViewResult, index: int) -> list[Message]:
     line = result_to_json(result).encode("ascii")
-    messages = [_message(RESULT, result.time_ns, line, index)]
+    messages = [_message(TOPICS.result, result.time_ns, line, index)]
     if isinstance(result.outcome, Fix):
         with contextlib.suppress(ValueError):  # a value that is not finite
-            data = position_message(result.outcome, result.time_ns)
-            messages.append(_message(POSITION, result.time_ns, data, index))
             confident = result.is_recognized
             data = navsat_message(result.outcome, result.time_ns, confident=confident)
-            messages.append(_message(NAVSAT, result.time_ns, data, index))
+            messages.append(_message(TOPICS.navsat, result.time_ns, data, index))
     return messages
 
 
@@ -424,13 +415,14 @@ class Segment:
         self._writer.start(profile=PROFILE, library=f"orthonav {__version__}")
         schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        for topic in TOPICS:
+        for topic in vars(TOPICS).values():
             if topic.schema not in schemas:
+                encoding = "ros2msg" if topic.is_ros else "jsonschema"
                 schemas[topic.schema] = self._writer.register_schema(
-                    topic.schema, topic.schema_encoding, topic.text.encode()
+                    topic.schema, encoding, topic.definition().encode()
                 )
             self._channels[topic.name] = self._writer.register_channel(
-                topic.name, topic.encoding, schemas[topic.schema]
+                topic.name, "cdr" if topic.is_ros else "json", schemas[topic.schema]
             )
 
     @property

@@ -2,7 +2,6 @@
 
 from orthonav.core.flight.folder import (
     FlightFolder,
-    FlightView,
     FlightWriter,
     decode_image,
     open_flight,
@@ -15,7 +14,6 @@ from orthonav.core.flight.recording import Flight, RecordedView
 __all__ = [
     "Flight",
     "FlightFolder",
-    "FlightView",
     "FlightWriter",
     "RecordedView",
     "decode_image",

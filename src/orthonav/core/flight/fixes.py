@@ -17,7 +17,7 @@ from decimal import Decimal
 from importlib import import_module
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,13 +65,8 @@ TRACK_KEYS = (
     "state",  # one of `STATES`
 )
 STATES = ("searching", "tracking", "coasting", "lost")
-_NULL_IN_FIX = {"reason": None, "detail": None}
-_NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:11])
 MAX_LINE_BYTES = 2**20  # limit of a line; the evidence of a view takes about 1000 bytes
 MAX_RESULTS = 1_000_000  # limit of lines: as many as a flight folder may have views
-_TIME_LIMIT_S = 2**63 / 1e9
-FIRST_BYTES = 2**16  # longest first line that is read
-View = TypeVar("View", bound=RecordedView)
 
 
 @dataclass(frozen=True)
@@ -109,7 +104,7 @@ class FlightDigest:
 
     _sum: Any = field(default_factory=hashlib.sha256)
 
-    def watching(self, views: Iterable[View]) -> Iterator[View]:
+    def watching(self, views: Iterable[RecordedView]) -> Iterator[RecordedView]:
         """The same views, which are counted as they pass."""
         for view in views:
             telemetry = view.telemetry
@@ -134,7 +129,7 @@ def flight_digest(views: Iterable[RecordedView]) -> str:
 def read_identity(path: Path) -> Identity:
     """What the first line of a file of fixes states; raises `MissingFileError`."""
     with require_file(path, "file of fixes").open("rb") as stream:
-        for raw in iter(lambda: stream.readline(FIRST_BYTES), b""):
+        for raw in iter(lambda: stream.readline(2**16), b""):
             try:
                 plain = json.loads(raw)
             except (ValueError, RecursionError):
@@ -290,19 +285,17 @@ def _all(fixes: StrPath | Iterable[Any]) -> Iterable[Any]:
     return found
 
 
-_NUMBERS = "lat_deg", "lon_deg", "confidence", "radius_m", "heading_deg", "agl_m"
-
-
 def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
     if isinstance(outcome, NoFix):
         no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
-        return {**no_fix, **_NULL_IN_NO_FIX}
+        return {**dict.fromkeys(KEYS[3:11]), **no_fix}
     return {
         "status": "fix",
         "confident": outcome.is_confident,
-        **{key: _or_none(getattr(outcome, key)) for key in _NUMBERS},
+        **{key: _or_none(getattr(outcome, key)) for key in (*KEYS[4:6], *KEYS[7:11])},
         "cov_en_m2": _rows(outcome.cov_en_m2),
-        **_NULL_IN_FIX,
+        "reason": None,
+        "detail": None,
         **_ground_values(outcome),
         **_pose_values(outcome),
     }
@@ -342,25 +335,24 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
     ground = None
     if GROUND_KEYS[0] in values:
         ground = _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
+    cov_en_m2 = _numbers(values, "cov_en_m2", (2, 2))
+    # Absent in earlier files.
+    values = {**dict.fromkeys((*INTEGRITY_KEYS, *GROUND_KEYS, *POSE_KEYS)), **values}
     return Fix(
         lat_deg=_angle(values, "lat_deg", 90.0),
         lon_deg=_angle(values, "lon_deg", 180.0),
-        cov_en_m2=_numbers(values, "cov_en_m2", (2, 2), [[None] * 2] * 2),
+        cov_en_m2=np.full((2, 2), math.nan) if cov_en_m2 is None else cov_en_m2,
         confidence=_share(values, "confidence"),
         radius_m=_number(values, "radius_m"),
         heading_deg=_number(values, "heading_deg"),
         agl_m=_number(values, "agl_m"),
         evidence=evidence,
         ground_latlon_deg=ground,
-        ground_cov_en_m2=_numbers(values, GROUND_KEYS[2], (2, 2))
-        if values.get(GROUND_KEYS[2]) is not None
-        else None,
-        pitch_deg=_number(values, "pitch_deg") if "pitch_deg" in values else math.nan,
-        roll_deg=_number(values, "roll_deg") if "roll_deg" in values else math.nan,
-        pose_cov=_pose_covariance(values) if values.get(POSE_KEYS[2]) is not None else None,
-        place_probability=_share(values, INTEGRITY_KEYS[0])
-        if INTEGRITY_KEYS[0] in values
-        else math.nan,
+        ground_cov_en_m2=_numbers(values, GROUND_KEYS[2], (2, 2)),
+        pitch_deg=_number(values, "pitch_deg"),
+        roll_deg=_number(values, "roll_deg"),
+        pose_cov=_pose_covariance(values),
+        place_probability=_share(values, INTEGRITY_KEYS[0]),
     )
 
 
@@ -372,7 +364,7 @@ def _seconds(time_ns: int) -> str:
 
 def _time_ns(values: Mapping[str, Any]) -> int:
     seconds = _number(values, "time_s")
-    _checked(values, "time_s", "seconds that fit 64 bits of ns", abs(seconds) < _TIME_LIMIT_S)
+    _checked(values, "time_s", "seconds that fit 64 bits of ns", abs(seconds) < 2**63 / 1e9)
     return int(Decimal(values["time_s"]).scaleb(9).to_integral_value())
 
 
@@ -416,10 +408,13 @@ def _angle(values: Mapping[str, Any], key: str, limit_deg: float) -> float:
 
 
 def _numbers(
-    values: Mapping[str, Any], key: str, shape: tuple[int, ...], otherwise: Any = None
-) -> NDArray[np.float64]:
-    """The numbers of a list, or of a list of lists, of this shape; NaN for null."""
-    rows = otherwise if values[key] is None else values[key]
+    values: Mapping[str, Any], key: str, shape: tuple[int, ...]
+) -> NDArray[np.float64] | None:
+    """The numbers of a list, or of a list of lists, of this shape, NaN for null; None for null in
+    place of all."""
+    rows = values[key]
+    if rows is None:
+        return None
     flat = rows if isinstance(rows, list) else []
     if len(shape) == 2:
         sound = [len(row) if isinstance(row, list) else 0 for row in flat] == [shape[1]] * shape[0]
@@ -430,8 +425,10 @@ def _numbers(
     return numbers
 
 
-def _pose_covariance(values: Mapping[str, Any]) -> NDArray[np.float64]:
+def _pose_covariance(values: Mapping[str, Any]) -> NDArray[np.float64] | None:
     upper = _numbers(values, POSE_KEYS[2], (21,))
+    if upper is None:
+        return None
     _checked(values, POSE_KEYS[2], "21 numbers", not np.isnan(upper).any())
     cov = np.zeros((6, 6))
     cov[np.triu_indices(6)] = upper

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from decimal import Decimal
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError, MissingFileError, OutputError
 from orthonav.core.files import StrPath, require_file
+from orthonav.core.flight.recording import RecordedView, fitted
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import (
@@ -40,36 +42,7 @@ _OPTIONAL_FIELDS = [each.name for each in fields(Telemetry) if each.name in OPTI
 MAX_TEXT_BYTES = 500_000_000
 MAX_VIEWS = 1_000_000
 """Rows of a table of a flight: as many views as `simulate` makes, 55 hours at 5 Hz."""
-# The camera describes the sensor: an orientation tag must not rotate the image.
-_DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-LEAST_SPAN, LEAST_SHARE = 2.0, 0.05
-"""Temperatures (deg C) and other real numbers count as spread over so much at least, those from 0
-to 1, such as reflectances, over the second."""
 BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
-_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
-
-
-@dataclass(frozen=True, slots=True)
-class FlightView:
-    """One view of a flight: its name in the folder `frames`, and its telemetry."""
-
-    frames: Path
-    frame: str
-    telemetry: Telemetry
-
-    @property
-    def path(self) -> Path:
-        """File of the image."""
-        return self.frames / self.frame
-
-    @property
-    def where(self) -> str:
-        """Location of the image, for messages."""
-        return str(self.path)
-
-    def grey(self) -> NDArray[np.uint8]:
-        """Grey levels (H, W) uint8 of the image; raises as `read_image`."""
-        return read_image(self.path)
 
 
 @dataclass(frozen=True)
@@ -79,7 +52,7 @@ class FlightFolder:
     path: Path
     camera: Camera
     note: str
-    views: tuple[FlightView, ...]
+    views: tuple[RecordedView, ...]
 
     @property
     def expected(self) -> int:
@@ -106,16 +79,13 @@ def open_flight(path: StrPath, *, images_needed: bool = True) -> FlightFolder:
     return FlightFolder(path, _fitted(camera, views), note, views)
 
 
-def _fitted(camera: Camera, views: Iterable[FlightView]) -> Camera:
+def _fitted(camera: Camera, views: Iterable[RecordedView]) -> Camera:
     for view in views:
         try:
             height, width = view.grey().shape
         except (FlightError, MissingFileError):
             continue
-        try:
-            return camera.fitted(width, height)
-        except CameraError as error:
-            raise CameraError(f"{error}: {view.where}") from error
+        return fitted(camera, width, height, view.where)
     return camera
 
 
@@ -143,8 +113,10 @@ def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
     """
     if _is_cut_jpeg(data):
         raise FlightError(f"image of the flight was cut short: {where}")
+    # The camera describes the sensor: an orientation tag must not rotate the image.
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _DECODE) if data else None
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     except cv2.error:
         image = None
     if image is None:
@@ -155,12 +127,13 @@ def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
 
 
 def _measured(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Grey levels of temperatures, reflectances and other numbers."""
+    """Grey levels of temperatures (deg C), reflectances and other numbers. Real ones count as
+    spread over 2.0 at least, those from 0 to 1 over 0.05."""
     if image.dtype.kind != "f":
         return stretched(image, spread(image), LEAST_COUNTS)
     known = np.where(np.abs(image) < NO_VALUE, image, np.nan)
     is_share = ((known >= 0) & (known <= 1) | np.isnan(known)).all()
-    return stretched(known, spread(known), LEAST_SHARE if is_share else LEAST_SPAN)
+    return stretched(known, spread(known), 0.05 if is_share else 2.0)
 
 
 def _is_cut_jpeg(data: bytes) -> bool:
@@ -171,13 +144,13 @@ def _is_cut_jpeg(data: bytes) -> bool:
     before it end with a marker of their own, compressed data never holds one, and previews or
     padding after it do not matter.
     """
-    if not data.startswith(_JPEG_START):
+    if not data.startswith(b"\xff\xd8"):
         return False
-    at = len(_JPEG_START)
-    while data[at : at + 1] == b"\xff" and data[at : at + 2] != _JPEG_SCAN:
+    at = 2
+    while data[at : at + 1] == b"\xff" and data[at : at + 2] != b"\xff\xda":  # start of scan
         filling = data[at + 1 : at + 2] == b"\xff"
         at += 1 if filling else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return data.find(_JPEG_END, at) < 0
+    return data.find(b"\xff\xd9", at) < 0
 
 
 def read_truth(path: StrPath) -> dict[str, tuple[float, float]]:
@@ -240,7 +213,7 @@ def camera_from_plain(raw: Any) -> Camera:
     ).plausible()
 
 
-def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[FlightView]:
+def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[RecordedView]:
     seen: set[str] = set()
     for line, row in csv_rows(telemetry, TELEMETRY_COLUMNS):
         frame = row["frame"]
@@ -262,7 +235,10 @@ def _views(telemetry: Path, frames: Path, images_needed: bool) -> Iterator[Fligh
         prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
         if hint := swapped_hint(*prior):
             raise FlightError(f"line {line}: prior position is out of range{hint}: {telemetry}")
-        yield FlightView(frames, frame, _telemetry(row, time_ns))
+        load = partial(read_image, image)
+        yield RecordedView(
+            frame, _telemetry(row, time_ns), None, str(image), load, image.read_bytes
+        )
 
 
 def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
@@ -277,13 +253,16 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
     return Telemetry(time_ns, **values, prior=prior, vel_en_mps=velocity)
 
 
-def csv_rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
-    """Line number and fields of each row of a CSV that must have the columns `needed`."""
+def csv_rows(
+    path: Path, needed: tuple[str, ...], most_rows: int | None = None
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """Line number and fields of each row of a CSV that must have the columns `needed`; it has at
+    most `most_rows`, by default `MAX_VIEWS`."""
     if path.stat().st_size > MAX_TEXT_BYTES:
         raise FlightError(f"file is larger than {MAX_TEXT_BYTES // 10**6} MB: {path}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = TableRows(stream, most_rows=MAX_VIEWS)
+            rows = TableRows(stream, most_rows=most_rows or MAX_VIEWS)
             missing = [name for name in needed if name not in rows.columns]
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")

@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,30 +111,27 @@ def read_gnss(path: Path) -> list[GnssSample]:
     Raises `MissingFileError`, or `FlightError`, which names the line.
     """
     path = require_file(path, "solutions of a GNSS receiver")
-    samples = []
-    for line, row in csv_rows(path, COLUMNS):
-        arrived_ns = time_ns_of(row["time_s"])
-        solved_ns = time_ns_of(row.get("solved_s"))
-        lat, lon = number_of(row["lat_deg"]), number_of(row["lon_deg"])
-        fix_type = number_of(row["fix_type"])
-        if arrived_ns is None or not 0 <= fix_type < 256:
-            raise FlightError(f"line {line}: time_s or fix_type is not a number: {path}")
-        if fix_type >= FIX_3D:
-            check_latlon(lat, lon, line, path)
-        vel = number_of(row.get("vel_east_mps")), number_of(row.get("vel_north_mps"))
-        satellites, receiver = number_of(row.get("satellites")), number_of(row.get("receiver"))
-        samples.append(
-            GnssSample(
-                time_ns=arrived_ns if solved_ns is None else solved_ns,
-                arrived_ns=arrived_ns,
-                lat_deg=lat,
-                lon_deg=lon,
-                fix_type=int(fix_type),
-                std_m=number_of(row.get("std_m")),
-                vel_en_mps=vel if all(map(math.isfinite, vel)) else None,
-                satellites=int(satellites) if math.isfinite(satellites) else -1,
-                stamp_ns=solved_ns,
-                receiver=1 if receiver == 1 else 0,
-            )
-        )
-    return samples
+    return [_sample(line, row, path) for line, row in csv_rows(path, COLUMNS)]
+
+
+def _sample(line: int, row: Mapping[str, str], path: Path) -> GnssSample:
+    arrived_ns, solved_ns = time_ns_of(row["time_s"]), time_ns_of(row.get("solved_s"))
+    number = {name: number_of(row.get(name)) for name in (*COLUMNS, *OPTIONAL_COLUMNS)}
+    fix_type, satellites = number["fix_type"], number["satellites"]
+    if arrived_ns is None or not 0 <= fix_type < 256:
+        raise FlightError(f"line {line}: time_s or fix_type is not a number: {path}")
+    if fix_type >= FIX_3D:
+        check_latlon(number["lat_deg"], number["lon_deg"], line, path)
+    velocity = number["vel_east_mps"], number["vel_north_mps"]
+    return GnssSample(
+        time_ns=arrived_ns if solved_ns is None else solved_ns,
+        arrived_ns=arrived_ns,
+        lat_deg=number["lat_deg"],
+        lon_deg=number["lon_deg"],
+        fix_type=int(fix_type),
+        std_m=number["std_m"],
+        vel_en_mps=velocity if all(map(math.isfinite, velocity)) else None,
+        satellites=int(satellites) if math.isfinite(satellites) else -1,
+        stamp_ns=solved_ns,
+        receiver=int(number["receiver"] == 1),
+    )

@@ -22,28 +22,34 @@ Array = NDArray[np.float64]
 Place = tuple[float, float]
 Undulation = Callable[[Array, Array], Array]
 """Height of the geoid above the ellipsoid (m) at latitudes and longitudes (deg)."""
-USUAL_MPS = 30.0
-"""Speed at which a position ages where none is reported: that of a fast small aircraft."""
-VELOCITY_ERROR = 0.3
-"""Error of a reported velocity as a fraction of it, turns between two fixes included."""
-MISMATCH_M = 20.0
-"""Heights above sea and above take-off that differ by more over the terrain are named: barometers
-and positions of take-off explain less, a wrong datum more."""
-LARGEST_STD_M = 10_000.0
-"""A position with a larger standard deviation is unknown: a map is at most 50 km across."""
-MIN_VIEWS = 20  # fewer confident views say nothing about the terrain
-OFF_M = 25.0
-"""Heights by the views and by the terrain that differ by more on the whole are named: barometers
-explain less, a wrong datum more."""
-SPREAD_M, SPREAD_SHARE = 3.0, 0.02
-"""So is a difference whose robust standard deviation is more, in metres and as a fraction of the
-height above ground: by a right terrain it was 1.3 %, by one displaced by 200 m 2 to 3 %
-(`benchmarks.terrain_flight` at d63ac91)."""
-MAX_VIEWS = 2000  # only so many of the latest confident views are kept
-HOLES_SHARE = 0.1  # so are holes below more than this fraction of the confident views
 DATUM_ADVICE = "state it with --dem-datum, or use heights above ground or take-off"
 _LOST = ("searching", "lost")  # states of a track that has no position
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class HeightLimits:
+    """How places age, and from which differences of heights on a warning is logged."""
+
+    usual_mps: float = 30.0  # speed where none is reported: that of a fast small aircraft
+    velocity_error: float = 0.3  # of a reported velocity, a fraction, turns between fixes included
+    largest_std_m: float = 10_000.0  # a place with more is unknown: a map is at most 50 km across
+    mismatch_m: float = 20.0
+    """Between heights above sea and above take-off: barometers and positions of take-off explain
+    less, a wrong datum more."""
+    off_m: float = 25.0
+    """Between heights by the views and by the terrain on the whole: barometers explain less."""
+    spread_m: float = 3.0
+    spread_share: float = 0.02
+    """Their robust standard deviation, in metres and as a fraction of the height above ground: by a
+    right terrain it was 1.3 %, by one displaced by 200 m 2 to 3 %
+    (`benchmarks.terrain_flight` at d63ac91)."""
+    holes_share: float = 0.1  # of the confident views, over holes of the terrain
+    min_views: int = 20  # fewer confident views say nothing about the terrain
+    max_views: int = 2000  # only so many of the latest confident views are kept
+
+
+LIMITS = HeightLimits()
 
 
 def is_measured(telemetry: Telemetry) -> bool:
@@ -214,7 +220,7 @@ class FlownHeights:
         if self._last is not None:
             found.append(_aged(*self._last, telemetry))
         std_m, place = min(found, default=(math.inf, None))
-        return (place, std_m) if std_m <= LARGEST_STD_M else (None, math.inf)
+        return (place, std_m) if std_m <= LIMITS.largest_std_m else (None, math.inf)
 
     @cached_property
     def _whole(self) -> Ground | None:
@@ -225,15 +231,15 @@ def _aged(time_ns: int, place: Place, std_m: float, telemetry: Telemetry) -> tup
     """Standard deviation and place at a view, of a place known at an earlier time."""
     seconds = (telemetry.time_ns - time_ns) / 1e9
     if telemetry.vel_en_mps is None:
-        return std_m + USUAL_MPS * abs(seconds), place
+        return std_m + LIMITS.usual_mps * abs(seconds), place
     moved_m = np.array(telemetry.vel_en_mps) * seconds
     lat, lon = LocalFrame(*place).latlon_from_en(moved_m)
-    return std_m + VELOCITY_ERROR * float(np.hypot(*moved_m)), (float(lat), float(lon))
+    return std_m + LIMITS.velocity_error * float(np.hypot(*moved_m)), (float(lat), float(lon))
 
 
 def warn_of_mismatch(off_m: float) -> None:
     """Log a warning where heights above sea and above take-off differ by a large `off_m`."""
-    if abs(off_m) > MISMATCH_M:
+    if abs(off_m) > LIMITS.mismatch_m:
         log.warning(
             "heights above take-off and above sea level differ by %.0f m over this terrain: check "
             "its vertical datum, the take-off position and the altitude of the autopilot",
@@ -244,13 +250,13 @@ def warn_of_mismatch(off_m: float) -> None:
 class TerrainFit:
     """Compares heights above sea by confident views with those reported. Mutable.
 
-    It judges by the latest `MAX_VIEWS` of them, so that long flights cost no more memory and time.
+    It judges by the latest of them, so that long flights cost no more memory and time.
     """
 
     def __init__(self, terrain: TerrainHeights) -> None:
         self._terrain = terrain
         # Height by the view less the reported one (NaN over a hole), and height above ground.
-        self._latest: deque[tuple[float, float]] = deque(maxlen=MAX_VIEWS)
+        self._latest: deque[tuple[float, float]] = deque(maxlen=LIMITS.max_views)
         self._views = 0
         self._said: set[str] = set()
 
@@ -259,28 +265,28 @@ class TerrainFit:
         below_m = float(self._terrain(np.array([fix.lat_deg]), np.array([fix.lon_deg]))[0])
         self._latest.append((below_m + fix.agl_m - above_sea_m, fix.agl_m))
         self._views += 1
-        if self._views % MIN_VIEWS:
+        if self._views % LIMITS.min_views:
             return
         off_m, agl_m = np.array(self._latest).T
         known = np.isfinite(off_m)
         holes, views = int((~known).sum()), len(known)
-        if holes > HOLES_SHARE * views:
+        if holes > LIMITS.holes_share * views:
             self._say("the terrain has no height below %d of %d views", holes, views)
-        if views - holes >= MIN_VIEWS:
+        if views - holes >= LIMITS.min_views:
             self._judge(off_m[known], agl_m[known])
 
     def _judge(self, off_m: NDArray[np.float64], agl_m: NDArray[np.float64]) -> None:
         middle_m = float(np.median(off_m))
         spread_m = 1.4826 * float(np.median(np.abs(off_m - middle_m)))
         log.debug("heights by views less reported ones: %.1f m +- %.1f m", middle_m, spread_m)
-        if abs(middle_m) > OFF_M:
+        if abs(middle_m) > LIMITS.off_m:
             self._say(
                 "by the views the aircraft is %.0f m %s than reported over this terrain: check its "
                 "vertical datum, the take-off position and the altitude of the autopilot",
                 abs(middle_m),
                 "higher" if middle_m > 0 else "lower",
             )
-        if spread_m > max(SPREAD_M, SPREAD_SHARE * float(np.median(agl_m))):
+        if spread_m > max(LIMITS.spread_m, LIMITS.spread_share * float(np.median(agl_m))):
             self._say(
                 "heights by the views scatter by %.0f m about those reported over this terrain: it "
                 "may be displaced, or not show this ground",

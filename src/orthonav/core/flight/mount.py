@@ -12,13 +12,12 @@ from typing import Any, TypeVar
 
 from orthonav.core.errors import FlightError, described
 from orthonav.core.files import require_file, write_text
+from orthonav.core.flight.folder import BROKEN
 from orthonav.core.records import Telemetry
 
 _LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg": 60.0}
 MOST_MS = 12_000.0
 VERSION = 1
-MAX_BYTES = 100_000
-BROKEN = (KeyError, TypeError, ValueError, OverflowError)
 Record = TypeVar("Record")
 
 
@@ -73,7 +72,7 @@ def read_mount(path: Path) -> Mount:
 
 
 def mount_from_plain(plain: Any) -> Mount:
-    """Inverse of `asdict`, checked; raises one of `calibrated.BROKEN` for an invalid mount."""
+    """Inverse of `asdict`, checked; raises one of `BROKEN` for an invalid mount."""
     biases = {name: _bias(plain[name], name) for name in _LIMITS}
     return Mount(**biases, views=int(plain["views"]))
 
@@ -134,13 +133,13 @@ def _read(path: Path, kind: str, command: str, from_plain: Callable[[Any], Recor
     """What `command` wrote; `from_plain` raises one of `BROKEN` for impossible values."""
     path = require_file(path, f"{kind} file")
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if path.stat().st_size > 100_000:
             raise ValueError("too large")
         plain = json.loads(path.read_text(encoding="utf-8"))
         if plain[f"orthonav_{kind}"] != VERSION:
             raise ValueError(f"version {plain[f'orthonav_{kind}']}, expected {VERSION}")
         return from_plain(plain)
-    except (*BROKEN, AttributeError, RecursionError, OSError) as error:
+    except (*BROKEN, OSError) as error:
         raise FlightError(
             f"not a {kind} file of `{command}` ({described(error)}): {path}"
         ) from error

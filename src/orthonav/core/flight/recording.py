@@ -1,6 +1,6 @@
 """The interface of a recorded flight, whatever it was recorded with."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,23 +16,21 @@ LONG_GAP_NS = 1_000_000_000
 may have turned."""
 
 
-class RecordedView(Protocol):
-    """One view: its name, its telemetry, and its image, which is decoded on request."""
+@dataclass(frozen=True, eq=False)
+class RecordedView:
+    """One view of a recorded flight; its image is decoded on request."""
 
-    @property
-    def frame(self) -> str:
-        """Name of the view, unique in its flight."""
-
-    @property
-    def telemetry(self) -> Telemetry:
-        """Telemetry of the exposure."""
-
-    @property
-    def where(self) -> str:
-        """Location of the image, for messages."""
+    frame: str  # name, unique in its flight, with the suffix of the format of its image
+    telemetry: Telemetry  # telemetry of the exposure
+    truth_latlon_deg: tuple[float, float] | None  # true position, where it is known
+    where: str  # location of the image, for messages; its path where it is a file
+    load: Callable[[], NDArray[np.uint8]]  # decodes the image
+    data: Callable[[], bytes] | None = None
+    """Returns the image as it was encoded; None where it was recorded unencoded."""
 
     def grey(self) -> NDArray[np.uint8]:
         """Grey levels (H, W) uint8. Raises `FlightError` where it cannot be decoded."""
+        return self.load()
 
 
 class Flight(Protocol):
@@ -53,28 +51,6 @@ class Flight(Protocol):
     @property
     def expected(self) -> int:
         """Approximate number of views, for progress; 0 where it is unknown."""
-
-
-@dataclass(frozen=True)
-class WithTelemetry:
-    """A recorded view with other telemetry."""
-
-    view: RecordedView
-    telemetry: Telemetry
-
-    @property
-    def frame(self) -> str:
-        """See `RecordedView.frame`."""
-        return self.view.frame
-
-    @property
-    def where(self) -> str:
-        """See `RecordedView.where`."""
-        return self.view.where
-
-    def grey(self) -> NDArray[np.uint8]:
-        """See `RecordedView.grey`."""
-        return self.view.grey()
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:

@@ -7,14 +7,13 @@ from orthonav.ground.recordings.opening import (
     open_source,
     source_kind,
 )
-from orthonav.ground.recordings.recording import Recording, SourceOptions, SourceView
+from orthonav.ground.recordings.recording import Recording, SourceOptions
 
 __all__ = [
     "Imported",
     "LoggedFlight",
     "Recording",
     "SourceOptions",
-    "SourceView",
     "import_flight",
     "open_source",
     "source_kind",

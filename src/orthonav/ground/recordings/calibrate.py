@@ -18,6 +18,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -27,11 +28,7 @@ from orthonav.core.errors import FlightError
 from orthonav.core.flight.mount import Bias, CameraLatency, Mount
 from orthonav.core.flight.recording import Flight, RecordedView
 from orthonav.core.geo.camera import Camera, enu_from_camera
-from orthonav.core.records import (
-    CONFIDENT,
-    Fix,
-    ViewResult,
-)
+from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.ground.recordings.flightlog import LoggedFlight
 from orthonav.onboard.motion import (
     LONGEST_S,
@@ -45,43 +42,49 @@ from orthonav.onboard.motion import (
 )
 
 MIN_VIEWS = 5
-MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
-"""A tilt that differs by more than both from that at the end shows that the camera moved."""
 MAD_TO_STD = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""
-STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
-"""Lower bounds of the standard deviations of the estimated biases."""
-_EVIDENCE = {
-    "heading_deg": "heading_bias_deg",
-    "log_scale": "log_scale_bias",
-    "pitch_deg": "pitch_bias_deg",
-    "roll_deg": "roll_bias_deg",
+_BIASES = {
+    "heading_deg": ("heading_bias_deg", 0.2),
+    "log_scale": ("log_scale_bias", 0.003),
+    "pitch_deg": ("pitch_bias_deg", 0.3),
+    "roll_deg": ("roll_bias_deg", 0.3),
 }
-LEAST = 3  # number of estimates that must agree
-AGREE_S, AGREE_SIGMAS = 0.1, 4.0
-NEEDED = (
-    "fly at least two minutes at a height where the ground is textured, with turns of 10 deg/s or "
-    "more or banking every 10 s, and log at least 2 views a second (`orthonav fly --log`)"
-)
-LEAST_S, MOST_S, STEP_S = -0.5, 12.0, 0.1
-"""Candidates of the latency. Below 0: an exposure after the arrival shows clocks that disagree."""
-WINDOW_S = 30.0
-MOST_PAIRS, LEAST_PAIRS = 300, 12
-PAIR_SHARE, KNOWN_SHARE = 0.9, 0.6
-"""Fraction of candidates for which the motion of a pair must be known, and of pairs for one
-candidate."""
-NEAR_S, NEAR_MASS = 0.35, 0.99  # a latency is found where this probability lies this close to it
-LARGEST_STD_S, FLOOR_S = 0.3, 0.025
-"""Largest standard deviation of an answer; least one: half an interval of the stored states."""
-OUTLIER = 3.0  # scale of the Cauchy weights, in standard deviations
-ALIKE = 4.0
-"""Differences of successive pairs are correlated: so many count as one. Chosen so that errors of
-the estimate are as large as stated (tests/onboard/test_calibrate_latency.py)."""
-CANDIDATES_S = np.arange(round((MOST_S - LEAST_S) / STEP_S) + 1) * STEP_S + LEAST_S
-_CANDIDATES_NS = np.round(CANDIDATES_S * 1e9).astype(np.int64)
+"""Keys of the estimated biases in evidence, and lower bounds of their standard deviations."""
 Array = NDArray[np.float64]
 Prior = tuple[Array, Array]
 """Mean (5,) and precision (5, 5) of the linear parameters."""
+
+
+@dataclass(frozen=True)
+class LatencySearch:
+    """How the latency is sought."""
+
+    least_s: float = -0.5  # first candidate; an exposure after the arrival shows clocks that differ
+    most_s: float = 12.0  # last candidate
+    step_s: float = 0.1  # between candidates
+    window_s: float = 30.0  # time over which pairs are compared
+    most_pairs: int = 300
+    least_pairs: int = 12
+    pair_share: float = 0.9  # fraction of candidates for which the motion of a pair must be known
+    known_share: float = 0.6  # fraction of pairs that must be known for each candidate
+    near_s: float = 0.35  # a latency is found where the probability `near_mass` lies this close
+    near_mass: float = 0.99
+    largest_std_s: float = 0.3  # largest standard deviation of an answer
+    floor_s: float = 0.025  # least one: half an interval of the stored states
+    outlier: float = 3.0  # scale of the Cauchy weights, in standard deviations
+    alike: float = 4.0
+    """Differences of successive pairs are correlated: so many count as one. Chosen so that errors
+    of the estimate are as large as stated (tests/onboard/test_calibrate_latency.py)."""
+
+    @cached_property
+    def candidates_s(self) -> Array:
+        """Candidates (C,) of the latency."""
+        steps = np.arange(round((self.most_s - self.least_s) / self.step_s) + 1, dtype=np.float64)
+        return np.asarray(steps * self.step_s + self.least_s)
+
+
+SEARCH = LatencySearch()
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
     values, spreads = (
         {
             name: np.array([each.outcome.evidence[key.replace("bias", bias)] for each in confident])
-            for name, key in _EVIDENCE.items()
+            for name, (key, _) in _BIASES.items()
         }
         for bias in ("bias", "bias_std")
     )
@@ -115,7 +118,8 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
     begin = min(begin, len(confident) - MIN_VIEWS)
     used = slice(begin, None)
     biases = {
-        name: _bias(values[name][used], spreads[name][used], STD_FLOOR[name]) for name in _EVIDENCE
+        name: _bias(values[name][used], spreads[name][used], floor)
+        for name, (_, floor) in _BIASES.items()
     }
     mount = Mount(**biases, views=len(confident) - begin)
     return MountCalibration(mount, confident[begin].frame, confident[-1].frame, begin > 0)
@@ -134,7 +138,7 @@ def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
 def _still_from(values: Array, spreads: Array) -> int:
     """Index of the first view from which on a value stays close to that at the end."""
     end = float(np.median(values[-MIN_VIEWS:]))
-    far = np.abs(values - end) > np.maximum(MOVED_SIGMAS * spreads, MOVED_DEG)
+    far = np.abs(values - end) > np.maximum(3.0 * spreads, 2.0)  # deg: the camera moved
     return int(np.flatnonzero(far)[-1]) + 1 if far.any() else 0
 
 
@@ -212,26 +216,27 @@ class LatencyEstimator:
 
     def __init__(self, *, heading_known: bool = True) -> None:
         self._heading_known = heading_known
-        self._waiting: deque[ImageMotion] = deque(maxlen=MOST_PAIRS)
-        self._pairs: deque[tuple[ImageMotion, Array]] = deque(maxlen=MOST_PAIRS)
+        self._waiting: deque[ImageMotion] = deque(maxlen=SEARCH.most_pairs)
+        self._pairs: deque[tuple[ImageMotion, Array]] = deque(maxlen=SEARCH.most_pairs)
 
     def add(self, motion: ImageMotion | None, history: StateHistory) -> None:
         """Add the motion of a pair. It counts once the history reaches beyond all candidates."""
         if motion is not None:
             self._waiting.append(motion)
-        reach_ns = round(-LEAST_S * 1e9)
+        reach_ns = round(-SEARCH.least_s * 1e9)
+        candidates_ns = np.round(SEARCH.candidates_s * 1e9).astype(np.int64)
         while self._waiting and self._waiting[0].end_ns + reach_ns <= history.newest_ns:
             one = self._waiting.popleft()
-            shown = history.motion(one.start_ns - _CANDIDATES_NS, one.end_ns - _CANDIDATES_NS)
-            if np.isfinite(shown[0]).mean() < PAIR_SHARE:
+            shown = history.motion(one.start_ns - candidates_ns, one.end_ns - candidates_ns)
+            if np.isfinite(shown[0]).mean() < SEARCH.pair_share:
                 continue
             self._pairs.append((one, np.column_stack(shown)))
-            while self._pairs[0][0].start_ns < one.end_ns - WINDOW_S * 1e9:
+            while self._pairs[0][0].start_ns < one.end_ns - SEARCH.window_s * 1e9:
                 self._pairs.popleft()
 
     def estimate(self) -> LatencyEstimate | None:
         """The latency in the window, None where it is not observable."""
-        if len(self._pairs) < LEAST_PAIRS:
+        if len(self._pairs) < SEARCH.least_pairs:
             return None
         motions, reported = zip(*self._pairs, strict=True)
         pairs = _Pairs(
@@ -290,7 +295,7 @@ class _Fit:
 
 
 def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
-    if (np.isfinite(pairs.reported[..., :3]).all(axis=-1).mean(axis=0) < KNOWN_SHARE).any():
+    if (np.isfinite(pairs.reported[..., :3]).all(axis=-1).mean(axis=0) < SEARCH.known_share).any():
         return None  # a latency that cannot be excluded
     prior = _prior(pairs.reported, heading_known=heading_known)
     noise = least = pairs.least_noise()
@@ -300,9 +305,10 @@ def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
         best = int(np.argmin(cost))
         fit = fits[best]
         noise = np.maximum(least, fit.scatter())
-    chance = np.exp((cost[best] - cost) / (2 * ALIKE))
-    near = np.abs(CANDIDATES_S - CANDIDATES_S[best]) <= NEAR_S
-    ambiguous = chance[near].sum() < NEAR_MASS * chance.sum()
+    chance = np.exp((cost[best] - cost) / (2 * SEARCH.alike))
+    candidates_s = SEARCH.candidates_s
+    near = np.abs(candidates_s - candidates_s[best]) <= SEARCH.near_s
+    ambiguous = chance[near].sum() < SEARCH.near_mass * chance.sum()
     scale, across = fit.linear[:2].tolist()
     turned = abs(math.atan2(across, scale)) if heading_known else 0.0
     usual = 0.5 < math.hypot(scale, across) < 2.0 and turned < 0.6
@@ -314,9 +320,9 @@ def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
     bend = before - 2 * least_cost + after
     if not bend > 0:
         return None
-    delay_s = float(CANDIDATES_S[middle]) + STEP_S * (before - after) / (2 * bend)
-    std_s = math.hypot(FLOOR_S, STEP_S * math.sqrt(2 * ALIKE / bend))
-    if std_s > LARGEST_STD_S or not pairs.explained(fit) >= 0.6:
+    delay_s = float(candidates_s[middle]) + SEARCH.step_s * (before - after) / (2 * bend)
+    std_s = math.hypot(SEARCH.floor_s, SEARCH.step_s * math.sqrt(2 * SEARCH.alike / bend))
+    if std_s > SEARCH.largest_std_s or not pairs.explained(fit) >= 0.6:
         return None
     return LatencyEstimate(delay_s, std_s, len(pairs.turn))
 
@@ -360,44 +366,47 @@ def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: Prior) -> _Fit:
         shift_off = wanted - lines @ linear
         square: Array = np.square(turn_off / noise[0])
         square = square + np.square(shift_off / noise[1]).sum(axis=1)
-        weights = known / (1 + square / OUTLIER**2)
+        weights = known / (1 + square / SEARCH.outlier**2)
     # Cauchy's loss; where pairs are not known, as if all were.
-    loss = float((known * np.log1p(square / OUTLIER**2)).sum()) * OUTLIER**2
+    loss = float((known * np.log1p(square / SEARCH.outlier**2)).sum()) * SEARCH.outlier**2
     off = linear - prior[0]
     cost = loss * len(known) / max(known.sum(), 1.0) + float(off @ prior[1] @ off)
     return _Fit(cost, linear, turn_off, shift_off, weights)
 
 
 def _agreed(estimates: list[LatencyEstimate | None], intervals: list[float]) -> CameraLatency:
-    if not intervals or float(np.median(intervals)) > LONGEST_S / 2:
-        usual_s = float(np.median(intervals)) if intervals else math.inf
+    advice = (
+        "fly at least two minutes at a height where the ground is textured, with turns of 10 deg/s "
+        "or more or banking every 10 s, and log at least 2 views a second (`orthonav fly --log`)"
+    )
+    usual_s = float(np.median(intervals)) if intervals else math.inf
+    if usual_s > LONGEST_S / 2:
         raise FlightError(
             f"views are {usual_s:.1f} s apart; the latency of a camera needs views at most "
-            f"{LONGEST_S / 2:g} s apart: {NEEDED}"
+            f"{LONGEST_S / 2:g} s apart: {advice}"
         )
-    found = [each for each in estimates if each is not None]
-    if len(found) < LEAST:
+    found, least = [each for each in estimates if each is not None], 3
+    if len(found) < least:
         raise FlightError(
             f"the flight does not show the latency of the camera: {len(found)} of "
-            f"{len(estimates)} windows give an estimate, {LEAST} are needed. "
-            f"{NEEDED[0].upper()}{NEEDED[1:]}. If it was flown so, images do not move as the "
-            "telemetry reports: check --mount-deg, the height and the heading"
+            f"{len(estimates)} windows give an estimate, {least} are needed: {advice}. "
+            "If it was flown so, images do not move as the telemetry reports: check --mount-deg, "
+            "the height and the heading"
         )
     delays = np.array([each.delay_s for each in found])
     stds = np.array([each.std_s for each in found])
-    middle = float(np.median(delays))
-    far = np.abs(delays - middle) > np.maximum(AGREE_S, AGREE_SIGMAS * stds)
+    middle, agree_s = float(np.median(delays)), 0.1
+    far = np.abs(delays - middle) > np.maximum(agree_s, 4.0 * stds)
     if far.mean() > 0.2:
         raise FlightError(
             f"the latency of the camera is not constant: {delays.min() * 1e3:.0f} to "
             f"{delays.max() * 1e3:.0f} ms during the flight"
         )
-    if not -AGREE_S <= middle <= MOST_S:
+    if not -agree_s <= middle <= SEARCH.most_s:
         raise FlightError(
             f"images seem to be exposed {-middle * 1e3:.0f} ms after they arrived: the clocks of "
             "images and telemetry disagree"
         )
-    scatter = float(np.std(delays[~far]))
-    std_s = max(float(np.median(stds)), scatter)
+    std_s = max(float(np.median(stds)), float(np.std(delays[~far])))
     pairs = max(each.pairs for each in found)
     return CameraLatency(max(0.0, middle) * 1e3, std_s * 1e3, pairs)

@@ -10,7 +10,7 @@ import re
 import struct
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,18 +22,11 @@ from orthonav.core.errors import CameraError
 from orthonav.core.flight.telemetry_track import measured
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
-from orthonav.ground.recordings.image_table import ImageRow, ns_of
+from orthonav.ground.recordings.image_table import ImageRow, moment_of, ns_of
 
-_FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 MAX_FIELD_DEG = 110.0
 """Field of view along the longer side that is believed: wider lenses are fisheyes, whose pictures
 need a calibration."""
-_WIDE_ASPECT = 1.65  # pictures at least as wide are parts of a sensor of 4:3
-_FOUR_THIRDS = 4 / 3
-_GIVEN_STD, _PLANE_STD, _FILM_STD, _CROPPED_STD = 0.02, 0.03, 0.03, 0.06
-"""Standard deviations by rule: focal lengths are rounded to 1 or 2 digits (2 to 3 %); whether a
-wide picture is a part of its sensor makes 9 %."""
 
 
 @dataclass(frozen=True)
@@ -50,30 +43,30 @@ class Sensor:
     std: float  # standard deviation of the focal length, as a fraction of it
 
 
-_DJI_12MP = Sensor(4000, 3000, 6.2, 0.02)  # 1/2.3 inch, 1.55 um: the published fields of view
-_DJI_1INCH = Sensor(5472, 3648, 13.2, 0.015)
-_DJI_M43 = Sensor(5280, 3956, 17.3, 0.02)
 _SENSORS: Mapping[tuple[str, str], Sensor] = {
-    **{("DJI", name): _DJI_12MP for name in ("FC300C", "FC300S", "FC300X", "FC330", "FC350")},
-    ("DJI", "FC220"): _DJI_12MP,
-    **{("DJI", name): _DJI_1INCH for name in ("FC6310", "FC6310S", "FC6310R")},
-    ("HASSELBLAD", "L1D-20C"): _DJI_1INCH,
-    **{(make, "L2D-20C"): _DJI_M43 for make in ("DJI", "HASSELBLAD")},
-    ("DJI", "M3E"): _DJI_M43,
-    ("DJI", "FC6520"): _DJI_M43,
-    ("DJI", "FC550"): Sensor(4608, 3456, 17.3, 0.02),
-    ("DJI", "FC6540"): Sensor(6016, 4008, 23.5, 0.02),
-    ("DJI", "ZENMUSEP1"): Sensor(8192, 5460, 35.9, 0.01),
-    **{("DJI", name): Sensor(4000, 3000, None, 0.03) for name in ("FC2204", "FC7203", "FC7303")},
-    ("DJI", "FC1102"): Sensor(3968, 2976, None, 0.03),
-    ("DJI", "FC2103"): Sensor(4056, 3040, None, 0.03),
-    ("DJI", "FC3170"): Sensor(8000, 6000, None, 0.03),
-    ("DJI", "FC3411"): Sensor(5472, 3648, None, 0.03),
-    **{("DJI", name): Sensor(8064, 6048, None, 0.03) for name in ("FC3582", "FC3682", "FC8482")},
-    ("SENSEFLY", "SENSEFLY S.O.D.A."): Sensor(5472, 3648, 12.75, 0.02),
+    (make, model): sensor
+    for make, models, sensor in (
+        # 1/2.3 inch, 1.55 um: the published fields of view
+        ("DJI", "FC300C FC300S FC300X FC330 FC350 FC220", Sensor(4000, 3000, 6.2, 0.02)),
+        ("DJI", "FC6310 FC6310S FC6310R", Sensor(5472, 3648, 13.2, 0.015)),
+        ("HASSELBLAD", "L1D-20C", Sensor(5472, 3648, 13.2, 0.015)),
+        ("DJI", "L2D-20C M3E FC6520", Sensor(5280, 3956, 17.3, 0.02)),
+        ("HASSELBLAD", "L2D-20C", Sensor(5280, 3956, 17.3, 0.02)),
+        ("DJI", "FC550", Sensor(4608, 3456, 17.3, 0.02)),
+        ("DJI", "FC6540", Sensor(6016, 4008, 23.5, 0.02)),
+        ("DJI", "ZENMUSEP1", Sensor(8192, 5460, 35.9, 0.01)),
+        ("DJI", "FC2204 FC7203 FC7303", Sensor(4000, 3000, None, 0.03)),
+        ("DJI", "FC1102", Sensor(3968, 2976, None, 0.03)),
+        ("DJI", "FC2103", Sensor(4056, 3040, None, 0.03)),
+        ("DJI", "FC3170", Sensor(8000, 6000, None, 0.03)),
+        ("DJI", "FC3411", Sensor(5472, 3648, None, 0.03)),
+        ("DJI", "FC3582 FC3682 FC8482", Sensor(8064, 6048, None, 0.03)),
+        ("SENSEFLY", "S.O.D.A.", Sensor(5472, 3648, 12.75, 0.02)),
+    )
+    for model in models.split()
 }
-"""By maker and model as EXIF has them. Sizes by the makers' specifications; widths were compared
-with their fields of view (docs/flights.md)."""
+"""By maker and model as EXIF has them, without the maker's name. Sizes by the makers'
+specifications; widths were compared with their fields of view (docs/flights.md)."""
 
 
 @dataclass(frozen=True)
@@ -125,10 +118,12 @@ def focal_length(
 def _found(
     optics: Optics, width_px: int, height_px: int, sensor_width_mm: float | None
 ) -> FocalLength | None:
+    """By the best of the rules. Focal lengths of EXIF are rounded to 1 or 2 digits: 2 to 3 %."""
     if sensor_width_mm is not None and optics.focal_mm > 0:
         px = optics.focal_mm / sensor_width_mm * max(width_px, height_px)
-        return FocalLength(px, _GIVEN_STD, "EXIF and the width of the sensor")
-    sensor = _SENSORS.get((optics.make.upper(), optics.model.upper()))
+        return FocalLength(px, 0.02, "EXIF and the width of the sensor")
+    make = optics.make.upper()
+    sensor = _SENSORS.get((make, optics.model.upper().removeprefix(f"{make} ")))
     if sensor is not None and (known := _of_sensor(sensor, optics, width_px, height_px)):
         return known
     if optics.film_mm > 0:
@@ -136,13 +131,17 @@ def _found(
     return _of_plane(optics, width_px, height_px)
 
 
+def _film_px(film_mm: float, width_px: float, height_px: float) -> float:
+    """Focal length of a picture by its equivalent on film of 36 x 24 mm, by the diagonals."""
+    return film_mm / math.hypot(36.0, 24.0) * math.hypot(width_px, height_px)
+
+
 def _of_sensor(sensor: Sensor, optics: Optics, width_px: int, height_px: int) -> FocalLength | None:
     """The focal length of a known camera; a picture keeps the sensor's width or its height."""
     if sensor.width_mm is not None:
         px = optics.focal_mm / sensor.width_mm * sensor.width_px
     else:
-        diagonal_px = math.hypot(sensor.width_px, sensor.height_px)
-        px = optics.film_mm / _FILM_DIAGONAL_MM * diagonal_px
+        px = _film_px(optics.film_mm, sensor.width_px, sensor.height_px)
     if not px > 0:
         return None
     longer_px, shorter_px = max(width_px, height_px), min(width_px, height_px)
@@ -151,46 +150,34 @@ def _of_sensor(sensor: Sensor, optics: Optics, width_px: int, height_px: int) ->
 
 
 def _of_film(film_mm: float, width_px: int, height_px: int) -> FocalLength:
+    """Pictures of 16:9 are taken as parts of a sensor of 4:3; whether they are makes 9 %."""
     longer_px, shorter_px = max(width_px, height_px), min(width_px, height_px)
-    cropped = longer_px / shorter_px >= _WIDE_ASPECT
-    whole_px = longer_px / _FOUR_THIRDS if cropped else shorter_px
-    px = film_mm / _FILM_DIAGONAL_MM * math.hypot(longer_px, whole_px)
-    if cropped:
-        return FocalLength(px, _CROPPED_STD, "35 mm equivalent of EXIF, of an uncropped 4:3 sensor")
-    return FocalLength(px, _FILM_STD, "35 mm equivalent of EXIF")
+    if longer_px / shorter_px < 1.65:
+        px = _film_px(film_mm, longer_px, shorter_px)
+        return FocalLength(px, 0.03, "35 mm equivalent of EXIF")
+    px = _film_px(film_mm, longer_px, longer_px * 3 / 4)
+    return FocalLength(px, 0.06, "35 mm equivalent of EXIF, of an uncropped 4:3 sensor")
 
 
 def _of_plane(optics: Optics, width_px: int, height_px: int) -> FocalLength | None:
     """Of the resolution of the sensor. Some cameras write its width there instead."""
-    unit_mm = _MM_PER_UNIT.get(optics.plane_unit, math.nan)
+    unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(optics.plane_unit, math.nan)
     taken_px = optics.taken_px if optics.taken_px > 0 else float(width_px)
     thinned = width_px / taken_px
     px, longer_px = optics.focal_mm * optics.plane / unit_mm * thinned, max(width_px, height_px)
     if not px > 0:
         return None
-    found = FocalLength(px, _PLANE_STD, "focal length and sensor resolution of EXIF")
+    found = FocalLength(px, 0.03, "focal length and sensor resolution of EXIF")
     px = optics.focal_mm / (optics.plane * unit_mm) * width_px
-    as_width = replace(
-        found, px=px, source="EXIF, with the sensor's width instead of its resolution"
-    )
+    source = "EXIF, with the sensor's width instead of its resolution"
+    as_width = FocalLength(px, 0.03, source)
     wide = found.field_deg(longer_px) > MAX_FIELD_DEG
     return as_width if wide and as_width.field_deg(longer_px) <= MAX_FIELD_DEG else found
 
 
-_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_XMP_TAG, _MAKE, _MODEL, _SOFTWARE, _ORIENTATION = 700, 0x010F, 0x0110, 0x0131, 0x0112
-MAX_POSITION_ERROR_M, MAX_DOP = 100.0, 20.0  # of positions that are no truth if they have more
-_TIME, _TIME_ORIGINAL, _MAKER_NOTE = 0x0132, 0x9003, 0x927C
-_OFFSET, _OFFSET_ORIGINAL = 0x9010, 0x9011
-_SUBSEC, _SUBSEC_ORIGINAL = 0x9290, 0x9291
-_FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
-_ZOOM = 0xA404
-_ZONE = re.compile(r"Z|[+-][01]\d:?[0-5]\d")
-_FLOAT, _ENTRY_BYTES, _MAX_ENTRIES = 11, 12, 100
-_BODY_YAW, _CAMERA_ANGLES = 7, (10, 9, 11)  # yaw, pitch, roll
 _VALUE = re.compile(
     r"(?<![/\w-])([A-Za-z][\w-]{0,20}:[A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
-    r"([^\"'<\s][^\"'<]{0,60}?)\s*[\"'<]"
+    r"([^\"'<\s][^\"'<]{0,300}?)\s*[\"'<]"
 )
 _NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
 """A number with a decimal point or comma, or a fraction."""
@@ -200,15 +187,6 @@ _ANGLE_OR_PLACE = re.compile(
 )
 """Values that a view is worse off without."""
 _SKYDIO = re.compile(r"(?s)(drone-skydio:CameraOrientationNED\b)(?:[^<>]{0,600}/>|.{0,600}?</\1)")
-_EXPOSED = re.compile(
-    r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
-    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)"
-)
-_DEWARP = re.compile(
-    r"\bdrone-dji:DewarpData\s*(?:=\s*[\"']|>)\s*[\d-]{8,10};([-+\d.eE]{1,30}(?:,[-+\d.eE]{1,30}){8})"
-)
-"""Date; then fx, fy, cx, cy from the middle of the picture in px, k1, k2, p1, p2, k3."""
-_WRITER = re.compile(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})")
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +215,6 @@ class Photo:
     lens: tuple[float, ...] | None
     """DJI's calibration of a picture that is as the lens made it: fx, fy, and the principal point
     from the middle, px; k1, k2, p1, p2, k3."""
-    software: str  # programs that wrote the file; of a camera its firmware
     turned: bool  # whether other programs show it turned, by the orientation of EXIF
     agl_m: float = math.nan  # height above ground, where a table states it
     doubts: tuple[str, ...] = ()
@@ -249,21 +226,20 @@ class Photo:
 
 def read_photo(path: Path) -> Photo:
     """Metadata of the photograph at `path`; the image is not decoded."""
-    pillow = needed("PIL.Image", "photographs")
+    pillow, names = needed("PIL.Image", "photographs"), needed("PIL.ExifTags", "photographs")
     with reading("photograph", path), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about large images and odd tags
         with pillow.open(path) as image:
             exif = image.getexif()
-            tags = dict(exif)  # here, because tags are decoded on access
-            more, gps = dict(exif.get_ifd(_EXIF_IFD)), dict(exif.get_ifd(_GPS_IFD))
+            # Some thermal cameras have XMP in the Exif directory.
+            tags = _named(exif, names.TAGS) | _named(exif.get_ifd(names.IFD.Exif), names.TAGS)
+            gps = _named(exif.get_ifd(names.IFD.GPSInfo), names.GPSTAGS)
             packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")
             width, height = image.size
-    # Some thermal cameras have XMP in the Exif directory.
-    xmp = Xmp.of(packet or tags.get(_XMP_TAG) or more.get(_XMP_TAG) or b"")
-    make = _word(tags.get(_MAKE))
-    notes = more.get(_MAKER_NOTE)
+    xmp = Xmp.of(packet or tags.get("XMLPacket") or b"")
+    make, notes = _word(tags.get("Make")), tags.get("MakerNote")
     gimbal, heading = read_maker_notes(notes if isinstance(notes, bytes) else b"", make)
-    time_ns, zone_known = (xmp.time_ns, True) if xmp.time_ns else _time(tags, more)
+    time_ns, zone_known = (xmp.time_ns, True) if xmp.time_ns else _time(tags)
     gps_ns = None if xmp.time_ns else _gps_time_ns(gps)  # that of XMP is of the exposure
     if void := _void(gps):
         gps = {}
@@ -279,7 +255,7 @@ def read_photo(path: Path) -> Photo:
     doubts = [f"unreadable value {value}" for value in sorted(xmp.unread)]
     if gimbal is None and rotation is None and math.isnan(body_yaw):
         others = [name for name in xmp.values if "Yaw" in name or "Heading" in name]
-        others += ["GPSImgDirection"] if 17 in gps else []
+        others += ["GPSImgDirection"] if "GPSImgDirection" in gps else []
         doubts += [f"angles of {other}, which are not read" for other in others[:1]]
     return Photo(
         path=path,
@@ -302,25 +278,29 @@ def read_photo(path: Path) -> Photo:
         amsl_m=xmp.first("sensefly:AltitudeAMSL"),
         hae_m=xmp.first("drone-dji:AbsoluteAltitude" if rtk else "sensefly:AltitudeWGS84"),
         vel_en_mps=(east, north) if math.isfinite(east + north) else None,
-        optics=_optics(tags, more),
+        optics=_optics(tags),
         lens=xmp.lens if xmp.first("drone-dji:DewarpFlag") == 0 else None,
-        software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
-        turned=tags.get(_ORIENTATION, 1) not in (0, 1),
+        turned=tags.get("Orientation", 1) not in (0, 1),
         doubts=tuple(filter(None, (*doubts, void, doubt))),
     )
 
 
-def _optics(tags: dict[int, Any], more: dict[int, Any]) -> Optics:
-    unit = _number(more.get(_PLANE_UNIT) or 2)
+def _named(tags: Mapping[int, Any], names: Mapping[int, str]) -> dict[str, Any]:
+    """Values by the names of their tags; tags are decoded on access."""
+    return {names[tag]: tags[tag] for tag in list(tags) if tag in names}
+
+
+def _optics(tags: Mapping[str, Any]) -> Optics:
+    unit = _number(tags.get("FocalPlaneResolutionUnit") or 2)
     return Optics(
-        make=_word(tags.get(_MAKE)),
-        model=_word(tags.get(_MODEL)),
-        focal_mm=_number(more.get(_FOCAL)),
-        film_mm=_number(more.get(_FOCAL_35)),
-        plane=_number(more.get(_PLANE_X)),
+        make=_word(tags.get("Make")),
+        model=_word(tags.get("Model")),
+        focal_mm=_number(tags.get("FocalLength")),
+        film_mm=_number(tags.get("FocalLengthIn35mmFilm")),
+        plane=_number(tags.get("FocalPlaneXResolution")),
         plane_unit=int(unit) if math.isfinite(unit) else 0,
-        taken_px=_number(more.get(_PIXELS_X)),
-        zoom=_number(more.get(_ZOOM)),
+        taken_px=_number(tags.get("ExifImageWidth")),
+        zoom=_number(tags.get("DigitalZoomRatio")),
     )
 
 
@@ -329,13 +309,13 @@ def _word(value: Any) -> str:
     return "" if value is None else str(text).strip("\0 ")
 
 
-def _time(tags: dict[int, Any], more: dict[int, Any]) -> tuple[int | None, bool]:
+def _time(tags: Mapping[str, Any]) -> tuple[int | None, bool]:
     """Time in ns by the camera's clock, and whether it is UTC, by `OffsetTimeOriginal`."""
-    parts = (_TIME_ORIGINAL, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL)
-    if not str(more.get(_TIME_ORIGINAL, "")).strip("\0 :"):
-        more, parts = {**more, _TIME: tags.get(_TIME, "")}, (_TIME, _SUBSEC, _OFFSET)
-    text, fraction, zone = (str(more.get(part, "")).strip("\0 ") for part in parts)
-    zone = zone if _ZONE.fullmatch(zone) else ""
+    kind = "Original" if _word(tags.get("DateTimeOriginal")).strip(" :") else ""
+    text, fraction, zone = (
+        _word(tags.get(f"{name}{kind}")) for name in ("DateTime", "SubsecTime", "OffsetTime")
+    )
+    zone = zone if re.fullmatch(r"Z|[+-][01]\d:?[0-5]\d", zone) else ""
     nanoseconds = int(fraction[:9].ljust(9, "0")) if fraction.isdecimal() else 0
     try:
         moment = datetime.strptime(text + zone, "%Y:%m:%d %H:%M:%S" + "%z" * bool(zone))
@@ -344,23 +324,27 @@ def _time(tags: dict[int, Any], more: dict[int, Any]) -> tuple[int | None, bool]
         return None, False
 
 
-def _gps_time_ns(gps: dict[int, Any]) -> int | None:
+def _gps_time_ns(gps: Mapping[str, Any]) -> int | None:
     try:
-        day = datetime.strptime(str(gps[29]).strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
-        hours, minutes, seconds = (float(part) for part in gps[7])
+        day = datetime.strptime(_word(gps["GPSDateStamp"]), "%Y:%m:%d").replace(tzinfo=UTC)
+        hours, minutes, seconds = (float(part) for part in gps["GPSTimeStamp"])
         return round((day.timestamp() + hours * 3600 + minutes * 60 + seconds) * 1e9)
     except (KeyError, ValueError, TypeError, ZeroDivisionError, OverflowError):
         return None
 
 
-def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float, str]:
-    """Latitude and longitude in degrees, altitude, and why there is none (tags 1 to 6)."""
-    alt = measured(_number(gps.get(6)) * (-1 if gps.get(5) in (1, 3, b"\x01", b"\x03") else 1))
+def _place(gps: Mapping[str, Any]) -> tuple[tuple[float, float] | None, float, str]:
+    """Latitude and longitude in degrees, altitude, and why there is none."""
+    below = gps.get("GPSAltitudeRef") in (1, 3, b"\x01", b"\x03")
+    alt = measured(_number(gps.get("GPSAltitude")) * (-1 if below else 1))
     try:
-        lat, lon = (sum(float(part) / 60**i for i, part in enumerate(gps[tag])) for tag in (2, 4))
+        lat, lon = (
+            sum(float(part) / 60**i for i, part in enumerate(gps[f"GPS{name}"]))
+            for name in ("Latitude", "Longitude")
+        )
     except (KeyError, ValueError, TypeError, ZeroDivisionError):
         return None, alt, ""
-    north, east = (_word(gps.get(tag)).upper()[:1] for tag in (1, 3))
+    north, east = (_word(gps.get(f"GPS{x}Ref")).upper()[:1] for x in ("Latitude", "Longitude"))
     if north not in tuple("NS") or east not in tuple("EW"):
         return None, alt, "GPS position without N or S, or without E or W"
     lat, lon = -lat if north == "S" else lat, -lon if east == "W" else lon
@@ -368,11 +352,11 @@ def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float, str]
     return ((lat, lon) if sound else None), alt, ""
 
 
-def _void(gps: dict[int, Any]) -> str:
+def _void(gps: Mapping[str, Any]) -> str:
     """Why the receiver's values are not used, empty where they are."""
-    if _word(gps.get(9)).upper() == "V" or _word(gps.get(10)) == "0":
+    if _word(gps.get("GPSStatus")).upper() == "V" or _word(gps.get("GPSMeasureMode")) == "0":
         return "GPS position without a fix (GPSStatus, GPSMeasureMode)"
-    if _number(gps.get(31)) > MAX_POSITION_ERROR_M or _number(gps.get(11)) > MAX_DOP:
+    if _number(gps.get("GPSHPositioningError")) > 100.0 or _number(gps.get("GPSDOP")) > 20.0:
         return "GPS position with a large error (GPSHPositioningError, GPSDOP)"
     return ""
 
@@ -397,15 +381,14 @@ def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float]
     # Programs that rewrite EXIF may change its byte order, not that of the notes.
     for order in "<>":
         count = struct.unpack_from(f"{order}H", data.ljust(2, b"\0"))[0]
-        if values or not 1 <= count <= _MAX_ENTRIES or len(data) < 2 + count * _ENTRY_BYTES:
+        if values or not 1 <= count <= 100 or len(data) < 2 + count * 12:
             continue
-        for number in range(count):
-            entry = struct.unpack_from(f"{order}HHIf", data, 2 + number * _ENTRY_BYTES)
-            if entry[1:3] == (_FLOAT, 1) and abs(entry[3]) <= 360:
-                values[entry[0]] = entry[3]
-    yaw, pitch, roll = (values.get(tag, math.nan) for tag in _CAMERA_ANGLES)
+        for tag, kind, size, value in struct.iter_unpack(f"{order}HHIf", data[2 : 2 + count * 12]):
+            if (kind, size) == (11, 1) and abs(value) <= 360:  # one float
+                values[tag] = value
+    yaw, pitch, roll = (values.get(tag, math.nan) for tag in (10, 9, 11))
     known = math.isfinite(yaw + pitch + roll)
-    return (yaw, pitch, roll) if known else None, values.get(_BODY_YAW, math.nan)
+    return (yaw, pitch, roll) if known else None, values.get(7, math.nan)
 
 
 @dataclass(frozen=True)
@@ -414,7 +397,6 @@ class Xmp:
 
     values: Mapping[str, float]
     time_ns: int | None  # UTC at exposure
-    writer: str  # program that wrote the packet, empty where it is not named
     lens: tuple[float, ...] | None = None  # `DewarpData`, see `Photo`
     unread: tuple[str, ...] = ()
     """Angles, heights and positions that are not numbers, as name and value."""
@@ -432,9 +414,10 @@ class Xmp:
             for name in found.keys() - values.keys()
             if _ANGLE_OR_PLACE.match(name)
         )
-        writer = _WRITER.search(text)
-        name = writer[1].strip() if writer else ""
-        return cls(values, _exposed_ns(text), name, _lens(text), unread)
+        exposed = texts.get("drone-dji:UTCAtExposure") or texts.get("sensefly:UTCTime", "")
+        return cls(
+            values, _exposed_ns(exposed), _lens(texts.get("drone-dji:DewarpData", "")), unread
+        )
 
     def first(self, *names: str) -> float:
         return next((self.values[name] for name in names if name in self.values), math.nan)
@@ -482,11 +465,12 @@ class Xmp:
 
 
 def _lens(text: str) -> tuple[float, ...] | None:
-    found = _DEWARP.search(text)
+    """DJI's calibration, which follows its date."""
     try:
-        return tuple(map(float, found[1].split(","))) if found else None
+        found = tuple(map(float, text.rpartition(";")[2].split(",")))
     except ValueError:
         return None
+    return found if len(found) == 9 and all(map(math.isfinite, found)) else None
 
 
 def _stated(text: str) -> float:
@@ -498,9 +482,7 @@ def _stated(text: str) -> float:
 
 
 def _exposed_ns(text: str) -> int | None:
-    if (found := _EXPOSED.search(text)) is None:
-        return None
     try:
-        return ns_of(datetime.fromisoformat("{}-{}-{}T{}".format(*found.groups())))
+        return ns_of(moment_of(text))
     except ValueError:
         return None

@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 from xml.sax.saxutils import escape
@@ -25,14 +24,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import TerrainHeights
 from orthonav.core.records import MAP_STD_M, Fix, ViewResult
 
-_XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
-_YEAR_2000_NS = 946_684_800 * 10**9  # earlier times count from something else than 1970
 CSV_COLUMNS = ("frame", "lat_deg", "lon_deg", "height_m", "agl_m", "heading_deg", "std_m")
-EXIF_COLUMNS = (
-    *("SourceFile", "GPSLatitude", "GPSLatitudeRef", "GPSLongitude", "GPSLongitudeRef"),
-    *("GPSAltitude", "GPSAltitudeRef", "GPSImgDirection", "GPSImgDirectionRef"),
-    *("GPSHPositioningError", "GPSMapDatum"),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +133,11 @@ def _geojson(positions: Positions) -> list[str]:
 
 def _exif(positions: Positions) -> list[str]:
     """A table that ExifTool writes into photographs (`exiftool -csv=TABLE FOLDER`)."""
+    columns = [
+        *("SourceFile", "GPSLatitude", "GPSLatitudeRef", "GPSLongitude", "GPSLongitudeRef"),
+        *("GPSAltitude", "GPSAltitudeRef", "GPSImgDirection", "GPSImgDirectionRef"),
+        *("GPSHPositioningError", "GPSMapDatum"),
+    ]
     rows = []
     for each in positions:
         lat, lon, height_m = each.fix.lat_deg, each.fix.lon_deg, each.height_m
@@ -154,7 +151,7 @@ def _exif(positions: Positions) -> list[str]:
                 *(heading, heading and "True North", _text(each.std_m), "WGS-84"),
             ]
         )
-    return _table(EXIF_COLUMNS, rows)
+    return _table(columns, rows)
 
 
 def _odm_geo(positions: Positions) -> list[str]:
@@ -199,7 +196,8 @@ def _kml(positions: Positions) -> list[str]:
     for each, point in zip(positions, points, strict=True):
         marks.append((escape(each.view.frame), f"std {each.std_m:.1f} m", "Point", point))
     return [
-        f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document>',
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<kml xmlns="http://www.opengis.net/kml/2.2"><Document>',
         *(
             f"<Placemark><name>{name}</name><description>{about}</description><{kind}>"
             f"<altitudeMode>{mode}</altitudeMode><coordinates>{coordinates}</coordinates>"
@@ -210,30 +208,10 @@ def _kml(positions: Positions) -> list[str]:
     ]
 
 
-def _gpx(positions: Positions) -> list[str]:
-    """A track (GPX 1.1); with heights above sea and dates where they are known."""
-    lines = [
-        f'{_XML}<gpx version="1.1" creator="orthonav" xmlns="http://www.topografix.com/GPX/1/1">'
-        "<trk><trkseg>"
-    ]
-    for each in positions:
-        height = f"<ele>{each.height_m:.2f}</ele>" if math.isfinite(each.height_m) else ""
-        time = ""
-        if each.view.time_ns >= _YEAR_2000_NS:
-            whole = datetime.fromtimestamp(each.view.time_ns // 10**9, UTC)
-            milliseconds = each.view.time_ns % 10**9 // 10**6
-            time = f"<time>{whole:%Y-%m-%dT%H:%M:%S}.{milliseconds:03d}Z</time>"
-        place = f'lat="{each.fix.lat_deg:.8f}" lon="{each.fix.lon_deg:.8f}"'
-        name = f"<name>{escape(each.view.frame)}</name>"
-        lines.append(f"<trkpt {place}>{height}{time}{name}</trkpt>")
-    return [*lines, "</trkseg></trk></gpx>"]
-
-
 FORMATS: dict[str, Callable[[Positions], list[str]]] = {
     "csv": _csv,
     "geojson": _geojson,
     "kml": _kml,
-    "gpx": _gpx,
     "tum": _tum,
     "odm-geo": _odm_geo,
     "exif": _exif,

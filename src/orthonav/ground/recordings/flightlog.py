@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -20,11 +21,7 @@ from orthonav.core.flight.logged import (
     FORMAT,
     MAX_JSON_BYTES,
     PROFILE,
-    RESULT,
-    SESSION,
-    TELEMETRY,
-    THUMBNAIL,
-    VIEW,
+    TOPICS,
     LoggedView,
     camera_of,
     from_json,
@@ -33,14 +30,21 @@ from orthonav.core.flight.logged import (
     view_of,
 )
 from orthonav.core.flight.mount import logged_mount
+from orthonav.core.flight.recording import RecordedView
 from orthonav.core.geo.camera import Camera
 from orthonav.core.records import ViewResult
-from orthonav.ground.recordings.mcap_files import McapFile, chunk_at, chunks, messages, profile_of
+from orthonav.ground.recordings.mcap_files import (
+    LoggedMessage,
+    McapFile,
+    chunk_at,
+    chunks,
+    messages,
+    profile_of,
+)
 from orthonav.ground.recordings.recording import (
     Grey,
     Recording,
     SourceOptions,
-    SourceView,
     given_camera,
     with_options,
 )
@@ -63,20 +67,19 @@ class LoggedFlight(Recording):
 
     session: Mapping[str, Any] = field(default_factory=dict)
     results: Callable[[], list[ViewResult]] = list
-    arrivals: Callable[[], Iterable[tuple[SourceView, float]]] = list
+    arrivals: Callable[[], Iterable[tuple[RecordedView, float]]] = list
 
 
 @dataclass(frozen=True)
 class ImagePlace:
-    """Where the image of a view is: file, offset of its chunk, first and last byte in the chunk.
+    """Where the image of a view is: file, offset of its chunk, and its number in the chunk.
 
     `whole`: whether it is the full image, not a thumbnail.
     """
 
     path: Path
     offset: int
-    first: int
-    last: int
+    number: int
     whole: bool
 
 
@@ -85,6 +88,8 @@ class BrokenLogError(FlightError):
 
 
 class LogContent:
+    """What the files of a log hold. Safe to share between threads."""
+
     def __init__(self) -> None:
         self.session: dict[str, Any] = {}  # of the last message
         self.views: list[LoggedView] = []
@@ -102,14 +107,14 @@ class LogContent:
 
         Messages that are damaged, or for which `take` raises, are skipped. Raises `BrokenLogError`.
         """
-        for offset, data in chunks(file):
-            for found in messages(data, file):
-                if found.topic in (VIEW.name, THUMBNAIL.name):
-                    whole = found.topic == VIEW.name
-                    place = ImagePlace(file.path, offset, found.first, found.last, whole)
-                    self.places.setdefault(found.number, place)
+        for offset, chunk in chunks(file):
+            for number, message in enumerate(messages(chunk, file.channels)):
+                if message.topic in (TOPICS.view.name, TOPICS.thumbnail.name):
+                    whole = message.topic == TOPICS.view.name
+                    place = ImagePlace(file.path, offset, number, whole)
+                    self.places.setdefault(message.number, place)
                 else:
-                    self._try(found.topic, data[found.first : found.last], file.path, take)
+                    self._try(message, file.path, take)
                 self._messages += 1
                 views = max(len(self.views), len(self.places))
                 if views > MAX_VIEWS or self._messages > MAX_MESSAGES:
@@ -117,13 +122,13 @@ class LogContent:
                         f"flight log holds more than {MAX_VIEWS} views: {file.path}"
                     )
 
-    def _try(self, topic: str, data: bytes, path: Path, take: Callable[[str, bytes], None]) -> None:
+    def _try(self, message: LoggedMessage, path: Path, take: Callable[[str, bytes], None]) -> None:
         try:
-            if topic == TELEMETRY.name:
-                self.views.append(view_of(data))
-            elif topic == SESSION.name:
-                self.session = _session(data, path)
-            take(topic, data)
+            if message.topic == TOPICS.telemetry.name:
+                self.views.append(view_of(message.data))
+            elif message.topic == TOPICS.session.name:
+                self.session = _session(message.data, path)
+            take(message.topic, message.data)
         except BrokenLogError:
             raise
         except (OrthonavError, UnicodeDecodeError) as error:
@@ -133,7 +138,7 @@ class LogContent:
     def grey(self, place: ImagePlace, camera: Camera, where: str) -> Grey:
         """The image at a place; raises `FlightError` where it cannot be decoded."""
         try:
-            data, kind = picture_of(self._message(place))
+            data, kind = picture_of(self._data(place))
         except FlightError as error:
             raise FlightError(f"{error}: {where}") from error
         except OSError as error:
@@ -144,13 +149,14 @@ class LogContent:
             raise FlightError(f"image has an unknown format, {kind!r:.20}: {where}")
         return decode_image(data, where)
 
-    def _message(self, place: ImagePlace) -> bytes:
-        """The data at a place, empty where its chunk is damaged; the last chunk is cached."""
+    def _data(self, place: ImagePlace) -> bytes:
+        """The message at a place, empty where its chunk is damaged; the last chunk is cached."""
         with self._lock:
             if self._held != (place.path, place.offset):
                 self._chunk = chunk_at(place.path, place.offset)
                 self._held = place.path, place.offset
-            return self._chunk[place.first : place.last]
+            found = islice(messages(self._chunk, {}), place.number, None)
+            return next((message.data for message in found), b"")
 
 
 def is_flight_log(path: Path) -> bool:
@@ -230,10 +236,10 @@ def _order(path: Path) -> tuple[str, int]:
 
 def run_of(path: Path) -> str | None:
     """The run that a file belongs to; None where no chunk states it."""
-    for _, data in chunks(file := McapFile(path)):
-        for found in messages(data, file):
-            if found.topic == SESSION.name:
-                return str(from_json(data[found.first : found.last]).get("run"))
+    for _, chunk in chunks(file := McapFile(path)):
+        for message in messages(chunk, file.channels):
+            if message.topic == TOPICS.session.name:
+                return str(from_json(message.data).get("run"))
     return None
 
 
@@ -327,13 +333,13 @@ def _gaps(views: list[LoggedView], replayable: list[LoggedView]) -> list[str]:
 
 def _view(
     view: LoggedView, content: LogContent, camera: Camera, options: SourceOptions
-) -> SourceView:
+) -> RecordedView:
     place = content.places.get(view.index) if _has_image(view, content) else None
     where = f"view {view.frame} of {'the flight log' if place is None else place.path}"
     load = (
         partial(_unusable, where) if place is None else partial(content.grey, place, camera, where)
     )
-    return SourceView(view.frame, with_options(view.telemetry, None, options), None, where, load)
+    return RecordedView(view.frame, with_options(view.telemetry, None, options), None, where, load)
 
 
 def _unusable(where: str) -> Grey:
@@ -344,7 +350,7 @@ def _results(files: list[Path]) -> list[ViewResult]:
     found: list[ViewResult] = []
 
     def take(topic: str, data: bytes) -> None:
-        if topic == RESULT.name:
+        if topic == TOPICS.result.name:
             found.append(logged_result(data))
 
     for path in files:
@@ -353,7 +359,7 @@ def _results(files: list[Path]) -> list[ViewResult]:
 
 
 def logged_result(data: bytes) -> ViewResult:
-    """The result in a message of `RESULT`. Raises `FlightError` or `UnicodeDecodeError`."""
+    """The result in a message of `Topics.result`. Raises `FlightError` or `UnicodeDecodeError`."""
     if len(data) > MAX_JSON_BYTES:
         raise FlightError(f"result of the log has {len(data)} bytes")
     return result_from_json(data.decode("utf-8"))

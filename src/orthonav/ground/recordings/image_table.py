@@ -7,7 +7,7 @@ counts it, where -90 looks straight down; any other is in the convention of orth
 import math
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -50,12 +50,7 @@ _UNITS = ("deg", "degree", "degrees", "m", "meter", "meters", "metre", "metres",
 _UNREAD = re.compile(r"omega|phi|kappa|q[wxyz]")
 _EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
 _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
-_GIMBAL_DEG = -45.0
-"""A median pitch below is that of a gimbal: no camera that is of use looks so far back."""
-_DATE = re.compile(r"(\d{4}):(\d\d):(\d\d)")  # as EXIF writes it
-_LARGEST_S = 9e9
 Columns = Mapping[str, tuple[str, float]]  # name in the table and scale, by field
-_HEAD_BYTES = 100_000
 
 
 @dataclass(frozen=True)
@@ -137,13 +132,12 @@ def read_image_table(path: Path) -> ImageTable:
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
     comma = delimiter != ","
-    numbers = [(line, texts, _numbers(texts, columns, line, comma, path)) for line, texts in lines]
-    found = [values for _, _, values in numbers]
+    found = [_numbers(texts, columns, line, comma, path) for line, texts in lines]
     gimbal = _is_gimbal(columns, found)
     unrecorded = _is_unrecorded(gimbal, found)
     _head(unrecorded, found)
     rows: dict[str, ImageRow] = {}
-    for order, (line, texts, values) in enumerate(numbers):
+    for order, ((line, texts), values) in enumerate(zip(lines, found, strict=True)):
         name = str(PurePosixPath(texts["file"].replace("\\", "/").lower()))
         if name in rows:
             raise FlightError(f"table names {texts['file']!r:.80} twice: {path}")
@@ -206,9 +200,9 @@ def _is_gimbal(columns: Columns, rows: Sequence[Mapping[str, float]]) -> bool:
     if "pitch" not in columns:
         return False
     known = [values["pitch"] for values in rows if "pitch" in values]
-    return "gimbal" in columns["pitch"][0].lower() or (
-        bool(known) and float(np.median(known)) <= _GIMBAL_DEG
-    )
+    # No camera that is of use looks back by more than 45 deg.
+    looks_back = bool(known) and float(np.median(known)) <= -45.0
+    return looks_back or "gimbal" in columns["pitch"][0].lower()
 
 
 def _is_unrecorded(gimbal: bool, rows: Sequence[Mapping[str, float]]) -> bool:
@@ -261,16 +255,20 @@ def _time_ns(text: str, line: int, path: Path) -> int | None:
     try:
         if math.isfinite(number_of(text)):
             seconds = Decimal(text)
-            while abs(seconds) > _LARGEST_S:
+            while abs(seconds) > 9e9:  # milliseconds or less since 1970
                 seconds /= 1000
             return round(seconds * 10**9)
-        moment = datetime.fromisoformat(_DATE.sub(r"\1-\2-\3", text))
+        return ns_of(moment_of(text))
     except (ValueError, ArithmeticError) as error:
         raise FlightError(
             f"line {line}: time must be seconds or a date such as 2024-05-01T10:00:00Z, got "
             f"{text!r:.40}: {path}"
         ) from error
-    return ns_of(moment)
+
+
+def moment_of(text: str) -> datetime:
+    """A date and time as of ISO 8601 or EXIF (2024:05:01 10:00:00). Raises `ValueError`."""
+    return datetime.fromisoformat(re.sub(r"^(\d{4}):(\d\d):(\d\d)", r"\1-\2-\3", text))
 
 
 def ns_of(moment: datetime) -> int:
@@ -297,12 +295,3 @@ def _doubts(
         yield UNRECORDED
     elif gimbal and "gimbal" not in columns["pitch"][0].lower():
         yield "pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight down"
-
-
-def names_images(path: Path, names: Collection[str]) -> bool:
-    """Whether a text names some of these images, in lower case."""
-    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        text = stream.read(_HEAD_BYTES).decode("utf-8", errors="replace").lower()
-    return not set(re.split(r"[\s,;\"/\\]+", text)).isdisjoint(names)

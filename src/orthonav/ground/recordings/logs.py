@@ -5,18 +5,18 @@ import io
 import math
 import mmap
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file
-from orthonav.core.flight.folder import number_of, time_ns_of
+from orthonav.core.flight.folder import csv_rows, number_of, time_ns_of
 from orthonav.core.flight.telemetry_track import (
     RecordedTrack,
     Samples,
@@ -32,37 +32,25 @@ from orthonav.core.flight.telemetry_track import (
 from orthonav.core.geo.attitude import (
     Angles,
     enu_from_body_camera,
-    enu_from_gimbal_camera,
     ned_from_angles,
     rotations_of_wxyz,
 )
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.guard import needed, reading
-from orthonav.core.tables import TableError, TableRows
+from orthonav.core.tables import MAX_ROWS
 from orthonav.core.tilt import (
     ARDUPILOT,
-    ASSUMED,
     AUTOPILOT,
-    GIMBAL,
-    UNRECORDED,
     UNSTATED,
     TiltSource,
 )
+from orthonav.ground.recordings.subtitles import read_srt
 from orthonav.onboard.messages import mavlink
 
 DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats
 MAVLINK_MAGICS = (0xFE, 0xFD)
-_RANGE_IS_GOOD = 4
-_WANTED = {
-    *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
-    *("GPS2_RAW", "DISTANCE_SENSOR", "RANGEFINDER"),
-}
 ULOG_MAGIC = b"ULog\x01\x12\x35"
-_TOPICS = [
-    *("vehicle_attitude", "vehicle_local_position", "vehicle_global_position", "home_position"),
-    *("vehicle_gps_position", "sensor_gps", "distance_sensor"),
-]
 Columns = dict[str, NDArray[Any]]
 
 
@@ -141,13 +129,10 @@ def _from_dataflash(collected: _Collected, message: Any, time_ns: int) -> None:
     elif kind == "POS":
         collected.above_home.add(time_ns, message.RelHomeAlt)
     elif kind == "RFND":
-        good = getattr(message, "Stat", _RANGE_IS_GOOD) == _RANGE_IS_GOOD
-        for number in ("", "1", "2"):  # numbered up to ArduPilot 3.6
-            if (distance_m := getattr(message, f"Dist{number}", None)) is not None:
-                instance = int(number) - 1 if number else getattr(message, "Instance", 0)
-                down = getattr(message, f"Orient{number}", mavlink.DOWNWARD) == mavlink.DOWNWARD
-                sound = good and down and distance_m > 0
-                _add(collected.distances, f"RFND[{instance}]", sound, time_ns, distance_m)
+        down = getattr(message, "Orient", mavlink.DOWNWARD) == mavlink.DOWNWARD
+        sound = getattr(message, "Stat", 4) == 4 and down and message.Dist > 0  # 4: good
+        name = f"RFND[{getattr(message, 'Instance', 0)}]"
+        _add(collected.distances, name, sound, time_ns, message.Dist)
     else:
         receiver = f"GPS[{message.I}]" if hasattr(message, "I") else kind
         course = math.radians(message.GCrs)
@@ -162,11 +147,15 @@ def read_tlog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     Its first autopilot is read: gimbals and other vehicles send attitudes too.
     """
     mavutil = needed("pymavlink.mavutil", "telemetry logs")
+    wanted = {
+        *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
+        *("GPS2_RAW", "DISTANCE_SENSOR", "RANGEFINDER"),
+    }
     parts: dict[str, _Collected] = {}
     with reading("telemetry log", path, silent=True):
         log = mavutil.mavlogfile(str(path), robust_parsing=True)
         try:
-            while (message := log.recv_match(type=_WANTED)) is not None:
+            while (message := log.recv_match(type=wanted)) is not None:
                 name = f"ATTITUDE[{message.get_srcSystem()}:{message.get_srcComponent()}]"
                 part = parts.setdefault(name, _Collected(mount_deg))
                 _from_tlog(part, message, round(message._timestamp * 1e6) * 1000)
@@ -225,12 +214,16 @@ def _distance_of_tlog(collected: _Collected, kind: str, message: Any, time_ns: i
 def read_ulog(path: Path, mount_deg: Angles, sources: Sources) -> RecordedTrack:
     """The track of a ULog; times are UTC where the log has a GPS fix, else since boot."""
     core = needed("pyulog.core", "PX4 logs")
+    names = [
+        *("vehicle_attitude", "vehicle_local_position", "vehicle_global_position"),
+        *("home_position", "vehicle_gps_position", "sensor_gps", "distance_sensor"),
+    ]
     with reading("PX4 log", path, silent=True), path.open("rb") as whole:
         with mmap.mmap(whole.fileno(), 0, access=mmap.ACCESS_READ) as data:
             end = data.find(ULOG_MAGIC, 1)  # of a log behind it, on a card that was not erased
             stream: Any = whole if end < 0 else io.BytesIO(data[:end])
-        log = core.ULog(stream, _TOPICS)
-        topics: dict[str, dict[str, Columns]] = {name: {} for name in _TOPICS}
+        log = core.ULog(stream, names)
+        topics: dict[str, dict[str, Columns]] = {name: {} for name in names}
         for one in log.data_list:
             topics[one.name][f"{one.name}[{one.multi_id}]"] = one.data
         topics = {name: dict(sorted(each.items())) for name, each in topics.items()}
@@ -359,27 +352,7 @@ def _position(columns: Columns) -> TimeSeries | None:
     return position_series(columns["time_ns"][sound], place[sound])
 
 
-_SRT = re.compile(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->")
 MAX_BYTES = 500_000_000
-_NUMBER = r"([-+]?\d{1,20}(?:\.\d{1,20})?)"  # limited, as the time of a search is
-_TIMES = re.compile(
-    r"(?<!\d)(\d{1,9}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d{1,9}):(\d\d):(\d\d)[,.](\d{1,3})"
-)
-_ENDS = (">", "]", ")")  # what blocks end with that are whole, besides the end of a line
-_TAG = re.compile(r"<[^<>]*>")
-_FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
-_GPS = re.compile(
-    rf"\b(?:GPS|RTK)\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)"
-)
-_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
-_HOME = re.compile(r"\bHOME\s*\(")
-_HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
-_GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
-_DIGITAL_ZOOM = re.compile(
-    rf"\bd(?:igital)?[_ ]?zoom[a-z_]*\s{{0,9}}(?::\s{{0,9}})?{_NUMBER}", re.IGNORECASE
-)
-SAME_ZOOM = 0.02  # zooms that differ by less, as a fraction, are one
-NEEDED = ("time_s", "pitch_deg", "roll_deg")
 _COLUMNS = {
     "height": ("agl_m",),
     "home": ("home_m",),
@@ -393,11 +366,6 @@ _COLUMNS = {
     "prior": ("prior_lat_deg", "prior_lon_deg", "prior_std_m"),
 }
 """Columns of a table by the series of `RecordedTrack`."""
-_HEIGHTS = ("height", "home", "amsl", "hae")
-UNCLEAR_ORDER = (
-    "subtitles do not show whether GPS(..) begins with the latitude or the longitude: positions "
-    "are left out"
-)
 
 
 def log_kind(path: Path) -> str:
@@ -414,7 +382,7 @@ def log_kind(path: Path) -> str:
     if len(head) > 8 and head[0] == 0 and head[8] in MAVLINK_MAGICS:
         return "tlog"
     text = head.replace(b"\0", b"") if head[:2] in (b"\xff\xfe", b"\xfe\xff") else head
-    if _SRT.search(text):
+    if re.search(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->", text):
         return "srt"
     if b"time_s" in head.partition(b"\n")[0]:
         return "table"
@@ -436,166 +404,19 @@ def read_log(
     kind, sources = log_kind(path), Sources(named or {}, path)
     if unknown := sources.named.keys() - {"image", "camera_info", "attitude", "position", "height"}:
         raise FlightError(f"logs have no sources of {', '.join(unknown)}: {path}")
-    if kind in ("srt", "table") and sources.named.keys() & {"attitude", "position", "height"}:
-        raise FlightError(f"a file of this kind has one source each; omit --topic: {path}")
-    if kind in ("srt", "table") and path.stat().st_size > MAX_BYTES:
-        raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
-    if kind == "ulog":
-        return read_ulog(path, mount_deg, sources)
-    if kind == "dataflash":
-        return read_dataflash(path, mount_deg, sources)
-    if kind == "tlog":
-        return read_tlog(path, mount_deg, sources)
-    return read_srt(path) if kind == "srt" else read_table(path)
-
-
-class SubtitleBlock(NamedTuple):
-    """One subtitle; values it does not hold are NaN."""
-
-    start_ns: int  # begin in the video
-    end_ns: int  # end in the video
-    lat_deg: float
-    lon_deg: float
-    alt_m: float  # altitude in the drone's own reference
-    height_m: float  # height above take-off
-    yaw_deg: float  # yaw of the gimbal, as are pitch and roll
-    pitch_deg: float
-    roll_deg: float
-    zoom: tuple[float, float]  # focal length, in any unit, and digital zoom
-
-
-def read_srt(path: Path) -> RecordedTrack:
-    """The track of an SRT file; times are those of its video."""
-    data = path.read_bytes()
-    text = _decoded(data)
-    doubtful = _GPS.search(text) is not None and _latitude_first(text) is None
-    found = list(blocks(data))
-    if not found:
-        raise FlightError(f"subtitles hold no telemetry: {path}")
-    attitude, position, height, zoomed = Samples(3), Samples(3), Samples(1), Samples(1)
-    unrecorded = not any(
-        (each.yaw_deg, each.pitch_deg, each.roll_deg) != (0, 0, 0) for each in found
-    )
-    odd = _zoomed(found)
-    ending = found[-1]._replace(start_ns=found[-1].end_ns)
-    for block, other in zip([*found, ending], [*odd, odd[-1]], strict=True):
-        gimbal = block.yaw_deg, block.pitch_deg, block.roll_deg
-        attitude.add(block.start_ns, *((math.nan, -90.0, 0.0) if unrecorded else gimbal))
-        position.add(block.start_ns, block.lat_deg, block.lon_deg, block.alt_m)
-        height.add(block.start_ns, block.height_m)
-        zoomed.add(block.start_ns, other)
-    warnings = [UNCLEAR_ORDER] * doubtful + [f"{UNRECORDED}: {path}"] * unrecorded
-    if any(odd):
-        warnings.append(
-            f"{sum(odd)} of {len(odd)} subtitles state another zoom than most, the first at "
-            f"{found[odd.index(True)].start_ns / 1e9:.1f} s; views there are left out: {path}"
-        )
-    most = (block.zoom[1] for block, other in zip(found, odd, strict=True) if not other)
-    if (digital := next(most, 1.0)) > 1 + SAME_ZOOM:
-        warnings.append(
-            f"most of the subtitles state a digital zoom of {digital:g}: --camera or --fov-deg "
-            f"must be that of this zoom: {path}"
-        )
-    track = RecordedTrack(
-        attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
-        home=height.series(),
-        position=position.positions(),
-        zoomed=zoomed.series(),
-        tilt=ASSUMED if unrecorded else GIMBAL,
-        warnings=tuple(warnings),
-    )
-    if track.attitude is None and track.position is None:
-        raise FlightError(f"subtitles have neither position nor gimbal angles: {path}")
-    return track
-
-
-def _zoomed(found: Sequence[SubtitleBlock]) -> list[bool]:
-    """Whether each states another focal length or digital zoom than most of them."""
-    odd = np.zeros(len(found), bool)
-    for zooms in np.array([each.zoom for each in found]).T:
-        values, counts = np.unique(zooms[zooms > 0], return_counts=True)
-        if len(values):
-            odd |= np.abs(zooms / values[counts.argmax()] - 1) > SAME_ZOOM
-    return list(map(bool, odd))
+    if kind in ("srt", "table"):
+        if sources.named.keys() & {"attitude", "position", "height"}:
+            raise FlightError(f"a file of this kind has one source each; omit --topic: {path}")
+        if path.stat().st_size > MAX_BYTES:
+            raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
+        return read_srt(path) if kind == "srt" else read_table(path)
+    read = {"ulog": read_ulog, "dataflash": read_dataflash, "tlog": read_tlog}[kind]
+    return read(path, mount_deg, sources)
 
 
 def end_ns(track: RecordedTrack) -> int:
     series = (track.attitude, track.position, track.home, *track.heights)
     return max(int(one.time_ns[-1]) for one in series if one is not None)
-
-
-def blocks(data: bytes) -> Iterator[SubtitleBlock]:
-    """The blocks of an SRT file in order; those without a line of times are left out, and so is the
-    last one of a file that ends within it: its last number may be cut."""
-    text = _decoded(data)
-    latitude_first = _latitude_first(text)
-    parts = re.split(r"\n\s*\n", text.replace("\r\n", "\n"))
-    if not text.endswith(("\n", *_ENDS)):
-        parts.pop()
-    for part in parts:
-        times = _TIMES.search(part)
-        if times:
-            start, end = _ns(times.groups()[:4]), _ns(times.groups()[4:])
-            yield _block(start, end, _TAG.sub(" ", part[times.end() :]), latitude_first)
-
-
-def _decoded(data: bytes) -> str:
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return data.decode("utf-16", errors="replace")
-    return data.decode("utf-8-sig", errors="replace")
-
-
-def _ns(parts: tuple[str, ...]) -> int:
-    hours, minutes, seconds = (int(part) for part in parts[:3])
-    return ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(parts[3].ljust(3, "0")) * 10**6
-
-
-def _latitude_first(text: str) -> bool | None:
-    """Whether the file writes GPS(latitude, longitude, ..), as the Matrice 300 does; None where its
-    marks contradict each other, or there are none.
-
-    Most models write the longitude first, then the number of satellites, and HOME(..); the Matrice
-    300 writes an altitude with its unit in their place, and BAROMETER with a unit.
-    """
-    found = _GPS.findall(text)
-    beyond = [any(abs(float(each[i])) > 90 for each in found) for i in (0, 1)]
-    if any(beyond):
-        return None if all(beyond) else beyond[1]
-    barometer = _BAROMETER.search(text)
-    unit = barometer is not None and bool(barometer[2])
-    latitude = any(each[3] for each in found) or unit
-    longitude = any(each[2].isdecimal() and not each[3] for each in found)
-    longitude = longitude or _HOME.search(text) is not None
-    return None if latitude == longitude else latitude
-
-
-def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> SubtitleBlock:
-    fields = {name: float(value) for name, value in _FIELD.findall(text)}
-    lat, lon = fields.get("latitude", math.nan), fields.get("longitude", math.nan)
-    lon = fields.get("longtitude", lon)  # misspelt by some models
-    if latitude_first is not None and (gps := _GPS.search(text)):
-        lat, lon = float(gps[1]), float(gps[2])
-        if not latitude_first:
-            lat, lon = lon, lat
-    height = fields.get("rel_alt", _first(_BAROMETER, text))
-    if math.isnan(height):
-        height = _first(_HEIGHT, text)
-    pitch, roll, yaw = (fields.get(f"gb_{name}", math.nan) for name in ("pitch", "roll", "yaw"))
-    if gimbal := _GIMBAL.search(text):
-        pitch, roll, yaw = (float(gimbal[i]) for i in (1, 2, 3))
-    altitude = fields.get("abs_alt", fields.get("altitude", math.nan))
-    if not (abs(lat) <= 90 and abs(lon) <= 360):
-        lat = lon = math.nan
-    height, altitude = measured(height), measured(altitude)
-    digital = _first(_DIGITAL_ZOOM, text)
-    digital = digital / 10_000 if digital >= 10_000 else digital  # some write 10000 for 1
-    zoom = fields.get("focal_len") or math.nan, digital if digital > 0 else 1.0
-    return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll, zoom)
-
-
-def _first(pattern: re.Pattern[str], text: str) -> float:
-    found = pattern.search(text)
-    return float(found[1]) if found else math.nan
 
 
 def read_table(path: Path) -> RecordedTrack:
@@ -606,27 +427,19 @@ def read_table(path: Path) -> RecordedTrack:
     """
     attitude, position = Samples(3), Samples(3)
     others = {name: Samples(len(columns)) for name, columns in _COLUMNS.items()}
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = TableRows(stream)
-            missing = [name for name in NEEDED if name not in rows.columns]
-            if missing:
-                raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
-            held = [name for name in _COLUMNS if set(_COLUMNS[name]) & set(rows.columns)]
-            for row in rows:
-                time_ns = time_ns_of(row["time_s"])
-                if time_ns is None:
-                    raise FlightError(f"line {rows.line}: time_s is not a time: {path}")
-                angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
-                attitude.add(time_ns, *angles)
-                position.add(time_ns, *_table_position(row, rows.line, path), math.nan)
-                for name in held:
-                    values = [number_of(row.get(column)) for column in _COLUMNS[name]]
-                    if name in _HEIGHTS:
-                        values = [measured(value) for value in values]
-                    others[name].add(time_ns, *values)
-    except TableError as error:
-        raise FlightError(f"{error}: {path}") from error
+    for line, row in csv_rows(path, ("time_s", "pitch_deg", "roll_deg"), MAX_ROWS):
+        time_ns = time_ns_of(row["time_s"])
+        if time_ns is None:
+            raise FlightError(f"line {line}: time_s is not a time: {path}")
+        angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
+        attitude.add(time_ns, *angles)
+        position.add(time_ns, *_table_position(row, line, path), math.nan)
+        for name, columns in _COLUMNS.items():
+            if not row.keys().isdisjoint(columns):
+                values = [number_of(row.get(column)) for column in columns]
+                if name in ("height", "home", "amsl", "hae"):
+                    values = [measured(value) for value in values]
+                others[name].add(time_ns, *values)
     found: dict[str, Any] = {name: each.series() for name, each in others.items()}
     height = found.pop("height")
     track = RecordedTrack(
@@ -641,7 +454,7 @@ def read_table(path: Path) -> RecordedTrack:
     return track
 
 
-def _table_position(row: Mapping[str, str | None], line: int, path: Path) -> tuple[float, float]:
+def _table_position(row: Mapping[str, str], line: int, path: Path) -> tuple[float, float]:
     lat_deg, lon_deg = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
     prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
     if hint := swapped_hint(lat_deg, lon_deg) or swapped_hint(*prior):

@@ -9,25 +9,21 @@ from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.files import replacing_folder, require_file
 from orthonav.core.flight import FlightFolder, FlightWriter, open_flight, read_truth
 from orthonav.core.flight.folder import encoded
+from orthonav.core.flight.recording import RecordedView
 from orthonav.core.geo.camera_files import masked
 from orthonav.core.geo.headings import seem_radians
 from orthonav.ground.recordings.flightlog import is_flight_log, open_flight_log
 from orthonav.ground.recordings.image_table import is_image_table
-from orthonav.ground.recordings.photos import is_photo, open_photos, photo_paths
+from orthonav.ground.recordings.photos import SUFFIXES, is_photo, open_photos, photo_paths
 from orthonav.ground.recordings.recording import (
     Recording,
     SourceOptions,
-    SourceView,
     given_camera,
     time_warnings,
     with_options,
 )
 from orthonav.ground.recordings.ros import METADATA, bag_suffix, open_ros, storage_files
 from orthonav.ground.recordings.video import open_video
-
-_VIDEO_STARTS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"FLV\1")
-_TS_PACKET_BYTES = 188
-READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 
 def open_source(path: Path | Sequence[Path], options: SourceOptions | None = None) -> Recording:
@@ -106,14 +102,16 @@ def _folder_kind(path: Path) -> str:
 
 
 def _is_video(path: Path) -> bool:
+    packet_bytes = 188  # of an MPEG transport stream
     with path.open("rb") as stream:
-        head = stream.read(_TS_PACKET_BYTES + 1)
+        head = stream.read(packet_bytes + 1)
     if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free"):  # ISO base media, QuickTime
         return True
     if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
         return True
-    transport = len(head) > _TS_PACKET_BYTES and head[0] == head[_TS_PACKET_BYTES] == 0x47
-    return transport or head.startswith(_VIDEO_STARTS)
+    if len(head) > packet_bytes and head[0] == head[packet_bytes] == 0x47:
+        return True
+    return head.startswith((b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"FLV\1"))
 
 
 def _flight(folder: FlightFolder, options: SourceOptions) -> Recording:
@@ -140,17 +138,11 @@ def _flight(folder: FlightFolder, options: SourceOptions) -> Recording:
 
 def _flight_views(
     folder: FlightFolder, truth: dict[str, tuple[float, float]], options: SourceOptions
-) -> Iterator[SourceView]:
+) -> Iterator[RecordedView]:
     for view in folder.views:
         known = truth.get(view.frame)
-        yield SourceView(
-            frame=view.frame,
-            telemetry=with_options(view.telemetry, known, options),
-            truth_latlon_deg=known,
-            where=view.where,
-            load=view.grey,
-            data=view.path.read_bytes,
-        )
+        telemetry = with_options(view.telemetry, known, options)
+        yield replace(view, telemetry=telemetry, truth_latlon_deg=known)
 
 
 @dataclass(frozen=True)
@@ -205,7 +197,7 @@ def import_flight(
 
 
 def _encoded_image(
-    view: SourceView, recording: Recording, jpeg_quality: int | None
+    view: RecordedView, recording: Recording, jpeg_quality: int | None
 ) -> tuple[str, bytes]:
     grey, camera = view.grey(), recording.camera
     if grey.shape != (camera.height_px, camera.width_px):
@@ -213,7 +205,7 @@ def _encoded_image(
             f"camera is {camera.width_px} x {camera.height_px} px, the image is "
             f"{grey.shape[1]} x {grey.shape[0]} px: {view.where}"
         )
-    if view.data is not None and view.frame.lower().endswith(READABLE):
+    if view.data is not None and view.frame.lower().endswith(SUFFIXES):
         return view.frame, view.data()
     suffix = ".png" if jpeg_quality is None else ".jpg"
     frame = str(PurePosixPath(view.frame).with_suffix(suffix))

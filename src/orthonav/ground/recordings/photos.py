@@ -17,6 +17,7 @@ import numpy as np
 from orthonav.core.errors import CameraError, FlightError, lfs_pointer
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_image
+from orthonav.core.flight.recording import RecordedView
 from orthonav.core.flight.telemetry_track import RecordedTrack
 from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import Camera, attitude_of
@@ -26,14 +27,12 @@ from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, re
 from orthonav.ground.recordings.image_table import (
     ImageTable,
     is_image_table,
-    names_images,
     read_image_table,
 )
 from orthonav.ground.recordings.logs import read_log
 from orthonav.ground.recordings.recording import (
     Recording,
     SourceOptions,
-    SourceView,
     check_overlap,
     given_camera,
     height_warnings,
@@ -47,26 +46,10 @@ from orthonav.ground.recordings.recording import (
 
 log = logging.getLogger(__name__)
 
-UNKNOWN_YAW_STD_DEG = 180.0  # standard deviation of a heading that may be off by any angle
 ZONE_STEP_NS, MAX_LAG_NS = 900 * 10**9, 20 * 10**9
 """Zones are quarters of an hour; a clock that is off by more than the latter is corrected."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-_MAGICS = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*")
-_EDITOR = re.compile(
-    r"microsoft|windows|photo\s*(?:viewer|shop|gallery|scape)|lightroom|gimp|picasa|paint|irfan"
-    r"|acdsee|xnview|magick|digikam|darktable|rawtherapee|affinity|capture one|snapseed|preview"
-    r"|pixelmator|faststone|zoner|corel|gthumb|shotwell|polarr|gwenview|nomacs|apple|google",
-    re.IGNORECASE,
-)
-"""Programs that show, turn or develop photographs."""
-_FIRMWARE = re.compile(r"[vV]?\d+(?:\.\d+)+")
 ROUNDED = 0.02  # focal lengths of EXIF that differ by less, as a fraction, are of one lens
-MAX_EXIF_SIGMA = 3.0
-"""Largest difference between the focal lengths of DJI's calibration and of EXIF, in standard
-deviations of the latter; a larger one means another size of the picture."""
-FACTORY_STD = 0.01
-"""Standard deviation of the calibrated focal length, a fraction: it changes with focus."""
-_BY_NAME_NS = 10**9  # spacing of photographs without a time, which are ordered by name
 
 
 def photo_paths(folder: Path) -> list[Path]:
@@ -81,7 +64,8 @@ def photo_paths(folder: Path) -> list[Path]:
 
 def is_photo(path: Path) -> bool:
     with path.open("rb") as stream:
-        return stream.read(8).startswith(_MAGICS)
+        head = stream.read(8)
+    return head.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*"))
 
 
 @dataclass(frozen=True)
@@ -121,16 +105,12 @@ def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
     """The table that lies in a folder and names some of these photographs below it."""
     names = [path.relative_to(folder).as_posix() for path in photos]
     found = []
-    ends = {path.name.lower() for path in photos}
-    for path in sorted(folder.iterdir()):
-        if is_image_table(path):
-            table = read_image_table(path)
-            if any(table.row(name) for name in names):
-                found.append(table)
-            else:
-                log.warning("table that names none of the photographs is not used: %s", path)
-        elif names_images(path, ends):
-            log.warning("not read, for want of a header such as file,yaw,pitch,roll,agl: %s", path)
+    for path in filter(is_image_table, sorted(folder.iterdir())):
+        table = read_image_table(path)
+        if any(table.row(name) for name in names):
+            found.append(table)
+        else:
+            log.warning("table that names none of the photographs is not used: %s", path)
     if len(found) > 1:
         several = ", ".join(table.path.name for table in found[:5])
         raise FlightError(
@@ -159,15 +139,6 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
             f"gimbal angles of {sum(lost)} photographs are all 0, so they were not recorded: "
             "heading of the aircraft and a camera that looks straight down assumed"
         )
-    edited = _edited(photos)
-    if edited:
-        warnings.append(
-            f"{len(edited)} of {len(photos)} photographs were written by an editor "
-            f"({photos[edited[0]].software}); one that was turned there has kept its angles, so "
-            "the heading of these is taken as unknown"
-        )
-    for number in edited:
-        poses[number]["yaw_std_deg"] = UNKNOWN_YAW_STD_DEG
     return [
         replace(photo, pose={**pose, **(photo.row.pose if photo.row else {})})
         for photo, pose in zip(photos, poses, strict=True)
@@ -186,18 +157,6 @@ def _pose(photo: Photo, gimbal_unrecorded: bool, turns: bool) -> dict[str, Any]:
         angles = photo.body_yaw_deg % 360, math.nan, math.nan
     pose: dict[str, Any] = dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), angles, strict=True))
     return pose if source is None else pose | source.stated(aided=photo.latlon_deg is not None)
-
-
-def _edited(photos: Sequence[Photo]) -> list[int]:
-    """Numbers of the photographs that an editor has written, which may have turned them."""
-    usual, count = Counter(photo.software for photo in photos).most_common(1)[0]
-    named = _FIRMWARE.match(usual) is not None and 2 * count > len(photos)
-    return [
-        number
-        for number, photo in enumerate(photos)
-        if _EDITOR.search(photo.software)
-        or (named and photo.software and not _FIRMWARE.match(photo.software))
-    ]
 
 
 def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
@@ -404,7 +363,7 @@ def _in_time(
         timed = [photo for photo in photos if photo.time_ns is not None]
         return timed, [photo.path for photo in untimed], 0
     left_out = [] if chosen.singly else [each.path for each in untimed if each not in ordered]
-    spaced = [replace(each, time_ns=number * _BY_NAME_NS) for number, each in enumerate(ordered)]
+    spaced = [replace(each, time_ns=number * 10**9) for number, each in enumerate(ordered)]
     return spaced, left_out, len(spaced)
 
 
@@ -444,32 +403,33 @@ def _camera(photos: Sequence[Photo], options: SourceOptions) -> tuple[Camera, st
 
 
 def _factory_camera(photos: Sequence[Photo], focal: FocalLength) -> Camera | None:
-    """The camera as DJI calibrated it; None where not all photographs state the same one, where an
-    editor may have turned or dewarped them, and where it is of another size by EXIF."""
+    """The camera as DJI calibrated it; None where not all photographs state the same one, and
+    where it is of another size by EXIF."""
     lens, size = photos[0].lens, (photos[0].width_px, photos[0].height_px)
-    if lens is None or any(each.lens != lens for each in photos) or _edited(photos):
+    if lens is None or any(each.lens != lens for each in photos):
         return None
-    if size[0] < size[1] or abs(lens[0] / focal.px - 1) > MAX_EXIF_SIGMA * focal.std:
+    # A larger difference from the focal length of EXIF means another size of the picture.
+    if size[0] < size[1] or abs(lens[0] / focal.px - 1) > 3.0 * focal.std:
         return None
     fx, fy, right, down, *distortion = lens
     middle = size[0] / 2 + right, size[1] / 2 + down
     try:
-        made = Camera(*size, fx, fy, *middle, tuple(distortion), focal_std=FACTORY_STD)
-        return made.plausible()
+        # The focal length changes with focus.
+        return Camera(*size, fx, fy, *middle, tuple(distortion), focal_std=0.01).plausible()
     except CameraError:
         return None
 
 
 def _views(
     folder: Path, photos: list[Photo], track: RecordedTrack | None, options: SourceOptions
-) -> Iterator[SourceView]:
+) -> Iterator[RecordedView]:
     for photo in photos:
         if track is None:
             truth = photo.latlon_deg
             telemetry = rounded(with_options(_own_telemetry(photo, options), truth, options))
         else:
             telemetry, truth = known_at(track, _time_ns(photo), options)
-        yield SourceView(
+        yield RecordedView(
             frame=photo.path.relative_to(folder).as_posix(),
             telemetry=telemetry,
             truth_latlon_deg=truth or photo.latlon_deg,

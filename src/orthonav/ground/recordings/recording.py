@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError, UsageError
 from orthonav.core.files import with_paths
-from orthonav.core.flight.recording import LONG_GAP_NS, fitted
+from orthonav.core.flight.recording import LONG_GAP_NS, RecordedView, fitted
 from orthonav.core.flight.telemetry_track import RecordedTrack, measured
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
@@ -22,19 +22,7 @@ from orthonav.core.tilt import ASSUMED
 KINDS = ("flight", "photos", "video", "ros", "log")
 ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
 MAX_FOV_DEG = 150.0
-LEVEL_GROUND = (
-    "height above ground is taken from the height above take-off: level ground is assumed"
-)
-LEVEL_GROUND_IN_GAPS = (
-    "where no height above ground was measured, it is taken from the height above take-off: level "
-    "ground is assumed there"
-)
 Grey = NDArray[np.uint8]
-DECIMALS = 8
-_ROUNDED = (
-    *("yaw_deg", "pitch_deg", "roll_deg", "agl_m", "yaw_std_deg", "agl_std_m", "prior"),
-    *("vel_en_mps", "tilt_std_deg", "mount_std_deg", "home_m", "amsl_m", "hae_m"),
-)
 
 
 @dataclass(frozen=True)
@@ -94,23 +82,6 @@ class SourceOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class SourceView:
-    """One view of a recording: a `RecordedView` that can also be written to a flight folder."""
-
-    frame: str  # name, with the suffix of the format that its image is written in
-    telemetry: Telemetry  # telemetry of the exposure
-    truth_latlon_deg: tuple[float, float] | None  # true position, where it is known
-    where: str  # location of the image, for messages
-    load: Callable[[], Grey]  # decodes the image
-    data: Callable[[], bytes] | None = None
-    """Returns the image as it was encoded; None where it was recorded unencoded."""
-
-    def grey(self) -> Grey:
-        """Grey levels (H, W) uint8. Raises `FlightError` where it cannot be decoded."""
-        return self.load()
-
-
-@dataclass(frozen=True, eq=False)
 class Recording:
     """An open recording: an `orthonav.core.flight.Flight`, with `warnings` for people."""
 
@@ -119,7 +90,7 @@ class Recording:
     camera: Camera
     note: str
     expected: int
-    stream: Callable[[], Iterator[SourceView]]
+    stream: Callable[[], Iterator[RecordedView]]
     warnings: tuple[str, ...] = ()
     choices: tuple[str, ...] = ()
     """What was used where the source has several, by `orthonav.core.flight.chosen`."""
@@ -127,7 +98,7 @@ class Recording:
     """First position of its track, where heights above take-off count from; None: unknown."""
 
     @property
-    def views(self) -> Iterator[SourceView]:
+    def views(self) -> Iterator[RecordedView]:
         return self.stream()
 
 
@@ -150,7 +121,8 @@ def with_options(
 
 def rounded(telemetry: Telemetry) -> Telemetry:
     """The telemetry at the precision of a flight folder, so that import changes no result."""
-    return replace(telemetry, **{name: _rounded(getattr(telemetry, name)) for name in _ROUNDED})
+    names = (each.name for each in fields(telemetry) if each.name not in ("time_ns", "below"))
+    return replace(telemetry, **{name: _rounded(getattr(telemetry, name)) for name in names})
 
 
 def _rounded(value: Any) -> Any:
@@ -158,7 +130,7 @@ def _rounded(value: Any) -> Any:
         return tuple(map(_rounded, value))
     if isinstance(value, Prior):
         return Prior(*map(_rounded, astuple(value)))
-    return None if value is None else round(value, DECIMALS)
+    return None if value is None else round(value, 8)
 
 
 def known_at(
@@ -169,7 +141,9 @@ def known_at(
     return rounded(with_options(telemetry, truth, options)), truth
 
 
-def with_mean_velocities(views: Iterable[SourceView], track: RecordedTrack) -> Iterator[SourceView]:
+def with_mean_velocities(
+    views: Iterable[RecordedView], track: RecordedTrack
+) -> Iterator[RecordedView]:
     """Views, in order; the velocity of each that follows another after `LONG_GAP_NS` is the mean
     since that one, by the track."""
     before_ns = None
@@ -207,7 +181,11 @@ def height_warnings(options: SourceOptions, known: set[str]) -> list[str]:
     if options.agl_m is not None or over_terrain:
         return []
     if "home_m" in known:
-        return [LEVEL_GROUND_IN_GAPS if "agl_m" in known else LEVEL_GROUND]
+        gaps = "where none was measured " * ("agl_m" in known)
+        return [
+            f"height above ground {gaps}is taken from the height above take-off: level ground is "
+            "assumed"
+        ]
     if "agl_m" in known or "alt_m" not in known:
         return []
     if options.ground_alt_m is None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import CameraError, FlightError
 from orthonav.core.files import require_file
 from orthonav.core.flight.logged import MAX_CHUNK_BYTES
-from orthonav.core.flight.recording import fitted
+from orthonav.core.flight.recording import RecordedView, fitted
 from orthonav.core.flight.ros_messages import (
     attitude_of_message,
     camera_of_info,
@@ -48,13 +48,11 @@ from orthonav.ground.recordings.mcap_files import (
     MAGIC,
     complete_bytes,
     inflated,
-    partial_records,
 )
 from orthonav.ground.recordings.recording import (
     ROLES,
     Recording,
     SourceOptions,
-    SourceView,
     check_overlap,
     given_camera,
     known_at,
@@ -240,19 +238,18 @@ def _whole(path: Path, warnings: list[str]) -> "Path | _CutMcap":
         return path
     complete = complete_bytes(path)
     warnings.append(
-        "recording was cut short: it is read up to its last complete message; `mcap recover` "
+        "recording was cut short: it is read up to its last complete chunk; `mcap recover` "
         f"repairs it for other programs: {path}"
     )
-    return _CutMcap(path, complete, partial_records(path, complete) + _END)
+    return _CutMcap(path, complete)
 
 
 @dataclass(frozen=True)
 class _CutMcap:
-    """The path, for `rosbags`, of an MCAP file whose first `complete` bytes `end` follows."""
+    """The path, for `rosbags`, of an MCAP file whose first `complete` bytes an end follows."""
 
     path: Path
     complete: int
-    end: bytes
     suffix: str = ".mcap"
 
     def exists(self) -> bool:
@@ -262,14 +259,14 @@ class _CutMcap:
         return False
 
     def open(self, mode: str = "rb") -> io.BufferedReader:
-        return io.BufferedReader(_Ended(self.path.open(mode, buffering=0), self.complete, self.end))
+        return io.BufferedReader(_Ended(self.path.open(mode, buffering=0), self.complete))
 
 
 class _Ended(io.RawIOBase):
-    """The first `complete` bytes of a file, then `end`."""
+    """The first `complete` bytes of a file, then the end of an MCAP file without a summary."""
 
-    def __init__(self, stream: Any, complete: int, end: bytes) -> None:
-        self._stream, self._complete, self._end, self._at = stream, complete, end, 0
+    def __init__(self, stream: Any, complete: int) -> None:
+        self._stream, self._complete, self._at = stream, complete, 0
 
     def readable(self) -> bool:
         return True
@@ -278,7 +275,7 @@ class _Ended(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        starts = 0, self._at, self._complete + len(self._end)
+        starts = 0, self._at, self._complete + len(_END)
         self._at = max(0, starts[whence] + offset)
         return self._at
 
@@ -288,7 +285,7 @@ class _Ended(io.RawIOBase):
             data = self._stream.read(min(len(buffer), self._complete - self._at))
         else:
             first = self._at - self._complete
-            data = self._end[first : first + len(buffer)]
+            data = _END[first : first + len(buffer)]
         buffer[: len(data)] = data
         self._at += len(data)
         return len(data)
@@ -308,7 +305,7 @@ def bound_inflation() -> None:
 
     def unpacked_zstd(data: bytes, size: int) -> bytes:
         _require(size)
-        return inflated(b"zstd", data, size + 1)
+        return inflated("zstd", data, size + 1)
 
     def unpacked(decompressor: Any, data: bytes, size: int) -> bytes:
         _require(size)
@@ -460,7 +457,7 @@ def _camera(reader: Any, topics: Topics, sources: Sources) -> Camera:
 
 def _views(
     path: Path, topic: str, track: RecordedTrack, options: SourceOptions
-) -> Iterator[SourceView]:
+) -> Iterator[RecordedView]:
     """The views; a damaged message raises when its image is decoded."""
     with opened(path) as (reader, _):
         connections = [one for one in reader.connections if one.topic == topic]
@@ -478,7 +475,7 @@ def _views(
             except Exception as error:
                 load = partial(_broken, f"{type(error).__name__}: {error}", where)
             telemetry, truth = known_at(track, time_ns + options.time_offset_ns, options)
-            yield SourceView(f"{number:06d}{ending}", telemetry, truth, where, load, data)
+            yield RecordedView(f"{number:06d}{ending}", telemetry, truth, where, load, data)
 
 
 def _broken(reason: str, where: str) -> NDArray[np.uint8]:

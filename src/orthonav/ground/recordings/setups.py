@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -21,14 +20,10 @@ from orthonav.core.localize.localizer import Localizer
 from orthonav.core.localize.view import MAX_AGL_STD
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 
-V = TypeVar("V", bound=RecordedView)
 FEW = 0.5
 """Below this fraction of confident views the configuration may be wrong; a change that reaches it
 explains it."""
 SAMPLE = 8  # at most so many views are localized again
-_GIVE_UP = 4  # a change that makes none of so many views confident is left
-_RETRIED = ("too_small", "too_coarse", "no_match", "outside_map", "low_confidence")
-"""Reasons of views without a position that another configuration may give one."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +43,8 @@ class Setup:
         return replace(view, telemetry=telemetry)
 
 
-_AS_REPORTED = Setup("as reported")
 _SETUPS = (
+    Setup("as reported"),
     Setup("any heading", any_heading=True),
     Setup("twice the height", factor=2.0),
     Setup("half the height", factor=0.5),
@@ -89,7 +84,7 @@ class LowConfidenceViews:
         self._count, self._every = 0, 1
         self.views: list[View] = []
 
-    def watching(self, views: Iterable[V]) -> Iterator[V]:
+    def watching(self, views: Iterable[RecordedView]) -> Iterator[RecordedView]:
         """The same views; the newest one is the one whose result `take` receives next."""
         for view in views:
             self._current = view
@@ -98,7 +93,8 @@ class LowConfidenceViews:
     def take(self, result: ViewResult) -> None:
         """Keep the view of this result if its confidence is low, and its turn."""
         outcome = result.outcome
-        retried = isinstance(outcome, Fix) or outcome.reason in _RETRIED
+        placeable = ("too_small", "too_coarse", "no_match", "outside_map", "low_confidence")
+        retried = isinstance(outcome, Fix) or outcome.reason in placeable
         if self._current is None or result.is_confident or not retried:
             return
         self._count += 1
@@ -130,18 +126,15 @@ def try_setups(
     change that explains it ends the search; each is tried on at most `SAMPLE` views. `tracked`: the
     views were judged as a track, so they are first placed one by one as reported.
     """
-    setups = [
-        setup
-        for setup in ((_AS_REPORTED, *_SETUPS) if tracked else _SETUPS)
-        if (heading_known or not setup.any_heading)
-        and (not setup.without_prior or (use_prior and any(v.telemetry.prior for v in views)))
-    ]
+    with_prior = use_prior and any(view.telemetry.prior for view in views)
     found: list[Tried] = []
-    for setup in setups:
+    for setup in _SETUPS if tracked else _SETUPS[1:]:
+        if (setup.any_heading and not heading_known) or (setup.without_prior and not with_prior):
+            continue
         fixes: list[tuple[View, Fix]] = []
         placed = 0
-        for i, view in enumerate(views):
-            if stop() or (i == _GIVE_UP and not fixes):
+        for view in views:
+            if stop() or (placed == 4 and not fixes):
                 break
             placed += 1
             outcome = localizer.locate(
@@ -178,18 +171,10 @@ class Counts:
 
     @classmethod
     def of(cls, results: Sequence[ViewResult]) -> "Counts":
-        reasons = Counter(
-            each.outcome.reason for each in results if isinstance(each.outcome, NoFix)
-        )
-        fixes = sum(isinstance(result.outcome, Fix) for result in results)
+        none = [each.outcome.reason for each in results if isinstance(each.outcome, NoFix)]
         confident = sum(result.is_confident for result in results)
-        return cls(
-            len(results),
-            confident,
-            fixes - confident,
-            len(results) - fixes,
-            tuple(reasons.most_common()),
-        )
+        low, reasons = len(results) - len(none) - confident, Counter(none).most_common()
+        return cls(len(results), confident, low, len(none), tuple(reasons))
 
     @property
     def few(self) -> bool:
@@ -214,21 +199,21 @@ def setup_text(tried: Sequence[Tried], *, on_map: bool) -> list[str]:
         )
         tested = f"{names}: at most {most} of {last.views} views of low confidence become confident"
         return [f"no other configuration explains it ({tested}); {where}"]
-    off, ratio = last.heading_off_deg, last.height_ratio
-    if last.setup == _AS_REPORTED:
-        cause = (
-            "if localized one by one: the configuration is right, but the views do not form a track"
-        )
-    elif last.setup.without_prior:
-        cause = "without the prior; check the prior positions"
-    elif last.setup.any_heading:
-        apart = "" if math.isnan(off) else f", {off:+.0f} deg from the reported one"
-        cause = f"with any heading{apart}; check the heading column and the mounting of the camera"
-    else:
-        cause = (
-            f"at {ratio:.2f} times the reported height (or {1 / ratio:.2f} times the focal "
-            "length); check the height column (above ground?) and the camera"
-        )
-    lines = [f"{last.confident} of {last.views} views of low confidence become confident {cause}"]
+    of = f"{last.confident} of {last.views} views of low confidence become confident"
     also = ", ".join(f"{each.setup.name} ({each.confident} of {each.views})" for each in failed)
-    return [*lines, f"also tried: {also}"] if failed else lines
+    return [f"{of} {_cause(last)}", *([f"also tried: {also}"] if failed else [])]
+
+
+def _cause(last: Tried) -> str:
+    off, ratio = last.heading_off_deg, last.height_ratio
+    if last.setup.without_prior:
+        return "without the prior; check the prior positions"
+    if last.setup.any_heading:
+        apart = "" if math.isnan(off) else f", {off:+.0f} deg from the reported one"
+        return f"with any heading{apart}; check the heading column and the mounting of the camera"
+    if last.setup.factor == 1.0:
+        return "one by one: the configuration is right, but the views do not form a track"
+    return (
+        f"at {ratio:.2f} times the reported height (or {1 / ratio:.2f} times the focal length); "
+        "check the height column (above ground?) and the camera"
+    )

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
+from orthonav.core.flight.recording import RecordedView
 from orthonav.core.flight.telemetry_track import RecordedTrack, chosen
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.recordings.logs import end_ns, log_kind, read_log
 from orthonav.ground.recordings.recording import (
     Recording,
     SourceOptions,
-    SourceView,
     check_overlap,
     given_camera,
     known_at,
@@ -32,14 +32,6 @@ from orthonav.ground.recordings.recording import (
     with_mean_velocities,
 )
 
-SIDECARS = (".srt", ".csv")
-MAX_BEGIN_S = 86_400.0  # later is no time, but OpenCV's value for none
-MAX_ASPECT_ERROR = 0.02  # of pixels, as a fraction
-_SHORT_NS = 1_000_000_000
-_MISSING_FRAMES = 0.01
-SILENT = 0  # OpenCV's level of logging at which it writes nothing
-_MATROSKA = b"\x1aE\xdf\xa3"  # lengths count from the time 0 of the clock
-_STREAMED = (b"\x47", b"\0\0\1\xba")  # MPEG: clocks begin anywhere
 MAX_END_BYTES = 10_000_000
 _UNREAD = {
     rb"(?s)stsd.{12}(?:tx3g|text)|S_TEXT/": "subtitles (ffmpeg -i VIDEO OUT.srt extracts them)",
@@ -94,7 +86,7 @@ def _check_pixels(capture: cv2.VideoCapture, camera: Camera, path: Path) -> None
     wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
     stated = wide / high if wide > 0 and high > 0 else 1.0
     of_camera = camera.fy_px / camera.fx_px
-    if min(abs(stated - 1), abs(of_camera / stated - 1)) > MAX_ASPECT_ERROR:
+    if min(abs(stated - 1), abs(of_camera / stated - 1)) > 0.02:
         raise CameraError(
             f"pixels of the video are {stated:.3f} times as wide as high, those of the camera "
             f"{of_camera:.3f}; give a --camera calibrated with its stored frames: {path}"
@@ -108,9 +100,11 @@ def _extent(path: Path, capture: cv2.VideoCapture) -> tuple[int, int, float]:
     if not (fps > 0 and frames > 0):
         return 0, 0, 0.0
     held, begin_s = _ends(path), capture.get(cv2.CAP_PROP_PTS) / fps
-    if held.startswith(_STREAMED) or not 0 < begin_s < MAX_BEGIN_S:
+    streamed = held.startswith((b"\x47", b"\0\0\1\xba"))  # MPEG: clocks begin anywhere
+    if streamed or not 0 < begin_s < 86_400.0:  # a later time is OpenCV's value for none
         begin_s = 0.0
-    matroska, shown_s = held.startswith(_MATROSKA), frames / fps
+    # Lengths of Matroska count from the time 0 of the clock.
+    matroska, shown_s = held.startswith(b"\x1aE\xdf\xa3"), frames / fps
     if header := re.search(rb"(?s)moov.{4}mvhd(.{32})", held):  # ISO/IEC 14496-12, 8.2.2
         late = header[1][0] == 1
         scale, ticks = struct.unpack_from(">IQ" if late else ">II", header[1], 20 if late else 12)
@@ -133,7 +127,9 @@ def _track(
 ) -> tuple[RecordedTrack, Path, list[str], list[str]]:
     """Telemetry, its file, choices and warnings."""
     named = sorted(each for each in path.parent.iterdir() if each.stem == path.stem)
-    beside = [each for suffix in SIDECARS for each in named if each.suffix.lower() == suffix]
+    beside = [
+        each for suffix in (".srt", ".csv") for each in named if each.suffix.lower() == suffix
+    ]
     telemetry_path = options.telemetry or next(iter(beside), None)
     if telemetry_path is None:
         held = _ends(path)
@@ -150,7 +146,7 @@ def _track(
     check_overlap(track, start_ns, start_ns + last_ns, telemetry_path)
     warnings: list[str] = []
     short_ns = start_ns + last_ns - end_ns(track)
-    if log_kind(telemetry_path) in ("srt", "table") and short_ns > _SHORT_NS:
+    if log_kind(telemetry_path) in ("srt", "table") and short_ns > 10**9:
         warnings.append(
             f"telemetry ends {short_ns / 1e9:.1f} s before the video of {last_ns / 1e9:.1f} s; "
             f"views after its end have none: {telemetry_path}"
@@ -160,7 +156,7 @@ def _track(
 
 def _views(
     path: Path, promised: int, track: RecordedTrack, options: SourceOptions
-) -> Iterator[SourceView]:
+) -> Iterator[RecordedView]:
     start_ns = track.origin_ns + options.time_offset_ns
     due, number, stuck, before_ns = 0, 0, 0, -1
     with _opened(path) as capture:
@@ -173,11 +169,11 @@ def _views(
                     known = known_at(track, start_ns + time_ns, options)
                     where, (found, frame) = f"frame {number} of {path}", capture.retrieve()
                     load = partial(_grey, np.asarray(frame) if found else None, where)
-                    yield SourceView(f"{number:06d}.png", *known, where, load)
+                    yield RecordedView(f"{number:06d}.png", *known, where, load)
             number, before_ns = number + 1, max(time_ns, before_ns)
     if stuck > number / 2:
         raise FlightError(f"video has no times: {path}")
-    if number < promised - max(2, _MISSING_FRAMES * promised):
+    if number < promised - max(2, promised / 100):
         raise FlightError(f"video was cut short: {number} of {promised} frames: {path}")
 
 
@@ -194,7 +190,7 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
     # OpenCV 5 has these in a module of their own, OpenCV 4 at the top.
     logging: Any = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
     before = logging.getLogLevel()
-    logging.setLogLevel(SILENT)
+    logging.setLogLevel(0)  # nothing
     try:
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     finally:

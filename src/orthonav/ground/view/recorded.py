@@ -14,10 +14,7 @@ from orthonav.core.errors import FlightError, MissingFileError
 from orthonav.core.files import require_file
 from orthonav.core.flight.fixes import is_health, result_from_json
 from orthonav.core.flight.logged import (
-    HEALTH,
-    RESULT,
-    SESSION,
-    TELEMETRY,
+    TOPICS,
     LoggedView,
     camera_of,
     from_json,
@@ -159,17 +156,17 @@ class LoggedRun(Recorded):
         return Shot(view.telemetry, self._camera, load)
 
     def _take(self, topic: str, data: bytes) -> None:
-        if topic == TELEMETRY.name:
+        if topic == TOPICS.telemetry.name:
             view = self._content.views[-1]
             self._views.setdefault(view.frame, view)
-        elif topic == SESSION.name:
+        elif topic == TOPICS.session.name:
             self.session = self._content.session
             self._camera = camera_of(self.session["camera"])
             options = self.session.get("options")
             self.mount = logged_mount(options if isinstance(options, dict) else {})
-        elif topic == RESULT.name:
+        elif topic == TOPICS.result.name:
             self.add_result(logged_result(data))
-        elif topic == HEALTH.name:
+        elif topic == TOPICS.health.name:
             self.add_health(from_json(data))
 
 
