@@ -32,7 +32,7 @@ def atlas(area, made_once):
                 "orthonav.ground.build.calibrate.CROPS", 24
             )  # most of the time of a sheet
             request = AtlasRequest(str(folder / "atlas"), [area.past], recipe)
-            assert not build_atlas(request, runner).names("failed")
+            assert not build_atlas(request, runner).failed
 
     return Atlas.open(made_once("searched-atlas", make) / "atlas")
 

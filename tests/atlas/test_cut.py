@@ -29,13 +29,12 @@ from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
 from orthonav.ground.atlas.cut import (
     Warp,
-    _relief,
-    _roughness_m,
     check_shown,
     cut_heights,
-    cut_in_memory,
     cut_map,
+    least_roughness_m,
     opened_sheets,
+    steepest,
 )
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
@@ -99,7 +98,7 @@ def wooded(east_m, north_m):
 
 
 def built(ortho, name, out, **request):
-    request = {"cells": True, "calibration_views": RECIPE.calibration_views, **request}
+    request = {"calibration_views": RECIPE.calibration_views, **request}
     bounds = RECIPE.sheets.bounds_deg(name)
     telemetry = {
         "tile_px": RECIPE.tile_px,
@@ -145,16 +144,6 @@ def cut(folder, middle, tmp_path_factory):
     return open_map(out)
 
 
-@pytest.mark.long
-def test_a_map_cut_in_memory_is_the_one_that_is_written(folder, middle, cut):
-    area = Area.from_bounds(bounds_around(middle, 150))
-    made = cut_in_memory(Atlas.open(str(folder)), area)
-    assert set(made.arrays) == set(cut.arrays)
-    for name in cut.arrays:
-        np.testing.assert_array_equal(made.arrays[name], cut.arrays[name])
-    assert Localizer(made).registration is not None
-
-
 def test_terrain_is_that_of_the_sheets(cut, middle):
     layer = TerrainLayer.of(cut)
     assert (layer.info.name, layer.info.datum, layer.info.posting_m) == (
@@ -189,7 +178,7 @@ def test_terrain_is_a_surface_model_only_where_all_of_it_is_one(cut):
     info = TerrainLayer.of(cut).info
 
     def least(*roughness_m):
-        return _roughness_m([replace(info, roughness_m=each) for each in roughness_m])
+        return least_roughness_m([replace(info, roughness_m=each) for each in roughness_m])
 
     assert (least(3.0, 2.0), least(3.0, None), least(None)) == (2.0, None, None)
 
@@ -198,10 +187,10 @@ def test_relief_is_the_steepest_of_the_sheets():
     def member(relief):
         return SimpleNamespace(manifest=SimpleNamespace(sheets=[SimpleNamespace(relief=relief)]))
 
-    for stated, steepest in (
+    for stated, expected in (
         (["level", "level"], "level"), (["level", None], None), (["hills", None, "level"], "hills")
     ):  # fmt: skip
-        assert _relief([member(each) for each in stated]) == steepest
+        assert steepest([member(each) for each in stated]) == expected
 
 
 def sheet_file(atlas, name):
@@ -359,7 +348,7 @@ def test_the_affine_agrees_with_the_geodesy():
 
     frame, grid = LocalFrame(60.02, 10.0), TileGrid(18000.0, 3000.0, 1.0, 256, 32, 300, 300)
     block = Block(1024, 2048, 1024, 1024)
-    warp = Warp(Sheet, frame, grid, True)
+    warp = Warp(Sheet, frame, grid)
     assert warp.reaches(block) and not warp.reaches(Block(1024, 12_000, 1024, 1024))
     px = np.random.default_rng(0).uniform([2048, 1024], [3072, 2048], (50, 2))
     places = np.column_stack([grid.west_m + px[:, 0], grid.north_m - px[:, 1]])

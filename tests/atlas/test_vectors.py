@@ -59,14 +59,9 @@ def folder(tmp_path, vectors, quantizers):
 
 
 def write(folder, name, quantizers, vectors):
-    where = places(len(vectors))
-    parts = [slice(start, start + 1500) for start in range(0, len(vectors), 1500)]
     info = ShardInfo(name, 0, (Part("", "", len(vectors)),))
-    write_shard(folder, info, quantizers, ((where[part], vectors[part]) for part in parts))
-
-
-def places(count):
-    return np.stack([np.arange(count) / 100, -np.arange(count) / 100], axis=1)
+    batches = (vectors[start : start + 1500] for start in range(0, len(vectors), 1500))
+    write_shard(folder, info, quantizers, batches)
 
 
 def exact(vectors, queries, k):
@@ -82,6 +77,9 @@ def test_search_finds_what_exact_search_finds(folder, vectors):
     assert np.mean([np.isin(a, b).mean() for a, b in zip(ids, expected, strict=True)]) > 0.99
     same = ids == expected
     np.testing.assert_allclose(scores[same], exact_scores[same], atol=1e-6)
+    assert index.sheets_of(np.array([0, 1499, 1500, 3999, 4000])) == [
+        *("one", "one", "two", "two", "three"),
+    ]
     _, few = index.search(queries, 10, probes=16, rerank=400)
     assert np.mean([np.isin(a, b).mean() for a, b in zip(few, expected, strict=True)]) > 0.6
 
@@ -92,7 +90,7 @@ def test_same_input_same_bytes(tmp_path, vectors):
         write(tmp_path / name, "a", again, vectors[:4000])
         again.save(tmp_path / name / QUANTIZERS_NAME)
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
-    assert files == ["a.codes", "a.lists.npy", "a.places.npy", "a.vectors.npy", QUANTIZERS_NAME]
+    assert files == ["a.codes", "a.lists.npy", "a.vectors.npy", QUANTIZERS_NAME]
     for name in files:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
 
@@ -107,9 +105,7 @@ def test_fewer_vectors_than_requested(tmp_path, vectors, quantizers):
     assert (ids[:, 3:] == -1).all() and np.isneginf(scores[:, 3:]).all()
 
 
-@pytest.mark.parametrize(
-    "name", ["a.codes", "a.lists.npy", "a.vectors.npy", "a.places.npy", QUANTIZERS_NAME]
-)
+@pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.vectors.npy", QUANTIZERS_NAME])
 def test_truncated_and_missing_files_are_refused(folder, name):
     contents = (folder / name).read_bytes()
     (folder / name).write_bytes(contents[: len(contents) // 2])

@@ -209,7 +209,7 @@ def _add(options: argparse.Namespace) -> None:
     source = Atlas.open(options.source)
     atlas = Atlas.open_or_create(options.atlas, source.recipe)
     with progress(options) as shown:
-        copied, unchanged = copy_sheets(source, atlas, None, options.replace, shown)
+        copied, unchanged = copy_sheets(source, atlas, options.replace, shown)
     print(f"{len(copied)} sheets added, {len(unchanged)} unchanged: {atlas.store}")
 
 
