@@ -40,20 +40,10 @@ COUNT = 8
 RECIPE = AtlasRecipe(**{"gsd_m": 1.0, **SMALL, "coarse": COARSE})
 
 
-@pytest.fixture(autouse=True)
-def fewer_crops(monkeypatch):
-    """Calibration from few crops: it takes longest."""
-    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
-    monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
-
-
 @pytest.fixture(scope="module")
 def built(ortho, tmp_path_factory):
     place = tmp_path_factory.mktemp("built") / "atlas"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
-        patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
-        return place, made(place, ortho)
+    return place, made(place, ortho)
 
 
 def made(place, *orthos, **request):
@@ -235,9 +225,8 @@ def test_a_sheet_that_fails_is_named_and_the_others_are_built(
     monkeypatch.setattr(shutil, "copyfile", copy)
     monkeypatch.setattr(building, "build_map", build)
     place = tmp_path / "atlas"
+    Atlas.open_or_create(place, RECIPE)
     arguments = ["atlas", "build", place, "--ortho", ortho, "--no-index", "--json"]
-    arguments += ["--sheet-km", 0.3, "--tile-px", 64, "--overlap", 0.5, "--calibration-views", 1]
-    arguments += ["--coarse-gsd-m", 4, "--coarse-tile-px", 32, "--coarse-overlap", 0.5]
     done = run(*arguments)
     assert done.code == 1
     assert f"error: sheet {full}: StorageError" in done.err and "full" in done.err
@@ -248,7 +237,6 @@ def test_a_sheet_that_fails_is_named_and_the_others_are_built(
     there = [name for name in content(place) if full in name or broken in name]
     assert all(name.startswith("coarse/") for name in there), "whole, and named by no item"
     monkeypatch.undo()
-    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
     assert run(*arguments).code == 0
     assert content(place) == content(built[0])
 

@@ -156,8 +156,8 @@ def test_creating_and_opening(tmp_path):
     url = tmp_path / "atlas"
     assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
     assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
-    with pytest.raises(AtlasError, match=r"made alike.*gsd_m: 1\.0, not 0\.5.*seed: 0, not 3"):
-        Atlas.open_or_create(url, replace(RECIPE, gsd_m=0.5, seed=3))
+    with pytest.raises(AtlasError, match=r"alike.*gsd_m: 1\.0, not 0\.5.*tile_px: 256, not 64"):
+        Atlas.open_or_create(url, replace(RECIPE, gsd_m=0.5, tile_px=64))
     with pytest.raises(AtlasError, match="coarse"):
         Atlas.open_or_create(url, replace(RECIPE, coarse=CoarseRecipe(gsd_m=4.0)))
 
@@ -170,7 +170,7 @@ def test_creating_and_opening(tmp_path):
         (lambda text: text.replace('"schema":2', '"schema":3'), "update orthonav"),
         (lambda text: text.replace('"schema":2', '"schema":"2"'), "impossible recipe or schema"),
         (lambda text: text.replace('"gsd_m":1.0', '"gsd_m":NaN'), "recipe of the atlas"),
-        (lambda text: text.replace('"seed":0,', ""), "recipe of the atlas cannot be read"),
+        (lambda text: text.replace('"overlap":0.875,', ""), "recipe of the atlas cannot be read"),
         (lambda text: text.replace("Licences", "No licences"), "altered"),
         (lambda text: "[" * 100_000, "damaged"),
         (lambda text: '{"type":' + "9" * 5000 + "}", "damaged"),

@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,7 +26,9 @@ from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
-from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
+from orthonav.ground.atlas.build import AtlasRequest, build_atlas
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.cluster import SerialRunner
 from orthonav.ground.atlas.cut import (
     Warp,
     check_shown,
@@ -36,7 +38,6 @@ from orthonav.ground.atlas.cut import (
     opened_sheets,
     steepest,
 )
-from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
@@ -73,16 +74,24 @@ def names(middle):
 @pytest.fixture(scope="module")
 def folder(ortho, names, middle, tmp_path_factory):
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
-    atlas = Atlas.open_or_create(str(folder), RECIPE)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.build.calibrate.CROPS", 12)
-        patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
-        dem = write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0)
-        trees = write_dem(folder.parent / "trees.tif", middle, wooded, half_m=900.0, px_m=2.0)
-        for name in names:
-            heights = {"dem": dem, "dem_datum": "msl", "surface": [trees]}
-            put(atlas, name, built(ortho, name, folder.parent / "sheet.onav", **heights))
+    recipe = {name: value for name, value in asdict(RECIPE).items() if name != "coarse"}
+    request = AtlasRequest(
+        str(folder),
+        [ortho],
+        recipe | {"coarse": None},
+        bounds_around(middle, 190),
+        dem=write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0),
+        surface=[write_dem(folder.parent / "trees.tif", middle, wooded, half_m=900.0, px_m=2.0)],
+        dem_datum="msl",
+    )
+    with SerialRunner() as runner:
+        assert sorted(build_atlas(request, runner).built) == names
     return folder
+
+
+@pytest.fixture(scope="module")
+def crops():
+    return 12
 
 
 def ground(east_m, north_m):
@@ -95,28 +104,6 @@ def above(east_m, north_m):
 
 def wooded(east_m, north_m):
     return ground(east_m, north_m) + above(east_m, north_m)
-
-
-def built(ortho, name, out, **request):
-    request = {"calibration_views": RECIPE.calibration_views, **request}
-    bounds = RECIPE.sheets.bounds_deg(name)
-    telemetry = {
-        "tile_px": RECIPE.tile_px,
-        "overlap": RECIPE.overlap,
-        "gsd_m": RECIPE.gsd_m,
-        **request,
-    }
-    build_map(BuildRequest([ortho], out, bounds_deg=bounds, **telemetry))
-    return out
-
-
-def put(atlas, name, path):
-    manifest = open_map(path).manifest
-    sheet = manifest.sheets[0]
-    bounds = RECIPE.sheets.bounds_deg(name)
-    dates = tuple(str(each["date"]) for each in manifest.imagery)
-    facts = (bounds, 1.0, sheet.tiles, sheet.area_km2, dates, manifest.imagery)
-    return atlas.put({"map": path}, Sheet(name, *facts, "asked", {"orthonav": "test"}))
 
 
 @pytest.fixture
@@ -305,7 +292,7 @@ def test_sheets_of_another_recipe_are_refused(atlas, names, middle, tmp_path, ch
     else:
         manifest = replace(manifest, recipe={**manifest.recipe, "embed": {"name": "bovw"}})
     write_map(tmp_path / "s.onav", manifest, opened.arrays)
-    put(atlas, sorted(names)[1], tmp_path / "s.onav")
+    atlas.put({"map": tmp_path / "s.onav"}, atlas.sheets()[sorted(names)[1]])
     with pytest.raises(AtlasError, match=sorted(names)[1]):
         cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=1)
 
@@ -324,7 +311,7 @@ def test_a_damaged_chunk_is_found_by_any_thread(atlas, names, middle, tmp_path):
     parts = {name: part.copy() for name, part in opened.arrays.items()}
     parts["sheet0/grey/bytes"][:] = 7
     write_map(tmp_path / "s.onav", opened.manifest, parts)
-    put(atlas, names[1], tmp_path / "s.onav")
+    atlas.put({"map": tmp_path / "s.onav"}, atlas.sheets()[names[1]])
     with pytest.raises(MapFileError, match=rf"damaged.*{names[1]}"):
         cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=2)
 

@@ -213,6 +213,6 @@ def test_add_and_retire(near, tmp_path, capfd):
     code, done = run(capfd, "retire", copy, HERE)
     assert code == 1 and "has no sheet" in done.err
     shutil.rmtree(copy)
-    Atlas.open_or_create(copy, replace(RECIPE, seed=1))
+    Atlas.open_or_create(copy, replace(RECIPE, overlap=0.5))
     code, done = run(capfd, "add", copy, near.url)
-    assert code == 1 and "seed: 1, not 0" in done.err
+    assert code == 1 and "overlap: 0.5, not 0.875" in done.err

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
@@ -20,8 +21,10 @@ from orthonav.core.records import Fix, NoFix, View
 from orthonav.ground.atlas import locate
 from orthonav.ground.atlas.catalog import Atlas, canonical
 from orthonav.ground.atlas.index import (
+    LEARNT,
     MANIFEST,
     IndexManifest,
+    load_learnt,
     make_index,
     read_manifest,
     stale_sheets,
@@ -29,6 +32,11 @@ from orthonav.ground.atlas.index import (
 from orthonav.ground.atlas.locate import AtlasLocator
 from orthonav.ground.atlas.search import SheetSearch
 from orthonav.onboard.run import locate_view
+
+
+@pytest.fixture(scope="module")
+def crops():
+    return 24
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +248,7 @@ def test_an_untrusted_index_is_checked(atlas, change, words):
 
 
 def _asset(plain):
-    return plain["files"]["quantizers.safetensors"]
+    return plain["files"]["learnt.safetensors"]
 
 
 def test_a_missing_and_a_damaged_index_are_reported(copied):
@@ -252,3 +260,15 @@ def test_a_missing_and_a_damaged_index_are_reported(copied):
     with pytest.raises(AtlasError, match="orthonav atlas index"):
         SheetSearch(damaged)
     assert make_index(damaged) is not None
+
+
+@pytest.mark.parametrize("name", ["mean", "basis", "rotation", "halves", "codebook"])
+def test_damaged_parts_of_an_index_are_refused(atlas, tmp_path, name):
+    recipe, path = read_manifest(atlas).recipe, tmp_path / LEARNT
+    parts = load_file(Path(atlas.url, "index", LEARNT))
+    save_file({**parts, name: parts[name][:-1]}, path)
+    with pytest.raises(AtlasError, match="index of the atlas is damaged"):
+        load_learnt(path, recipe)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(AtlasError, match="index of the atlas is damaged"):
+        load_learnt(path, recipe)

@@ -299,7 +299,6 @@ class AtlasRecipe:
     gsd_m: float  # metres per pixel
     tile_px: int = 256
     overlap: float = 0.875
-    seed: int = 0
     calibration_views: int = 24
     sheet_km: float = 10.0  # greatest width of a sheet
     coarse: CoarseRecipe | None = CoarseRecipe()

@@ -27,7 +27,6 @@ from orthonav.ground.atlas.store import digest_of
 from orthonav.ground.atlas.vectors import (
     CODE_BITS,
     MAX_TRAINING_VECTORS,
-    QUANTIZERS_NAME,
     Part,
     Quantizers,
     ShardInfo,
@@ -107,7 +106,7 @@ def stale_sheets(atlas: Atlas, manifest: IndexManifest) -> tuple[list[str], list
     return new, [name for name in known if name not in there]
 
 
-WHITENING_NAME = "whitening.safetensors"
+LEARNT = "learnt.safetensors"  # what embeds, assigns and codes tiles
 Features = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -160,12 +159,10 @@ def _learnt(
     dims = min(embedder.dims, POOLING.dims if total <= 3_000_000 else 64)
     basis = np.ascontiguousarray(embedder.basis[:, : dims - dims % 2])
     embedder = replace(embedder, basis=basis)
-    whitening = save(embedder.parts(), metadata={"orthonav": FORMAT})
-    (folder / WHITENING_NAME).write_bytes(whitening)
     sample = over_sheets(lambda *features: vectors_of(embedder, features), MAX_TRAINING_VECTORS)
     recipe = VectorRecipe.for_count(total, embedder.dims)
     quantizers = train(np.concatenate(list(sample)), recipe)
-    quantizers.save(folder / QUANTIZERS_NAME)
+    (folder / LEARNT).write_bytes(save({**embedder.parts(), **quantizers.parts}))
     return embedder, quantizers
 
 
@@ -217,16 +214,17 @@ def half_whitened(embedder: WhitenedEmbedder, embedded: NDArray[np.float32]) -> 
     return np.asarray(weighed / np.maximum(lengths, 1e-12), dtype=np.float32)
 
 
-def load_whitening(path: Path) -> WhitenedEmbedder:
+def load_learnt(path: Path, recipe: VectorRecipe) -> tuple[WhitenedEmbedder, Quantizers]:
+    """Raises `AtlasError` for a file that is damaged or does not fit the recipe."""
     try:
         parts = load_file(path)
         mean, basis = parts["mean"], parts["basis"]
+        fits = mean.ndim == 1 and basis.shape == (len(mean), recipe.dims)
+        if not fits or not (np.isfinite(mean).all() and np.isfinite(basis).all()):
+            raise AtlasError("whitening does not fit")
+        return WhitenedEmbedder(POOLING, mean, basis), Quantizers.of(recipe, parts)
     except Exception as error:  # safetensors raises its own and the system's
-        raise AtlasError(f"whitening of an index cannot be read ({error}): {path}") from error
-    fits = mean.ndim == 1 and basis.ndim == 2 and len(mean) == len(basis) and basis.shape[1] > 0
-    if not fits or not (np.isfinite(mean).all() and np.isfinite(basis).all()):
-        raise AtlasError(f"whitening of an index is damaged: {path}")
-    return WhitenedEmbedder(POOLING, mean, basis)
+        raise AtlasError(f"index of the atlas is damaged ({error}): {path}") from error
 
 
 def index_file(atlas: Atlas, manifest: IndexManifest, name: str) -> Path:

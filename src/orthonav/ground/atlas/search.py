@@ -17,10 +17,10 @@ from orthonav.core.variants import make_variant
 from orthonav.ground.atlas.catalog import Atlas, CoarseRecipe
 from orthonav.ground.atlas.coarse import EDGES
 from orthonav.ground.atlas.index import (
-    WHITENING_NAME,
+    LEARNT,
     half_whitened,
     index_file,
-    load_whitening,
+    load_learnt,
     read_manifest,
     stale_sheets,
 )
@@ -59,11 +59,9 @@ class SheetSearch:
             )
         file = partial(index_file, atlas, manifest)
         self._policy = DEFAULT_PLAN.policy
-        self._embedder = load_whitening(file(WHITENING_NAME))
+        self._embedder, quantizers = load_learnt(file(LEARNT), manifest.recipe)
         self._representation = make_variant(represent.TABLE, EDGES)
-        self._index = ShardedIndex(file, manifest.shards)
-        if self._embedder.dims != self._index.quantizers.recipe.dims:
-            raise AtlasError(f"files of the index do not fit together: {atlas.url}")
+        self._index = ShardedIndex(file, manifest.shards, quantizers)
         share, rerank = next(effort for most, *effort in EFFORTS if len(self._index) <= most)
         self._probes = max(1, round(share * manifest.recipe.lists))
         self._rerank = int(rerank)

@@ -9,30 +9,25 @@ A shard NAME is three files in a folder: `NAME.vectors.npy` (rows, D) float16, `
 codes and rows of every list, and `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of
 each list. Every length is checked before FAISS is given the map."""
 
-import json
 import os
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from orthonav.core.errors import AtlasError
 from orthonav.core.extras import needed
 
 Array = NDArray[np.float32]
 
-QUANTIZERS_NAME = "quantizers.safetensors"
 MAX_TRAINING_VECTORS = 200_000  # as in `benchmarks.atlas_search` at d63ac91
 CODE_BITS = 4  # bits per quantizer: what the fast scan of FAISS supports
 BLOCK = 32  # codes that FAISS scans together; the room of a list is a multiple of it
-FORMAT = "orthonav-vectors"
 
 
 def faiss() -> Any:
@@ -59,7 +54,6 @@ class VectorRecipe:
     dims: int  # components per vector, even
     list_bits: int = 14
     quantizers: int = 32  # codes of 4 bits per vector; even, divides `dims`
-    seed: int = 0  # seed of k-means
 
     def __post_init__(self) -> None:
         even = not (self.dims % 2 or self.list_bits % 2 or self.quantizers % 2)
@@ -94,24 +88,18 @@ class Quantizers:
     halves: Array
     codebook: Array  # (quantizers, 16, D / quantizers), codes of the residual
 
-    def save(self, path: Path) -> None:
-        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
-        recipe = json.dumps(asdict(self.recipe), sort_keys=True)
-        path.write_bytes(save(arrays, metadata={FORMAT: recipe}))
-
     @classmethod
-    def load(cls, path: Path) -> "Quantizers":
-        try:
-            with safe_open(path, framework="numpy") as stored:
-                recipe = VectorRecipe(**json.loads((stored.metadata() or {}).get(FORMAT, "")))
-                made = cls(recipe, *(stored.get_tensor(name) for name in _shapes(recipe)))
-        except (OSError, SafetensorError, ValueError, TypeError) as error:
-            raise AtlasError(f"quantizers of an index cannot be read ({error}): {path}") from error
+    def of(cls, recipe: VectorRecipe, parts: Mapping[str, NDArray[Any]]) -> "Quantizers":
+        """From `parts`, which may be untrusted; raises `AtlasError` unless they fit the recipe."""
         for name, shape in _shapes(recipe).items():
-            array = getattr(made, name)
-            if array.shape != shape or array.dtype != np.float32:
-                raise AtlasError(f"{name} of an index must be {shape}, got {array.shape}: {path}")
-        return made
+            array = parts.get(name)
+            if array is None or array.shape != shape or array.dtype != np.float32:
+                raise AtlasError(f"{name} of an index is not float32 {shape}")
+        return cls(recipe, *(parts[name] for name in _shapes(recipe)))
+
+    @property
+    def parts(self) -> dict[str, Array]:
+        return {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
 
     def rotated(self, vectors: Array) -> Array:
         return np.ascontiguousarray(np.asarray(vectors, dtype=np.float32) @ self.rotation)
@@ -174,7 +162,7 @@ def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers
     index, coarse = _untrained(recipe)
     for each in (coarse, index):
         means = each.pq.cp
-        means.niter, means.seed = 12, recipe.seed + 1
+        means.niter, means.seed = 12, 1
         # FAISS's limit of 256 points loses 2 to 4 points of recall where there are few centres.
         means.min_points_per_centroid, means.max_points_per_centroid = 1, 4096
     with one_thread():
@@ -352,9 +340,11 @@ class ShardedIndex:
     """The shards of an index, mapped and searched on one core. The id of a vector is the base of
     its shard plus its row. Not for several threads at once."""
 
-    def __init__(self, file: Callable[[str], Path], shards: Sequence[ShardInfo]) -> None:
-        self.quantizers = Quantizers.load(file(QUANTIZERS_NAME))
-        self._shards = [OpenShard(file, each, self.quantizers) for each in shards]
+    def __init__(
+        self, file: Callable[[str], Path], shards: Sequence[ShardInfo], quantizers: Quantizers
+    ) -> None:
+        self.quantizers = quantizers
+        self._shards = [OpenShard(file, each, quantizers) for each in shards]
 
     def __len__(self) -> int:
         return sum(each.info.rows for each in self._shards)
