@@ -49,7 +49,7 @@ from orthonav.ground.build.encoders import (
     stored_representation,
     usual_edges,
 )
-from orthonav.ground.build.layer import HeightLayers, cell_parts, height_layers
+from orthonav.ground.build.layer import HeightLayers, height_layers
 from orthonav.ground.build.sheet import SheetPictures, SheetReader, grid_of, read_pictures, tiles_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
@@ -95,8 +95,6 @@ class BuildRequest:
     - `bands`: that are used, one or three, from 1, such as near infrared; None: colours, or the
       first.
     - `true_ortho`: houses stand upright in the orthophotos; else how far they lean is estimated.
-    - `cells`: whether the map carries the cell means from which new tiles are embedded without
-      imagery, for sheets of an atlas; method gradient only.
     """
 
     orthos: Sequence[GivenPath]
@@ -124,7 +122,6 @@ class BuildRequest:
     relief: str | None = None
     epoch: float | None = None
     device: str = "auto"
-    cells: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.orthos, str | os.PathLike):
@@ -292,8 +289,6 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         arrays |= parts
     arrays |= inputs.heights.arrays
     terrain, surface = inputs.heights.infos
-    if request.cells and isinstance(inputs.recipe, WhitenedRecipe):
-        arrays |= cell_parts(sheet.cells)
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     info = SheetInfo(
         *(sheet.area.frame, grid, len(tiles_rc), area_km2),
