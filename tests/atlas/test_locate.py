@@ -18,6 +18,7 @@ from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.flight.folder import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.records import Fix, NoFix, View
+from orthonav.core.track import State
 from orthonav.ground.atlas import locate
 from orthonav.ground.atlas.catalog import Atlas, canonical
 from orthonav.ground.atlas.index import (
@@ -32,6 +33,8 @@ from orthonav.ground.atlas.index import (
 from orthonav.ground.atlas.locate import AtlasLocator
 from orthonav.ground.atlas.search import SheetSearch
 from orthonav.onboard.run import locate_view
+
+SILENT = NoFix("no_match", "shows nothing")
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +127,18 @@ def test_a_track_continues_on_the_next_sheet(atlas, locator, views, places, monk
     monkeypatch.setattr(locator._maps, "name_at", lambda *_: other)
     assert error_m(locator.locate(views[3]), places[3]) < 25
     assert [track.sheet for track in locator._tracks] == [other]
+
+
+def test_a_track_that_is_lost_at_two_views_ends(locator, views, monkeypatch):
+    locator.locate(views[0])
+    monkeypatch.setattr(locator._search, "sheets", lambda *_: [])
+    trackers = [track._tracker for track in locator._tracks]
+    for state, left in ((State.COASTING, True), (State.LOST, True), (State.LOST, False)):
+        for each in trackers:
+            each.locate = lambda _, each=each, state=state: setattr(each, "state", state) or SILENT
+        assert isinstance(locator.locate(views[1]), NoFix)
+        assert bool(locator._tracks) == left
+    assert locator.state_name == "lost"
 
 
 def test_a_sheet_that_cannot_be_used_is_left_out(copied, views, caplog):

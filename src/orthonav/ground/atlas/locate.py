@@ -102,7 +102,7 @@ class SheetTrack:
             return
         fix, before_ns = self._last
         velocity = np.array([fix.evidence["vel_east_mps"], fix.evidence["vel_north_mps"]])
-        moved_m = velocity * max(0.0, (time_ns - before_ns) / 1e9)
+        moved_m = velocity * min(max((time_ns - before_ns) / 1e9, 0.0), 600.0)
         lat, lon = LocalFrame(fix.lat_deg, fix.lon_deg).latlon_from_en(moved_m)
         name = self._maps.name_at(float(lat), float(lon))
         if name != self.sheet and (localizer := self._maps.open(name)) is not None:
