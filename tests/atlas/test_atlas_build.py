@@ -262,12 +262,6 @@ def test_sheets_stay_where_the_snapshot_cannot_be_written(built, ortho, tmp_path
     assert len(Atlas.open(place).sheets()) == COUNT
 
 
-def test_the_index_is_made_at_the_end(built, ortho, tmp_path):
-    place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
-    made(place, ortho, index=True)
-    assert any((place / "index").iterdir())
-
-
 def test_only_sheets_of_the_area_are_planned(ortho, built):
     mosaic = Mosaic.open([ortho])
     names = sorted(built[1].built)
