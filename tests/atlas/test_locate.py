@@ -76,6 +76,7 @@ def mirrored(view):
     return dataclasses.replace(view, grey=np.ascontiguousarray(view.grey[:, ::-1]))
 
 
+@pytest.mark.long
 def test_a_flight_is_located_without_prior_and_heading(atlas, flown, places, tmp_path, run):
     out = tmp_path / "fixes.jsonl"
     done = run("localize", "--atlas", atlas.url, flown, "--out", out, "--heading", "unknown")

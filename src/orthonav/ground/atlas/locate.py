@@ -41,7 +41,7 @@ class SheetMaps:
     def __init__(self, atlas: Atlas) -> None:
         self._atlas, sheets = atlas, atlas.sheets()
         self.area_m2 = 1e6 * sum(each.area_km2 for each in sheets.values())
-        self.open = lru_cache(maxsize=8)(self._opened)
+        self.open = lru_cache(maxsize=4)(self._opened)
 
     def name_at(self, lat_deg: float, lon_deg: float) -> str:
         return self._atlas.recipe.sheets.name_at(lat_deg, lon_deg)
