@@ -1,7 +1,6 @@
 """The catalogue of an atlas: canonical, checked, and whole whenever somebody is killed."""
 
 import copy
-import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -85,7 +84,7 @@ def test_a_sheet_that_is_put_is_read_back(atlas, files):
     sheet = atlas.put(files(), described())
     again = Atlas.open(atlas.url)
     assert again.recipe == RECIPE and again.sheets() == {HERE: sheet} == atlas.sheets()
-    assert sheet.revision == 1 and sheet.made_by == {"orthonav": "1.0"}
+    assert sheet.made_by == {"orthonav": "1.0"}
     assert sheet.size_bytes == len("map of one") + len("coarse of one")
     assert again.path(sheet).read_text() == "map of one"
     assert again.path(sheet, "coarse").read_text() == "coarse of one"
@@ -97,7 +96,7 @@ def test_putting_the_same_sheet_again_writes_nothing(atlas, files, monkeypatch):
     atlas.put(files(), described())
     for name in ("write", "remove"):
         monkeypatch.setattr(Store, name, lambda *_: pytest.fail("nothing to do"))
-    assert atlas.put(files(), described()).revision == 1
+    assert atlas.put(files(), described()) == atlas.sheets()[HERE]
 
 
 @pytest.mark.parametrize(("content", "request_"), [("two", "request 1"), ("one", "request 2")])
@@ -105,7 +104,6 @@ def test_a_sheet_is_replaced(atlas, files, content, request_):
     atlas.put(files(), described())
     atlas.put(files("east"), described(EAST))
     sheet = atlas.put(files(content), described(request=request_))
-    assert sheet.revision == 2
     again = Atlas.open(atlas.url)
     assert list(again.sheets()) == [HERE, EAST] and again.sheets()[HERE] == sheet
     assert again.path(sheet).read_text() == f"map of {content}"
@@ -158,8 +156,8 @@ def test_creating_and_opening(tmp_path):
     url = tmp_path / "atlas"
     assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
     assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
-    with pytest.raises(AtlasError, match=r"made alike.*gsd_m: 1\.0, not 0\.5.*seed: 0, not 3"):
-        Atlas.open_or_create(url, replace(RECIPE, gsd_m=0.5, seed=3))
+    with pytest.raises(AtlasError, match=r"alike.*gsd_m: 1\.0, not 0\.5.*tile_px: 256, not 64"):
+        Atlas.open_or_create(url, replace(RECIPE, gsd_m=0.5, tile_px=64))
     with pytest.raises(AtlasError, match="coarse"):
         Atlas.open_or_create(url, replace(RECIPE, coarse=CoarseRecipe(gsd_m=4.0)))
 
@@ -169,10 +167,10 @@ def test_creating_and_opening(tmp_path):
     [
         (lambda text: text[:-5], "damaged"),
         (lambda text: text.replace("orthonav-atlas", "other"), "not an atlas of orthonav"),
-        (lambda text: text.replace('"schema":1', '"schema":2'), "update orthonav"),
-        (lambda text: text.replace('"schema":1', '"schema":"1"'), "impossible recipe or schema"),
+        (lambda text: text.replace('"schema":2', '"schema":3'), "update orthonav"),
+        (lambda text: text.replace('"schema":2', '"schema":"2"'), "impossible recipe or schema"),
         (lambda text: text.replace('"gsd_m":1.0', '"gsd_m":NaN'), "recipe of the atlas"),
-        (lambda text: text.replace('"seed":0,', ""), "recipe of the atlas cannot be read"),
+        (lambda text: text.replace('"overlap":0.875,', ""), "recipe of the atlas cannot be read"),
         (lambda text: text.replace("Licences", "No licences"), "altered"),
         (lambda text: "[" * 100_000, "damaged"),
         (lambda text: '{"type":' + "9" * 5000 + "}", "damaged"),
@@ -198,10 +196,6 @@ def test_an_altered_catalogue_is_refused(near, change, words):
         ("tile_px", True),
         ("overlap", 1.0),
         ("sheet_km", 1e6),
-        ("method", 7),
-        ("method", "triplet:width=32"),
-        ("registration", "yes"),
-        ("registration", False),
         ("coarse", {"width": 3}),
         ("coarse", {"gsd_m": -8.0, "tile_px": 128, "overlap": 0.5}),
         ("coarse", 5),
@@ -209,7 +203,7 @@ def test_an_altered_catalogue_is_refused(near, change, words):
     ids=str,
 )
 def test_impossible_recipes_are_refused(name, value):
-    with pytest.raises(AtlasError, match=r"recipe|method gradient"):
+    with pytest.raises(AtlasError, match="recipe"):
         AtlasRecipe.from_plain({**RECIPE.to_plain(), name: value})
 
 
@@ -232,8 +226,7 @@ def altered(item, path, value):
         (("bbox",), ["a", 46.0, 1.0, 47.0]),
         (("properties", "gsd"), 0.0),
         (("properties", "orthonav:sheet"), None),
-        (("properties", "orthonav:sheet", "schema"), 2),
-        (("properties", "orthonav:sheet", "revision"), 0),
+        (("properties", "orthonav:sheet", "schema"), 3),
         (("properties", "orthonav:sheet", "tiles"), 1.5),
         (("properties", "orthonav:sheet", "more"), 1),
         (("assets", "map", "href"), "../../../etc/passwd"),
@@ -246,11 +239,8 @@ def altered(item, path, value):
     ],
 )
 def test_untrusted_items_are_refused(near, files, path, value):
-    """The file name agrees with the content, so only the content can be wrong."""
     item = altered(near.put(files(), described()).to_item(), path, value)
-    data = canonical(item)
-    name = f"{HERE}.0002.{hashlib.sha256(data).hexdigest()[:12]}.json"
-    near.store.write(f"items/{name}", data)
+    near.store.write(f"items/{HERE}.json", canonical(item))
     with pytest.raises(AtlasError, match=f"items/{HERE}"):
         near.sheets(refresh=True)
     with pytest.raises(AtlasError, match=r"atlas check.*atlas retire"):
@@ -261,7 +251,6 @@ def test_untrusted_items_are_refused(near, files, path, value):
     "change",
     [
         lambda data: data[:-1],
-        lambda data: data.replace(b"IGN", b"NGI"),
         lambda data: data + b"\n",
         lambda data: data.replace(b'"tiles":12', b'"tiles":11,"tiles":12'),
         lambda data: data.replace(b"3.25", b"Infinity"),
@@ -275,13 +264,12 @@ def test_untrusted_items_are_refused(near, files, path, value):
 )
 def test_damaged_items_are_reported_and_can_be_replaced(near, files, change):
     sheet = near.put(files(), described())
-    path = Path(near.url, "items", sheet.item_name)
+    path = Path(near.url, sheet.item_name)
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(AtlasError, match=f"items/{HERE}"):
         near.sheets(refresh=True)
     assert [each.kind for each in check_atlas(near)] == ["damaged item"]
-    near.put(files("two"), described())
-    assert near.sheets(refresh=True)[HERE].revision == 2
+    assert near.put(files("two"), described()) == near.sheets(refresh=True)[HERE]
     near.retire(HERE)
     assert near.sheets(refresh=True) == {}
 
@@ -341,14 +329,13 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_sheet(near, files, monkeyp
             assert again.path(found, "coarse").read_text() == f"coarse of {content}"
         else:
             assert act != "replace"
-        kinds = {problem.kind for problem in check_atlas(again)}
-        assert kinds <= {"orphan", "second revision"}
+        assert {problem.kind for problem in check_atlas(again)} <= {"orphan"}
         assert all(each.removed for each in check_atlas(again, clean=True, min_age_s=0))
         assert check_atlas(again) == [] and again.sheets(refresh=True).get(HERE) == found
         if found is not None or act != "retire":
             change(again)
         assert (HERE in again.sheets(refresh=True)) == (act != "retire")
-    assert step == {"put": 6, "replace": 12, "retire": 6}[act]
+    assert step == {"put": 6, "replace": 10, "retire": 6}[act]
     assert check_atlas(near) == []
 
 
@@ -367,12 +354,12 @@ def test_items_are_stac(near, files):
     from pystac.validation.stac_validator import JsonSchemaSTACValidator
 
     sheet = near.put(files(), described())
-    item = Item.from_file(str(Path(near.url, "items", sheet.item_name)))
+    item = Item.from_file(str(Path(near.url, sheet.item_name)))
     collection = Collection.from_file(str(Path(near.url, "atlas.json")))
     validator = JsonSchemaSTACValidator()  # it brings the schemas of 1.1, which asks for no less
     for plain, kind in (
         (sheet.to_item(), STACObjectType.ITEM),
-        (described(dates=("2020",)).stored(1, sheet.files).to_item(), STACObjectType.ITEM),
+        (described(dates=("2020",), files=sheet.files).to_item(), STACObjectType.ITEM),
         (json.loads(near.store.read("atlas.json")), STACObjectType.COLLECTION),
     ):
         assert validator.validate_core({**plain, "stac_version": "1.1.0"}, kind, "1.1.0")
@@ -400,7 +387,7 @@ def test_items_are_stac(near, files):
 )
 def test_dates_become_times_of_stac(dates, times):
     asset = StoredFile(f"sheets/{HERE}.{'0' * 12}.onav", 1, "0" * 64)
-    sheet = described(dates=dates).stored(1, {"map": asset})
+    sheet = described(dates=dates, files={"map": asset})
     found = {k: v for k, v in sheet.to_item()["properties"].items() if "date" in k}
     if isinstance(times, tuple):
         times = {"datetime": None, "start_datetime": times[0], "end_datetime": times[1]}
@@ -412,7 +399,7 @@ def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
     source = Atlas.open_or_create(tmp_path / "source", RECIPE)
     for sheet in (HERE, EAST):
         source.put(files(sheet), described(sheet))
-    assert copy_sheets(source, near, [EAST]) == ([EAST], [])
+    near.put(files(EAST), described(EAST))
     assert copy_sheets(source, near) == ([HERE], [EAST])
     assert contents(near.url) == {**contents(source.url), **contents(near.url)}
     source.put(files("new"), described())
@@ -420,8 +407,6 @@ def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
     assert copy_sheets(source, near, replace=True) == ([HERE], [EAST])
     assert near.path(near.sheets()[HERE]).read_text() == "map of new"
     assert check_atlas(near) == []
-    with pytest.raises(AtlasError, match="has no sheet 'x'"):
-        copy_sheets(source, near, ["x"])
     other = Atlas.open_or_create(tmp_path / "other", replace(RECIPE, overlap=0.5))
     with pytest.raises(AtlasError, match=r"overlap: 0\.5, not 0\.875"):
         copy_sheets(source, other)

@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,18 +26,18 @@ from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
-from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet
+from orthonav.ground.atlas.build import AtlasRequest, build_atlas
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.cluster import SerialRunner
 from orthonav.ground.atlas.cut import (
     Warp,
-    _relief,
-    _roughness_m,
     check_shown,
     cut_heights,
-    cut_in_memory,
     cut_map,
+    least_roughness_m,
     opened_sheets,
+    steepest,
 )
-from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.sheet import Block, grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
@@ -74,16 +74,24 @@ def names(middle):
 @pytest.fixture(scope="module")
 def folder(ortho, names, middle, tmp_path_factory):
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
-    atlas = Atlas.open_or_create(str(folder), RECIPE)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.ground.build.calibrate.CROPS", 12)
-        patch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
-        dem = write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0)
-        trees = write_dem(folder.parent / "trees.tif", middle, wooded, half_m=900.0, px_m=2.0)
-        for name in names:
-            heights = {"dem": dem, "dem_datum": "msl", "surface": [trees]}
-            put(atlas, name, built(ortho, name, folder.parent / "sheet.onav", **heights))
+    recipe = {name: value for name, value in asdict(RECIPE).items() if name != "coarse"}
+    request = AtlasRequest(
+        str(folder),
+        [ortho],
+        recipe | {"coarse": None},
+        bounds_around(middle, 190),
+        dem=write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0),
+        surface=[write_dem(folder.parent / "trees.tif", middle, wooded, half_m=900.0, px_m=2.0)],
+        dem_datum="msl",
+    )
+    with SerialRunner() as runner:
+        assert sorted(build_atlas(request, runner).built) == names
     return folder
+
+
+@pytest.fixture(scope="module")
+def crops():
+    return 12
 
 
 def ground(east_m, north_m):
@@ -96,28 +104,6 @@ def above(east_m, north_m):
 
 def wooded(east_m, north_m):
     return ground(east_m, north_m) + above(east_m, north_m)
-
-
-def built(ortho, name, out, **request):
-    request = {"cells": True, "calibration_views": RECIPE.calibration_views, **request}
-    bounds = RECIPE.sheets.bounds_deg(name)
-    telemetry = {
-        "tile_px": RECIPE.tile_px,
-        "overlap": RECIPE.overlap,
-        "gsd_m": RECIPE.gsd_m,
-        **request,
-    }
-    build_map(BuildRequest([ortho], out, bounds_deg=bounds, **telemetry))
-    return out
-
-
-def put(atlas, name, path):
-    manifest = open_map(path).manifest
-    sheet = manifest.sheets[0]
-    bounds = RECIPE.sheets.bounds_deg(name)
-    dates = tuple(str(each["date"]) for each in manifest.imagery)
-    facts = (bounds, 1.0, sheet.tiles, sheet.area_km2, dates, manifest.imagery)
-    return atlas.put({"map": path}, Sheet(name, *facts, "asked", {"orthonav": "test"}))
 
 
 @pytest.fixture
@@ -143,16 +129,6 @@ def cut(folder, middle, tmp_path_factory):
     out = tmp_path_factory.mktemp("cut") / "cut.onav"
     cut_map(Atlas.open(str(folder)), out, area_around(middle, 150), workers=1)
     return open_map(out)
-
-
-@pytest.mark.long
-def test_a_map_cut_in_memory_is_the_one_that_is_written(folder, middle, cut):
-    area = Area.from_bounds(bounds_around(middle, 150))
-    made = cut_in_memory(Atlas.open(str(folder)), area)
-    assert set(made.arrays) == set(cut.arrays)
-    for name in cut.arrays:
-        np.testing.assert_array_equal(made.arrays[name], cut.arrays[name])
-    assert Localizer(made).registration is not None
 
 
 def test_terrain_is_that_of_the_sheets(cut, middle):
@@ -189,7 +165,7 @@ def test_terrain_is_a_surface_model_only_where_all_of_it_is_one(cut):
     info = TerrainLayer.of(cut).info
 
     def least(*roughness_m):
-        return _roughness_m([replace(info, roughness_m=each) for each in roughness_m])
+        return least_roughness_m([replace(info, roughness_m=each) for each in roughness_m])
 
     assert (least(3.0, 2.0), least(3.0, None), least(None)) == (2.0, None, None)
 
@@ -198,10 +174,10 @@ def test_relief_is_the_steepest_of_the_sheets():
     def member(relief):
         return SimpleNamespace(manifest=SimpleNamespace(sheets=[SimpleNamespace(relief=relief)]))
 
-    for stated, steepest in (
+    for stated, expected in (
         (["level", "level"], "level"), (["level", None], None), (["hills", None, "level"], "hills")
     ):  # fmt: skip
-        assert _relief([member(each) for each in stated]) == steepest
+        assert steepest([member(each) for each in stated]) == expected
 
 
 def sheet_file(atlas, name):
@@ -316,7 +292,7 @@ def test_sheets_of_another_recipe_are_refused(atlas, names, middle, tmp_path, ch
     else:
         manifest = replace(manifest, recipe={**manifest.recipe, "embed": {"name": "bovw"}})
     write_map(tmp_path / "s.onav", manifest, opened.arrays)
-    put(atlas, sorted(names)[1], tmp_path / "s.onav")
+    atlas.put({"map": tmp_path / "s.onav"}, atlas.sheets()[sorted(names)[1]])
     with pytest.raises(AtlasError, match=sorted(names)[1]):
         cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=1)
 
@@ -335,7 +311,7 @@ def test_a_damaged_chunk_is_found_by_any_thread(atlas, names, middle, tmp_path):
     parts = {name: part.copy() for name, part in opened.arrays.items()}
     parts["sheet0/grey/bytes"][:] = 7
     write_map(tmp_path / "s.onav", opened.manifest, parts)
-    put(atlas, names[1], tmp_path / "s.onav")
+    atlas.put({"map": tmp_path / "s.onav"}, atlas.sheets()[names[1]])
     with pytest.raises(MapFileError, match=rf"damaged.*{names[1]}"):
         cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=2)
 
@@ -359,7 +335,7 @@ def test_the_affine_agrees_with_the_geodesy():
 
     frame, grid = LocalFrame(60.02, 10.0), TileGrid(18000.0, 3000.0, 1.0, 256, 32, 300, 300)
     block = Block(1024, 2048, 1024, 1024)
-    warp = Warp(Sheet, frame, grid, True)
+    warp = Warp(Sheet, frame, grid)
     assert warp.reaches(block) and not warp.reaches(Block(1024, 12_000, 1024, 1024))
     px = np.random.default_rng(0).uniform([2048, 1024], [3072, 2048], (50, 2))
     places = np.column_stack([grid.west_m + px[:, 0], grid.north_m - px[:, 1]])

@@ -99,36 +99,8 @@ def test_old_leftovers_are_removed(atlas):
     assert len(atlas.sheets(refresh=True)) == 2
 
 
-def second_revision(atlas, missing=False):
-    """As if a process had ended before it removed the revision that it replaced."""
-    old = atlas.sheets()[HERE]
-    asset = replace(old.files["map"], sha256="ab" * 32, size_bytes=3)
-    asset = replace(asset, name=f"sheets/{HERE}.abababababab.onav")
-    new = described(HERE).stored(2, {"map": asset})
-    if not missing:
-        atlas.store.write(asset.name, b"new")
-    atlas.store.write(f"items/{new.item_name}", canonical(new.to_item()))
-    return old, new
-
-
-def test_a_replaced_revision_is_removed(atlas):
-    old, new = second_revision(atlas)
-    assert atlas.sheets(refresh=True)[HERE] == new
-    left = [("second revision", f"items/{old.item_name}"), ("orphan", old.files["map"].name)]
-    assert found(atlas) == left == found(atlas, clean=True, min_age_s=-5)
-    assert found(atlas) == [] and atlas.sheets(refresh=True)[HERE] == new
-    assert len(atlas.store.names("sheets")) == 2
-
-
-def test_a_revision_stays_while_its_replacement_is_incomplete(atlas):
-    old, new = second_revision(atlas, missing=True)
-    wrong = [("missing file", new.files["map"].name)]
-    assert found(atlas, clean=True, min_age_s=-5) == wrong == found(atlas)
-    assert {old.item_name, new.item_name} <= atlas.store.names("items").keys()
-
-
 def test_files_of_unreadable_items_stay(near):
-    path = Path(near.url, "items", near.sheets()[HERE].item_name)
+    path = Path(near.url, near.sheets()[HERE].item_name)
     path.write_bytes(path.read_bytes()[:-2])
     assert found(near, clean=True, min_age_s=-5) == [("damaged item", f"items/{path.name}")]
     assert len(near.store.names("sheets")) == 2
@@ -139,8 +111,7 @@ def test_files_of_unreadable_items_stay(near):
 
 def test_a_sheet_of_another_lattice_is_found(near):
     description = replace(near.sheets()[HERE], bounds_deg=RECIPE.sheets.bounds_deg(EAST))
-    sheet = description.stored(2, description.files)
-    near.store.write(f"items/{sheet.item_name}", canonical(sheet.to_item()))
+    near.store.write(description.item_name, canonical(description.to_item()))
     assert [kind for kind, _ in found(near)] == ["damaged item"]
 
 
@@ -168,8 +139,8 @@ def test_a_stale_or_damaged_index_is_found(atlas):
 def test_a_sheet_finished_meanwhile_is_no_orphan(near, tmp_path, monkeypatch):
     act = Store.names
 
-    def names(self, folder="", prefix=""):
-        found = act(self, folder, prefix)
+    def names(self, folder=""):
+        found = act(self, folder)
         if folder == "sheets" and EAST not in near.sheets():
             (tmp_path / "file").write_text(f"map of {EAST}")
             near.put({"map": tmp_path / "file"}, described(EAST))
@@ -242,6 +213,6 @@ def test_add_and_retire(near, tmp_path, capfd):
     code, done = run(capfd, "retire", copy, HERE)
     assert code == 1 and "has no sheet" in done.err
     shutil.rmtree(copy)
-    Atlas.open_or_create(copy, replace(RECIPE, seed=1))
+    Atlas.open_or_create(copy, replace(RECIPE, overlap=0.5))
     code, done = run(capfd, "add", copy, near.url)
-    assert code == 1 and "seed: 1, not 0" in done.err
+    assert code == 1 and "overlap: 0.5, not 0.875" in done.err

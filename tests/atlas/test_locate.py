@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 import shutil
 from pathlib import Path
@@ -9,49 +10,57 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
-from orthonav.core.errors import AtlasError
+from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.flight.folder import open_flight, read_truth
-from orthonav.core.geo.frames import distances_m
+from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.records import Fix, NoFix, View
+from orthonav.core.track import State
+from orthonav.ground.atlas import locate
 from orthonav.ground.atlas.catalog import Atlas, canonical
 from orthonav.ground.atlas.index import (
+    LEARNT,
     MANIFEST,
     IndexManifest,
+    load_learnt,
     make_index,
     read_manifest,
     stale_sheets,
 )
 from orthonav.ground.atlas.locate import AtlasLocator
-from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
+from orthonav.ground.atlas.search import SheetSearch
 from orthonav.onboard.run import locate_view
 
-CANDIDATES = 6
-"""Registering candidates takes most of the time."""
+SILENT = NoFix("no_match", "shows nothing")
 
 
-@pytest.fixture(autouse=True)
-def fewer_candidates(monkeypatch):
-    monkeypatch.setattr("orthonav.ground.atlas.locate.CANDIDATES", CANDIDATES)
+@pytest.fixture(scope="module")
+def crops():
+    return 24
 
 
 @pytest.fixture(scope="module")
 def search(atlas):
-    return TileSearch(atlas)
+    return SheetSearch(atlas)
 
 
 @pytest.fixture
-def locator(atlas, search):
-    return AtlasLocator(SheetRegistrar(atlas), search)
+def locator(search):
+    return AtlasLocator(search)
 
 
 @pytest.fixture(scope="module")
-def first_view(flown):
+def views(flown):
     flight = open_flight(flown)
-    view = next(iter(flight.views))
-    return View(view.grey(), flight.camera, view.telemetry)
+    return [View(view.grey(), flight.camera, view.telemetry) for view in flight.views]
+
+
+@pytest.fixture(scope="module")
+def places(flown):
+    return list(read_truth(flown / "truth.csv").values())
 
 
 @pytest.fixture
@@ -59,8 +68,16 @@ def copied(atlas, tmp_path):
     return Atlas.open(shutil.copytree(atlas.url, tmp_path / "copy"))
 
 
+def error_m(fix, place):
+    return distances_m([(fix.lat_deg, fix.lon_deg)], [place])[0]
+
+
+def mirrored(view):
+    return dataclasses.replace(view, grey=np.ascontiguousarray(view.grey[:, ::-1]))
+
+
 @pytest.mark.long
-def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, run):
+def test_a_flight_is_located_without_prior_and_heading(atlas, flown, places, tmp_path, run):
     out = tmp_path / "fixes.jsonl"
     done = run("localize", atlas.url, flown, "--out", out, "--heading", "unknown")
     assert done.code == 0, done.err
@@ -69,14 +86,80 @@ def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, r
     assert (lines[0]["status"], lines[0]["reason"], lines[0]["state"]) == (
         *("no_fix", "searching", "searching"),
     )
-    truth = read_truth(flown / "truth.csv")
     fixes = [line for line in lines if line["status"] == "fix"]
     assert len(fixes) >= len(lines) - 3
+    along = LocalFrame(*places[0]).en_from_latlon(*places[-1])
+    heading_deg = math.degrees(math.atan2(*along))  # views look along the route
+    truth = read_truth(flown / "truth.csv")
     for fix in fixes:
         place = (fix["lat_deg"], fix["lon_deg"])
         assert distances_m([place], [truth[fix["frame"]]])[0] < 25
+        assert abs((fix["heading_deg"] - heading_deg + 180) % 360 - 180) < 5
         assert fix["place_probability"] <= fix["evidence"]["recognized"]
-    assert fixes[-1]["confidence"] > 0.9 and fixes[-1]["state"] == "tracking"
+        assert fix["state"] == "tracking"
+    assert fixes[-1]["confidence"] > 0.9
+
+
+@pytest.mark.parametrize("blind", ["another place", "no image"])
+def test_a_position_needs_a_view_in_which_the_map_is_recognized(locator, views, places, blind):
+    for view in views[:3]:
+        fix = locator.locate(view)
+    assert isinstance(fix, Fix) and error_m(fix, places[2]) < 25
+    reason = NoFix("bad_image", "damaged")
+    if blind == "no image":
+        assert locator.passed(views[3].telemetry, reason) is reason
+    else:
+        assert isinstance(locator.locate(mirrored(views[3])), NoFix)
+    assert locator.state_name in ("coasting", "lost")
+    fix = locator.locate(views[4])
+    assert isinstance(fix, Fix) and error_m(fix, places[4]) < 25
+    assert locator.state_name == "tracking"
+
+
+def test_a_track_continues_on_the_next_sheet(atlas, locator, views, places, monkeypatch):
+    """Two sheets show the flight: it changes from one to the other, wherever the border is."""
+    names = {sheet: index for index, sheet in enumerate(atlas.sheets())}
+    first, other = names
+    monkeypatch.setattr(locator._search, "sheets", lambda *_: [first])
+    whole = locator._maps.open(max(names, key=lambda name: atlas.sheets()[name].tiles))
+    monkeypatch.setattr(locator._maps, "open", lambda name: whole)
+    for view in views[:3]:
+        locator.locate(view)
+    monkeypatch.setattr(locator._maps, "name_at", lambda *_: other)
+    assert error_m(locator.locate(views[3]), places[3]) < 25
+    assert [track.sheet for track in locator._tracks] == [other]
+
+
+def test_a_track_that_is_lost_at_two_views_ends(locator, views, monkeypatch):
+    locator.locate(views[0])
+    monkeypatch.setattr(locator._search, "sheets", lambda *_: [])
+    trackers = [track._tracker for track in locator._tracks]
+    for state, left in ((State.COASTING, True), (State.LOST, True), (State.LOST, False)):
+        for each in trackers:
+            each.locate = lambda _, each=each, state=state: setattr(each, "state", state) or SILENT
+        assert isinstance(locator.locate(views[1]), NoFix)
+        assert bool(locator._tracks) == left
+    assert locator.state_name == "lost"
+
+
+def test_a_sheet_that_cannot_be_used_is_left_out(copied, views, caplog):
+    for sheet in copied.sheets().values():
+        path = copied.path(sheet)
+        path.write_bytes(path.read_bytes()[:-1])
+    outcome = AtlasLocator(SheetSearch(copied)).locate(views[0])
+    assert outcome.reason == "searching" and "cannot be used" in caplog.text
+
+
+def test_a_track_on_a_damaged_sheet_ends(locator, views, monkeypatch):
+    locator.locate(views[0])
+    assert locator._tracks
+
+    def damaged(*_):
+        raise MapFileError("a chunk is damaged")
+
+    monkeypatch.setattr(locate.SheetTrack, "locate", damaged)
+    assert isinstance(locator.locate(views[1]), NoFix)
+    assert not locator._tracks
 
 
 def test_options_of_maps_are_refused(atlas, flown, tmp_path, run):
@@ -84,17 +167,43 @@ def test_options_of_maps_are_refused(atlas, flown, tmp_path, run):
     assert refused.code == 2 and "--track" in refused.err
 
 
-def test_a_negative_has_no_confident_fix(locator, first_view):
-    mirrored = np.ascontiguousarray(first_view.grey[:, ::-1])
-    outcome = locator.locate(dataclasses.replace(first_view, grey=mirrored))
-    assert not (isinstance(outcome, Fix) and outcome.confidence > 0.8)
+@pytest.mark.long
+def test_negatives_have_no_fix(locator, views):
+    for view in views:
+        assert isinstance(locator.locate(mirrored(view)), NoFix)
+    assert locator.state_name == "searching"
 
 
-def test_views_of_another_scale_are_refused_with_the_reason(locator, first_view):
-    low = dataclasses.replace(first_view.telemetry, agl_m=60.0)
-    outcome = locator.locate(dataclasses.replace(first_view, telemetry=low))
-    assert isinstance(outcome, NoFix)
+def test_views_of_another_scale_are_refused_with_the_reason(locator, views):
+    low = dataclasses.replace(views[0].telemetry, agl_m=60.0)
+    outcome = locator.locate(dataclasses.replace(views[0], telemetry=low))
     assert outcome.reason in {"wrong_scale", "too_small"}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"agl_m": np.nan},
+        {"agl_m": -5.0},
+        {"pitch_deg": 80.0},
+        {"yaw_std_deg": -5.0, "yaw_deg": 10.0},
+        {"tilt_std_deg": np.nan},
+    ],
+)
+def test_impossible_telemetry_gives_a_reason_and_no_fix(search, views, change):
+    telemetry = dataclasses.replace(views[0].telemetry, **change)
+    locator = AtlasLocator(search, heading_known="yaw_std_deg" in change)
+    outcome, _ = locate_view(locator, dataclasses.replace(views[0], telemetry=telemetry))
+    assert isinstance(outcome, NoFix)
+    assert outcome.reason != "internal_error"
+    assert locator.state_name == "searching"
+
+
+def test_blank_views_give_a_reason_and_no_fix(locator, views):
+    black = dataclasses.replace(views[0], grey=np.zeros_like(views[0].grey))
+    assert locator.locate(black).reason == "too_dark"
+    noise = np.asarray(cv2.randu(np.zeros_like(views[0].grey), 0, 255))
+    assert isinstance(locator.locate(dataclasses.replace(views[0], grey=noise)), NoFix)
 
 
 def test_the_same_sheets_make_the_same_index(atlas, copied):
@@ -109,7 +218,7 @@ def test_the_same_sheets_make_the_same_index(atlas, copied):
         assert again.store.read(f"index/{name}") == atlas.store.read(f"index/{name}")
 
 
-def test_the_index_follows_the_sheets(copied, tmp_path):
+def test_the_index_follows_the_sheets(copied, tmp_path, caplog):
     smallest = min(copied.sheets().values(), key=lambda each: each.tiles)
     kept = {key: copied.path(smallest, key) for key in smallest.files}
     aside = {key: shutil.copy(path, tmp_path / path.name) for key, path in kept.items()}
@@ -121,8 +230,9 @@ def test_the_index_follows_the_sheets(copied, tmp_path):
     assert smallest.id not in after.sheets
     assert set(copied.store.names("index")) == {*after.files, "index.json"}
     copied.put(aside, smallest)
-    assert TileSearch(copied).unknown == [smallest.id]
-    assert make_index(copied) == before and not TileSearch(copied).unknown
+    SheetSearch(copied)
+    assert "1 sheets are missing from the index" in caplog.text
+    assert make_index(copied) == before
 
 
 @pytest.mark.parametrize(
@@ -133,7 +243,6 @@ def test_the_index_follows_the_sheets(copied, tmp_path):
         (lambda plain: plain["shards"][0]["parts"][0].update(rows=2.5), "altered"),
         (lambda plain: plain["shards"][0]["parts"][0].update(rows=True), "altered"),
         (lambda plain: plain["shards"][0]["parts"][0].update(sheet=1), "altered"),
-        (lambda plain: plain["shards"][0]["parts"][0].update(retired=0), "altered"),
         (lambda plain: _asset(plain).update(name="../../../etc/passwd"), "altered"),
         (lambda plain: _asset(plain).update(size_bytes="x"), "size"),
         (lambda plain: _asset(plain).update(sha256="../../../etc/passwd"), "sha256"),
@@ -153,39 +262,27 @@ def test_an_untrusted_index_is_checked(atlas, change, words):
 
 
 def _asset(plain):
-    return plain["files"]["quantizers.safetensors"]
+    return plain["files"]["learnt.safetensors"]
 
 
 def test_a_missing_and_a_damaged_index_are_reported(copied):
     damaged = copied
     damaged.store.write(MANIFEST, b'{"format": "orthonav-index", "schema": 99}')
     with pytest.raises(AtlasError, match="cannot be read"):
-        TileSearch(damaged)
+        SheetSearch(damaged)
     damaged.store.remove(MANIFEST)
     with pytest.raises(AtlasError, match="orthonav atlas index"):
-        TileSearch(damaged)
+        SheetSearch(damaged)
     assert make_index(damaged) is not None
 
 
-def test_impossible_telemetry_gives_a_reason_and_no_fix(atlas, search, first_view):
-    for change in (
-        {"agl_m": np.nan},
-        {"agl_m": -5.0},
-        {"pitch_deg": 80.0},
-        {"yaw_std_deg": -5.0, "yaw_deg": 10.0},
-        {"tilt_std_deg": np.nan},
-    ):
-        telemetry = dataclasses.replace(first_view.telemetry, **change)
-        registrar = SheetRegistrar(atlas)
-        locator = AtlasLocator(registrar, search, heading_known="yaw_std_deg" in change)
-        outcome, _ = locate_view(locator, dataclasses.replace(first_view, telemetry=telemetry))
-        assert isinstance(outcome, NoFix)
-        assert outcome.reason != "internal_error"
-        assert locator.state_name == "searching"
-
-
-def test_blank_views_give_a_reason_and_no_fix(locator, first_view):
-    black = dataclasses.replace(first_view, grey=np.zeros_like(first_view.grey))
-    assert locator.locate(black).reason == "too_dark"
-    noise = np.asarray(cv2.randu(np.zeros_like(first_view.grey), 0, 255))
-    assert isinstance(locator.locate(dataclasses.replace(first_view, grey=noise)), NoFix)
+@pytest.mark.parametrize("name", ["mean", "basis", "rotation", "halves", "codebook"])
+def test_damaged_parts_of_an_index_are_refused(atlas, tmp_path, name):
+    recipe, path = read_manifest(atlas).recipe, tmp_path / LEARNT
+    parts = load_file(Path(atlas.url, "index", LEARNT))
+    save_file({**parts, name: parts[name][:-1]}, path)
+    with pytest.raises(AtlasError, match="index of the atlas is damaged"):
+        load_learnt(path, recipe)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(AtlasError, match="index of the atlas is damaged"):
+        load_learnt(path, recipe)

@@ -7,7 +7,6 @@ import pytest
 
 from orthonav.core.errors import AtlasError
 from orthonav.ground.atlas.vectors import (
-    QUANTIZERS_NAME,
     Part,
     ShardedIndex,
     ShardInfo,
@@ -52,21 +51,15 @@ SHARDS = (
 
 @pytest.fixture
 def folder(tmp_path, vectors, quantizers):
-    quantizers.save(tmp_path / QUANTIZERS_NAME)
     write(tmp_path, "a", quantizers, vectors[:4000])
     write(tmp_path, "b", quantizers, vectors[4000:])
     return tmp_path
 
 
 def write(folder, name, quantizers, vectors):
-    where = places(len(vectors))
-    parts = [slice(start, start + 1500) for start in range(0, len(vectors), 1500)]
     info = ShardInfo(name, 0, (Part("", "", len(vectors)),))
-    write_shard(folder, info, quantizers, ((where[part], vectors[part]) for part in parts))
-
-
-def places(count):
-    return np.stack([np.arange(count) / 100, -np.arange(count) / 100], axis=1)
+    batches = (vectors[start : start + 1500] for start in range(0, len(vectors), 1500))
+    write_shard(folder, info, quantizers, batches)
 
 
 def exact(vectors, queries, k):
@@ -75,13 +68,16 @@ def exact(vectors, queries, k):
     return np.take_along_axis(products, order, 1), order
 
 
-def test_search_finds_what_exact_search_finds(folder, vectors):
-    index, queries = ShardedIndex(folder.joinpath, SHARDS), seen(vectors)
+def test_search_finds_what_exact_search_finds(folder, vectors, quantizers):
+    index, queries = ShardedIndex(folder.joinpath, SHARDS, quantizers), seen(vectors)
     exact_scores, expected = exact(vectors, queries, 10)
     scores, ids = index.search(queries, 10, probes=64, rerank=400)
     assert np.mean([np.isin(a, b).mean() for a, b in zip(ids, expected, strict=True)]) > 0.99
     same = ids == expected
     np.testing.assert_allclose(scores[same], exact_scores[same], atol=1e-6)
+    assert index.sheets_of(np.array([0, 1499, 1500, 3999, 4000])) == [
+        *("one", "one", "two", "two", "three"),
+    ]
     _, few = index.search(queries, 10, probes=16, rerank=400)
     assert np.mean([np.isin(a, b).mean() for a, b in zip(few, expected, strict=True)]) > 0.6
 
@@ -90,9 +86,8 @@ def test_same_input_same_bytes(tmp_path, vectors):
     for name in ("one", "other"):
         again = train(vectors, RECIPE)
         write(tmp_path / name, "a", again, vectors[:4000])
-        again.save(tmp_path / name / QUANTIZERS_NAME)
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
-    assert files == ["a.codes", "a.lists.npy", "a.places.npy", "a.vectors.npy", QUANTIZERS_NAME]
+    assert files == ["a.codes", "a.lists.npy", "a.vectors.npy"]
     for name in files:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
 
@@ -100,34 +95,32 @@ def test_same_input_same_bytes(tmp_path, vectors):
 def test_fewer_vectors_than_requested(tmp_path, vectors, quantizers):
     write(tmp_path, "few", quantizers, vectors[:3])
     write(tmp_path, "none", quantizers, vectors[:0])
-    quantizers.save(tmp_path / QUANTIZERS_NAME)
     shards = ShardInfo("few", 0, (Part("x", "", 3),)), ShardInfo("none", 3, (Part("y", "", 0),))
-    scores, ids = ShardedIndex(tmp_path.joinpath, shards).search(vectors[:2], 5, 64, 10)
+    index = ShardedIndex(tmp_path.joinpath, shards, quantizers)
+    scores, ids = index.search(vectors[:2], 5, 64, 10)
     assert sorted(ids[0, :3]) == [0, 1, 2]
     assert (ids[:, 3:] == -1).all() and np.isneginf(scores[:, 3:]).all()
 
 
-@pytest.mark.parametrize(
-    "name", ["a.codes", "a.lists.npy", "a.vectors.npy", "a.places.npy", QUANTIZERS_NAME]
-)
-def test_truncated_and_missing_files_are_refused(folder, name):
+@pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.vectors.npy"])
+def test_truncated_and_missing_files_are_refused(folder, name, quantizers):
     contents = (folder / name).read_bytes()
     (folder / name).write_bytes(contents[: len(contents) // 2])
     with pytest.raises(AtlasError):
-        ShardedIndex(folder.joinpath, SHARDS)
+        ShardedIndex(folder.joinpath, SHARDS, quantizers)
     (folder / name).unlink()
     with pytest.raises(AtlasError):
-        ShardedIndex(folder.joinpath, SHARDS)
+        ShardedIndex(folder.joinpath, SHARDS, quantizers)
 
 
-def test_damaged_codes_are_refused(folder, vectors):
+def test_damaged_codes_are_refused(folder, vectors, quantizers):
     size = (folder / "a.codes").stat().st_size
     (folder / "a.codes").write_bytes(b"\x7f" * size)
     with pytest.raises(AtlasError, match="damaged"):
-        ShardedIndex(folder.joinpath, SHARDS).search(vectors[:1], 5, 64, 100)
+        ShardedIndex(folder.joinpath, SHARDS, quantizers).search(vectors[:1], 5, 64, 100)
 
 
-def test_a_shard_of_another_size_is_refused(folder):
+def test_a_shard_of_another_size_is_refused(folder, quantizers):
     other = (replace(SHARDS[0], parts=SHARDS[0].parts[:1]),)
     with pytest.raises(AtlasError, match="expected 1500 rows"):
-        ShardedIndex(folder.joinpath, other)
+        ShardedIndex(folder.joinpath, other, quantizers)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli import verbosity
-from orthonav.cli.build import add_recipe, asked
+from orthonav.cli.build import asked
 from orthonav.cli.common import add_area, add_options, area_of, given, print_json, progress
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("sheets (set by the first build of an atlas)")
     text = "greatest width of a sheet (default 10)"
     group.add_argument("--sheet-km", type=float, help=text)
-    add_recipe(group, any_method=False)
+    add_options(group, "--gsd-m", "--tile-px", "--overlap")
     add_options(group, "--dem", "--surface", "--true-ortho", "--dem-datum", "--relief")
     text = "rebuild sheets that have other imagery or versions"
     group.add_argument("--replace", action="store_true", help=text)
@@ -74,8 +74,6 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
     text = "ground resolution of coarse tiles, metres per pixel (default 8)"
     add("--coarse-gsd-m", type=float, help=text)
     add("--coarse-tile-px", type=int, help="width of a coarse tile (default 128)")
-    text = "overlap of coarse tiles, as a fraction of their width (default 0.875)"
-    add("--coarse-overlap", type=float, metavar="FRACTION", help=text)
     text = "do not update the search index at the end"
     add("--no-index", dest="index", action="store_false", help=text)
     group = parser.add_argument_group("workers")
@@ -103,7 +101,7 @@ def _build(options: argparse.Namespace) -> int:
     from orthonav.ground.atlas.catalog import AtlasRecipe
 
     recipe = given(options, AtlasRecipe)
-    coarse = {name: getattr(options, f"coarse_{name}") for name in ("gsd_m", "tile_px", "overlap")}
+    coarse = {name: getattr(options, f"coarse_{name}") for name in ("gsd_m", "tile_px")}
     if set_ := {name: value for name, value in coarse.items() if value is not None}:
         recipe["coarse"] = set_
     fields = asked(options, AtlasRequest) | {"url": options.atlas, "recipe": recipe}
@@ -209,7 +207,7 @@ def _add(options: argparse.Namespace) -> None:
     source = Atlas.open(options.source)
     atlas = Atlas.open_or_create(options.atlas, source.recipe)
     with progress(options) as shown:
-        copied, unchanged = copy_sheets(source, atlas, None, options.replace, shown)
+        copied, unchanged = copy_sheets(source, atlas, options.replace, shown)
     print(f"{len(copied)} sheets added, {len(unchanged)} unchanged: {atlas.store}")
 
 

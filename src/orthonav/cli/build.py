@@ -53,13 +53,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help=text)
 
 
-def add_recipe(group: argparse._ActionsContainer, *, any_method: bool = True) -> None:
+def add_recipe(group: argparse._ActionsContainer) -> None:
     add_options(group, "--gsd-m", "--tile-px", "--overlap", "--seed")
     add = group.add_argument
     text = "mirrored views that measure the level of chance on this map (default 24)"
     add("--calibration-views", type=int, help=text)
-    if not any_method:
-        return
     text = "embedding: gradient (default), autoencoder, caevl, triplet or bovw"
     add("--method", metavar="NAME[:FIELD=VALUE,..]", help=text)
     text = "image representation: gradient, gray, canny (canny:low=100,high=200), segments, "

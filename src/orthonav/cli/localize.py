@@ -193,7 +193,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.core.flight.fixes import FlightDigest, Identity
     from orthonav.ground.atlas.catalog import Atlas
     from orthonav.ground.atlas.locate import AtlasLocator
-    from orthonav.ground.atlas.search import SheetRegistrar, TileSearch
+    from orthonav.ground.atlas.search import SheetSearch
     from orthonav.ground.recordings.export import export_all, export_of
 
     of_maps = (
@@ -212,17 +212,9 @@ def _on_atlas(options: argparse.Namespace) -> None:
     flight = open_source(options.flight, options)
     say_assumed_heights(flight, advice="cut a map with terrain out of the atlas")
     digest = FlightDigest()
-    search = TileSearch(Atlas.open(options.map))
+    search = SheetSearch(Atlas.open(options.map))
+    locator = AtlasLocator(search, heading_known=options.heading == "known")
     with progress(options) as shown:
-        if search.unknown:
-            log.warning(
-                "%d sheets are missing from the index and are not searched; update it with "
-                "'orthonav atlas index'",
-                len(search.unknown),
-            )
-        locator = AtlasLocator(
-            SheetRegistrar(search.atlas), search, heading_known=options.heading == "known"
-        )
         views = digest.watching(flight.views)
         results = located(options, locator, flight, views, shown, accept)
     _write_positions(options, results, Identity(flight_sha256=digest.sha256))

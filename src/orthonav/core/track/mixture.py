@@ -95,9 +95,15 @@ class Estimate:
 class Mixture:
     """The belief about one flight. Mutable; not to be shared between threads."""
 
-    def __init__(self, model: Model, extent_en_m: tuple[float, float, float, float]) -> None:
-        """`extent_en_m`: west, south, east, north of the map, on which the aircraft is."""
-        self.model = model
+    def __init__(
+        self,
+        model: Model,
+        extent_en_m: tuple[float, float, float, float],
+        area_m2: float = 0.0,
+    ) -> None:
+        """`extent_en_m`: west, south, east, north of the map. `area_m2`: where the aircraft may be,
+        if that is more than the map."""
+        self.model, self._least_m2 = model, area_m2
         self._set_extent(extent_en_m)
         self.hypotheses: list[Hypothesis] = []  # the likeliest first, unless split
         self._is_split = False  # by a prediction, and not merged since
@@ -110,7 +116,8 @@ class Mixture:
 
     def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
         self._extent = np.array(extent_en_m)
-        self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
+        self.map_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
+        self.area_m2 = max(self.map_m2, self._least_m2)
 
     def move(
         self, plane: LocalFrame, other: LocalFrame, extent_en_m: tuple[float, float, float, float]

@@ -99,9 +99,10 @@ class Tracker:
         every_prior: bool = False,
         smooth: bool = False,
         lag: int | None = None,
+        area_m2: float = 0.0,
     ) -> None:
         """`localizer`: or an opened map. `model`: None: the usual one, with a mount as good as the
-        height asks for.
+        height asks for. `area_m2`: where the aircraft may be, if that is more than the map.
 
         With `use_prior` the track starts at the first view's prior; with `every_prior` all priors
         are position measurements, such as GNSS. `smooth` records the history for `smoothed_track`;
@@ -114,7 +115,7 @@ class Tracker:
         self.model, self._usual_model = model or Model(), model is None
         self._usual_scale = self._usual_model
         self._usual_horizon_rad = self.model.horizon_rad
-        self.mixture = Mixture(self.model, self._use(localizer))
+        self.mixture = Mixture(self.model, self._use(localizer), area_m2)
         self._time_ns: int | None = None
         self._predicted_ns: int | None = None  # a view predicted, but without an outcome so far
         self._before: OdometryView | None = None
@@ -466,7 +467,7 @@ class Tracker:
         newness = max(1 - overlap, LEAST_NEW)
         found = found_by(search)
         if isinstance(found, Found):
-            share = min(searched.area_m2 / self.mixture.area_m2, 1.0)
+            share = min(searched.area_m2, self.mixture.map_m2) / self.mixture.area_m2
             self._seen = list(sightings(*found, known, bias[1], share))
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,

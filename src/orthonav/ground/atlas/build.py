@@ -12,21 +12,19 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.core.errors import AreaError, AtlasError, WorkerError
 from orthonav.core.files import Progress, no_progress, with_paths
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.ground.atlas.catalog import CATALOG, Atlas, AtlasRecipe, CoarseRecipe, Sheet
-from orthonav.ground.atlas.cluster import Failure, TaskRunner
+from orthonav.ground.atlas.cluster import TaskRunner
 from orthonav.ground.atlas.coarse import coarse_grid, write_coarse
 from orthonav.ground.atlas.cut import box_around, box_deg, turned
 from orthonav.ground.atlas.store import Store
@@ -42,9 +40,6 @@ from orthonav.ground.planning.sheets import sheets_of_route
 log = logging.getLogger(__name__)
 
 GIVE_UP_AFTER = 8  # sheets in a row that could not be stored: the disk is full or gone
-MARGIN_PX = 64  # pixels beyond a tile that gradients and resampling use, and some more
-TOUCH_DEG = 1e-9  # boxes that overlap by less than this only touch: a tenth of a millimetre
-_POINTS = 17  # points along a side of a sheet at which it is compared with a search band
 
 
 @dataclass(frozen=True)
@@ -149,23 +144,28 @@ def request_digest(
 
 
 def margin_m(recipe: AtlasRecipe) -> float:
-    reach_m = (recipe.tile_px + MARGIN_PX) * recipe.gsd_m
-    if recipe.coarse is None:
-        return reach_m
-    return max(reach_m, (recipe.coarse.tile_px + MARGIN_PX) * recipe.coarse.gsd_m)
+    """A tile, and 64 pixels beyond it for gradients and resampling."""
+    coarse = recipe.coarse or recipe
+    return max((recipe.tile_px + 64) * recipe.gsd_m, (coarse.tile_px + 64) * coarse.gsd_m)
 
 
 class Imagery:
+    """Orthophotos by the boxes around them: of thousands, few show a sheet."""
+
     def __init__(self, mosaic: Mosaic) -> None:
         self.mosaic = mosaic
+        boxes = []
+        for source in mosaic.sources:
+            lat, lon = source.outline_latlon_deg.T
+            lon = lon - 360 * np.round((lon - lon[0]) / 360)
+            boxes.append([lon.min(), lat.min(), lon.max(), lat.max()])
+        self._boxes = np.array(boxes, np.float64)
 
     def under(self, bounds_deg: Extent, reach_m: float) -> Mosaic:
         west, south, east, north = box_around(Area.from_bounds(bounds_deg), reach_m)
-        boxes = self._boxes
-        middle = (west + east) / 2
-        shift = 360 * np.round((middle - (boxes[:, 0] + boxes[:, 2]) / 2) / 360)
-        near = (boxes[:, 0] + shift < east) & (boxes[:, 2] + shift > west)
-        near &= (boxes[:, 1] < north) & (boxes[:, 3] > south)
+        left, bottom, right, top = self._boxes.T
+        shift = 360 * np.round(((west + east) / 2 - (left + right) / 2) / 360)
+        near = (left + shift < east) & (right + shift > west) & (bottom < north) & (top > south)
         chosen = np.flatnonzero(near).tolist()
         sources = tuple(self.mosaic.sources[index] for index in chosen)
         return Mosaic(sources, tuple(self.mosaic.stretches[index] for index in chosen))
@@ -176,16 +176,6 @@ class Imagery:
             around = turned(west) if east - west < 360 else -180.0
             found.update(recipe.sheets.over((around, south, around + east - west, north)))
         return found
-
-    @cached_property
-    def _boxes(self) -> NDArray[np.float64]:
-        outlines = [source.outline_latlon_deg for source in self.mosaic.sources]
-        boxes = []
-        for outline in outlines:
-            lat, lon = outline[:, 0], outline[:, 1]
-            lon = lon - 360 * np.round((lon - lon[0]) / 360)
-            boxes.append([lon.min(), lat.min(), lon.max(), lat.max()])
-        return np.array(boxes, np.float64)
 
 
 def _names(recipe: AtlasRecipe, imagery: Imagery, request: AtlasRequest) -> set[str]:
@@ -209,11 +199,9 @@ def _along(
         area = Area.from_route(part, band_m)
         for name in there.intersection(world.over(box_deg(area, 0.0))):
             west, south, east, north = world.bounds_deg(name)
-            lon, lat = np.meshgrid(
-                np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS)
-            )
+            lon, lat = np.meshgrid(np.linspace(west, east, 17), np.linspace(south, north, 17))
             points = area.frame.en_from_latlon(lat.ravel(), lon.ravel())
-            if area.contains(points, world.side_m / (_POINTS - 1) * math.sqrt(0.5)).any():
+            if area.contains(points, world.side_m / 16 * math.sqrt(0.5)).any():
                 yield name
 
 
@@ -221,7 +209,8 @@ def _overlap(bounds_deg: Extent, other: Extent) -> bool:
     west, south, east, north = bounds_deg
     shift = 360 * round(((other[0] + other[2]) / 2 - (west + east) / 2) / 360)
     across = min(east + shift, other[2]) - max(west + shift, other[0])
-    return across > TOUCH_DEG and min(north, other[3]) - max(south, other[1]) > TOUCH_DEG
+    along = min(north, other[3]) - max(south, other[1])
+    return min(across, along) > 1e-9  # boxes that overlap by less only touch
 
 
 def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: float) -> None:
@@ -263,50 +252,36 @@ def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None
     )
 
 
-Status = Literal["built", "unchanged", "empty", "failed"]
-
-
-@dataclass(frozen=True)
-class SheetResult:
-    """`unchanged`: the sheet was there already; `empty`: there is no imagery."""
-
-    sheet: Sheet
-    status: Status
-    error: str = ""  # why it failed
-
-
 @dataclass
 class BuildReport:
-    """The results of a build of `total` sheets; grows while sheets are finished."""
+    """The results of a build of `total` sheets, by name; grows while sheets are finished.
+
+    `unchanged`: sheets that were there already; `empty`: those without imagery; `failed`: why."""
 
     url: str  # the atlas
     total: int  # sheets asked for
-    results: list[SheetResult] = field(default_factory=list)  # sheets that are finished or failed
+    built: dict[str, Sheet] = field(default_factory=dict)
+    unchanged: list[str] = field(default_factory=list)
+    empty: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
     wall_s: float = 0.0
-
-    def names(self, status: Status) -> list[str]:
-        return sorted(each.sheet.id for each in self.results if each.status == status)
 
     @property
     def untried(self) -> int:
-        return self.total - len(self.results)
+        return self.total - sum(map(len, (self.built, self.unchanged, self.empty, self.failed)))
 
     @property
     def is_complete(self) -> bool:
-        return not self.names("failed") and not self.untried
+        return not self.failed and not self.untried
 
     def to_plain(self) -> dict[str, Any]:
-        built = [each.sheet for each in self.results if each.status == "built"]
+        built = self.built.values()
         return {
             "atlas": self.url,
             "built": len(built),
-            "unchanged": len(self.names("unchanged")),
-            "empty": len(self.names("empty")),
-            "failed": [
-                {"sheet": each.sheet.id, "error": each.error}
-                for each in sorted(self.results, key=lambda each: each.sheet.id)
-                if each.status == "failed"
-            ],
+            "unchanged": len(self.unchanged),
+            "empty": len(self.empty),
+            "failed": [{"sheet": name, "error": why} for name, why in sorted(self.failed.items())],
             "untried": self.untried,
             "area_km2": round(sum(each.area_km2 for each in built), 4),
             "tiles": sum(each.tiles for each in built),
@@ -343,13 +318,13 @@ def build_atlas(
     for task in tasks:
         same = known.get(task.sheet.id)
         if same is not None and same.request == task.sheet.request:
-            result.results.append(SheetResult(same, "unchanged"))
+            result.unchanged.append(same.id)
         else:
             missing.append(task)
     log.info("%d of %d sheets to build", len(missing), len(tasks))
     _build_sheets(missing, runner, result, progress)
     atlas.snapshot()
-    if request.index and recipe.coarse is not None and not result.names("failed"):
+    if request.index and recipe.coarse is not None and not result.failed:
         from orthonav.ground.atlas.index import make_index  # with FAISS
 
         make_index(atlas, progress=progress)
@@ -377,7 +352,8 @@ def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, 
     return fields
 
 
-def build_sheet(task: SheetTask) -> SheetResult:
+def build_sheet(task: SheetTask) -> Sheet | None:
+    """A sheet, put into the atlas; None where there is no imagery."""
     wanted = task.sheet
     if differences := version_differences(wanted.made_by, versions()):
         raise WorkerError(
@@ -390,39 +366,36 @@ def build_sheet(task: SheetTask) -> SheetResult:
     if request_digest(task.recipe, mosaic, wanted.made_by, task.request) != wanted.request:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with tempfile.TemporaryDirectory(prefix="orthonav-sheet-") as folder:
-        built = _built(task, mosaic, Path(folder))
-    return SheetResult(wanted, "empty") if built is None else SheetResult(built, "built")
+        return _built(task, mosaic, Path(folder))
 
 
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
-    recipe = asdict(task.recipe)
-    del recipe["sheet_km"], recipe["coarse"]
-    name, bounds_deg = task.sheet.id, task.sheet.bounds_deg
-    files = {"map": folder / f"{name}.onav"}
+    sheet, made, common = task.sheet, task.request, asdict(task.recipe)
+    del common["sheet_km"], common["coarse"]
+    files = {"map": folder / f"{sheet.id}.onav"}
     request = BuildRequest(
-        orthos=task.request.orthos,
+        orthos=made.orthos,
         out=files["map"],
-        bounds_deg=bounds_deg,
+        bounds_deg=sheet.bounds_deg,
         workers=1,
-        dem=task.request.dem,
-        surface=task.request.surface,
-        true_ortho=task.request.true_ortho,
-        dem_datum=task.request.dem_datum,
+        dem=made.dem,
+        surface=made.surface,
+        true_ortho=made.true_ortho,
+        dem_datum=made.dem_datum,
         dem_needed=False,
-        relief=task.request.relief,
-        cells=True,
-        **recipe,
+        relief=made.relief,
+        **common,
     )
     try:
         info = build_map(request).manifest.sheets[0]
     except AreaError as error:  # the recipe was tried when the task was made: no imagery
-        log.info("%s is empty: %s", name, error)
+        log.info("%s is empty: %s", sheet.id, error)
         return None
     if task.recipe.coarse is not None:
-        files["coarse"] = folder / f"{name}.safetensors"
-        write_coarse(mosaic, bounds_deg, task.recipe.coarse, files["coarse"])
-    described = replace(task.sheet, tiles=info.tiles, area_km2=info.area_km2)
-    return Atlas.open(task.request.url).put(files, described)
+        files["coarse"] = folder / f"{sheet.id}.safetensors"
+        write_coarse(mosaic, sheet.bounds_deg, task.recipe.coarse, files["coarse"])
+    described = replace(sheet, tiles=info.tiles, area_km2=info.area_km2)
+    return Atlas.open(made.url).put(files, described)
 
 
 def _build_sheets(
@@ -431,17 +404,20 @@ def _build_sheets(
     not_stored = 0
     with closing(runner.run(build_sheet, tasks)) as finished:
         for task, made in finished:
-            if isinstance(made, Failure):
-                if made.kind == WorkerError.__name__:
-                    raise WorkerError(made.text)
-                log.info("sheet %s failed: %s: %s", task.sheet.id, made.kind, made.text)
-                log.debug("%s", made.trace)
-                not_stored = not_stored + 1 if made.kind in ("StorageError", "OutputError") else 0
-                made = SheetResult(task.sheet, "failed", f"{made.kind}: {made.text}")
+            name, full = task.sheet.id, False
+            if isinstance(made, Sheet):
+                result.built[name] = made
+            elif made is None:
+                result.empty.append(name)
+            elif made.kind == WorkerError.__name__:
+                raise WorkerError(made.text)
             else:
-                not_stored = 0
-            result.results.append(made)
-            progress("sheets", len(result.results) / result.total)
+                log.info("sheet %s failed: %s: %s", name, made.kind, made.text)
+                log.debug("%s", made.trace)
+                full = made.kind in ("StorageError", "OutputError")
+                result.failed[name] = f"{made.kind}: {made.text}"
+            progress("sheets", 1 - result.untried / result.total)
+            not_stored = not_stored + 1 if full else 0
             if not_stored >= GIVE_UP_AFTER:
                 log.error("%d sheets in a row could not be stored: the build ends", not_stored)
                 return

@@ -8,15 +8,14 @@ An item is a STAC item (https://stacspec.org) in canonical JSON: the same sheet 
 bytes. It is accepted only if writing the sheet read from it gives the same bytes again, so that an
 untrusted item can hold nothing that this program would not write."""
 
-import hashlib
 import json
 import re
-from calendar import monthrange
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from datetime import date
 from pathlib import Path
 from typing import Any, cast
+
+import numpy as np
 
 from orthonav.core.errors import AtlasError, described
 from orthonav.core.files import Progress, no_progress
@@ -24,26 +23,15 @@ from orthonav.ground.atlas.store import Store, digest_of
 from orthonav.ground.planning.area import Extent
 from orthonav.ground.planning.sheets import WorldSheets
 
-SCHEMA = 1
-FORMAT = "orthonav-atlas"
-ITEMS, SNAPSHOT = "items", "items.geojson"
-_READ_AT_ONCE = 1000  # one page of a listing of S3
-STAC_VERSION = "1.0.0"
-COLLECTION = "orthonav-atlas"
+SCHEMA = 2
+FORMAT = "orthonav-atlas"  # and the id of its collection
+CATALOG, ITEMS, SNAPSHOT = "atlas.json", "items", "items.geojson"
 MAX_ITEM_BYTES = 2**20  # a guard for memory: 2 kB, 60 bytes more for each further orthophoto
-MAX_REVISION = 9999  # what four digits of a file name hold
 FILES = {  # folder, suffix and media type of the files that a sheet may have
     "map": ("sheets", ".onav", "application/octet-stream"),
     "coarse": ("coarse", ".safetensors", "application/octet-stream"),
 }
-_FILE_EXTENSION = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
-_SHA256_MULTIHASH = "1220"
-_SHEET = re.compile(r"r[0-9]{6}c[0-9]{6}")
-_ITEM_NAME = re.compile(r"r[0-9]{6}c[0-9]{6}\.[0-9]{4}\.[0-9a-f]{12}\.json")
-_FILE_NAME = re.compile(r"([a-z]+)/(r[0-9]{6}c[0-9]{6})\.[0-9a-f]{12}\.[a-z]+")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
-_ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False)
-_DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){0,2}")
+_SHEET = "r[0-9]{6}c[0-9]{6}"
 
 
 @dataclass(frozen=True)
@@ -55,15 +43,15 @@ class StoredFile:
     def __post_init__(self) -> None:
         if not (isinstance(self.size_bytes, int) and self.size_bytes >= 0):
             raise AtlasError(f"size of a file is {self.size_bytes!r:.40}")
-        if not (isinstance(self.sha256, str) and _SHA256.fullmatch(self.sha256)):
+        if not (isinstance(self.sha256, str) and re.fullmatch("[0-9a-f]{64}", self.sha256)):
             raise AtlasError(f"sha256 of a file is {self.sha256!r:.80}")
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A sheet of an atlas. All but `revision` and `files` is independent of place and time of
-    building, so that the same sheet is the same bytes everywhere. `imagery`: its orthophotos, as
-    the manifest of a map describes them."""
+    """A sheet of an atlas. Nothing depends on place and time of building, so that the same sheet is
+    the same bytes everywhere. `imagery`: its orthophotos, as the manifest of a map describes them.
+    """
 
     id: str  # name in the lattice, as r001526c001392
     bounds_deg: Extent  # its box in the lattice: west, south, east, north
@@ -74,12 +62,7 @@ class Sheet:
     imagery: tuple[Mapping[str, Any], ...]
     request: str  # digest of all that it was made from and how
     made_by: Mapping[str, str]  # programs and versions that made it
-    revision: int = 0  # from 1; 0 for a sheet that is not in an atlas yet
     files: Mapping[str, StoredFile] = field(default_factory=dict)
-
-    def stored(self, revision: int, files: Mapping[str, StoredFile]) -> "Sheet":
-        data = canonical(replace(self, revision=revision, files=files).to_item())
-        return self.from_item(json.loads(data), data)
 
     @property
     def size_bytes(self) -> int:
@@ -87,18 +70,17 @@ class Sheet:
 
     @property
     def item_name(self) -> str:
-        digest = hashlib.sha256(canonical(self.to_item())).hexdigest()
-        return f"{self.id}.{self.revision:04d}.{digest[:12]}.json"
+        return f"{ITEMS}/{self.id}.json"
 
     def to_item(self) -> dict[str, Any]:
         west, south, east, north = map(float, self.bounds_deg)
         ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
         return {
             "type": "Feature",
-            "stac_version": STAC_VERSION,
-            "stac_extensions": [_FILE_EXTENSION],
+            "stac_version": "1.0.0",
+            "stac_extensions": ["https://stac-extensions.github.io/file/v2.1.0/schema.json"],
             "id": self.id,
-            "collection": COLLECTION,
+            "collection": FORMAT,
             "geometry": {"type": "Polygon", "coordinates": [ring]},
             "bbox": [west, south, east, north],
             "properties": {
@@ -106,7 +88,6 @@ class Sheet:
                 "gsd": float(self.gsd_m),
                 "orthonav:sheet": {
                     "schema": SCHEMA,
-                    "revision": self.revision,
                     "tiles": self.tiles,
                     "area_km2": float(self.area_km2),
                     "dates": list(self.dates),
@@ -125,16 +106,17 @@ class Sheet:
                     "type": FILES[key][2],
                     "roles": ["data"],
                     "file:size": file.size_bytes,
-                    "file:checksum": _SHA256_MULTIHASH + file.sha256,
+                    "file:checksum": f"1220{file.sha256}",  # a multihash
                 }
                 for key, file in self.files.items()
             },
         }
 
     @classmethod
-    def from_item(cls, plain: Any, data: bytes) -> "Sheet":
-        """Inverse of `to_item`; `data` are the bytes that `plain` was parsed from. Writing
-        the sheet must give them, which also refuses values of another type."""
+    def from_item(cls, data: bytes) -> "Sheet":
+        """Inverse of `to_item` and `canonical`. Writing the sheet must give `data`, which also
+        refuses values of another type."""
+        plain = parsed(data)
         try:
             properties = plain["properties"]
             own = properties["orthonav:sheet"]
@@ -149,24 +131,22 @@ class Sheet:
                 imagery=tuple(own["imagery"]),
                 request=str(own["request"]),
                 made_by={key: str(value) for key, value in own["made_by"].items()},
-                revision=int(own["revision"]),
                 files=_files(plain["assets"], plain["id"]),
             )
-            possible = (
-                _SHEET.fullmatch(sheet.id)
-                and -180 <= west < east <= 180
-                and -90 <= south < north <= 90
-                and 1 <= sheet.revision <= MAX_REVISION
-                and sheet.gsd_m > 0
-                and sheet.tiles >= 1
-                and sheet.area_km2 >= 0
-            )
-            if not possible or canonical(sheet.to_item()) != data:
-                raise AtlasError(f"damaged, altered or not an item of orthonav: {sheet.id:.40}")
         except AtlasError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise AtlasError(f"damaged, or not an item of orthonav ({reason(error)})") from error
+        possible = (
+            re.fullmatch(_SHEET, sheet.id)
+            and -180 <= west < east <= 180
+            and -90 <= south < north <= 90
+            and sheet.gsd_m > 0
+            and sheet.tiles >= 1
+            and sheet.area_km2 >= 0
+        )
+        if not possible or canonical(sheet.to_item()) != data:
+            raise AtlasError(f"damaged, altered or not an item of orthonav: {sheet.id:.40}")
         return sheet
 
 
@@ -178,39 +158,41 @@ def reason(error: Exception) -> str:
 
 def canonical(plain: Any) -> bytes:
     try:
-        return _ENCODER.encode(plain).encode()
+        return json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise AtlasError(f"cannot be written into the catalogue of an atlas: {error}") from error
 
 
-def parsed(data: bytes, what: str) -> Any:
+def parsed(data: bytes) -> Any:
     """Plain values of JSON. The caller must compare the bytes with the canonical ones, which also
     excludes repeated keys and numbers that are not finite."""
     try:
         return json.loads(data.decode())
     except (ValueError, RecursionError) as error:
-        raise AtlasError(f"damaged, not JSON ({error}): {what}") from error
+        raise AtlasError(f"damaged, not JSON ({error})") from error
 
 
 def read_item(name: str, data: bytes) -> Sheet:
-    plain = parsed(data, f"{ITEMS}/{name}")
+    """The sheet of an item, a file `items/SHEET.json`."""
     try:
-        sheet = Sheet.from_item(plain, data)
+        sheet = Sheet.from_item(data)
     except AtlasError as error:
-        raise AtlasError(f"{error}: {ITEMS}/{name}") from error
+        raise AtlasError(f"{error}: {name}") from error
     if sheet.item_name != name:
-        raise AtlasError(f"damaged or altered: {ITEMS}/{name}")
+        raise AtlasError(f"damaged or altered: {name}")
     return sheet
 
 
-def file_name(key: str, sheet_id: str, sha256: str) -> str:
-    folder, suffix, _ = FILES[key]
-    return f"{folder}/{sheet_id}.{sha256[:12]}{suffix}"
-
-
 def sheet_of_file(name: str) -> str | None:
-    match = _FILE_NAME.fullmatch(name)
-    return match[2] if match and any(match[1] == each[0] for each in FILES.values()) else None
+    """The sheet to which a map or coarse tiles belong by their name; None for other files."""
+    folders = "|".join(folder for folder, _, _ in FILES.values())
+    match = re.fullmatch(rf"(?:{folders})/({_SHEET})\.[0-9a-f]{{12}}\.[a-z]+", name)
+    return match[1] if match else None
+
+
+def _file(key: str, sheet_id: str, size_bytes: int, sha256: str) -> StoredFile:
+    folder, suffix, _ = FILES[key]
+    return StoredFile(f"{folder}/{sheet_id}.{sha256[:12]}{suffix}", size_bytes, sha256)
 
 
 def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
@@ -218,9 +200,8 @@ def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
     for key, entry in sorted(assets.items()):
         if key not in FILES:
             raise AtlasError(f"an item names an impossible file: {key:.40} {entry!r:.200}")
-        sha256 = entry["file:checksum"].removeprefix(_SHA256_MULTIHASH)
-        name = file_name(key, sheet_id, sha256)
-        found[key] = StoredFile(name, int(entry["file:size"]), sha256)
+        sha256 = entry["file:checksum"].removeprefix("1220")
+        found[key] = _file(key, sheet_id, int(entry["file:size"]), sha256)
     if "map" not in found:
         raise AtlasError("an item names no map")
     return found
@@ -229,10 +210,10 @@ def _files(assets: Any, sheet_id: str) -> dict[str, StoredFile]:
 def _times(dates: tuple[str, ...]) -> dict[str, Any]:
     """`datetime` and related properties, one of which STAC requires. A single day is a date; a
     year, a month or several dates are a range; unknown dates are the epoch, marked as unknown."""
-    spans = [span for span in map(_span, dates) if span is not None]
+    spans = [span for text in dates for span in _span(text)]
     if not spans:
         return {"datetime": "1970-01-01T00:00:00Z", "orthonav:date_known": False}
-    first, last = min(start for start, _ in spans), max(end for _, end in spans)
+    first, last = min(spans), max(spans)
     if first == last:
         return {"datetime": f"{first}T00:00:00Z"}
     return {
@@ -242,45 +223,37 @@ def _times(dates: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def _span(text: str) -> tuple[date, date] | None:
-    if not _DATE.fullmatch(text):
-        return None
+def _span(text: str) -> list[np.datetime64]:
+    """First and last day of a year, month or day; empty for other texts."""
+    if not re.fullmatch(r"[0-9]{4}(-[0-9]{2}){0,2}", text):
+        return []
     try:
-        first = date.fromisoformat(f"{text}-01-01"[:10])
+        first = np.datetime64(text)
     except ValueError:
-        return None
-    if len(text) == len("YYYY-MM"):
-        return first, first.replace(day=monthrange(first.year, first.month)[1])
-    return first, date.fromisoformat(f"{text}-12-31"[:10])
+        return []
+    return [first.astype("M8[D]"), (first + 1).astype("M8[D]") - 1]
 
 
-def read_items(store: Store, prefix: str = "") -> tuple[dict[str, Sheet], dict[str, str]]:
-    """Items by file name, and the errors of damaged items by file name. Where a sheet has several
-    items, the last in the order of names is current."""
-    names = {n: s for n, s in store.names(ITEMS, prefix).items() if _ITEM_NAME.fullmatch(n)}
+def read_items(store: Store) -> tuple[dict[str, Sheet], dict[str, str]]:
+    """Sheets by name, and the errors of damaged items by the name of their sheet."""
     found: dict[str, Sheet] = {}
-    broken = {
-        name: f"{size} bytes, at most {MAX_ITEM_BYTES} are allowed: {ITEMS}/{name}"
-        for name, size in names.items()
-        if size > MAX_ITEM_BYTES
-    }
-    wanted = [f"{ITEMS}/{name}" for name in names if name not in broken]
-    for start in range(0, len(wanted), _READ_AT_ONCE):
-        for path, data in store.read_many(wanted[start : start + _READ_AT_ONCE]).items():
-            name = path.partition("/")[2]
+    broken: dict[str, str] = {}
+    wanted = {}
+    for file, size in store.names(ITEMS).items():
+        sheet_id = file.removesuffix(".json")
+        if not re.fullmatch(rf"{_SHEET}\.json", file):
+            continue
+        wanted[f"{ITEMS}/{file}"] = sheet_id
+        if size > MAX_ITEM_BYTES:
+            broken[sheet_id] = f"{size} bytes, at most {MAX_ITEM_BYTES} are allowed: {ITEMS}/{file}"
+    names = [name for name, sheet_id in wanted.items() if sheet_id not in broken]
+    for start in range(0, len(names), 1000):  # a page of a listing of S3
+        for name, data in store.read_many(names[start : start + 1000]).items():
             try:
-                found[name] = read_item(name, data)
+                found[wanted[name]] = read_item(name, data)
             except AtlasError as error:
-                broken[name] = str(error)
+                broken[wanted[name]] = str(error)
     return found, broken
-
-
-def snapshot_of(sheets: Iterable[Sheet]) -> bytes:
-    items = [sheet.to_item() for sheet in sheets]
-    for item in items:
-        for link in (*item["links"], *item["assets"].values()):
-            link["href"] = f"./{link['href'].removeprefix('../')}"
-    return canonical({"type": "FeatureCollection", "features": items})
 
 
 def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
@@ -319,16 +292,13 @@ class CoarseRecipe:
 
 @dataclass(frozen=True)
 class AtlasRecipe:
-    """How every sheet is made; fields and defaults not listed here are those of `BuildRequest`.
-    `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior."""
+    """How every sheet is made; fields are those of `BuildRequest`, whose defaults hold for all
+    others. `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior.
+    """
 
     gsd_m: float  # metres per pixel
     tile_px: int = 256
     overlap: float = 0.875
-    method: str = "gradient"
-    edges: str | None = None
-    seed: int = 0
-    registration: bool = True
     calibration_views: int = 24
     sheet_km: float = 10.0  # greatest width of a sheet
     coarse: CoarseRecipe | None = CoarseRecipe()
@@ -336,10 +306,6 @@ class AtlasRecipe:
     def __post_init__(self) -> None:
         _require_possible(self)
         WorldSheets(self.sheet_km * 1000)  # refuses impossible widths
-        if self.method.partition(":")[0] != "gradient" or not self.registration:
-            raise AtlasError(
-                "maps are cut from sheets of the method gradient with registration layers only"
-            )
 
     @property
     def sheets(self) -> WorldSheets:
@@ -356,9 +322,6 @@ class AtlasRecipe:
             return cls(**values, coarse=None if coarse is None else CoarseRecipe(**coarse))
         except (KeyError, TypeError, ValueError) as error:
             raise AtlasError(f"recipe of the atlas cannot be read ({reason(error)})") from error
-
-
-CATALOG = "atlas.json"
 
 
 class Atlas:
@@ -396,10 +359,9 @@ class Atlas:
                     f"{len(broken)} items of the atlas cannot be used, the first: {first}; see "
                     f"'orthonav atlas check', remove with 'orthonav atlas retire': {self.store}"
                 )
-            # The highest revision comes last.
-            self._sheets = {found[name].id: found[name] for name in sorted(found)}
-            for sheet in self._sheets.values():
+            for sheet in found.values():
                 self.require_place(sheet)
+            self._sheets = found
         return dict(self._sheets)
 
     def over(self, bounds_deg: Extent) -> list[Sheet]:
@@ -416,44 +378,42 @@ class Atlas:
         return min(west), min(south), max(east), max(north)
 
     def put(self, files: Mapping[str, Path], described: Sheet) -> Sheet:
-        """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`. Nothing is
-        written where the same files of the same request are there already. After a kill the sheet
-        is as before or as described."""
-        sheet_id = described.id
-        stored = {}
+        """Put a sheet in, or replace it; `files` by kind: `map`, `coarse`. Nothing is written where
+        the same sheet is there already. After a kill it is as before or as described."""
+        sheet_id, stored = described.id, {}
         for key, path in sorted(files.items()):
-            sha256 = digest_of(path)
-            stored[key] = StoredFile(file_name(key, sheet_id, sha256), path.stat().st_size, sha256)
-        there = self._revisions(sheet_id)
-        before = there[max(there)] if there else None
-        if before and before.request == described.request and before.files == stored:
-            sheet = before
-        else:
-            revisions = [int(name.split(".")[1]) for name in there]
-            sheet = described.stored(1 + max(revisions, default=0), stored)
+            stored[key] = _file(key, sheet_id, path.stat().st_size, digest_of(path))
+        data = canonical(replace(described, files=stored).to_item())
+        sheet = Sheet.from_item(data)
         self.require_place(sheet)
-        for key, file in sheet.files.items():
-            if sheet is not before or self.store.size(file.name) != file.size_bytes:
+        before = self._item(sheet_id)
+        for key, file in stored.items():
+            if sheet != before or self.store.size(file.name) != file.size_bytes:
                 self.store.write(file.name, files[key])
-        if sheet is not before:
-            self.store.write(f"{ITEMS}/{sheet.item_name}", canonical(sheet.to_item()))
-            there = {sheet.item_name: sheet, **self._revisions(sheet_id)}
-        current = max(there)  # perhaps of another process that has put this sheet meanwhile
-        self._remove_items(sheet_id, {name: there[name] for name in there if name != current})
-        return there[current] or sheet
+        if sheet != before:
+            self.store.write(sheet.item_name, data)
+            self._remove_files(before)
+        return sheet
 
     def retire(self, sheet_id: str) -> None:
-        there = self._revisions(sheet_id)
-        if not there:
+        name = f"{ITEMS}/{sheet_id:.40}.json"
+        if not re.fullmatch(_SHEET, sheet_id) or self.store.size(name) is None:
             raise AtlasError(f"the atlas has no sheet {sheet_id!r:.40}: {self.store}")
-        self._remove_items(sheet_id, there)
+        before = self._item(sheet_id)
+        self.store.remove(name)
+        self._remove_files(before)
 
     def path(self, sheet: Sheet, kind: str = "map") -> Path:
         found = sheet.files[kind]
         return self.store.fetch(found.name, found.size_bytes, found.sha256)
 
     def snapshot(self) -> None:
-        self.store.write(SNAPSHOT, snapshot_of(self.sheets(refresh=True).values()))
+        """Write all items into one file."""
+        items = [sheet.to_item() for sheet in self.sheets(refresh=True).values()]
+        for item in items:
+            for link in (*item["links"], *item["assets"].values()):
+                link["href"] = f"./{link['href'].removeprefix('../')}"
+        self.store.write(SNAPSHOT, canonical({"type": "FeatureCollection", "features": items}))
 
     def require_recipe(self, recipe: AtlasRecipe) -> "Atlas":
         mine, other = self.recipe.to_plain(), recipe.to_plain()
@@ -477,43 +437,45 @@ class Atlas:
                 f"{box}: {self.store}"
             )
 
-    def _revisions(self, sheet_id: str) -> dict[str, Sheet | None]:
-        found, broken = read_items(self.store, f"{sheet_id}.")
-        return {**found, **dict.fromkeys(broken)}
+    def _item(self, sheet_id: str) -> Sheet | None:
+        """None where there is none, or a damaged one."""
+        name = f"{ITEMS}/{sheet_id}.json"
+        if (self.store.size(name) or 0) > MAX_ITEM_BYTES:
+            return None
+        data = self.store.read_many([name]).get(name)
+        try:
+            return None if data is None else read_item(name, data)
+        except AtlasError:
+            return None
 
-    def _remove_items(self, sheet_id: str, items: Mapping[str, Sheet | None]) -> None:
-        for name in sorted(items):
-            self.store.remove(f"{ITEMS}/{name}")
-        if gone := _named_by(items):
-            for file in sorted(gone - _named_by(self._revisions(sheet_id))):
-                self.store.remove(file)
+    def _remove_files(self, before: Sheet | None) -> None:
+        """Remove the files of a sheet that was replaced or removed, unless its item names them."""
         self._sheets = None
+        if before is None:
+            return
+        there = self._item(before.id)  # perhaps of another process
+        left = {file.name for file in there.files.values()} if there else set()
+        for file in before.files.values():
+            if file.name not in left:
+                self.store.remove(file.name)
 
 
 def copy_sheets(
-    source: Atlas,
-    atlas: Atlas,
-    sheet_ids: Sequence[str] | None = None,
-    replace: bool = False,
-    progress: Progress = no_progress,
+    source: Atlas, atlas: Atlas, replace: bool = False, progress: Progress = no_progress
 ) -> tuple[list[str], list[str]]:
-    """Copy sheets of one atlas into another of the same recipe: names of copied sheets, and of
+    """Copy the sheets of one atlas into another of the same recipe: names of copied sheets, and of
     those that were there and left unchanged. With `replace` sheets that differ are replaced."""
     atlas.require_recipe(source.recipe)
     found, there = source.sheets(), atlas.sheets(refresh=True)
-    unknown = [each for each in sheet_ids or () if each not in found]
-    if unknown:
-        raise AtlasError(f"the atlas has no sheet {unknown[0]!r:.40}: {source.store}")
-    wanted = list(found) if sheet_ids is None else list(dict.fromkeys(sheet_ids))
     copied: list[str] = []
-    for number, sheet_id in enumerate(wanted):
-        progress("copy", number / len(wanted))
-        new, old = found[sheet_id], there.get(sheet_id)
-        if old is None or (replace and (old.request, old.files) != (new.request, new.files)):
+    for number, (sheet_id, new) in enumerate(found.items()):
+        progress("copy", number / len(found))
+        old = there.get(sheet_id)
+        if old is None or (replace and old != new):
             atlas.put({key: source.path(new, key) for key in new.files}, new)
             copied.append(sheet_id)
     atlas.snapshot()
-    return copied, [each for each in wanted if each not in copied]
+    return copied, [each for each in found if each not in copied]
 
 
 def _is_free(store: Store) -> bool:
@@ -523,16 +485,12 @@ def _is_free(store: Store) -> bool:
     return all(name.startswith(".") for name in names)
 
 
-def _named_by(items: Mapping[str, Sheet | None]) -> set[str]:
-    return {file.name for sheet in items.values() if sheet for file in sheet.files.values()}
-
-
 def _catalog(recipe: AtlasRecipe) -> bytes:
     return canonical(
         {
             "type": "Collection",
-            "stac_version": STAC_VERSION,
-            "id": COLLECTION,
+            "stac_version": "1.0.0",
+            "id": FORMAT,
             "title": "orthonav atlas",
             "description": "Maps for position fixes from a downward camera, a sheet per item. "
             "Licences and attributions are those of the imagery of each item.",
@@ -553,7 +511,10 @@ def _catalog(recipe: AtlasRecipe) -> bytes:
 def _read_catalog(store: Store) -> AtlasRecipe:
     where = f"{store}/{CATALOG}"
     data = store.read(CATALOG, MAX_ITEM_BYTES)
-    plain = parsed(data, where)
+    try:
+        plain = parsed(data)
+    except AtlasError as error:
+        raise AtlasError(f"{error}: {where}") from error
     own = plain.get("orthonav:atlas") if isinstance(plain, dict) else None
     if not isinstance(own, dict) or own.get("format") != FORMAT:
         raise AtlasError(f"not an atlas of orthonav: {where}")

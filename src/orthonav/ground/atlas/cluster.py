@@ -19,11 +19,6 @@ from orthonav.core.extras import needed
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
-RETRIES = 3  # how often an item is started again where its process or machine died
-WINDOW = 2  # items submitted at a time for each core: one running, one waiting
-POLL_S = 1.0  # how long is waited for results before free cores are counted again
-STOP_S = 15.0  # how long processes may take to clean up before they are killed
-OBJECTS_BYTES = 100 * 2**20  # shared memory of a local cluster; items and results are small
 ENVIRONMENT = {  # environment of the workers, as the command line sets it for itself
     "OPENBLAS_NUM_THREADS": "1",
     "OPENCV_LOG_LEVEL": "OFF",
@@ -71,21 +66,23 @@ class RayRunner:
         self, work: Callable[[Item], Made], items: Sequence[Item]
     ) -> Generator[tuple[Item, Made | Failure]]:
         """Each item with its result, when it is finished; closing the iterator stops the others, by
-        request, so that they remove temporary files. Items whose process died are tried again
-        `RETRIES` times."""
+        request, so that they remove temporary files. Items whose process died are tried again three
+        times."""
         ray = self._ray
         # Errors of an item are returned as values: Ray tries again only where a process died.
-        task = ray.remote(attempted).options(max_retries=RETRIES, num_cpus=1)
+        task = ray.remote(attempted).options(max_retries=3, num_cpus=1)
         waiting = iter(items)
         running: dict[Any, Item] = {}
         try:
             while True:
-                most = self.at_once * (WINDOW if self._workers is None else 1)
+                # With one running and one waiting on each core.
+                most = self.at_once * (2 if self._workers is None else 1)
                 for item in itertools.islice(waiting, max(0, most - len(running))):
                     running[task.remote(work, item)] = item
                 if not running:
                     return
-                done, _ = ray.wait(list(running), num_returns=1, timeout=POLL_S)
+                # A second later the free cores are counted again.
+                done, _ = ray.wait(list(running), num_returns=1, timeout=1.0)
                 for ref in done:
                     made: Made | Failure = self._made(ref)
                     yield running.pop(ref), made
@@ -93,7 +90,7 @@ class RayRunner:
             for ref in running:
                 ray.cancel(ref)
             if running:
-                ray.wait(list(running), num_returns=len(running), timeout=STOP_S)
+                ray.wait(list(running), num_returns=len(running), timeout=15.0)
 
     def _made(self, ref: Any) -> Any:
         try:
@@ -115,7 +112,7 @@ class RayRunner:
             options |= {
                 "num_cpus": self._workers or usable_cores(),
                 "include_dashboard": False,
-                "object_store_memory": OBJECTS_BYTES,
+                "object_store_memory": 100 * 2**20,  # items and results are small
             }
         at_sigterm = signal.getsignal(signal.SIGTERM)
         try:

@@ -1,9 +1,8 @@
 """Cutting a flight's map out of an atlas: the content of its sheets, resampled into one plane.
 
-The imagery is not needed: the grey picture comes from the registration layers of the sheets, tiles
-are embedded from the cell means of the sheets. The confidence of registered views is the usual one,
-with the scores of chance of the sheet where they are highest; tiles have none. The same atlas gives
-the same bytes for any number of threads.
+The imagery is not needed: the grey levels are those of the registration layers of the sheets. The
+confidence of registered views is the usual one, with the scores of chance of the sheet where they
+are highest; tiles have none. The same atlas gives the same bytes for any number of threads.
 
 Within a block of a kilometre two planes differ by a shift, a rotation of less than a degree and
 millimetres, so each sheet is resampled by one affine per block. A place is taken from the sheet
@@ -11,12 +10,11 @@ whose box holds it; where that sheet shows nothing, from neighbours that reach o
 
 import json
 import logging
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -24,68 +22,41 @@ from numpy.typing import NDArray
 
 from orthonav import __version__
 from orthonav.core.cores import usable_cores
-from orthonav.core.errors import (
-    AreaError,
-    AtlasError,
-    VariantError,
-)
+from orthonav.core.errors import AreaError, AtlasError, VariantError
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import relief_slope
-from orthonav.core.localize.confidence import (
-    CHANCES,
-    Chances,
-    RegisteredConfidence,
-)
+from orthonav.core.localize.confidence import CHANCES, Chances, RegisteredConfidence
 from orthonav.core.localize.ground import UNKNOWN_LEAN
 from orthonav.core.mapfile.layer import GreyLayer
 from orthonav.core.mapfile.manifest import Lean, Manifest, SheetInfo, TerrainInfo
-from orthonav.core.mapfile.reader import MapFile, open_map, write_map
+from orthonav.core.mapfile.reader import open_map, write_map
 from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, TerrainLayer
 from orthonav.core.tiles import embed, represent
-from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.represent import HARMONICS, OrientedGradients
 from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import variant_from_recipe
 from orthonav.ground.atlas.catalog import Atlas, Sheet
+from orthonav.ground.atlas.coarse import NoCrops
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
-from orthonav.ground.build.layer import (
-    GreyLayerWriter,
-    HeightLayers,
-    Parts,
-    StoredCells,
-    TerrainParts,
-    terrain_parts,
-)
+from orthonav.ground.build.layer import HeightLayers, TerrainParts, terrain_parts
 from orthonav.ground.build.sheet import (
     MIN_TILE_VALID_SHARE,
     Block,
-    Preview,
-    blocks_of_area,
+    SheetReader,
     grid_of,
-    in_order,
-    layer_parts,
-    one_opencv_thread,
     tiles_of,
 )
+from orthonav.ground.imagery.mosaic import Mosaic, Pixels
 from orthonav.ground.planning.area import Area, Extent, outline
 from orthonav.ground.planning.route import along_polyline_en_m
 from orthonav.ground.planning.sheets import in_box
 
 log = logging.getLogger(__name__)
 
-MAX_TILES = 20_000  # tiles of an area that are checked; more are checked at even spacing
-EDGE_POINTS = 33  # points along an edge of a box: edges are not straight in degrees
-NAMED = 8  # missing sheets named in a message, at most
+EDGE_POINTS = 33  # points along an edge of a box: edges are not straight in another plane
+REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace)"
 Array = NDArray[np.float64]
-KERNEL_PX = 3  # margin of cubic interpolation, 2 pixels, and one more for rounding
-SHEET_POINTS = 16  # points along an edge of a sheet, which is not straight in another plane
-FILL_PX = 5  # kernel of cubic interpolation: imagery is extended beyond its edge
-OWN_BONUS = 0.01  # decides ties between sheets for the one whose box holds the cell
-_SHIFT = 6  # fractional bits of polygon corners in OpenCV
-Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]
-Cells = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +64,6 @@ class SheetSource:
     sheet: Sheet
     manifest: Manifest
     layer: GreyLayer
-    cells: StoredCells
     terrain: TerrainLayer | None
     surface: TerrainLayer | None
 
@@ -108,10 +78,11 @@ class SheetSource:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
+    """The grey levels of one sheet in the plane and grid of another map."""
+
     source: SheetSource
     frame: LocalFrame
     grid: TileGrid
-    turns: bool  # whether cells are harmonics of a direction, which rotate with the plane
 
     def reaches(self, block: Block) -> bool:
         left, top, right, bottom = self._box_px
@@ -133,59 +104,44 @@ class Warp:
         solved[:, 2] -= solved[:, :2] @ corners[0]
         return np.asarray(solved)
 
-    def owned(self, block: Block, layout: CellLayout | None = None) -> NDArray[np.bool_]:
-        spacing, middle = (1, 0.5) if layout is None else (layout.spacing_px, layout.micro_px / 2)
-        shape = -(-block.height // spacing), -(-block.width // spacing)
-        # OpenCV's coordinates 0, 0 are the middle of pixel or cell 0, 0.
-        points = (self._outline_px - [block.col + middle, block.row + middle]) / spacing
-        points = np.rint(points * 2**_SHIFT).astype(np.int32)
-        mask = np.zeros(shape, dtype=np.uint8)
-        cv2.fillPoly(mask, [points], 1, lineType=cv2.LINE_8, shift=_SHIFT)
+    def owned(self, block: Block) -> NDArray[np.bool_]:
+        """Which pixels of a block lie in the box of the sheet."""
+        # OpenCV's coordinates 0, 0 are the middle of pixel 0, 0; 6 of their bits are fractional.
+        points = np.rint((self._outline_px - [block.col + 0.5, block.row + 0.5]) * 2**6)
+        mask = np.zeros((block.height, block.width), dtype=np.uint8)
+        cv2.fillPoly(mask, [points.astype(np.int32)], 1, lineType=cv2.LINE_8, shift=6)
         return mask.astype(np.bool_)
 
-    def grey(self, block: Block) -> Pixels:
-        affine = self.affine(block)
-        matrix = _by_middles(affine, block, 1, 0.5)
+    def grey(self, block: Block) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        matrix = self.affine(block)
+        first = np.array([block.col, block.row]) + 0.5
+        matrix[:, 2] += matrix[:, :2] @ first - 0.5  # between the middles of pixels
         size = block.width, block.height
-        top, left, height, width = _window(matrix, size)
-        grey, valid = self.source.layer.read(0, top, left, height, width)
-        shape = block.height, block.width
+        corners = _corners(Block(0, 0, block.height - 1, block.width - 1))
+        there = corners @ matrix[:, :2].T + matrix[:, 2]
+        # Cubic interpolation takes 2 pixels, and rounding one more.
+        left, top = (np.floor(there.min(axis=0)).astype(int) - 3).tolist()
+        right, bottom = (np.ceil(there.max(axis=0)).astype(int) + 3).tolist()
+        grey, valid = self.source.layer.read(0, top, left, bottom - top + 1, right - left + 1)
         if not valid.any():
-            return np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
+            return np.zeros(size[::-1], np.uint8), np.zeros(size[::-1], np.bool_)
         matrix[:, 2] -= [left, top]
         whole = bool(valid.all())
         if not whole:  # zeros beyond the imagery must not darken its edge
-            grown = cv2.dilate(grey, np.ones((FILL_PX, FILL_PX), np.uint8))
+            grown = cv2.dilate(grey, np.ones((5, 5), np.uint8))
             grey = np.where(valid, grey, grown).astype(np.uint8)
         flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
         made = cv2.warpAffine(grey, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         if whole:
-            return np.asarray(made, np.uint8), np.ones(shape, np.bool_)
+            return np.asarray(made, np.uint8), np.ones(size[::-1], np.bool_)
         mask = valid.astype(np.uint8) * 255
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         shown = cv2.warpAffine(mask, matrix, size, flags=flags) >= 254
         return np.where(shown, made, 0).astype(np.uint8), np.asarray(shown, np.bool_)
 
-    def cells(self, block: Block, layout: CellLayout) -> Cells:
-        spacing, middle = layout.spacing_px, layout.micro_px / 2
-        rows, cols = -(-block.height // spacing), -(-block.width // spacing)
-        matrix = _by_middles(self.affine(block), block, spacing, middle)
-        top, left, height, width = _window(matrix, (cols, rows))
-        means, share = self.source.cells.read(top, left, height, width)
-        matrix[:, 2] -= [left, top]
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        planes = [
-            cv2.warpAffine(np.ascontiguousarray(plane), matrix, (cols, rows), flags=flags)
-            for plane in (*np.moveaxis(means, 2, 0), share)
-        ]
-        made = np.stack(planes[:-1], axis=2).astype(np.float32)
-        if self.turns:
-            _turn(made, math.atan2(matrix[1, 0], matrix[0, 0]))
-        return made, np.asarray(planes[-1], np.float32)
-
     @cached_property
     def _outline_px(self) -> Array:
-        lon, lat = outline(self.source.sheet.bounds_deg, SHEET_POINTS).T
+        lon, lat = outline(self.source.sheet.bounds_deg, EDGE_POINTS).T
         return _px_from_latlon(self.frame, self.grid, lat, lon)
 
     @cached_property
@@ -208,56 +164,6 @@ def _latlon_from_px(frame: LocalFrame, grid: TileGrid, px: Array) -> tuple[Array
     return frame.latlon_from_en(places)
 
 
-def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
-    grey = np.zeros((block.height, block.width), dtype=np.uint8)
-    valid = np.zeros(grey.shape, dtype=np.bool_)
-    owners = [(warp, warp.owned(block)) for warp in warps]
-    for own in (True, False):
-        for warp, mask in owners:
-            wanted = ~valid & mask if own else ~(valid | mask)
-            part = _around(wanted)
-            if part is None:
-                continue
-            rows, cols = part
-            size = rows.stop - rows.start, cols.stop - cols.start
-            some, there = warp.grey(Block(block.row + rows.start, block.col + cols.start, *size))
-            taken = there & wanted[part]
-            np.copyto(grey[part], some, where=taken)
-            valid[part] |= taken
-    return grey, valid
-
-
-def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
-    rows, cols = (np.flatnonzero(wanted.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return None
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
-
-
-def joined_cells(warps: Sequence[Warp], block: Block, layout: CellLayout) -> Cells:
-    owners = [(warp, warp.owned(block, layout)) for warp in warps]
-    owners.sort(key=lambda each: not each[1].any())
-    means, share = owners[0][0].cells(block, layout)
-    best = share + np.float32(OWN_BONUS) * owners[0][1]
-    for warp, mask in owners[1:]:
-        if best.min() >= 1:
-            break
-        some, their_share = warp.cells(block, layout)
-        rank = their_share + np.float32(OWN_BONUS) * mask
-        better = rank > best
-        means[better], share[better] = some[better], their_share[better]
-        best = np.maximum(best, rank)
-    return means, share
-
-
-def _turn(means: NDArray[np.float32], angle_rad: float) -> None:
-    for k in range(1, HARMONICS + 1):
-        cos, sin = np.float32(math.cos(2 * k * angle_rad)), np.float32(math.sin(2 * k * angle_rad))
-        real, imaginary = means[..., 2 * k - 1].copy(), means[..., 2 * k].copy()
-        means[..., 2 * k - 1] = real * cos + imaginary * sin
-        means[..., 2 * k] = imaginary * cos - real * sin
-
-
 def _corners(block: Block) -> Array:
     right, bottom = block.col + block.width, block.row + block.height
     return np.array(
@@ -265,21 +171,42 @@ def _corners(block: Block) -> Array:
     )
 
 
-def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Array:
-    """The affine between indices of pixels (or cells) whose middles lie `middle` px into them.
-    Index 0, 0 is the first of the block, and the first of the raster of the sheet."""
-    linear = affine[:, :2]
-    first = linear @ [block.col + middle, block.row + middle] + affine[:, 2] - middle
-    return np.column_stack([linear, first / spacing])
+class SheetMosaic:
+    """Sheets read as one picture, as `SheetReader` reads a `Mosaic` of orthophotos. Threads may
+    share it."""
 
+    def __init__(self, members: Sequence[SheetSource], frame: LocalFrame, grid: TileGrid) -> None:
+        self._warps = [Warp(each, frame, grid) for each in members]
 
-def _window(matrix: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    cols, rows = size
-    corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]], float)
-    there = corners @ matrix[:, :2].T + matrix[:, 2]
-    left, top = (int(value) for value in np.floor(there.min(axis=0)) - KERNEL_PX)
-    right, bottom = (int(value) for value in np.ceil(there.max(axis=0)) + KERNEL_PX)
-    return top, left, bottom - top + 1, right - left + 1
+    def grid_sheet(self, *_: Any, **__: Any) -> "SheetMosaic":
+        return self
+
+    def __enter__(self) -> "SheetMosaic":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
+        block = Block(row, col, height_px, width_px)
+        grey = np.zeros((block.height, block.width), dtype=np.uint8)
+        valid = np.zeros(grey.shape, dtype=np.bool_)
+        warps = [(warp, warp.owned(block)) for warp in self._warps if warp.reaches(block)]
+        for own in (True, False):
+            for warp, mask in warps:
+                wanted = ~valid & mask if own else ~(valid | mask)
+                if not wanted.any():
+                    continue
+                part = tuple(
+                    slice(int(found[0]), int(found[-1]) + 1)
+                    for found in (np.flatnonzero(wanted.any(axis=axis)) for axis in (1, 0))
+                )
+                size = part[0].stop - part[0].start, part[1].stop - part[1].start
+                some, there = warp.grey(Block(row + part[0].start, col + part[1].start, *size))
+                taken = there & wanted[part]
+                np.copyto(grey[part], some, where=taken)
+                valid[part] |= taken
+        return Pixels(grey[..., None], valid)
 
 
 def box_around(area: Area, margin_m: float) -> Extent:
@@ -307,7 +234,7 @@ def check_shown(
 ) -> None:
     """Warn where the atlas shows no imagery of an area; `AtlasError` where the route is there. With
     `allow_holes` that is a warning too."""
-    for part, points in _checked_points(area, grid).items():
+    for part, points in _checked_points(area, grid):
         tiles = grid.tiles_rc(points).clip(0, [grid.rows - 1, grid.cols - 1])
         bare = cells.valid_share(tiles * grid.stride_px) < MIN_TILE_VALID_SHARE
         if not bare.any():
@@ -315,64 +242,58 @@ def check_shown(
         places = np.stack(area.frame.latlon_from_en(points[bare]), axis=1).tolist()
         under = {atlas.recipe.sheets.name_at(*place) for place in places}
         names = sorted(under - atlas.sheets().keys())
-        lacking = ", ".join(names[:NAMED]) + ", .." * (len(names) > NAMED)
         said = f"{100 * bare.mean():.3g} % of the {part} has no imagery in the atlas"
-        said += f", which lacks sheets {lacking}" if names else ""
+        if names:
+            said += f", which lacks sheets {', '.join(names[:8])}" + ", .." * (len(names) > 8)
         if part == "route" and not allow_holes:
             raise AtlasError(f"{said}; extend the atlas, or allow holes (--allow-holes)")
         log.warning("%s", said)
 
 
-def _checked_points(area: Area, grid: TileGrid) -> dict[str, Array]:
-    points = {}
+def _checked_points(area: Area, grid: TileGrid) -> Iterator[tuple[str, Array]]:
+    """Of the route, and centres of the tiles of the area, or of 20,000 evenly spaced ones."""
     if area.route is not None:
         line = area.route.points_en_m(area.frame)
-        points["route"] = np.concatenate([along_polyline_en_m(line, grid.tile_m / 4)[0], line[-1:]])
-    step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / MAX_TILES))))
+        along = along_polyline_en_m(line, grid.tile_m / 4)[0]
+        yield "route", np.concatenate([along, line[-1:]])
+    step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / 20_000))))
     tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T
     centres = grid.centres_en_m(tiles)
-    points["area"] = centres[area.contains(centres, grid.stride_m * np.sqrt(0.5))]
-    return points
-
-
-CACHE_BYTES = 24 * 2**20  # decoded chunks of each sheet: those along the border of a row of blocks
-REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace)"
-
-GRID = "gsd_m", "tile_px", "stride_px"  # what the grids of all sheets have in common
-RECIPE = "method", "represent", "embed", "overlap"  # and their recipes
+    yield "area", centres[area.contains(centres, grid.stride_m * np.sqrt(0.5))]
 
 
 def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[SheetSource]:
     found: list[SheetSource] = []
     for sheet in sheets:
         opened = open_map(atlas.path(sheet))
-        first = found[0].manifest if found else opened.manifest
-        _require_alike(sheet, opened.manifest, grid, first)
-        found.append(_source(opened, sheet))
+        manifest = opened.manifest
+        _require_alike(sheet, manifest, grid, found[0].manifest if found else manifest)
+        # Decoded chunks of each sheet: those along the border of a row of blocks.
+        layer = GreyLayer.of(opened, cache_bytes=24 * 2**20)
+        if layer is None or manifest.registration is None:
+            raise AtlasError(
+                f"sheet {sheet.id} has no registration layer, from which maps are cut; {REBUILD}: "
+                f"{opened.path}"
+            )
+        heights = (TerrainLayer.of(opened, layer=each) for each in (TERRAIN, SURFACE))
+        found.append(SheetSource(sheet, manifest, layer, *heights))
     return found
 
 
 def _require_alike(sheet: Sheet, manifest: Manifest, grid: TileGrid, first: Manifest) -> None:
-    own = manifest.sheets[0].grid
-    other = [name for name in GRID if getattr(own, name) != getattr(grid, name)]
-    other += [name for name in RECIPE if manifest.recipe.get(name) != first.recipe.get(name)]
+    own, recipe = manifest.sheets[0].grid, manifest.recipe
+    other = [
+        name
+        for name in ("gsd_m", "tile_px", "stride_px")
+        if getattr(own, name) != getattr(grid, name)
+    ]
+    other += [
+        name
+        for name in ("method", "represent", "embed", "overlap")
+        if recipe.get(name) != first.recipe.get(name)
+    ]
     if other:
         raise AtlasError(f"sheet {sheet.id} has another {' and '.join(other)}, {REBUILD}")
-
-
-def _source(opened: MapFile, sheet: Sheet) -> SheetSource:
-    _, representation = recipes(opened.manifest)
-    grid = opened.manifest.sheets[0].grid
-    layer = GreyLayer.of(opened, cache_bytes=CACHE_BYTES)
-    layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
-    cells = StoredCells.of(opened, layout, representation.channels)
-    if layer is None or cells is None or opened.manifest.registration is None:
-        lacking = "registration layer" if layer is None else "cells"
-        raise AtlasError(
-            f"sheet {sheet.id} has no {lacking}, from which maps are cut; {REBUILD}: {opened.path}"
-        )
-    heights = (TerrainLayer.of(opened, layer=each) for each in (TERRAIN, SURFACE))
-    return SheetSource(sheet, opened.manifest, layer, cells, *heights)
 
 
 def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
@@ -383,9 +304,7 @@ def recipes(manifest: Manifest) -> tuple[WhitenedRecipe, Any]:
     return recipe, representation
 
 
-def pooled_manifest(
-    members: Sequence[SheetSource], shares: NDArray[np.float64], sheet: SheetInfo
-) -> Manifest:
+def pooled_manifest(members: Sequence[SheetSource], sheet: SheetInfo) -> Manifest:
     manifests = [member.manifest for member in members]
     return Manifest(
         recipe={
@@ -402,16 +321,16 @@ def pooled_manifest(
         confidence=None,
         radius_m=max(each.radius_m for each in manifests),
         created_by=f"orthonav {__version__}",
-        registration=_registration(manifests, shares),
+        registration=_registration(manifests),
     )
 
 
-def _registration(manifests: Sequence[Manifest], shares: NDArray[np.float64]) -> dict[str, Any]:
+def _registration(manifests: Sequence[Manifest]) -> dict[str, Any]:
     layers = [each.registration or {} for each in manifests]
     known = [
         RegisteredConfidence.from_plain(each["confidence"]).chances
-        for each, share in zip(layers, shares, strict=True)
-        if each.get("confidence") is not None and share > 0
+        for each in layers
+        if each.get("confidence") is not None
     ]
     confidence = None
     if known:
@@ -426,7 +345,6 @@ def _registration(manifests: Sequence[Manifest], shares: NDArray[np.float64]) ->
 
 def _imagery(manifests: Sequence[Manifest]) -> tuple[dict[str, Any], ...]:
     sources = {json.dumps(each, sort_keys=True): each for one in manifests for each in one.imagery}
-
     dated = sorted(
         (str(s.get("date") or ""), str(s.get("name") or ""), k) for k, s in sources.items()
     )
@@ -480,20 +398,9 @@ def _cut_heights(
     info = replace(
         made.info,
         source_posting_m=max(source_m, default=None),
-        roughness_m=_roughness_m(infos),
+        roughness_m=least_roughness_m(infos),
     )
     return made._replace(info=info)
-
-
-def _roughness_m(infos: Sequence[TerrainInfo]) -> float | None:
-    """The least of the sheets: a surface model only where all of it is one."""
-    return min(each.roughness_m or 0.0 for each in infos) or None
-
-
-def _relief(members: Sequence[SheetSource]) -> str | None:
-    """The steepest of the sheets."""
-    stated = [each.manifest.sheets[0].relief for each in members]
-    return max(stated, key=relief_slope)
 
 
 def _heights(
@@ -509,6 +416,16 @@ def _heights(
     return found
 
 
+def least_roughness_m(infos: Sequence[TerrainInfo]) -> float | None:
+    """None, a terrain model, unless all are surface models."""
+    return min(each.roughness_m or 0.0 for each in infos) or None
+
+
+def steepest(members: Sequence[SheetSource]) -> str | None:
+    """The relief of the sheets where it is steepest."""
+    return max((each.manifest.sheets[0].relief for each in members), key=relief_slope)
+
+
 def cut_map(
     atlas: Atlas,
     out: Path,
@@ -522,114 +439,53 @@ def cut_map(
     Missing sheets under the route are an error unless `allow_holes`; other missing sheets are a
     warning. Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged
     or cannot be cut from, `StorageError`, `OutputError`."""
-    out = Path(out)
+    out, common = Path(out), atlas.recipe
     workers = usable_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")
     progress("sheets", 0.0)
-    cutter = _MapCutter(atlas, area)
-    cutter.read(progress, workers)
-    check_shown(area, cutter.grid, cutter.cells, atlas, allow_holes)
-    written = write_map(out, *_learnt(cutter, workers, progress))
+    grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
+    sheets = atlas.over(box_deg(area, grid.tile_m))
+    if not sheets:
+        bounds = ",".join(f"{each:.4f}" for each in atlas.bounds_deg or ())
+        raise AreaError(
+            f"the area lies outside the atlas, whose {len(atlas.sheets())} sheets lie within "
+            f"'{bounds}' (west, south, east, north): {atlas.url}"
+        )
+    members = opened_sheets(atlas, sheets, grid)
+    recipe, representation = recipes(members[0].manifest)
+    mosaic = cast(Mosaic, SheetMosaic(members, area.frame, grid))
+    reader = SheetReader(
+        mosaic, area, grid, representation, NoCrops(grid.tile_px), registration=True
+    )
+    reader.read(progress, workers)
+    check_shown(area, grid, reader.cells, atlas, allow_holes)
+    progress("learn", 0.0)
+    written = write_map(out, *_learnt(reader, recipe, members, workers))
     return BuildResult(written, out.stat().st_size)
 
 
-def cut_in_memory(atlas: Atlas, area: Area) -> MapFile:
-    """The map of an area, flown at once and never written; missing sheets are holes in it."""
-    cutter = _MapCutter(atlas, area)
-    cutter.read(no_progress, 1)
-    manifest, arrays = _learnt(cutter, 1, no_progress)
-    return MapFile(Path(atlas.url, "cut"), 0, manifest, arrays)
-
-
-class _MapCutter:
-    def __init__(self, atlas: Atlas, area: Area) -> None:
-        common = atlas.recipe
-        self.area = area
-        self.grid = grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
-        sheets = atlas.over(box_deg(area, grid.tile_m))
-        if not sheets:
-            bounds = ",".join(f"{each:.4f}" for each in atlas.bounds_deg or ())
-            raise AreaError(
-                f"the area lies outside the atlas, whose {len(atlas.sheets())} sheets lie within "
-                f"'{bounds}' (west, south, east, north): {atlas.url}"
-            )
-        self.members = members = opened_sheets(atlas, sheets, grid)
-        self.recipe, representation = recipes(members[0].manifest)
-        turns = isinstance(representation, OrientedGradients)
-        self._warps = [Warp(each, area.frame, grid, turns) for each in members]
-        self._layout = layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
-        height, width = grid.height_px, grid.width_px
-        self.cells = CellSheet(layout, height, width, representation.channels)
-        self.layer = GreyLayerWriter(height, width)
-        self.preview = Preview(grid)
-
-    def read(self, progress: Progress, workers: int) -> None:
-        blocks = blocks_of_area(self.area, self.grid, self._layout)
-        with one_opencv_thread():
-            made = in_order(self._made, blocks, workers)
-            for done, parts in enumerate(made):
-                self._take(blocks[done], parts)
-                progress("imagery", (done + 1) / len(blocks))
-
-    def _made(self, block: Block) -> Parts:
-        """The parts of the map in a block. Called by several threads: changes nothing."""
-        warps = [warp for warp in self._warps if warp.reaches(block)]
-        grey, valid = joined_grey(warps, block)
-        if not valid.any():
-            return {}
-        means, share = joined_cells(warps, block, self._layout)
-        # A whole factor, as 4, is many times faster.
-        size = max(1, block.width // 4), max(1, block.height // 4)
-        coarse = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-        parts: Parts = {"means": means, "share": share}
-        parts["preview"] = self.preview.small(block, coarse)
-        return parts | layer_parts(self.area, self.grid, block, grey, valid)
-
-    def _take(self, block: Block, parts: Parts) -> None:
-        if not parts:
-            return
-        spacing = self._layout.spacing_px
-        rows, cols = self.cells.valid.shape
-        part = np.s_[: rows - block.row // spacing, : cols - block.col // spacing]
-        self.cells.put(block.row, block.col, parts["means"][part], parts["share"][part])
-        self.preview.put(block, parts["preview"])
-        self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
-
-
 def _learnt(
-    cutter: _MapCutter, workers: int, progress: Progress
+    reader: SheetReader, recipe: WhitenedRecipe, members: Sequence[SheetSource], workers: int
 ) -> tuple[Manifest, dict[str, NDArray[Any]]]:
-    area, grid, members = cutter.area, cutter.grid, cutter.members
-    tiles_rc = tiles_of(area, grid, cutter.cells)
+    area, grid, layer = reader.area, reader.grid, reader.layer
+    assert layer is not None
+    tiles_rc = tiles_of(area, grid, reader.cells)
     tiles_px = tiles_rc * grid.stride_px
-    progress("learn", 0.0)
-    embedder = learn(cutter.recipe, cutter.cells, tiles_px, workers)
-    embeddings = embedder.tiles(cutter.cells, tiles_px, workers)
-    centres = grid.centres_en_m(tiles_rc)
-    grey, grey_parts = cutter.layer.finish()
+    embedder = learn(recipe, reader.cells, tiles_px, workers)
+    grey, grey_parts = layer.finish()
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     heights = cut_heights(members, area, grid)
     terrain, surface = heights.infos
     sheet = SheetInfo(
-        *(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, _relief(members), surface),
+        *(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, steepest(members), surface),
         lean=heights.lean,
     )
-    manifest = pooled_manifest(members, _shares(area, centres, members), sheet)
-    return manifest, {
-        "sheet0/centres_en_m": centres.astype(np.float32),
-        "sheet0/embeddings": embeddings,
-        "sheet0/preview_jpeg": cutter.preview.jpeg(),
+    return pooled_manifest(members, sheet), {
+        "sheet0/centres_en_m": grid.centres_en_m(tiles_rc).astype(np.float32),
+        "sheet0/embeddings": embedder.tiles(reader.cells, tiles_px, workers),
+        "sheet0/preview_jpeg": reader.preview.jpeg(),
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
         **grey_parts,
         **heights.arrays,
     }
-
-
-def _shares(
-    area: Area, centres_en_m: NDArray[np.float64], members: Sequence[SheetSource]
-) -> NDArray[np.float64]:
-    lat, lon = area.frame.latlon_from_en(centres_en_m)
-    boxes = [each.sheet.bounds_deg for each in members]
-    found = np.array([np.count_nonzero(in_box(box, lat, lon)) for box in boxes], np.float64)
-    return found / found.sum() if found.any() else np.full(len(found), 1 / len(found))

@@ -25,8 +25,8 @@ from orthonav.ground.atlas.catalog import Atlas, Sheet, StoredFile, canonical, p
 from orthonav.ground.atlas.coarse import MAX_TILES, POOLING, read_coarse, tile_count
 from orthonav.ground.atlas.store import digest_of
 from orthonav.ground.atlas.vectors import (
+    CODE_BITS,
     MAX_TRAINING_VECTORS,
-    QUANTIZERS_NAME,
     Part,
     Quantizers,
     ShardInfo,
@@ -38,7 +38,7 @@ from orthonav.ground.atlas.vectors import (
 FOLDER = "index"
 MANIFEST = f"{FOLDER}/index.json"
 FORMAT = "orthonav-index"
-SCHEMA = 2  # 2: shards have no manifests of their own
+SCHEMA = 3
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{0,80}")
 
 
@@ -59,7 +59,7 @@ class IndexManifest:
     def from_json(cls, data: bytes) -> "IndexManifest":
         """Inverse of `to_json`; raises `AtlasError` unless writing it again gives `data`."""
         try:
-            plain: Any = parsed(data, MANIFEST)
+            plain: Any = parsed(data)
             shards = tuple(map(_shard, plain["shards"]))
             files = {name: StoredFile(**file) for name, file in plain["files"].items()}
             parts = [part for shard in shards for part in shard.parts]
@@ -68,7 +68,6 @@ class IndexManifest:
                 all(map(_NAME.fullmatch, [*files, *(shard.name for shard in shards)]))
                 and all(file.name == f"{FOLDER}/{name}" for name, file in files.items())
                 and all(0 <= part.rows <= MAX_TILES for part in parts)
-                and not any(part.retired for part in parts)
                 and list(accumulate((shard.rows for shard in shards), initial=0))[:-1]
                 == [shard.base for shard in shards]
                 and made.to_json() == data
@@ -85,8 +84,7 @@ class IndexManifest:
 
 def _shard(plain: Any) -> ShardInfo:
     parts = tuple(
-        Part(str(part["sheet"]), str(part["sha256"]), int(part["rows"]), bool(part["retired"]))
-        for part in plain["parts"]
+        Part(str(part["sheet"]), str(part["sha256"]), int(part["rows"])) for part in plain["parts"]
     )
     return ShardInfo(str(plain["name"]), int(plain["base"]), parts)
 
@@ -108,16 +106,7 @@ def stale_sheets(atlas: Atlas, manifest: IndexManifest) -> tuple[list[str], list
     return new, [name for name in known if name not in there]
 
 
-WHITENING_NAME = "whitening.safetensors"
-MAX_TRAINING_TILES = 40_000  # of the whitening: twice those of a map (`MAX_LEARNT_TILES`)
-SHARD_ROWS = 10_000_000  # 1.5 GB of files (`benchmarks.atlas_search` at d63ac91)
-POWER = 0.5
-"""Exponent of the whitening: full whitening (1) does not recognize a place an eighth of a tile off.
-On 2,500 generated km2 half whitening ranks the right tile first for 87 instead of 83 % of views of
-another year."""
-MANY_TILES, MANY_DIMS = 3_000_000, 64  # above so many tiles, so many components
-MIN_TILES = 16  # fewer tiles than codes of a quantizer cannot train it
-BATCH_TILES = 4096
+LEARNT = "learnt.safetensors"  # what embeds, assigns and codes tiles
 Features = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -136,7 +125,7 @@ def make_index(
             if before is not None and stale_sheets(atlas, before) == ([], []):
                 return before
     counts = [tile_count(atlas.path(sheet, "coarse")) for sheet in sheets]
-    if sum(counts) < MIN_TILES:
+    if sum(counts) < 2**CODE_BITS:  # the codes of a quantizer
         raise AtlasError(
             f"the atlas has {sum(counts)} coarse tiles with imagery, too few for an index; build "
             "it with smaller ones (--coarse-gsd-m, --coarse-tile-px)"
@@ -152,7 +141,7 @@ def make_index(
             parts = [Part(each.id, each.files["coarse"].sha256, count) for each, count in group]
             shards.append(ShardInfo(f"shard-{base:012d}", base, tuple(parts)))
             tiles = _tiles(atlas, [each for each, _ in group])
-            rows = ((places, vectors_of(embedder, features)) for places, features in tiles)
+            rows = (vectors_of(embedder, features) for features in tiles)
             write_shard(folder, shards[-1], quantizers, rows)
         progress("index", 1.0)
         return _stored(atlas, IndexManifest(quantizers.recipe, tuple(shards), {}), folder)
@@ -161,20 +150,19 @@ def make_index(
 def _learnt(
     atlas: Atlas, sheets: Sequence[Sheet], total: int, folder: Path
 ) -> tuple[WhitenedEmbedder, Quantizers]:
-    def over_sheets(work: Work[Made], most: int = MAX_TRAINING_TILES) -> Iterator[Made]:
-        for _, features in _tiles(atlas, sheets, max(1, total // most)):
+    # The whitening is learnt from twice the tiles of that of a map.
+    def over_sheets(work: Work[Made], most: int = 40_000) -> Iterator[Made]:
+        for features in _tiles(atlas, sheets, max(1, total // most)):
             yield work(*features)
 
     embedder = learn_in_two_passes(POOLING, over_sheets)
-    dims = min(embedder.dims, POOLING.dims if total <= MANY_TILES else MANY_DIMS)
+    dims = min(embedder.dims, POOLING.dims if total <= 3_000_000 else 64)
     basis = np.ascontiguousarray(embedder.basis[:, : dims - dims % 2])
     embedder = replace(embedder, basis=basis)
-    whitening = save(embedder.parts(), metadata={"orthonav": FORMAT})
-    (folder / WHITENING_NAME).write_bytes(whitening)
     sample = over_sheets(lambda *features: vectors_of(embedder, features), MAX_TRAINING_VECTORS)
     recipe = VectorRecipe.for_count(total, embedder.dims)
     quantizers = train(np.concatenate(list(sample)), recipe)
-    quantizers.save(folder / QUANTIZERS_NAME)
+    (folder / LEARNT).write_bytes(save({**embedder.parts(), **quantizers.parts}))
     return embedder, quantizers
 
 
@@ -193,21 +181,21 @@ def _stored(atlas: Atlas, index: IndexManifest, folder: Path) -> IndexManifest:
     return manifest
 
 
-def _tiles(
-    atlas: Atlas, sheets: Sequence[Sheet], step: int = 1
-) -> Iterator[tuple[NDArray[np.float64], Features]]:
-    """Places (n, 2) and features of every `step`-th tile of sheets, some at a time."""
+def _tiles(atlas: Atlas, sheets: Sequence[Sheet], step: int = 1) -> Iterator[Features]:
+    """Features of every `step`-th tile of sheets, 4096 at a time."""
     for sheet in sheets:
         tiles = read_coarse(atlas.path(sheet, "coarse"))
-        for start in range(0, len(tiles.valid), step * BATCH_TILES):
-            part = slice(start, start + step * BATCH_TILES, step)
-            yield tiles.centres_latlon_deg[part], tiles.features_of(part)
+        for start in range(0, len(tiles.valid), step * 4096):
+            yield tiles.features_of(slice(start, start + step * 4096, step))
 
 
-def _groups(sheets: Sequence[Sheet], counts: Sequence[int]) -> list[list[tuple[Sheet, int]]]:
+def _groups(
+    sheets: Sequence[Sheet], counts: Sequence[int], max_rows: int = 10_000_000
+) -> list[list[tuple[Sheet, int]]]:
+    """Sheets of a shard, with their counts of tiles; 10 million rows are 1.5 GB of files."""
     groups: list[list[tuple[Sheet, int]]] = [[]]
     for sheet, count in zip(sheets, counts, strict=True):
-        if groups[-1] and sum(rows for _, rows in groups[-1]) + count > SHARD_ROWS:
+        if groups[-1] and sum(rows for _, rows in groups[-1]) + count > max_rows:
             groups.append([])
         groups[-1].append((sheet, count))
     return groups
@@ -218,22 +206,25 @@ def vectors_of(embedder: WhitenedEmbedder, features: Features) -> NDArray[np.flo
 
 
 def half_whitened(embedder: WhitenedEmbedder, embedded: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Whitened to the power 0.5: fully whitened vectors do not recognize a place an eighth of a
+    tile off (docs/decisions/atlas.md)."""
     norms = np.linalg.norm(embedder.basis.astype(np.float32), axis=0)
-    weighed = embedded * (norms / norms.max()) ** (POWER - 1)
+    weighed = embedded * (norms / norms.max()) ** -0.5
     lengths = np.linalg.norm(weighed, axis=1, keepdims=True)
     return np.asarray(weighed / np.maximum(lengths, 1e-12), dtype=np.float32)
 
 
-def load_whitening(path: Path) -> WhitenedEmbedder:
+def load_learnt(path: Path, recipe: VectorRecipe) -> tuple[WhitenedEmbedder, Quantizers]:
+    """Raises `AtlasError` for a file that is damaged or does not fit the recipe."""
     try:
         parts = load_file(path)
         mean, basis = parts["mean"], parts["basis"]
+        fits = mean.ndim == 1 and basis.shape == (len(mean), recipe.dims)
+        if not fits or not (np.isfinite(mean).all() and np.isfinite(basis).all()):
+            raise AtlasError("whitening does not fit")
+        return WhitenedEmbedder(POOLING, mean, basis), Quantizers.of(recipe, parts)
     except Exception as error:  # safetensors raises its own and the system's
-        raise AtlasError(f"whitening of an index cannot be read ({error}): {path}") from error
-    fits = mean.ndim == 1 and basis.ndim == 2 and len(mean) == len(basis) and basis.shape[1] > 0
-    if not fits or not (np.isfinite(mean).all() and np.isfinite(basis).all()):
-        raise AtlasError(f"whitening of an index is damaged: {path}")
-    return WhitenedEmbedder(POOLING, mean, basis)
+        raise AtlasError(f"index of the atlas is damaged ({error}): {path}") from error
 
 
 def index_file(atlas: Atlas, manifest: IndexManifest, name: str) -> Path:

@@ -24,7 +24,6 @@ from orthonav.ground.atlas.store import Store, digest_of
 MIN_AGE_S = 24 * 3600.0
 """Younger files may belong to a running build, which writes the files of a sheet before its item:
 no sheet takes a day."""
-_TEMPORARY = re.compile(r"\..+\.[A-Za-z0-9_]{8,12}\.tmp(\.[A-Za-z0-9]+)?")
 
 
 @dataclass(frozen=True)
@@ -45,34 +44,28 @@ def check_atlas(
 ) -> list[Problem]:
     """All problems of an atlas by name; empty where it is whole. `deep` reads every file and
     verifies its checksum. `clean` removes leftovers older than `min_age_s` (files that no item
-    names, temporary files, replaced revisions); nothing else is changed."""
+    names, and temporary files); nothing else is changed."""
     store = atlas.store
     # Files before items: a sheet that is finished meanwhile has both.
     folders = (*(folder for folder, _, _ in FILES.values()), INDEX)
     sizes = {f"{each}/{name}": size for each in folders for name, size in store.names(each).items()}
-    items, broken = read_items(store)
-    problems = [Problem("damaged item", f"{ITEMS}/{name}", why) for name, why in broken.items()]
-    current = {sheet.id: sheet for _, sheet in sorted(items.items())}
-    incomplete = {name.partition(".")[0] for name in broken}
-    for number, sheet in enumerate(current.values()):
-        progress("check", number / len(current))
-        if found := list(_sheet_problems(atlas, sheet, sizes, deep)):
-            incomplete.add(sheet.id)
-            problems += found
-    leftovers = [
-        (f"{ITEMS}/{name}", "second revision", "was replaced and not removed")
-        for name, sheet in items.items()
-        if sheet != current[sheet.id] and sheet.id not in incomplete
+    sheets, broken = read_items(store)
+    problems = [
+        Problem("damaged item", f"{ITEMS}/{name}.json", why) for name, why in broken.items()
     ]
-    named = {file.name for sheet in current.values() for file in sheet.files.values()}
-    leftovers += [
+    for number, sheet in enumerate(sheets.values()):
+        progress("check", number / len(sheets))
+        problems += _sheet_problems(atlas, sheet, sizes, deep)
+    named = {file.name for sheet in sheets.values() for file in sheet.files.values()}
+    leftovers = [
         (name, "orphan", "no item names it")
         for name in sizes.keys() - named
-        if (sheet_id := sheet_of_file(name)) is not None and sheet_id not in incomplete
+        if (sheet_id := sheet_of_file(name)) is not None and sheet_id not in broken
     ]
     for folder in ("", ITEMS, *folders):
-        for file in filter(_TEMPORARY.fullmatch, store.names(folder)):
-            leftovers.append((f"{folder}/{file}".lstrip("/"), "leftover", "incomplete file"))
+        for file in store.names(folder):
+            if re.fullmatch(r"\..+\.[A-Za-z0-9_]{8,12}\.tmp(\.[A-Za-z0-9]+)?", file):
+                leftovers.append((f"{folder}/{file}".lstrip("/"), "leftover", "incomplete file"))
     problems += [_leftover(store, *each, min_age_s if clean else None) for each in leftovers]
     if not any(each.kind == "damaged item" for each in problems):
         atlas.sheets(refresh=True)
@@ -86,7 +79,7 @@ def _sheet_problems(
     try:
         atlas.require_place(sheet)
     except (AreaError, AtlasError) as error:
-        yield Problem("damaged item", f"{ITEMS}/{sheet.item_name}", str(error))
+        yield Problem("damaged item", sheet.item_name, str(error))
     for file in sheet.files.values():
         remedy = f"build sheet {sheet.id} again"
         yield from _file_problems(atlas.store, file, sizes, deep, remedy)
@@ -119,23 +112,21 @@ def _index_problems(atlas: Atlas, sizes: Mapping[str, int], deep: bool) -> Itera
 
 
 def _file_problems(
-    store: Store,
-    file: StoredFile,
-    sizes: Mapping[str, int],
-    deep: bool,
-    remedy: str,
+    store: Store, file: StoredFile, sizes: Mapping[str, int], deep: bool, remedy: str
 ) -> Iterator[Problem]:
     size = sizes.get(file.name, store.size(file.name))
     if size is None:
         yield Problem("missing file", file.name, remedy)
     elif size != file.size_bytes:
         yield Problem("wrong size", file.name, f"{size} of {file.size_bytes} bytes; {remedy}")
-    elif deep:
-        with tempfile.TemporaryDirectory(prefix="orthonav-check-") as folder:
-            path = Path(folder, file.name.rpartition("/")[2])
-            if store.is_local:
-                path = Path(store.url, file.name)
-            else:
-                store.download(file.name, path)
-            if digest_of(path) != file.sha256:
-                yield Problem("wrong checksum", file.name, remedy)
+    elif deep and _digest(store, file.name) != file.sha256:
+        yield Problem("wrong checksum", file.name, remedy)
+
+
+def _digest(store: Store, name: str) -> str:
+    if store.is_local:
+        return digest_of(Path(store.url, name))
+    with tempfile.TemporaryDirectory(prefix="orthonav-check-") as folder:
+        path = Path(folder, name.rpartition("/")[2])
+        store.download(name, path)
+        return digest_of(path)

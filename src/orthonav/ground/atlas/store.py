@@ -24,11 +24,6 @@ from orthonav.core.extras import needed
 from orthonav.core.files import replacing
 
 MAX_READ_BYTES = 64 * 2**20  # a guard for memory: catalogue and index manifest are smaller
-_FINDS_BY_PREFIX = {"s3", "s3a", "gs", "gcs"}
-_NEEDS_OVERWRITE = {"abfs", "abfss", "az"}  # refuse to replace a file unless told
-_PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
-_PROTOCOL = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
-_PASSWORD = re.compile(r"(://[^/@:]*):[^/]*@")
 
 
 class Store:
@@ -37,7 +32,7 @@ class Store:
     not installed. `str()` gives the address without a password."""
 
     def __init__(self, url: str) -> None:
-        match = _PROTOCOL.match(url)
+        match = re.match(r"([a-z][a-z0-9+.-]*)://", url, re.IGNORECASE)
         self._protocol = match.group(1).lower() if match else "file"
         self.is_local = self._protocol in ("file", "local")
         if self.is_local:
@@ -50,19 +45,19 @@ class Store:
             self._remote("")
 
     def __str__(self) -> str:
-        return self.url if self.is_local else _PASSWORD.sub(r"\1@", self.url)
+        return self.url if self.is_local else re.sub(r"(://[^/@:]*):[^/]*@", r"\1@", self.url)
 
-    def names(self, folder: str = "", prefix: str = "") -> dict[str, int]:
-        """Names of the files of a folder that begin with `prefix`, sorted, and their sizes.
-        Subfolders are left out. Empty where there is no such folder."""
+    def names(self, folder: str = "") -> dict[str, int]:
+        """Names of the files of a folder, sorted, and their sizes. Subfolders are left out. Empty
+        where there is no such folder."""
         found: dict[str, int] = {}
         with storage_errors(self.shown(folder), "list the files of the atlas"):
             folder = checked_name(folder) if folder else ""
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):
                 if self.is_local:
-                    found = _listed(self._path(folder), prefix)
+                    found = _listed(self._path(folder))
                 else:
-                    found = self._listed_remote(folder, prefix)
+                    found = self._listed_remote(folder)
         return dict(sorted(found.items()))
 
     def size(self, name: str) -> int | None:
@@ -150,7 +145,9 @@ class Store:
                 if isinstance(content, bytes):
                     fs.pipe_file(path, content)
                 else:
-                    more = {"overwrite": True} if self._protocol in _NEEDS_OVERWRITE else {}
+                    # Azure refuses to replace a file unless told.
+                    is_azure = self._protocol in ("abfs", "abfss", "az")
+                    more = {"overwrite": True} if is_azure else {}
                     fs.put_file(str(content), path, **more)
                 return
             with replacing(self._path(checked_name(name))) as temporary:
@@ -191,26 +188,22 @@ class Store:
             ) from error
         return fs, f"{root.rstrip('/')}/{name}" if name else root.rstrip("/")
 
-    def _listed_remote(self, folder: str, prefix: str) -> dict[str, int]:
+    def _listed_remote(self, folder: str) -> dict[str, int]:
         fs, path = self._remote(folder)
         fs.invalidate_cache()
-        if prefix and self._protocol in _FINDS_BY_PREFIX:
-            found = list(fs.find(path, prefix=prefix, detail=True).values())
-        else:
-            found = fs.ls(path, detail=True)
         sizes = {}
-        for each in found:
+        for each in fs.ls(path, detail=True):
             parent, _, name = each["name"].strip("/").rpartition("/")
-            if each["type"] == "file" and parent == path.strip("/") and name.startswith(prefix):
+            if each["type"] == "file" and parent == path.strip("/"):
                 sizes[name] = int(each["size"])
         return sizes
 
 
-def _listed(folder: Path, prefix: str) -> dict[str, int]:
+def _listed(folder: Path) -> dict[str, int]:
     found = {}
     with os.scandir(folder) as entries:
         for entry in entries:
-            if entry.name.startswith(prefix) and not entry.is_dir():
+            if not entry.is_dir():
                 with contextlib.suppress(FileNotFoundError):  # removed meanwhile
                     found[entry.name] = entry.stat(follow_symlinks=False).st_size
     return found
@@ -218,7 +211,8 @@ def _listed(folder: Path, prefix: str) -> dict[str, int]:
 
 def checked_name(name: str) -> str:
     parts = name.split("/")
-    if not all(_PART.fullmatch(part) and part not in (".", "..") for part in parts):
+    possible = re.compile(r"[A-Za-z0-9._-]{1,200}")
+    if not all(possible.fullmatch(part) and part not in (".", "..") for part in parts):
         raise StorageError(f"invalid name of a file in an atlas: {name!r:.120}")
     return name
 

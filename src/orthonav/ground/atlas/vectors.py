@@ -5,39 +5,29 @@ quantizer (product quantization: Jegou, Douze and Schmid, PAMI 2011; fast scan: 
 Le Scouarnec, VLDB 2015). Both are computed by FAISS. All shards of an index share one set of
 quantizers (`train`) and depend on nothing else, so they can be added and removed one by one.
 
-A shard NAME is four files in a folder: `NAME.vectors.npy` (rows, D) float16, `NAME.codes` with the
-codes and rows of every list, `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of each
-list, and `NAME.places.npy` (rows, 2) float64 with latitude and longitude of every row. Every length
-is checked before FAISS is given the map."""
+A shard NAME is three files in a folder: `NAME.vectors.npy` (rows, D) float16, `NAME.codes` with the
+codes and rows of every list, and `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of
+each list. Every length is checked before FAISS is given the map."""
 
-import json
 import os
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
 from orthonav.core.errors import AtlasError
 from orthonav.core.extras import needed
 
 Array = NDArray[np.float32]
 
-QUANTIZERS_NAME = "quantizers.safetensors"
 MAX_TRAINING_VECTORS = 200_000  # as in `benchmarks.atlas_search` at d63ac91
-POINTS_PER_CENTRE = 4096
-"""Training vectors per centre, if there are as many. FAISS's default, 256, loses 2 to 4 points of
-recall where lists or codes have few centres (2e5 of `benchmarks.atlas_fields` at d63ac91)."""
-ROUNDS = 12  # iterations of k-means, as in `benchmarks.atlas_search` at d63ac91
 CODE_BITS = 4  # bits per quantizer: what the fast scan of FAISS supports
 BLOCK = 32  # codes that FAISS scans together; the room of a list is a multiple of it
-FORMAT = "orthonav-vectors"
 
 
 def faiss() -> Any:
@@ -64,7 +54,6 @@ class VectorRecipe:
     dims: int  # components per vector, even
     list_bits: int = 14
     quantizers: int = 32  # codes of 4 bits per vector; even, divides `dims`
-    seed: int = 0  # seed of k-means
 
     def __post_init__(self) -> None:
         even = not (self.dims % 2 or self.list_bits % 2 or self.quantizers % 2)
@@ -99,24 +88,18 @@ class Quantizers:
     halves: Array
     codebook: Array  # (quantizers, 16, D / quantizers), codes of the residual
 
-    def save(self, path: Path) -> None:
-        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
-        recipe = json.dumps(asdict(self.recipe), sort_keys=True)
-        path.write_bytes(save(arrays, metadata={FORMAT: recipe}))
-
     @classmethod
-    def load(cls, path: Path) -> "Quantizers":
-        try:
-            with safe_open(path, framework="numpy") as stored:
-                recipe = VectorRecipe(**json.loads((stored.metadata() or {}).get(FORMAT, "")))
-                made = cls(recipe, *(stored.get_tensor(name) for name in _shapes(recipe)))
-        except (OSError, SafetensorError, ValueError, TypeError) as error:
-            raise AtlasError(f"quantizers of an index cannot be read ({error}): {path}") from error
+    def of(cls, recipe: VectorRecipe, parts: Mapping[str, NDArray[Any]]) -> "Quantizers":
+        """From `parts`, which may be untrusted; raises `AtlasError` unless they fit the recipe."""
         for name, shape in _shapes(recipe).items():
-            array = getattr(made, name)
-            if array.shape != shape or array.dtype != np.float32:
-                raise AtlasError(f"{name} of an index must be {shape}, got {array.shape}: {path}")
-        return made
+            array = parts.get(name)
+            if array is None or array.shape != shape or array.dtype != np.float32:
+                raise AtlasError(f"{name} of an index is not float32 {shape}")
+        return cls(recipe, *(parts[name] for name in _shapes(recipe)))
+
+    @property
+    def parts(self) -> dict[str, Array]:
+        return {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
 
     def rotated(self, vectors: Array) -> Array:
         return np.ascontiguousarray(np.asarray(vectors, dtype=np.float32) @ self.rotation)
@@ -179,8 +162,9 @@ def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers
     index, coarse = _untrained(recipe)
     for each in (coarse, index):
         means = each.pq.cp
-        means.niter, means.seed = ROUNDS, recipe.seed + 1
-        means.min_points_per_centroid, means.max_points_per_centroid = 1, POINTS_PER_CENTRE
+        means.niter, means.seed = 12, 1
+        # FAISS's limit of 256 points loses 2 to 4 points of recall where there are few centres.
+        means.min_points_per_centroid, means.max_points_per_centroid = 1, 4096
     with one_thread():
         index.train(np.ascontiguousarray(taken @ rotation))
     halves, codebook = (faiss().vector_to_array(each.pq.centroids) for each in (coarse, index))
@@ -215,11 +199,8 @@ def _rotation(vectors: Array, groups: int) -> Array:
     return np.ascontiguousarray(axes[:, order], dtype=np.float32)
 
 
-SCAN_ONE = 10  # FAISS's implementation of the scan that is fastest for one query at a time
 NONE = -1  # id where fewer than k vectors were found
-
 Ids = NDArray[np.int64]
-Places = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -227,7 +208,6 @@ class Part:
     sheet: str  # name of the sheet
     sha256: str  # digest of its coarse tiles (hex)
     rows: int  # how many
-    retired: bool = False  # the sheet has gone: of earlier versions, refused
 
 
 @dataclass(frozen=True)
@@ -245,25 +225,22 @@ def write_shard(
     folder: Path,
     info: ShardInfo,
     quantizers: Quantizers,
-    batches: Iterable[tuple[Places, Array]],
+    batches: Iterable[Array],
 ) -> None:
-    """`batches`: latitudes and longitudes (n, 2) and unit vectors (n, D) of some rows at a time.
-    Memory grows by codes and places, some 40 bytes a vector."""
+    """`batches`: unit vectors (n, D) of some rows at a time. Memory grows by codes, some 24 bytes a
+    vector."""
     folder.mkdir(parents=True, exist_ok=True)
     dims, index = quantizers.recipe.dims, quantizers.empty_index()
     header = {"descr": "<f2", "fortran_order": False, "shape": (info.rows, dims)}
-    places_deg = [np.empty((0, 2))]
     with (folder / f"{info.name}.vectors.npy").open("wb") as out:
         np.lib.format.write_array_header_1_0(out, header)
-        for places, batch in batches:
-            places_deg.append(places)
+        for batch in batches:
             stored = np.ascontiguousarray(batch, dtype=np.float16)
             if not np.isfinite(stored).all():
                 raise AtlasError("vectors of an index must be finite")
             out.write(stored.data)
             with one_thread():
                 index.add(quantizers.rotated(stored.astype(np.float32)))
-    np.save(folder / f"{info.name}.places.npy", np.concatenate(places_deg))
     _write_lists(folder, info.name, index, quantizers.recipe)
 
 
@@ -293,16 +270,14 @@ class OpenShard:
         self, file: Callable[[str], Path], info: ShardInfo, quantizers: Quantizers
     ) -> None:
         self.info = info
-        ends = ("vectors.npy", "codes", "lists.npy", "places.npy")
-        path, codes, lists, places = (file(f"{info.name}.{end}") for end in ends)
+        ends = ("vectors.npy", "codes", "lists.npy")
+        path, codes, lists = (file(f"{info.name}.{end}") for end in ends)
         dims = quantizers.recipe.dims
         try:
             vectors = np.load(path, mmap_mode="r")
             table = np.load(lists)
-            self.places_deg = np.load(places, mmap_mode="r")
-            for array, width, kind in ((vectors, dims, "<f2"), (self.places_deg, 2, "<f8")):
-                if array.shape != (info.rows, width) or array.dtype != kind:
-                    raise ValueError(f"{array.shape} {array.dtype}, expected {info.rows} rows")
+            if vectors.shape != (info.rows, dims) or vectors.dtype != "<f2":
+                raise ValueError(f"{vectors.shape} {vectors.dtype}, expected {info.rows} rows")
             _check_table(table, quantizers.recipe, info.rows, codes.stat().st_size)
         except (OSError, ValueError) as error:
             raise AtlasError(
@@ -329,7 +304,7 @@ class OpenShard:
         found = np.empty((len(rotated), count), dtype=np.float32)
         rows = np.empty((len(rotated), count), dtype=np.int64)
         index.nprobe = lists.shape[1]
-        index.implem = SCAN_ONE if len(rotated) == 1 else 0
+        index.implem = 10 if len(rotated) == 1 else 0  # 10 is faster for one query
         point = module.swig_ptr
         index.search_preassigned_c(
             len(rotated),
@@ -365,9 +340,11 @@ class ShardedIndex:
     """The shards of an index, mapped and searched on one core. The id of a vector is the base of
     its shard plus its row. Not for several threads at once."""
 
-    def __init__(self, file: Callable[[str], Path], shards: Sequence[ShardInfo]) -> None:
-        self.quantizers = Quantizers.load(file(QUANTIZERS_NAME))
-        self._shards = [OpenShard(file, each, self.quantizers) for each in shards]
+    def __init__(
+        self, file: Callable[[str], Path], shards: Sequence[ShardInfo], quantizers: Quantizers
+    ) -> None:
+        self.quantizers = quantizers
+        self._shards = [OpenShard(file, each, quantizers) for each in shards]
 
     def __len__(self) -> int:
         return sum(each.info.rows for each in self._shards)
@@ -405,12 +382,11 @@ class ShardedIndex:
                 out[ours] = shard.vectors(rows[ours])
         return out
 
-    def place_deg(self, number: int) -> tuple[float, float] | None:
-        for shard in self._shards:
-            if shard.info.base <= number < shard.info.base + shard.info.rows:
-                lat, lon = shard.places_deg[number - shard.info.base].tolist()
-                return lat, lon
-        return None
+    def sheets_of(self, ids: Ids) -> list[str]:
+        """Names of the sheets to which vectors belong."""
+        parts = [part for shard in self._shards for part in shard.info.parts]
+        ends = np.cumsum([part.rows for part in parts])
+        return [parts[at].sheet for at in np.searchsorted(ends, ids, side="right").tolist()]
 
     def _compared(self, queries: Array, ids: Ids, k: int) -> tuple[Array, Ids]:
         out_scores = np.full((len(queries), k), -np.inf, dtype=np.float32)

@@ -47,7 +47,7 @@ from orthonav.ground.build.encoders import (
     stored_representation,
     usual_edges,
 )
-from orthonav.ground.build.layer import HeightLayers, cell_parts, height_layers
+from orthonav.ground.build.layer import HeightLayers, height_layers
 from orthonav.ground.build.sheet import SheetPictures, SheetReader, grid_of, read_pictures, tiles_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
@@ -100,9 +100,6 @@ class BuildRequest:
     Not with `dem` or `surface`."""
     epoch: float | None = None  # decimal year of positions that drift with a plate
     device: str = "auto"  # where a network is learnt; or "cpu", "cuda"
-    cells: bool = False
-    """Whether it carries the cell means from which new tiles are embedded without imagery, for
-    sheets of an atlas; method gradient only."""
 
     def __post_init__(self) -> None:
         if isinstance(self.orthos, str | os.PathLike):
@@ -270,8 +267,6 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         arrays |= parts
     arrays |= inputs.heights.arrays
     terrain, surface = inputs.heights.infos
-    if request.cells and isinstance(inputs.recipe, WhitenedRecipe):
-        arrays |= cell_parts(sheet.cells)
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     info = SheetInfo(
         *(sheet.area.frame, grid, len(tiles_rc), area_km2),

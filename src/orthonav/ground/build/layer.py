@@ -1,10 +1,8 @@
-"""Layers of a map: the grey pyramid of registration, the means of micro-cells, terrain, surface.
+"""Layers of a map: the grey pyramid of registration, terrain, surface.
 
 A chunk is encoded as soon as it is complete, and passed at half the resolution to the next level,
 so memory holds compressed chunks and incomplete ones; heights are held as float32, 4 MB per km2 of
-a surface. Cell means, from which new tiles are embedded
-without imagery, are quantized to a byte each, relative to the largest of a cell, which is a
-float16: the rounding error is at most 0.4 % of the largest.
+a surface.
 """
 
 import logging
@@ -20,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import AreaError, ImageryError, MapFileError
+from orthonav.core.errors import AreaError, ImageryError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import bilinear_of
 from orthonav.core.geo.swapped import swapped_hint
@@ -34,10 +32,8 @@ from orthonav.core.mapfile.manifest import (
     TerrainInfo,
     clamped,
 )
-from orthonav.core.mapfile.reader import MapFile, blob_parts
+from orthonav.core.mapfile.reader import blob_parts
 from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, encode_terrain, terrain_part_names
-from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.build.lean import TRUE_ORTHO, PlaneSampler, as_shown, visible_lean
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import Dem
@@ -171,68 +167,6 @@ def _jpeg(grey: NDArray[np.uint8]) -> bytes:
         if len(encoded) <= MAX_BYTES_PER_PX * grey.size + 512:
             break
     return encoded
-
-
-CODES, SCALE, VALID = (f"sheet0/cells/{kind}" for kind in ("codes", "scale", "valid"))
-
-
-def cell_parts(cells: CellSheet) -> Parts:
-    """Codes from 1 to 255, 128 standing for 0; valid shares only where not all are 1."""
-    codes = np.full(cells.means.shape, 128, dtype=np.uint8)
-    scale = np.zeros(cells.valid.shape, dtype=np.float16)
-    valid = np.zeros(cells.valid.shape, dtype=np.uint8)
-    smallest = float(np.finfo(np.float16).tiny)
-    for first in range(0, len(codes), 256):
-        rows = slice(first, first + 256)
-        means = cells.means[rows]
-        scale[rows] = np.abs(means).max(axis=2) / 127
-        unit = np.maximum(scale[rows].astype(np.float32), smallest)[..., None]
-        codes[rows] = np.clip(np.rint(means / unit) + 128, 1, 255)
-        valid[rows] = cells.valid[rows] * 255 + 1e-3  # truncated: only complete cells get 255
-    parts: Parts = {CODES: codes, SCALE: scale}
-    return parts if (valid == 255).all() else {**parts, VALID: valid}
-
-
-class StoredCells:
-    """Cell means of a sheet in an opened map. May be shared between threads."""
-
-    def __init__(self, opened: MapFile, layout: CellLayout, channels: int) -> None:
-        """Raises `MapFileError` if the parts do not fit the manifest."""
-        grid = opened.manifest.sheets[0].grid
-        self.shape = layout.samples(grid.height_px), layout.samples(grid.width_px)
-        self._codes = opened.array(CODES, np.uint8, 3)
-        self._scale = opened.array(SCALE, np.float16, 2)
-        self._valid = opened.array(VALID, np.uint8, 2) if VALID in opened.arrays else None
-        shapes = {part.shape for part in (self._scale, self._valid) if part is not None}
-        if self._codes.shape != (*self.shape, channels) or shapes != {self.shape}:
-            raise MapFileError(
-                f"map's cells must be {self.shape} of {channels} numbers, got "
-                f"{self._codes.shape}: {opened.path}"
-            )
-
-    @classmethod
-    def of(cls, opened: MapFile, layout: CellLayout, channels: int) -> "StoredCells | None":
-        return cls(opened, layout, channels) if CODES in opened.arrays else None
-
-    def read(
-        self, row: int, col: int, height: int, width: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Means (height, width, C) and shares (height, width) of a window; 0 outside the sheet."""
-        channels = self._codes.shape[2]
-        means = np.zeros((max(height, 0), max(width, 0), channels), dtype=np.float32)
-        share = np.zeros(means.shape[:2], dtype=np.float32)
-        top, left = max(row, 0), max(col, 0)
-        bottom, right = min(row + height, self.shape[0]), min(col + width, self.shape[1])
-        if top >= bottom or left >= right:
-            return means, share
-        part = np.s_[top:bottom, left:right]
-        inside = np.s_[top - row : bottom - row, left - col : right - col]
-        scale = self._scale[part].astype(np.float32)
-        means[inside] = (self._codes[part].astype(np.float32) - 128) * scale[..., None]
-        share[inside] = 1.0
-        if self._valid is not None:
-            share[inside] = self._valid[part] / np.float32(255)
-        return means, share
 
 
 POSTING_M = 10.0
