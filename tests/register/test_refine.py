@@ -17,7 +17,7 @@ from scenes import (
 
 from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.refine import STEPS, Refiner
+from orthonav.core.register.refine import DESCENT, Refiner
 from orthonav.core.register.template import ViewTemplates
 
 SHAPE = (384, 448)
@@ -116,7 +116,7 @@ def test_beyond_the_map_nothing_is_said(reference):
 def test_a_blank_view_says_nothing(reference, grey):
     view = ViewTemplates(np.full(VIEW, grey, np.uint8), np.ones(VIEW, bool), 0)
     placed = Refiner(view.at(0), reference).place(
-        Pose(200.0, 180.0, 0.0, 0.0), STEPS, with_covariance=True
+        Pose(200.0, 180.0, 0.0, 0.0), DESCENT.steps, with_covariance=True
     )
     assert abs(placed.score) < 1e-3 and np.isfinite(placed.covariance).all()
     assert math.isfinite(placed.pose.x_px + placed.pose.turn_rad + placed.pose.log_scale)

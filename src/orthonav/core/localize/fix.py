@@ -7,18 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.integrity import probability_within
-from orthonav.core.localize.camera import CameraFound, tilt_std_deg
-from orthonav.core.localize.ground import SearchedSheet
-from orthonav.core.localize.place import Place
+from orthonav.core.localize.camera import CameraEstimate, tilt_std_deg
+from orthonav.core.localize.ground import PreparedMap
+from orthonav.core.localize.place import Finished
 from orthonav.core.localize.rectify import off_nadir_deg
 from orthonav.core.localize.search import Search
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import RADIUS_SHARE, Fix
 
 
-def fix_of(search: Search, best: Place) -> Fix:
+def fix_of(search: Search, best: Finished) -> Fix:
     """From the camera that the picture shows, else from the place alone."""
-    sheet, ground, pose = search.sheet, search.ground, best.fit.pose
+    sheet, ground, pose = search.sheet, search.over_ground, best.fit.pose
     camera = search.camera(best)
     orientation, middle_en_m = ground.orientation(pose), None
     if camera is not None:
@@ -34,7 +34,7 @@ def fix_of(search: Search, best: Place) -> Fix:
     if found.middle_cov_en_m2 is not None:
         widest = float(np.linalg.eigvalsh(found.middle_cov_en_m2)[-1])
         evidence["middle_std_m"] = math.sqrt(widest)
-    if orientation is not None and not sheet.relief.is_level:
+    if orientation is not None and not sheet.ground.is_level:
         evidence["terrain_gain"] = best.gain or 1.0
     lat, lon = sheet.sheet.frame.latlon_from_en(found.place_en_m)
     middle = None
@@ -63,7 +63,7 @@ def fix_of(search: Search, best: Place) -> Fix:
     )
 
 
-def _by_camera(sheet: SearchedSheet, view: PreparedView, camera: CameraFound) -> "_Exterior":
+def _by_camera(sheet: PreparedMap, view: PreparedView, camera: CameraEstimate) -> "_Exterior":
     """From the blocks of the view."""
     heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
     _, _, up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)).tolist()
@@ -89,7 +89,7 @@ def _by_camera(sheet: SearchedSheet, view: PreparedView, camera: CameraFound) ->
     )
 
 
-def _by_similarity(sheet: SearchedSheet, view: PreparedView, best: Place) -> "_Exterior":
+def _by_similarity(sheet: PreparedMap, view: PreparedView, best: Finished) -> "_Exterior":
     """Under the reported pitch and roll."""
     pose, covariance = best.pose, best.fit.covariance
     assert covariance is not None

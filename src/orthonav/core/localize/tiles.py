@@ -33,6 +33,9 @@ from orthonav.core.tiles.whitened import WhitenedEmbedder
 from orthonav.core.variants import variant_from_recipe
 
 MAX_RATIO = 10.0  # A rival at or below zero leaves the best without any
+HEADING_STEP_DEG = 8.0
+"""Where the heading is unknown: embeddings find their tile up to 8 deg off
+(docs/decisions/evidence.md)."""
 
 
 def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
@@ -60,17 +63,10 @@ def rival_score(
     return float(np.max(scores, where=elsewhere, initial=-1.0))
 
 
-def peak_ratio(best_score: float, rival: float) -> float:
-    return _ratio(best_score, rival)
-
-
 def _ratio(best: float, second: float) -> float:
     if best <= 0:
         return 1.0
     return min(MAX_RATIO, best / second) if second > 0 else MAX_RATIO
-
-
-BACKGROUND_TILES = 20_000  # of the whole map, evenly spread, for rivals; a narrow prior stays fast
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +95,8 @@ class TileMatcher:
         self.grid = grid
         self.centres_en_m = centres_en_m
         self.neighbours = TileNeighbours(grid, centres_en_m)
-        step = -(-len(embeddings) // BACKGROUND_TILES)
+        # Of the whole map, evenly spread, for rivals; a narrow prior stays fast.
+        step = -(-len(embeddings) // 20_000)
         self._background = np.arange(0, len(embeddings), step, dtype=np.intp)
 
     def match(self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None) -> Match:
@@ -127,7 +124,7 @@ class TileMatcher:
             "score": score,
             "margin": score - rival,
             "lowe_ratio": lowe_ratio(per_tile, best),
-            "peak_ratio": peak_ratio(score, rival),
+            "peak_ratio": _ratio(score, rival),
             "tiles_searched": float(len(per_tile) if rows is None else len(rows)),
         }
         # The background serves as rivals only: a mean of all is one of those that are allowed.
@@ -229,12 +226,6 @@ def peak_poses(
     return peaks
 
 
-HEADING_SIGMAS = 1.5
-"""Reach in standard deviations: three headings at 5 deg (docs/decisions/embedding.md)."""
-UNKNOWN_HEADING_STEP_DEG = 8.0
-"""Embeddings find their tile up to 8 deg off (docs/decisions/evidence.md)."""
-
-
 class TileLocalizer:
     """Places views on the tiles of one map; threads may share it."""
 
@@ -317,12 +308,13 @@ class TileLocalizer:
     def _headings_deg(self, telemetry: Telemetry, heading_known: bool) -> list[float]:
         """Around the reported one as far as its error reaches, or all."""
         if not heading_known:
-            return [float(heading) for heading in np.arange(0, 360, UNKNOWN_HEADING_STEP_DEG)]
+            return [float(heading) for heading in np.arange(0, 360, HEADING_STEP_DEG)]
         std = telemetry.yaw_std_deg
         if std is None or math.isnan(std):
             std = TILE_YAW_STD_DEG
         std = min(max(std, 0.0), 90.0)
-        side = math.floor(HEADING_SIGMAS * std / self._step_deg + 0.5)
+        # 1.5 standard deviations: three headings at 5 deg (docs/decisions/embedding.md).
+        side = math.floor(1.5 * std / self._step_deg + 0.5)
         return [telemetry.yaw_deg + k * self._step_deg for k in range(-side, side + 1)]
 
     def _fix(

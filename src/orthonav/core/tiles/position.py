@@ -18,7 +18,6 @@ from orthonav.core.geo.grid import TileGrid
 
 PositionRule = Literal["peak", "best", "neighbours", "weighted"]
 RULES: tuple[PositionRule, ...] = get_args(PositionRule)
-STEPS_EN = ((1, 0), (0, 1))
 
 
 class TileNeighbours:
@@ -59,7 +58,7 @@ class TileNeighbours:
     ) -> tuple[float, float]:
         """(east, north) in strides within 0.5; zero on an axis where a neighbour is missing."""
         offsets = []
-        for east, north in STEPS_EN:
+        for east, north in ((1, 0), (0, 1)):
             ahead, behind = (
                 _score(scores, rows, self.beside(best, sign * east, sign * north))
                 for sign in (1, -1)

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from orthonav.core.errors import AreaError, AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.confidence import USUAL_CONFIDENCE
+from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_footprint
-from orthonav.core.localize.view import MIN_VIEW_PX, check_footprint, check_view, pose_prior
+from orthonav.core.localize.view import LIMITS, check_footprint, check_view, pose_prior
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.track import Model, State
 from orthonav.core.track.tracker import Tracker
@@ -261,7 +261,7 @@ class PlaceFinder:
         if refused is not None:
             return refused
         coarse = rectified(view, recipe.gsd_m)
-        refused = check_footprint(coarse, 1.0, MIN_VIEW_PX)
+        refused = check_footprint(coarse, 1.0, LIMITS.min_view_px)
         if refused is not None:
             return refused
         side_m = math.sqrt(float(coarse.valid.sum())) * recipe.gsd_m
@@ -460,7 +460,7 @@ class LocalTrack:
         area = Area(middle, (-half_m, -half_m, half_m, half_m))
         localizer = Localizer(cut_in_memory(self._atlas, area))
         if localizer.registration is not None and localizer.registration.confidence is None:
-            localizer.registration.confidence = USUAL_CONFIDENCE
+            localizer.registration.confidence = DEFAULT_CONFIDENCE
         return area, localizer
 
 

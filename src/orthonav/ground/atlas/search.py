@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame, distances_m
-from orthonav.core.localize.confidence import USUAL_CONFIDENCE, RegisteredConfidence, logit
-from orthonav.core.localize.ground import Relief
+from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE, RegisteredConfidence, logit
+from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.localizer import RegistrationLocalizer
-from orthonav.core.localize.place import HOPE, MIN_HOPEFUL, Place
+from orthonav.core.localize.place import REFINEMENT, Finished, Judged
 from orthonav.core.localize.policy import DEFAULT_PLAN
 from orthonav.core.localize.rectify import RectifiedView
 from orthonav.core.localize.search import Search
@@ -233,14 +233,14 @@ class ViewRegistrar:
             return None
         half_diagonal_px = math.hypot(*view.templates.valid.shape) / 2 * 2**view.levels.final
         margin_px = max(
-            FINE.margin_px * 2**view.levels.judged, COARSE.margin_px * 2**view.levels.coarse
+            FINE.margin_px * 2**view.levels.mid, COARSE.margin_px * 2**view.levels.coarse
         )
         around_px = whole.reach_px + WIDEST * half_diagonal_px + margin_px
         part = part_of(sheet, whole.middle_px, around_px)
         if part is None:
             return None
-        if part.relief is not None:
-            view = replace(view, prior=part.relief.expected(view))
+        if part.ground is not None:
+            view = replace(view, prior=part.ground.expected(view))
         return JudgedRegion(part, view, region, prior)
 
 
@@ -270,9 +270,9 @@ def part_of(
         floor_px=sheet.floor_px,
         plan=sheet.plan,
     )
-    if sheet.relief is not None:
-        whole = sheet.relief
-        part.relief = Relief(whole.terrain, part_grid, whole.info, whole.land, whole.surface)
+    if sheet.ground is not None:
+        whole = sheet.ground
+        part.ground = GroundModel(whole.terrain, part_grid, whole.info, whole.land, whole.surface)
     return part
 
 
@@ -288,7 +288,7 @@ class JudgedRegion:
         return Search(self.sheet, self.view, self.prior)
 
     @functools.cached_property
-    def judged(self) -> list[Place]:
+    def judged(self) -> list[Judged]:
         """Places near the middle of the region, under headings and scales around its own, at the
         level where views are judged, best first."""
         view, region, search = self.view, self.region, self.search
@@ -297,39 +297,39 @@ class JudgedRegion:
         seen_from = (np.array([east, north, turn, region.log_scale]) for turn in turns)
         poses = [Peak(0.0, self.sheet.pose_of(view, each)) for each in seen_from]
         near = search.nearby(poses, region.reach_m / self.sheet.grid.gsd_m)
-        return search.placer.judge([each.pose for each in near], view.levels.coarse)
+        return search.refiner.judge([each.pose for each in near], view.levels.coarse)
 
     @property
     def look(self) -> float:
-        return self.search.placer.standing(self.judged)[0]
+        return self.search.refiner.best_and_rival(self.judged)[0]
 
     @property
     def latlon_deg(self) -> tuple[float, float]:
         return self._latlon_deg(self.judged[0].pose)
 
     def finished(self) -> SheetMatch:
-        placer = self.search.placer
-        places = placer.on_terrain(self.judged, 1)
-        return self._match(placer.below_camera(placer.finished(places, len(places))))
+        refiner = self.search.refiner
+        places = refiner.on_terrain(self.judged, 1)
+        return self._match(refiner.below_camera(refiner.finished(places, len(places))))
 
     def searched(self) -> SheetMatch | None:
         """The best match in all of the region; this takes ten times as long."""
         found = self.search.best()
-        return None if found is None else self._match(self.search.placer.below_camera(found))
+        return None if found is None else self._match(self.search.refiner.below_camera(found))
 
     def _latlon_deg(self, pose: Pose) -> tuple[float, float]:
         camera_en_m = self.sheet.camera_en_m(self.view, pose)
         lat, lon = self.sheet.sheet.frame.latlon_from_en(camera_en_m)
         return float(lat), float(lon)
 
-    def _match(self, found: Place) -> SheetMatch:
+    def _match(self, found: Finished) -> SheetMatch:
         pose = found.pose
         place = *self._latlon_deg(pose), pose.turn_rad, pose.log_scale
         return SheetMatch(*place, found.scores, self.sheet.confidence)
 
 
 SEARCHED = 4  # candidates: the right one and the best rivals (docs/decisions/atlas.md)
-PROVEN = logit(1 - DEFAULT_PLAN.policy.trial_doubt, 0.0)
+PROVEN = logit(1 - DEFAULT_PLAN.trial_doubt, 0.0)
 """Log odds of a match that ends the search of candidates: as for a place whose rivals were not all
 searched."""
 RIVAL_SHARE = 0.25  # matches farther apart than this share of the view's side are different places
@@ -349,8 +349,8 @@ class ViewMatches:
     def add_candidates(self, registrar: ViewRegistrar, regions: Sequence[SearchRegion]) -> None:
         judged = [each for each in map(registrar.judged, regions) if each is not None]
         judged.sort(key=lambda each: -each.look)
-        hopeful = sum(each.look >= HOPE * judged[0].look for each in judged)
-        hopeful = max(hopeful, MIN_HOPEFUL)
+        hopeful = sum(each.look >= REFINEMENT.hope * judged[0].look for each in judged)
+        hopeful = max(hopeful, REFINEMENT.min_hopeful)
         self._judged = judged[hopeful:]
         self.compared = [each.region for each in judged[:hopeful]]
         finished = [(each.finished(), each) for each in judged[:hopeful]]
@@ -397,7 +397,7 @@ class ViewMatches:
             for each in self._judged
             if nearest_m(each.latlon_deg, [one.latlon_deg]) > self._apart_m
         ]
-        confidence = one.confidence or USUAL_CONFIDENCE
+        confidence = one.confidence or DEFAULT_CONFIDENCE
         return logit(confidence(against(one.evidence, rivals, looks)), LEAST)
 
     def _distinct(self, matches: Sequence[SheetMatch]) -> list[SheetMatch]:

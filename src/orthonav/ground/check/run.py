@@ -16,7 +16,7 @@ from orthonav.core.cores import usable_cores
 from orthonav.core.errors import AreaError, CameraError, MapFileError
 from orthonav.core.files import Progress, StrPath, no_progress
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize.ground import MIN_KNOWN
+from orthonav.core.localize.ground import SAMPLING
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
@@ -319,7 +319,7 @@ class _Check:
             MapCoverage(pixels, each).seen_share(places, side_m)
             for each in (self.above_m > LOWEST_OBJECT_M, np.isfinite(self.above_m))
         )
-        unknown = known < MIN_KNOWN * self.coverage.seen_share(places, side_m)
+        unknown = known < SAMPLING.min_known * self.coverage.seen_share(places, side_m)
         return float(((shown >= MANY_OBJECTS) & ~unknown).mean()), float(unknown.mean())
 
     def _along(self, predictor: Predictor) -> Along | None:
