@@ -184,7 +184,9 @@ def test_a_place_that_stands_out_is_known_better(localizer, monkeypatch):
     )
     search = localizer.registration.search(view, None, True)
     place = search.run()
-    alike, alone = (camera_of(search.over_ground, place.fit.pose, ratio) for ratio in (1.0, 10.0))
+    alike, alone = (
+        camera_of(search.over_ground, place.fit.pose, ratio, 0.0) for ratio in (1.0, 10.0)
+    )
     assert (alone.orientation.position_m == alike.orientation.position_m).all()
     stds = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in (alone, alike)]
     assert 0.3 < stds[0] / stds[1] < 0.7

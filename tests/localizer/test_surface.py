@@ -122,7 +122,7 @@ def test_a_camera_that_the_picture_does_not_show_among_houses_is_not_found(opene
             prepared = registration.prepared(replace(view, grey=picture), True)
             seen = ViewOverGround(registration.ground, prepared, registration.reference)
             pose = registration.pose_of(prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
-            camera = camera_of(seen, pose, 1.0)
+            camera = camera_of(seen, pose, 1.0, 0.0)
             assert (camera is not None) == found
 
 

@@ -41,7 +41,7 @@ class Place:
 
     def __init__(self, name="gradient", cells=8):
         self.representation = make_variant(represent.TABLE, name)
-        self.grey = textured((GROUND_PX, GROUND_PX))
+        self.grey = cv2.GaussianBlur(textured((GROUND_PX, GROUND_PX)), (0, 0), 1.5)
         valid = np.ones(self.grey.shape, bool)
         maps = self.representation(self.grey, valid)
         self.sheet = CellSheet(CellLayout.for_tiles(TILE_PX, 16), *self.grey.shape, len(maps))

@@ -84,7 +84,7 @@ def test_features_that_see_invalid_pixels_are_dropped():
     """What lies there has no influence, and its border gives no features."""
     grey = tiles(AREA, size=192)[0]
     valid = everywhere(grey)
-    valid[:, 96:] = False
+    valid[:, 86:] = False
     recipe = WordsRecipe()
     painted = np.where(valid, grey, 255).astype(np.uint8)
     kept, other = describe(recipe, grey, valid), describe(recipe, painted, valid)

@@ -88,7 +88,6 @@ class CameraEstimate:
     """The camera of a view; `agl_m`: above the ground below it; `image_only`: without telemetry.
 
     - covariances (6, 6): m east, north, up, deg heading, pitch, roll; `WEAK` where not shown.
-    - `variance`: of the errors of blocks over what their curvature says.
     - `middle_en_m`, `middle_covariance` (2, 2): ground in the middle of the picture, None: unknown.
     """
 
@@ -97,7 +96,6 @@ class CameraEstimate:
     covariance: Array
     image_only: Orientation
     image_only_covariance: Array
-    variance: float
     middle_en_m: tuple[float, float]
     middle_covariance: Array | None
 
@@ -162,12 +160,17 @@ def _climbed(
 
 
 def camera_of(
-    seen: ViewOverGround, pose: Pose, local_ratio: float, start: Orientation | None = None
+    seen: ViewOverGround,
+    pose: Pose,
+    local_ratio: float,
+    floor_m: float,
+    start: Orientation | None = None,
 ) -> CameraEstimate | None:
     """Position, attitude and covariance of the camera of a view that was placed at `pose`; None
     where too few blocks are seen, or the camera would be below the ground.
 
-    `local_ratio`: of the scores of the place. `start`: `approached`, where it is known."""
+    `local_ratio`: of the scores of the place. `floor_m`: standard deviation with which maps of two
+    dates agree. `start`: `approached`, where it is known."""
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
         level = GroundModel(LevelTerrain(), seen.ground.grid, land=seen.ground.land)
         seen, start = ViewOverGround(level, seen.view, seen.reference), None
@@ -191,16 +194,23 @@ def camera_of(
     if not agl_m > 0:
         return None
     sight_en_m = seen.sight_en_m(orientation)
+    middle = _middle_covariance(seen, orientation, sight_en_m, found.covariance)
+    floor_m2 = np.eye(2) * floor_m**2 * variance
     return CameraEstimate(
         orientation,
         agl_m,
-        found.covariance,
+        _with_floor(found.covariance, floor_m2),
         near.start.moved(found.image_only),
-        found.image_only_covariance,
-        variance,
+        _with_floor(found.image_only_covariance, floor_m2),
         seen.middle_en_m(sight_en_m, pose),
-        _middle_covariance(seen, orientation, sight_en_m, found.covariance),
+        None if middle is None else middle + floor_m2,
     )
+
+
+def _with_floor(covariance: Array, floor_m2: Array) -> Array:
+    out = covariance.copy()
+    out[:2, :2] += floor_m2
+    return out
 
 
 def tilt_std_deg(telemetry: Telemetry) -> float:

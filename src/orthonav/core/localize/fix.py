@@ -22,7 +22,7 @@ def fix_of(search: Search, best: Finished) -> Fix:
     camera = search.camera(best)
     orientation, middle_en_m = ground.orientation(pose), None
     if camera is not None:
-        found = _by_camera(sheet, search.view, camera)
+        found = _by_camera(search.view, camera)
         middle_en_m = camera.middle_en_m
     else:
         found = _by_similarity(sheet, search.view, best)
@@ -63,20 +63,16 @@ def fix_of(search: Search, best: Finished) -> Fix:
     )
 
 
-def _by_camera(sheet: PreparedMap, view: PreparedView, camera: CameraEstimate) -> "_Exterior":
+def _by_camera(view: PreparedView, camera: CameraEstimate) -> "_Exterior":
     """From the blocks of the view."""
     heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
     _, _, up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)).tolist()
-    floor_m2 = np.eye(2) * sheet.floor_m(view) ** 2 * camera.variance
-    covariance = camera.covariance.copy()
-    covariance[:2, :2] += floor_m2
-    middle = camera.middle_covariance
     return _Exterior(
         camera.orientation.position_m[:2],
         (heading_deg, pitch_deg, roll_deg),
         camera.agl_m,
-        covariance[:2, :2].copy(),
-        None if middle is None else middle + floor_m2,
+        camera.covariance[:2, :2].copy(),
+        camera.middle_covariance,
         {
             "heading_std_deg": heading,
             "log_scale_std": up_m / camera.agl_m,
@@ -85,7 +81,7 @@ def _by_camera(sheet: PreparedMap, view: PreparedView, camera: CameraEstimate) -
             "pitch_bias_std_deg": pitch,
             "roll_bias_std_deg": roll,
         },
-        covariance,
+        camera.covariance,
     )
 
 

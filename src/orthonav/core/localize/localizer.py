@@ -56,8 +56,10 @@ class Localizer:
         self.tiles = TileLocalizer(map, position=position, flying=flying)
         self.registration = None
         if registration:
+            tiles = self.tiles
+            propose = TileProposer.of(tiles.matcher, tiles.embedder, tiles.representation)
             self.registration = RegistrationLocalizer.of_map(
-                map, self.tiles.proposer(), plan or DEFAULT_PLAN, level_ground=level_ground
+                map, propose, plan or DEFAULT_PLAN, level_ground=level_ground
             )
 
     def __repr__(self) -> str:

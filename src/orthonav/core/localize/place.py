@@ -376,6 +376,7 @@ class CandidateRefiner:
             if self._over_ground.moved_px(pose, fit.pose) < REFINEMENT.moved_px * 2**final:
                 break
             pose = fit.pose
+        assert made is not None
         found = self._by_templates(place, fit, made)
         assert found.mid_score is not None
         if found.mid_score < place.level_score:

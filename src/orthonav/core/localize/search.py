@@ -117,7 +117,8 @@ class Search:
     def camera(self, place: Finished) -> CameraEstimate | None:
         """None where too few blocks of the view are seen."""
         ratio = place.scores.get("local_ratio", 1.0)  # of the best place only
-        return camera_of(self.over_ground, place.fit.pose, ratio, place.camera)
+        floor_m = self.sheet.floor_m(self.view)
+        return camera_of(self.over_ground, place.fit.pose, ratio, floor_m, place.camera)
 
     # What is tried
 

@@ -63,7 +63,7 @@ def sightings(
         if camera is None:
             mean, covariance = _by_similarity(search, place, telemetry)
         else:
-            mean, covariance = _by_camera(search, camera, telemetry)
+            mean, covariance = _by_camera(camera, telemetry)
         mean[3] += log_scale
         if np.isfinite(covariance).all():
             yield Sighting(mean, covariance, log_odds, alone)
@@ -92,15 +92,10 @@ def places_of(
             scores
             | {k: max(scores[k], least) for k, least in chance.items() if not math.isnan(scores[k])}
         )
-        log_odds = min(
-            logit(confidence(scores), LIMITS.min_probability) + share,
-            logit(alone, LIMITS.min_probability),
-        )
+        edge = LIMITS.min_probability
+        log_odds = min(logit(confidence(scores), edge) + share, logit(alone, edge))
         if out:  # the best place may have won in detail, against stronger scores elsewhere
-            log_odds, alone = (
-                min(log_odds, out[0][0]),
-                min(alone, out[0][1]),
-            )
+            log_odds, alone = min(log_odds, out[0][0]), min(alone, out[0][1])
         if not out or log_odds > LIMITS.min_log_odds:
             out.append((log_odds, alone, place))
     return out
@@ -120,7 +115,7 @@ def _as_rival(best: Finished, place: Finished) -> dict[str, float]:
     }
 
 
-def _by_camera(search: Search, camera: CameraEstimate, telemetry: Telemetry) -> tuple[Array, Array]:
+def _by_camera(camera: CameraEstimate, telemetry: Telemetry) -> tuple[Array, Array]:
     """Mean (6,) and covariance (6, 6) by the view alone."""
     rad, agl_m = math.pi / 180, camera.agl_m
     east, north, up_m = camera.image_only.position_m.tolist()
@@ -130,8 +125,6 @@ def _by_camera(search: Search, camera: CameraEstimate, telemetry: Telemetry) -> 
     units = np.diag([1.0, 1.0, 1 / agl_m, rad, rad, rad])
     order = [0, 1, 3, 2, 4, 5]
     covariance = (units @ camera.image_only_covariance @ units)[np.ix_(order, order)]
-    floor_m = search.sheet.floor_m(search.view)
-    covariance[:2, :2] += np.eye(2) * floor_m**2 * camera.variance
     return np.array([east, north, heading, scale, pitch, roll]), covariance
 
 

@@ -262,9 +262,6 @@ class TileLocalizer:
             raise MapFileError(f"{error}: {opened.path}") from error
         self.radius_m = manifest.radius_m
 
-    def proposer(self) -> TileProposer | None:
-        return TileProposer.of(self.matcher, self.embedder, self.representation)
-
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
         headings = self._headings_deg(view.telemetry, heading_known)
         smaller = downsampled(view, self.grid.gsd_m)

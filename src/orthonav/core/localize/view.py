@@ -102,11 +102,7 @@ def check_picture(grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None
         sample = sample[mask[::8, ::8] > 0]
         if sample.size == 0:
             return NoFix("blank", "the mask of the camera leaves too little of the view")
-    counts = np.bincount(sample.reshape(-1), minlength=256)
-    low, high = (_percentile(counts, percent) for percent in (1, 99))
-    levels, size = np.arange(256), int(counts.sum())
-    mean = float(counts @ levels) / size
-    std = math.sqrt(max(float(counts @ levels**2) / size - mean**2, 0.0))
+    (low, high), std = np.percentile(sample, (1, 99)), float(sample.std())
     if high < LIMITS.dark:
         return NoFix("too_dark", f"99 % of the view is {high:.0f} of 255 or darker")
     if low > LIMITS.bright:
@@ -114,14 +110,6 @@ def check_picture(grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None
     if std < LIMITS.min_std:
         return NoFix("blank", f"grey levels differ by {std:.1f} of 255 only (standard deviation)")
     return None
-
-
-def _percentile(counts: NDArray[np.intp], percent: float) -> float:
-    """As `np.percentile`, in a tenth of the time."""
-    upto = np.cumsum(counts)
-    at = percent / 100 * (int(upto[-1]) - 1)
-    below, above = np.searchsorted(upto, [math.floor(at), math.ceil(at)], side="right").tolist()
-    return float(below + (at - math.floor(at)) * (above - below))
 
 
 def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None:

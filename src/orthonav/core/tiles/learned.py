@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import VariantError
 from orthonav.core.extras import needed
 from orthonav.core.files import require_file
+from orthonav.core.tiles.network import session_of
 
 VARIABLE = "ORTHONAV_EDGES"
 MAX_BYTES = 64 << 20  # larger networks are not meant for an aircraft
@@ -88,13 +89,8 @@ def _network(path: str, sha256: str) -> tuple[Any, int]:
         )
     runtime = needed("onnxruntime", "neural", "edges by a network")
     probe_px, max_margin_px = 96, 32
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    options.add_session_config_entry("session.load_model_format", "ONNX")
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        session = session_of(runtime, data)
         shape = _run(session, np.zeros((probe_px, probe_px + 2), np.float32)).shape
     except Exception as error:
         # Its errors have no common class below Exception.

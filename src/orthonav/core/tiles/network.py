@@ -166,17 +166,8 @@ class NetworkEmbedder:
     def _session(self) -> Any:
         """Made at first use; threads may share it."""
         runtime = _onnxruntime()
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = self.threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        options.add_session_config_entry("session.load_model_format", "ONNX")
-        # Threads that wait must not use time that the aircraft needs.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            session = runtime.InferenceSession(
-                self.onnx.tobytes(), options, providers=["CPUExecutionProvider"]
-            )
+            session = session_of(runtime, self.onnx.tobytes(), self.threads)
         except Exception as error:
             # Its errors have no common class below Exception.
             raise MapFileError(f"map's encoder cannot be loaded: {error}") from error
@@ -202,6 +193,17 @@ class NetworkEmbedder:
 
 def _onnxruntime() -> Any:
     return needed("onnxruntime", "neural", "running a neural encoder")
+
+
+def session_of(runtime: Any, data: bytes, threads: int = 1) -> Any:
+    """A session of onnxruntime for a graph; raises its own errors."""
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 4  # errors are raised
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    # Threads that wait must not use time that the aircraft needs.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
 
 
 def check_graph(data: NDArray[np.uint8]) -> None:
