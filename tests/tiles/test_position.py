@@ -13,7 +13,6 @@ from orthonav.core.tiles.position import (
     RULES,
     ExactIndex,
     TileNeighbours,
-    offset_en_m,
     rows_within,
 )
 
@@ -162,9 +161,7 @@ def scores_around(east, north, width_m=60.0):
 
 def position(rule, scores, rows=None):
     best = int(scores.argmax()) if rows is None else int(rows[scores.argmax()])
-    offset = offset_en_m(
-        rule, scores, best, rows, WHOLE, TileNeighbours(GRID, WHOLE), GRID.stride_m
-    )
+    offset = TileNeighbours(GRID, WHOLE).offset_en_m(rule, scores, best, rows)
     return WHOLE[best] + np.array(offset)
 
 

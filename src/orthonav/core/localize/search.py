@@ -123,28 +123,36 @@ class Search:
     # What is tried
 
     def steps(self) -> Iterator[Step]:
-        """To be run in this order until the search ends."""
-        plan, levels, prior = self.plan, self.levels, self.view.prior
-        every, nats = self._directions(plan.mid_steps)
+        """To be run in this order until the search ends: on a small area the mid level, on a large
+        one coarse candidates first; the final level where that is cheap too."""
+        plan, levels = self.plan, self.levels
+        every, _ = self._directions(plan.mid_steps)
         mid_ms, tried_all = self._fft_ms(levels.mid, len(every)), False
-        if mid_ms > plan.cheap_ms:  # a large area
+        if mid_ms > plan.cheap_ms:
             for step in self._on_large_area(mid_ms):
                 # Over relief the expected scale is another one at every place.
-                tried_all |= not step.from_tiles and prior.scale_map is None
+                tried_all |= not step.from_tiles and self.view.prior.scale_map is None
                 yield from self._likely_first(step)
         if mid_ms <= max(plan.last_ms, plan.cheap_ms):
-            for least, most in pairwise(plan.stages_nats):
-                stage = [each for each, its in zip(every, nats, strict=True) if least < its <= most]
-                step = self._fft_step(levels.mid, stage, plan.candidates)
-                is_last = most == plan.stages_nats[-1]
-                if is_last and tried_all and step.cost_ms > plan.last_stage_ms:
-                    break
-                if stage:
-                    yield step
-        final = self._directions(plan.final_steps)[0]
+            yield from self._stages(tried_all)
+        final, _ = self._directions(plan.final_steps)
         step = self._fft_step(levels.final, final, plan.final_candidates)
         if levels.final < levels.mid and step.cost_ms <= plan.cheap_ms:
             yield step
+
+    def _stages(self, tried_all: bool) -> Iterator[Step]:
+        """The mid level, by how likely headings and scales are; without the last stage where the
+        coarse level `tried_all` and it takes long."""
+        plan = self.plan
+        every, nats = self._directions(plan.mid_steps)
+        for least, most in pairwise(plan.stages_nats):
+            stage = [each for each, its in zip(every, nats, strict=True) if least < its <= most]
+            step = self._fft_step(self.levels.mid, stage, plan.candidates)
+            is_last = most == plan.stages_nats[-1]
+            if is_last and tried_all and step.cost_ms > plan.last_stage_ms:
+                return
+            if stage:
+                yield step
 
     def _directions(self, steps: tuple[float, float]) -> tuple[list[Direction], list[float]]:
         """Those to try, the most likely first, and their negative log densities."""
@@ -174,7 +182,8 @@ class Search:
             return [coarse]
         count = plan.candidates_from(self.tiles)
         cost_ms = plan.tiles_ms(len(tried), self.tiles, self.sheet.propose.embedder.dims)
-        return [coarse, Step(level, tried, count, cost_ms + plan.nearby_ms * count, True)]
+        cost_ms += plan.nearby_ms * count
+        return [coarse, Step(level, tried, count, cost_ms, from_tiles=True)]
 
     def _fft_step(self, level: int, directions: list[Direction], count: int) -> Step:
         cost_ms = self._fft_ms(level, len(directions))
@@ -301,7 +310,7 @@ class Search:
         propose, rows = self.sheet.propose, self.tile_rows
         if propose is None or not propose.fits(self.view.side_px, self.plan.view_tiles):
             return 0
-        return len(propose.centres_en_m) if rows is None else len(rows)
+        return len(propose.tiles.centres_en_m) if rows is None else len(rows)
 
     @cached_property
     def tile_rows(self) -> NDArray[np.intp] | None:
@@ -311,7 +320,7 @@ class Search:
         grid, (x, y) = self.sheet.grid, self.middle_px
         centre = np.array([grid.west_m + x * grid.gsd_m, grid.north_m - y * grid.gsd_m])
         reach_m = self.reach_px * grid.gsd_m + grid.stride_m
-        return rows_within(self.sheet.propose.centres_en_m, centre, reach_m)
+        return rows_within(self.sheet.propose.tiles.centres_en_m, centre, reach_m)
 
     # Near by
 

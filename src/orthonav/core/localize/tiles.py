@@ -25,7 +25,6 @@ from orthonav.core.tiles.position import (
     ExactIndex,
     PositionRule,
     TileNeighbours,
-    offset_en_m,
     parabola_peak,
     rows_within,
 )
@@ -131,15 +130,7 @@ class TileMatcher:
         used, used_rows = per_tile, searched
         if self._position == "weighted" and searched is not None and rows is not None:
             used, used_rows = per_tile[np.searchsorted(searched, rows)], rows
-        shift = offset_en_m(
-            self._position,
-            used,
-            tile,
-            used_rows,
-            self.centres_en_m,
-            self.neighbours,
-            self.grid.stride_m,
-        )
+        shift = self.neighbours.offset_en_m(self._position, used, tile, used_rows)
         return Match(tile, shift, int(best_heading[best]), evidence)
 
 
@@ -147,12 +138,9 @@ class TileMatcher:
 class TileProposer:
     """Embeds a view under many poses and finds the most similar tiles of a sheet."""
 
-    grid: TileGrid
-    centres_en_m: NDArray[np.float32]
-    index: ExactIndex
+    tiles: TileMatcher
     embedder: WhitenedEmbedder
     representation: Representation
-    neighbours: TileNeighbours
 
     @classmethod
     def of(
@@ -161,14 +149,12 @@ class TileProposer:
         """None for embeddings that cannot embed a view under many poses at once."""
         if not isinstance(embedder, WhitenedEmbedder):
             return None
-        return cls(
-            tiles.grid, tiles.centres_en_m, tiles.index, embedder, representation, tiles.neighbours
-        )
+        return cls(tiles, embedder, representation)
 
     def fits(self, side_px: float, view_tiles: tuple[float, float]) -> bool:
         """Whether its side (pixels of the map) is within `view_tiles` tiles."""
-        smallest, largest = view_tiles
-        return smallest * self.grid.tile_px <= side_px <= largest * self.grid.tile_px
+        (smallest, largest), tile_px = view_tiles, self.tiles.grid.tile_px
+        return smallest * tile_px <= side_px <= largest * tile_px
 
     def candidates(
         self,
@@ -181,20 +167,21 @@ class TileProposer:
         """Up to `count` tiles that no tile next to them exceeds, among `rows`, for a view
         heading-up at the map's resolution under headings (rad) and log scales with `weights` (Q,).
         """
+        tiles, grid = self.tiles, self.tiles.grid
         queries = embed_poses(
-            self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
+            self.embedder, self.representation, view.grey, view.valid, poses, grid.tile_px
         )
-        scores = self.index.best(queries * weights[:, None], rows)
-        chosen = self.neighbours.maxima(scores, count, rows)
-        tiles = chosen if rows is None else rows[chosen]
-        by_pose = self.index.scores(queries, tiles)
+        scores = tiles.index.best(queries * weights[:, None], rows)
+        chosen = tiles.neighbours.maxima(scores, count, rows)
+        numbers = chosen if rows is None else rows[chosen]
+        by_pose = tiles.index.scores(queries, numbers)
         peaks = peak_poses(np.array(poses), by_pose, weights)
         found = []
-        for place, tile, (turn_rad, log_scale) in zip(chosen, tiles, peaks.tolist(), strict=True):
-            shift = self.neighbours.peak_offset(scores, int(tile), rows)
-            east, north = self.centres_en_m[tile] + np.array(shift) * self.grid.stride_m
-            x_px = (float(east) - self.grid.west_m) / self.grid.gsd_m
-            y_px = (self.grid.north_m - float(north)) / self.grid.gsd_m
+        for place, tile, (turn_rad, log_scale) in zip(chosen, numbers, peaks.tolist(), strict=True):
+            shift_m = tiles.neighbours.offset_en_m("peak", scores, int(tile), rows)
+            east, north = tiles.centres_en_m[tile] + np.array(shift_m)
+            x_px = (float(east) - grid.west_m) / grid.gsd_m
+            y_px = (grid.north_m - float(north)) / grid.gsd_m
             pose = Pose(x_px, y_px, turn_rad, log_scale)
             found.append(Peak(float(scores[place]), pose))
         return found

@@ -118,19 +118,13 @@ def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None
         return NoFix(
             "too_small", f"view covers {share:.0%} of a tile, {min_valid_share:.0%} are needed"
         )
-    if _is_uniform(view):
-        return NoFix("blank", "the part of the view that would be compared is uniform")
-    return None
+    return _check_contrast(view)
 
 
 def check_footprint(view: RectifiedView, pixel: float, min_side_px: float) -> NoFix | None:
     """`pixel`: size of its pixels in pixels of the map, the unit of `min_side_px`."""
     side = math.sqrt(cv2.countNonZero(view.valid.view(np.uint8))) * pixel
-    if side < min_side_px:
-        return _too_small(side, min_side_px)
-    if _is_uniform(view):
-        return NoFix("blank", "the part of the view that would be compared is uniform")
-    return None
+    return _too_small(side, min_side_px) if side < min_side_px else _check_contrast(view)
 
 
 def _too_small(side_px: float, least_px: float, where: str = "") -> NoFix:
@@ -138,9 +132,11 @@ def _too_small(side_px: float, least_px: float, where: str = "") -> NoFix:
     return NoFix("too_small", detail)
 
 
-def _is_uniform(view: RectifiedView) -> bool:
+def _check_contrast(view: RectifiedView) -> NoFix | None:
     _, std = cv2.meanStdDev(view.grey, mask=view.valid.view(np.uint8))
-    return float(std[0, 0]) < LIMITS.min_std / 2
+    if float(std[0, 0]) < LIMITS.min_std / 2:
+        return NoFix("blank", "the part of the view that would be compared is uniform")
+    return None
 
 
 @dataclass(frozen=True, eq=False)
