@@ -32,8 +32,8 @@ from orthonav.core.integrity import protection_levels_m
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.localize.confidence import (
     ALONE,
+    DEFAULT_CHANCES,
     FEATURES,
-    USUAL_CHANCES,
     Chances,
     RegisteredConfidence,
     features_of,
@@ -139,7 +139,7 @@ def fit_judge(features: Array, right: Mask) -> RegisteredConfidence:
         float(found[0] - weights[:-ALONE] @ mean[:-ALONE]),
         float(found[1] - weights[-ALONE:] @ mean[-ALONE:]),
     )
-    return RegisteredConfidence(biases, tuple(float(each) for each in weights), USUAL_CHANCES)
+    return RegisteredConfidence(biases, tuple(float(each) for each in weights), DEFAULT_CHANCES)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -174,8 +174,8 @@ def measure(options: argparse.Namespace) -> Section:
     judged = Judged.of([each for each in rows if each["evidence"] is not None])
     if options.fit:
         judge = fit_judge(judged.features, judged.right)
-        print("USUAL_BIASES =", tuple(round(each, 2) for each in judge.biases))
-        print("USUAL_WEIGHTS =", tuple(round(each, 2) for each in judge.weights))
+        print("biases =", tuple(round(each, 2) for each in judge.biases))
+        print("weights =", tuple(round(each, 2) for each in judge.weights))
     diagram(judged.error_m, judged.level_m, options.out / "integrity.png")
     tables = [
         _groups_table(judged, "By scene, left out", _scenes(judged)),

@@ -24,7 +24,7 @@ from orthonav.cli.source import map_heights
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.ground import Relief
+from orthonav.core.localize.ground import GroundModel
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
@@ -252,7 +252,7 @@ def _ways(row: Row, opened: MapFile, hills: Raster) -> Iterator[tuple[str, Locat
     lat, lon = frame.latlon_from_en(terrain.middle_en_m)
     level, over = Localizer(opened), Localizer(opened)
     assert over.registration is not None
-    over.registration.relief = Relief(terrain, over.grid)  # heights as a layer's
+    over.registration.ground = GroundModel(terrain, over.grid)  # heights as a layer's
 
     def on_level_ground(view: View) -> Fix | NoFix:
         telemetry = view.telemetry

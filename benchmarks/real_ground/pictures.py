@@ -34,7 +34,7 @@ def residuals(localizer: Localizer, view: View) -> NDArray[np.uint8] | None:
     if camera is None:
         return None
     level, pose = search.levels.final, place.fit.pose
-    made = search.ground.templates_at(pose, level, camera.orientation)
+    made = search.over_ground.templates_at(pose, level, camera.orientation)
     if made is None:
         return None
     template = made.at(level)

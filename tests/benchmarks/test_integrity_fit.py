@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from benchmarks.integrity import fit_judge
 
-from orthonav.core.localize.confidence import FEATURES, USUAL_CHANCES, RegisteredConfidence
+from orthonav.core.localize.confidence import DEFAULT_CHANCES, FEATURES, RegisteredConfidence
 
-TRUE = RegisteredConfidence((-2.0, -1.0), (1.0, 2.0, 1.5, 0.5, 1.0, 2.0, 1.0), USUAL_CHANCES)
+TRUE = RegisteredConfidence((-2.0, -1.0), (1.0, 2.0, 1.5, 0.5, 1.0, 2.0, 1.0), DEFAULT_CHANCES)
 
 
 def views(count, seed):

@@ -61,12 +61,8 @@ FINEST_M = 0.5
 
 
 def planned(**changes):
-    """The usual plan of a search with other values of its policy, its costs or its options."""
-    parts = {"policy": DEFAULT_PLAN.policy, "costs": DEFAULT_PLAN.costs}
-    for name, part in parts.items():
-        own = [key for key in changes if hasattr(part, key)]
-        parts[name] = replace(part, **{key: changes.pop(key) for key in own})
-    return replace(DEFAULT_PLAN, **parts, **changes)
+    """The usual plan of a search with other values."""
+    return replace(DEFAULT_PLAN, **changes)
 
 
 class Ground:

@@ -23,7 +23,7 @@ from blots import (
 )
 
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.place import Placer
+from orthonav.core.localize.place import CandidateRefiner
 from orthonav.core.localize.policy import ClearMargin
 from orthonav.core.mapfile import GreyLayer, open_map
 from orthonav.core.mapfile.layer import part_names
@@ -180,8 +180,13 @@ def from_tiles_only(localizer, monkeypatch):
     registration = localizer.registration
     plan = planned(max_search_px=100, tile_candidates=(40, 80))
     monkeypatch.setattr(registration, "plan", plan)
-    judge, seen = Placer.judge, []
-    monkeypatch.setattr(Placer, "judge", lambda *taken: seen.extend(taken[1]) or judge(*taken))
+    judge, seen = CandidateRefiner.judge, []
+
+    def noted(refiner, poses, *more):
+        seen.extend(poses)
+        return judge(refiner, poses, *more)
+
+    monkeypatch.setattr(CandidateRefiner, "judge", noted)
     return seen
 
 
@@ -281,7 +286,7 @@ def test_threads_within_a_view_change_nothing(localizer, map_path, plain):
 def test_a_spent_budget_leaves_the_best_place_so_far(map_path, plain):
     """One that ends before the first search does, so that only this one is made. No margin is
     enough to end the search here, and such a place is not confident."""
-    doubting = planned(clear=NEVER_CLEAR, clear_at_judged=NEVER_CLEAR)
+    doubting = planned(clear=NEVER_CLEAR, clear_at_mid=NEVER_CLEAR)
     view = View(plain[0], CAMERA, plain[1])
     whole, fix = (
         Localizer(open_map(map_path), plan=plan).locate(view)

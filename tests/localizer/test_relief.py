@@ -22,11 +22,11 @@ from lab.terrain import random_relief, seen_view
 
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.camera import VARIANCE, VARIANCE_POWER
-from orthonav.core.localize.ground import Relief, ViewOverGround
+from orthonav.core.localize.camera import FITTING
+from orthonav.core.localize.ground import GroundModel, ViewOverGround
 from orthonav.core.localize.place import MAX_RATIO
 from orthonav.core.localize.rectify import Orientation
-from orthonav.core.localize.systematic import SURFACE_M
+from orthonav.core.localize.systematic import ERRORS
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.register.pose import Pose
@@ -64,7 +64,7 @@ def relief():
 
 def on_terrain(opened, relief):
     localizer = Localizer(opened)
-    localizer.registration.relief = Relief(Heights(relief), localizer.grid, surface=Flat())
+    localizer.registration.ground = GroundModel(Heights(relief), localizer.grid, surface=Flat())
     return localizer
 
 
@@ -123,7 +123,7 @@ def test_pitch_and_roll_are_estimated_unless_they_are_exact(opened, grey, relief
     # a view stands out most.
     camera_m = math.sqrt(np.linalg.eigvalsh(fixes[1].cov_en_m2)[-1])
     floor_m = localizer.registration.floor_px * localizer.grid.gsd_m
-    floor_m *= math.sqrt(VARIANCE * MAX_RATIO**VARIANCE_POWER)
+    floor_m *= math.sqrt(FITTING.variance * MAX_RATIO**FITTING.variance_power)
     assert 0.99 * floor_m < fixes[1].evidence["middle_std_m"] < camera_m
 
 
@@ -178,11 +178,11 @@ def test_the_camera_over_a_hole_of_the_terrain_is_found(opened, grey, relief):
 
 def test_simulated_level_ground_is_known_as_well_as_the_terrain(opened):
     localizer = on_terrain(opened, hills(0.05))
-    known = localizer.registration.relief
-    assert known.levelled().level_errors.fields == (SURFACE_M,)
+    known = localizer.registration.ground
+    assert known.levelled().level_errors.fields == (ERRORS.surface_m,)
     known.info = replace(ROUGH, roughness_m=None, source_posting_m=30.0)
     known.surface = None
-    levelled, unknown = known.levelled(), Localizer(opened).registration.relief
+    levelled, unknown = known.levelled(), Localizer(opened).registration.ground
     assert levelled.is_level and levelled.level_errors.slope == 0 < unknown.level_errors.slope
     (std_m, _), _ = levelled.level_errors.fields
     assert 3.0 < std_m <= 5.5  # 100 m times the slope
@@ -209,11 +209,14 @@ def test_formulas_for_level_ground_agree_with_those_for_any(opened, attitude):
     registration = Localizer(opened).registration
     picture = rendered(GROUND, PLACE, ATTITUDE)
     prepared = registration.prepared(View(picture, CAMERA, telemetry(ATTITUDE)), True)
-    flat = Relief(
+    flat = GroundModel(
         Heights(Raster(np.zeros((70, 70), np.float32), -7e4, 7e4, 2e3)), registration.grid
     )
-    seen, any_seen = (ViewOverGround(each, prepared) for each in (registration.relief, flat))
-    assert seen.relief.is_level and not flat.is_level
+    seen, any_seen = (
+        ViewOverGround(each, prepared, registration.reference)
+        for each in (registration.ground, flat)
+    )
+    assert seen.ground.is_level and not flat.is_level
     pose = Pose(300.0, 290.0, 0.3, 0.01)
     assert seen.reference_m(pose) == any_seen.reference_m(pose) == 0.0
     for above_m in (AGL_M, 0.0, -5.0):
@@ -221,7 +224,7 @@ def test_formulas_for_level_ground_agree_with_those_for_any(opened, attitude):
         met, any_met = seen.sight_en_m(orientation), any_seen.sight_en_m(orientation)
         np.testing.assert_allclose(met, any_met, atol=1e-6)
     ground = np.zeros((3, 3))
-    np.testing.assert_array_equal(seen.relief.slopes(ground), flat.slopes(ground))
+    np.testing.assert_array_equal(seen.ground.slopes(ground), flat.slopes(ground))
 
 
 def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):

@@ -1,6 +1,7 @@
 """Position, height and attitude from single views whose tilt is not reported."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,8 +10,8 @@ from blots import AGL_M, CAMERA, GROUND, Flat, as_grey, known_map, rendered
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer, systematic
-from orthonav.core.localize.camera import camera_found
-from orthonav.core.localize.ground import Relief
+from orthonav.core.localize.camera import camera_of
+from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.resection import _Marginal
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Prior, Telemetry, View
@@ -32,7 +33,7 @@ def localizer(made_once, make_ortho):
     """The same on a map with a surface model."""
     made = Localizer(open_map(known_map(made_once, make_ortho).path))
     made.registration.floor_px = 0.0
-    made.registration.relief = Relief(Flat(), made.grid, surface=Flat())
+    made.registration.ground = GroundModel(Flat(), made.grid, surface=Flat())
     return made
 
 
@@ -172,8 +173,9 @@ def test_systematic_errors_are_marginalized():
 
 
 def test_a_place_that_stands_out_is_known_better(localizer, monkeypatch):
-    for field in ("SURFACE_M", "STRETCH_PX"):  # noise of blocks alone
-        monkeypatch.setattr(systematic, field, (1e-3, 10.0))
+    none = (1e-3, 10.0)  # noise of blocks alone
+    errors = replace(systematic.ERRORS, surface_m=none, stretch_px=none)
+    monkeypatch.setattr(systematic, "ERRORS", errors)
     attitude = (20.0, 0.0, 0.0)
     view = View(
         as_grey(rendered(GROUND, np.zeros(2), attitude, AGL_M)),
@@ -183,8 +185,7 @@ def test_a_place_that_stands_out_is_known_better(localizer, monkeypatch):
     search = localizer.registration.search(view, None, True)
     place = search.run()
     alike, alone = (
-        camera_found(search.ground, search.sheet.reference, place.fit.pose, ratio)
-        for ratio in (1.0, 10.0)
+        camera_of(search.over_ground, place.fit.pose, ratio, 0.0) for ratio in (1.0, 10.0)
     )
     assert (alone.orientation.position_m == alike.orientation.position_m).all()
     stds = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in (alone, alike)]

@@ -10,16 +10,16 @@ from blots import AGL_M, CAMERA, GROUND, Heights, as_grey, error_m, known_map
 from lab.terrain import seen_view
 
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.camera import approached, camera_found
+from orthonav.core.localize.camera import approached, camera_of
 from orthonav.core.localize.ground import (
-    MIN_KNOWN,
-    Relief,
-    SearchedSheet,
+    SAMPLING,
+    GroundModel,
+    PreparedMap,
     ViewOverGround,
     _smoothed,
 )
 from orthonav.core.localize.rectify import hidden
-from orthonav.core.localize.systematic import SURFACE_M
+from orthonav.core.localize.systematic import ERRORS
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import Telemetry, View
@@ -55,7 +55,7 @@ def town():
 def on(opened, ground, surface, lean=None):
     localizer = Localizer(opened)
     registration = localizer.registration
-    registration.relief = Relief(Heights(ground), localizer.grid, None, None, surface, lean)
+    registration.ground = GroundModel(Heights(ground), localizer.grid, None, None, surface, lean)
     return localizer
 
 
@@ -99,11 +99,11 @@ def test_the_camera_is_approached_from_metres_and_degrees(opened, town, view):
     _, ground, above = town
     registration = on(opened, ground, Heights(above)).registration
     prepared = registration.prepared(view, True)
-    seen = ViewOverGround(registration.relief, prepared)
+    seen = ViewOverGround(registration.ground, prepared, registration.reference)
     below = float(ground.at(PLACE[:1], PLACE[1:])[0])
     off = np.array([PLACE[0] + 2.0, PLACE[1] - 1.5, np.radians(ATTITUDE[0] + 1.0), np.log(0.98)])
     pose = registration.pose_of(prepared, off)
-    found = approached(seen, registration.reference, pose)
+    found = approached(seen, pose)
     start = seen.orientation(pose)
     truth = np.array([*PLACE, below + AGL_M / 2])
     assert np.linalg.norm(start.position_m - truth) > 2.0
@@ -120,9 +120,9 @@ def test_a_camera_that_the_picture_does_not_show_among_houses_is_not_found(opene
         registration = on(opened, ground, surface).registration
         for picture, found in ((view.grey, True), (other, shown)):
             prepared = registration.prepared(replace(view, grey=picture), True)
-            seen = ViewOverGround(registration.relief, prepared)
+            seen = ViewOverGround(registration.ground, prepared, registration.reference)
             pose = registration.pose_of(prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
-            camera = camera_found(seen, registration.reference, pose, 1.0)
+            camera = camera_of(seen, pose, 1.0, 0.0)
             assert (camera is not None) == found
 
 
@@ -132,10 +132,10 @@ def test_houses_that_lean_on_the_map_are_seen_where_they_stand(opened, town, vie
     lean = Lean(east, north, 0.0)
     registration = on(opened, ground, Heights(shown(above, lean)), lean).registration
     prepared = registration.prepared(view, True)
-    seen = ViewOverGround(registration.relief, prepared)
+    seen = ViewOverGround(registration.ground, prepared, registration.reference)
     pose = registration.pose_of(prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
     nodes, on_map = seen._nodes_m(pose, 0, (120, 160), smooth=False)
-    level_m = registration.relief.terrain.at_en_m(on_map[..., :2])
+    level_m = registration.ground.terrain.at_en_m(on_map[..., :2])
     high_m = nodes[..., 2] - level_m
     off_m = on_map[..., :2] - nodes[..., :2] - high_m[..., None] * [east, north]
     assert np.nanmax(np.abs(off_m)) < 1e-6 and np.nanmax(high_m) > 5.0
@@ -163,7 +163,9 @@ def test_an_unknown_height_at_the_rim_hides_nothing_less(opened, town, view):
     hides = []
     for surface in (above, holed):
         registration = on(opened, ground, Heights(surface)).registration
-        seen = ViewOverGround(registration.relief, registration.prepared(view, True))
+        seen = ViewOverGround(
+            registration.ground, registration.prepared(view, True), registration.reference
+        )
         pose = registration.pose_of(seen.view, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
         nodes, _ = seen._nodes_m(pose, 0, (200, 260), smooth=False)
         assert np.isfinite(nodes[..., :2]).all()
@@ -233,7 +235,7 @@ def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
         telemetry = Telemetry(0, heading_deg, ahead_deg, 0.0, agl_m)
         picture = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
         prepared = registration.prepared(View(picture, CAMERA, telemetry), True)
-        return registration.relief.expected(prepared), prepared
+        return registration.ground.expected(prepared), prepared
 
     nadir, prepared = expected(90.0, 0.0)
     assert nadir is prepared.prior
@@ -253,7 +255,7 @@ def test_views_are_compared_one_level_finer_where_houses_are_mostly_known(opened
     known = round(share * imagery_m2 / posting_m**2)
     info = TerrainInfo(0.0, 0.0, posting_m, 9, 9, 16, 0.0, 9.0, 0.1, known, "surface", "none")
     surface = SimpleNamespace(info=info)
-    found = SearchedSheet(
+    found = PreparedMap(
         made.sheet, made.pyramid, confidence=None, radius_m=9.0, floor_px=1.0, surface=surface
     )
     assert found.is_finer == finer
@@ -265,8 +267,8 @@ def test_views_on_level_ground_know_the_surface_of_a_route(town, opened):
     grid = opened.manifest.sheets[0].grid
     from_m = grid.west_m + 0.7 * grid.width_px * grid.gsd_m
     parts = Heights(ground, from_m=from_m), Heights(above, from_m=from_m)
-    relief = Relief(parts[0], grid, None, None, parts[1])
-    assert relief.levelled().level_errors.fields == (SURFACE_M,)
+    relief = GroundModel(parts[0], grid, None, None, parts[1])
+    assert relief.levelled().level_errors.fields == (ERRORS.surface_m,)
 
 
 def test_a_surface_counts_where_most_of_it_is_known(town, opened):
@@ -276,13 +278,13 @@ def test_a_surface_counts_where_most_of_it_is_known(town, opened):
     east_m = grid.west_m + np.linspace(50, 250, 40) * grid.gsd_m
     for share in (0.2, 0.8):
         surface = Heights(above, from_m=float(np.quantile(east_m, 1 - share)))
-        relief = Relief(Heights(ground), grid, None, None, surface)
+        relief = GroundModel(Heights(ground), grid, None, None, surface)
         found, level = relief.surface_m(px)[..., 2], relief.ground_m(px)[..., 2]
         errors = relief.errors(relief.ground_m(px).reshape(-1, 3), np.zeros((1600, 2)))
-        if share < MIN_KNOWN:
+        if share < SAMPLING.min_known:
             np.testing.assert_array_equal(found, level)
-            assert SURFACE_M not in errors.fields
+            assert ERRORS.surface_m not in errors.fields
         else:
             assert np.isnan(found).mean() == pytest.approx(1 - share, abs=0.03)
             assert np.nanmax(found - level) > 3.0
-            assert errors.fields == (SURFACE_M,)
+            assert errors.fields == (ERRORS.surface_m,)

@@ -11,11 +11,7 @@ from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.localize.camera import ground_by_picture, picture_by_camera, picture_by_ground
 from orthonav.core.localize.rectify import Orientation
 from orthonav.core.localize.systematic import (
-    BARE_EARTH_M,
-    COARSE_STD_M,
-    OBJECTS_M,
-    SURFACE_M,
-    UNDULATION_M,
+    ERRORS,
     GroundErrors,
     field_modes,
     lens_px,
@@ -63,7 +59,7 @@ def explained(moves, by_camera):
 
 
 def test_a_slope_of_the_ground_displaces_as_a_tilt_of_the_camera():
-    by_camera, found = displaced(GroundErrors(math.tan(math.radians(1.0)), (OBJECTS_M,)))
+    by_camera, found = displaced(GroundErrors(math.tan(math.radians(1.0)), (ERRORS.objects_m,)))
     for axis in range(2):
         assert explained(found.moves_px[:, :, axis], by_camera) > 0.999
     # By the same angle: both displace the corners alike, but for a shift and a scale.
@@ -115,7 +111,7 @@ def test_a_field_longer_than_the_view_keeps_its_slope():
 
 
 def test_terrain_houses_and_dates_have_variances_of_their_own():
-    _, found = displaced(GroundErrors(0.0, ((6.0, 150.0), OBJECTS_M)))
+    _, found = displaced(GroundErrors(0.0, ((6.0, 150.0), ERRORS.objects_m)))
     terrain, objects, stretch = (each.at for each in found.components)
     assert (terrain.start, terrain.stop, objects.stop) == (0, objects.start, stretch.start)
     assert stretch.stop == found.moves_px.shape[2]
@@ -124,31 +120,32 @@ def test_terrain_houses_and_dates_have_variances_of_their_own():
 @pytest.mark.parametrize("relief, slope", [("level", 0.01), (None, 0.05), ("hills", 0.12)])
 def test_unknown_ground_is_as_steep_as_the_map_says(relief, slope):
     errors = unknown_ground(relief)
-    assert errors.slope == pytest.approx(slope / math.sqrt(2)) and OBJECTS_M in errors.fields
+    assert errors.slope == pytest.approx(slope / math.sqrt(2)) and ERRORS.objects_m in errors.fields
 
 
 def test_errors_of_terrain_follow_its_source():
     bare = replace(ROUGH, roughness_m=0.3, source_posting_m=1.0)
     coarse = replace(bare, source_posting_m=30.0)
-    assert terrain_errors(ROUGH, SLOPES).fields == (SURFACE_M, (ROUGH.roughness_m, OBJECTS_M[1]))
-    assert terrain_errors(bare, SLOPES).fields == (BARE_EARTH_M, OBJECTS_M)
+    rough = (ROUGH.roughness_m, ERRORS.objects_m[1])
+    assert terrain_errors(ROUGH, SLOPES).fields == (ERRORS.surface_m, rough)
+    assert terrain_errors(bare, SLOPES).fields == (ERRORS.bare_earth_m, ERRORS.objects_m)
     (std_m, length_m), objects = terrain_errors(coarse, SLOPES).fields
-    assert 2.0 < std_m < COARSE_STD_M and length_m == 150.0 and objects == OBJECTS_M
-    assert terrain_errors(coarse, 0 * SLOPES).fields[0][0] == BARE_EARTH_M[0]
-    assert terrain_errors(coarse, 10 * SLOPES).fields[0][0] == COARSE_STD_M
+    assert 2.0 < std_m < ERRORS.coarse_std_m and length_m == 150.0 and objects == ERRORS.objects_m
+    assert terrain_errors(coarse, 0 * SLOPES).fields[0][0] == ERRORS.bare_earth_m[0]
+    assert terrain_errors(coarse, 10 * SLOPES).fields[0][0] == ERRORS.coarse_std_m
     assert terrain_errors(None, SLOPES) == terrain_errors(coarse, SLOPES)
     older = replace(bare, source_posting_m=None, roughness_m=None, posting_m=10.0)
-    assert terrain_errors(older, 10 * SLOPES).fields[0][0] == pytest.approx(COARSE_STD_M / 3)
+    assert terrain_errors(older, 10 * SLOPES).fields[0][0] == pytest.approx(ERRORS.coarse_std_m / 3)
     half = np.where(np.arange(36)[:, None] < 18, np.nan, SLOPES)
     assert terrain_errors(coarse, half).fields == terrain_errors(coarse, SLOPES).fields
-    assert terrain_errors(coarse, np.full((36, 2), np.nan)).fields[0][0] == COARSE_STD_M
+    assert terrain_errors(coarse, np.full((36, 2), np.nan)).fields[0][0] == ERRORS.coarse_std_m
 
 
 def test_houses_that_lean_are_displaced_on_the_map():
     above = np.where(np.arange(36) % 3 == 0, 6.0, np.nan)
     upright, leaning = surface_errors(0.0, above), surface_errors(0.1, above)
-    assert upright.fields == leaning.fields == (SURFACE_M,) and upright.shift is None
-    assert leaning.shift == pytest.approx((0.6, SURFACE_M[1]))
+    assert upright.fields == leaning.fields == (ERRORS.surface_m,) and upright.shift is None
+    assert leaning.shift == pytest.approx((0.6, ERRORS.surface_m[1]))
     _, found = displaced(leaning)
     more = found.moves_px[:, :, found.components[-1].at]
     both = np.einsum("nak,nbk->ab", more, more) / len(more)
@@ -166,7 +163,7 @@ def test_a_coarser_terrain_is_not_believed_more(posting_m):
     coarse = replace(info, source_posting_m=posting_m)
     (std_m, length_m), undulation, _ = terrain_errors(coarse, 10 * SLOPES).fields
     assert std_m / length_m == pytest.approx(fine_m / fine_length_m) and std_m > fine_m
-    assert undulation[1] == UNDULATION_M[1] and 0 < undulation[0] <= std_m
+    assert undulation[1] == ERRORS.undulation_m[1] and 0 < undulation[0] <= std_m
 
 
 def test_derivatives_of_points_on_a_slope_are_those_of_lines_of_sight():

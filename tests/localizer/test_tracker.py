@@ -13,7 +13,7 @@ from blots import AGL_M, GROUND, Flat, Ground, place_of, rendered
 from orthonav.core.errors import CameraError, MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.ground import Relief
+from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.odometry import OdometryView, displacement
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
@@ -118,8 +118,8 @@ def test_the_confidence_of_a_track_is_that_of_its_covariance_and_place(usual):
 def test_biases_of_heading_height_and_mount_are_estimated(localizer, monkeypatch):
     """Uncorrected, 5 deg of pitch are 13 m from 150 m. Over known ground single views show their
     tilt themselves."""
-    relief = Relief(Flat(), localizer.grid, surface=Flat())
-    monkeypatch.setattr(localizer.registration, "relief", relief)
+    ground = GroundModel(Flat(), localizer.grid, surface=Flat())
+    monkeypatch.setattr(localizer.registration, "ground", ground)
     tracker = Tracker(localizer)
     seen = list(
         views(

@@ -13,7 +13,7 @@ import pytest
 
 from helpers import textured
 from orthonav.core.errors import ImageryError, OutputError
-from orthonav.core.localize.confidence import USUAL_CONFIDENCE
+from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import RegistrationCalibration
 from orthonav.ground.build.sheet import AHEAD, Block, BlockCache, in_order
@@ -25,7 +25,7 @@ SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     """Many small blocks, few crops, registration as if it was calibrated."""
-    learnt = RegistrationCalibration(USUAL_CONFIDENCE, 0.5)
+    learnt = RegistrationCalibration(DEFAULT_CONFIDENCE, 0.5)
     monkeypatch.setattr("orthonav.ground.build.build.calibrate_registration", lambda *_: learnt)
     monkeypatch.setattr("orthonav.ground.build.sheet.BLOCK_PX", 128)
     monkeypatch.setattr("orthonav.ground.build.sheet.MIN_CACHED_BLOCKS", 4)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.localize.confidence import USUAL_CONFIDENCE
+from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
 from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import CALIBRATION
@@ -41,7 +41,7 @@ def test_a_second_date_sets_the_floor_of_a_map(small):
 
 def test_a_uniform_map_has_the_usual_confidence(small):
     plain = small(np.full((200, 200), 99, np.uint8))
-    assert plain["confidence"] == USUAL_CONFIDENCE.to_plain()
+    assert plain["confidence"] == DEFAULT_CONFIDENCE.to_plain()
     assert plain["position_floor_px"] == CALIBRATION.floor_px
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-from orthonav.core.localize.place import Placer
+from orthonav.core.localize.place import CandidateRefiner
 from orthonav.core.register.pose import Pose, PosePrior
 from orthonav.core.register.search import SearchWindows, bank, search
 from orthonav.core.register.template import Levels, ViewTemplates
@@ -42,14 +42,14 @@ def searched(reference, templates, prior, level, count=24):
     return [each.pose for each in search(templates.at(level, recipe), window, around, count)]
 
 
-def verified(placer, candidates, level, **more):
+def verified(refiner, candidates, level, **more):
     """From candidates to the best place."""
-    return placer.finished(placer.judge(candidates, level), len(candidates), **more)
+    return refiner.finished(refiner.judge(candidates, level), len(candidates), **more)
 
 
-def registered(reference, templates, prior, level=LEVELS.judged):
-    placer = Placer(templates, LEVELS, prior, reference)
-    return verified(placer, searched(reference, templates, prior, level), level)
+def registered(reference, templates, prior, level=LEVELS.mid):
+    refiner = CandidateRefiner(templates, LEVELS, prior, reference)
+    return verified(refiner, searched(reference, templates, prior, level), level)
 
 
 def near(pose, dx=0.0, dy=0.0):
@@ -76,7 +76,7 @@ ONE = Pose(112.0, 192.0, 0.3, 0.0)
 SAME_AGAIN = Pose(336.0, 192.0, 0.3, 0.0)
 
 
-@pytest.mark.parametrize("level", [LEVELS.judged, LEVELS.coarse])
+@pytest.mark.parametrize("level", [LEVELS.mid, LEVELS.coarse])
 def test_a_view_is_found_and_stands_out(reference, level):
     for pose in random_poses(4, SHAPE, 90, seed=1, log_scale=0.08):
         found = registered(reference, templates_of(GROUND, pose), prior_of(pose), level)
@@ -107,7 +107,9 @@ def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
     candidates = [near(ONE, 3, -2), near(twin, -2, 3), near(twin, 0, 90), near(ONE, 0, -80)]
 
     def found_with(prior):
-        return verified(Placer(templates, LEVELS, prior, reference), candidates, LEVELS.judged)
+        return verified(
+            CandidateRefiner(templates, LEVELS, prior, reference), candidates, LEVELS.mid
+        )
 
     ratios = []
     for pose, std_deg in ((ONE, 10.0), (twin, 10.0), (ONE, 40.0)):
@@ -135,8 +137,8 @@ def test_blank_views_and_blank_maps_are_no_crash(reference, grey):
     empty = reference_of(lambda x, y: grey + 0 * x + 0 * y, SHAPE)
     for where, templates in ((reference, blank), (empty, templates_of(GROUND, HERE))):
         candidates = [HERE, near(HERE, 80.0, 40.0), near(HERE, 1e4, 1e4)]
-        placer = Placer(templates, LEVELS, prior_of(HERE), where)
-        found = verified(placer, candidates, LEVELS.coarse)
+        refiner = CandidateRefiner(templates, LEVELS, prior_of(HERE), where)
+        found = verified(refiner, candidates, LEVELS.coarse)
         assert abs(found.score) < 30 and np.isfinite(found.fit.covariance).all()
         assert math.isfinite(found.scores["peak_ratio"] + found.scores["look_ratio"])
 

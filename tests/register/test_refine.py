@@ -1,6 +1,7 @@
 """Refinement finds the very place, says how well it fits and how exactly it is known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,8 +18,9 @@ from scenes import (
 
 from orthonav.core.register.channels import COARSE, FINE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.refine import STEPS, Refiner
+from orthonav.core.register.refine import DESCENT, Refiner
 from orthonav.core.register.template import ViewTemplates
+from orthonav.core.register.window import Reference
 
 SHAPE = (384, 448)
 VIEW = (96, 128)
@@ -116,19 +118,18 @@ def test_beyond_the_map_nothing_is_said(reference):
 def test_a_blank_view_says_nothing(reference, grey):
     view = ViewTemplates(np.full(VIEW, grey, np.uint8), np.ones(VIEW, bool), 0)
     placed = Refiner(view.at(0), reference).place(
-        Pose(200.0, 180.0, 0.0, 0.0), STEPS, with_covariance=True
+        Pose(200.0, 180.0, 0.0, 0.0), DESCENT.steps, with_covariance=True
     )
     assert abs(placed.score) < 1e-3 and np.isfinite(placed.covariance).all()
     assert math.isfinite(placed.pose.x_px + placed.pose.turn_rad + placed.pose.log_scale)
 
 
-def many_placed(reference, level, count, seed, **view):
-    """Errors (N, 4) and covariances (N, 4, 4) of noisy views, from poses near the truth."""
-    rng = np.random.default_rng(seed)
-    off, covariances = [], []
-    for pose in random_poses(count, SHAPE, REACH_PX, seed=seed, log_scale=0.1):
-        template = noisy(GROUND, pose, rng, **view).at(level)
-        placed = Refiner(template, reference).place(pose, with_covariance=True)
+def placed_all(reference, level, poses, starts=None, seed=5, ground=GROUND, **view):
+    """Errors (N, 4) and covariances (N, 4, 4) of noisy views at poses, refined from `starts`."""
+    rng, off, covariances = np.random.default_rng(seed), [], []
+    for pose, start in zip(poses, starts or poses, strict=True):
+        template = noisy(ground, pose, rng, **view).at(level)
+        placed = Refiner(template, reference).place(start, with_covariance=True)
         off.append(errors(placed, pose))
         covariances.append(placed.covariance)
     return np.array(off), np.array(covariances)
@@ -143,7 +144,8 @@ def normalized_squares(off, covariances, part=np.s_[:2]):
 @pytest.mark.parametrize("view", [{"noise": 12.0}, {"noise": 8.0, "clutter": 24.0}], ids=str)
 def test_errors_are_as_large_as_the_covariance_says(reference, level, view):
     """Squared errors over the covariance average 2 where it is right, on two axes."""
-    off, covariances = many_placed(reference, level, 50, 10 + level, **view)
+    poses = random_poses(50, SHAPE, REACH_PX, seed=10 + level, log_scale=0.1)
+    off, covariances = placed_all(reference, level, poses, seed=10 + level, **view)
     squares = normalized_squares(off, covariances)
     assert 0.75 < squares.mean() < 3.0
     assert np.mean(squares < 9.21) > 0.95  # 99 % of a true one's
@@ -172,3 +174,47 @@ def test_tiny_views_are_no_crash(reference, shape):
     for recipe in (FINE, COARSE):
         placed = Refiner(view.at(0, recipe), reference).place(pose, with_covariance=True)
         assert math.isfinite(placed.score) and np.isfinite(placed.covariance).all()
+
+
+@pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())
+@pytest.mark.parametrize("level", [pytest.param(0, marks=pytest.mark.slow), 1])
+def test_errors_on_a_part_of_the_map_are_as_large_as_the_covariance_says(hole, level):
+    valid = np.ones(SHAPE, bool)
+    valid[hole] = False
+    moves = np.random.default_rng(4).uniform(-1, 1, (60 if level else 30, 4))
+    moves *= [8, 8, math.pi, 0.05]
+    poses = [Pose(222 + x, 181 + y, turn, log_scale) for x, y, turn, log_scale in moves]
+    starts = [moved(each, 2.0**level, number, 1.0, 1.01) for number, each in enumerate(poses)]
+    reference = reference_of(GROUND, SHAPE, valid)
+    found = placed_all(reference, level, poses, starts, noise=10.0, clutter=12.0)
+    assert 1.0 < normalized_squares(*found).mean() < 3.5
+
+
+@pytest.mark.parametrize("log_scale", [2.0, 7.0, 700.0])
+def test_an_absurd_scale_takes_no_memory(log_scale, monkeypatch):
+    """As computed from a bank at a low height: a window of 129 GiB was asked for."""
+    pose = Pose(222.0, 181.0, 0.1, 0.0)
+    view = noisy(GROUND, pose, np.random.default_rng(1), noise=10.0).at(0)
+    reference = reference_of(GROUND, SHAPE)
+    monkeypatch.setattr(Reference, "caches", lambda self, level: False)
+    sizes, window = [], Reference.window
+
+    def counted(self, level, row, col, height, width, *more):
+        sizes.append(height * width)
+        return window(self, level, row, col, height, width, *more)
+
+    monkeypatch.setattr(Reference, "window", counted)
+    usual = Refiner(view, reference).place(pose)
+    absurd = Refiner(view, reference).place(replace(pose, log_scale=log_scale))
+    assert sizes[-1] < 10 * sizes[0] and not absurd.score > 0.5 * usual.score
+
+
+@pytest.mark.parametrize("spread_rad", [0.12, 0.6])
+@pytest.mark.parametrize("level", [0, 1])
+def test_where_the_ground_runs_in_one_direction_the_covariance_covers_the_errors(spread_rad, level):
+    """Furrows: a changed view says nothing along them, whatever its own noise says."""
+    furrows = Ground(seed=1, spread_rad=spread_rad)
+    poses = random_poses(20, SHAPE, REACH_PX, seed=5)
+    view = {"ground": furrows, "noise": 8.0, "clutter": 24.0}
+    found = placed_all(reference_of(furrows, SHAPE), level, poses, **view)
+    assert normalized_squares(*found).mean() < 3.5

@@ -1,6 +1,8 @@
 """Views are found where they were cut, under any heading, or nothing is claimed."""
 
 import math
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -9,7 +11,7 @@ from scenes import Ground, apart_px, random_poses, reference_of, templates_of, t
 
 from orthonav.core.register.channels import FINE, GREY_SHARE
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.search import SearchWindow, bank, best_near, search
+from orthonav.core.register.search import SearchWindow, SearchWindows, bank, best_near, search
 from orthonav.core.register.template import Template
 
 SHAPE = (384, 448)
@@ -161,3 +163,20 @@ def test_nothing_to_compare_is_no_crash(reference):
     ):
         found = search(template, window, near(pose), 3)
         assert len(found) <= 3 and all(abs(each.score) < 1e-3 for each in found)
+
+
+def test_threads_may_ask_for_windows_of_many_sizes():
+    windows = SearchWindows(reference_of(GROUND, (64, 64)))
+    windows.whole(2, FINE, 20.0)
+
+    def ask(seed):
+        for view_px in np.random.default_rng(seed).uniform(8, 300, 400):
+            windows.whole(2, FINE, float(view_px))
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(ask, range(8)))
+    finally:
+        sys.setswitchinterval(interval)

@@ -8,9 +8,9 @@
 2. `search.Search` runs steps that find candidates, the cheapest first: a correlation with the map
    by FFT, or the tiles whose embeddings are most similar (`tiles`). What is tried, what it costs
    and when it ends are numbers in `policy`.
-3. `place.Placer` refines candidates from coarse to fine and compares the best `Place` with its
-   strongest rival; the search ends as soon as it stands out. On a map with a terrain the best are
-   orthorectified on it first (`ground`). Where none is recognized, gradients alone decide
+3. `place.CandidateRefiner` refines candidates from coarse to fine and compares the best place with
+   its strongest rival; the search ends as soon as it stands out. On a map with a terrain the best
+   are orthorectified on it first (`ground`). Where none is recognized, gradients alone decide
    (`search.found_by`).
 4. `camera` fits position, height, heading, pitch and roll to the blocks of the view there, with the
    reported ones as a prior. That gives their covariance too.

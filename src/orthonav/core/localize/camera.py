@@ -11,46 +11,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera, enu_from_camera, seen_px
-from orthonav.core.localize.ground import LevelTerrain, Relief, ViewOverGround
+from orthonav.core.localize.ground import GroundModel, LevelTerrain, ViewOverGround
 from orthonav.core.localize.rectify import Orientation, is_oblique
-from orthonav.core.localize.resection import Expected, Resection, climbed, resected, values
+from orthonav.core.localize.resection import Blocks, Expected, Resection, values
 from orthonav.core.localize.systematic import GroundErrors, lens_px, systematic
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
 from orthonav.core.register.blocks import BlockScores, block_scores
 from orthonav.core.register.pose import Pose
 from orthonav.core.register.template import BLOCKS, ViewTemplates
-from orthonav.core.register.window import Reference
 
-STEPS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
-"""Of numerical derivatives: metres east, north, up, degrees of heading, pitch, roll."""
-GROUND_STEP_M = 1.0  # of a point of the ground
-MIN_TILT_STD_DEG = 0.05  # of a tilt that is reported as exact
-FIRST_REACH_PX, REACH_PX = 7, 4
-"""Reach, pixels of the level: 7 px are 10 deg of tilt at the rim of a view 65 deg wide."""
-SURFACE_REACHES_PX = 16, 8
-"""The first reaches over houses and trees, at the finer level: coarser ones do not show the camera
-(docs/terrain.md)."""
-LEAST_FIT, CLOSE_FIT = 0.13, 0.15
-"""Mean correlation of the blocks of a view among houses: below the first the camera is not shown,
-from the second on one close to the reported one is not sought any farther. Over towns right ones
-had 0.15 and more, wrong ones at most 0.12 (docs/terrain.md)."""
-AGAIN_PX = 1.0
-"""A view is orthorectified once more where its correction moves a block by more pixels of the final
-level."""
-VARIANCE, VARIANCE_POWER, LEAST_RATIO = 1.6, -0.8, 0.5
-"""Variance of the errors of blocks over what their curvature says: the first, times the local ratio
-of the place (at least the third) to the power of the second (docs/decisions/camera.md)."""
 Array = NDArray[np.float64]
-STAYS: Array = np.zeros(6)
-"""No correction of a camera."""
+
+
+@dataclass(frozen=True)
+class CameraFitting:
+    """How blocks of a view are fitted; reasons: docs/decisions/camera.md and terrain.md."""
+
+    step_m: float = 1.0  # of numerical derivatives by points of the ground
+    step_deg: float = 0.1  # and by the attitude
+    min_tilt_std_deg: float = 0.05  # of a tilt that is reported as exact
+    first_reach_px: int = 7
+    """Pixels of the level: 10 deg of tilt at the rim of a view 65 deg wide."""
+    reach_px: int = 4  # of the last comparison
+    house_reaches_px: tuple[int, ...] = (16, 8)
+    """The first reaches over houses and trees, at the finer level: coarser ones do not show the
+    camera."""
+    min_fit: float = 0.13
+    """Mean correlation of the blocks of a view among houses, below which the camera is not shown.
+    Over towns right cameras had 0.15 and more, wrong ones at most 0.12."""
+    close_fit: float = 0.15  # a camera close to the reported one that fits so well is right
+    moved_px: float = 1.0
+    """A view is orthorectified again where its correction moves a block by more pixels of the final
+    level."""
+    variance: float = 1.6
+    """Variance of the errors of blocks over what their curvature says, at a local ratio of 1,"""
+    variance_power: float = -0.8  # times this power of the local ratio of the place,
+    min_local_ratio: float = 0.5  # at least this
+
+
+FITTING = CameraFitting()
 
 
 def picture_by_ground(camera: Camera, orientation: Orientation, ground_m: Array) -> Array:
     """Pixels (N, 2, 3) by which points of the ground (N, 3) move in the picture per metre east,
     north and up; NaN where not seen."""
-    steps = GROUND_STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
+    steps = FITTING.step_m * np.concatenate([np.eye(3), -np.eye(3)])
     ahead, behind = orientation.seen_px(camera, ground_m + steps[:, None]).reshape(2, 3, -1, 2)
-    return np.asarray(np.moveaxis(ahead - behind, 0, -1) / (2 * GROUND_STEP_M))
+    return np.asarray(np.moveaxis(ahead - behind, 0, -1) / (2 * FITTING.step_m))
 
 
 def ground_by_picture(by_ground: Array, slopes: Array) -> Array:
@@ -66,146 +73,144 @@ def picture_by_camera(
 ) -> Array:
     """Pixels (N, 2, 6) by which points of the ground (N, 3) move in the picture per unit of the
     camera. `by_ground` (N, 2, 3): `picture_by_ground`, as of a camera that moves the other way."""
-    steps = np.concatenate([np.diag(STEPS[3:]), -np.diag(STEPS[3:])])
+    steps = FITTING.step_deg * np.concatenate([np.eye(3), -np.eye(3)])
     attitudes_deg = (orientation.attitude_deg + steps).tolist()
     rotations = np.stack([enu_from_camera(*each) for each in attitudes_deg])
     ahead, behind = seen_px(camera, (ground_m - orientation.position_m) @ rotations).reshape(
         2, 3, -1, 2
     )
-    turned = np.moveaxis((ahead - behind) / (2 * STEPS[3:, None, None]), 0, -1)
+    turned = np.moveaxis((ahead - behind) / (2 * FITTING.step_deg), 0, -1)
     return np.concatenate([-by_ground, turned], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
-class CameraFound:
-    """The camera of a view; `agl_m`: above the ground below it; `alone`: without telemetry.
+class CameraEstimate:
+    """The camera of a view; `agl_m`: above the ground below it; `image_only`: without telemetry.
 
     - covariances (6, 6): m east, north, up, deg heading, pitch, roll; `WEAK` where not shown.
-    - `variance`: of the errors of blocks over what their curvature says.
     - `middle_en_m`, `middle_covariance` (2, 2): ground in the middle of the picture, None: unknown.
     """
 
     orientation: Orientation
     agl_m: float
     covariance: Array
-    alone: Orientation
-    alone_covariance: Array
-    variance: float
+    image_only: Orientation
+    image_only_covariance: Array
     middle_en_m: tuple[float, float]
     middle_covariance: Array | None
 
 
-def approached(seen: ViewOverGround, reference: Reference, pose: Pose) -> Orientation | None:
+def approached(seen: ViewOverGround, pose: Pose) -> Orientation | None:
     """The camera of a view that was placed at `pose`, known to some pixels; None where too few
     blocks are seen."""
     start = seen.orientation(pose)
     if start is None:
         return None
-    smooth = _climbed(seen, reference, pose, start, FIRST_REACH_PX, finer=False)
-    if seen.relief.surface is None:
+    smooth = _climbed(seen, pose, start, FITTING.first_reach_px, finer=False)
+    if seen.ground.surface is None:
         return smooth
-    end = _among_houses(seen, reference, pose, start)
+    end = _among_houses(seen, pose, start)
     if end is None or smooth is None:
-        return smooth if end is None else end[1]
-    away = np.concatenate([smooth.position_m - end[1].position_m, _turn(end[1], smooth)])
-    if end[0].moves_px(away) < SURFACE_REACHES_PX[0] * 2.0 ** (seen.view.levels.final - 1):
-        return end[1]
+        return smooth if end is None else end.orientation
+    if end.moves_px(_correction(end.orientation, smooth)) < (
+        FITTING.house_reaches_px[0] * 2.0 ** (seen.view.levels.final - 1)
+    ):
+        return end.orientation
     # Over roofs the fit may end at another camera; that which fits best is right.
-    other = _among_houses(seen, reference, pose, smooth)
-    return end[1] if other is None or other[0].fit() <= end[0].fit() else other[1]
+    other = _among_houses(seen, pose, smooth)
+    return end.orientation if other is None or other.fit() <= end.fit() else other.orientation
 
 
-def _turn(one: Orientation, other: Orientation) -> Array:
-    """From one attitude to the other (3,), within half a turn."""
-    return np.asarray((other.attitude_deg - one.attitude_deg + 180.0) % 360.0 - 180.0)
+def _correction(one: Orientation, other: Orientation) -> Array:
+    """From one camera to the other (6,), turned by less than half a turn."""
+    turn_deg = (other.attitude_deg - one.attitude_deg + 180.0) % 360.0 - 180.0
+    return np.concatenate([other.position_m - one.position_m, turn_deg])
 
 
-def _close(
-    seen: ViewOverGround, reference: Reference, pose: Pose
-) -> "tuple[_Compared, Orientation] | None":
-    """The camera among houses, with the blocks there, where it is close to the reported one."""
+def _close(seen: ViewOverGround, pose: Pose) -> "_Compared | None":
+    """The blocks among houses under a camera close to the reported one, where they fit."""
     start = seen.orientation(pose)
-    if seen.relief.surface is None or start is None:
+    if seen.ground.surface is None or start is None:
         return None
-    end = _among_houses(seen, reference, pose, start, SURFACE_REACHES_PX[-1:])
-    return None if end is None or end[0].mean_correlation() < CLOSE_FIT else end
+    end = _among_houses(seen, pose, start, FITTING.house_reaches_px[-1:])
+    return None if end is None or end.mean_correlation() < FITTING.close_fit else end
 
 
 def _among_houses(
     seen: ViewOverGround,
-    reference: Reference,
     pose: Pose,
     start: Orientation,
-    reaches_px: tuple[int, ...] = SURFACE_REACHES_PX,
-) -> "tuple[_Compared, Orientation] | None":
-    """The camera where the fit ends, with the blocks there."""
+    reaches_px: tuple[int, ...] = FITTING.house_reaches_px,
+) -> "_Compared | None":
+    """The blocks under the camera where the fit ends."""
     orientation: Orientation | None = start
     for reach_px in reaches_px:
         if orientation is not None:
-            orientation = _climbed(seen, reference, pose, orientation, reach_px, finer=True)
-    if orientation is None:
-        return None
-    end = _compared(seen, reference, pose, orientation, REACH_PX, finer=True)
-    return None if end is None else (end, orientation)
+            orientation = _climbed(seen, pose, orientation, reach_px, finer=True)
+    return None if orientation is None else _compared(seen, pose, orientation)
 
 
 def _climbed(
-    seen: ViewOverGround,
-    reference: Reference,
-    pose: Pose,
-    start: Orientation,
-    reach_px: int,
-    *,
-    finer: bool,
+    seen: ViewOverGround, pose: Pose, start: Orientation, reach_px: int, *, finer: bool
 ) -> Orientation | None:
-    compared = _compared(seen, reference, pose, start, reach_px, finer=finer)
-    correction = None if compared is None else compared.climbed()
-    return None if correction is None else start.moved(correction)
+    compared = _compared(seen, pose, start, reach_px, finer=finer)
+    if compared is None or compared.blocks is None:
+        return None
+    return start.moved(compared.blocks.climb(compared.expected, compared.errors.slope))
 
 
-def camera_found(
+def camera_of(
     seen: ViewOverGround,
-    reference: Reference,
     pose: Pose,
     local_ratio: float,
+    floor_m: float,
     start: Orientation | None = None,
-) -> CameraFound | None:
+) -> CameraEstimate | None:
     """Position, attitude and covariance of the camera of a view that was placed at `pose`; None
     where too few blocks are seen, or the camera would be below the ground.
 
-    `local_ratio`: of the scores of the place. `start`: `approached`, where it is known."""
+    `local_ratio`: of the scores of the place. `floor_m`: standard deviation with which maps of two
+    dates agree. `start`: `approached`, where it is known."""
     if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
-        level = Relief(LevelTerrain(), seen.relief.grid, land=seen.relief.land)
-        seen, start = ViewOverGround(level, seen.view), None
-    close = None if start is not None else _close(seen, reference, pose)
+        level = GroundModel(LevelTerrain(), seen.ground.grid, land=seen.ground.land)
+        seen, start = ViewOverGround(level, seen.view, seen.reference), None
+    close = None if start is not None else _close(seen, pose)
     if close is not None:
-        start = close[1]
-    start = start or approached(seen, reference, pose)
+        start = close.orientation
+    start = start or approached(seen, pose)
     if start is None:
         return None
-    variance = VARIANCE * max(local_ratio, LEAST_RATIO) ** VARIANCE_POWER
-    near = _fitted(seen, reference, pose, start, variance, close and close[0])
-    if near is not None and near.moved_px > AGAIN_PX * 2.0**seen.view.levels.final:
-        near = _fitted(seen, reference, pose, near.orientation, variance)
+    ratio = max(local_ratio, FITTING.min_local_ratio)
+    variance = FITTING.variance * ratio**FITTING.variance_power
+    near = _fitted(close or _compared(seen, pose, start), variance)
+    if near is not None and near.moved_px > FITTING.moved_px * 2.0**seen.view.levels.final:
+        near = _fitted(_compared(seen, pose, near.orientation), variance)
     if near is None or not near.is_shown:
         return None
     found, orientation = near.found, near.orientation
     east, north, above_sea_m = orientation.position_m.tolist()
-    below_m = float(seen.relief.terrain.at_en_m([east, north]))
+    below_m = float(seen.ground.terrain.at_en_m([east, north]))
     agl_m = above_sea_m - (seen.reference_m(pose) if math.isnan(below_m) else below_m)
     if not agl_m > 0:
         return None
     sight_en_m = seen.sight_en_m(orientation)
-    return CameraFound(
+    middle = _middle_covariance(seen, orientation, sight_en_m, found.covariance)
+    floor_m2 = np.eye(2) * floor_m**2 * variance
+    return CameraEstimate(
         orientation,
         agl_m,
-        found.covariance,
-        near.start.moved(found.alone),
-        found.alone_covariance,
-        variance,
+        _with_floor(found.covariance, floor_m2),
+        near.start.moved(found.image_only),
+        _with_floor(found.image_only_covariance, floor_m2),
         seen.middle_en_m(sight_en_m, pose),
-        _middle_covariance(seen, orientation, sight_en_m, found.covariance),
+        None if middle is None else middle + floor_m2,
     )
+
+
+def _with_floor(covariance: Array, floor_m2: Array) -> Array:
+    out = covariance.copy()
+    out[:2, :2] += floor_m2
+    return out
 
 
 def tilt_std_deg(telemetry: Telemetry) -> float:
@@ -229,22 +234,13 @@ class _Fitted(NamedTuple):
         return self.start.moved(self.found.correction)
 
 
-def _fitted(
-    seen: ViewOverGround,
-    reference: Reference,
-    pose: Pose,
-    start: Orientation,
-    variance: float,
-    near: "_Compared | None" = None,
-) -> _Fitted | None:
-    """`near`: the blocks under `start`, None: to be compared."""
-    near = near or _compared(seen, reference, pose, start, REACH_PX, finer=True)
-    found = None if near is None else near.resected(variance)
+def _fitted(near: "_Compared | None", variance: float) -> _Fitted | None:
+    found = None if near is None else near.resect(variance)
     if near is None or found is None:
         return None
-    is_shown = not seen.relief.shows_houses(near.ground_m)
-    is_shown = is_shown or near.mean_correlation(found.correction) >= LEAST_FIT
-    return _Fitted(start, found, near.moves_px(found.correction), is_shown)
+    is_shown = not near.seen.ground.shows_houses(near.ground_m)
+    is_shown = is_shown or near.mean_correlation(found.correction) >= FITTING.min_fit
+    return _Fitted(near.orientation, found, near.moves_px(found.correction), is_shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,75 +248,66 @@ class _Compared:
     """Blocks of a view under an orientation, beside the map.
 
     - `seen`: the view. `expected`: its camera by telemetry.
-    - `blocks`: of each level, and its pixel in pixels of level 0.
+    - `finest`: blocks of the finest level, and its pixel in pixels of level 0.
+    - `blocks`: of all levels, None: too few are seen.
     - `ground_m` (N, 3): in their middles, and its `errors`.
     - `moved_px` (N, 2, 6): they move by so many pixels of level 0 per unit of the camera.
     - `by_lens_px`: see `systematic`."""
 
     seen: ViewOverGround
+    orientation: Orientation
     expected: Expected
-    blocks: list[tuple[BlockScores, float]]
+    finest: tuple[BlockScores, float]
+    blocks: Blocks | None
     ground_m: Array
     errors: GroundErrors
     moved_px: Array
     by_lens_px: Array | None
 
-    @property
-    def block_px(self) -> float:
-        return self.seen.view.side_px / BLOCKS
-
-    def fit(self, correction: Array = STAYS) -> float:
+    def fit(self, correction: Array | None = None) -> float:
         """Sum of the correlations of the finest blocks under a correction (6,), over what chance
         makes."""
-        (correlations, pixels, _), pixel = self.blocks[0]
-        moved_px = np.nan_to_num(self.moved_px @ correction) / pixel
+        (correlations, pixels, _), pixel = self.finest
+        moved_px = np.zeros((len(pixels), 2))
+        if correction is not None:
+            moved_px = np.nan_to_num(self.moved_px @ correction) / pixel
         return float((values(correlations, moved_px) * np.sqrt(pixels)).sum())
 
-    def mean_correlation(self, correction: Array = STAYS) -> float:
+    def mean_correlation(self, correction: Array | None = None) -> float:
         """Of the same blocks, weighted by the roots of their pixels."""
-        return self.fit(correction) / max(float(np.sqrt(self.blocks[0][0].pixels).sum()), 1.0)
+        return self.fit(correction) / max(float(np.sqrt(self.finest[0].pixels).sum()), 1.0)
 
     def moves_px(self, correction: Array) -> float:
         """How far a correction (6,) moves a block, pixels of level 0."""
         return float(np.nanmax(np.hypot(*(self.moved_px @ correction).T)))
 
-    def climbed(self) -> Array | None:
-        blocks, moved_px, slope = self.blocks, self.moved_px, self.errors.slope
-        return climbed(blocks, moved_px, self.expected, slope, block_px=self.block_px)
-
-    def resected(self, variance: float) -> Resection | None:
+    def resect(self, variance: float) -> Resection | None:
+        if self.blocks is None:
+            return None
         errors = systematic(
             self.errors,
             places_m=self.ground_m[:, :2],
             # Raised ground moves as under a camera that is lower by as much.
             by_height_px=-self.moved_px[:, :, 2],
             by_lens_px=self.by_lens_px,
-            block_px=self.block_px,
-            gsd_m=self.seen.relief.grid.gsd_m,
+            block_px=self.seen.view.side_px / BLOCKS,
+            gsd_m=self.seen.ground.grid.gsd_m,
         )
-        return resected(
-            self.blocks,
-            self.moved_px,
-            self.expected,
-            errors,
-            variance=variance,
-            block_px=self.block_px,
-        )
+        return self.blocks.resect(self.expected, errors, variance)
 
 
 def _compared(
     seen: ViewOverGround,
-    reference: Reference,
     pose: Pose,
     orientation: Orientation,
-    reach_px: int,
+    reach_px: int = FITTING.reach_px,
     *,
-    finer: bool,
+    finer: bool = True,
 ) -> _Compared | None:
     """The blocks of a view under an orientation, compared with the map, moved by up to `reach_px`
     pixels of the level; None: too few pixels. At the final level and a coarser one, or at a finer
     one too."""
-    final = seen.view.levels.final
+    final, reference, ground_model = seen.view.levels.final, seen.reference, seen.ground
     finest = max(final - 1, 0) if finer else final
     made = _templates(seen, pose, finest, orientation, first=not finer)
     if made is None:
@@ -329,23 +316,26 @@ def _compared(
     levels = [at for at in range(finest, coarsest + 1) if min(made.shape(at)) >= BLOCKS]
     if not levels:
         return None
-    blocks = [(block_scores(made.at(at), reference, pose, reach_px), 2.0**at) for at in levels]
+    scores = [(block_scores(made.at(at), reference, pose, reach_px), 2.0**at) for at in levels]
     camera = seen.view.picture_at(finest).camera
-    ground = seen.relief.ground_m(pose.map_px(blocks[0][0].middles_px * blocks[0][1]))
-    slopes = seen.relief.slopes(ground)
-    window_from_en = np.linalg.inv(pose.linear) @ np.diag([1.0, -1.0]) / seen.relief.grid.gsd_m
+    ground = ground_model.ground_m(pose.map_px(scores[0][0].middles_px * scores[0][1]))
+    slopes = ground_model.slopes(ground)
+    window_from_en = np.linalg.inv(pose.linear) @ np.diag([1.0, -1.0]) / ground_model.grid.gsd_m
     by_ground = picture_by_ground(camera, orientation, ground)
     by_picture = window_from_en @ ground_by_picture(by_ground, slopes)
     by_lens = None
     if camera.focal_std > 0:
         by_lens = by_picture @ lens_px(camera, orientation.seen_px(camera, ground))
+    moved_px = -by_picture @ picture_by_camera(camera, orientation, ground, by_ground)
     return _Compared(
         seen,
+        orientation,
         _expected(seen, pose, orientation),
-        blocks,
+        scores[0],
+        Blocks.of(scores, moved_px, seen.view.side_px / BLOCKS),
         ground,
-        seen.relief.errors(ground, slopes),
-        -by_picture @ picture_by_camera(camera, orientation, ground, by_ground),
+        ground_model.errors(ground, slopes),
+        moved_px,
         by_lens,
     )
 
@@ -363,8 +353,8 @@ def _middle_covariance(
     seen: ViewOverGround, orientation: Orientation, sight_en_m: Array, covariance: Array
 ) -> Array | None:
     """Of the ground (2, 2), m2, that the middle of a view shows; None beside unknown ground."""
-    point = np.array([[*sight_en_m, float(seen.relief.terrain.at_en_m(sight_en_m))]])
-    slopes = seen.relief.slopes(point)
+    point = np.array([[*sight_en_m, float(seen.ground.terrain.at_en_m(sight_en_m))]])
+    slopes = seen.ground.slopes(point)
     if not (np.isfinite(point).all() and np.isfinite(slopes).all()):
         return None
     camera = seen.view.picture_at(seen.view.levels.final).camera
@@ -384,7 +374,7 @@ def _expected(seen: ViewOverGround, pose: Pose, orientation: Orientation) -> Exp
     turn = math.degrees(prior.turn_rad or 0.0) - orientation.attitude_deg[0]
     tilt = np.array([telemetry.pitch_deg, telemetry.roll_deg]) - orientation.attitude_deg[1:]
     mean = np.array([0.0, 0.0, up_m, math.remainder(turn, 360.0), *tilt.tolist()])
-    tilt_std = max(tilt_std_deg(telemetry), MIN_TILT_STD_DEG)
+    tilt_std = max(tilt_std_deg(telemetry), FITTING.min_tilt_std_deg)
     stds = np.array([1e4, 1e4, telemetry.agl_m * std, 180.0, tilt_std, tilt_std])
     if prior.turn_rad is not None:
         stds[3] = math.degrees(prior.turn_std_rad)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 from orthonav.core.limits import DEFAULT_RISK
-from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.core.records import CONFIDENT, Fix, NoFix, ViewResult
 
 FEATURES = (
     "log_strength",
@@ -26,14 +26,6 @@ FEATURES = (
 )
 ALONE = 2  # the last two features say whether the view fits nowhere near as well
 CHANCES = ("total", "look", "fine")
-CUT_SHORT = 0.89
-"""Limit where `--budget-ms` ended the search before a place stood out. Below `CONFIDENT`."""
-USUAL_BIASES = -6.68, -8.0
-USUAL_WEIGHTS = 2.35, 4.29, 5.87, 2.7, 2.28, 4.05, 3.03
-"""Fitted to 1,734 views (docs/decisions/confidence.md)."""
-STAND_IN = 0.7  # of the chance value: stands in for a rival where none was found
-LEAST_DEVIATIONS = 1.0  # least height above the ground nearby that counts, in standard deviations
-USUAL_DETAIL = 1.4  # for views too small to be finished one level finer
 
 
 @dataclass(frozen=True)
@@ -54,7 +46,7 @@ class Chances:
         return self.look if math.isnan(evidence["detail_ratio"]) else self.total
 
 
-USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
+DEFAULT_CHANCES = Chances(32.0, 15.0, 48.0)
 """Of generated landscapes, for maps on which none were measured."""
 
 
@@ -82,8 +74,9 @@ class RegisteredConfidence:
     chances: Chances
 
     def __call__(self, evidence: Mapping[str, float]) -> float:
+        """Below `CONFIDENT` where `--budget-ms` ended the search before a place stood out."""
         found = self.of(features_of(evidence, self.chances))
-        return min(found, CUT_SHORT) if evidence.get("cut_short") else found
+        return min(found, CONFIDENT - 0.01) if evidence.get("cut_short") else found
 
     def of(self, features: NDArray[np.float64]) -> float:
         fits = self.biases[0] + float(np.dot(self.weights[:-ALONE], features[:-ALONE]))
@@ -92,7 +85,8 @@ class RegisteredConfidence:
 
     @classmethod
     def usual(cls, chances: Chances) -> "RegisteredConfidence":
-        return cls(USUAL_BIASES, USUAL_WEIGHTS, chances)
+        """Fitted to 1,734 views (docs/decisions/confidence.md)."""
+        return cls((-6.68, -8.0), (2.35, 4.29, 5.87, 2.7, 2.28, 4.05, 3.03), chances)
 
     def to_plain(self) -> dict[str, Any]:
         return {
@@ -125,24 +119,23 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
     strength, look = max(evidence["strength"], 1e-3), max(evidence["look"], 1e-3)
     detail, chance = evidence["detail_ratio"], chances.of_strength(evidence)
     if math.isnan(detail):
-        detail = USUAL_DETAIL
-    ratio = strength / max(evidence["rival"], STAND_IN * chance)
+        detail = 1.4  # usual; the view is too small to be finished one level finer
+    stand_in = 0.7  # of the chance value: stands in for a rival where none was found
+    ratio = strength / max(evidence["rival"], stand_in * chance)
     fine, fine_rival = evidence["fine"], evidence["fine_rival"]
     if math.isfinite(fine + fine_rival):
-        ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, STAND_IN * chances.fine))
-    look_ratio = look / max(evidence["look_rival"], STAND_IN * chances.look)
-    phase, gradients = (
-        max(evidence[name], LEAST_DEVIATIONS) for name in ("local_phase", "local_gradients")
-    )
+        ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, stand_in * chances.fine))
+    look_ratio = look / max(evidence["look_rival"], stand_in * chances.look)
+    # Less than one standard deviation above the ground nearby does not count.
+    phase, gradients = (max(evidence[name], 1.0) for name in ("local_phase", "local_gradients"))
     return np.log(
         [strength / chance, ratio, look_ratio, max(detail, 1e-3), phase, phase, gradients]
     )
 
 
-USUAL_CONFIDENCE = RegisteredConfidence.usual(USUAL_CHANCES)
+DEFAULT_CONFIDENCE = RegisteredConfidence.usual(DEFAULT_CHANCES)
 TILE_FEATURES = ("score", "margin")
-USUAL_SHIFT = 0.42  # of the bias from map to map, under `USUAL_TILES`
-LIMIT = 60.0  # Beyond, the probability is 0 or 1 in floating point
+DEFAULT_SHIFT = 0.42  # of the bias from map to map, under `DEFAULT_TILE_CONFIDENCE`
 
 
 @dataclass(frozen=True)
@@ -178,12 +171,13 @@ class LogisticConfidence:
         return cls(numbers[0], tuple(numbers[1:]))
 
 
-USUAL_TILES = LogisticConfidence(-3.42 - USUAL_SHIFT, (5.87, 12.08))
+DEFAULT_TILE_CONFIDENCE = LogisticConfidence(-3.42 - DEFAULT_SHIFT, (5.87, 12.08))
 """Fitted to 22 maps of nine scenes, one standard deviation lower (docs/decisions/confidence.md)."""
 
 
 def probability(logit: float) -> float:
-    return 1 / (1 + math.exp(-min(max(logit, -LIMIT), LIMIT)))
+    # Beyond 60 it is 0 or 1 in floating point.
+    return 1 / (1 + math.exp(-min(max(logit, -60.0), 60.0)))
 
 
 def logit(likely: float, least: float) -> float:

@@ -7,22 +7,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.integrity import probability_within
-from orthonav.core.localize.camera import CameraFound, tilt_std_deg
-from orthonav.core.localize.ground import SearchedSheet
-from orthonav.core.localize.place import Place
+from orthonav.core.localize.camera import CameraEstimate, tilt_std_deg
+from orthonav.core.localize.ground import PreparedMap
+from orthonav.core.localize.place import Finished
 from orthonav.core.localize.rectify import off_nadir_deg
 from orthonav.core.localize.search import Search
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import RADIUS_SHARE, Fix
 
 
-def fix_of(search: Search, best: Place) -> Fix:
+def fix_of(search: Search, best: Finished) -> Fix:
     """From the camera that the picture shows, else from the place alone."""
-    sheet, ground, pose = search.sheet, search.ground, best.fit.pose
+    sheet, ground, pose = search.sheet, search.over_ground, best.fit.pose
     camera = search.camera(best)
     orientation, middle_en_m = ground.orientation(pose), None
     if camera is not None:
-        found = _by_camera(sheet, search.view, camera)
+        found = _by_camera(search.view, camera)
         middle_en_m = camera.middle_en_m
     else:
         found = _by_similarity(sheet, search.view, best)
@@ -34,7 +34,7 @@ def fix_of(search: Search, best: Place) -> Fix:
     if found.middle_cov_en_m2 is not None:
         widest = float(np.linalg.eigvalsh(found.middle_cov_en_m2)[-1])
         evidence["middle_std_m"] = math.sqrt(widest)
-    if orientation is not None and not sheet.relief.is_level:
+    if orientation is not None and not sheet.ground.is_level:
         evidence["terrain_gain"] = best.gain or 1.0
     lat, lon = sheet.sheet.frame.latlon_from_en(found.place_en_m)
     middle = None
@@ -63,20 +63,16 @@ def fix_of(search: Search, best: Place) -> Fix:
     )
 
 
-def _by_camera(sheet: SearchedSheet, view: PreparedView, camera: CameraFound) -> "_Exterior":
+def _by_camera(view: PreparedView, camera: CameraEstimate) -> "_Exterior":
     """From the blocks of the view."""
     heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
     _, _, up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)).tolist()
-    floor_m2 = np.eye(2) * sheet.floor_m(view) ** 2 * camera.variance
-    covariance = camera.covariance.copy()
-    covariance[:2, :2] += floor_m2
-    middle = camera.middle_covariance
     return _Exterior(
         camera.orientation.position_m[:2],
         (heading_deg, pitch_deg, roll_deg),
         camera.agl_m,
-        covariance[:2, :2].copy(),
-        None if middle is None else middle + floor_m2,
+        camera.covariance[:2, :2].copy(),
+        camera.middle_covariance,
         {
             "heading_std_deg": heading,
             "log_scale_std": up_m / camera.agl_m,
@@ -85,11 +81,11 @@ def _by_camera(sheet: SearchedSheet, view: PreparedView, camera: CameraFound) ->
             "pitch_bias_std_deg": pitch,
             "roll_bias_std_deg": roll,
         },
-        covariance,
+        camera.covariance,
     )
 
 
-def _by_similarity(sheet: SearchedSheet, view: PreparedView, best: Place) -> "_Exterior":
+def _by_similarity(sheet: PreparedMap, view: PreparedView, best: Finished) -> "_Exterior":
     """Under the reported pitch and roll."""
     pose, covariance = best.pose, best.fit.covariance
     assert covariance is not None

@@ -3,7 +3,7 @@ window lies, its heading, and that the camera is `agl_m * exp(log_scale)` above 
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -29,7 +29,7 @@ from orthonav.core.localize.systematic import (
     unknown_ground,
 )
 from orthonav.core.localize.tiles import TileProposer
-from orthonav.core.localize.view import MIN_AGL_STD, PreparedView
+from orthonav.core.localize.view import LIMITS, PreparedView
 from orthonav.core.mapfile.manifest import Lean, SheetInfo, TerrainInfo
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import DEFAULT_AGL_STD
@@ -38,12 +38,32 @@ from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
 from orthonav.core.register.window import GreyPyramid, Reference
 
-MAP_NODES = 256  # of expected scales across the map, at most
-LEVELLED_NODES = 32  # across the map, for the slopes of its terrain
-SLOPE_M = 10.0  # half the base over which slopes are measured
 UNKNOWN_LEAN = Lean(0.0, 0.0, 0.15)  # up to 0.3 between the middles of overlapping pictures
-LARGEST_STD = 0.3  # of scales searched: three are 0.41 to 2.46
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GroundSampling:
+    """Where heights are taken, and what is too little to count."""
+
+    map_nodes: int = 256  # of expected scales across the map, at most
+    levelled_nodes: int = 32  # across the map, for the slopes of its terrain
+    window_nodes: int = 9  # across a window, for its mean height
+    slope_m: float = 10.0  # half the base over which slopes are measured
+    max_scale_std: float = 0.3  # of log scales searched: three are 0.41 to 2.46
+    min_ahead: float = 0.2
+    """Least distance of the camera from the middle of its view, of the view's side,"""
+    min_rise: float = 0.05
+    """and least rise of the ground below it over that in the view, of the height, at which scales
+    are expected by place."""
+    min_known: float = 0.5  # windows of which less is known are registered on level ground
+    level_px: float = 0.2  # relief that displaces less (pixels of the final level) is left out
+    surface_node_m: float = 2.0  # largest spacing of heights among houses,
+    surface_nodes: int = 320  # but at most so many across a view
+    smooth_m: float = 10.0  # width over which these are smoothed for the search
+
+
+SAMPLING = GroundSampling()
 
 
 class Terrain(Protocol):
@@ -56,7 +76,7 @@ class LevelTerrain:
         return np.zeros(np.shape(points_en_m)[:-1])
 
 
-class Relief:
+class GroundModel:
     """The ground of a sheet; threads may share it."""
 
     def __init__(
@@ -111,7 +131,7 @@ class Relief:
         if self.surface is None:
             return None
         above_m = self.surface.at_en_m(ground_m[..., :2])
-        return above_m if np.isfinite(above_m).mean() >= MIN_KNOWN else None
+        return above_m if np.isfinite(above_m).mean() >= SAMPLING.min_known else None
 
     def shows_houses(self, ground_m: Array) -> bool:
         """Whether houses and trees are mostly known at (N, 3)."""
@@ -121,9 +141,9 @@ class Relief:
         """Rise (N, 2) per metre east and north at (N, 3)."""
         if self.is_level:
             return np.zeros((len(ground_m), 2))
-        steps = SLOPE_M * np.concatenate([np.eye(2), -np.eye(2)])
+        steps = SAMPLING.slope_m * np.concatenate([np.eye(2), -np.eye(2)])
         ahead, behind = np.split(self.terrain.at_en_m(ground_m[:, None, :2] + steps), 2, axis=1)
-        return np.asarray((ahead - behind) / (2 * SLOPE_M))
+        return np.asarray((ahead - behind) / (2 * SAMPLING.slope_m))
 
     def errors(self, ground_m: Array, slopes: Array) -> GroundErrors:
         """Of the heights under a view, by points (N, 3) and slopes (N, 2) there."""
@@ -134,13 +154,13 @@ class Relief:
             return terrain_errors(self.info, slopes)
         return surface_errors(self._lean.std, above_m)
 
-    def levelled(self) -> "Relief":
+    def levelled(self) -> "GroundModel":
         """Level ground that is known as well as this: of simulated views."""
         if self.is_level:
             return self
         sides_px = self.grid.width_px, self.grid.height_px
-        nodes_px = [np.linspace(0.0, side, LEVELLED_NODES) for side in sides_px]
-        found = Relief(LevelTerrain(), self.grid, self.info, self.land)
+        nodes_px = [np.linspace(0.0, side, SAMPLING.levelled_nodes) for side in sides_px]
+        found = GroundModel(LevelTerrain(), self.grid, self.info, self.land)
         ground_m = self.ground_m(np.stack(np.meshgrid(*nodes_px), -1).reshape(-1, 2))
         if (known := np.isfinite(ground_m[:, 2])).any():  # others lie off the route of the map
             ground_m = ground_m[known]
@@ -152,7 +172,7 @@ class Relief:
         the ground below the camera over the ground in the view."""
         telemetry, prior = view.telemetry, view.prior
         below, agl_m = telemetry.below, telemetry.agl_m
-        ahead = np.hypot(*view.camera_px) >= AHEAD * view.side_px
+        ahead = np.hypot(*view.camera_px) >= SAMPLING.min_ahead * view.side_px
         if below is None and (prior.turn_rad is None or not ahead):
             return prior
         means, step_px = self._mean_heights(view.side_px)
@@ -162,20 +182,20 @@ class Relief:
             below_m = self._at_nodes(step_px, rotation(prior.turn_rad or 0.0) @ view.camera_px)
         over = np.maximum(1 + (below_m - means) / agl_m, 0.05)
         values = np.log(np.where(np.isfinite(over), over, 1.0)).astype(np.float32)
-        if below is None and np.abs(values).max() < LEAST_RISE:
+        if below is None and np.abs(values).max() < SAMPLING.min_rise:
             return prior
         own_m, std_m = DEFAULT_AGL_STD * agl_m, 0.0 if below is None else below.std_m
         if telemetry.agl_std_m is not None:
             own_m = math.sqrt(max(telemetry.agl_std_m**2 - std_m**2, 0.0))
         focal_std = view.view.camera.focal_std
-        std = max(math.hypot(own_m / agl_m, focal_std), MIN_AGL_STD)
+        std = max(math.hypot(own_m / agl_m, focal_std), LIMITS.min_agl_std)
         reach = min(float(np.abs(values).max()) + SIGMAS * std, SIGMAS * prior.log_scale_std)
         if std_m / agl_m > std:
             reach = float(np.abs(values).max()) + SIGMAS * std
-        widest = min(reach / SIGMAS, LARGEST_STD)
+        widest = min(reach / SIGMAS, SAMPLING.max_scale_std)
         return replace(
             prior,
-            log_scale_std=max(widest, MIN_AGL_STD),
+            log_scale_std=max(widest, LIMITS.min_agl_std),
             scale_map=ScaleMap(values, step_px, min(std, prior.log_scale_std)),
         )
 
@@ -190,7 +210,7 @@ class Relief:
         key = round(math.log2(max(side_px, 1.0)))
         if key not in self._means:
             size = self.grid.width_px, self.grid.height_px
-            step = max(max(size) / MAP_NODES, 2.0**key / 4)
+            step = max(max(size) / SAMPLING.map_nodes, 2.0**key / 4)
             heights = self._at_nodes(step, np.zeros(2))
             known = np.isfinite(heights).astype(np.float32)
             box = (max(round(2.0**key / step), 1),) * 2
@@ -204,19 +224,8 @@ class Relief:
         return self._means[key]
 
 
-AHEAD, LEAST_RISE = 0.2, 0.05
-"""Least distance of the camera from the middle of its view, of the view's side, and least rise of
-the ground below it over that in the view, of the height, at which scales are expected by place."""
-REFERENCE_NODES = 9  # across a window, for its mean height
-MIN_KNOWN = 0.5  # windows of which less is known are registered on level ground
-LEVEL_PX = 0.2  # relief that displaces less (pixels of the final level) is left out
-SURFACE_NODE_M = 2.0  # largest spacing of heights among houses,
-SURFACE_NODES = 320  # but at most so many across a view
-SMOOTH_M = 10.0  # width over which these are smoothed for the search
-
-
-class SearchedSheet:
-    """A sheet and its imagery, made ready for all views; threads may share it."""
+class PreparedMap:
+    """A map and its imagery, made ready for all views; threads may share it."""
 
     def __init__(
         self,
@@ -242,11 +251,11 @@ class SearchedSheet:
         known_m2 = 0.0 if surface is None else surface.info.known_m2
         imagery_px = 0 if sheet.grey is None else sheet.grey.valid_px
         # Whether all views are compared one level finer than over bare ground.
-        self.is_finer = known_m2 > MIN_KNOWN * imagery_px * self.grid.gsd_m**2
+        self.is_finer = known_m2 > SAMPLING.min_known * imagery_px * self.grid.gsd_m**2
         self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
         self.propose, self.plan = propose, plan
         info = None if terrain is None else terrain.info
-        self.relief = Relief(
+        self.ground = GroundModel(
             terrain or LevelTerrain(), self.grid, info, sheet.relief, surface, sheet.lean
         )
 
@@ -255,7 +264,7 @@ class SearchedSheet:
         return self.reference.pyramid
 
     def px_of(self, place_en_m: Array) -> tuple[float, float]:
-        """The inverse of `Relief.en_m`."""
+        """The inverse of `GroundModel.en_m`."""
         (east, north), grid = place_en_m, self.grid
         return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
 
@@ -266,23 +275,23 @@ class SearchedSheet:
 
     def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
         """Of the camera (2,)."""
-        return self.relief.en_m(pose.map_px(view.camera_px))
+        return self.ground.en_m(pose.map_px(view.camera_px))
 
-    def seen_from(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
+    def camera_state(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
         """Of the camera (4,): m east and north, heading (rad), log scale."""
         return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
 
-    def pose_of(self, view: PreparedView, seen_from: NDArray[np.float64]) -> Pose:
-        """The inverse of `seen_from`."""
-        x, y = self.px_of(seen_from[:2])
-        turn, log_scale = seen_from[2:].tolist()
+    def pose_of(self, view: PreparedView, camera_state: NDArray[np.float64]) -> Pose:
+        """The inverse of `camera_state`."""
+        x, y = self.px_of(camera_state[:2])
+        turn, log_scale = camera_state[2:].tolist()
         moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
         return Pose(x - float(moved[0]), y - float(moved[1]), turn, log_scale)
 
     def camera_covariance(
         self, view: PreparedView, pose: Pose, covariance: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Of `seen_from`, by the covariance of the pose."""
+        """Of `camera_state`, by the covariance of the pose."""
         moved = pose.linear @ view.camera_px
         camera_from_pose = np.eye(4)
         camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
@@ -304,11 +313,15 @@ def _smoothed(heights: Array, side: int) -> Array:
 
 
 class ViewOverGround:
-    def __init__(self, relief: Relief, view: PreparedView) -> None:
-        self.relief, self.view = relief, view
+    """A view over a ground: its camera under a pose, and what it sees then."""
+
+    def __init__(self, ground: GroundModel, view: PreparedView, reference: Reference) -> None:
+        """`reference`: the imagery of the map there."""
+        self.ground, self.view, self.reference = ground, view, reference
         valid = view.templates.valid
         rows, cols = (
-            (np.arange(REFERENCE_NODES) + 0.5) * side / REFERENCE_NODES for side in valid.shape
+            (np.arange(SAMPLING.window_nodes) + 0.5) * side / SAMPLING.window_nodes
+            for side in valid.shape
         )
         used = valid[np.ix_(rows.astype(int), cols.astype(int))]
         x, y = np.meshgrid(cols - valid.shape[1] / 2, rows - valid.shape[0] / 2)
@@ -336,7 +349,7 @@ class ViewOverGround:
         shape = round(rows * scale), round(cols * scale)
         picture, middle = self.view.picture_at(level), np.array([shape[1], shape[0]]) / 2
         made = None
-        if self.relief.is_level:
+        if self.ground.is_level:
             en_from_window = self._en_from_window(pose, level, middle)
             made = rectified_level(picture, orientation, en_from_window, shape)
         if made is None:
@@ -346,7 +359,7 @@ class ViewOverGround:
             if shown is not None:  # straight lines of sight stay straight
                 camera_m = orientation.position_m.copy()
                 above_m = camera_m[2] - np.nan_to_num(np.nanmean(ground[..., 2]))
-                camera_m[:2] += self.relief.lean_en * above_m
+                camera_m[:2] += self.ground.lean_en * above_m
                 sheared = shown, camera_m
             made = orthorectified(picture, orientation, ground, shape, sheared)
         return ViewTemplates(*made, level, self.view.templates.grey_share)
@@ -358,25 +371,28 @@ class ViewOverGround:
         trees as they are, or smoothed, which more cameras near the right one fit. And, where they
         lean, the same where the map shows them."""
         middle, unit = np.array([shape[1], shape[0]]) / 2, 2.0**level
-        if self.relief.surface is None:
-            return self.relief.ground_m(pose.map_px((node_px(shape) - middle) * unit)), None
-        node_m = NODE_PX * self.relief.grid.gsd_m * unit
-        finer = min(math.ceil(node_m / SURFACE_NODE_M), SURFACE_NODES * NODE_PX // max(shape))
+        if self.ground.surface is None:
+            return self.ground.ground_m(pose.map_px((node_px(shape) - middle) * unit)), None
+        node_m = NODE_PX * self.ground.grid.gsd_m * unit
+        finer = min(
+            math.ceil(node_m / SAMPLING.surface_node_m),
+            SAMPLING.surface_nodes * NODE_PX // max(shape),
+        )
         finer = max(finer, 1)
-        across_m = SMOOTH_M if smooth else node_m if finer > 1 else 0.0
+        across_m = SAMPLING.smooth_m if smooth else node_m if finer > 1 else 0.0
         map_px = pose.map_px((node_px(shape, finer) - middle) * unit)
-        nodes = self.relief.surface_m(map_px, round(across_m * finer / node_m))
+        nodes = self.ground.surface_m(map_px, round(across_m * finer / node_m))
         nodes, shown = np.ascontiguousarray(nodes[::finer, ::finer]), None
-        if self.relief.leans:
-            shown = np.dstack([self.relief.en_m(map_px[::finer, ::finer]), nodes[..., 2]])
+        if self.ground.leans:
+            shown = np.dstack([self.ground.en_m(map_px[::finer, ::finer]), nodes[..., 2]])
         return nodes, shown
 
     def _en_from_window(self, pose: Pose, level: int, middle: Array) -> Array:
         """Metres by pixels of a window of a level (3, 3)."""
-        metres = np.array([1.0, -1.0]) * self.relief.grid.gsd_m
+        metres = np.array([1.0, -1.0]) * self.ground.grid.gsd_m
         made = np.eye(3)
         made[:2, :2] = metres[:, None] * pose.linear * 2.0**level
-        made[:2, 2] = self.relief.en_m(np.array([pose.x_px, pose.y_px])) - made[:2, :2] @ middle
+        made[:2, 2] = self.ground.en_m(np.array([pose.x_px, pose.y_px])) - made[:2, :2] @ middle
         return made
 
     def orientation(self, pose: Pose) -> Orientation | None:
@@ -386,36 +402,36 @@ class ViewOverGround:
             return None
         telemetry = self.view.telemetry
         above_m = telemetry.agl_m * math.exp(pose.log_scale)
-        east, north = self.relief.en_m(pose.map_px(self.view.camera_px))
+        east, north = self.ground.en_m(pose.map_px(self.view.camera_px))
         position = np.array([east, north, reference_m + above_m])
         attitude = np.array([math.degrees(pose.turn_rad), telemetry.pitch_deg, telemetry.roll_deg])
         return Orientation(position, attitude)
 
     def reference_m(self, pose: Pose) -> float:
         """Mean height under the window; NaN where less than half is known."""
-        if self.relief.is_level:
+        if self.ground.is_level:
             return 0.0
         heights = self._ground_m(pose)[:, 2]
         known = np.isfinite(heights)
-        return float(heights[known].mean()) if known.mean() >= MIN_KNOWN else math.nan
+        return float(heights[known].mean()) if known.mean() >= SAMPLING.min_known else math.nan
 
     def _ground_m(self, pose: Pose) -> Array:
         """East, north, above sea (N, 3) at nodes of the window, kept for the last pose."""
         last = self._last_ground
         if last is None or last[0] != pose:
-            last = pose, self.relief.ground_m(pose.map_px(self._reference_px))
+            last = pose, self.ground.ground_m(pose.map_px(self._reference_px))
             self._last_ground = last
         return last[1]
 
     def _surface_m(self, pose: Pose) -> Array:
         """The same with houses and trees."""
-        if self.relief.surface is None:
+        if self.ground.surface is None:
             return self._ground_m(pose)
-        return self.relief.surface_m(pose.map_px(self._reference_px))
+        return self.ground.surface_m(pose.map_px(self._reference_px))
 
     def is_level(self, pose: Pose) -> bool:
         """Whether relief displaces the window by less than is visible."""
-        if self.relief.is_level:
+        if self.ground.is_level:
             return True
         ground = self._surface_m(pose)
         orientation = self.orientation(pose)
@@ -424,8 +440,8 @@ class ViewOverGround:
         offset = ground - orientation.position_m
         rise = np.abs(ground[:, 2] - ground[:, 2].mean())
         shift_m = rise * np.hypot(offset[:, 0], offset[:, 1]) / np.maximum(-offset[:, 2], 1.0)
-        pixel_m = self.relief.grid.gsd_m * 2.0**self.view.levels.final
-        return bool(shift_m.max() < LEVEL_PX * pixel_m)
+        pixel_m = self.ground.grid.gsd_m * 2.0**self.view.levels.final
+        return bool(shift_m.max() < SAMPLING.level_px * pixel_m)
 
     def moved_px(self, one: Pose, other: Pose) -> float:
         """At the rim of the window, pixels of level 0."""
@@ -440,7 +456,7 @@ class ViewOverGround:
         if orientation is None:
             return pose
         east, north, above_sea_m = orientation.position_m.tolist()
-        below_m = float(self.relief.terrain.at_en_m([east, north]))
+        below_m = float(self.ground.terrain.at_en_m([east, north]))
         agl_m = self.view.telemetry.agl_m
         if not above_sea_m - below_m > 0:  # also where it is unknown
             return pose
@@ -452,7 +468,7 @@ class ViewOverGround:
         """Ground in the middle of the picture; that of the window where unknown."""
         found = sight_en_m
         if not np.isfinite(found).all():
-            found = self.relief.en_m(np.array([pose.x_px, pose.y_px]))
+            found = self.ground.en_m(np.array([pose.x_px, pose.y_px]))
         return float(found[0]), float(found[1])
 
     def sight_en_m(self, orientation: Orientation) -> Array:
@@ -462,13 +478,13 @@ class ViewOverGround:
         plane = undistort(camera, px / [camera.fx_px, camera.fy_px])
         ray = enu_from_camera(*orientation.attitude_deg.tolist()) @ [*plane.tolist(), 1.0]
         above_m = float(orientation.position_m[2])
-        if not ray[2] < -1e-6 or (self.relief.is_level and not above_m > 0):
+        if not ray[2] < -1e-6 or (self.ground.is_level and not above_m > 0):
             return np.full(2, np.nan)
-        if self.relief.is_level:
+        if self.ground.is_level:
             return np.asarray(orientation.position_m[:2] - ray[:2] / ray[2] * above_m)
 
         def above_sea_m(offset_en_m: Array) -> Array:
-            return self.relief.terrain.at_en_m(orientation.position_m[:2] + offset_en_m)
+            return self.ground.terrain.at_en_m(orientation.position_m[:2] + offset_en_m)
 
         met = sight_on_ground(ray[:2] / -ray[2], above_m, above_sea_m)
         return np.asarray(orientation.position_m[:2] + met)

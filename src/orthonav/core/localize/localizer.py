@@ -12,7 +12,7 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.fix import fix_of
-from orthonav.core.localize.ground import SearchedSheet
+from orthonav.core.localize.ground import PreparedMap
 from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
 from orthonav.core.localize.search import Found, Search, found_by
 from orthonav.core.localize.tiles import TileLocalizer, TileProposer
@@ -23,8 +23,6 @@ from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, NoFix, Prior, View, has_type
 from orthonav.core.tiles.position import PositionRule
-
-WIDEST_M = 2e7  # half the Earth's circumference
 
 
 class Localizer:
@@ -58,8 +56,10 @@ class Localizer:
         self.tiles = TileLocalizer(map, position=position, flying=flying)
         self.registration = None
         if registration:
+            tiles = self.tiles
+            propose = TileProposer.of(tiles.matcher, tiles.embedder, tiles.representation)
             self.registration = RegistrationLocalizer.of_map(
-                map, self.tiles.proposer(), plan or DEFAULT_PLAN, level_ground=level_ground
+                map, propose, plan or DEFAULT_PLAN, level_ground=level_ground
             )
 
     def __repr__(self) -> str:
@@ -92,8 +92,9 @@ class Localizer:
         refused = check_view(view, self.grid.gsd_m, heading_known)
         if refused is not None:
             return refused
-        if prior is not None and prior.std_m > WIDEST_M:
-            prior = replace(prior, std_m=WIDEST_M)
+        if prior is not None:
+            half_earth_m = 2e7
+            prior = replace(prior, std_m=min(prior.std_m, half_earth_m))
         found = (self.registration or self.tiles).locate(view, prior, heading_known)
         if prior is not None and isinstance(found, NoFix) and found.reason == "outside_map":
             hint = swapped_hint(prior.lat_deg, prior.lon_deg, self.opened.contains)
@@ -135,7 +136,7 @@ class Localizer:
         return self.locate(view, prior=prior, heading_known=heading_deg is not None)
 
 
-class RegistrationLocalizer(SearchedSheet):
+class RegistrationLocalizer(PreparedMap):
     @classmethod
     def of_map(
         cls,
@@ -172,7 +173,7 @@ class RegistrationLocalizer(SearchedSheet):
             surface=TerrainLayer.of(opened, layer=SURFACE),
         )
         if level_ground:
-            made.relief = made.relief.levelled()
+            made.ground = made.ground.levelled()
         return made
 
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
@@ -195,8 +196,8 @@ class RegistrationLocalizer(SearchedSheet):
         prepared = self.prepared(view, heading_known)
         if isinstance(prepared, NoFix):
             return prepared
-        if not self.relief.is_level:
-            prepared = replace(prepared, prior=self.relief.expected(prepared))
+        if not self.ground.is_level:
+            prepared = replace(prepared, prior=self.ground.expected(prepared))
         return Search(self, prepared, prior)
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:

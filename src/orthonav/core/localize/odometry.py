@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import axis_on_ground_en_m
-from orthonav.core.localize.ground import Relief
-from orthonav.core.localize.place import Placer
+from orthonav.core.localize.ground import GroundModel
+from orthonav.core.localize.place import CandidateRefiner
 from orthonav.core.localize.rectify import downsampled, rectify_footprint
 from orthonav.core.localize.view import check_footprint
 from orthonav.core.records import Telemetry, View
@@ -19,33 +19,43 @@ from orthonav.core.register.search import SearchWindows, bank, largest_half_px, 
 from orthonav.core.register.template import Levels, ViewTemplates
 from orthonav.core.register.window import Reference
 
-VIEW_PX = 160
-"""Across: half that of a fix. Values without a source: by the flights of docs/tracking.md."""
-LEVELS = 3  # of a view that serves as the map of the next one
-TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
-"""Of the search from a coarse level: about that of `policy.SearchPolicy`."""
-MAX_SPEED_MPS = 80.0  # for which a displacement is sought
-MIN_SCORE_RATIO = 2.5
-"""Over the strongest rival: at least 4 for right ones, at most 1.7 for wrong ones."""
-MIN_CORRELATION = 0.4
-"""Right ones have at least 0.56, wrong ones at most 0.11 (docs/tracking.md)."""
-EXPECTED_CORRELATION = 0.6
-"""An expected displacement that fits this well ends the search (docs/tracking.md)."""
-NOISE_PX, NOISE_SHARE = 0.4, 0.01  # per axis: in pixels, and as a fraction of its length
-CANDIDATES = 8
-EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
-"""Of the expected displacement at each level: most steps, and the step that ends it."""
-TILT_SHARE = 0.6
-"""Left of an independent error of the tilt in a sum: the next displacement cancels most of it."""
-SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
-"""Changes of heading, log scale, pitch, roll up to which a view is not rectified again."""
-LEVER_STEP_DEG = 0.05  # of numerical derivatives by pitch and roll
-UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
-"""Of ground without a known slope, and the fraction of it that a terrain leaves."""
-SIGHT_STEPS = 4  # to the ground that a view shows: each leaves a fraction of the error
-LEAST_SCALED = 0.5  # least height or distance over the one expected: the rest is an error
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
+
+
+@dataclass(frozen=True)
+class OdometryLimits:
+    """How views are compared; values without a source are by the flights of docs/tracking.md."""
+
+    view_px: int = 160  # across: half that of a fix
+    levels: int = 3  # of a view that serves as the map of the next one
+    turn_step_rad: float = math.radians(8.0)
+    scale_step: float = 0.1
+    """Of the search from a coarse level: about that of `policy.SearchPlan`."""
+    candidates: int = 8
+    max_speed_mps: float = 80.0  # for which a displacement is sought
+    min_score_ratio: float = 2.5
+    """Over the strongest rival: at least 4 for right ones, at most 1.7 for wrong ones."""
+    min_correlation: float = 0.4
+    """Right ones have at least 0.56, wrong ones at most 0.11 (docs/tracking.md)."""
+    expected_correlation: float = 0.6
+    """An expected displacement that fits this well ends the search (docs/tracking.md)."""
+    expected_steps: int = 5  # of it at each level, at most
+    noise_px: float = 0.4  # per axis: in pixels,
+    noise_share: float = 0.01  # and as a fraction of its length
+    tilt_share: float = 0.6
+    """Left of an independent error of the tilt in a sum: the next displacement cancels most."""
+    same_scale: float = 0.01
+    same_tilt_rad: float = math.radians(0.1)
+    """Changes of log scale, and of pitch or roll, up to which a view is not rectified again."""
+    lever_step_deg: float = 0.05  # of numerical derivatives by pitch and roll
+    unknown_slope: float = 0.1  # of ground without a known slope,
+    left_of_slope: float = 0.3  # and the fraction of it that a terrain leaves
+    sight_steps: int = 4  # to the ground that a view shows: each leaves a fraction of the error
+    min_scaled: float = 0.5  # height or distance over the one expected: less is an error
+
+
+ODOMETRY = OdometryLimits()
 
 
 def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
@@ -65,13 +75,13 @@ def tilt_lever_m(telemetry: Telemetry) -> Array:
     angles, columns = np.array([telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg]), []
     for axis in (1, 2):
         step = np.zeros(3)
-        step[axis] = LEVER_STEP_DEG
+        step[axis] = ODOMETRY.lever_step_deg
         seen = []
         for sign in (1, -1):
             yaw_deg, pitch_deg, roll_deg = (angles + sign * step).tolist()
             seen.append(axis_on_ground_en_m(yaw_deg, pitch_deg, roll_deg, telemetry.agl_m))
         ahead, behind = seen
-        columns.append(np.subtract(ahead, behind) / (2 * math.radians(LEVER_STEP_DEG)))
+        columns.append(np.subtract(ahead, behind) / (2 * math.radians(ODOMETRY.lever_step_deg)))
     return np.stack(columns, axis=1)
 
 
@@ -85,7 +95,7 @@ class _ViewAsMap(Reference):
 
     @property
     def levels(self) -> int:
-        return LEVELS
+        return ODOMETRY.levels
 
     def shape(self, level: int) -> tuple[int, int]:
         return self._templates.shape(level)
@@ -138,10 +148,10 @@ class OdometryView:
         """None where it shows too little."""
         camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
-        pixel_m = pixel_m or side_m / VIEW_PX
+        pixel_m = pixel_m or side_m / ODOMETRY.view_px
         thinned = downsampled(replace(view, telemetry=telemetry), pixel_m)
-        made = rectify_footprint(thinned, gsd_m=pixel_m, multiple_px=2 ** (LEVELS - 1))
-        if check_footprint(made, 1.0, VIEW_PX / 4) is not None:
+        made = rectify_footprint(thinned, gsd_m=pixel_m, multiple_px=2 ** (ODOMETRY.levels - 1))
+        if check_footprint(made, 1.0, ODOMETRY.view_px / 4) is not None:
             return None
         camera_px = np.array([-made.offset_en_m[0], made.offset_en_m[1]]) / pixel_m
         templates = ViewTemplates(made.grey, made.valid, 0)
@@ -157,7 +167,8 @@ class OdometryView:
     def corrected(self, bias: Array) -> "OdometryView | None":
         """With the present biases: what was learnt between two views would else appear as motion
         (docs/tracking.md)."""
-        if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
+        change = np.abs(bias - self.bias)
+        if change[1] > ODOMETRY.same_scale or (change[2:] > ODOMETRY.same_tilt_rad).any():
             return OdometryView.of(self.view, self.pixel_m, bias)
         # Rectified with its heading up, so only the heading may change without rectifying again.
         same = np.array([bias[0], *self.bias[1:]])
@@ -210,18 +221,20 @@ def displacement(
         return None
     prior = PosePrior(
         math.remainder(reported_turn, 2 * math.pi),
-        max(math.sqrt(2 * telemetry_noise[0]), TURN_STEP_RAD / 3),
-        max(math.sqrt(2 * telemetry_noise[1]), SCALE_STEP / 3),
+        max(math.sqrt(2 * telemetry_noise[0]), ODOMETRY.turn_step_rad / 3),
+        max(math.sqrt(2 * telemetry_noise[1]), ODOMETRY.scale_step / 3),
     )
     placed = _registered(before, now, prior, expected_en_m)
-    if placed is None or placed.weighted < MIN_CORRELATION:
+    if placed is None or placed.weighted < ODOMETRY.min_correlation:
         return None
     pose = placed.pose
     moved_en_m = before.en_from_px @ (
         pose.map_px(now.camera_px) - np.array(before.middle_px) - before.camera_px
     )
-    std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*moved_en_m)))
-    variance = std_m**2 + (TILT_SHARE * now.telemetry.agl_m * tilt_noise_rad) ** 2
+    std_m = math.hypot(
+        ODOMETRY.noise_px * before.pixel_m, ODOMETRY.noise_share * float(np.hypot(*moved_en_m))
+    )
+    variance = std_m**2 + (ODOMETRY.tilt_share * now.telemetry.agl_m * tilt_noise_rad) ** 2
     reported_rad = math.radians(now.view.telemetry.yaw_deg - before.view.telemetry.yaw_deg)
     seen = CameraDisplacement(
         moved_en_m,
@@ -246,22 +259,19 @@ class Terrain:
 
     @classmethod
     def ahead(
-        cls, relief: Relief, place: Array, agl_m: float, ahead_en_m: Array
+        cls, ground: GroundModel, place: Array, agl_m: float, ahead_en_m: Array
     ) -> "Terrain | None":
         """Below a camera at a place (2,), `agl_m` above the ground there, and where it looks; None
         where unknown. `ahead_en_m` (2,): where it would look on level ground."""
         seen, rise = place, 0.0
-        for _ in range(SIGHT_STEPS):
+        for _ in range(ODOMETRY.sight_steps):
             seen = place + (1 - rise) * ahead_en_m
-            ground_m = relief.terrain.at_en_m(np.stack([place, seen]))
+            ground_m = ground.terrain.at_en_m(np.stack([place, seen]))
             rise = float(ground_m[1] - ground_m[0]) / agl_m
-        slopes = relief.slopes(np.stack([place, seen]))
+        slopes = ground.slopes(np.stack([place, seen]))
         if not (np.isfinite(slopes).all() and math.isfinite(rise)):
             return None
         return cls(slopes[0], slopes[1], rise)
-
-
-LEVEL = Terrain(np.zeros(2), np.zeros(2), 0.0)
 
 
 def over_terrain(
@@ -279,16 +289,16 @@ def over_terrain(
     half, about the middle of the views: this parallax displaces the camera. The displacement is
     seen at the distance of the ground there, and the height changes by what this rises
     (docs/terrain.md)."""
-    seen, ground = measured.displacement, terrain or LEVEL
-    steep = max(1 + float(ground.seen @ ahead_en_m) / agl_m[0], LEAST_SCALED)
+    seen, ground = measured.displacement, terrain or Terrain(np.zeros(2), np.zeros(2), 0.0)
+    steep = max(1 + float(ground.seen @ ahead_en_m) / agl_m[0], ODOMETRY.min_scaled)
     share_en = seen.moved_en_m / (agl_m[0] * steep)
     scale = float(share_en @ ground.seen) / 2
     turn = float(share_en[1] * ground.seen[0] - share_en[0] * ground.seen[1]) / 2
     parallax = np.array([[scale, -turn], [turn, scale]])
-    distance = max(1 - ground.rise, LEAST_SCALED)  # over the height, as on level ground
+    distance = max(1 - ground.rise, ODOMETRY.min_scaled)  # over the height, as on level ground
     moved_en_m = distance * (seen.moved_en_m + parallax @ ahead_en_m)
     # What remains of the slope: all of a usual one where it is unknown.
-    slope = UNKNOWN_SLOPE * (1.0 if terrain is None else LEFT_OF_SLOPE)
+    slope = ODOMETRY.unknown_slope * (1.0 if terrain is None else ODOMETRY.left_of_slope)
     slope *= float(np.hypot(*moved_en_m)) / agl_m[0]
     aside_m = float(np.hypot(*ahead_en_m)) * slope / 2
     reported = math.log(agl_m[1] / agl_m[0])
@@ -301,7 +311,7 @@ def over_terrain(
         covariance=seen.covariance + np.eye(2) * aside_m**2,
         turned_rad=seen.turned_rad + turn,
         turned_std_rad=math.hypot(seen.turned_std_rad, slope / 2),
-        scaled=math.log(max(height, LEAST_SCALED)) - reported,
+        scaled=math.log(max(height, ODOMETRY.min_scaled)) - reported,
         scaled_std=math.hypot(seen.scaled_std, 1.5 * slope),
     )
     return replace(measured, displacement=over)
@@ -313,42 +323,42 @@ def _registered(
     """None where no place stands out."""
     templates, reference = now.templates, _ViewAsMap(before.templates)
     side_px = math.sqrt(float(templates.valid.sum()))
-    placer = Placer(templates, Levels.of(side_px, LEVELS), prior, reference)
+    refiner = CandidateRefiner(templates, Levels.of(side_px, ODOMETRY.levels), prior, reference)
     if expected_en_m is not None:
-        fit = _as_expected(before, now, placer, expected_en_m)
-        if fit.weighted >= EXPECTED_CORRELATION:
+        fit = _as_expected(before, now, refiner, expected_en_m)
+        if fit.weighted >= ODOMETRY.expected_correlation:
             return fit
     tried = bank(
         prior.turn_std_rad,
         prior.log_scale_std,
-        turn_step_rad=TURN_STEP_RAD,
-        scale_step=SCALE_STEP,
+        turn_step_rad=ODOMETRY.turn_step_rad,
+        scale_step=ODOMETRY.scale_step,
         sigmas=2.5,
     )
     poses = [((prior.turn_rad or 0.0) + turn, scale) for turn, scale in tried]
-    level = placer.levels.coarse
-    recipe = placer.levels.recipe(level)
+    level = refiner.levels.coarse
+    recipe = refiner.levels.recipe(level)
     template = templates.at(level, recipe)
     reach_px, half_px = _reach_px(before, now) + 2.0 * 2**level, largest_half_px(template, poses)
     windows = SearchWindows(reference)
     window = windows.part(level, recipe, side_px, before.middle_px, reach_px, half_px)
-    found = [each.pose for each in search(template, window, poses, CANDIDATES)]
+    found = [each.pose for each in search(template, window, poses, ODOMETRY.candidates)]
     if not found:
         return None
-    best = placer.finished(placer.judge(found, level), len(found))
-    return best.fit if best.scores["peak_ratio"] >= MIN_SCORE_RATIO else None
+    best = refiner.finished(refiner.judge(found, level), len(found))
+    return best.fit if best.scores["peak_ratio"] >= ODOMETRY.min_score_ratio else None
 
 
 def _as_expected(
-    before: OdometryView, now: OdometryView, placer: Placer, expected_en_m: Array
+    before: OdometryView, now: OdometryView, refiner: CandidateRefiner, expected_en_m: Array
 ) -> Fit:
     """From its expected place, from coarse to fine."""
-    turned = Pose(0.0, 0.0, placer.prior.turn_rad or 0.0, 0.0)
+    turned = Pose(0.0, 0.0, refiner.prior.turn_rad or 0.0, 0.0)
     moved_px = np.linalg.solve(before.en_from_px, expected_en_m)
     x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)
     pose = replace(turned, x_px=float(x), y_px=float(y))
-    for level in range(placer.levels.judged, placer.levels.final - 1, -1):
-        fit = placer.refiner(level).place(pose, EXPECTED_STEPS, SMALL_STEP_PX)
+    for level in range(refiner.levels.mid, refiner.levels.final - 1, -1):
+        fit = refiner.refiner(level).place(pose, ODOMETRY.expected_steps, 0.1)
         pose = fit.pose
     return fit
 
@@ -358,4 +368,4 @@ def _reach_px(before: OdometryView, now: OdometryView) -> float:
     seconds = (now.telemetry.time_ns - before.telemetry.time_ns) / 1e9
     far = math.hypot(*before.shape)
     # A clock that stands still does not bound the distance.
-    return min(MAX_SPEED_MPS * seconds / before.pixel_m, far) if seconds > 0 else far
+    return min(ODOMETRY.max_speed_mps * seconds / before.pixel_m, far) if seconds > 0 else far

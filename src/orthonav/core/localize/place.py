@@ -20,93 +20,104 @@ from orthonav.core.localize.ground import ViewOverGround
 from orthonav.core.localize.rectify import Orientation
 from orthonav.core.register.pose import Pose, PosePrior
 from orthonav.core.register.refine import Fit, Refiner
-from orthonav.core.register.search import SearchWindows, largest_half_px, search
-from orthonav.core.register.sharpness import sharpness
+from orthonav.core.register.search import Peak, SearchWindows, largest_half_px, search
+from orthonav.core.register.sharpness import MAX_RATIO, sharpness
 from orthonav.core.register.template import Levels, ViewTemplates
 from orthonav.core.register.window import Reference
 
-KEPT_TO_JUDGED = 200
-"""From the coarse level to the judged one, at most (docs/decisions/registration.md)."""
-KEPT_TO_FINISH = 3  # the best and its rivals
-KEPT_TO_FINEST = 12  # compared one level finer, at most, where they are in doubt
-HOPE_AT_FIRST = 0.4
-HOPE = 0.5
-"""Fractions of the best score to stay, after one step and all (docs/decisions/registration.md)."""
-MIN_HOPEFUL = 4  # so many stay anyway: the scores need rivals
-FIRST_STEPS = 1
-FULL_STEPS = 4  # before and after the first of these decisions
-COVARIANCE_STEPS = 3  # of the best place once more, with its covariance
-FINER_STEPS = 2
-ROUGH_STEP_PX = 0.1
-EXCLUSION_SHARE = 0.25  # A rival lies farther from the best than this fraction of the view's side
-MAX_RATIO = 10.0
-RIVAL_SHARE = 0.75
-"""Weaker ones are finished on level ground: chance fits as well there, at half the cost."""
-AGAIN_PX = 1.0  # A window moved by more (pixels of the level, at its rim) is orthorectified again,
-ROUNDS = 3  # at most so often
-AROUND = 6  # places whose surroundings are searched on the terrain, where none stands out,
-NEAR_REACH = 0.2  # as a fraction of the view's side,
-NEAR_TURNS_RAD, NEAR_SCALES = (-0.1, 0.0, 0.1), (-0.09, 0.0, 0.09)
-"""and with these added to heading and log scale."""
 Given = TypeVar("Given")
 Made = TypeVar("Made")
 
 
-@dataclass(eq=False)
-class Place:
-    """A place where a view may have been taken, and what is known of it so far.
+@dataclass(frozen=True)
+class Refinement:
+    """How many candidates go on, how far they are refined, and what is a rival.
 
-    - `judged`: its fit at the judged level; `level_score`: on level ground, where `judged` is on
-      the terrain; `terrain`: the view orthorectified there.
-    - `twin`: the same on the terrain, `around`: the best around it there; None: level ground is as
-      good, or not asked for (`tried`, `searched`).
-    - `final`: its fit at the final level, by `templates`; with covariance for the best.
-    - `total`: scores of both levels added. `again`: the judged one after finishing on the terrain,
-      `gain`: over the one on level ground; None: finished there.
-    - `score`: `total` less the cost of its prior. `finer`: one level finer, NaN: not needed;
-      `fine`: sum.
-    - `camera`: under which it fits better there, None: that of the telemetry; `seen`: sought.
+    Sources: docs/decisions/registration.md, for places on a terrain docs/terrain.md."""
+
+    to_mid_level: int = 200  # candidates that go on from the coarse level, at most
+    to_finish: int = 3  # the best judged place and its rivals
+    to_finest: int = 12  # compared one level finer, at most, where they are in doubt
+    hope_at_first: float = 0.4
+    hope: float = 0.5
+    """Fractions of the best score to stay, after `first_steps` and after all steps."""
+    min_hopeful: int = 4  # so many stay anyway: the scores need rivals
+    first_steps: int = 1
+    full_steps: int = 4
+    covariance_steps: int = 3  # of the best place once more, with its covariance
+    finer_steps: int = 2  # one level finer
+    small_step_px: float = 0.1  # ends a refinement
+    apart: float = 0.25  # least distance of a rival from the best, over the side of the view
+    rival_on_terrain: float = 0.75
+    """Rivals with less than this fraction of the best score are finished on level ground: chance
+    fits as well there, at half the cost."""
+    moved_px: float = 1.0  # a window moved by more (px of the level) is orthorectified again,
+    rounds: int = 3  # at most so often
+    searched_around: int = 6  # places whose surroundings are searched on the terrain,
+    reach_around: float = 0.2  # as far as this fraction of the side of the view,
+    turns_around_rad: tuple[float, ...] = (-0.1, 0.0, 0.1)  # with these added to the heading
+    scales_around: tuple[float, ...] = (-0.09, 0.0, 0.09)  # and to the log scale
+
+
+REFINEMENT = Refinement()
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A place where a view may have been taken, refined at the mid level.
+
+    `level_score`: on level ground. `terrain`: the view orthorectified there, None: `fit` is on
+    level ground."""
+
+    fit: Fit
+    level_score: float
+    terrain: ViewTemplates | None = None
+
+    @property
+    def pose(self) -> Pose:
+        return self.fit.pose
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """A place refined at the final level.
+
+    - `fit`: by `templates`, those of level ground or of the terrain; with covariance for the best.
+    - `total`: scores of the mid and the final level. `score`: less the cost of the prior.
+    - `mid_score`: at the mid level after finishing on the terrain, `gain`: over that on level
+      ground; None: finished on level ground.
+    - `finer`: score one level finer, NaN: not needed. `fine`: sum of `score` and it.
+    - `camera`: under which the view fits better there, None: that of the telemetry.
     - `scores`: of the best place, see `docs/reference/formats.md`. `rivals`: other finished places,
       best first, near ones too.
     - `below_camera`: the pose with the height counted from the ground below the camera."""
 
-    judged: Fit
-    level_score: float | None = None
-    terrain: ViewTemplates | None = None
-    twin: "Place | None" = None
-    around: "Place | None" = None
-    tried: bool = False
-    searched: bool = False
-    final: Fit | None = None
-    templates: ViewTemplates | None = None
-    total: float = math.nan
-    again: float | None = None
+    judged: Judged
+    fit: Fit
+    templates: ViewTemplates
+    total: float
+    score: float
+    mid_score: float | None = None
     gain: float | None = None
-    score: float = math.nan
     finer: float = math.nan
     fine: float = math.nan
     camera: Orientation | None = None
-    seen: bool = False
     scores: dict[str, float] = field(default_factory=dict)
-    rivals: tuple["Place", ...] = ()
+    rivals: tuple["Finished", ...] = ()
     below_camera: Pose | None = None
-
-    @property
-    def fit(self) -> Fit:
-        return self.final or self.judged
 
     @property
     def pose(self) -> Pose:
         """With the height counted from the ground below the camera."""
         return self.below_camera or self.fit.pose
 
-    def apart_px(self, other: "Place") -> float:
+    def apart_px(self, other: "Finished") -> float:
         """In pixels of level 0."""
         return self.fit.pose.distance_px(other.fit.pose)
 
 
-class Placer:
-    """Judges and finishes the places of one view, in one thread."""
+class CandidateRefiner:
+    """Judges and finishes the places of one view, in one thread; each is finished once."""
 
     def __init__(
         self,
@@ -120,22 +131,21 @@ class Placer:
     ) -> None:
         """`pool` shares candidates; without `ground` it is level, and no level is finer."""
         self.templates, self.levels, self.prior = templates, levels, prior
-        self.reference, self._pool, self._view_over_ground = reference, pool, ground
-        self.is_level = ground is None or ground.relief.is_level
-        self._best_on_terrain = 0.0
+        self.reference, self._pool, self._ground = reference, pool, ground
+        self.is_level = ground is None or ground.ground.is_level
+        self._twins: dict[Judged, Judged | None] = {}
+        self._around: dict[Judged, Judged | None] = {}
+        self._finished: dict[Judged, Finished] = {}
+        self._seen: set[Judged] = set()
 
     @property
-    def _ground(self) -> ViewOverGround:
-        assert self._view_over_ground is not None
-        return self._view_over_ground
-
-    @property
-    def _has_houses(self) -> bool:
-        return not self.is_level and self._ground.relief.surface is not None
+    def _over_ground(self) -> ViewOverGround:
+        assert self._ground is not None
+        return self._ground
 
     @property
     def _exclusion_px(self) -> float:
-        return EXCLUSION_SHARE * self.templates.side_px
+        return REFINEMENT.apart * self.templates.side_px
 
     def _value(self, fit: Fit) -> float:
         """Less the cost of its prior."""
@@ -145,299 +155,293 @@ class Placer:
         made = (templates or self.templates).at(level, self.levels.recipe(level))
         return Refiner(made, self.reference)
 
+    def refined(self, pose: Pose, level: int, templates: ViewTemplates | None = None) -> Fit:
+        refiner = self.refiner(level, templates)
+        return refiner.place(pose, REFINEMENT.full_steps, REFINEMENT.small_step_px)
+
     def shared(self, function: Callable[[Given], Made], given: Sequence[Given]) -> list[Made]:
         """In order; by all threads, where there are some."""
         return list((self._pool.map if self._pool else map)(function, given))
 
     # Judging
 
-    def judge(self, poses: Sequence[Pose], level: int, known: Sequence[Place] = ()) -> list[Place]:
-        """Refined down to the judged level, best first; the best `known` place counts too."""
+    def judge(
+        self, poses: Sequence[Pose], level: int, known: Sequence[Judged] = ()
+    ) -> list[Judged]:
+        """Refined down to the mid level, best first; the best `known` place counts too."""
         fits: list[Fit] = []
-        for at in range(level, self.levels.judged - 1, -1):
-            is_last = at == self.levels.judged
+        for at in range(level, self.levels.mid - 1, -1):
+            is_last = at == self.levels.mid
             fits = self._compared(self.refiner(at), poses, known if is_last else ())
             if not is_last:
-                fits = fits[: min(self._hopeful(fits, HOPE), KEPT_TO_JUDGED)]
+                fits = fits[: min(self._hopeful(fits, REFINEMENT.hope), REFINEMENT.to_mid_level)]
             poses = [each.pose for each in fits]
-        return [Place(each) for each in fits]
+        return [Judged(each, each.score) for each in fits]
 
-    def direct(self, poses: Sequence[Pose]) -> list[Place]:
-        """Found at the final level, scored at the judged one: refined there they would be lost."""
-        refiner = self.refiner(self.levels.judged)
-        return [Place(refiner.place(each, 0)) for each in poses]
+    def direct(self, poses: Sequence[Pose]) -> list[Judged]:
+        """Found at the final level, scored at the mid level, where refining would lose them."""
+        refiner = self.refiner(self.levels.mid)
+        fits = [refiner.place(each, 0) for each in poses]
+        return [Judged(each, each.score) for each in fits]
 
-    def standing(self, places: Sequence[Place]) -> tuple[float, float]:
-        """Of the best judged place, and of its strongest rival."""
-        values = [self._value(each.judged) for each in places]
+    def best_and_rival(self, places: Sequence[Judged]) -> tuple[float, float]:
+        """Scores of the best judged place and of its strongest rival, 0 for none."""
+        values = [self._value(each.fit) for each in places]
         best = max(range(len(places)), key=lambda number: values[number])
-        middle = places[best].judged.pose
         rivals = [
             value
             for value, each in zip(values, places, strict=True)
-            if each.judged.pose.distance_px(middle) > self._exclusion_px
+            if each.pose.distance_px(places[best].pose) > self._exclusion_px
         ]
         return values[best], max(rivals, default=0.0)
 
     def _compared(
-        self, refiner: Refiner, poses: Sequence[Pose], known: Sequence[Place]
+        self, refiner: Refiner, poses: Sequence[Pose], known: Sequence[Judged]
     ) -> list[Fit]:
         """Best first; those without hope are refined only a little."""
-        ranked = self._ranked(self._refined_all(refiner, poses, FIRST_STEPS))
-        least, at_least = 0.0, MIN_HOPEFUL
+        ranked = self._ranked(self._refined_all(refiner, poses, REFINEMENT.first_steps))
+        least, at_least = 0.0, REFINEMENT.min_hopeful
         if known:
-            least, at_least = HOPE * max(self._value(each.judged) for each in known), 1
-        count = self._hopeful(ranked, HOPE_AT_FIRST, at_least, least)
-        hopeful = [each.pose for each in ranked[:count]]
-        return self._ranked(self._refined_all(refiner, hopeful, FULL_STEPS) + ranked[count:])
+            least, at_least = REFINEMENT.hope * max(self._value(each.fit) for each in known), 1
+        count = self._hopeful(ranked, REFINEMENT.hope_at_first, at_least, least)
+        hopeful = self._refined_all(
+            refiner, [each.pose for each in ranked[:count]], REFINEMENT.full_steps
+        )
+        return self._ranked(hopeful + ranked[count:])
 
     def _refined_all(self, refiner: Refiner, poses: Sequence[Pose], steps: int) -> list[Fit]:
         refiner.prepare()
-        return self.shared(lambda pose: refiner.place(pose, steps, ROUGH_STEP_PX), poses)
+        small_px = REFINEMENT.small_step_px
+        return self.shared(lambda pose: refiner.place(pose, steps, small_px), poses)
 
     def _ranked(self, fits: Sequence[Fit]) -> list[Fit]:
         return sorted(fits, key=lambda each: -self._value(each))
 
     def _hopeful(
-        self, ranked: Sequence[Fit], share: float, at_least: int = MIN_HOPEFUL, least: float = 0.0
+        self,
+        ranked: Sequence[Fit],
+        share: float,
+        at_least: int = REFINEMENT.min_hopeful,
+        least: float = 0.0,
     ) -> int:
         """How many fits, best first, reach `least` and a fraction of the best score."""
         values = [self._value(each) for each in ranked]
         enough = sum(value >= max(share * values[0], least) for value in values)
         return min(max(enough, at_least), len(ranked))
 
-    def _apart(self, ranked: Sequence[Fit], apart_px: float, count: int) -> list[int]:
-        """Numbers of the first `count` fits that are farther apart."""
-        chosen: list[int] = []
-        for number, each in enumerate(ranked):
+    def _best_apart(self, places: Sequence[Judged], count: int, apart_px: float) -> list[Judged]:
+        """The best `count` places, best first, farther apart than `apart_px`."""
+        chosen: list[Judged] = []
+        for each in sorted(places, key=lambda each: -self._value(each.fit)):
             if len(chosen) == count:
                 break
-            if all(each.pose.distance_px(ranked[other].pose) > apart_px for other in chosen):
-                chosen.append(number)
+            if all(each.pose.distance_px(other.pose) > apart_px for other in chosen):
+                chosen.append(each)
         return chosen
 
     # On the terrain
 
-    def on_terrain(self, places: Sequence[Place], at_most: int) -> list[Place]:
+    def on_terrain(self, places: Sequence[Judged], at_most: int) -> list[Judged]:
         """The best judged places that lie apart, on the terrain where they are better there; the
-        first `AROUND` with their surroundings, for relief displaces more than refinement follows.
-        """
+        first with their surroundings, for relief displaces more than refinement follows."""
         if self.is_level:
             return list(places)
-        chosen = self._best_apart(places, at_most)
-        moved = [self._twin(places[number]) or places[number] for number in chosen]
-        for number in self._best_apart(moved, AROUND):
-            before = places[chosen[number]]
-            moved[number] = self._best_around(before) or before
-        found = list(places)
-        for number, after in zip(chosen, moved, strict=True):
-            if after.judged.score > places[number].judged.score:
-                found[number] = after
-        return found
+        apart_px = REFINEMENT.apart * self._over_ground.view.side_px
+        moved = {
+            each: self._twin(each) or each for each in self._best_apart(places, at_most, apart_px)
+        }
+        before = {after: each for each, after in moved.items()}
+        for after in self._best_apart(list(before), REFINEMENT.searched_around, apart_px):
+            moved[before[after]] = self._best_around(before[after]) or before[after]
+        better = {a: b for a, b in moved.items() if b.fit.score > a.fit.score}
+        return [better.get(each, each) for each in places]
 
-    def _best_apart(self, places: Sequence[Place], count: int) -> list[int]:
-        order = sorted(range(len(places)), key=lambda number: -self._value(places[number].judged))
-        ranked = [places[number].judged for number in order]
-        apart_px = EXCLUSION_SHARE * self._ground.view.side_px
-        return [order[number] for number in self._apart(ranked, apart_px, count)]
+    def _twin(self, place: Judged) -> Judged | None:
+        """A place refined on the terrain; None where level ground is as good."""
+        if place not in self._twins:
+            pose, made = place.pose, None
+            if not self._over_ground.is_level(pose):
+                made = self._over_ground.templates_at(pose, self.levels.mid)
+            fit = None if made is None else self.refined(pose, self.levels.mid, made)
+            self._twins[place] = None if fit is None else Judged(fit, place.fit.score, made)
+        return self._twins[place]
 
-    def _twin(self, place: Place) -> Place | None:
-        """A place refined on the terrain, once; None where level ground is as good."""
-        if not place.tried:
-            place.tried, pose = True, place.judged.pose
-            if not self._ground.is_level(pose):
-                made = self._ground.templates_at(pose, self.levels.judged)
-                if made is not None:
-                    place.twin = Place(self._rejudged(pose, made), place.judged.score, made)
-        return place.twin
-
-    def _rejudged(self, pose: Pose, templates: ViewTemplates) -> Fit:
-        refiner = self.refiner(self.levels.judged, templates)
-        return refiner.place(pose, FULL_STEPS, ROUGH_STEP_PX)
-
-    def _best_around(self, place: Place) -> Place | None:
+    def _best_around(self, place: Judged) -> Judged | None:
         """`_twin`, or a better place by a search around it at the coarse level."""
-        twin = self._twin(place)
-        if twin is None or place.searched:
-            return place.around
-        assert twin.terrain is not None
-        place.searched, pose = True, place.judged.pose
-        starts, scales = [(pose, twin.terrain)], self.prior.scale_map
-        expected = scales.at(pose.x_px, pose.y_px) if scales else pose.log_scale
-        if abs(expected - pose.log_scale) > max(NEAR_SCALES):  # level ground may fit at another
-            raised = replace(pose, log_scale=expected)
-            made = self._ground.templates_at(raised, self.levels.judged)
-            starts += [] if made is None else [(raised, made)]
-        found = [
-            Place(fit, place.judged.score, made)
-            for start, made in starts
-            for fit in self._around(start, made)
-        ]
-        place.around = max([twin, *found], key=lambda each: each.judged.score)
-        return place.around
+        if place not in self._around:
+            twin = self._twin(place)
+            found = [] if twin is None else [twin, *self._found_around(place, twin)]
+            self._around[place] = max(found, key=lambda each: each.fit.score, default=None)
+        return self._around[place]
 
-    def _around(self, pose: Pose, templates: ViewTemplates) -> Iterator[Fit]:
-        """By a search around a pose at the coarse level."""
-        level, side_px = self.levels.coarse, self._ground.view.side_px
+    def _found_around(self, place: Judged, twin: Judged) -> Iterator[Judged]:
+        assert twin.terrain is not None
+        pose, scales = place.pose, self.prior.scale_map
+        starts = [(pose, twin.terrain)]
+        expected = scales.at(pose.x_px, pose.y_px) if scales else pose.log_scale
+        # Level ground may fit at another scale.
+        if abs(expected - pose.log_scale) > max(REFINEMENT.scales_around):
+            raised = replace(pose, log_scale=expected)
+            made = self._over_ground.templates_at(raised, self.levels.mid)
+            starts += [] if made is None else [(raised, made)]
+        for start, templates in starts:
+            for near in self._searched_around(start, templates):
+                fit = self.refined(near.pose, self.levels.mid, templates)
+                yield Judged(fit, place.fit.score, templates)
+
+    def _searched_around(self, pose: Pose, templates: ViewTemplates) -> list[Peak]:
+        """The best pose around another one at the coarse level."""
+        level, side_px = self.levels.coarse, self._over_ground.view.side_px
         poses = [
             (pose.turn_rad + turn, pose.log_scale + scale)
-            for turn in NEAR_TURNS_RAD
-            for scale in NEAR_SCALES
+            for turn in REFINEMENT.turns_around_rad
+            for scale in REFINEMENT.scales_around
         ]
         recipe = self.levels.recipe(level)
         template = templates.at(level, recipe)
         middle, half_px = (pose.x_px, pose.y_px), largest_half_px(template, poses)
-        windows, reach_px = SearchWindows(self.reference), NEAR_REACH * side_px
+        windows, reach_px = SearchWindows(self.reference), REFINEMENT.reach_around * side_px
         window = windows.part(level, recipe, side_px, middle, reach_px, half_px)
-        for near in search(template, window, poses, 1, self.prior.scale_map):
-            yield self._rejudged(near.pose, templates)
+        return search(template, window, poses, 1, self.prior.scale_map)
 
     # Finishing
 
     def finished(
         self,
-        places: Sequence[Place],
+        places: Sequence[Judged],
         candidates: int,
-        direct: Sequence[Place] = (),
+        direct: Sequence[Judged] = (),
         *,
-        kept: int = KEPT_TO_FINISH,
+        kept: int = REFINEMENT.to_finish,
         closer: bool = False,
-    ) -> Place:
+    ) -> Finished:
         """The best of judged places, found by searches of `candidates` in all: the best `kept` and
-        all `direct` ones at the final level, with `closer` the best `KEPT_TO_FINEST` one level
-        finer, where there is one, and as their houses show them."""
-        ranked = sorted(places, key=lambda each: -self._value(each.judged))
-        chosen = self._apart([each.judged for each in ranked], self._exclusion_px, kept)
-        apart = [ranked[number] for number in chosen]
-        finalists = apart[: self._hopeful([each.judged for each in apart], HOPE, 2)]
-        finalists += direct
-        for each in finalists:
-            self._finish(each)
-        finalists.sort(key=lambda each: -each.score)
-        if closer and self._has_houses:
-            for each in finalists[:KEPT_TO_FINEST]:
-                self._see_houses(each)
-            finalists.sort(key=lambda each: -each.score)
+        all `direct` ones at the final level; with `closer` the best of these one level finer, where
+        there is one, and as their houses show them."""
+        apart = self._best_apart(places, kept, self._exclusion_px)
+        chosen = apart[: self._hopeful([each.fit for each in apart], REFINEMENT.hope, 2)]
+        finalists = _best_first(self._finish_all([*chosen, *direct]))
+        if closer and not self.is_level and self._over_ground.ground.surface is not None:
+            for number, each in enumerate(finalists[: REFINEMENT.to_finest]):
+                finalists[number] = self._seen_with_houses(each)
+            finalists = _best_first(finalists)
         if closer and self.levels.final > 0:
-            finalists = [
-                replace(each, fine=each.score + self._finer_score(each))
-                for each in finalists[:KEPT_TO_FINEST]
-            ]
+            finer = map(self._compared_finer, finalists[: REFINEMENT.to_finest])
+            finalists = [replace(each, fine=each.score + each.finer) for each in finer]
             finalists.sort(key=lambda each: -each.fine)
         best = finalists[0]
         final = self._with_covariance(best.fit.pose, best.templates)
-        scores = self._scores(finalists, [*ranked, *direct], final)
+        scores = self._scores(finalists, [*places, *direct], final)
         return replace(
             best,
-            final=final,
+            fit=final,
             scores=scores | {"candidates": float(candidates)},
             rivals=tuple(replace(each, score=_weight(each, best)) for each in finalists[1:]),
         )
 
-    def _finish(self, place: Place) -> None:
-        """At the final level, once: on the terrain, unless level ground is as good, too little is
-        known, or it is far below the best one before."""
-        if place.final is not None:
-            return
-        first = None
-        if not self.is_level:
-            is_twin = place.level_score is not None
-            first = self._twin(place) if is_twin else self._best_around(place)
-        if first is None or first.judged.score < RIVAL_SHARE * self._best_on_terrain:
-            self._finish_on_level(place)
-        else:
-            self._best_on_terrain = max(self._best_on_terrain, first.judged.score)
-            self._finish_on_terrain(place, first.judged.pose)
-        place.score = place.total - self.prior.cost(place.fit.pose)
+    def _finish_all(self, places: Sequence[Judged]) -> list[Finished]:
+        """On the terrain, unless level ground is as good, too little is known, or a place is far
+        below the best one."""
+        starts = [self._start(each) for each in places]
+        best = max((start.fit.score for start in starts if start is not None), default=0.0)
+        for place, start in zip(places, starts, strict=True):
+            if place in self._finished:
+                continue
+            if start is None or start.fit.score < REFINEMENT.rival_on_terrain * best:
+                self._finished[place] = self._on_level(place)
+            else:
+                self._finished[place] = self._on_terrain(place, start.pose)
+        return [self._finished[each] for each in places]
 
-    def _finish_on_level(self, place: Place) -> None:
-        place.final, place.templates, place.total = place.judged, self.templates, place.judged.score
-        place.again = place.gain = None
-        if self.levels.final != self.levels.judged:
-            place.final = self.refiner(self.levels.final).place(
-                place.judged.pose, FULL_STEPS, ROUGH_STEP_PX
-            )
-            again = self.refiner(self.levels.judged).place(place.final.pose, 0)
-            place.total = place.final.score + again.score
+    def _start(self, place: Judged) -> Judged | None:
+        """Where a place is finished on the terrain; None: on level ground."""
+        if self.is_level:
+            return None
+        return self._best_around(place) if place.terrain is None else self._twin(place)
 
-    def _finish_on_terrain(self, place: Place, pose: Pose) -> None:
-        levels = self.levels
-        for _ in range(ROUNDS):
-            made = self._ground.templates_at(pose, levels.final)
+    def _on_level(self, place: Judged) -> Finished:
+        fit, total = place.fit, place.fit.score
+        if self.levels.final != self.levels.mid:
+            fit = self.refined(place.pose, self.levels.final)
+            total = fit.score + self.refiner(self.levels.mid).place(fit.pose, 0).score
+        return Finished(place, fit, self.templates, total, total - self.prior.cost(fit.pose))
+
+    def _on_terrain(self, place: Judged, pose: Pose) -> Finished:
+        final = self.levels.final
+        for _ in range(REFINEMENT.rounds):
+            made = self._over_ground.templates_at(pose, final)
             if made is None:
-                self._finish_on_level(place)
-                return
-            final = self.refiner(levels.final, made).place(pose, FULL_STEPS, ROUGH_STEP_PX)
-            if self._ground.moved_px(pose, final.pose) < AGAIN_PX * 2**levels.final:
+                return self._on_level(place)
+            fit = self.refined(pose, final, made)
+            if self._over_ground.moved_px(pose, fit.pose) < REFINEMENT.moved_px * 2**final:
                 break
-            pose = final.pose
-        again, total = self._again(final, made)
-        on_level = _on_level(place)
-        if again < on_level:
-            self._finish_on_level(place)
-            if place.total > total:
-                return
-        place.final, place.templates, place.total, place.again = final, made, total, again
-        place.gain = again / max(on_level, 1e-6)
+            pose = fit.pose
+        assert made is not None
+        found = self._by_templates(place, fit, made)
+        assert found.mid_score is not None
+        if found.mid_score < place.level_score:
+            level = self._on_level(place)
+            if level.total > found.total:
+                return level
+        return found
 
-    def _again(self, final: Fit, templates: ViewTemplates | None) -> tuple[float, float]:
-        """Score at the judged level of a fit at the final one, and both added."""
-        levels = self.levels
-        if levels.final == levels.judged:
-            return final.score, final.score
-        again = self.refiner(levels.judged, templates).place(final.pose, 0).score
-        return again, final.score + again
+    def _by_templates(self, place: Judged, fit: Fit, templates: ViewTemplates) -> Finished:
+        """Finished by orthorectified templates."""
+        mid_score = total = fit.score
+        if self.levels.final != self.levels.mid:
+            mid_score = self.refiner(self.levels.mid, templates).place(fit.pose, 0).score
+            total += mid_score
+        score, gain = total - self.prior.cost(fit.pose), mid_score / max(place.level_score, 1e-6)
+        return Finished(place, fit, templates, total, score, mid_score, gain)
 
-    def _see_houses(self, place: Place) -> None:
+    def _seen_with_houses(self, place: Finished) -> Finished:
         """Once, under the camera that the picture shows there, not the reported one: among houses
         and trees that is the difference between the right place and chance."""
-        if place.seen:
-            return
-        place.seen, pose, levels = True, place.fit.pose, self.levels
-        camera = approached(self._ground, self.reference, pose)
-        if camera is None:
-            return
-        made = self._ground.templates_at(pose, levels.final, camera)
+        judged, pose, final = place.judged, place.fit.pose, self.levels.final
+        if judged in self._seen:
+            return place
+        self._seen.add(judged)
+        camera = approached(self._over_ground, pose)
+        made = None if camera is None else self._over_ground.templates_at(pose, final, camera)
         if made is None:
-            return
-        final = self.refiner(levels.final, made).place(pose, FULL_STEPS, ROUGH_STEP_PX)
-        again, total = self._again(final, made)
-        if total > place.total or levels.final > 0:
-            place.camera = camera  # one level finer it may fit even so
-        if total > place.total:
-            place.final, place.templates, place.total, place.again = final, made, total, again
-            place.score = total - self.prior.cost(final.pose)
-            place.gain = again / max(_on_level(place), 1e-6)
+            return place
+        under = self._by_templates(judged, self.refined(pose, final, made), made)
+        if under.total > place.total:
+            place = replace(under, finer=place.finer, camera=camera)
+        elif final > 0:
+            place = replace(place, camera=camera)  # one level finer it may fit even so
+        self._finished[judged] = place
+        return place
 
-    def _finer_score(self, place: Place) -> float:
+    def _compared_finer(self, place: Finished) -> Finished:
         """One level finer than the final one, once."""
         if math.isnan(place.finer):
-            place.finer = self._finer_under(place, None)
+            finer, camera = self._finer_score(place, None), None
             if place.camera is not None:
-                score = self._finer_under(place, place.camera)
-                if score > place.finer:
-                    place.finer = score
-                else:
-                    place.camera = None
-        return place.finer
+                score = self._finer_score(place, place.camera)
+                if score > finer:
+                    finer, camera = score, place.camera
+            place = replace(place, finer=finer, camera=camera)
+            self._finished[place.judged] = place
+        return place
 
-    def _finer_under(self, place: Place, camera: Orientation | None) -> float:
+    def _finer_score(self, place: Finished, camera: Orientation | None) -> float:
         level, made = self.levels.final - 1, None
         if place.gain is not None or camera is not None:
-            made = self._ground.templates_at(place.fit.pose, level, camera)
+            made = self._over_ground.templates_at(place.fit.pose, level, camera)
         refiner = Refiner((made or self._finer_on_level).at(level), self.reference)
-        return refiner.place(place.fit.pose, FINER_STEPS).score
+        return refiner.place(place.fit.pose, REFINEMENT.finer_steps).score
 
     @cached_property
     def _finer_on_level(self) -> ViewTemplates:
         level = self.levels.final - 1
-        made = self._ground.view.rectified_at(level)
+        made = self._over_ground.view.rectified_at(level)
         return ViewTemplates(made.grey, made.valid, level, self.templates.grey_share)
 
     def _with_covariance(self, pose: Pose, templates: ViewTemplates | None = None) -> Fit:
         """At the final level, once more."""
         refiner = self.refiner(self.levels.final, templates)
-        return refiner.place(pose, COVARIANCE_STEPS, with_covariance=True)
+        return refiner.place(pose, REFINEMENT.covariance_steps, with_covariance=True)
 
     def covariance_at(self, pose: Pose) -> NDArray[np.float64]:
         """Of the fit (4, 4) near a pose, on level ground."""
@@ -445,39 +449,39 @@ class Placer:
         assert found is not None
         return found
 
-    def below_camera(self, best: Place) -> Place:
+    def below_camera(self, best: Finished) -> Finished:
         """With heights, of its rivals too, counted from the ground below the camera."""
-        for each in (best, *best.rivals):
-            if each.gain is not None:
-                each.below_camera = self._ground.below_camera(each.fit.pose)
-        return best
+        rivals = tuple(self.below_camera(each) for each in best.rivals)
+        below = None if best.gain is None else self._over_ground.below_camera(best.fit.pose)
+        return replace(best, rivals=rivals, below_camera=below)
 
     def _scores(
-        self, finalists: Sequence[Place], judged: Sequence[Place], final: Fit
+        self, finalists: Sequence[Finished], judged: Sequence[Judged], final: Fit
     ) -> dict[str, float]:
         """The numbers behind the first finished place, `final` with its covariance."""
-        best, cost, fit = finalists[0], self.prior.cost, finalists[0].fit
+        best, cost, pose = finalists[0], self.prior.cost, finalists[0].fit.pose
         far = [each for each in finalists if each.apart_px(best) > self._exclusion_px]
         others = [
-            self._value(each.judged)
+            self._value(each.fit)
             for each in judged
-            if each.judged.pose.distance_px(fit.pose) > self._exclusion_px
+            if each.pose.distance_px(pose) > self._exclusion_px
         ]
-        others += [each.again - cost(each.fit.pose) for each in far if each.again is not None]
-        if best.again is None:
+        others += [
+            each.mid_score - cost(each.fit.pose) for each in far if each.mid_score is not None
+        ]
+        if best.mid_score is None:
             # Of what was judged there: refined at the final level, it may be another candidate.
-            nearest = min(judged, key=lambda each: each.judged.pose.distance_px(fit.pose))
-            look = self._value(nearest.judged)
+            nearest = min(judged, key=lambda each: each.pose.distance_px(pose))
+            look = self._value(nearest.fit)
         else:
-            look = best.again - cost(fit.pose)
+            look = best.mid_score - cost(pose)
         rival, look_rival = max((each.score for each in far), default=0.0), max(others, default=0.0)
         is_fine = not math.isnan(best.fine)
         detail = math.nan
-        if self.levels.final != self.levels.judged:
-            detail = max(fit.score, 1e-3) / max(best.total - fit.score, 1e-3)
-        templates = best.templates or self.templates
-        template = templates.at(self.levels.final, self.levels.recipe(self.levels.final))
-        local = sharpness(template, self.reference, fit.pose)
+        if self.levels.final != self.levels.mid:
+            detail = max(best.fit.score, 1e-3) / max(best.total - best.fit.score, 1e-3)
+        template = best.templates.at(self.levels.final, self.levels.recipe(self.levels.final))
+        local = sharpness(template, self.reference, pose)
         gradient, grey = final.correlations
         return {
             "score": final.weighted,
@@ -501,12 +505,11 @@ class Placer:
         }
 
 
-def _on_level(place: Place) -> float:
-    """Its judged score on level ground."""
-    return place.judged.score if place.level_score is None else place.level_score
+def _best_first(places: Sequence[Finished]) -> list[Finished]:
+    return sorted(places, key=lambda each: -each.score)
 
 
-def _weight(place: Place, best: Place) -> float:
+def _weight(place: Finished, best: Finished) -> float:
     """At most as far below that of the best as with the finer level."""
     if math.isnan(place.fine) or best.fine <= 0:
         return place.score

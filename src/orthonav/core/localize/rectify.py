@@ -29,10 +29,6 @@ NODE_PX = 4
 """Spacing of heights and projections: at most one and a half postings of a usual terrain."""
 MAX_COARSER = 3.0
 """Coarser ground, over the window's pixel and the view's finest ground, does not count."""
-SHOWN = 254  # grey level of a rectified mask above which a pixel shows nothing but ground
-SIGHT_STEPS = 48  # of a line of sight, at most
-CLEAR_M = 0.5  # error of interpolation
-FASTER_FROM, FASTER_TO = 3, 256  # factors by which the kernel makes pictures smaller, as OpenCV
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -86,7 +82,7 @@ def _unmasked(
     grey, valid = rectified(view.grey)
     if view.camera.mask is None:
         return grey, valid
-    shown = rectified(view.camera.mask)[0] > SHOWN
+    shown = rectified(view.camera.mask)[0] > 254  # nothing but ground
     return np.where(shown, grey, 0).astype(np.uint8), valid & shown
 
 
@@ -182,20 +178,18 @@ def _behind(nodes_m: Array, position_m: Array, sight: Array) -> Mask:
     rise = float(np.nanmax(nodes_m[..., 2]) - np.nanmin(nodes_m[..., 2]))
     # Farther along, a line of sight is above all ground.
     reach = min(rise / (max(float(np.nanmin(sight)), 1e-3) * spacing), math.hypot(rows, cols))
-    for step in np.arange(1.0, reach + 1, max(1.0, reach / SIGHT_STEPS)):
+    for step in np.arange(1.0, reach + 1, max(1.0, reach / 48)):
         at = np.minimum(step / length, 1.0)
         col, row = cv2.split((np.dstack([x, y]) + left * at[..., None]).astype(np.float32))
         outside = cv2.BORDER_CONSTANT
         there = cv2.remap(heights, col, row, cv2.INTER_LINEAR, borderMode=outside, borderValue=-1e4)
-        found |= there > nodes_m[..., 2] + sight * step * spacing + CLEAR_M
+        error_m = 0.5  # of interpolation
+        found |= there > nodes_m[..., 2] + sight * step * spacing + error_m
     return found
 
 
 MAX_REACH = 2.0
-MAX_NEAR_NADIR_DEG = 45.0  # views farther off nadir are used in part
 NEAR_CELLS = 32  # along both sides of a picture, to find how finely it sees the ground
-EDGE_PX = 1e-6
-NODE_ERROR_PX = 0.02  # the lens is computed at every `NODE_PX` where that errs by no more
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +207,7 @@ def is_oblique(view: View) -> bool:
     """Far off nadir, or cropped so that the principal point is missing: see `near_part`."""
     camera = view.camera
     inside = 0 <= camera.cx_px <= camera.width_px and 0 <= camera.cy_px <= camera.height_px
-    return not inside or off_nadir_deg(view.telemetry) > MAX_NEAR_NADIR_DEG
+    return not inside or off_nadir_deg(view.telemetry) > 45.0
 
 
 def off_nadir_deg(telemetry: Telemetry) -> float:
@@ -275,7 +269,8 @@ def downsampled(view: View, gsd_m: float) -> View:
 def _thinned(grey: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """Means over squares of `factor` pixels, whole multiples of which the sides are."""
     height, width = (side // factor for side in grey.shape)
-    if KERNEL is None or not FASTER_FROM <= factor <= FASTER_TO:
+    # The kernel makes pictures smaller, as OpenCV, by these factors.
+    if KERNEL is None or not 3 <= factor <= 256:
         thinned = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
         return np.asarray(thinned, dtype=np.uint8)
     out = np.empty((height, width), np.uint8)
@@ -370,7 +365,7 @@ def _warped(
     projected = corners @ px_from_window.T
     seen = projected[:, :2] / projected[:, 2:]
     height, width = picture.shape
-    if (seen >= -EDGE_PX).all() and (seen <= np.array([width, height]) + EDGE_PX).all():
+    if (seen >= -1e-6).all() and (seen <= np.array([width, height]) + 1e-6).all():
         valid = np.ones(shape, dtype=np.bool_)
     else:
         inside = np.full(picture.shape, 255, dtype=np.uint8)
@@ -409,7 +404,7 @@ def _remapped(
 
 
 def _is_smooth(index: Array, shape: tuple[int, ...]) -> bool:
-    """Whether lines between nodes (H, W, 2) miss by less than `NODE_ERROR_PX`.
+    """Whether lines between nodes (H, W, 2) miss by less than 0.02 px.
 
     Between every other node they miss by four times as much, which the skipped nodes show."""
     odd = [side // 2 * 2 - 1 for side in index.shape[:2]]
@@ -419,7 +414,7 @@ def _is_smooth(index: Array, shape: tuple[int, ...]) -> bool:
     size = np.array(shape[::-1])
     near = (np.abs(exact - size / 2) < 0.6 * size + NODE_PX).all(axis=-1)
     missed = np.abs(middle - exact)[near].max(initial=0.0) / 4
-    return bool(np.isfinite(index).all() and missed < NODE_ERROR_PX)
+    return bool(np.isfinite(index).all() and missed < 0.02)
 
 
 def _seen_px(camera: Camera, camera_from_window: Array, rows: Array, cols: Array) -> Array:

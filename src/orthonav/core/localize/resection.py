@@ -17,27 +17,44 @@ from orthonav.core.localize.systematic import Systematic
 from orthonav.core.register.blocks import BlockScores
 from orthonav.core.register.kernel import KERNEL
 
-BLURS_PX = (2.0, 1.0, 0.0, 0.0)
-"""Gaussian blur of correlations at each step: wide peaks first, for views off by some pixels."""
-SHARP_PX = (0.7, 0.0)  # the same from a correction by `SAMPLE` blocks, or from one close by
-SAMPLES, SAMPLE, SAMPLE_STD_PX = 200, 3, 1.0
-"""Corrections tried by the peaks of a few blocks, known to so many pixels (RANSAC)."""
-JOINT_STEPS = 6  # of camera and systematic errors together
-LONGEST_STEP_PX = 3.0  # of any block, per step, pixels of its level
-PIXELS_PER_NUMBER = 5.0  # pixels per independent number; only the odds of outliers depend on it
-LEAST_CORRELATION, MOST_CORRELATION = 0.03, 0.9  # limits of the mean correlation of a right block
-CORRELATED, CORRELATED_PX = 2.0, 60.0
-"""Errors of levels and dates correlate: least excess of the variance over the scatter of blocks,
-and what errors reach over, pixels of the map (docs/decisions/camera.md)."""
-MIN_BLOCKS = 8
-SINGULAR = 1e-15  # least eigenvalue over the largest of what blocks show of the camera
-MIN_LEFT = 0.25  # least share of the blocks' numbers that the solution leaves to their scatter
-COMPONENT_PRIOR = 4.0  # numbers that the prior variance of a systematic error counts as,
-MAX_COMPONENT = 16.0  # and the largest factor on it
+Array = NDArray[np.float64]
+CAMERA = slice(0, 6)
 WEAK = np.array([1e4, 1e4, 1e3, 60.0, 20.0, 20.0])
 """Standard deviations of a camera of which nothing is reported."""
-CAMERA = slice(0, 6)
-Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Solver:
+    """How the posterior is climbed; reasons are in docs/decisions/camera.md."""
+
+    blurs_px: tuple[float, ...] = (2.0, 1.0, 0.0, 0.0)
+    """Gaussian blur of correlations at each step: wide peaks first, for views pixels off."""
+    sharp_px: tuple[float, ...] = (0.7, 0.0)
+    """The same from a correction by `sample` blocks, or from one close by."""
+    samples: int = 200  # corrections tried by the peaks
+    sample: int = 3  # of so many blocks (RANSAC),
+    sample_std_px: float = 1.0  # known to so many pixels
+    joint_steps: int = 6  # of camera and systematic errors together
+    longest_step_px: float = 3.0  # of any block, per step, pixels of its level
+    pixels_per_number: float = 5.0
+    """Pixels per independent number; only the odds of outliers depend on it."""
+    min_correlation: float = 0.03
+    max_correlation: float = 0.9
+    """Limits of the mean correlation of a right block."""
+    correlated: float = 2.0
+    correlated_px: float = 60.0
+    """Errors of levels and dates correlate: least inflation of the variance over the scatter of
+    blocks, and what errors reach over, pixels of the map."""
+    min_blocks: int = 8
+    singular: float = 1e-15  # least eigenvalue over the largest of what blocks show of the camera
+    min_left: float = 0.25
+    """Least share of the blocks' numbers that the solution leaves to their scatter."""
+    component_prior: float = 4.0
+    """Numbers that the prior variance of a systematic error counts as,"""
+    max_component: float = 16.0  # and the largest factor on it
+
+
+SOLVER = Solver()
 
 
 class Expected(NamedTuple):
@@ -53,55 +70,12 @@ NOTHING = Expected(np.zeros(6), np.diag(WEAK**-2))
 @dataclass(frozen=True, eq=False)
 class Resection:
     """Corrections (6,), m east, north, up, deg heading, pitch, roll, and covariances (6, 6);
-    `alone`: by the picture without telemetry, as far as it shows them (`WEAK`)."""
+    `image_only`: by the picture without telemetry, as far as it shows them (`WEAK`)."""
 
     correction: Array
     covariance: Array
-    alone: Array
-    alone_covariance: Array
-
-
-def climbed(
-    seen: Sequence[tuple[BlockScores, float]],
-    moved_px: Array,
-    expected: Expected,
-    slope_rad: float,
-    *,
-    block_px: float,
-) -> Array | None:
-    """The correction (6,) alone, from far away; None where too few blocks are seen. For the
-    arguments see `resected`."""
-    blocks = _Blocks.of(seen, moved_px, block_px)
-    if blocks is None:
-        return None
-    loose = _with_slope(expected, slope_rad)
-    correction = blocks.climbed(np.zeros(6), BLURS_PX, loose)
-    sampled = blocks.best(blocks.sampled(loose), loose)
-    ascents = [correction, blocks.climbed(sampled, SHARP_PX, loose)]
-    return blocks.best(np.stack(ascents), loose)
-
-
-def resected(
-    seen: Sequence[tuple[BlockScores, float]],
-    moved_px: Array,
-    expected: Expected,
-    systematic: Systematic,
-    *,
-    variance: float,
-    block_px: float,
-) -> Resection | None:
-    """The camera with its covariance, from one known to a pixel or two; None where too few blocks
-    are seen.
-
-    `seen`: of each level the blocks and its pixel in pixels of level 0. `moved_px` (N, 2, 6): how
-    far each moves by the camera, pixels right and down at level 0. `variance`: of the blocks'
-    noise over what their curvature says. `block_px`: their width, pixels of level 0."""
-    blocks = _Blocks.of(seen, moved_px, block_px)
-    if blocks is None:
-        return None
-    loose = _with_slope(expected, systematic.slope_rad)
-    correction = blocks.climbed(np.zeros(6), SHARP_PX, loose)
-    return _joint(blocks, correction, expected, systematic, variance)
+    image_only: Array
+    image_only_covariance: Array
 
 
 def _with_slope(expected: Expected, slope_rad: float) -> Expected:
@@ -113,44 +87,11 @@ def _with_slope(expected: Expected, slope_rad: float) -> Expected:
     return Expected(correction, loose)
 
 
-def _joint(
-    blocks: "_Blocks",
-    correction: Array,
-    expected: Expected,
-    systematic: Systematic,
-    variance: float,
-) -> Resection | None:
-    """With systematic errors, from a camera (6,) near by."""
-    blocks = blocks.with_moves(systematic.moves_px)
-    size = blocks.moved_px.shape[2]
-    state, prior, precision = np.zeros(size), np.zeros(size), np.ones(size)
-    state[CAMERA], prior[CAMERA] = correction, expected.correction
-    components = [(slice(6 + at.start, 6 + at.stop), least) for at, least in systematic.components]
-    excess = blocks.correlated
-    for _ in range(JOINT_STEPS):
-        information = np.diag(precision)
-        information[CAMERA, CAMERA] = expected.information
-        curvature, slopes = blocks.system(state)
-        covariance = np.asarray(np.linalg.inv(curvature / excess + information))
-        pull = slopes.sum(axis=0) / excess + information @ (prior - state)
-        state = state + blocks.limited(covariance @ pull)
-        excess = blocks.excess(curvature, slopes, covariance, excess)
-        for at, least in components:
-            precision[at] = 1 / _component(state[at], np.diag(covariance)[at], least)
-    shown = _Marginal.of(curvature / excess, information)
-    covariance = shown.covariance(expected.information, variance)
-    alone = shown.without(state[CAMERA], expected)
-    alone_covariance = shown.covariance(NOTHING.information, variance)
-    if not all(np.isfinite(each).all() for each in (state, covariance, alone, alone_covariance)):
-        return None
-    return Resection(state[CAMERA], covariance, alone, alone_covariance)
-
-
 def _component(values: Array, variances: Array, least: float) -> float:
     """Common variance of systematic errors, 1 as assumed, by expectation maximization."""
     shown = float(values @ values + variances.sum())
-    found = (COMPONENT_PRIOR + shown) / (COMPONENT_PRIOR + len(values))
-    return min(max(found, least), MAX_COMPONENT)
+    found = (SOLVER.component_prior + shown) / (SOLVER.component_prior + len(values))
+    return min(max(found, least), SOLVER.max_component)
 
 
 class _Marginal(NamedTuple):
@@ -183,9 +124,10 @@ class _Marginal(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Blocks:
+class Blocks:
     """Of all levels: correlations (L * N, S, S), pixels (L * N,), and the size of these in pixels
-    of level 0 (L * N,). `moved_px` (N, 2, D): by each unknown."""
+    of level 0 (L * N,). `moved_px` (N, 2, D): by each unknown. `correlated`: least inflation of
+    their variance."""
 
     levels: int
     correlated: float
@@ -197,19 +139,69 @@ class _Blocks:
     @classmethod
     def of(
         cls, seen: Sequence[tuple[BlockScores, float]], moved_px: Array, block_px: float
-    ) -> "_Blocks | None":
-        correlated = max(CORRELATED, 1 + (CORRELATED_PX / block_px) ** 2)
+    ) -> "Blocks | None":
+        """None where too few are seen.
+
+        `seen`: of each level the blocks and its pixel in pixels of level 0. `moved_px` (N, 2, 6):
+        how far each moves by the camera, pixels right and down at level 0. `block_px`: their width,
+        pixels of level 0."""
+        correlated = max(SOLVER.correlated, 1 + (SOLVER.correlated_px / block_px) ** 2)
         known = np.tile(np.isfinite(moved_px).all(axis=(1, 2)), len(seen))
         pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in seen]), 0.0)
         by_level = np.asarray(pixels.reshape(len(seen), -1) > 0, np.bool_)
-        if by_level.sum(axis=1).max() < MIN_BLOCKS:
+        if by_level.sum(axis=1).max() < SOLVER.min_blocks:
             return None
         correlations = np.concatenate([scores.correlations for scores, _ in seen])
         moved_px = np.where(by_level.any(axis=0).reshape(-1, 1, 1), moved_px, 0.0)
         unit_px = np.repeat([unit for _, unit in seen], len(moved_px))
         return cls(len(seen), correlated, correlations, pixels, unit_px, moved_px)
 
-    def with_moves(self, moves_px: Array) -> "_Blocks":
+    def climb(self, expected: Expected, slope_rad: float) -> Array:
+        """The correction (6,) alone, from far away."""
+        loose = _with_slope(expected, slope_rad)
+        correction = self._climbed(np.zeros(6), SOLVER.blurs_px, loose)
+        sampled = self.best(self.sampled(loose), loose)
+        ascents = [correction, self._climbed(sampled, SOLVER.sharp_px, loose)]
+        return self.best(np.stack(ascents), loose)
+
+    def resect(
+        self, expected: Expected, systematic: Systematic, variance: float
+    ) -> Resection | None:
+        """The camera with its covariance, from one known to a pixel or two; None where these are
+        not finite. `variance`: of the blocks' noise over what their curvature says."""
+        loose = _with_slope(expected, systematic.slope_rad)
+        correction = self._climbed(np.zeros(6), SOLVER.sharp_px, loose)
+        return self._with(systematic.moves_px)._joint(correction, expected, systematic, variance)
+
+    def _joint(
+        self, correction: Array, expected: Expected, systematic: Systematic, variance: float
+    ) -> Resection | None:
+        """With systematic errors, from a camera (6,) near by."""
+        size = self.moved_px.shape[2]
+        state, prior, precision = np.zeros(size), np.zeros(size), np.ones(size)
+        state[CAMERA], prior[CAMERA] = correction, expected.correction
+        inflation = self.correlated
+        for _ in range(SOLVER.joint_steps):
+            information = np.diag(precision)
+            information[CAMERA, CAMERA] = expected.information
+            curvature, slopes = self.system(state)
+            covariance = np.asarray(np.linalg.inv(curvature / inflation + information))
+            pull = slopes.sum(axis=0) / inflation + information @ (prior - state)
+            state = state + self.limited(covariance @ pull)
+            inflation = self.variance_inflation(curvature, slopes, covariance, inflation)
+            for at, least in systematic.components:
+                own = slice(6 + at.start, 6 + at.stop)
+                precision[own] = 1 / _component(state[own], np.diag(covariance)[own], least)
+        shown = _Marginal.of(curvature / inflation, information)
+        covariance = shown.covariance(expected.information, variance)
+        image_only = shown.without(state[CAMERA], expected)
+        weak = shown.covariance(NOTHING.information, variance)
+        if not all(np.isfinite(each).all() for each in (state, covariance, image_only, weak)):
+            return None
+        return Resection(state[CAMERA], covariance, image_only, weak)
+
+    def _with(self, moves_px: Array) -> "Blocks":
+        """With more unknowns."""
         used = np.asarray(self.moved_px.any(axis=(1, 2)), np.bool_)
         more_px = np.where(used[:, None, None], moves_px, 0.0)
         return replace(self, moved_px=np.concatenate([self.moved_px, more_px], axis=2))
@@ -225,10 +217,11 @@ class _Blocks:
         with np.errstate(divide="ignore"):
             chance = np.log(self._weights(self._usual(height)) * height)
         drawn = _drawn(count) - chance
-        chosen = np.argpartition(drawn, SAMPLE, axis=1)[:, :SAMPLE]
-        moved = self._by_level.reshape(count, 2, -1)[chosen].reshape(SAMPLES, 2 * SAMPLE, 6)
-        peaks = peaks_px[chosen].reshape(SAMPLES, 2 * SAMPLE)
-        known = moved.swapaxes(1, 2) / SAMPLE_STD_PX**2
+        samples, sample = SOLVER.samples, SOLVER.sample
+        chosen = np.argpartition(drawn, sample, axis=1)[:, :sample]
+        moved = self._by_level.reshape(count, 2, -1)[chosen].reshape(samples, 2 * sample, 6)
+        peaks = peaks_px[chosen].reshape(samples, 2 * sample)
+        known = moved.swapaxes(1, 2) / SOLVER.sample_std_px**2
         right = np.einsum("spk,sk->sp", known, peaks) + information @ mean
         return np.asarray(np.linalg.solve(known @ moved + information, right[..., None])[..., 0])
 
@@ -242,7 +235,7 @@ class _Blocks:
     def seen(self) -> int:
         return int((self.pixels.reshape(self.levels, -1) > 0).any(axis=0).sum())
 
-    def climbed(self, start: Array, blurs_px: Sequence[float], expected: Expected) -> Array:
+    def _climbed(self, start: Array, blurs_px: Sequence[float], expected: Expected) -> Array:
         """A maximum of the posterior near a correction."""
         correction = start
         for blur_px in blurs_px:
@@ -269,12 +262,12 @@ class _Blocks:
         weighted = (correlations * self.pixels).reshape(by_level).sum(axis=-1)
         pixels = self.pixels.reshape(self.levels, -1).sum(axis=1)
         usual = weighted / np.maximum(pixels, 1.0)
-        usual = np.minimum(np.maximum(usual, LEAST_CORRELATION), MOST_CORRELATION)
+        usual = np.minimum(np.maximum(usual, SOLVER.min_correlation), SOLVER.max_correlation)
         return np.repeat(usual, len(self.pixels) // self.levels, axis=-1)
 
     def _weights(self, usual: Array) -> Array:
         """Log likelihood ratio (L * N,) per unit of correlation, of a right block against none."""
-        return usual / (1 - usual**2) * self.pixels / PIXELS_PER_NUMBER
+        return usual / (1 - usual**2) * self.pixels / SOLVER.pixels_per_number
 
     def stepped(self, state: Array, blur_px: float, expected: Expected) -> Array:
         """One step of Newton's method on a state (D,)."""
@@ -284,18 +277,20 @@ class _Blocks:
         return np.asarray(state + self.limited(np.linalg.solve(curvature + information, pull)))
 
     def limited(self, step: Array) -> Array:
-        """No block by more than `LONGEST_STEP_PX`."""
+        """No block by more than `SOLVER.longest_step_px`."""
         longest = float(np.hypot(*(self.moved_px @ step).T).max() / self.unit_px.min())
-        return step * min(1.0, LONGEST_STEP_PX / max(longest, 1e-9))
+        return step * min(1.0, SOLVER.longest_step_px / max(longest, 1e-9))
 
-    def excess(self, curvature: Array, slopes: Array, covariance: Array, excess: float) -> float:
+    def variance_inflation(
+        self, curvature: Array, slopes: Array, covariance: Array, before: float
+    ) -> float:
         """Variance of the slopes by the camera over the curvature, times `correlated`, at least 1;
-        the numbers that a solution with `covariance` and `excess` uses are not counted."""
+        the numbers that a solution with `covariance` and inflation `before` uses do not count."""
         numbers = 2 * self.seen
-        left = max(1 - float((covariance * curvature).sum()) / excess / numbers, MIN_LEFT)
+        left = max(1 - float((covariance * curvature).sum()) / before / numbers, SOLVER.min_left)
         values, vectors = np.linalg.eigh(curvature[CAMERA, CAMERA])
         spread = np.square(slopes[:, CAMERA] @ vectors).sum(axis=0)
-        shown = values > SINGULAR * values[-1]
+        shown = values > SOLVER.singular * values[-1]
         return max(1.0, self.correlated * float((spread[shown] / values[shown]).sum()) / 6 / left)
 
     def system(self, state: Array, blur_px: float = 0.0) -> tuple[Array, Array]:
@@ -312,8 +307,8 @@ class _Blocks:
         count, blur = len(self.moved_px), _gaussian(self.correlations.shape[1], blur_px)
         if KERNEL is not None:
             out = np.empty((count, 6))
-            limits = LEAST_CORRELATION, MOST_CORRELATION, PIXELS_PER_NUMBER
-            weighted = self.pixels, self.unit_px, limits
+            limits = SOLVER.min_correlation, SOLVER.max_correlation
+            weighted = self.pixels, self.unit_px, (*limits, SOLVER.pixels_per_number)
             KERNEL.bend(self.correlations, blur, np.ascontiguousarray(moved_px), *weighted, out)
             return out[:, :2], out[:, 2:].reshape(-1, 2, 2)
         blurred = self.correlations if blur is None else blur @ self.correlations @ blur.T
@@ -329,9 +324,9 @@ class _Blocks:
 
 @lru_cache(maxsize=8)
 def _drawn(count: int) -> Array:
-    """Random numbers (SAMPLES, count) whose least ones choose with the chances that are subtracted
+    """Random numbers (S, count) whose least ones choose with the chances that are subtracted
     as logarithms. Shared: not to be written to."""
-    made = -np.random.default_rng(0).gumbel(size=(SAMPLES, count))
+    made = -np.random.default_rng(0).gumbel(size=(SOLVER.samples, count))
     made.flags.writeable = False
     return made
 

@@ -4,7 +4,6 @@
 them. A search ends as soon as the best place stands out or is proven by its confidence."""
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.localize.camera import CameraFound, camera_found
-from orthonav.core.localize.confidence import USUAL_CHANCES
-from orthonav.core.localize.ground import SearchedSheet, ViewOverGround
-from orthonav.core.localize.place import KEPT_TO_FINISH, Place, Placer
+from orthonav.core.localize.camera import CameraEstimate, camera_of
+from orthonav.core.localize.confidence import DEFAULT_CHANCES
+from orthonav.core.localize.ground import PreparedMap, ViewOverGround
+from orthonav.core.localize.place import REFINEMENT, CandidateRefiner, Finished, Judged
 from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, NoFix, Prior
@@ -26,119 +25,44 @@ from orthonav.core.register.pose import Pose, rotation
 from orthonav.core.register.search import PLACES_AT_ONCE, Peak, best_near, largest_half_px, search
 from orthonav.core.tiles.position import rows_within
 
-SAME_PLACE_SHARE = 1 / 8  # closer candidates from tiles are one place
-WHOLE_WINDOW_PX = 8_000_000
-"""Up to so many pixels of the coarse level one window of the whole sheet is cut (12 bytes each)."""
 
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One way to find candidates, `count` at most, under `directions`, the most likely first.
 
-@dataclass(frozen=True)
-class Step(ABC):
-    """One way to find candidates, at `level`; those of tiles are refined there first.
+    By FFT at `level`, or from tiles, whose candidates are refined at `level` first. `cost_ms`:
+    infinite where it is impossible."""
 
-    `directions`: to try, of `whole` in all stages, which share the cost. `count`: at most."""
-
-    search: "Search"
     level: int
     directions: list[Direction]
     count: int
-    whole: int
-    from_tiles = False
+    cost_ms: float
+    from_tiles: bool = False
 
-    @property
-    def cost_ms(self) -> float:
-        """Infinite where it is impossible."""
-        return self.whole_cost_ms() * len(self.directions) / self.whole
-
-    @abstractmethod
-    def whole_cost_ms(self) -> float:
-        """Of all stages."""
-
-    @abstractmethod
-    def run(self) -> list[Peak]:
-        """Best first."""
-
-
-class FftStep(Step):
-    """The best places of the sheet, or of what the prior allows, at a level."""
-
-    def whole_cost_ms(self) -> float:
-        cost_ms = self.search.fft_ms(self.level, self.whole)
-        if self.level > self.search.levels.coarse:
-            cost_ms += self.search.costs.nearby_ms * self.count
-        return cost_ms
-
-    def run(self) -> list[Peak]:
-        """The peaks of correlation; those of a far level at their best places near by."""
-        made, view, level = self.search, self.search.view, self.level
-        recipe = view.levels.recipe(level)
-        template = made.sought.at(level, recipe)
-        if made.prior is None:
-            window = made.sheet.windows.whole(level, recipe, view.side_px)
-        else:
-            half_px = largest_half_px(template, self.directions)
-            window = made.sheet.windows.part(
-                level, recipe, view.side_px, made.middle_px, made.reach_px, half_px
-            )
-        # Every thread has memory for a whole window.
-        fits = math.prod(window.size) * made.plan.threads <= made.costs.max_search_px
-        pool = made.sheet.pool if fits else None
-        found = search(template, window, self.directions, self.count, view.prior.scale_map, pool)
-        if level > view.levels.coarse:
-            return made.allowed_nearby(found, made.policy.far_reach_px * 2**level)
-        return made.promising(found)
-
-
-class TileStep(Step):
-    """The most similar tiles, each at its best place near by."""
-
-    from_tiles = True
-
-    def whole_cost_ms(self) -> float:
-        made = self.search
-        assert made.sheet.propose is not None
-        tiles, dims = made.tiles, made.sheet.propose.embedder.dims
-        return made.costs.tiles_ms(self.whole, tiles, dims) + made.costs.nearby_ms * self.count
-
-    def run(self) -> list[Peak]:
-        """Those that no tile next to them exceeds."""
-        made, grid = self.search, self.search.sheet.grid
-        assert made.sheet.propose is not None
-        # Over a terrain the telemetry predicts another scale at every place.
-        expected = made.view.prior
-        if expected.scale_map is not None:
-            expected = replace(expected, log_scale_std=math.inf)
-        nats = np.array([expected.nats(*each) for each in self.directions], np.float32)
-        tiles = made.sheet.propose.candidates(
-            made.view.rectified_at(0),
-            self.directions,
-            1 - np.float32(made.policy.tile_share_per_nat) * nats,
-            made.tile_rows,
-            self.count,
-        )
-        return made.allowed_nearby(
-            tiles, made.policy.tile_reach_strides * grid.stride_m / grid.gsd_m
-        )
+    def part(self, directions: list[Direction]) -> "Step":
+        """The same under some of its directions only."""
+        cost_ms = self.cost_ms * len(directions) / len(self.directions)
+        return replace(self, directions=directions, cost_ms=cost_ms)
 
 
 class Search:
-    """The search for one view on one sheet, to be run once."""
+    """The search for one view on one map, to be run once."""
 
-    def __init__(self, sheet: SearchedSheet, view: PreparedView, prior: Prior | None) -> None:
+    def __init__(self, sheet: PreparedMap, view: PreparedView, prior: Prior | None) -> None:
         self.sheet, self.view, self.prior = sheet, view, prior
-        self.plan, self.policy, self.costs = sheet.plan, sheet.plan.policy, sheet.plan.costs
-        self.levels = view.levels
-        self.ground = ViewOverGround(sheet.relief, view)
-        self.placer = Placer(
+        self.plan, self.levels = sheet.plan, view.levels
+        self.over_ground = ViewOverGround(sheet.ground, view, sheet.reference)
+        self.refiner = CandidateRefiner(
             view.templates,
             view.levels,
             view.prior,
             sheet.reference,
             pool=sheet.pool,
-            ground=self.ground,
+            ground=self.over_ground,
         )
-        self.chances = sheet.confidence.chances if sheet.confidence else USUAL_CHANCES
-        self.places: list[Place] = []
-        self.direct: list[Place] = []
+        self.chances = sheet.confidence.chances if sheet.confidence else DEFAULT_CHANCES
+        self.places: list[Judged] = []
+        self.direct: list[Judged] = []
         # With a prior few candidates are sought, by both kinds; `by_gradients` seeks the others.
         share = SOUGHT_SHARE if prior is None else math.inf
         self.sought = view.templates.weighing_grey(min(share, view.templates.grey_share))
@@ -149,14 +73,14 @@ class Search:
     def candidates(self) -> int:
         return sum(len(poses) for _, poses in self.found)
 
-    def run(self) -> Place | NoFix:
+    def run(self) -> Finished | NoFix:
         """By the channels of the view alone; see `found_by`."""
         return self.outcome(self.best())
 
-    def outcome(self, best: Place | None) -> Place | NoFix:
+    def outcome(self, best: Finished | None) -> Finished | NoFix:
         """With its height counted from the ground below the camera."""
         if best is not None:
-            return self.placer.below_camera(best)
+            return self.refiner.below_camera(best)
         if not self.touches_map:
             return NoFix("outside_map", "the area of the prior is outside the map")
         detail = "no place of the map could be compared with the view"
@@ -164,7 +88,7 @@ class Search:
             detail += "; a large map needs a prior, or views as large as its tiles"
         return NoFix("no_match", detail)
 
-    def best(self) -> Place | None:
+    def best(self) -> Finished | None:
         """None where nothing was found."""
         if not self.touches_map:
             return None
@@ -190,80 +114,150 @@ class Search:
             made._take(step)
         return made
 
-    def camera(self, place: Place) -> CameraFound | None:
+    def camera(self, place: Finished) -> CameraEstimate | None:
         """None where too few blocks of the view are seen."""
         ratio = place.scores.get("local_ratio", 1.0)  # of the best place only
-        return camera_found(self.ground, self.sheet.reference, place.fit.pose, ratio, place.camera)
+        floor_m = self.sheet.floor_m(self.view)
+        return camera_of(self.over_ground, place.fit.pose, ratio, floor_m, place.camera)
 
     # What is tried
 
     def steps(self) -> Iterator[Step]:
-        """To be run in this order until the search ends."""
-        policy, levels, prior = self.policy, self.levels, self.view.prior
-        judged = policy.directions(prior, policy.judged_steps)
-        judged_ms, tried_all = self.fft_ms(levels.judged, len(judged)), False
-        if judged_ms > policy.cheap_ms:
-            # The cheaper one wherever it is possible; the other only where it can be afforded.
-            affordable = 0.0 if judged_ms <= policy.last_ms else policy.last_ms
-            for number, step in enumerate(
-                sorted(self._coarse_steps(), key=lambda each: each.cost_ms)
-            ):
-                if math.isinf(step.cost_ms) or (number and step.cost_ms > affordable):
-                    break
+        """To be run in this order until the search ends: on a small area the mid level, on a large
+        one coarse candidates first; the final level where that is cheap too."""
+        plan, levels = self.plan, self.levels
+        every, _ = self._directions(plan.mid_steps)
+        mid_ms, tried_all = self._fft_ms(levels.mid, len(every)), False
+        if mid_ms > plan.cheap_ms:
+            for step in self._on_large_area(mid_ms):
                 # Over relief the expected scale is another one at every place.
-                tried_all |= not step.from_tiles and prior.scale_map is None
+                tried_all |= not step.from_tiles and self.view.prior.scale_map is None
                 yield from self._likely_first(step)
-        if judged_ms <= max(policy.last_ms, policy.cheap_ms):
-            for least, most in pairwise(policy.stages_nats):
-                stage = [each for each, nats in judged if least < nats <= most]
-                if not stage:
-                    continue
-                step = FftStep(self, levels.judged, stage, policy.candidates, len(stage))
-                is_last = most == policy.stages_nats[-1]
-                if is_last and tried_all and step.cost_ms > policy.last_stage_ms:
-                    break
+        if mid_ms <= max(plan.last_ms, plan.cheap_ms):
+            yield from self._stages(tried_all)
+        final, _ = self._directions(plan.final_steps)
+        step = self._fft_step(levels.final, final, plan.final_candidates)
+        if levels.final < levels.mid and step.cost_ms <= plan.cheap_ms:
+            yield step
+
+    def _stages(self, tried_all: bool) -> Iterator[Step]:
+        """The mid level, by how likely headings and scales are; without the last stage where the
+        coarse level `tried_all` and it takes long."""
+        plan = self.plan
+        every, nats = self._directions(plan.mid_steps)
+        for least, most in pairwise(plan.stages_nats):
+            stage = [each for each, its in zip(every, nats, strict=True) if least < its <= most]
+            step = self._fft_step(self.levels.mid, stage, plan.candidates)
+            is_last = most == plan.stages_nats[-1]
+            if is_last and tried_all and step.cost_ms > plan.last_stage_ms:
+                return
+            if stage:
                 yield step
-        final = [each for each, _ in policy.directions(prior, policy.final_steps)]
-        step = FftStep(self, levels.final, final, policy.final_candidates, len(final))
-        if levels.final < levels.judged and step.cost_ms <= policy.cheap_ms:
+
+    def _directions(self, steps: tuple[float, float]) -> tuple[list[Direction], list[float]]:
+        """Those to try, the most likely first, and their negative log densities."""
+        rated = self.plan.directions(self.view.prior, steps)
+        return [each for each, _ in rated], [nats for _, nats in rated]
+
+    def _on_large_area(self, mid_ms: float) -> Iterator[Step]:
+        """The cheaper of the coarse ones where it is possible; the other only where the mid level
+        takes too long, and this one does not."""
+        by_cost = sorted(self._coarse_steps(), key=lambda each: each.cost_ms)
+        affordable_ms = 0.0 if mid_ms <= self.plan.last_ms else self.plan.last_ms
+        for number, step in enumerate(by_cost):
+            if math.isinf(step.cost_ms) or (number and step.cost_ms > affordable_ms):
+                return
             yield step
 
     def _coarse_steps(self) -> list[Step]:
         """The coarse level, or one above it where that takes too long; and tiles."""
-        policy, level = self.policy, self.levels.coarse
-        tried = [each for each, _ in policy.directions(self.view.prior, policy.coarse_steps)]
-        coarse = FftStep(self, level, tried, policy.candidates, len(tried))
-        if coarse.cost_ms > policy.last_ms:
-            far = replace(coarse, level=level + 1, count=policy.far_candidates)
+        plan, level = self.plan, self.levels.coarse
+        tried, _ = self._directions(plan.coarse_steps)
+        coarse = self._fft_step(level, tried, plan.candidates)
+        if coarse.cost_ms > plan.last_ms:
+            far = self._fft_step(level + 1, tried, plan.far_candidates)
             if not math.isinf(far.cost_ms):  # there is such a level
                 coarse = far
-        if not self.tiles:
+        if self.sheet.propose is None or not self.tiles:
             return [coarse]
-        count = policy.candidates_from(self.tiles)
-        return [coarse, TileStep(self, level, tried, count, len(tried))]
+        count = plan.candidates_from(self.tiles)
+        cost_ms = plan.tiles_ms(len(tried), self.tiles, self.sheet.propose.embedder.dims)
+        cost_ms += plan.nearby_ms * count
+        return [coarse, Step(level, tried, count, cost_ms, from_tiles=True)]
+
+    def _fft_step(self, level: int, directions: list[Direction], count: int) -> Step:
+        cost_ms = self._fft_ms(level, len(directions))
+        if level > self.levels.coarse:
+            cost_ms += self.plan.nearby_ms * count
+        return Step(level, directions, count, cost_ms)
 
     def _likeliest(self) -> Step:
-        """All directions at the judged level where that takes little, else the first stage of them,
-        or the coarse level where even that takes too long."""
-        policy = self.policy
-        rated = policy.directions(self.view.prior, policy.judged_steps)
-        every = [each for each, _ in rated]
-        first = [each for each, nats in rated if nats <= policy.stages_nats[1]] or every[:1]
-        for some, most_ms in ((every, policy.cheap_ms), (first, policy.last_ms)):
-            step = FftStep(self, self.levels.judged, some, policy.candidates, len(some))
+        """All directions at the mid level where that takes little, else the first stage of them, or
+        the coarse level where even that takes too long."""
+        plan = self.plan
+        every, nats = self._directions(plan.mid_steps)
+        first = every[: max(sum(each <= plan.stages_nats[1] for each in nats), 1)]
+        for some, most_ms in ((every, plan.cheap_ms), (first, plan.last_ms)):
+            step = self._fft_step(self.levels.mid, some, plan.candidates)
             if step.cost_ms <= most_ms:
                 return step
         return self._coarse_steps()[0]
 
     def _likely_first(self, step: Step) -> Iterator[Step]:
         """Likely directions first; all at once where the heading is known."""
-        likely = step.whole
+        likely = len(step.directions)
         if self.view.prior.turn_rad is None:
-            rated = self.policy.directions(self.view.prior, self.policy.coarse_steps)
-            likely = sum(nats <= self.policy.likely_nats for _, nats in rated)
+            _, nats = self._directions(self.plan.coarse_steps)
+            likely = sum(each <= self.plan.likely_nats for each in nats)
         for some in (step.directions[:likely], step.directions[likely:]):
             if some:
-                yield replace(step, directions=some)
+                yield step.part(some)
+
+    # Candidates
+
+    def _candidates(self, step: Step) -> list[Peak]:
+        """Best first."""
+        return self._from_tiles(step) if step.from_tiles else self._by_fft(step)
+
+    def _by_fft(self, step: Step) -> list[Peak]:
+        """The peaks of correlation, of the sheet or of what the prior allows; those of a far level
+        at their best places near by."""
+        view, level, windows = self.view, step.level, self.sheet.windows
+        recipe = view.levels.recipe(level)
+        template = self.sought.at(level, recipe)
+        if self.prior is None:
+            window = windows.whole(level, recipe, view.side_px)
+        else:
+            half_px = largest_half_px(template, step.directions)
+            middle, reach = self.middle_px, self.reach_px
+            window = windows.part(level, recipe, view.side_px, middle, reach, half_px)
+        # Every thread has memory for a whole window.
+        fits = math.prod(window.size) * self.plan.threads <= self.plan.max_search_px
+        pool = self.sheet.pool if fits else None
+        found = search(template, window, step.directions, step.count, view.prior.scale_map, pool)
+        if level > view.levels.coarse:
+            return self._allowed_nearby(found, self.plan.far_reach_px * 2**level)
+        return self._promising(found)
+
+    def _from_tiles(self, step: Step) -> list[Peak]:
+        """The most similar tiles that no tile next to them exceeds, each at its best place near
+        by."""
+        grid, expected, propose = self.sheet.grid, self.view.prior, self.sheet.propose
+        assert propose is not None
+        # Over a terrain the telemetry predicts another scale at every place.
+        if expected.scale_map is not None:
+            expected = replace(expected, log_scale_std=math.inf)
+        nats = [expected.negative_log_density(*each) for each in step.directions]
+        tiles = propose.candidates(
+            self.view.rectified_at(0),
+            step.directions,
+            1 - np.float32(self.plan.tile_share_per_nat) * np.array(nats, np.float32),
+            self.tile_rows,
+            step.count,
+        )
+        return self._allowed_nearby(
+            tiles, self.plan.tile_reach_strides * grid.stride_m / grid.gsd_m
+        )
 
     # Where it is tried
 
@@ -298,7 +292,7 @@ class Search:
         rows, cols = self.sheet.reference.shape(0)
         return -reach < x < cols + reach and -reach < y < rows + reach
 
-    def fft_ms(self, level: int, poses: int) -> float:
+    def _fft_ms(self, level: int, poses: int) -> float:
         """Of the sheet or what the prior allows; infinite where there is no such level."""
         if level >= self.sheet.reference.levels:
             return math.inf
@@ -309,14 +303,14 @@ class Search:
         side = self.view.side_px / 2**level
         if self.prior is not None or min(rows, cols) < 3 * side:
             rows, cols = round(rows + side), round(cols + side)
-        return self.costs.fft_ms(poses, rows, cols)
+        return self.plan.fft_ms(poses, rows, cols)
 
     @cached_property
     def tiles(self) -> int:
         propose, rows = self.sheet.propose, self.tile_rows
-        if propose is None or not propose.fits(self.view.side_px, self.policy.view_tiles):
+        if propose is None or not propose.fits(self.view.side_px, self.plan.view_tiles):
             return 0
-        return len(propose.centres_en_m) if rows is None else len(rows)
+        return len(propose.tiles.centres_en_m) if rows is None else len(rows)
 
     @cached_property
     def tile_rows(self) -> NDArray[np.intp] | None:
@@ -326,9 +320,9 @@ class Search:
         grid, (x, y) = self.sheet.grid, self.middle_px
         centre = np.array([grid.west_m + x * grid.gsd_m, grid.north_m - y * grid.gsd_m])
         reach_m = self.reach_px * grid.gsd_m + grid.stride_m
-        return rows_within(self.sheet.propose.centres_en_m, centre, reach_m)
+        return rows_within(self.sheet.propose.tiles.centres_en_m, centre, reach_m)
 
-    # Candidates
+    # Near by
 
     def nearby(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
         """At the best place within `reach_px` (level 0) of each, at the coarse level, best first.
@@ -341,12 +335,12 @@ class Search:
             if free[number]:
                 kept.append(each)
                 apart_px = abs(places - places[number])
-                free &= apart_px > self.view.templates.side_px * SAME_PLACE_SHARE
+                free &= apart_px > self.plan.apart * self.view.templates.side_px
         return kept
 
-    def allowed_nearby(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
+    def _allowed_nearby(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
         """The promising ones within the prior."""
-        kept = self.promising(self.nearby(found, reach_px))
+        kept = self._promising(self.nearby(found, reach_px))
         if self.prior is None:
             return kept
         x, y = self.middle_px
@@ -360,7 +354,7 @@ class Search:
         level, windows = self.levels.coarse, self.sheet.windows
         recipe, side_px = self.levels.recipe(level), self.view.templates.side_px
         template, whole = self.sought.at(level, recipe), None
-        if math.prod(self.sheet.reference.shape(level)) <= WHOLE_WINDOW_PX:
+        if math.prod(self.sheet.reference.shape(level)) <= self.plan.whole_window_px:
             whole = windows.whole(level, recipe, side_px)
             whole.prepare_near(template)
 
@@ -369,72 +363,72 @@ class Search:
             around_px = reach_px + side_px
             window = whole or windows.part(level, recipe, side_px, place, around_px)
             made = []
-            for more in self.policy.nearby_log_scales:
+            for more in self.plan.nearby_log_scales:
                 poses = [replace(each.pose, log_scale=each.pose.log_scale + more) for each in some]
                 made.append(best_near(template, window, poses, reach_px))
             return [max(same, key=lambda each: each.score) for same in zip(*made, strict=True)]
 
         at_once = PLACES_AT_ONCE if whole else 1
         parts = [found[at : at + at_once] for at in range(0, len(found), at_once)]
-        return [each for some in self.placer.shared(moved, parts) for each in some]
+        return [each for some in self.refiner.shared(moved, parts) for each in some]
 
-    def promising(self, found: list[Peak]) -> list[Peak]:
+    def _promising(self, found: list[Peak]) -> list[Peak]:
         """Without those far weaker than the best."""
-        least = self.policy.candidate_share
+        least = self.plan.candidate_share
         enough = sum(each.score >= least * found[0].score for each in found)
-        return found[: max(enough, self.policy.min_candidates)]
+        return found[: max(enough, self.plan.min_candidates)]
 
     # When it ends
 
     def _take(self, step: Step) -> None:
-        self._judge(step, [each.pose for each in step.run()])
+        self._judge(step, [each.pose for each in self._candidates(step)])
 
     def _judge(self, step: Step, found: list[Pose]) -> None:
         self.found.append((step, found))
-        if step.level < self.levels.judged:
-            self.direct = self.placer.direct(found)
+        if step.level < self.levels.mid:
+            self.direct = self.refiner.direct(found)
         else:
             level = min(step.level, self.levels.coarse)
-            self.places += self.placer.judge(found, level, self.places)
+            self.places += self.refiner.judge(found, level, self.places)
 
-    def _clear_after(self, step: Step) -> Place | None:
-        policy, levels = self.policy, self.levels
-        is_fine = step.from_tiles or step.level == levels.judged
-        margin = policy.clear_at_judged if is_fine else policy.clear
+    def _clear_after(self, step: Step) -> Finished | None:
+        plan, levels = self.plan, self.levels
+        is_fine = step.from_tiles or step.level == levels.mid
+        margin = plan.clear_at_mid if is_fine else plan.clear
         if not self.places:
             return None
-        best, rival = self.placer.standing(self.places)
-        if best <= margin.strength * self.chances.look or best <= margin.judged_ratio * rival:
+        best, rival = self.refiner.best_and_rival(self.places)
+        if best <= margin.strength * self.chances.look or best <= margin.mid_ratio * rival:
             return None  # before the cost of finishing it
         found = self._finished(self.places)
         # Candidates from tiles or from far above are not all places: rivals alone prove too little.
         compared_all = not step.from_tiles and step.level <= levels.coarse
-        proven = compared_all or self._is_proven(found, policy.doubt)
+        proven = compared_all or self._is_proven(found, plan.doubt)
         return found if proven and self._is_clear(found, margin) else None
 
-    def _proven_before(self, step: Step) -> Place | None:
+    def _proven_before(self, step: Step) -> Finished | None:
         """The best place so far, if a trial before the next step proves it.
 
         The best few are finished on the terrain; where that proves none, they are compared one
         level finer. Where only a part of all places was compared, the best must stand out too. No
         trial before a step that costs less, except the final level, before which all directions
         were tried."""
-        policy, last, levels = self.policy, self.found[-1][0] if self.found else None, self.levels
-        if last is None or self.sheet.confidence is None or levels.final == levels.judged:
+        plan, last, levels = self.plan, self.found[-1][0] if self.found else None, self.levels
+        if last is None or self.sheet.confidence is None or levels.final == levels.mid:
             return None
-        at_final, is_level = step.level < levels.judged, self.placer.is_level
-        trial_ms = self.costs.trial_ms if is_level else self.costs.terrain_trial_ms
+        at_final, is_level = step.level < levels.mid, self.refiner.is_level
+        trial_ms = plan.trial_ms if is_level else plan.terrain_trial_ms
         if not self.places or not (at_final or step.cost_ms > trial_ms):
             return None
         # Without time for it the search goes on, and is cut short only where that has no time.
         if not (self.budget.fits(trial_ms) and self.budget.allows(trial_ms)):
             return None
-        places = self.placer.on_terrain(self.places, policy.trials)
-        compared_all = is_level and last.level == levels.judged and not last.from_tiles
-        doubt = policy.doubt if at_final else policy.trial_doubt
+        places = self.refiner.on_terrain(self.places, plan.trials)
+        compared_all = is_level and last.level == levels.mid and not last.from_tiles
+        doubt = plan.doubt if at_final else plan.trial_doubt
         for closer in (False, True):
-            found = self._finished(places, policy.trials, closer=closer)
-            if not compared_all and not self._is_clear(found, policy.trial_clear):
+            found = self._finished(places, plan.trials, closer=closer)
+            if not compared_all and not self._is_clear(found, plan.trial_clear):
                 return None
             if self._is_proven(found, doubt):
                 return found
@@ -442,17 +436,17 @@ class Search:
                 return None
         return None
 
-    def concluded(self) -> Place | None:
+    def concluded(self) -> Finished | None:
         """After all steps. While none is proven, more are finished and compared one level finer."""
-        policy, levels, places = self.policy, self.levels, self.places
+        plan, levels, places = self.plan, self.levels, self.places
         if not places:
             return None
-        if not self.placer.is_level and self.budget.allows(0.0):
-            places = self.placer.on_terrain(places, policy.terrain_candidates)
+        if not self.refiner.is_level and self.budget.allows(0.0):
+            places = self.refiner.on_terrain(places, plan.terrain_candidates)
         found = self._finished(places)
-        passes = policy.finer if levels.final > 0 else policy.finer[-1:]
-        for kept, cost_ms in passes if levels.final != levels.judged else ():
-            if self._is_proven(found, policy.doubt) or not self.budget.allows(cost_ms):
+        passes = plan.finer if levels.final > 0 else plan.finer[-1:]
+        for kept, cost_ms in passes if levels.final != levels.mid else ():
+            if self._is_proven(found, plan.doubt) or not self.budget.allows(cost_ms):
                 break
             found = self._finished(places, kept, closer=True)
         if self.budget.cut_short:
@@ -460,32 +454,32 @@ class Search:
         return found
 
     def _finished(
-        self, places: Sequence[Place], kept: int = KEPT_TO_FINISH, *, closer: bool = False
-    ) -> Place:
-        return self.placer.finished(places, self.candidates, self.direct, kept=kept, closer=closer)
+        self, places: Sequence[Judged], kept: int = REFINEMENT.to_finish, *, closer: bool = False
+    ) -> Finished:
+        return self.refiner.finished(places, self.candidates, self.direct, kept=kept, closer=closer)
 
-    def _is_clear(self, best: Place, margin: ClearMargin) -> bool:
+    def _is_clear(self, best: Finished, margin: ClearMargin) -> bool:
         scores = best.scores
         return (
             scores["strength"] > margin.strength * self.chances.total
-            and scores["look_ratio"] > margin.judged_ratio
+            and scores["look_ratio"] > margin.mid_ratio
             and scores["peak_ratio"] > margin.peak_ratio
         )
 
-    def _is_proven(self, best: Place, doubt: float) -> bool:
+    def _is_proven(self, best: Finished, doubt: float) -> bool:
         return self.likelihood(best) > 1 - doubt
 
-    def tentative(self) -> Place | None:
+    def tentative(self) -> Finished | None:
         """The best place so far, not compared one level finer."""
         return self._finished(self.places) if self.places else None
 
-    def is_doubtful(self, best: Place) -> bool:
+    def is_doubtful(self, best: Finished) -> bool:
         """Whether it is not recognized, and there is time to compare all candidates again."""
         doubtful = self.sheet.confidence is not None and self.likelihood(best) < CONFIDENT
-        again_ms = self.costs.trial_ms + self.costs.nearby_ms * self.candidates
+        again_ms = self.plan.trial_ms + self.plan.nearby_ms * self.candidates
         return doubtful and not self.budget.cut_short and self.budget.allows(again_ms)
 
-    def likelihood(self, place: Place | None) -> float:
+    def likelihood(self, place: Finished | None) -> float:
         """Probability that the place is right, 0 for none."""
         if place is None or self.sheet.confidence is None:
             return 0.0
@@ -496,7 +490,7 @@ class Found(NamedTuple):
     """A place, and the search that found it."""
 
     search: Search
-    place: Place
+    place: Finished
 
 
 def found_by(search: Search) -> Found | NoFix:

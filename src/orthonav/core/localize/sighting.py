@@ -7,19 +7,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.localize.camera import CameraFound
+from orthonav.core.localize.camera import CameraEstimate
 from orthonav.core.localize.confidence import RegisteredConfidence, logit
 from orthonav.core.localize.odometry import tilt_lever_m
-from orthonav.core.localize.place import Place
+from orthonav.core.localize.place import Finished
 from orthonav.core.localize.search import Search
 from orthonav.core.records import Telemetry
 
-WORTH_LOG_ODDS = -12.0  # less likely places are left out
-LEAST_PLACE = 1e-12  # least and greatest (1 - LEAST_PLACE) probability of a place, for finite odds
-NEAR_SHARE = 0.05  # of the side of a view: closer places are one
-LIKELY_NATS = 5.0  # places so much less likely than the best one are not examined for their tilt
-UNSEEN_TILT_RAD = math.radians(20.0)  # standard deviation of a tilt that a view does not show
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SightingLimits:
+    """Which places count."""
+
+    min_log_odds: float = -12.0  # less likely places are left out
+    min_probability: float = 1e-12  # of a place, and of none, for finite odds
+    apart: float = 0.05  # of the side of a view: closer places are one
+    likely_nats: float = 5.0
+    """Places so much less likely than the best one are not examined for their tilt."""
+    unseen_tilt_rad: float = math.radians(20.0)
+    """Standard deviation of a tilt that a view does not show."""
+
+
+LIMITS = SightingLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,30 +48,30 @@ class Sighting:
 
 
 def sightings(
-    search: Search, best: Place, telemetry: Telemetry, log_scale: float, searched_share: float
+    search: Search, best: Finished, telemetry: Telemetry, log_scale: float, searched_share: float
 ) -> Iterator[Sighting]:
     """Of the best place and its rivals; the sheet has a confidence.
 
     `telemetry`: as searched, its height corrected by `log_scale`. `searched_share`: of the map."""
     confidence = search.sheet.confidence
     assert confidence is not None
-    near_px = NEAR_SHARE * search.view.side_px
+    near_px = LIMITS.apart * search.view.side_px
     places = places_of(best, confidence, near_px, searched_share)
     for log_odds, alone, place in places:
-        likely = log_odds > places[0][0] - LIKELY_NATS
+        likely = log_odds > places[0][0] - LIMITS.likely_nats
         camera = search.camera(place) if likely else None
         if camera is None:
             mean, covariance = _by_similarity(search, place, telemetry)
         else:
-            mean, covariance = _by_camera(search, camera, telemetry)
+            mean, covariance = _by_camera(camera, telemetry)
         mean[3] += log_scale
         if np.isfinite(covariance).all():
             yield Sighting(mean, covariance, log_odds, alone)
 
 
 def places_of(
-    best: Place, confidence: RegisteredConfidence, near_px: float, searched_share: float
-) -> list[tuple[float, float, Place]]:
+    best: Finished, confidence: RegisteredConfidence, near_px: float, searched_share: float
+) -> list[tuple[float, float, Finished]]:
     """Log odds, probability by the view alone, and place: the best, and rivals `near_px` apart.
 
     A search of a share of the map finds fewer rivals, and chance is lower: the log odds are those
@@ -72,7 +83,7 @@ def places_of(
         "look_rival": chances.look,
         "fine_rival": chances.fine,
     }
-    out: list[tuple[float, float, Place]] = []
+    out: list[tuple[float, float, Finished]] = []
     for place in (best, *best.rivals):
         if any(place.pose.distance_px(other.pose) < near_px for *_, other in out):
             continue
@@ -81,15 +92,16 @@ def places_of(
             scores
             | {k: max(scores[k], least) for k, least in chance.items() if not math.isnan(scores[k])}
         )
-        log_odds = min(logit(confidence(scores), LEAST_PLACE) + share, logit(alone, LEAST_PLACE))
+        edge = LIMITS.min_probability
+        log_odds = min(logit(confidence(scores), edge) + share, logit(alone, edge))
         if out:  # the best place may have won in detail, against stronger scores elsewhere
             log_odds, alone = min(log_odds, out[0][0]), min(alone, out[0][1])
-        if not out or log_odds > WORTH_LOG_ODDS:
+        if not out or log_odds > LIMITS.min_log_odds:
             out.append((log_odds, alone, place))
     return out
 
 
-def _as_rival(best: Place, place: Place) -> dict[str, float]:
+def _as_rival(best: Finished, place: Finished) -> dict[str, float]:
     """As if it were the best place, and the best one its rival."""
     share = place.score / max(best.score, 1e-6)
     look = best.scores["look"]
@@ -103,33 +115,31 @@ def _as_rival(best: Place, place: Place) -> dict[str, float]:
     }
 
 
-def _by_camera(search: Search, camera: CameraFound, telemetry: Telemetry) -> tuple[Array, Array]:
+def _by_camera(camera: CameraEstimate, telemetry: Telemetry) -> tuple[Array, Array]:
     """Mean (6,) and covariance (6, 6) by the view alone."""
     rad, agl_m = math.pi / 180, camera.agl_m
-    east, north, up_m = camera.alone.position_m.tolist()
-    heading, pitch, roll = np.radians(camera.alone.attitude_deg).tolist()
+    east, north, up_m = camera.image_only.position_m.tolist()
+    heading, pitch, roll = np.radians(camera.image_only.attitude_deg).tolist()
     above_m = agl_m + up_m - float(camera.orientation.position_m[2])
     scale = math.log(max(above_m, agl_m / 2) / telemetry.agl_m)
     units = np.diag([1.0, 1.0, 1 / agl_m, rad, rad, rad])
     order = [0, 1, 3, 2, 4, 5]
-    covariance = (units @ camera.alone_covariance @ units)[np.ix_(order, order)]
-    floor_m = search.sheet.floor_m(search.view)
-    covariance[:2, :2] += np.eye(2) * floor_m**2 * camera.variance
+    covariance = (units @ camera.image_only_covariance @ units)[np.ix_(order, order)]
     return np.array([east, north, heading, scale, pitch, roll]), covariance
 
 
-def _by_similarity(search: Search, place: Place, telemetry: Telemetry) -> tuple[Array, Array]:
+def _by_similarity(search: Search, place: Finished, telemetry: Telemetry) -> tuple[Array, Array]:
     """The same of a view that does not show its tilt."""
     sheet, pose, spread = search.sheet, place.pose, place.fit.covariance
     if spread is None:
-        spread = search.placer.covariance_at(pose)
+        spread = search.refiner.covariance_at(pose)
     tilt_rad = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-    mean = np.concatenate([sheet.seen_from(search.view, pose), tilt_rad])
+    mean = np.concatenate([sheet.camera_state(search.view, pose), tilt_rad])
     lever = tilt_lever_m(replace(telemetry, yaw_deg=math.degrees(pose.turn_rad)))
     covariance = np.zeros((6, 6))
     covariance[:4, :4] = sheet.camera_covariance(search.view, pose, spread)
-    covariance[:2, :2] += UNSEEN_TILT_RAD**2 * lever @ lever.T
-    covariance[:2, 4:] = -(UNSEEN_TILT_RAD**2) * lever
+    covariance[:2, :2] += LIMITS.unseen_tilt_rad**2 * lever @ lever.T
+    covariance[:2, 4:] = -(LIMITS.unseen_tilt_rad**2) * lever
     covariance[4:, :2] = covariance[:2, 4:].T
-    covariance[4:, 4:] = UNSEEN_TILT_RAD**2 * np.eye(2)
+    covariance[4:, 4:] = LIMITS.unseen_tilt_rad**2 * np.eye(2)
     return mean, covariance

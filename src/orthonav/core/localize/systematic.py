@@ -15,37 +15,53 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import relief_slope
 from orthonav.core.mapfile.manifest import TerrainInfo
 
-OBJECTS_M = 3.0, 15.0
-"""Houses and trees: 6 to 8 m high on a fifth of the ground."""
-SURFACE_M = 0.5, 10.0
-"""A surface model, whose houses and trees are those of another date."""
-BARE_EARTH_M = 0.5, 50.0
-"""Bare earth of laser scanning or photogrammetry, 0.1 to 0.5 m (docs/decisions/camera.md)."""
-COARSE_STD_M, COARSE_POSTING_M = 6.0, 30.0
-"""Copernicus GLO-30 and its like on slopes, and their posting. Finer models err by less, coarser
-ones by more: the slope of the error stays."""
-STD_PER_SLOPE_M = 100.0
-"""Standard deviation over the root mean square slope of the terrain, which its errors add to; of
-coarser models in proportion."""
-COARSE_LENGTH_M, MOST_COARSER = 150.0, 8.0
-"""Correlation length of these errors, in proportion to the posting up to a multiple at which they
-are longer than any view; at least that of bare earth."""
-ROUGH_M, ROUGH_PER_SLOPE_M = 1.0, 4.0
-"""Terrain as rough within a sample shows houses and trees; steep bare earth is rough too."""
-UNDULATION_M = 50.0, 100.0
-"""Of unknown ground, and what a terrain of a posting above 50 m leaves out: standard deviation over
-the slope, and correlation length."""
-STRETCH_PX = 0.3, 80.0
-"""Of imagery of two dates, pixels of the map: as residuals of blocks show (docs/decisions)."""
-LEAST_SHARE = 1e-3  # weaker modes of a field, of the variance of its strongest, are left out
-LEAST_KNOWN, LEAST_UNKNOWN = 0.1, 0.7
-"""Least factors on the variance of errors by what a view shows: ground that does not undulate may
-still slope."""
-CENTRE_SHARE, DISTORTION = 0.01, 0.05
-"""Of a nominal lens: principal point over the width, and first radial coefficient."""
 Array = NDArray[np.float64]
 Field = tuple[float, float]
 """A random field: standard deviation and correlation length, both m or both pixels."""
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Sizes of the errors; values without a source are in docs/decisions/camera.md."""
+
+    objects_m: Field = (3.0, 15.0)
+    """Houses and trees: 6 to 8 m high on a fifth of the ground."""
+    surface_m: Field = (0.5, 10.0)
+    """A surface model, whose houses and trees are those of another date."""
+    bare_earth_m: Field = (0.5, 50.0)
+    """Bare earth of laser scanning or photogrammetry, 0.1 to 0.5 m."""
+    coarse_std_m: float = 6.0
+    coarse_posting_m: float = 30.0
+    """Copernicus GLO-30 and its like on slopes, and their posting. Finer models err by less,
+    coarser ones by more: the slope of the error stays."""
+    std_per_slope_m: float = 100.0
+    """Standard deviation over the root mean square slope of the terrain, which its errors add to;
+    of coarser models in proportion."""
+    coarse_length_m: float = 150.0
+    max_coarser: float = 8.0
+    """Correlation length of these errors, in proportion to the posting up to a multiple at which
+    they are longer than any view; at least that of bare earth."""
+    rough_m: float = 1.0
+    rough_per_slope_m: float = 4.0
+    """Terrain as rough within a sample shows houses and trees; steep bare earth is rough too."""
+    undulation_m: Field = (50.0, 100.0)
+    """Of unknown ground, and what a terrain of a posting above 50 m leaves out: standard deviation
+    over the slope, and correlation length."""
+    stretch_px: Field = (0.3, 80.0)
+    """Of imagery of two dates, pixels of the map: as residuals of blocks show."""
+    min_mode: float = (
+        1e-3  # weaker modes of a field, of the variance of its strongest, are left out
+    )
+    min_known: float = 0.1
+    min_unknown: float = 0.7
+    """Least factors on the variance of errors by what a view shows: ground that does not undulate
+    may still slope."""
+    centre_share: float = 0.01
+    distortion: float = 0.05
+    """Of a nominal lens: principal point over the width, and first radial coefficient."""
+
+
+ERRORS = ErrorModel()
 
 
 @dataclass(frozen=True)
@@ -63,16 +79,16 @@ class GroundErrors:
 def unknown_ground(relief: str | None) -> GroundErrors:
     """Errors of assumed level ground; `relief`: what the land is like, None: nobody said."""
     slope = relief_slope(relief)
-    per_slope_m, length_m = UNDULATION_M
-    return GroundErrors(slope / math.sqrt(2), ((per_slope_m * slope, length_m), OBJECTS_M))
+    per_slope_m, length_m = ERRORS.undulation_m
+    return GroundErrors(slope / math.sqrt(2), ((per_slope_m * slope, length_m), ERRORS.objects_m))
 
 
 def surface_errors(lean_std: float, above_m: Array) -> GroundErrors:
     """Errors of a map that knows houses and trees, `above_m` (N,) above its terrain under a view,
     NaN where unknown, which lean in its picture by more or less than known."""
     high_m = math.sqrt(float(np.nanmean(above_m**2)))
-    shift = (lean_std * high_m, SURFACE_M[1]) if lean_std * high_m > 0 else None
-    return GroundErrors(0.0, (SURFACE_M,), shift)
+    shift = (lean_std * high_m, ERRORS.surface_m[1]) if lean_std * high_m > 0 else None
+    return GroundErrors(0.0, (ERRORS.surface_m,), shift)
 
 
 def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
@@ -81,21 +97,23 @@ def terrain_errors(source: TerrainInfo | None, slopes: Array) -> GroundErrors:
     `source`: None: a terrain like Copernicus'."""
     known = slopes[np.isfinite(slopes).all(axis=1)]
     steep = math.sqrt(float((known**2).sum(axis=1).mean())) if len(known) else math.inf
-    posting_m = COARSE_POSTING_M
+    posting_m = ERRORS.coarse_posting_m
     if source is not None:
         posting_m = source.source_posting_m or source.posting_m
         rough_m = source.roughness_m or 0.0
-        if rough_m > max(ROUGH_M, ROUGH_PER_SLOPE_M * steep):  # houses and trees, smoothed
-            return GroundErrors(0.0, (SURFACE_M, (rough_m, OBJECTS_M[1])))
-    least_m, least_length_m = BARE_EARTH_M
-    coarser = min(posting_m / COARSE_POSTING_M, MOST_COARSER)
-    most_m = max(COARSE_STD_M * coarser, least_m)
-    std_m = min(max(STD_PER_SLOPE_M * max(coarser, 1.0) * steep, least_m), most_m)
-    fields = [(std_m, max(COARSE_LENGTH_M * coarser, least_length_m))]
-    per_slope_m, length_m = UNDULATION_M
+        if rough_m > max(
+            ERRORS.rough_m, ERRORS.rough_per_slope_m * steep
+        ):  # houses and trees, smoothed
+            return GroundErrors(0.0, (ERRORS.surface_m, (rough_m, ERRORS.objects_m[1])))
+    least_m, least_length_m = ERRORS.bare_earth_m
+    coarser = min(posting_m / ERRORS.coarse_posting_m, ERRORS.max_coarser)
+    most_m = max(ERRORS.coarse_std_m * coarser, least_m)
+    std_m = min(max(ERRORS.std_per_slope_m * max(coarser, 1.0) * steep, least_m), most_m)
+    fields = [(std_m, max(ERRORS.coarse_length_m * coarser, least_length_m))]
+    per_slope_m, length_m = ERRORS.undulation_m
     if length_m < 2 * posting_m:
         fields.append((min(per_slope_m * steep, most_m), length_m))
-    return GroundErrors(0.0, (*fields, OBJECTS_M))
+    return GroundErrors(0.0, (*fields, ERRORS.objects_m))
 
 
 class Component(NamedTuple):
@@ -128,13 +146,13 @@ def systematic(
     They move by `by_height_px` (N, 2) per metre of height, and by `by_lens_px` (N, 2, L) per
     standard deviation of each error of the lens; None: it is calibrated."""
     heights_m = [field_modes(places_m, field, block_px * gsd_m) for field in errors.fields]
-    least = [LEAST_KNOWN] * len(heights_m)
+    least = [ERRORS.min_known] * len(heights_m)
     if errors.slope > 0:
         sloped_m = errors.slope * (places_m - places_m.mean(axis=0))
         heights_m[0] = np.concatenate([sloped_m, heights_m[0]], axis=1)
-        least[0] = LEAST_UNKNOWN
+        least[0] = ERRORS.min_unknown
     moves_px = [by_height_px[:, :, None] * each[:, None] for each in heights_m]
-    on_map = [STRETCH_PX]
+    on_map = [ERRORS.stretch_px]
     if errors.shift is not None:
         on_map.append((errors.shift[0] / gsd_m, errors.shift[1] / gsd_m))
     for each in on_map:
@@ -142,7 +160,7 @@ def systematic(
         none_px = np.zeros(along_px.shape)
         both_px = [[along_px, none_px], [none_px, along_px]]
         moves_px.append(np.concatenate([np.stack(axis, axis=1) for axis in both_px], axis=2))
-    least += [LEAST_KNOWN] * len(on_map)
+    least += [ERRORS.min_known] * len(on_map)
     ends = np.cumsum([each.shape[2] for each in moves_px]).tolist()
     components = tuple(
         Component(slice(start, end), low)
@@ -158,9 +176,9 @@ def lens_px(camera: Camera, seen_px: Array) -> Array:
     point, focal length and radial distortion, by one standard deviation of each."""
     off_px = seen_px - [camera.cx_px, camera.cy_px]
     square = (off_px**2).sum(axis=1, keepdims=True) / camera.fx_px**2
-    centre_px = np.full(len(seen_px), CENTRE_SHARE * camera.width_px)
+    centre_px = np.full(len(seen_px), ERRORS.centre_share * camera.width_px)
     right_px, down_px = (np.outer(centre_px, axis) for axis in np.eye(2))
-    scaled_px, bent_px = off_px * camera.focal_std, off_px * (DISTORTION * square)
+    scaled_px, bent_px = off_px * camera.focal_std, off_px * (ERRORS.distortion * square)
     return np.stack([right_px, down_px, scaled_px, bent_px], axis=2)
 
 
@@ -173,5 +191,5 @@ def field_modes(places: Array, field: Field, block: float) -> Array:
     wide = length**2 + block**2 / 6
     covariance = std**2 * length**2 / wide * np.exp(-squares / (2 * wide))
     values, vectors = np.linalg.eigh(covariance)
-    used = values > LEAST_SHARE * values[-1]
+    used = values > ERRORS.min_mode * values[-1]
     return np.asarray(vectors[:, used] * np.sqrt(values[used]))

@@ -25,7 +25,6 @@ from orthonav.core.tiles.position import (
     ExactIndex,
     PositionRule,
     TileNeighbours,
-    offset_en_m,
     parabola_peak,
     rows_within,
 )
@@ -33,6 +32,9 @@ from orthonav.core.tiles.whitened import WhitenedEmbedder
 from orthonav.core.variants import variant_from_recipe
 
 MAX_RATIO = 10.0  # A rival at or below zero leaves the best without any
+HEADING_STEP_DEG = 8.0
+"""Where the heading is unknown: embeddings find their tile up to 8 deg off
+(docs/decisions/evidence.md)."""
 
 
 def lowe_ratio(scores: NDArray[np.float32], best: int | None = None) -> float:
@@ -60,17 +62,10 @@ def rival_score(
     return float(np.max(scores, where=elsewhere, initial=-1.0))
 
 
-def peak_ratio(best_score: float, rival: float) -> float:
-    return _ratio(best_score, rival)
-
-
 def _ratio(best: float, second: float) -> float:
     if best <= 0:
         return 1.0
     return min(MAX_RATIO, best / second) if second > 0 else MAX_RATIO
-
-
-BACKGROUND_TILES = 20_000  # of the whole map, evenly spread, for rivals; a narrow prior stays fast
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +94,8 @@ class TileMatcher:
         self.grid = grid
         self.centres_en_m = centres_en_m
         self.neighbours = TileNeighbours(grid, centres_en_m)
-        step = -(-len(embeddings) // BACKGROUND_TILES)
+        # Of the whole map, evenly spread, for rivals; a narrow prior stays fast.
+        step = -(-len(embeddings) // 20_000)
         self._background = np.arange(0, len(embeddings), step, dtype=np.intp)
 
     def match(self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None) -> Match:
@@ -127,22 +123,14 @@ class TileMatcher:
             "score": score,
             "margin": score - rival,
             "lowe_ratio": lowe_ratio(per_tile, best),
-            "peak_ratio": peak_ratio(score, rival),
+            "peak_ratio": _ratio(score, rival),
             "tiles_searched": float(len(per_tile) if rows is None else len(rows)),
         }
         # The background serves as rivals only: a mean of all is one of those that are allowed.
         used, used_rows = per_tile, searched
         if self._position == "weighted" and searched is not None and rows is not None:
             used, used_rows = per_tile[np.searchsorted(searched, rows)], rows
-        shift = offset_en_m(
-            self._position,
-            used,
-            tile,
-            used_rows,
-            self.centres_en_m,
-            self.neighbours,
-            self.grid.stride_m,
-        )
+        shift = self.neighbours.offset_en_m(self._position, used, tile, used_rows)
         return Match(tile, shift, int(best_heading[best]), evidence)
 
 
@@ -150,12 +138,9 @@ class TileMatcher:
 class TileProposer:
     """Embeds a view under many poses and finds the most similar tiles of a sheet."""
 
-    grid: TileGrid
-    centres_en_m: NDArray[np.float32]
-    index: ExactIndex
+    tiles: TileMatcher
     embedder: WhitenedEmbedder
     representation: Representation
-    neighbours: TileNeighbours
 
     @classmethod
     def of(
@@ -164,14 +149,12 @@ class TileProposer:
         """None for embeddings that cannot embed a view under many poses at once."""
         if not isinstance(embedder, WhitenedEmbedder):
             return None
-        return cls(
-            tiles.grid, tiles.centres_en_m, tiles.index, embedder, representation, tiles.neighbours
-        )
+        return cls(tiles, embedder, representation)
 
     def fits(self, side_px: float, view_tiles: tuple[float, float]) -> bool:
         """Whether its side (pixels of the map) is within `view_tiles` tiles."""
-        smallest, largest = view_tiles
-        return smallest * self.grid.tile_px <= side_px <= largest * self.grid.tile_px
+        (smallest, largest), tile_px = view_tiles, self.tiles.grid.tile_px
+        return smallest * tile_px <= side_px <= largest * tile_px
 
     def candidates(
         self,
@@ -184,20 +167,21 @@ class TileProposer:
         """Up to `count` tiles that no tile next to them exceeds, among `rows`, for a view
         heading-up at the map's resolution under headings (rad) and log scales with `weights` (Q,).
         """
+        tiles, grid = self.tiles, self.tiles.grid
         queries = embed_poses(
-            self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
+            self.embedder, self.representation, view.grey, view.valid, poses, grid.tile_px
         )
-        scores = self.index.best(queries * weights[:, None], rows)
-        chosen = self.neighbours.maxima(scores, count, rows)
-        tiles = chosen if rows is None else rows[chosen]
-        by_pose = self.index.scores(queries, tiles)
+        scores = tiles.index.best(queries * weights[:, None], rows)
+        chosen = tiles.neighbours.maxima(scores, count, rows)
+        numbers = chosen if rows is None else rows[chosen]
+        by_pose = tiles.index.scores(queries, numbers)
         peaks = peak_poses(np.array(poses), by_pose, weights)
         found = []
-        for place, tile, (turn_rad, log_scale) in zip(chosen, tiles, peaks.tolist(), strict=True):
-            shift = self.neighbours.peak_offset(scores, int(tile), rows)
-            east, north = self.centres_en_m[tile] + np.array(shift) * self.grid.stride_m
-            x_px = (float(east) - self.grid.west_m) / self.grid.gsd_m
-            y_px = (self.grid.north_m - float(north)) / self.grid.gsd_m
+        for place, tile, (turn_rad, log_scale) in zip(chosen, numbers, peaks.tolist(), strict=True):
+            shift_m = tiles.neighbours.offset_en_m("peak", scores, int(tile), rows)
+            east, north = tiles.centres_en_m[tile] + np.array(shift_m)
+            x_px = (float(east) - grid.west_m) / grid.gsd_m
+            y_px = (grid.north_m - float(north)) / grid.gsd_m
             pose = Pose(x_px, y_px, turn_rad, log_scale)
             found.append(Peak(float(scores[place]), pose))
         return found
@@ -227,12 +211,6 @@ def peak_poses(
         step = np.where(has_both, (back + ahead) / 2, 0.0)
         peaks[:, axis] += np.where(has_both, moved, 0.0) * step
     return peaks
-
-
-HEADING_SIGMAS = 1.5
-"""Reach in standard deviations: three headings at 5 deg (docs/decisions/embedding.md)."""
-UNKNOWN_HEADING_STEP_DEG = 8.0
-"""Embeddings find their tile up to 8 deg off (docs/decisions/evidence.md)."""
 
 
 class TileLocalizer:
@@ -270,9 +248,6 @@ class TileLocalizer:
         except MapFileError as error:
             raise MapFileError(f"{error}: {opened.path}") from error
         self.radius_m = manifest.radius_m
-
-    def proposer(self) -> TileProposer | None:
-        return TileProposer.of(self.matcher, self.embedder, self.representation)
 
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
         headings = self._headings_deg(view.telemetry, heading_known)
@@ -317,12 +292,13 @@ class TileLocalizer:
     def _headings_deg(self, telemetry: Telemetry, heading_known: bool) -> list[float]:
         """Around the reported one as far as its error reaches, or all."""
         if not heading_known:
-            return [float(heading) for heading in np.arange(0, 360, UNKNOWN_HEADING_STEP_DEG)]
+            return [float(heading) for heading in np.arange(0, 360, HEADING_STEP_DEG)]
         std = telemetry.yaw_std_deg
         if std is None or math.isnan(std):
             std = TILE_YAW_STD_DEG
         std = min(max(std, 0.0), 90.0)
-        side = math.floor(HEADING_SIGMAS * std / self._step_deg + 0.5)
+        # 1.5 standard deviations: three headings at 5 deg (docs/decisions/embedding.md).
+        side = math.floor(1.5 * std / self._step_deg + 0.5)
         return [telemetry.yaw_deg + k * self._step_deg for k in range(-side, side + 1)]
 
     def _fix(

@@ -27,16 +27,28 @@ from orthonav.core.records import (
 from orthonav.core.register.pose import PosePrior
 from orthonav.core.register.template import Levels, ViewTemplates
 
-MAX_TILT_DEG = 65.0
-MIN_SIDE_PX = 32
-MIN_VIEW_PX = 24.0
-"""Of the map: a sixth of the size that views are finished at (docs/decisions/registration.md)."""
-MIN_TILT_COS = 0.5  # beyond 60 deg the footprint is cut off, not expected to grow
-MAX_COARSER = 4.0
-DARK_LEVEL = 16.0
-BRIGHT_LEVEL = 250.0
-MIN_STD = 3.0
-_SAMPLE_STEP_PX = 8
+
+@dataclass(frozen=True)
+class ViewLimits:
+    """What a view must be to be searched for (docs/decisions/registration.md)."""
+
+    max_tilt_deg: float = 65.0
+    min_side_px: int = 32  # of the picture
+    min_view_px: float = 24.0
+    """Of the map: a sixth of the size that views are finished at."""
+    max_coarser: float = 4.0  # a pixel of the view, in pixels of the map
+    dark: float = 16.0
+    bright: float = 250.0
+    """Grey levels that 1 % of the view must exceed, or stay below."""
+    min_std: float = 3.0  # of the grey levels
+    min_agl_std: float = 0.03  # of the log scale searched, whatever is reported
+    max_agl_std: float = 0.15
+    """Three are scales of 0.64 to 1.57: between these chance was measured to be alike."""
+    near_share: float = 0.6
+    """A part far off nadir is judged as one so many times smaller (docs/terrain.md)."""
+
+
+LIMITS = ViewLimits()
 
 
 def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
@@ -55,21 +67,21 @@ def check_telemetry(
     if telemetry.agl_m <= 0:
         return NoFix("bad_height", f"height above ground is {telemetry.agl_m:.1f} m")
     tilt_deg = off_nadir_deg(telemetry)
-    if tilt_deg > MAX_TILT_DEG:
+    if tilt_deg > LIMITS.max_tilt_deg:
         return NoFix(
             "extreme_tilt",
-            f"camera tilts {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used; pitch and "
-            "roll are 0 for a camera that looks down",
+            f"camera tilts {tilt_deg:.0f} deg, at most {LIMITS.max_tilt_deg:.0f} can be used; "
+            "pitch and roll are 0 for a camera that looks down",
         )
-    if min(camera.width_px, camera.height_px) < MIN_SIDE_PX:
+    if min(camera.width_px, camera.height_px) < LIMITS.min_side_px:
         return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")
     if gsd_m is None:
         return None
     side_px = footprint_side_m(telemetry, camera) / gsd_m
-    if side_px < MIN_VIEW_PX:
-        return _too_small(side_px, MIN_VIEW_PX, f"{telemetry.agl_m:.0f} m above ground, ")
+    if side_px < LIMITS.min_view_px:
+        return _too_small(side_px, LIMITS.min_view_px, f"{telemetry.agl_m:.0f} m above ground, ")
     coarser = camera.gsd_m(telemetry.agl_m) / gsd_m
-    if coarser > MAX_COARSER:
+    if coarser > LIMITS.max_coarser:
         return NoFix("too_coarse", f"a pixel of the view covers {coarser:.3g} pixels of the map")
     return None
 
@@ -77,38 +89,27 @@ def check_telemetry(
 def footprint_side_m(telemetry: Telemetry, camera: Camera) -> float:
     """Root of the area of flat ground expected from the telemetry."""
     tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(math.radians(telemetry.roll_deg))
-    # The area seen grows with the inverse cube of the cosine of the tilt.
+    # The area seen grows with the inverse cube of the cosine of the tilt; beyond 60 deg the
+    # footprint is cut off.
     across, along = camera.extent
-    return telemetry.agl_m * math.sqrt(across * along / max(tilt, MIN_TILT_COS) ** 3)
+    return telemetry.agl_m * math.sqrt(across * along / max(tilt, 0.5) ** 3)
 
 
 def check_picture(grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> NoFix | None:
     """Too dark, too bright, blank, where the mask of the camera shows ground?"""
-    sample = grey[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX]
+    sample = grey[::8, ::8]
     if mask is not None:
-        sample = sample[mask[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX] > 0]
+        sample = sample[mask[::8, ::8] > 0]
         if sample.size == 0:
             return NoFix("blank", "the mask of the camera leaves too little of the view")
-    counts = np.bincount(sample.reshape(-1), minlength=256)
-    low, high = (_percentile(counts, percent) for percent in (1, 99))
-    levels, size = np.arange(256), int(counts.sum())
-    mean = float(counts @ levels) / size
-    std = math.sqrt(max(float(counts @ levels**2) / size - mean**2, 0.0))
-    if high < DARK_LEVEL:
+    (low, high), std = np.percentile(sample, (1, 99)), float(sample.std())
+    if high < LIMITS.dark:
         return NoFix("too_dark", f"99 % of the view is {high:.0f} of 255 or darker")
-    if low > BRIGHT_LEVEL:
+    if low > LIMITS.bright:
         return NoFix("too_bright", f"99 % of the view is {low:.0f} of 255 or brighter")
-    if std < MIN_STD:
+    if std < LIMITS.min_std:
         return NoFix("blank", f"grey levels differ by {std:.1f} of 255 only (standard deviation)")
     return None
-
-
-def _percentile(counts: NDArray[np.intp], percent: float) -> float:
-    """As `np.percentile`, in a tenth of the time."""
-    upto = np.cumsum(counts)
-    at = percent / 100 * (int(upto[-1]) - 1)
-    below, above = np.searchsorted(upto, [math.floor(at), math.ceil(at)], side="right").tolist()
-    return float(below + (at - math.floor(at)) * (above - below))
 
 
 def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None:
@@ -117,19 +118,13 @@ def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None
         return NoFix(
             "too_small", f"view covers {share:.0%} of a tile, {min_valid_share:.0%} are needed"
         )
-    if _is_uniform(view):
-        return NoFix("blank", "the part of the view that would be compared is uniform")
-    return None
+    return _check_contrast(view)
 
 
 def check_footprint(view: RectifiedView, pixel: float, min_side_px: float) -> NoFix | None:
     """`pixel`: size of its pixels in pixels of the map, the unit of `min_side_px`."""
     side = math.sqrt(cv2.countNonZero(view.valid.view(np.uint8))) * pixel
-    if side < min_side_px:
-        return _too_small(side, min_side_px)
-    if _is_uniform(view):
-        return NoFix("blank", "the part of the view that would be compared is uniform")
-    return None
+    return _too_small(side, min_side_px) if side < min_side_px else _check_contrast(view)
 
 
 def _too_small(side_px: float, least_px: float, where: str = "") -> NoFix:
@@ -137,16 +132,11 @@ def _too_small(side_px: float, least_px: float, where: str = "") -> NoFix:
     return NoFix("too_small", detail)
 
 
-def _is_uniform(view: RectifiedView) -> bool:
+def _check_contrast(view: RectifiedView) -> NoFix | None:
     _, std = cv2.meanStdDev(view.grey, mask=view.valid.view(np.uint8))
-    return float(std[0, 0]) < MIN_STD / 2
-
-
-MIN_AGL_STD = 0.03  # of the log scale searched, whatever is reported
-MAX_AGL_STD = 0.15
-"""Three are 0.64 to 1.57, as far as chance was measured alike (docs/decisions/registration.md)."""
-NEAR_SHARE = 0.6
-"""A part far off nadir is judged as one so many times smaller (docs/terrain.md)."""
+    if float(std[0, 0]) < LIMITS.min_std / 2:
+        return NoFix("blank", "the part of the view that would be compared is uniform")
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,12 +181,12 @@ def prepare(
         near = near_part(view, gsd_m)
         if near is None:
             return NoFix("too_small", "the view shows no ground that is near enough")
-        nominal_m = NEAR_SHARE * math.sqrt(near.area_m2)
+        nominal_m = LIMITS.near_share * math.sqrt(near.area_m2)
     levels = Levels.of(nominal_m / gsd_m, map_levels, finer=finer)
     unit_px = 2**levels.final
     picture = downsampled(view, gsd_m * unit_px)
     rectified = _rectified(picture, gsd_m, levels, levels.final)
-    refused = check_footprint(rectified, unit_px, MIN_VIEW_PX)
+    refused = check_footprint(rectified, unit_px, LIMITS.min_view_px)
     if refused is not None:
         return refused
     offset = rectified.offset_en_m / gsd_m
@@ -226,7 +216,7 @@ def pose_prior(telemetry: Telemetry, heading_known: bool, focal_std: float = 0.0
     return PosePrior(
         math.radians(telemetry.yaw_deg) if heading_known else None,
         math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
-        min(max(scale_std, MIN_AGL_STD), MAX_AGL_STD),
+        min(max(scale_std, LIMITS.min_agl_std), LIMITS.max_agl_std),
     )
 
 

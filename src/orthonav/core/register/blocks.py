@@ -97,8 +97,7 @@ def _compared(
 
 def _sampled(window: MapWindow, pose: Pose) -> Array:
     """The window (H, W, 4), edge directions turned; 0 where not valid."""
-    sampled = np.empty((*window.shape, CHANNELS), np.float32)
-    window.sample(pose, sampled)
+    sampled = window.sample(pose)
     cos, sin = math.cos(2 * pose.turn_rad), math.sin(2 * pose.turn_rad)
     turn = np.eye(CHANNELS, dtype=np.float32)
     turn[:2, :2] = [[cos, sin], [-sin, cos]]

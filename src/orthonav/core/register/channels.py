@@ -38,10 +38,6 @@ class ChannelRecipe:
 FINE = ChannelRecipe()
 COARSE = ChannelRecipe(gradient_sigma_px=0.7, contrast_px=17, mean_px=7, deviation_px=17)
 """For views of some 30 pixels across: the same channels from smaller windows."""
-_GRADIENT_FLOOR = np.float32(0.5)
-_DEVIATION_FLOOR = np.float32(2.0)
-"""Below, gradient and contrast count as noise of an 8-bit picture."""
-_CLIP = 3.0
 
 
 def channels_of(
@@ -116,9 +112,10 @@ def _gradients(
     power = square + south
     square -= south
     magnitude = np.sqrt(power) * counts
-    # |g|^2 / (|g| + surroundings) / |g|^2: direction times |g| / (|g| + surroundings).
+    # |g|^2 / (|g| + surroundings) / |g|^2: direction times |g| / (|g| + surroundings). Gradients
+    # below 0.5 are noise of an 8-bit picture.
     weight = magnitude / (
-        (magnitude + local(magnitude, recipe.contrast_px) + _GRADIENT_FLOOR)
+        (magnitude + local(magnitude, recipe.contrast_px) + np.float32(0.5))
         * (power + np.float32(1e-6))
     )
     product *= 2
@@ -130,5 +127,5 @@ def _grey(picture: Array, share: Array, local: _LocalMean, recipe: ChannelRecipe
     rest = (picture - local(picture * share, recipe.mean_px)) * share
     # Running sums of a box filter may fall a little below zero.
     power = np.maximum(local(rest * rest, recipe.deviation_px), 0)
-    deviation = np.sqrt(power) + _DEVIATION_FLOOR
-    return np.asarray(np.clip(rest / deviation, -_CLIP, _CLIP), dtype=np.float32)
+    deviation = np.sqrt(power) + np.float32(2.0)  # less is noise of an 8-bit picture
+    return np.asarray(np.clip(rest / deviation, -3.0, 3.0), dtype=np.float32)

@@ -57,9 +57,7 @@ def even_scale(log_scale: float) -> float:
     return math.exp(log_scale / 2)
 
 
-NAT_SCORE = 1.0  # units of the score per nat of the prior (docs/decisions/registration.md)
-SIGMAS = 3.0  # scales compared at a place, in standard deviations,
-HALF_STEP = 0.07  # and half a step of the bank farther
+SIGMAS = 3.0  # scales compared at a place, in standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +86,7 @@ class ScaleMap:
 
     def reach(self, log_scale: float) -> tuple[float, float]:
         """Least and greatest expected log scale of the places where `log_scale` is compared."""
-        off = SIGMAS * self.std + HALF_STEP
+        off = SIGMAS * self.std + 0.07  # half a step of the bank farther
         return log_scale - off, log_scale + off
 
 
@@ -102,16 +100,17 @@ class PosePrior:
     scale_map: ScaleMap | None = None
 
     def cost(self, pose: Pose) -> float:
+        """Units of the score: one per nat (docs/decisions/registration.md)."""
         if self.scale_map is None:
-            return NAT_SCORE * self.nats(pose.turn_rad, pose.log_scale)
+            return self.negative_log_density(pose.turn_rad, pose.log_scale)
         own = PosePrior(self.turn_rad, self.turn_std_rad, self.scale_map.std)
         expected = self.scale_map.at(pose.x_px, pose.y_px)
-        return NAT_SCORE * own.nats(pose.turn_rad, pose.log_scale - expected)
+        return own.negative_log_density(pose.turn_rad, pose.log_scale - expected)
 
-    def nats(
+    def negative_log_density(
         self, turn_rad: float, log_scale: float, *, within: tuple[float, float] = (0.0, 0.0)
     ) -> float:
-        """Negative log density, 0 at its peak; the least `within` (rad, log scale) around."""
+        """In nats, 0 at its peak; the least `within` (rad, log scale) around."""
         parts = [(log_scale, self.log_scale_std, within[1])]
         if self.turn_rad is not None:
             off = math.remainder(turn_rad - self.turn_rad, 2 * math.pi)

@@ -28,15 +28,25 @@ from orthonav.core.register.window import (
 )
 
 Array = NDArray[np.float32]
-STEPS = 6  # At most. Values here without a source: by `python -m benchmarks.real_imagery`.
-SLACK_PX = 6  # two steps of `MAX_STEP_PX`
-SMALL_STEP_PX = 0.03  # ends the refinement
-MAX_STEP_PX = 3.0  # the basin of convergence (docs/decisions/registration.md)
-DAMPING = 1e-3  # relative (Levenberg and Marquardt)
-MIN_CORRELATION = 0.08  # least in the gain, so that steps do not vanish
-WHOLE_OVERLAP = 0.97  # Above, the Gauss-Newton matrix of the whole view is used
 BLOCK_SUMS = 7
-MIN_CURVATURE = 0.05  # of a direction in the covariance, as a fraction of the Gauss-Newton matrix
+
+
+@dataclass(frozen=True)
+class Descent:
+    """How a refinement goes; values without a source are by `python -m benchmarks.real_imagery`."""
+
+    steps: int = 6  # at most
+    small_step_px: float = 0.03  # ends the refinement
+    max_step_px: float = 3.0  # the basin of convergence (docs/decisions/registration.md)
+    slack_px: int = 6  # two of these steps
+    damping: float = 1e-3  # relative (Levenberg and Marquardt)
+    min_correlation: float = 0.08  # in the gain, so that steps do not vanish
+    whole_overlap: float = 0.97  # above, the Gauss-Newton matrix of the whole view is used
+    min_curvature: float = 0.05
+    """Of a direction in the covariance, as a fraction of the Gauss-Newton matrix."""
+
+
+DESCENT = Descent()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +85,13 @@ class Refiner:
     def place(
         self,
         pose: Pose,
-        steps: int = STEPS,
-        small_step_px: float = SMALL_STEP_PX,
+        steps: int = DESCENT.steps,
+        small_step_px: float = DESCENT.small_step_px,
         *,
         with_covariance: bool = False,
     ) -> Fit:
         """The best pose within a few pixels of the level; ends below `small_step_px`."""
-        window = MapWindow.of(self.template, self.reference, pose, SLACK_PX)
+        window = MapWindow.of(self.template, self.reference, pose, DESCENT.slack_px)
         fit, step = self._refined(window, pose, steps, small_step_px)
         if not with_covariance:
             return fit
@@ -113,7 +123,7 @@ class Refiner:
         template = self.template
         limits = (
             *(window.row, window.col, window.unit, steps, small_step_px),
-            *(MAX_STEP_PX, DAMPING, MIN_CORRELATION, WHOLE_OVERLAP),
+            *(DESCENT.max_step_px, DESCENT.damping, DESCENT.min_correlation, DESCENT.whole_overlap),
         )
         at = (pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale)
         return window.made, template.values, template.slopes, template.numbers, at, limits
@@ -127,7 +137,7 @@ class Refiner:
         for _ in range(steps):
             step = self._step(seen)
             moves_px = self._moves_px(step)
-            share = min(1.0, MAX_STEP_PX / max(moves_px, 1e-9))
+            share = min(1.0, DESCENT.max_step_px / max(moves_px, 1e-9))
             step = [share * each for each in step]
             moved = seen.pose.stepped([unit * step[0], unit * step[1], *step[2:]])
             seen = self._compared(window, moved)
@@ -139,14 +149,14 @@ class Refiner:
         return best.fit(converged), step
 
     def _compared(self, window: MapWindow, pose: Pose) -> "Comparison":
-        planes = sampled_planes(self.template, window, pose)
+        planes = sampled_planes(window, pose)
         return Comparison(self.template, pose, compared(self.template, *planes))
 
     def _hessian(self, seen: "Comparison") -> NDArray[np.float64]:
         """Over the part of the view that lies on the map."""
         first, second = seen.squares
         hessians = self.template.hessians
-        if seen.overlap <= WHOLE_OVERLAP:
+        if seen.overlap <= DESCENT.whole_overlap:
             # Block by block: derivatives weigh alike within one.
             hessians = np.tensordot(seen.shares(), self.template.block_hessians, axes=1)
         return np.asarray(first * hessians[0] + second * hessians[1])
@@ -163,7 +173,7 @@ class Refiner:
     def _step(self, seen: "Comparison") -> list[float]:
         """Of the window: x, y (px of the level), turn, log scale."""
         hessian = self._hessian(seen)
-        hessian.flat[::5] *= 1 + DAMPING
+        hessian.flat[::5] *= 1 + DESCENT.damping
         hessian.flat[::5] += 1e-12
         found: list[float] = np.linalg.solve(hessian, seen.slope()).tolist()
         return found
@@ -215,7 +225,7 @@ def _bounded_inverse(
     """Of `observed`, no direction held less than a fraction of what `hessian` says."""
     own = np.sqrt(np.diag(hessian)) + 1e-12
     values, vectors = np.linalg.eigh(observed / np.outer(own, own))
-    inverse = (vectors / np.maximum(values, MIN_CURVATURE)) @ vectors.T
+    inverse = (vectors / np.maximum(values, DESCENT.min_curvature)) @ vectors.T
     return np.asarray(inverse / np.outer(own, own))
 
 
@@ -234,7 +244,7 @@ class Comparison:
             self._sums.products.tolist(), self._sums.energies.tolist(), own, strict=True
         ):
             correlation = product / math.sqrt(energy * mine) if energy * mine > 0 else 0.0
-            square = max(correlation, MIN_CORRELATION) ** 2
+            square = max(correlation, DESCENT.min_correlation) ** 2
             found.append(correlation)
             squares.append(square)
             gains.append(math.sqrt(square * mine / energy) if energy > 0 else 0.0)
@@ -267,7 +277,7 @@ class _Pixels:
     """`map` (3, H, W), `counts` (H, W), `residual`: gain * map - correlation^2 * view."""
 
     def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
-        planes, valid = sampled_planes(template, window, pose)
+        planes, valid = sampled_planes(window, pose)
         seen = Comparison(template, pose, compared(template, planes, valid, slopes=False))
         self.seen = seen
         self.counts = template.mask * (valid > FULLY_VALID)

@@ -19,16 +19,13 @@ from orthonav.core.geo.camera import counted_from_centres
 from orthonav.core.register.channels import GROUPS, ChannelRecipe
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.pose import Pose, ScaleMap, even_scale, rotation
-from orthonav.core.register.template import Template, energy_of, turn_planes
-from orthonav.core.register.window import Reference, cut, thread_memory
+from orthonav.core.register.template import Template, energy_of, turned_planes
+from orthonav.core.register.window import MAX_SIDE_PX, Reference, cut
 
 Array = NDArray[np.float32]
-ENERGY_FLOOR = 0.3  # of the typical energy, so that blank ground is not amplified
 POSES_AT_ONCE = 6
 PLACES_AT_ONCE = 50
-MAX_KEPT_WINDOWS = 4  # of whole sheets in the cache
 WIDE = 8  # columns or rows that the kernel transforms together
-LONGEST_PX = 32768  # of a window that the kernel takes
 
 
 def bank(
@@ -112,7 +109,7 @@ class SearchWindow:
 
     @property
     def by_kernel(self) -> bool:
-        return KERNEL is not None and max(self.size) <= LONGEST_PX
+        return KERNEL is not None and max(self.size) <= MAX_SIDE_PX
 
     def prepare(self, template: Template) -> None:
         """What threads share, once."""
@@ -139,7 +136,8 @@ def _by_local_energy(channels: Array, counts: Array, view_px: int) -> Array:
     side = min(max(3, view_px // 2), 2 * min(energy.shape) - 1)
     local = cv2.blur(energy, (side, side)) / np.maximum(cv2.blur(counts, (side, side)), 0.1)
     typical = float(energy.sum() / max(counts.sum(), 1.0))
-    return np.asarray(channels / np.sqrt(local + ENERGY_FLOOR * typical + 1e-12)[..., None])
+    # The floor keeps blank ground from being amplified.
+    return np.asarray(channels / np.sqrt(local + 0.3 * typical + 1e-12)[..., None])
 
 
 class SearchWindows:
@@ -158,7 +156,7 @@ class SearchWindows:
             found = self._windows.pop(key, None)
             if found is None:
                 found = SearchWindow(self._reference.whole(level, recipe), level, 0, 0, side)
-                while len(self._windows) >= MAX_KEPT_WINDOWS:
+                while len(self._windows) >= 4:
                     self._windows.pop(next(iter(self._windows)))
             self._windows[key] = found  # the least recently used one is the first
         return found
@@ -291,10 +289,9 @@ def _best_of(
     best = np.full(shape, -np.inf, np.float32)
     which = np.zeros(shape, np.int32)
     numbers = np.empty(shape, np.int32)
-    scratch = _Scratch(window)
     for number in part:
         turn, log_scale = poses[number]
-        scores = scratch.scores(template, turn, log_scale)
+        scores = _scores(template, window, turn, log_scale)
         if scores is None:
             continue
         better = cv2.compare(scores, best, cv2.CMP_GT)
@@ -347,42 +344,23 @@ def _from_bands(values: NDArray[Any], window: SearchWindow) -> NDArray[Any]:
     return np.ascontiguousarray(rows[: window.height, : window.width])
 
 
-class _Scratch:
-    """Memory of one search, used again for every pose."""
-
-    def __init__(self, window: SearchWindow) -> None:
-        self._window = window
-        rows, cols = window.size
-        half = cols // 2 + 1
-        # Real and imaginary parts: three channels, their sum, and one product.
-        made = thread_memory("search", 2 * 5 * rows * half).view(np.complex64)
-        self._spectra = made[: 3 * rows * half].reshape(3, rows, half)
-        self._total, self._product = made[3 * rows * half :].reshape(2, rows, half)
-
-    def scores(self, template: Template, turn: float, log_scale: float) -> Array | None:
-        """Of the view's middle on each pixel's first corner; None if it does not fit."""
-        window = self._window
-        half = posed_half_px(template, log_scale)
-        rows, cols = window.size
-        if 2 * half > min(rows, cols):
-            return None
-        # Turned by half a turn, for a product of spectra to be a correlation; the middle goes to
-        # the first pixel, what lies before it wraps to the end.
-        posed = posed_channels(template, turn, log_scale)[:, ::-1, ::-1]
-        strip = np.zeros((3, 2 * half, cols), np.float32)
-        strip[:, :, : half + 1] = posed[:, :, half - 1 :]
-        strip[:, :, cols - half + 1 :] = posed[:, :, : half - 1]
-        along = np.fft.rfft(strip, axis=2)
-        self._spectra[:, : half + 1] = along[:, half - 1 :]
-        self._spectra[:, half + 1 : rows - half + 1] = 0
-        self._spectra[:, rows - half + 1 :] = along[:, : half - 1]
-        spectra = np.fft.fft(self._spectra, axis=1)
-        np.multiply(window.spectra[0], spectra[0], out=self._total)
-        for number in (1, 2):
-            np.multiply(window.spectra[number], spectra[number], out=self._product)
-            np.add(self._total, self._product, out=self._total)
-        surface = np.fft.irfft2(self._total, s=window.size, axes=(0, 1))
-        return np.asarray(surface, np.float32)[: window.height, : window.width]
+def _scores(
+    template: Template, window: SearchWindow, turn: float, log_scale: float
+) -> Array | None:
+    """Of the view's middle on each pixel's first corner; None if it does not fit."""
+    side = 2 * posed_half_px(template, log_scale)
+    if side > min(window.size):
+        return None
+    total = np.zeros(window.spectra.shape[1:], np.complex64)
+    posed = posed_channels(template, turn, log_scale)
+    for spectrum, channel in zip(window.spectra, posed, strict=True):
+        canvas = np.zeros(window.size, np.float32)
+        canvas[:side, :side] = channel
+        # The middle goes to the first pixel, what lies before it wraps to the end.
+        canvas = np.roll(canvas, (-side // 2, -side // 2), axis=(0, 1))
+        total += spectrum * np.conj(np.fft.rfft2(canvas))
+    surface = np.fft.irfft2(total, s=window.size)
+    return np.asarray(surface, np.float32)[: window.height, : window.width]
 
 
 def posed_half_px(template: Template, log_scale: float) -> int:
@@ -404,9 +382,7 @@ def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     centred = counted_from_centres(matrix)
     size = 2 * half, 2 * half
     warped = np.asarray(cv2.warpAffine(template.interleaved, centred[:2], size), np.float32)
-    planes = np.empty((2 + warped.shape[2], *warped.shape[:2]), np.float32)
-    posed, scratch = planes[2:], planes[:2]
-    turn_planes(warped, turn, posed, scratch)
+    posed = turned_planes(warped, turn)
     for group, weight in zip(GROUPS, template.weights, strict=True):
         energy = energy_of(posed[group])
         even = even_scale(-log_scale)

@@ -11,19 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.channels import CHANNELS, GROUPS
+from orthonav.core.register.channels import GROUPS
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.template import Template, turn_planes
-from orthonav.core.register.window import MapWindow, Reference
+from orthonav.core.register.template import Template
+from orthonav.core.register.window import MapWindow, Reference, sampled_planes
 
 Array = NDArray[np.float32]
-REACH_SHARE, MIN_REACH_PX = 0.125, 8
-"""How far the window is moved: fraction of its sides, pixels of the level at least."""
-PEAK_SHARE = 0.06
-"""Moves below this fraction of the view's side, or so many pixels, belong to the place itself."""
-MIN_PEAK_PX = 3.0
-NEAR_PX = 3.0  # the place itself is the best within so many pixels
 MAX_RATIO = 10.0
 PHASE_FLOOR = 1e-3  # fraction of the mean power below which frequencies count less
 
@@ -42,8 +36,8 @@ def sharpness(template: Template, reference: Reference, pose: Pose) -> Sharpness
     moved = _moved_scores(template, reference, pose)
     rows, cols = (np.arange(side, dtype=np.float64) - side // 2 for side in moved.shape[1:])
     moved_px = np.hypot(rows[:, None], cols)
-    peak_px = max(MIN_PEAK_PX, PEAK_SHARE * math.sqrt(template.pixels))
-    near, aside = moved_px <= NEAR_PX, moved_px > peak_px
+    # The place itself is the best near by; smaller moves than those aside belong to it too.
+    near, aside = moved_px <= 3.0, moved_px > max(3.0, 0.06 * math.sqrt(template.pixels))
     return Sharpness(
         _ratio(moved[0] + moved[1], near, aside),
         _deviations(moved[0], near, aside),
@@ -68,7 +62,7 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
 
     Not divided by the energy of the map under each move: that hardly changes."""
     height, width = template.mask.shape
-    rows, cols = (max(MIN_REACH_PX, int(side * REACH_SHARE)) for side in (height, width))
+    rows, cols = (max(8, int(side / 8)) for side in (height, width))
     window = MapWindow.of(template, reference, pose, 0, (rows, cols))
     # Moves of less than the margin never reach over the border: no padding.
     size = tuple(cv2.getOptimalDFTSize(side) for side in window.shape)
@@ -79,15 +73,12 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
             *((rows, cols), size, PHASE_FLOOR, moved),
         )
         return moved
-    sampled = np.empty((*window.shape, CHANNELS), np.float32)
-    window.sample(pose, sampled)
-    planes, scratch = np.empty((2, CHANNELS, *window.shape), np.float32)
-    turn_planes(sampled, -pose.turn_rad, planes, scratch[:2])
+    planes, _ = sampled_planes(window, pose)
     for group, weight in zip(GROUPS, template.weights, strict=True):
         energy = float(np.square(planes[group]).sum())
         planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
     products = np.conj(np.fft.rfft2(template.channels, s=size, axes=(1, 2)))
-    products *= np.fft.rfft2(planes[:3], s=size, axes=(1, 2))
+    products *= np.fft.rfft2(planes, s=size, axes=(1, 2))
     power = np.abs(products)
     floor = PHASE_FLOOR * power.mean(axis=(1, 2), keepdims=True) + 1e-12
     phase = (products / (power + floor)).sum(axis=0)

@@ -20,7 +20,6 @@ from orthonav.core.register.channels import (
 from orthonav.core.register.kernel import KERNEL
 
 Array = NDArray[np.float32]
-JUDGED_PX = 72.0  # Across, at the judged level (docs/decisions/registration.md)
 BLOCKS = 6  # along one side of a view, in which residuals are taken as one (see `refine`)
 
 
@@ -198,12 +197,15 @@ def from_middle(height: int, width: int) -> tuple[Array, Array]:
     return x, y
 
 
-def turn_planes(made: Array, turn_rad: float, into: Array, scratch: Array) -> None:
-    """As planes `into` (C, H, W), edge directions turned clockwise; `scratch` (2, H, W)."""
-    cv2.split(made, [*scratch, *into[2:]])
+def turned_planes(made: Array, turn_rad: float) -> Array:
+    """Planes (C, H, W) of channels (H, W, C), edge directions turned clockwise."""
+    east, north, *others = cv2.split(made)
     cos, sin = math.cos(2 * turn_rad), math.sin(2 * turn_rad)
-    cv2.addWeighted(scratch[0], cos, scratch[1], -sin, 0, dst=into[0])
-    cv2.addWeighted(scratch[0], sin, scratch[1], cos, 0, dst=into[1])
+    turned = (
+        cv2.addWeighted(east, cos, north, -sin, 0),
+        cv2.addWeighted(east, sin, north, cos, 0),
+    )
+    return np.asarray(np.stack([*turned, *others]), np.float32)
 
 
 def energy_of(values: Array) -> float:
@@ -213,20 +215,22 @@ def energy_of(values: Array) -> float:
 
 @dataclass(frozen=True)
 class Levels:
+    """Levels of the map at which a view is compared, each half as fine as the next one."""
+
     coarse: int
-    judged: int
+    mid: int
     final: int
 
     @classmethod
     def of(cls, view_px: float, levels: int, *, finer: bool = False) -> "Levels":
         """For a view of `view_px` pixels of level 0 across (root of its area); `finer`: by one
         level, among houses and trees."""
-        judged = round(math.log2(max(view_px, 1.0) / JUDGED_PX)) - finer
-        judged = max(0, min(judged, levels - 1))
-        return cls(min(judged + 1, levels - 1), judged, max(judged - 1, 0))
+        # At the mid level it is 72 px across (docs/decisions/registration.md).
+        mid = max(0, min(round(math.log2(max(view_px, 1.0) / 72.0)) - finer, levels - 1))
+        return cls(min(mid + 1, levels - 1), mid, max(mid - 1, 0))
 
     def recipe(self, level: int) -> ChannelRecipe:
-        return COARSE if level > self.judged else FINE
+        return COARSE if level > self.mid else FINE
 
 
 class ViewTemplates:

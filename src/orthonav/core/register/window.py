@@ -14,23 +14,10 @@ from numpy.typing import NDArray
 
 from orthonav.core.register.channels import CHANNELS, FINE, GROUPS, ChannelRecipe, channels_of
 from orthonav.core.register.pose import Pose
-from orthonav.core.register.template import BLOCKS, Template, by_kind, turn_planes
-
-_kept = threading.local()
-
-
-def thread_memory(name: str, size: int) -> NDArray[np.float32]:
-    """The same memory at every call of this thread with that `name`."""
-    found: NDArray[np.float32] | None = getattr(_kept, name, None)
-    if found is None or found.size < size:
-        found = np.empty(size, np.float32)
-        setattr(_kept, name, found)
-    return found[:size]
-
+from orthonav.core.register.template import BLOCKS, Template, by_kind, turned_planes
 
 Array = NDArray[np.float32]
-LONGEST_PX = 32768  # that the kernel and OpenCV sample
-WHOLE_LEVEL_PX = 2_000_000  # smaller levels are made ready whole, once (16 bytes each)
+MAX_SIDE_PX = 32768  # that the kernel and OpenCV sample
 
 
 class GreyPyramid(Protocol):
@@ -63,9 +50,9 @@ class Reference:
         return self.pyramid.shape(level)
 
     def caches(self, level: int) -> bool:
-        return (
-            math.prod(self.shape(level)) <= WHOLE_LEVEL_PX and max(self.shape(level)) <= LONGEST_PX
-        )
+        """Smaller levels are made ready whole, once (16 bytes each pixel)."""
+        shape = self.shape(level)
+        return math.prod(shape) <= 2_000_000 and max(shape) <= MAX_SIDE_PX
 
     def whole(self, level: int, recipe: ChannelRecipe = FINE) -> Array:
         """Once."""
@@ -106,9 +93,6 @@ def cut(whole: Array, row: int, col: int, height: int, width: int) -> Array:
     return out
 
 
-LARGEST_LOG_SCALE = 1.0  # Beyond, the map counts as missing: more than twice what is searched
-
-
 @dataclass(frozen=True, eq=False)
 class MapWindow:
     """Channels (R, C, 4) of a level, from (`row`, `col`), for windows (H, W) near a pose."""
@@ -137,7 +121,8 @@ class MapWindow:
         if reference.caches(template.level):
             whole = reference.whole(template.level, template.recipe)
             return cls(whole, 0, 0, unit, (height, width))
-        scale = math.exp(min(pose.log_scale, LARGEST_LOG_SCALE)) / 2
+        # Beyond 1, more than twice what is searched, the map counts as missing.
+        scale = math.exp(min(pose.log_scale, 1.0)) / 2
         cos, sin = abs(scale * math.cos(pose.turn_rad)), abs(scale * math.sin(pose.turn_rad))
         x, half_x = pose.x_px / unit, cos * width + sin * height
         y, half_y = pose.y_px / unit, sin * width + cos * height
@@ -148,10 +133,12 @@ class MapWindow:
         )
         return cls(made, row, col, unit, (height, width))
 
-    def sample(self, pose: Pose, into: Array) -> None:
+    def sample(self, pose: Pose) -> Array:
+        """Channels (H, W, 4) of the window at a pose."""
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         matrix = np.reshape(self.matrix(pose), (2, 3))
-        cv2.warpAffine(self.made, matrix, self.shape[::-1], dst=into, flags=flags)
+        sampled = cv2.warpAffine(self.made, matrix, self.shape[::-1], flags=flags)
+        return np.asarray(sampled, np.float32)
 
     def matrix(self, pose: Pose) -> tuple[float, ...]:
         """(2, 3), row by row, from pixels of the window to those of `made`, from pixel centres."""
@@ -209,11 +196,7 @@ def compared(template: Template, seen: Array, valid: Array, slopes: bool = True)
     return made
 
 
-def sampled_planes(template: Template, window: MapWindow, pose: Pose) -> tuple[Array, Array]:
-    """Channels (3, H, W), validity (H, W), in memory that the thread's next call overwrites."""
-    shape = template.mask.shape
-    planes = thread_memory("sampled", 10 * template.mask.size).reshape(10, *shape)
-    interleaved = planes[:4].reshape(*shape, 4)
-    window.sample(pose, interleaved)
-    turn_planes(interleaved, -pose.turn_rad, planes[4:8], planes[8:10])
-    return planes[4:7], planes[7]
+def sampled_planes(window: MapWindow, pose: Pose) -> tuple[Array, Array]:
+    """Channels (3, H, W) of the map as a view shows them, and validity (H, W)."""
+    planes = turned_planes(window.sample(pose), -pose.turn_rad)
+    return planes[:3], planes[3]

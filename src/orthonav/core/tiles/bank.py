@@ -17,9 +17,6 @@ from numpy.typing import NDArray
 from orthonav.core.tiles.cells import MICRO
 from orthonav.core.tiles.whitened import WhitenedEmbedder, WhitenedRecipe
 
-CHUNK_POSES = 64  # few enough for the processor's cache
-_PLANES = 4  # channels that OpenCV resamples at once
-
 Array = NDArray[np.float32]
 Poses = NDArray[np.float64]
 
@@ -64,15 +61,16 @@ def embed_poses(
     thinned = _thinned(representation, grey, valid, all_poses, tile_px)
     side = embedder.recipe.cells
     sums = np.empty((len(poses), side, side, channels + 1), dtype=np.float32)
-    for start in range(0, len(poses), CHUNK_POSES):
-        part = slice(start, start + CHUNK_POSES)
+    for start in range(0, len(poses), 64):  # few enough for the processor's cache
+        part = slice(start, start + 64)
         sums[part] = _pooled(embedder.recipe, thinned, all_poses[part], tile_px)
     return embedder.cells(_turned(sums[..., :channels], all_poses), sums[..., channels])
 
 
 @dataclass(frozen=True, eq=False)
 class _Thinned:
-    """Averaged over `cell_px`, the valid share as the last; up to four channels a plane.
+    """Averaged over `cell_px`, the valid share as the last; up to four channels a plane, which
+    OpenCV resamples at once.
 
     `middle_px` (x, y): of the view's window, in its pixels."""
 
@@ -99,9 +97,7 @@ def _thinned(
     grey, valid = grey[rows, cols], valid[rows, cols]
     channels = [*representation(grey, valid), valid.astype(np.float32)]
     small = [_averaged(channel, cell_px) for channel in channels]
-    planes = [
-        np.stack(small[first : first + _PLANES], axis=-1) for first in range(0, len(small), _PLANES)
-    ]
+    planes = [np.stack(small[first : first + 4], axis=-1) for first in range(0, len(small), 4)]
     return _Thinned(planes, middle, cell_px)
 
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from orthonav.core.errors import VariantError
 from orthonav.core.extras import needed
 from orthonav.core.files import require_file
+from orthonav.core.tiles.network import session_of
 
 VARIABLE = "ORTHONAV_EDGES"
-PROBE_PX, LARGEST_MARGIN_PX = 96, 32
-LARGEST_BYTES = 64 << 20  # larger networks are not meant for an aircraft
+MAX_BYTES = 64 << 20  # larger networks are not meant for an aircraft
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class LearnedEdges:
 
 def _read(path: str) -> bytes:
     with require_file(Path(path), "edge network").open("rb") as stream:
-        data = stream.read(LARGEST_BYTES + 1)
-    if len(data) > LARGEST_BYTES:
-        raise VariantError(f"edge network is larger than {LARGEST_BYTES >> 20} MiB: {path}")
+        data = stream.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise VariantError(f"edge network is larger than {MAX_BYTES >> 20} MiB: {path}")
     return data
 
 
@@ -88,28 +88,24 @@ def _network(path: str, sha256: str) -> tuple[Any, int]:
             f"{found[:12]}); give the one it was made with: {path}"
         )
     runtime = needed("onnxruntime", "neural", "edges by a network")
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    options.add_session_config_entry("session.load_model_format", "ONNX")
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    probe_px, max_margin_px = 96, 32
     try:
-        session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-        shape = _run(session, np.zeros((PROBE_PX, PROBE_PX + 2), np.float32)).shape
+        session = session_of(runtime, data)
+        shape = _run(session, np.zeros((probe_px, probe_px + 2), np.float32)).shape
     except Exception as error:
         # Its errors have no common class below Exception.
         raise VariantError(
             f'no network from "grey" (1, 1, H, W) to "edges", float32: {path} ({error})'
         ) from error
-    margin, odd = divmod(PROBE_PX - shape[-1] + 2, 2) if len(shape) == 2 else (-1, 0)
-    if odd or shape != (PROBE_PX - 2 * margin, PROBE_PX + 2 - 2 * margin):
+    margin, odd = divmod(probe_px - shape[-1] + 2, 2) if len(shape) == 2 else (-1, 0)
+    if odd or shape != (probe_px - 2 * margin, probe_px + 2 - 2 * margin):
         raise VariantError(
             f"edges must be as large as the grey levels less the same margin on each side, got "
-            f"{shape} of {(PROBE_PX, PROBE_PX + 2)}: {path}"
+            f"{shape} of {(probe_px, probe_px + 2)}: {path}"
         )
-    if not 0 <= margin <= LARGEST_MARGIN_PX:
+    if not 0 <= margin <= max_margin_px:
         raise VariantError(
-            f"edges must have a margin of 0 to {LARGEST_MARGIN_PX} px, got {margin}: {path}"
+            f"edges must have a margin of 0 to {max_margin_px} px, got {margin}: {path}"
         )
     return session, margin
 

@@ -14,10 +14,6 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError, VariantError
 from orthonav.core.extras import needed
 
-SIMILARITIES = ("product", "cosine")
-PRECISIONS = ("float32", "float16", "int8")
-MININGS = ("hardest", "semihard")
-CHUNK_TILES = 16  # enough to keep a core busy, few enough for a small machine's memory
 OPERATORS = frozenset(
     [
         "Add",
@@ -84,7 +80,7 @@ class TripletRecipe:
     def __post_init__(self) -> None:
         _require("width", self.width, 1 <= self.width <= 256, "1 to 256")
         _require("margin", self.margin, 0 < self.margin <= 1e6, "above 0, at most 1000000")
-        _require("mining", self.mining, self.mining in MININGS, " or ".join(MININGS))
+        _require_one_of("mining", self.mining, ("hardest", "semihard"))
         _require("apart", self.apart, 0 <= self.apart <= 100, "0 to 100")
         _require("batch", self.batch, self.batch >= 2, "at least 2")
         _require_training(self)
@@ -99,9 +95,12 @@ def _require_training(recipe: AutoEncoderRecipe | TripletRecipe) -> None:
     _require("batch", recipe.batch, 1 <= recipe.batch <= 65_536, "1 to 65536")
     rate = recipe.learning_rate
     _require("learning_rate", rate, 0 < rate <= 1, "above 0, at most 1")
-    similarity, precision = recipe.similarity, recipe.precision
-    _require("similarity", similarity, similarity in SIMILARITIES, " or ".join(SIMILARITIES))
-    _require("precision", precision, precision in PRECISIONS, " or ".join(PRECISIONS))
+    _require_one_of("similarity", recipe.similarity, ("product", "cosine"))
+    _require_one_of("precision", recipe.precision, ("float32", "float16", "int8"))
+
+
+def _require_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    _require(name, value, value in known, " or ".join(known))
 
 
 def _require(name: str, value: object, fits: bool, what: str) -> None:
@@ -150,9 +149,10 @@ class NetworkEmbedder:
         if maps.ndim != 4 or maps.shape[1:] != self.shape:
             raise ValueError(f"maps must be (N, {self.shape}), got {maps.shape}")
         out = np.empty((len(maps), self.dims), dtype=np.float32)
-        for start in range(0, len(maps), CHUNK_TILES):
-            part = np.ascontiguousarray(maps[start : start + CHUNK_TILES], dtype=np.float32)
-            out[start : start + CHUNK_TILES] = self._session.run(["embedding"], {"maps": part})[0]
+        # Enough to keep a core busy, few enough for a small machine's memory.
+        for start in range(0, len(maps), 16):
+            part = np.ascontiguousarray(maps[start : start + 16], dtype=np.float32)
+            out[start : start + 16] = self._session.run(["embedding"], {"maps": part})[0]
         if not np.isfinite(out).all():
             raise MapFileError("map's encoder gives numbers that are not finite")
         if self.recipe.similarity == "cosine":
@@ -166,17 +166,8 @@ class NetworkEmbedder:
     def _session(self) -> Any:
         """Made at first use; threads may share it."""
         runtime = _onnxruntime()
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = self.threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        options.add_session_config_entry("session.load_model_format", "ONNX")
-        # Threads that wait must not use time that the aircraft needs.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            session = runtime.InferenceSession(
-                self.onnx.tobytes(), options, providers=["CPUExecutionProvider"]
-            )
+            session = session_of(runtime, self.onnx.tobytes(), self.threads)
         except Exception as error:
             # Its errors have no common class below Exception.
             raise MapFileError(f"map's encoder cannot be loaded: {error}") from error
@@ -202,6 +193,17 @@ class NetworkEmbedder:
 
 def _onnxruntime() -> Any:
     return needed("onnxruntime", "neural", "running a neural encoder")
+
+
+def session_of(runtime: Any, data: bytes, threads: int = 1) -> Any:
+    """A session of onnxruntime for a graph; raises its own errors."""
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 4  # errors are raised
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    # Threads that wait must not use time that the aircraft needs.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
 
 
 def check_graph(data: NDArray[np.uint8]) -> None:

@@ -7,7 +7,7 @@ weighted by scores above the lowest (after Couturier and Akhloufi, 2021). *peak*
 the best tile and its neighbours: a third of the error (`python -m benchmarks --only compare`)."""
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.geo.grid import TileGrid
 
 PositionRule = Literal["peak", "best", "neighbours", "weighted"]
-STEPS_EN = ((1, 0), (0, 1))
+RULES: tuple[PositionRule, ...] = get_args(PositionRule)
 
 
 class TileNeighbours:
@@ -28,6 +28,7 @@ class TileNeighbours:
         tiles = grid.tiles_rc(centres_en_m)
         inside = (tiles >= 0).all() and (tiles < [grid.rows, grid.cols]).all()
         self._cols, self._shape = grid.cols, (grid.rows, grid.cols)
+        self._centres_en_m, self._stride_m = centres_en_m, grid.stride_m
         self._flat = tiles[:, 0] * grid.cols + tiles[:, 1]
         if not inside or (np.diff(self._flat) <= 0).any():
             raise MapFileError("tile centres are not those of the tile grid, sorted by rows")
@@ -58,13 +59,38 @@ class TileNeighbours:
     ) -> tuple[float, float]:
         """(east, north) in strides within 0.5; zero on an axis where a neighbour is missing."""
         offsets = []
-        for east, north in STEPS_EN:
+        for east, north in ((1, 0), (0, 1)):
             ahead, behind = (
                 _score(scores, rows, self.beside(best, sign * east, sign * north))
                 for sign in (1, -1)
             )
             offsets.append(parabola_peak(behind, _score(scores, rows, best), ahead))
         return offsets[0], offsets[1]
+
+    def offset_en_m(
+        self,
+        rule: PositionRule,
+        scores: NDArray[np.float32],
+        best: int,
+        rows: NDArray[np.intp] | None = None,
+    ) -> tuple[float, float]:
+        """(east, north) from the centre of the best tile, by a rule of position."""
+        if rule == "best":
+            return 0.0, 0.0
+        if rule == "peak":
+            east, north = self.peak_offset(scores, best, rows)
+            return east * self._stride_m, north * self._stride_m
+        if rule == "weighted":
+            tiles = np.arange(len(self._centres_en_m)) if rows is None else rows
+            weights = np.maximum(scores.astype(np.float64), 0)
+        else:
+            tiles, near = self.around(scores, best, rows)
+            weights = near - near.min(initial=np.inf) if len(near) > 1 else np.ones(len(near))
+        if not weights.sum() > 0:
+            return 0.0, 0.0
+        away = self._centres_en_m[tiles].astype(np.float64) - self._centres_en_m[best]
+        east, north = weights @ away / weights.sum()
+        return float(east), float(north)
 
     def around(
         self, scores: NDArray[np.float32], best: int, rows: NDArray[np.intp] | None = None
@@ -97,34 +123,6 @@ def find(sorted_values: NDArray[np.intp], value: int) -> int | None:
 def _score(scores: NDArray[np.float32], rows: NDArray[np.intp] | None, tile: int | None) -> float:
     at = tile if tile is None or rows is None else find(rows, tile)
     return float("nan") if at is None else float(scores[at])
-
-
-def offset_en_m(
-    rule: PositionRule,
-    scores: NDArray[np.float32],
-    best: int,
-    rows: NDArray[np.intp] | None,
-    centres_en_m: NDArray[np.float32],
-    neighbours: TileNeighbours,
-    stride_m: float,
-) -> tuple[float, float]:
-    """(east, north) from the centre of the best tile, a row of `centres_en_m` (N, 2)."""
-    if rule == "best":
-        return 0.0, 0.0
-    if rule == "peak":
-        east, north = neighbours.peak_offset(scores, best, rows)
-        return east * stride_m, north * stride_m
-    if rule == "weighted":
-        tiles = np.arange(len(centres_en_m)) if rows is None else rows
-        weights = np.maximum(scores.astype(np.float64), 0)
-    else:
-        tiles, near = neighbours.around(scores, best, rows)
-        weights = near - near.min(initial=np.inf) if len(near) > 1 else np.ones(len(near))
-    if not weights.sum() > 0:
-        return 0.0, 0.0
-    away = centres_en_m[tiles].astype(np.float64) - centres_en_m[best]
-    east, north = weights @ away / weights.sum()
-    return float(east), float(north)
 
 
 BLOCK_ROWS = 1024  # decoded at once: half a megabyte at 128 numbers, which stays in the cache

@@ -15,9 +15,6 @@ from orthonav.core.errors import VariantError
 from orthonav.core.variants import Variant
 
 HARMONICS = 3  # chosen on imagery of two dates (docs/decisions/embedding.md)
-BINS = 8  # of the equivalent histogram; its triangular bins set the weights of the harmonics
-# A triangular bin of an orientation histogram passes harmonic k with the weight sinc(k / bins)^2.
-_SHARES = [np.float32(np.sqrt(2) * np.sinc(k / BINS) ** 2) for k in range(1, HARMONICS + 1)]
 
 
 @dataclass(frozen=True)
@@ -75,8 +72,10 @@ def _fill_harmonics(
         out[2 * k - 1] -= np.multiply(imaginary, sin, out=product)
         np.multiply(real, sin, out=out[2 * k])
         out[2 * k] += np.multiply(imaginary, cos, out=product)
-    for k, share in enumerate(_SHARES, 1):
-        out[2 * k - 1 : 2 * k + 1] *= share
+    # A triangular bin of a histogram of 8 orientations passes harmonic k with the weight
+    # sinc(k / 8)^2.
+    for k in range(1, HARMONICS + 1):
+        out[2 * k - 1 : 2 * k + 1] *= np.float32(np.sqrt(2) * np.sinc(k / 8) ** 2)
 
 
 TABLE = {

@@ -23,15 +23,9 @@ from numpy.typing import NDArray
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
 
-CHUNK_TILES = 512  # 0.9 MB of features, which stays in the cache
 MAX_LEARNT_TILES = 20_000  # 44 for each of 448 features
 PART_NOISE = 2.0
 """Where cells are missing, over the smallest variance kept (docs/decisions/embedding.md)."""
-SOLVER_STEPS = 6  # of conjugate gradients for the same, over many poses
-SHARE_ROUNDING = 1e-3
-"""A cell seen to this much less than the whole counts as whole: resampling rounds."""
-TINY = np.float32(1e-30)
-SPARSE_BYTES = 32 * 2**20  # larger arrays of a sheet take memory only where they are written
 Made = TypeVar("Made")
 Features = NDArray[np.float32]
 Work = Callable[[Features, Features], Made]
@@ -114,7 +108,7 @@ class CellSheet:
 def _sparse_zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Take memory where written; NumPy's huge pages would take megabytes for one number."""
     size = math.prod(shape)
-    if 4 * size < SPARSE_BYTES:
+    if 4 * size < 32 * 2**20:
         return np.zeros(shape, dtype=np.float32)
     pages = mmap.mmap(-1, 4 * size)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
@@ -257,7 +251,8 @@ class WhitenedEmbedder:
             features = _normalized(self.recipe, cells[part])
             centred = features.reshape(len(features), -1) - self._mean
             out[part] = centred @ self._basis
-            missing = shares[part].min(axis=1) < 1 - SHARE_ROUNDING
+            # Resampling rounds: a cell seen to a thousandth less counts as whole.
+            missing = shares[part].min(axis=1) < 1 - 1e-3
             if missing.any():
                 weights = np.repeat(shares[part][missing], cells.shape[-1], axis=-1)
                 out[part][missing] = self._from_parts(centred[missing], weights)
@@ -276,15 +271,15 @@ class WhitenedEmbedder:
         solved = shrink * wanted
         residual = wanted - self._normal(solved, noisy)
         step = shrink * residual
-        fit = _dots(residual, step)
-        for _ in range(SOLVER_STEPS):
+        fit, tiny = _dots(residual, step), np.float32(1e-30)
+        for _ in range(6):
             response = self._normal(step, noisy)
-            length = fit / np.maximum(_dots(step, response), TINY)
+            length = fit / np.maximum(_dots(step, response), tiny)
             solved += length * step
             residual -= length * response
             scaled = shrink * residual
             before, fit = fit, _dots(residual, scaled)
-            step = scaled + (fit / np.maximum(before, TINY)) * step
+            step = scaled + (fit / np.maximum(before, tiny)) * step
         return np.asarray(solved)
 
     def _normal(
@@ -385,5 +380,5 @@ def _worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator
 
 
 def _chunks(count: int) -> Iterator[slice]:
-    for start in range(0, count, CHUNK_TILES):
-        yield slice(start, min(count, start + CHUNK_TILES))
+    for start in range(0, count, 512):  # 0.9 MB of features, which stays in the cache
+        yield slice(start, min(count, start + 512))

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 
-CHUNK_FEATURES = 4096  # 16 MB for 1,024 words
 DIMS = {"sift": 128, "superpoint": 256}  # numbers per descriptor
 
 Grey = NDArray[np.uint8]
@@ -122,8 +121,8 @@ class WordsEmbedder:
     def assigned(self, descriptors: Array) -> NDArray[np.intp]:
         """Nearest words (N,) of descriptors (N, D); the first of equally near ones."""
         out = np.empty(len(descriptors), dtype=np.intp)
-        for start in range(0, len(descriptors), CHUNK_FEATURES):
-            part = slice(start, start + CHUNK_FEATURES)
+        for start in range(0, len(descriptors), 4096):  # 16 MB for 1,024 words
+            part = slice(start, start + 4096)
             nearness = descriptors[part].astype(np.float32, copy=False) @ self._words
             nearness -= self._half_power
             out[part] = nearness.argmax(axis=1)
@@ -186,10 +185,6 @@ def seen(valid: Mask, points: Array, radii: Array) -> Mask:
     return np.asarray(inside > radii)
 
 
-SIFT_BORDER_PX = 5
-"""Of every octave, within which OpenCV finds no feature."""
-
-
 @dataclass(frozen=True, eq=False)
 class SiftFeatures:
     """Features of a picture, N of them; `descriptors` (N, 128): whole numbers."""
@@ -217,7 +212,7 @@ class SiftFeatures:
     def margins(self) -> Array:
         """Px (N,) from the edge within which OpenCV finds no feature of this scale."""
         octaves = np.array([point.octave & 255 for point in self.keypoints], np.uint8)
-        return SIFT_BORDER_PX * np.exp2(octaves.view(np.int8).astype(np.float32))
+        return 5 * np.exp2(octaves.view(np.int8).astype(np.float32))  # 5 px of every octave
 
 
 def sift_features(grey: Grey, most: int = 0) -> SiftFeatures:

@@ -425,7 +425,7 @@ class Tracker:
             return None
         white = WHITE_SHARE * math.sqrt(telemetry_noise[2])
         made = displacement(before, now, white, telemetry_noise, expected_en_m)
-        if made is None or self._registration.relief.is_level:
+        if made is None or self._registration.ground.is_level:
             return made
         heights_m = before.view.telemetry.agl_m, now.view.telemetry.agl_m
         ahead_en_m = (before.ahead_en_m + now.ahead_en_m) / 2
@@ -441,7 +441,7 @@ class Tracker:
             return None
         scale = math.exp(best.mean[SCALE])
         ahead_m = rotation(-best.mean[HEADING], scale) @ ahead_en_m
-        relief = self._registration.relief
+        relief = self._registration.ground
         return Terrain.ahead(relief, best.mean[POSITION], agl_m * scale, ahead_m)
 
     def _update(self, view: View, overlap: float, ground: float) -> NoFix | None:
@@ -481,7 +481,7 @@ class Tracker:
 
     def _above_expected(self, telemetry: Telemetry, place_en_m: Array) -> Telemetry:
         """The correction includes the error of the ground assumed before."""
-        relief = self._registration.relief
+        relief = self._registration.ground
         height_m = float(relief.terrain.at_en_m(place_en_m))
         if relief.is_level or not math.isfinite(height_m):
             return replace(telemetry, below=None)

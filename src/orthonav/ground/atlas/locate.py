@@ -16,7 +16,7 @@ import numpy as np
 from orthonav.core.errors import AtlasError, MapFileError, StorageError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.confidence import USUAL_CONFIDENCE
+from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Telemetry, View
 from orthonav.core.track import Model, State
@@ -57,7 +57,7 @@ class SheetMaps:
             log.warning("sheet %s cannot be used: %s", name, error)
             return None
         if localizer.registration is not None and localizer.registration.confidence is None:
-            localizer.registration.confidence = USUAL_CONFIDENCE
+            localizer.registration.confidence = DEFAULT_CONFIDENCE
         return localizer
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from orthonav.core.errors import AtlasError
 from orthonav.core.localize.policy import DEFAULT_PLAN
 from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_footprint
-from orthonav.core.localize.view import MIN_VIEW_PX, check_footprint, check_view, pose_prior
+from orthonav.core.localize.view import LIMITS, check_footprint, check_view, pose_prior
 from orthonav.core.records import NoFix, View
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_poses
@@ -96,7 +96,7 @@ class SheetSearch:
         side_m = math.sqrt(float(coarse.valid.sum())) * gsd_m
         least, most = (share * tile_m for share in self._policy.view_tiles)
         if least <= side_m <= most:
-            return check_footprint(coarse, 1.0, MIN_VIEW_PX) or coarse
+            return check_footprint(coarse, 1.0, LIMITS.min_view_px) or coarse
         return NoFix(
             "wrong_scale",
             f"view is {side_m:.0f} m wide; the coarse tiles of this atlas are for views of "

@@ -19,9 +19,9 @@ from orthonav.core.errors import AreaError, OutputError, VariantError
 from orthonav.core.files import GivenPath, Progress, no_progress, with_paths
 from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.core.localize.confidence import USUAL_TILES
+from orthonav.core.localize.confidence import DEFAULT_TILE_CONFIDENCE
 from orthonav.core.localize.localizer import RegistrationLocalizer
-from orthonav.core.localize.policy import SearchPlan, SearchPolicy
+from orthonav.core.localize.policy import SearchPlan
 from orthonav.core.localize.tiles import TileMatcher, TileProposer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 from orthonav.core.mapfile.reader import MapFile, write_map
@@ -252,7 +252,7 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         sheet.representation,
         embedder,
         progress,
-        usual=USUAL_TILES if is_usual else None,
+        usual=DEFAULT_TILE_CONFIDENCE if is_usual else None,
         slow=not represent.TABLE[name].flies,
     )
     arrays: dict[str, NDArray[Any]] = {
@@ -349,7 +349,7 @@ def _registration(
     localizer = RegistrationLocalizer.of_map(
         MapFile(request.out, 0, replace(manifest, registration=unfitted), arrays),
         TileProposer.of(tiles, embedder, sheet.representation),
-        SearchPlan(policy=SearchPolicy(last_ms=SEARCH_MS)),
+        SearchPlan(last_ms=SEARCH_MS),
     )
     assert localizer is not None
     crops = sheet.sampler.crops

@@ -21,9 +21,9 @@ from orthonav.core.files import Progress
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.confidence import (
+    DEFAULT_CHANCES,
+    DEFAULT_SHIFT,
     TILE_FEATURES,
-    USUAL_CHANCES,
-    USUAL_SHIFT,
     Chances,
     LogisticConfidence,
     RegisteredConfidence,
@@ -410,7 +410,8 @@ def _registration_calibration(
     outcomes: Sequence[_Outcome], radius_px: float
 ) -> RegistrationCalibration:
     negatives = [each.evidence for each in outcomes if each.mirrored]
-    chances = _chances(negatives) if len(negatives) >= CALIBRATION.min_negatives else USUAL_CHANCES
+    enough = len(negatives) >= CALIBRATION.min_negatives
+    chances = _chances(negatives) if enough else DEFAULT_CHANCES
     confidence, floor_px = RegisteredConfidence.usual(chances), CALIBRATION.floor_px
     errors_px = np.array([np.hypot(*each.error_px) for each in outcomes])
     mirrored = np.array([each.mirrored for each in outcomes], np.bool_)
@@ -430,7 +431,7 @@ def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
     """A view judged and finished at one level has the strength of one score, not of two."""
     look = _median(negatives, "look")
     both = [each for each in negatives if math.isfinite(each["detail_ratio"])]
-    total = look + USUAL_CHANCES.total - USUAL_CHANCES.look
+    total = look + DEFAULT_CHANCES.total - DEFAULT_CHANCES.look
     if len(both) >= CALIBRATION.min_negatives:
         total = _median(both, "strength")
     return Chances(total, look, _fine_chance(negatives, total))
@@ -488,7 +489,7 @@ def fit_few(
 
     def loss(shift: float) -> float:
         off = sample_weight @ np.logaddexp(0, -sign * (known + shift))
-        return float(off + (shift / USUAL_SHIFT) ** 2 / 2)
+        return float(off + (shift / DEFAULT_SHIFT) ** 2 / 2)
 
     shift = minimize_scalar(loss, bounds=(-10.0, 10.0)).x
     return LogisticConfidence(usual.bias + float(shift), usual.weights)

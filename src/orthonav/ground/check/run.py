@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthonav.core.cores import usable_cores
 from orthonav.core.errors import AreaError, CameraError, MapFileError
 from orthonav.core.files import Progress, StrPath, no_progress
-from orthonav.core.localize.ground import MIN_KNOWN
+from orthonav.core.localize.ground import SAMPLING
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
@@ -318,7 +318,7 @@ class _Check:
             MapCoverage(pixels, each).seen_share(places, side_m)
             for each in (self.above_m > 2.5, np.isfinite(self.above_m))
         )
-        unknown = known < MIN_KNOWN * self.coverage.seen_share(places, side_m)
+        unknown = known < SAMPLING.min_known * self.coverage.seen_share(places, side_m)
         return float(((shown >= 0.1) & ~unknown).mean()), float(unknown.mean())
 
     def _along(self, predictor: Predictor) -> Along | None:

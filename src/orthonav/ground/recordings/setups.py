@@ -17,7 +17,7 @@ from orthonav.core.errors import FlightError
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.localize.view import MAX_AGL_STD
+from orthonav.core.localize.view import LIMITS
 from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
 
 FEW = 0.5
@@ -39,7 +39,7 @@ class Setup:
         if self.factor == 1.0:
             return view
         agl_m = self.factor * view.telemetry.agl_m
-        telemetry = replace(view.telemetry, agl_m=agl_m, agl_std_m=MAX_AGL_STD * agl_m)
+        telemetry = replace(view.telemetry, agl_m=agl_m, agl_std_m=LIMITS.max_agl_std * agl_m)
         return replace(view, telemetry=telemetry)
 
 

@@ -1,6 +1,24 @@
-"""Networks of one convolution, for tests of edges by a network."""
+"""Pictures, and networks of one convolution for edges by a network."""
 
+import cv2
 import numpy as np
+
+
+def picture(shape=(96, 96), seed=0, blur=1.5):
+    """Blurred noise over the whole range of grey levels, read-only."""
+    noise = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), blur).reshape(shape)
+    grey = cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8).reshape(shape)
+    return frozen(grey)
+
+
+def frozen(array):
+    array.flags.writeable = False
+    return array
+
+
+def everywhere(grey):
+    return frozen(np.ones(grey.shape, dtype=bool))
 
 
 def sharp(side=5, threshold=0.02):
@@ -10,7 +28,7 @@ def sharp(side=5, threshold=0.02):
     return kernel, np.array([-threshold], np.float32)
 
 
-def write(
+def edge_network(
     path, *, kernel=None, pads=(0, 0, 0, 0), names=("grey", "edges"), kind=None, strides=(1, 1)
 ):
     """A network of one convolution."""

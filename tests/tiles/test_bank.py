@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import textured
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_poses
 from orthonav.core.tiles.cells import CellLayout
@@ -19,17 +20,6 @@ GROUND_PX = 640
 MIDDLE = GROUND_PX / 2
 WHOLE = (256, 341)
 STEP_RAD, SCALE_STEP = math.radians(8), 0.13
-
-
-def ground(seed=0):
-    """Grey levels with detail of several sizes."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros((GROUND_PX, GROUND_PX), np.float32)
-    for sigma in (2.0, 5.0, 15.0):
-        noise = rng.normal(size=total.shape).astype(np.float32)
-        blots = cv2.GaussianBlur(noise, (0, 0), sigma)
-        total += blots / blots.std()
-    return np.clip(128 + 35 * total, 0, 255).astype(np.uint8)
 
 
 def warped(picture, shape, linear, at, flags=cv2.INTER_LINEAR):
@@ -51,7 +41,7 @@ class Place:
 
     def __init__(self, name="gradient", cells=8):
         self.representation = make_variant(represent.TABLE, name)
-        self.grey = ground()
+        self.grey = cv2.GaussianBlur(textured((GROUND_PX, GROUND_PX)), (0, 0), 1.5)
         valid = np.ones(self.grey.shape, bool)
         maps = self.representation(self.grey, valid)
         self.sheet = CellSheet(CellLayout.for_tiles(TILE_PX, 16), *self.grey.shape, len(maps))

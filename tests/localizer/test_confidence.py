@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.confidence import TILE_FEATURES, USUAL_TILES, LogisticConfidence
+from orthonav.core.localize.confidence import (
+    DEFAULT_TILE_CONFIDENCE,
+    TILE_FEATURES,
+    LogisticConfidence,
+)
 from orthonav.ground.build.calibrate import fit_few, fit_weights
 
 TRUTH = LogisticConfidence(-6.0, (5.0, 12.0))
@@ -45,7 +49,7 @@ def test_weights_are_never_negative(flip):
         assert (weight == 0) == (sign < 0)
 
 
-@pytest.mark.parametrize("usual", [USUAL_TILES, None])
+@pytest.mark.parametrize("usual", [DEFAULT_TILE_CONFIDENCE, None])
 def test_few_trials_move_the_usual_confidence_and_without_any_nothing_is_confident(usual):
     evidence = {"score": 0.6, "margin": 0.2}
     features, weight = np.tile([0.6, 0.2], (20, 1)), np.ones(20)

@@ -5,6 +5,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from pictures import everywhere, frozen, picture
 
 from orthonav.core.errors import MissingExtraError, VariantError
 from orthonav.core.variants import Variant, make_variant
@@ -13,27 +14,11 @@ from orthonav.research.segments import Segments
 TABLE = {"segments": Variant("orthonav.research.segments:Segments", extra="segments")}
 
 
-def frozen(array):
-    array.flags.writeable = False
-    return array
-
-
-def picture(shape=(96, 96), seed=0, blur=1.5):
-    """Blurred noise over the whole range of grey levels, read-only."""
-    noise = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
-    smooth = cv2.GaussianBlur(noise, (0, 0), blur).reshape(shape)
-    return frozen(cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8))
-
-
 def fields(levels=(60, 110, 170, 220), size=96, noise=4.0, seed=0):
     """Four fields of `levels` that meet in the middle, with a little noise."""
     grey = np.repeat(np.repeat(np.reshape(levels, (2, 2)), size // 2, 0), size // 2, 1)
     grey = grey + np.random.default_rng(seed).normal(0, noise, grey.shape)
     return frozen(grey.clip(0, 255).astype(np.uint8))
-
-
-def everywhere(grey):
-    return frozen(np.ones(grey.shape, dtype=bool))
 
 
 def drawn(grey, **parameters):

@@ -1,9 +1,9 @@
 """The whitened embedding: a view of a tile gives what the tile gave, however it came in."""
 
-import cv2
 import numpy as np
 import pytest
 
+from helpers import textured
 from orthonav.core.errors import AreaError, VariantError
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.cells import MICRO, CellLayout
@@ -12,16 +12,7 @@ from orthonav.core.variants import make_variant
 
 TILE_PX = 128
 SHEET_PX = 384
-
-
-def ground(seed=0, size=SHEET_PX):
-    """Grey levels with detail of several sizes."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros((size, size), np.float32)
-    for sigma in (1.5, 5.0, 15.0):
-        blots = cv2.GaussianBlur(rng.normal(size=(size, size)).astype(np.float32), (0, 0), sigma)
-        total += blots / blots.std()
-    return np.clip(128 + 35 * total, 0, 255).astype(np.uint8)
+SHEET = (SHEET_PX, SHEET_PX)
 
 
 def maps_of(grey, valid=None, name="gradient"):
@@ -48,7 +39,7 @@ class Place:
     """A sheet whose every part is imagery, and an embedder learnt on it."""
 
     def __init__(self, name="gradient", cells=8, dims=48, seed=0):
-        self.maps = maps_of(ground(seed), name=name)
+        self.maps = maps_of(textured(SHEET, seed), name=name)
         self.valid = np.ones((SHEET_PX, SHEET_PX), bool)
         self.sheet = sheet_of(self.maps, self.valid, 16)
         self.tiles_px = grid_px(16, 17)
@@ -83,7 +74,7 @@ def test_a_view_that_equals_a_tile_gives_its_embedding(any_place):
 def test_the_stride_does_not_matter_where_imagery_is_missing(place, stride_px):
     valid = place.valid.copy()
     valid[150:, 170:] = False
-    maps = maps_of(ground(), valid)
+    maps = maps_of(textured(SHEET), valid)
     sheet, tiles_px = sheet_of(maps, valid, stride_px), grid_px(stride_px)
     together = place.embedder.tiles(sheet, tiles_px)
     shares = sheet.valid_share(tiles_px)
@@ -129,8 +120,8 @@ def test_part_of_a_view_still_finds_its_tile(place, hidden):
 def test_what_is_hidden_does_not_matter(place):
     valid = np.ones((TILE_PX, TILE_PX), bool)
     valid[30:, 90:] = False
-    grey = ground()[:TILE_PX, :TILE_PX]
-    painted = np.where(valid, grey, ground(1)[:TILE_PX, :TILE_PX])
+    grey = textured(SHEET)[:TILE_PX, :TILE_PX]
+    painted = np.where(valid, grey, textured(SHEET, 1)[:TILE_PX, :TILE_PX])
     seen = [place.embedder.view(maps_of(one, valid), valid) for one in (grey, painted)]
     np.testing.assert_array_equal(*seen)
 

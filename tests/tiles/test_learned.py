@@ -5,7 +5,7 @@ import json
 import numpy as np
 import onnx
 import pytest
-from edge_networks import sharp, write
+from pictures import edge_network, everywhere, sharp
 
 from orthonav.core.errors import MapFileError, MissingExtraError, MissingFileError, VariantError
 from orthonav.core.localize import Localizer
@@ -22,11 +22,7 @@ DOUBLE = onnx.TensorProto.DOUBLE
 
 @pytest.fixture
 def network(tmp_path):
-    return write(tmp_path / "edges.onnx")
-
-
-def ones(grey):
-    return np.ones(grey.shape, bool)
+    return edge_network(tmp_path / "edges.onnx")
 
 
 def test_edges_are_where_the_network_is_positive(network):
@@ -35,7 +31,7 @@ def test_edges_are_where_the_network_is_positive(network):
     assert made.margin_px == 2 and made.channels == 1
     padded = np.pad(grey.astype(np.float64) / 255, 2, mode="edge")
     means = sum(padded[y : y + 40, x : x + 50] for y in range(5) for x in range(5)) / 25
-    np.testing.assert_array_equal(made(grey, ones(grey))[0], means - grey / 255 > 0.02)
+    np.testing.assert_array_equal(made(grey, everywhere(grey))[0], means - grey / 255 > 0.02)
 
 
 def test_a_map_stores_the_digest_and_not_the_path(network, monkeypatch):
@@ -51,7 +47,7 @@ def test_a_map_stores_the_digest_and_not_the_path(network, monkeypatch):
 
 def test_another_network_than_the_maps_is_refused(network, tmp_path, monkeypatch):
     plain = stored_representation(LearnedEdges(str(network)))
-    other = write(tmp_path / "other.onnx", kernel=sharp(threshold=0.03))
+    other = edge_network(tmp_path / "other.onnx", kernel=sharp(threshold=0.03))
     monkeypatch.setenv(VARIABLE, str(other))
     with pytest.raises(VariantError, match="another edge network"):
         variant_from_recipe(TABLE, plain, flying=True)
@@ -59,7 +55,7 @@ def test_another_network_than_the_maps_is_refused(network, tmp_path, monkeypatch
 
 def test_a_network_that_is_exchanged_in_flight_is_refused(network):
     made = LearnedEdges(str(network))
-    write(network, kernel=sharp(threshold=0.5))
+    edge_network(network, kernel=sharp(threshold=0.5))
     learned._network.cache_clear()
     with pytest.raises(VariantError, match="another edge network"):
         made(np.zeros((9, 9), np.uint8), np.ones((9, 9), bool))
@@ -79,7 +75,7 @@ def test_a_network_that_is_exchanged_in_flight_is_refused(network):
     ],
 )
 def test_a_network_of_another_shape_is_refused(tmp_path, fields, says):
-    path = write(tmp_path / "edges.onnx", **fields)
+    path = edge_network(tmp_path / "edges.onnx", **fields)
     with pytest.raises(VariantError, match=says):
         LearnedEdges(str(path))
 
@@ -88,11 +84,11 @@ def test_what_is_no_network_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "edges.onnx"
     with pytest.raises(MissingFileError, match="does not exist"):
         LearnedEdges(str(path))
-    for data in (b"", b"no network", write(path).read_bytes()[:-40]):
+    for data in (b"", b"no network", edge_network(path).read_bytes()[:-40]):
         path.write_bytes(data)
         with pytest.raises(VariantError, match="no network from"):
             LearnedEdges(str(path))
-    monkeypatch.setattr(learned, "LARGEST_BYTES", 3)
+    monkeypatch.setattr(learned, "MAX_BYTES", 3)
     with pytest.raises(VariantError, match="larger than"):
         LearnedEdges(str(path))
     monkeypatch.delenv(VARIABLE, raising=False)

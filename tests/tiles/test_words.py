@@ -1,6 +1,5 @@
 """Bags of visual words: frequencies of known features, and places distinguished by them."""
 
-import functools
 import subprocess
 import sys
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from helpers import textured
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe, describe
@@ -16,19 +16,7 @@ from orthonav.research.words import SheetWords, learn_words
 
 TABLE = {"bovw": Variant("orthonav.core.tiles.words:WordsRecipe")}
 NOTHING = np.zeros(0, np.float32)
-
-
-@functools.cache
-def area(seed=0, size=700):
-    """A picture of blots of many sizes, unlike itself everywhere."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros((size, size), np.float32)
-    for sigma in (1.5, 3.0, 8.0):
-        blots = cv2.GaussianBlur(rng.normal(size=(size, size)).astype(np.float32), (0, 0), sigma)
-        total += blots / blots.std()
-    grey = np.clip(128 + 32 * total, 0, 255).astype(np.uint8)
-    grey.flags.writeable = False
-    return grey
+AREA = textured((700, 700))
 
 
 def tiles(grey, size=128, step=96):
@@ -58,11 +46,11 @@ def random_embedder(words=300, seed=0, tfidf=0, **parameters):
 
 @pytest.fixture(scope="module")
 def learnt():
-    return learn_words(WordsRecipe(words=256), pictures_of(tiles(area())), seed=1)
+    return learn_words(WordsRecipe(words=256), pictures_of(tiles(AREA)), seed=1)
 
 
 def test_features_are_opencvs_sift():
-    grey = tiles(area())[0]
+    grey = tiles(AREA)[0]
     _, expected = cv2.SIFT.create(nfeatures=2000).detectAndCompute(grey, None)
     np.testing.assert_array_equal(describe(WordsRecipe(), grey, everywhere(grey)), expected)
 
@@ -87,16 +75,16 @@ def test_views_without_features_are_zero(similarity, tfidf):
     embedder = random_embedder(similarity=similarity, tfidf=tfidf)
     for grey in (np.full((128, 128), 90, np.uint8), np.zeros((16, 16), np.uint8)):
         assert not embedder.view(maps_of(grey), everywhere(grey)).any()
-    grey = tiles(area())[0]
+    grey = tiles(AREA)[0]
     blind = embedder.view(maps_of(grey), np.zeros(grey.shape, bool))
     assert not blind.any() and np.isfinite(blind).all()
 
 
 def test_features_that_see_invalid_pixels_are_dropped():
     """What lies there has no influence, and its border gives no features."""
-    grey = tiles(area(), size=192)[0]
+    grey = tiles(AREA, size=192)[0]
     valid = everywhere(grey)
-    valid[:, 96:] = False
+    valid[:, 86:] = False
     recipe = WordsRecipe()
     painted = np.where(valid, grey, 255).astype(np.uint8)
     kept, other = describe(recipe, grey, valid), describe(recipe, painted, valid)
@@ -111,7 +99,7 @@ def test_features_that_see_invalid_pixels_are_dropped():
 
 def test_places_are_found_again(learnt):
     """Views between the tiles, turned by 8 degrees and darker: the nearest tile is most alike."""
-    grey = area()
+    grey = AREA
     reference = learnt.views(np.stack([maps_of(tile) for tile in tiles(grey)]))
     starts = [(y, x) for y in range(0, 573, 96) for x in range(0, 573, 96)]
     turn = cv2.getRotationMatrix2D((349.5, 349.5), 8, 1)
@@ -133,7 +121,7 @@ def test_places_are_found_again(learnt):
 def test_words_of_a_tile_are_those_of_the_sheet_within_it(learnt, monkeypatch, block_px):
     """But for the few whose surroundings the edge of the tile cuts."""
     monkeypatch.setattr("orthonav.research.words.BLOCK_PX", block_px)
-    grey, corners = area(), np.array([[96, 192], [500, 11]])
+    grey, corners = AREA, np.array([[96, 192], [500, 11]])
     shares = []
     found = SheetWords.find(learnt, grey, everywhere(grey), shares.append)
     assert shares[-1] == 1 and len(shares) == (4 if block_px == 400 else 1)
@@ -144,7 +132,7 @@ def test_words_of_a_tile_are_those_of_the_sheet_within_it(learnt, monkeypatch, b
 
 
 def test_words_of_a_tile_are_those_of_its_strongest_features(learnt):
-    grey, recipe = area(), WordsRecipe(words=256, max_features=20)
+    grey, recipe = AREA, WordsRecipe(words=256, max_features=20)
     few = WordsEmbedder(recipe, learnt.vocabulary, NOTHING)
     valid = everywhere(grey)
     valid[:, 300:] = False
@@ -154,13 +142,10 @@ def test_words_of_a_tile_are_those_of_its_strongest_features(learnt):
     assert view.sum() == pytest.approx(1) and found.points[:, 0].max() < 300
 
 
-@pytest.mark.parametrize("greys", [[], [np.zeros((64, 64), np.uint8)], [area(size=100)]])
+@pytest.mark.parametrize("greys", [[], [np.zeros((64, 64), np.uint8)], [textured((100, 100))]])
 def test_too_few_features_are_refused(greys):
     with pytest.raises(VariantError, match=r"1024 words cannot be learned from \d+ features"):
         learn_words(WordsRecipe(), pictures_of(greys))
-
-
-# SuperPoint.
 
 
 # Values.

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from edge_networks import write
+from pictures import edge_network, everywhere, frozen, picture
 
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.represent import TABLE, Canny, Gray, OrientedGradients
@@ -17,25 +17,8 @@ SHAPES = [(1, 1), (1, 40), (2, 3), (16, 16), (33, 47), (64, 64), (256, 255)]
 def variant(request, monkeypatch, tmp_path):
     """Every entry of the table, with its defaults; edges by a network with a small one."""
     if request.param == "onnx":
-        monkeypatch.setenv("ORTHONAV_EDGES", str(write(tmp_path / "edges.onnx")))
+        monkeypatch.setenv("ORTHONAV_EDGES", str(edge_network(tmp_path / "edges.onnx")))
     return make_variant(TABLE, request.param)
-
-
-def picture(shape=(96, 96), seed=0, blur=1.5):
-    """Blurred noise over the whole range of grey levels, read-only."""
-    noise = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
-    smooth = cv2.GaussianBlur(noise, (0, 0), blur).reshape(shape)
-    grey = cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8).reshape(shape)
-    return frozen(grey)
-
-
-def frozen(array):
-    array.flags.writeable = False
-    return array
-
-
-def everywhere(grey):
-    return frozen(np.ones(grey.shape, dtype=bool))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
