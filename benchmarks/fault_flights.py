@@ -284,7 +284,7 @@ class FaultFlight:
         self.runner = Runner(
             self._newest,
             CAMERA,
-            locator(self),
+            lambda: locator(self),
             publisher,
             FlyOptions(map_change=map_change),
             clocks,

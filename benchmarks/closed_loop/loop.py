@@ -220,7 +220,7 @@ class Sight:
             result = self._watch.view(result, telemetry.time_ns)
             outcome = result.outcome
             made = estimate_from_result(result, clock=Clock.BOOT, processing_s=LATENCY_S)
-        admitted = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
+        admitted, _ = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
         stated = None if admitted is None else self.stated(admitted, telemetry.time_ns)
         return self._judged(time_s, truth, estimate, outcome, stated), admitted
 

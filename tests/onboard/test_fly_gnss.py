@@ -11,7 +11,7 @@ from fake_autopilot import MS, FakeLocator, S, fix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_fly import AHEAD_NS, Flight
 
-from orthonav.cli.flying import gnss_watch
+from orthonav.cli.flying import _interrupted
 from orthonav.core.flight.gnss import FAULTS, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import ViewResult
@@ -29,10 +29,12 @@ class Watched(Flight):
 
     def __init__(self, tmp_path, receiver="gps_raw_int", **options):
         known = options.pop("known", {})
-        super().__init__(tmp_path, FakeLocator(lambda view: self.seen()), **options)
         self.off_m, self.fix_type, self.receiver, self.north_m = np.zeros(2), 3, receiver, 0.0
-        self.watch = GnssWatch(FRAME, live_solutions(self.link.gnss), digest="d", known=known)
-        self.runner._gnss = self.watch
+        solved = deque()
+        self.watch = GnssWatch(FRAME, live_solutions(solved), digest="d", known=known)
+        locator = FakeLocator(lambda view: self.seen())
+        super().__init__(tmp_path, locator, gnss=self.watch, **options)
+        self.link.gnss = solved
         self.frames, write = [], self.port.write
         self.port.write = lambda data: (self.frames.append(bytes(data)), write(data))
 
@@ -168,11 +170,16 @@ def test_the_reference_survives_a_restart_in_flight(tmp_path, age_s, east_m):
     dragged = replace(before, mean=np.array([14.0, 0, 0, 0, 0]))
     saved = {**dragged.to_plain(), "reference": before.to_plain()}
     save(path, SavedState(48.0, 2.0, 5.0, utc_ns=1000 * S), {"d": saved})
-    options = Namespace(state=path, state_max_age_s=300.0, recorded_telemetry=False, ros2=False)
     clocks = Clocks(utc_ns=lambda: (1000 + age_s) * S)
     for _ in range(2):
         solutions = deque()
-        watch = gnss_watch(options, FRAME, "d", (), solutions, 0.9, clocks)
+        watch = GnssWatch(
+            FRAME,
+            live_solutions(solutions),
+            digest="d",
+            known=learnt_biases(path),
+            reference=_interrupted(Namespace(state=path), "d", clocks),
+        )
         made = watch.maps()
         solutions.append(GnssSample(S, S, 48.0, 2.0, 3))
         watch.tick(S)
@@ -293,5 +300,5 @@ def test_the_displacement_of_an_earlier_flight_corrects_a_flight_without_gnss():
 
 def test_a_watch_without_solutions_reports_nothing():
     watch = GnssWatch(FRAME, live_solutions(deque()))
-    assert watch.tick(10**12) == [] and watch.reasons == () and watch.plain() == []
+    assert watch.tick(10**12) == [] and watch.reasons() == () and watch.plain() == []
     assert watch.maps() == {} and math.isnan(watch.difference_m)

@@ -23,7 +23,11 @@ from helpers import wait_for
 
 pytestmark = pytest.mark.long
 PEER = Path(__file__).with_name("rclpy_peer.py")
-FLY = "-c", "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))", "fly"
+PROGRAM = (
+    "import sys; from orthonav.cli import main; from orthonav.onboard import fly;"
+    "fly.MAX_AGE_S = 5.0; sys.exit(main(sys.argv[1:]))"
+)
+FLY = "-c", PROGRAM, "fly"
 HEADING, SPEED_MPS, COUNT, EVERY_S = 60.0, 14.0, 40, 0.4
 ENOUGH = 5
 LONGEST_S = 120.0
@@ -139,7 +143,7 @@ def test_a_flight_in_a_graph(flown, fly, hear, tmp_path, simulated):
     ros = [*INPUTS, "-p", "covariance:=fix", "-p", "altitude:=321"]
     ros += ["-p", f"use_sim_time:={str(simulated).lower()}"]
     outputs = "--log", tmp_path / "log.mcap", "--jsonl", lines
-    flying = fly(path, "--deadline-ms", "5000", *outputs, ros=ros)
+    flying = fly(path, *outputs, ros=ros)
     reminder = "no message on /cam/camera_info"
     flying.wait_for(lambda: reminder in flying.said())
 

@@ -154,8 +154,8 @@ class GnssWatch:
                 texts.append(text)
         return texts
 
-    @property
-    def reasons(self) -> tuple[str, ...]:
+    def reasons(self, now_ns: int = 0) -> tuple[str, ...]:
+        """Reasons of health by the last judgements."""
         found = [monitor.status.reason for monitor in self._monitors.values()]
         if not self._learnt.is_plausible:
             found.append(DISPLACED)

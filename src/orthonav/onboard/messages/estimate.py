@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from orthonav.core.errors import OrthonavError
 from orthonav.core.records import CONFIDENT, Fix, ViewResult, error_ellipse
 
-AVERAGING_S = 3.0
-"""Over which the filters of autopilots average positions (docs/decisions/correlated-errors.md)."""
-
 
 class EstimateError(OrthonavError, ValueError):
     """An estimate is invalid, or the requested message cannot represent it."""
@@ -42,7 +39,6 @@ class NavigationEstimate:
     `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
     `state`: state of the track; None for views that are located one by one.
     `reset_counter`: 0 to 255; changes when the position jumped.
-    `dead_reckoned`: the view did not show the map; only a message that can mark it is made.
     """
 
     lat_deg: float
@@ -58,7 +54,6 @@ class NavigationEstimate:
     vel_cov_en: NDArray[np.float64] | None = None
     state: str | None = None
     reset_counter: int = 0
-    dead_reckoned: bool = False
     protection_level_m: float = math.inf
     accepted: bool = True
 
@@ -168,16 +163,17 @@ def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
     return np.eye(2) * std_mps**2 if math.isfinite(std_mps) else None
 
 
-def messages_averaged(interval_s: float) -> float:
+def messages_averaged(interval_s: float, averaging_s: float = 3.0) -> float:
     """Number of messages, 1 or more, that a receiver averages.
 
-    Errors of consecutive fixes (of the map, the tilt, the track) last longer than that: a receiver
-    that takes n of them as independent claims n times too small a variance.
+    Errors of consecutive fixes (of the map, the tilt, the track) last longer than the filters of
+    autopilots average (docs/decisions/correlated-errors.md): a receiver that takes n of them as
+    independent claims n times too small a variance.
 
     `interval_s`: since the message before; infinite for the first. After a clock was set back it
     counts as infinite.
     """
-    return max(AVERAGING_S / interval_s, 1.0) if interval_s > 0 else 1.0
+    return max(averaging_s / interval_s, 1.0) if interval_s > 0 else 1.0
 
 
 def for_filter(

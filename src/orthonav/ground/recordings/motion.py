@@ -1,4 +1,4 @@
-"""Motion of the picture between consecutive images, as seen and as the autopilot reports it.
+"""Motion of the picture between consecutive images, as seen and as the telemetry reports it.
 
 Both are given as the rotation about the optical axis and the displacement of the centre of the
 picture, so that they can be compared. Corners are tracked (Shi and Tomasi 1994; Lucas and Kanade in
@@ -36,8 +36,6 @@ TRIMMED = 0.2
 """Fraction of the pairs, those that fit worst, that is left out of the explained share."""
 KEEP_S = 60.0
 """States are kept for so long: the longest latency, 30 s of motion, and some more."""
-GAP_S = 0.3
-"""Longest interval between states that is interpolated, unless the history says otherwise."""
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 Grey = NDArray[np.uint8]
@@ -181,7 +179,8 @@ def reported_motion(
 
 
 class StateHistory:
-    def __init__(self, gap_s: float = GAP_S) -> None:
+    def __init__(self, gap_s: float) -> None:
+        """`gap_s`: longest interval between states that is interpolated."""
         self._gap_ns = round(gap_s * 1e9)
         self._times: Times = np.zeros(0, np.int64)
         self._rows: Array = np.zeros((0, 13))
@@ -217,12 +216,6 @@ class StateHistory:
         before, after = (each[:, :9].reshape(-1, 3, 3) for each in (start, end))
         return reported_motion(before, after, velocity, height, seconds)
 
-    def velocity(self, times_ns: Times) -> Array:
-        return self._at(times_ns)[:, 9:11]
-
-    def height_m(self, times_ns: Times) -> Array:
-        return self._at(times_ns)[:, 12]
-
     def _at(self, times_ns: Times) -> Array:
         if len(self._times) < 2:
             return np.full((len(times_ns), 13), math.nan)
@@ -240,12 +233,12 @@ def varying(values: Array, seconds: Array) -> Array:
     return np.asarray(values - rates * seconds[:, None])
 
 
-def explained_part(seen: Array, off: Array, least: float, least_off: float = 0.0) -> float:
+def explained_part(seen: Array, off: Array, least: float) -> float:
     """Share of seen motion (N, K) that is explained, `off`: seen less reported; NaN where neither
-    is at least `least`, or `off` is less than `least_off`."""
+    is at least `least`."""
     seen2, off2 = np.square(seen).sum(axis=1), np.square(off).sum(axis=1)
     modelled2 = np.square(seen - off).sum(axis=1)  # reported motion that is not seen counts too
     used = np.argsort(off2)[: round((1 - TRIMMED) * len(off2))]
     moved = max(float(seen2[used].mean()), float(modelled2[used].mean()))
     left = float(off2[used].mean())
-    return 1 - left / moved if moved > least**2 and left >= least_off**2 else math.nan
+    return 1 - left / moved if moved > least**2 else math.nan
