@@ -17,7 +17,7 @@ from recorders import picture
 from rosbags.typesys import Stores
 from scipy.spatial.transform import Rotation
 
-from orthonav.core.errors import CameraError
+from orthonav.core.errors import CameraError, VariantError
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import ViewResult
@@ -30,7 +30,6 @@ from orthonav.onboard.messages.estimate import (
 )
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import Publisher
-from orthonav.onboard.ros2.arguments import ros_arguments
 from orthonav.onboard.ros2.node import Rosout
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader, loses_images
@@ -48,7 +47,7 @@ class Reading:
 
     def __init__(self, *words, image=IMAGE, **environment):
         words = ["-r", f"image:={image}", *REMAPPED, *words]
-        self.node = MemoryNode(ros_arguments(words, environment))
+        self.node = MemoryNode(words, environment.get("ROS_DISTRO", ""))
         self.time, self.deadline_ns = self.node.time, 0
         stopped = lambda: self.time.now_ns > self.deadline_ns  # noqa: E731
         self.reader = Ros2Reader(self.node, TelemetryBuffer(), self.time.clocks, stopped)
@@ -375,7 +374,7 @@ class Publishing:
 
     def __init__(self, *words, **options):
         self.time = Time()
-        self.node = MemoryNode(ros_arguments(words, {}))
+        self.node = MemoryNode(words)
         self.out = Ros2Publisher(self.node, FRAME, lambda: 5 * S, **options)
         self.gate = Gate(GateRules(), Clock.BOOT)
         self.whole = Publisher(self.gate, self.time.clocks, graph=self.out)
@@ -502,14 +501,21 @@ def test_the_origin_is_latched_for_later_subscribers():
     assert flying.node.latched == {ORIGIN}
 
 
-def test_names_follow_the_namespace_and_the_rules():
-    words = ["-r", "__ns:=/uav", "-r", "__node:=down", "-r", "~/fix:=/gps/fix"]
-    heard = Publishing(*words).node.kinds
-    assert set(heard) == {"/gps/fix", "/uav/down/pose", "/uav/down/origin", "/diagnostics"}
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("altitude:=high", "'high'"),
+        ("covariance:=mine", "filter or fix"),
+        ("image_transport:=theora", "raw or compressed"),
+    ],
+)
+def test_invalid_parameters_are_named(given, said):
+    with pytest.raises(VariantError, match=said):
+        MemoryNode(["-p", given])
 
 
 def test_health_is_a_diagnostic():
-    flying = Publishing("-r", "__node:=down")
+    flying = Publishing()
     for level, reasons in (("OK", []), ("DEGRADED", ["lost"]), ("FAILED", ["no_camera"])):
         flying.whole.health(
             {"health": level, "reasons": reasons, "state": None, "counts": {"late": 2}}
@@ -519,7 +525,7 @@ def test_health_is_a_diagnostic():
     assert [each.status[0].message for each in found] == ["OK", "lost", "no_camera"]
     values = {each.key: each.value for each in found[1].status[0].values}
     assert values == {"health": "DEGRADED", "reasons": "lost", "state": "", "counts.late": "2"}
-    assert found[0].status[0].name == "down: position" and found[0].header.stamp.sec == 5
+    assert found[0].status[0].name == "orthonav: position" and found[0].header.stamp.sec == 5
 
 
 def test_health_names_topics_that_cannot_match_while_that_lasts():
@@ -561,7 +567,6 @@ def test_conflicting_options_end_with_one_line(map_path, run):
         (["--ros2", "--autopilot", "udpin:0"], "--ros2 replaces"),
         (["--ros-args", "-r", "a:=b"], "needs --ros2"),
         ([], "--ros2"),
-        (["--ros2", "--ros-args", "-r", "a"], "FROM:=TO"),
     ):
         done = run("fly", map_path, *words)
         assert done.code == 2 and said in done.err and done.err.count("\n") == 1

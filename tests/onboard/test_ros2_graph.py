@@ -205,6 +205,28 @@ def test_types_and_qos_that_do_not_match_are_named(flown, env, fly, distribution
     assert flying.stop() == 0, flying.said()
 
 
+def test_names_follow_the_namespace_and_parameters_the_file(flown, fly, tmp_path):
+    params = tmp_path / "params.yaml"
+    params.write_text("/**:\n  ros__parameters: {image_transport: compressed, altitude: 12.5}\n")
+    words = [*INPUTS, "-r", "__ns:=/uav", "-r", "__node:=down", "--params-file", params]
+    flying = fly(flown[0], ros=list(map(str, words)))
+    flying.wait_for(lambda: "no message on /cam/camera_info" in flying.said())
+    assert flying.stop() == 0, flying.said()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["-r", "image"], 1, "Couldn't parse remap rule: '-r image'"),
+        (["-p", "covariance:=mine"], 2, "filter or fix, got 'mine'"),
+    ],
+)
+def test_invalid_arguments_are_one_line(flown, fly, words, code, said):
+    flying = fly(flown[0], ros=words)
+    assert flying.process.wait(LONGEST_S) == code, flying.said()
+    assert said in flying.said().splitlines()[-1] and "Traceback" not in flying.said()
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_the_wait_for_a_camera(flown, fly, number):
     flying = fly(flown[0])

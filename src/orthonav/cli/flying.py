@@ -176,15 +176,14 @@ class _Setup:
     def _ros2(self) -> "tuple[Any, Ros2Publisher]":
         """Reader and publisher of a new node. The centre of the map is the origin of the ROS map
         frame unless `--origin` is given."""
-        from orthonav.onboard.ros2.arguments import ros_arguments
         from orthonav.onboard.ros2.node import Node, Rosout
         from orthonav.onboard.ros2.publisher import Ros2Publisher
         from orthonav.onboard.ros2.reader import Ros2Reader
 
         options = self.options
-        node = Node(ros_arguments(options.ros_args, os.environ))
+        node = Node(options.ros_args, os.environ.get("ROS_DISTRO", ""))
         self.stack.callback(node.close)
-        if "--disable-rosout-logs" not in node.arguments.passed:
+        if "--disable-rosout-logs" not in options.ros_args:
             rosout, logger = Rosout(node), logging.getLogger("orthonav")
             logger.addHandler(rosout)
             self.stack.callback(logger.removeHandler, rosout)

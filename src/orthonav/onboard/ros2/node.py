@@ -13,7 +13,7 @@ from typing import Any
 
 from orthonav.core.errors import MissingExtraError, OutputError, described
 from orthonav.core.extras import needed
-from orthonav.onboard.ros2.arguments import RosArguments
+from orthonav.onboard.ros2.parameters import Parameters, declared
 
 log = logging.getLogger(__name__)
 TIME_NS = 10**9
@@ -83,39 +83,59 @@ class Node:
     match. `undecodable` counts damaged messages by topic.
     """
 
-    def __init__(self, arguments: RosArguments) -> None:
-        """Raises `MissingExtraError`, or `OutputError` where the middleware cannot join."""
-        self.arguments, self.definitions = arguments, Definitions(arguments.distro)
+    def __init__(self, words: Sequence[str] = (), distro: str = "") -> None:
+        """`words`: those after `--ros-args`. `distro`: whose message definitions, see there.
+
+        Raises `MissingExtraError`, `VariantError` for an invalid parameter, or `OutputError` where
+        the middleware cannot join or does not take the words.
+        """
+        self.definitions = Definitions(distro)
         self.problems: dict[str, str] = {}
         self.undecodable: Counter[str] = Counter()
         self._said: set[tuple[str, str]] = set()
         self._subscriptions: list[tuple[Any, str]] = []
         self._publishers: list[tuple[Any, str]] = []
         self._handled = 0
-        self._join()
+        self.name, self.full_name = self._join(words)
+        self.parameters: Parameters = declared(self._declared)
 
-    def _join(self) -> None:
+    def _join(self, words: Sequence[str]) -> tuple[str, str]:
+        """Name of the node, and with its namespace."""
         rclpy, self._qos = _ros_module("rclpy"), _ros_module("rclpy.qos")
         signals, executors = _ros_module("rclpy.signals"), _ros_module("rclpy.executors")
-        arguments = self.arguments
+        self._context = rclpy.Context()
         try:
-            self._context = rclpy.Context()
             rclpy.init(
-                args=["--ros-args", *arguments.passed],
+                args=["--ros-args", *words],
                 context=self._context,
                 signal_handler_options=signals.SignalHandlerOptions.NO,
             )
             self._node = rclpy.create_node(
-                arguments.node,
-                namespace=arguments.namespace,
+                "orthonav",
                 context=self._context,
-                use_global_arguments=False,  # names are resolved already
                 enable_rosout=False,  # see `Rosout`
             )
-        except Exception as error:  # of the middleware
+        except Exception as error:  # of the middleware, and of its parser of arguments
             raise OutputError(f"cannot join the ROS graph: {described(error)}") from error
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
+        return self._node.get_name(), self._node.get_fully_qualified_name()
+
+    def _declared(self, name: str, default: Any) -> Any:
+        """Value of a parameter, which may be given in another type."""
+        if self._node.has_parameter(name):
+            return self._node.get_parameter(name).value
+        messages = _ros_module("rcl_interfaces.msg")
+        descriptor = messages.ParameterDescriptor(dynamic_typing=True)
+        return self._node.declare_parameter(name, default, descriptor).value
+
+    def resolved(self, topic: str) -> str:
+        """Absolute name of a topic after remapping."""
+        return str(self._node.resolve_topic_name(topic))
+
+    def is_remapped(self, topic: str) -> bool:
+        expanded = self._node.resolve_topic_name(topic, only_expand=True)
+        return bool(self._node.resolve_topic_name(topic) != expanded)
 
     def subscribe(
         self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
@@ -250,9 +270,7 @@ class Rosout(logging.Handler):
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._node = node
-        self._write = node.advertise(
-            node.arguments.resolved("/rosout"), _LOG, depth=100, latched=True
-        )
+        self._write = node.advertise(node.resolved("/rosout"), _LOG, depth=100, latched=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         definitions = self._node.definitions
@@ -261,7 +279,7 @@ class Rosout(logging.Handler):
                 _LOG,
                 stamp=definitions.time(round(record.created * 1e9)),
                 level=min(record.levelno, logging.CRITICAL),
-                name=self._node.arguments.full_name.strip("/").replace("/", "."),
+                name=self._node.full_name.strip("/").replace("/", "."),
                 msg=record.getMessage(),
                 file=record.pathname,
                 function=record.funcName or "",
