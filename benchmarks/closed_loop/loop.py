@@ -33,7 +33,7 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import MAP_STD_M, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import FrozenCheck
-from orthonav.onboard.gnss.biases import DIFFERENTIAL
+from orthonav.onboard.gnss.monitor import DIFFERENTIAL
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
 from orthonav.onboard.messages.estimate import (
     Clock,
