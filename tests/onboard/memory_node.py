@@ -8,8 +8,8 @@ from orthonav.onboard.ros2.node import Node
 
 
 class MemoryNode(Node):
-    """`time` goes on while it waits in vain. `heard`: messages by topic. `mismatched`: topics whose
-    endpoints do not match. `latched`, `reliable`: topics with such a writer or reader of ours."""
+    """`time` goes on while it waits in vain. `heard`: messages by topic. `latched`, `reliable`:
+    topics with such a writer or reader of ours."""
 
     def __init__(self, words=(), distro=""):
         pairs = zip(words[::2], words[1::2], strict=True)
@@ -17,7 +17,7 @@ class MemoryNode(Node):
         for flag, text in pairs:
             name, _, value = text.partition(":=")
             self._given[flag][name] = value
-        self.time, self.heard, self.mismatched = Time(), defaultdict(list), {}
+        self.time, self.heard = Time(), defaultdict(list)
         self.latched, self.reliable, self.kinds = set(), set(), {}
         self._handlers, self._waiting = {}, deque()
         super().__init__(words, distro)
@@ -64,6 +64,3 @@ class MemoryNode(Node):
 
     def close(self):
         """Nothing to leave."""
-
-    def _mismatches(self):
-        return self.mismatched

@@ -181,16 +181,14 @@ def test_a_flight_in_a_graph(flown, fly, hear, tmp_path, simulated):
 
 
 def test_types_and_qos_that_do_not_match_are_named(flown, env, fly, distribution):
-    """A camera with best effort where every part is wanted, a number in place of a range, a
-    subscriber that wants positions of before it came."""
+    """By `rclpy`: a camera with best effort where every part is wanted, a subscriber that wants
+    positions of before it came."""
     flying = fly(flown[0], ros=[*INPUTS, "-p", "image_reliability:=reliable"])
     words = [distribution[1], PEER, "odd", "--seconds", str(LONGEST_S)]
     odd = subprocess.Popen(words, env=env, stderr=subprocess.PIPE, text=True)
-    qos = "has QoS that does not match ours:"
     named = (
-        f"topic /cam/image_raw a publisher {qos} reliability",
-        "topic /range is of type std_msgs/msg/Float64; expected sensor_msgs/msg/Range",
-        f"topic /orthonav/fix a subscriber {qos} durability",
+        "'/cam/image_raw', offering incompatible QoS",
+        "'/orthonav/fix', requesting incompatible",
     )
 
     def all_named():

@@ -79,8 +79,8 @@ class Definitions:
 class Node:
     """Reads and writes topics. `spin` is for one thread, writers are for any.
 
-    `problems` says by topic why little or nothing can flow there: another type, QoS that does not
-    match. `undecodable` counts damaged messages by topic.
+    `problems` says by topic why little flows there; `rclpy` logs types and QoS that do not match.
+    `undecodable` counts damaged messages by topic.
     """
 
     def __init__(self, words: Sequence[str] = (), distro: str = "") -> None:
@@ -93,8 +93,7 @@ class Node:
         self.problems: dict[str, str] = {}
         self.undecodable: Counter[str] = Counter()
         self._said: set[tuple[str, str]] = set()
-        self._subscriptions: list[tuple[Any, str]] = []
-        self._publishers: list[tuple[Any, str]] = []
+        self._subscriptions: list[Any] = []
         self._handled = 0
         self.name, self.full_name = self._join(words)
         self.parameters: Parameters = declared(self._declared)
@@ -154,7 +153,7 @@ class Node:
             made = self._node.create_subscription(message, topic, take, qos, raw=True)
         except Exception as error:  # of the middleware
             raise OutputError(f"cannot subscribe to {topic}: {described(error)}") from error
-        self._subscriptions.append((made, kind))
+        self._subscriptions.append(made)
 
     def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
         """A writer of `topic` (resolved already): reliable, and transient local if `latched`.
@@ -169,14 +168,13 @@ class Node:
             return lambda message: None
         except Exception as error:  # of the middleware
             raise OutputError(f"cannot publish on {topic}: {described(error)}") from error
-        self._publishers.append((made, kind))
         return self._writing(topic, made.publish)
 
     def spin(self, timeout_s: float) -> int:
         """Wait at most so long for messages and handle those that are there; how many."""
         self._handled = 0
         self._executor.spin_once(timeout_s)
-        for made, _ in self._subscriptions:  # spin_once handles one message
+        for made in self._subscriptions:  # spin_once handles one message
             with made.handle:
                 for _ in range(made.qos_profile.depth):
                     taken = made.handle.take_message(made.msg_type, True)
@@ -191,37 +189,13 @@ class Node:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def check_graph(self, others: Mapping[str, str]) -> None:
-        """Look for endpoints that cannot match now, beside `others`, further problems by topic;
-        each problem is logged once."""
-        self.problems = {**others, **self._mismatches()}
-        for topic, text in self.problems.items():
+    def note(self, problems: Mapping[str, str]) -> None:
+        """Take these problems by topic as the present ones; each is logged once."""
+        self.problems = dict(problems)
+        for topic, text in problems.items():
             if (topic, text) not in self._said:
                 self._said.add((topic, text))
                 log.warning("topic %s %s", topic, text)
-
-    def _mismatches(self) -> dict[str, str]:
-        """Topics whose endpoints cannot match now, and why."""
-        found: dict[str, str] = {}
-        for made, kind in self._subscriptions:
-            for other in self._node.get_publishers_info_by_topic(made.topic_name):
-                why = self._mismatch(other.qos_profile, made.qos_profile, "a publisher")
-                _note(found, made.topic_name, kind, other.topic_type, why)
-        for made, kind in self._publishers:
-            for other in self._node.get_subscriptions_info_by_topic(made.topic_name):
-                why = self._mismatch(made.qos_profile, other.qos_profile, "a subscriber")
-                _note(found, made.topic_name, kind, other.topic_type, why)
-        return found
-
-    def _mismatch(self, offered: Any, requested: Any, other: str) -> str:
-        """Why a subscription does not match a publisher; "" where it does."""
-        reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
-        policy = ""
-        if requested.reliability == reliability.RELIABLE != offered.reliability:
-            policy = "reliability"
-        elif requested.durability == durability.TRANSIENT_LOCAL != offered.durability:
-            policy = "durability"
-        return f"{other} has QoS that does not match ours: {policy}" if policy else ""
 
     def _made_qos(self, depth: int, *, reliable: bool, latched: bool = False) -> Any:
         reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
@@ -249,14 +223,6 @@ class Node:
             if not self.undecodable[topic]:
                 log.warning("message on %s cannot be used (%s)", topic, described(error))
             self.undecodable[topic] += 1
-
-
-def _note(found: dict[str, str], topic: str, kind: str, other_kind: str, why: str) -> None:
-    """Note that an endpoint of our topic has another type, or `why` it does not match."""
-    if other_kind != kind:
-        why = f"is of type {other_kind}; expected {kind}"
-    if why:
-        found.setdefault(topic, why)
 
 
 def _message(kind: str) -> Any:
