@@ -43,7 +43,7 @@ from orthonav.core.records import (
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.simulate.render import ViewEffects
 from orthonav.onboard.latency import MISMATCH, LatencyMonitor
-from orthonav.onboard.messages.estimate import Clock, estimate_from_result
+from orthonav.onboard.messages.estimate import estimate_from_result
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
 from orthonav.onboard.telemetry import (
@@ -391,7 +391,7 @@ def replay(
         "track": Tracker(area.localizer),
         "fly": Monitored(Tracker(area.localizer), buffer),
     }
-    gates = {name: Gate(clock=Clock.BOOT) for name in methods}
+    gates = {name: Gate() for name in methods}
     autopilot, _, _ = flight.name.partition("_")
     rows, alone = [], 0
     for exposure, view in recorded.views(area, work / "views", partial(rule, autopilot), buffer):
@@ -423,7 +423,7 @@ def _row(
     outcome, latency_ms = locate_view(locator, view)
     state = locator.state_name
     result = ViewResult(str(exposure.number), exposure.time_ns, outcome, latency_ms, state)
-    admitted, _ = gate.admit(estimate_from_result(result, clock=Clock.BOOT), exposure.time_ns)
+    admitted, _ = gate.admit(estimate_from_result(result), exposure.time_ns)
     error = cov = None
     confidence, velocity_off = 0.0, np.nan
     if isinstance(outcome, Fix):

@@ -52,7 +52,6 @@ from orthonav.onboard.console import Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level
 from orthonav.onboard.link import AutopilotLink
-from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import JsonOut, Messenger, Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
@@ -110,7 +109,7 @@ class Flight:
         self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
         clocks = self.time.clocks
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
-        self.gate = Gate(rules or GateRules(), Clock.BOOT)
+        self.gate = Gate(rules)
         self.lines, self.said, self.newest = tmp_path / "lines.jsonl", Said(), NewestImage()
         narrator = Narrator(
             *(self.said, clocks, self.newest, "images from 0", self.link, "udpin:1"),

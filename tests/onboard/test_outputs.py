@@ -16,7 +16,7 @@ from fake_autopilot import UTC_NS, S, Time, fix
 from orthonav.core.errors import VariantError
 from orthonav.core.flight.fixes import result_from_json
 from orthonav.core.records import NoFix, ViewResult
-from orthonav.onboard.messages.estimate import Clock, NavigationEstimate, messages_averaged
+from orthonav.onboard.messages.estimate import NavigationEstimate, messages_averaged
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.messages.mavlink import Autopilot, Origin, Packer, Target, north_east_m
 from orthonav.onboard.outputs import (
@@ -32,7 +32,7 @@ from wire import decode
 
 ORIGIN = Origin(48.0, 2.0, 100.0)
 ESTIMATE = NavigationEstimate(
-    48.01, 2.01, np.eye(2) * 9.0, 0.97, utc_ns=UTC_NS, boot_ns=1, vel_en_mps=(3.0, 4.0)
+    48.01, 2.01, np.eye(2) * 9.0, 0.97, utc_ns=UTC_NS, time_ns=1, vel_en_mps=(3.0, 4.0)
 )
 VEHICLE = VehicleState(np.eye(3), 100.0, (4.0, 3.0, 0.1), -90.0)
 
@@ -44,7 +44,7 @@ class Sending:
         self.time, self.frames, self.is_open = Time(), [], True
         self.kind, self.target, self.armed = Autopilot.PX4, Target(1, 1), False
         self.origin = ORIGIN
-        self.gate = Gate(rules or GateRules(), Clock.BOOT)
+        self.gate = Gate(rules)
         kinds = kinds or ("global-position",)
         self.messenger = Messenger(self.gate, self, self.time.clocks, kinds=kinds, **options)
         self.packer = Packer()
@@ -176,7 +176,7 @@ def test_the_gate_judges_the_accuracy_of_the_fix():
     sending = Sending(rules=GateRules(max_std_m=4.0))
     for _ in range(3):
         now_ns = sending.time.now_ns
-        sending.publish(sending.gate.admit(replace(ESTIMATE, boot_ns=now_ns), now_ns).estimate)
+        sending.publish(sending.gate.admit(replace(ESTIMATE, time_ns=now_ns), now_ns).estimate)
         sending.time.go(0.2)
     assert len(sending.frames) == 3 and not sending.gate.withheld
     assert sending.frames[-1]["eph"] > 4.0
@@ -240,7 +240,7 @@ class Written:
 
 def test_nmea_times_are_those_of_exposures_and_never_step_back():
     time, sink = Time(), Written()
-    gate = Gate(GateRules(), Clock.BOOT)
+    gate = Gate()
     publisher = Publisher(gate, time.clocks, nmea=[NmeaOut(sink)])
     begin_ns = time.now_ns
     ages_s = [(0.1, False), (0.4, True), (0.1, True), (0.3, False), (0.2, True)]

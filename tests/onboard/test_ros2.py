@@ -23,12 +23,11 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import ViewResult
 from orthonav.ground.recordings.opening import open_source
 from orthonav.onboard.messages.estimate import (
-    Clock,
     EstimateError,
     NavigationEstimate,
     messages_averaged,
 )
-from orthonav.onboard.messages.gate import Gate, GateRules
+from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.ros2.node import Rosout
 from orthonav.onboard.ros2.publisher import Ros2Publisher
@@ -374,7 +373,7 @@ class Publishing:
         self.time = Time()
         self.node = MemoryNode(words)
         self.out = Ros2Publisher(self.node, FRAME, lambda: 5 * S, **options)
-        self.gate = Gate(GateRules(), Clock.BOOT)
+        self.gate = Gate()
         self.whole = Publisher(self.gate, self.time.clocks, graph=self.out)
         self.heard = self.node.heard
 
@@ -479,7 +478,7 @@ def test_withheld_positions_are_not_published(changes, reason):
 def test_the_publisher_itself_refuses_a_low_confidence():
     with pytest.raises(EstimateError, match="NavSatFix"):
         Publishing().out.position(
-            NavigationEstimate(47.0, 8.0, COV, 0.5, utc_ns=1), VehicleState(None), 1
+            NavigationEstimate(47.0, 8.0, COV, 0.5, time_ns=1), VehicleState(None), 1
         )
 
 

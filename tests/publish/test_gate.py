@@ -20,7 +20,7 @@ FRAME = LocalFrame(48.0, -4.0)
 def estimate_at(seconds: float, east_m: float = 0.0, north_m: float = 0.0, **more: object):
     lat, lon = FRAME.latlon_from_en((east_m, north_m))
     made = NavigationEstimate(
-        float(lat), float(lon), np.eye(2) * 4.0, 0.95, utc_ns=START_NS + round(seconds * 1e9)
+        float(lat), float(lon), np.eye(2) * 4.0, 0.95, time_ns=START_NS + round(seconds * 1e9)
     )
     return replace(made, **more)
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from orthonav.core.errors import MissingExtraError
-from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
 from orthonav.onboard.messages.mavlink import (
     Autopilot,
     LocalPose,
@@ -44,7 +44,7 @@ ESTIMATE = NavigationEstimate(
     np.array([[16.0, 3.0], [3.0, 9.0]]),
     0.95,
     utc_ns=UTC_NS,
-    boot_ns=61_500_000_000,
+    time_ns=61_500_000_000,
     processing_s=0.08,
     vel_en_mps=(12.0, -3.5),
     state="tracking",
@@ -154,9 +154,8 @@ def test_a_global_position_has_all_known_values() -> None:
     assert read["time_usec"] == UTC_NS // 1000 + 80_000  # of sending
     assert read["eph"] == pytest.approx(EPH, rel=1e-6)
     assert all(math.isnan(read[field]) for field in ("alt_ellipsoid", "alt", "epv"))
-    high = sent(global_position_sensor(WITH_ALTITUDE, clock=Clock.BOOT))
+    high = sent(global_position_sensor(WITH_ALTITUDE))
     assert (high["alt"], high["epv"]) == (134.5, 2.5)
-    assert high["time_usec"] == 61_580_000
 
 
 def test_a_global_position_needs_an_accuracy() -> None:
@@ -194,13 +193,15 @@ def test_a_gps_input_of_low_confidence_is_no_fix(estimate: NavigationEstimate) -
 
 
 def test_a_single_fix_is_a_command() -> None:
-    read = sent(external_position_estimate(ESTIMATE, clock=Clock.BOOT))
+    read = sent(external_position_estimate(ESTIMATE))
     assert (read["command"], read["frame"]) == (43003, 0)
     assert (read["x"], read["y"]) == (481234567, -43210987)
-    assert read["param1"] == pytest.approx(61.58) and read["param2"] == pytest.approx(0.08)
+    assert read["param1"] == pytest.approx((UTC_NS / 1e9 + 0.08) % 250, abs=1e-3) and read[
+        "param2"
+    ] == pytest.approx(0.08)
     assert read["param3"] == pytest.approx(EPH) and math.isnan(read["z"])
-    late = replace(ESTIMATE, boot_ns=250 * 10**9 - 60_000_000)
-    wrapped = sent(external_position_estimate(late, clock=Clock.BOOT))
+    late = replace(ESTIMATE, utc_ns=250 * 10**9 - 60_000_000)
+    wrapped = sent(external_position_estimate(late))
     assert wrapped["param1"] == pytest.approx(0.02, abs=1e-5)
 
 
@@ -324,7 +325,7 @@ def test_values_are_clamped_not_wrapped(alt, alt_std, east, north, processing_s,
         vel_en_mps=(east, north),
         processing_s=processing_s,
         utc_ns=utc_ns,
-        boot_ns=0,
+        time_ns=0,
         cov_en_m2=np.eye(2) * 1e80,
     )
     read, gps = sent(global_position_sensor(estimate)), sent(gps_input(estimate, gps_id=999))

@@ -40,7 +40,6 @@ from orthonav.onboard.gnss.biases import Biases
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
 from orthonav.onboard.latency import MIN_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
-from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.messages.mavlink import Origin, Signing, signing_timestamp
 from orthonav.onboard.messages.nmea import Quality
@@ -214,7 +213,7 @@ class _Setup:
         rules = GateRules(self._min_sent, min_interval_s=_intervals_s(options))
         if options.alert_limit_m:
             rules = replace(rules, max_std_m=math.inf, alert_limit_m=options.alert_limit_m)
-        gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
+        gate = Gate(rules)
         messenger = None
         if link is not None:
             messenger = outputs.Messenger(

@@ -16,7 +16,6 @@ from orthonav.core.flight.fixes import UNKNOWN, Identity, result_to_json
 from orthonav.core.records import CONFIDENT, ViewResult
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import (
-    Clock,
     EstimateError,
     FilterCovariance,
     NavigationEstimate,
@@ -315,7 +314,7 @@ class Publisher:
             decision = self.gate.withhold(withheld)
         elif judged:
             by_our_clock = replace(result, time_ns=exposed_ns)
-            made = estimate_from_result(by_our_clock, clock=Clock.BOOT, utc_minus_boot_ns=ahead_ns)
+            made = estimate_from_result(by_our_clock, utc_ahead_ns=ahead_ns)
             decision = self.gate.admit(made, now_ns)
         estimate, withheld = decision
         if estimate is not None:

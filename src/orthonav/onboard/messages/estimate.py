@@ -3,7 +3,6 @@ number that looks like a measurement."""
 
 import math
 from dataclasses import dataclass, field, replace
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +15,6 @@ class EstimateError(OrthonavError, ValueError):
     """An estimate is invalid, or the requested message cannot represent it."""
 
 
-class Clock(Enum):
-    """Clock of the timestamps. A link uses one clock: receivers estimate its offset."""
-
-    UTC = "utc"
-    """Since 1970-01-01 UTC."""
-    BOOT = "boot"
-    """Time since boot of the autopilot (from TIMESYNC or the timestamps of its messages)."""
-
-
 @dataclass(frozen=True, eq=False)
 class NavigationEstimate:
     """Position of the aircraft at one exposure.
@@ -33,7 +23,7 @@ class NavigationEstimate:
     `confidence`: 0 to 1; NaN: not known.
     `protection_level_m`: the error exceeds it with the risk of the result; infinite: not known.
     `accepted`: whether it met a criterion beside the rules of the gate.
-    `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
+    `time_ns`: time of exposure by a steady clock; `utc_ns`: UTC, None: not known.
     `processing_s`: from exposure until the message is sent.
     `alt_amsl_m`, `alt_std_m`: above mean sea level; NaN where not known.
     `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
@@ -45,8 +35,8 @@ class NavigationEstimate:
     lon_deg: float
     cov_en_m2: NDArray[np.float64]
     confidence: float
+    time_ns: int
     utc_ns: int | None = None
-    boot_ns: int | None = None
     processing_s: float = 0.0
     alt_amsl_m: float = math.nan
     alt_std_m: float = math.nan
@@ -75,18 +65,18 @@ class NavigationEstimate:
         for name, applies in invalid.items():
             if applies:
                 raise EstimateError(f"the {name} of an estimate is out of range")
-        if self.utc_ns is None and self.boot_ns is None:
-            raise EstimateError("the time of exposure is missing: give utc_ns or boot_ns")
 
-    def exposed_ns(self, clock: Clock) -> int:
-        """Time of exposure by `clock`; raises `EstimateError` where it is not known."""
-        time_ns = self.utc_ns if clock is Clock.UTC else self.boot_ns
-        if time_ns is None:
-            raise EstimateError(f"the time of exposure is not known by the clock {clock.value!r}")
-        return time_ns
+    @property
+    def stamp_ns(self) -> int:
+        """UTC of exposure, which messages state; raises `EstimateError` where it is not known."""
+        if self.utc_ns is None:
+            raise EstimateError("the UTC time of exposure is not known")
+        return self.utc_ns
 
-    def sent_ns(self, clock: Clock) -> int:
-        return self.exposed_ns(clock) + round(self.processing_s * 1e9)
+    @property
+    def sent_ns(self) -> int:
+        """UTC of sending; raises as `stamp_ns`."""
+        return self.stamp_ns + round(self.processing_s * 1e9)
 
     def horizontal_std_m(self) -> float:
         """Standard deviation along the worst direction; NaN where the covariance is invalid.
@@ -106,15 +96,11 @@ class NavigationEstimate:
 
 
 def estimate_from_result(
-    result: ViewResult,
-    *,
-    clock: Clock = Clock.UTC,
-    utc_minus_boot_ns: int | None = None,
-    processing_s: float | None = None,
+    result: ViewResult, *, utc_ahead_ns: int = 0, processing_s: float | None = None
 ) -> NavigationEstimate | None:
     """Estimate of the fix of a view; None where there is no fix.
 
-    `clock`: clock of `result.time_ns`; with `utc_minus_boot_ns` both clocks are filled in.
+    `utc_ahead_ns`: UTC minus the clock of `result.time_ns`.
     `processing_s`: time from exposure to sending; by default the latency of the fix, without the
     latency of the camera.
     """
@@ -123,19 +109,13 @@ def estimate_from_result(
         return None
     if processing_s is None:
         processing_s = result.latency_ms / 1e3 if math.isfinite(result.latency_ms) else 0.0
-    utc_ns: int | None = result.time_ns
-    boot_ns: int | None = result.time_ns
-    if clock is Clock.UTC:
-        boot_ns = None if utc_minus_boot_ns is None else result.time_ns - utc_minus_boot_ns
-    else:
-        utc_ns = None if utc_minus_boot_ns is None else result.time_ns + utc_minus_boot_ns
     return NavigationEstimate(
         lat_deg=fix.lat_deg,
         lon_deg=fix.lon_deg,
         cov_en_m2=fix.cov_en_m2,
         confidence=fix.confidence,
-        utc_ns=utc_ns,
-        boot_ns=boot_ns,
+        time_ns=result.time_ns,
+        utc_ns=result.time_ns + utc_ahead_ns,
         processing_s=processing_s,
         vel_en_mps=_velocity(fix) if result.state is not None else None,
         vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,

@@ -15,11 +15,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT, error_ellipse
-from orthonav.onboard.messages.estimate import (
-    Clock,
-    EstimateError,
-    NavigationEstimate,
-)
+from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
 
 MAX_AGE_S = 1.0
 """Longest time since exposure."""
@@ -84,9 +80,8 @@ class Gate:
     and of tracks found again.
     """
 
-    def __init__(self, rules: GateRules | None = None, clock: Clock = Clock.UTC) -> None:
+    def __init__(self, rules: GateRules | None = None) -> None:
         self.rules = rules or GateRules()
-        self.clock = clock
         self.withheld: Counter[str] = Counter()
         self.sent: Counter[str] = Counter()
         self.resets = 0
@@ -98,8 +93,8 @@ class Gate:
         self._unavailable_ns: int | None = None
 
     def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> Decision:
-        """Whether an estimate may be sent. Pass every view, also without a fix: it shows that a
-        track was lost."""
+        """Whether an estimate may be sent at a time of its steady clock. Pass every view, also
+        without a fix: it shows that a track was lost."""
         reason = self._reason(estimate, now_ns)
         self._watch(estimate, now_ns)
         if estimate is None or reason is not None:
@@ -165,11 +160,10 @@ class Gate:
     def _reason(self, estimate: NavigationEstimate | None, now_ns: int) -> str | None:
         if estimate is None:
             return "no_fix"
-        exposed_ns, std_m = estimate.exposed_ns(self.clock), estimate.horizontal_std_m()
-        age_s = (now_ns - exposed_ns) / 1e9
+        std_m, age_s = estimate.horizontal_std_m(), (now_ns - estimate.time_ns) / 1e9
         behind_s = math.nan
         if self._last is not None:
-            behind_s = (self._last.exposed_ns(self.clock) - exposed_ns) / 1e9
+            behind_s = (self._last.time_ns - estimate.time_ns) / 1e9
         refusals = {
             "coasting": estimate.state == "coasting",
             "not_tracking": estimate.state not in (None, "tracking"),
@@ -200,7 +194,7 @@ class Gate:
             self._interrupted = True
 
     def _jumped(self, before: NavigationEstimate, now: NavigationEstimate) -> bool:
-        seconds = (now.exposed_ns(self.clock) - before.exposed_ns(self.clock)) / 1e9
+        seconds = (now.time_ns - before.time_ns) / 1e9
         if seconds <= 0:
             return True
         rules = self.rules

@@ -21,11 +21,7 @@ from orthonav.core.extras import needed
 from orthonav.core.geo.attitude import matrices_of_wxyz, wxyz_of_angles
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import CONFIDENT, error_ellipse
-from orthonav.onboard.messages.estimate import (
-    Clock,
-    EstimateError,
-    NavigationEstimate,
-)
+from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
 
 Message = Any
 """A `MAVLink_message` of pymavlink, which has no types."""
@@ -111,7 +107,6 @@ class Packer:
 def global_position_sensor(
     estimate: NavigationEstimate,
     *,
-    clock: Clock = Clock.UTC,
     target: Target = AUTOPILOT,
     min_confidence: float = CONFIDENT,
 ) -> Message:
@@ -128,7 +123,7 @@ def global_position_sensor(
         target_system=target.system_id,
         target_component=target.component_id,
         id=1,  # that of EKF2_AGP0_ID
-        time_usec=microseconds(estimate.sent_ns(clock)),
+        time_usec=microseconds(estimate.sent_ns),
         processing_time=clamped(estimate.processing_s * 1e6, 0, 2**32 - 1),
         source=2,  # vision
         flags=0,
@@ -144,7 +139,6 @@ def global_position_sensor(
 def gps_input(
     estimate: NavigationEstimate,
     *,
-    clock: Clock = Clock.UTC,
     gps_id: int = 0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
@@ -159,14 +153,14 @@ def gps_input(
     vel_cov = estimate.vel_cov_en
     speed_std_mps = math.nan if vel_cov is None else error_ellipse(vel_cov)[0]
     flags = _ignored(estimate, speed_std_mps) if confident else ~_Ignore(0)
-    week, week_ms = (0, 0) if estimate.utc_ns is None else gps_time(estimate.utc_ns)
+    week, week_ms = gps_time(estimate.stamp_ns)
     vel_east, vel_north = estimate.vel_en_mps or (0.0, 0.0)
 
     def unless(bit: _Ignore, value: float) -> float:
         return 0.0 if flags & bit else float32(value)
 
     return dialect().MAVLink_gps_input_message(
-        time_usec=microseconds(estimate.exposed_ns(clock)),
+        time_usec=microseconds(estimate.stamp_ns),
         gps_id=clamped(gps_id, 0, 255),
         ignore_flags=int(flags),
         time_week_ms=week_ms,
@@ -191,14 +185,13 @@ def gps_input(
 def external_position_estimate(
     estimate: NavigationEstimate,
     *,
-    clock: Clock = Clock.UTC,
     target: Target = AUTOPILOT,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) as COMMAND_INT: a single fix while dead reckoning.
     Raises `EstimateError` for an estimate of low confidence, which it cannot mark."""
     require_confident(estimate, min_confidence, "MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
-    wrapped_ns = estimate.sent_ns(clock) % (250 * 10**9)  # by the definition of the field
+    wrapped_ns = estimate.sent_ns % (250 * 10**9)  # by the definition of the field
     return dialect().MAVLink_command_int_message(
         target_system=target.system_id,
         target_component=target.component_id,
@@ -379,7 +372,6 @@ def odometry(
     pose: LocalPose,
     autopilot: Autopilot,
     *,
-    clock: Clock = Clock.UTC,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """ODOMETRY (message 331) as `autopilot` reads it, stamped at exposure.
@@ -406,7 +398,7 @@ def odometry(
                 "send VISION_POSITION_ESTIMATE"
             )
     return dialect().MAVLink_odometry_message(
-        time_usec=microseconds(estimate.exposed_ns(clock)),
+        time_usec=microseconds(estimate.stamp_ns),
         frame_id=frames[0],
         child_frame_id=frames[1],
         x=float32(position[0]),
@@ -432,7 +424,6 @@ def vision_position_estimate(
     pose: LocalPose,
     autopilot: Autopilot,
     *,
-    clock: Clock = Clock.UTC,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
@@ -445,7 +436,7 @@ def vision_position_estimate(
         raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude of the autopilot")
     roll, pitch, yaw = pose.attitude_rad
     return dialect().MAVLink_vision_position_estimate_message(
-        usec=microseconds(estimate.exposed_ns(clock)),
+        usec=microseconds(estimate.stamp_ns),
         x=float32(x),
         y=float32(y),
         z=float32(z),
