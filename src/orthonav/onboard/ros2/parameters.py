@@ -48,9 +48,8 @@ class Parameters:
 def declared(declare: Callable[[str, Any], Any]) -> Parameters:
     """Parameters whose values are what `declare` gives for a name and a default."""
     values = {each.name: declare(each.name, each.default) for each in fields(Parameters)}
-    return Parameters(
-        **{name: value if name == "use_sim_time" else str(value) for name, value in values.items()}
-    )
+    use_sim_time = bool(values.pop("use_sim_time"))
+    return Parameters(use_sim_time, **{name: str(value) for name, value in values.items()})
 
 
 def _is_number(text: str) -> bool:
