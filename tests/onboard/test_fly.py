@@ -649,6 +649,10 @@ def test_time_that_goes_back_begins_the_track_again(begin, caplog):
     assert caplog.text.count("time went back by 50.5 s") == 1
 
 
+def level(lat_deg, lon_deg):
+    return np.full(np.shape(lat_deg), 300.0)
+
+
 def test_a_map_with_terrain_gives_heights_above_ground(begin):
     """Also the first view, by its start position, and where only a height above sea is known."""
     north_deg = 10.0  # metres of terrain per degree
@@ -669,10 +673,7 @@ def test_a_map_with_terrain_gives_heights_above_ground(begin):
 
 
 def test_over_an_unknown_datum_heights_above_sea_give_no_fix(begin):
-    def terrain(lat_deg, lon_deg):
-        return np.full(np.shape(lat_deg), 300.0)
-
-    heights = FlownHeights(terrain, (np.zeros(2), np.zeros(2)), datum_known=False)
+    heights = FlownHeights(level, (np.zeros(2), np.zeros(2)), datum_known=False)
     flight = begin(recorded=True, heights=heights, start=[None].pop)
     above_sea = Telemetry(5, 1.0, 2.0, 3.0, math.nan, amsl_m=400.0)
     refused = flight.recorded(above_sea).outcome
@@ -684,10 +685,7 @@ def test_over_an_unknown_datum_heights_above_sea_give_no_fix(begin):
 
 
 def test_gps_input_has_the_altitude_by_the_terrain_where_the_autopilot_knows_none(begin):
-    def terrain(lat_deg, lon_deg):
-        return np.full(np.shape(lat_deg), 300.0)
-
-    heights = FlownHeights(terrain, (np.zeros(2), np.zeros(2)), take_off=(48.0, 2.0, 5.0))
+    heights = FlownHeights(level, (np.zeros(2), np.zeros(2)), take_off=(48.0, 2.0, 5.0))
     flight = begin(heights=heights)
     flight.views(3)  # 100 m above the place of take-off
     (message,) = flight.port.sent("GPS_INPUT")

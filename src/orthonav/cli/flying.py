@@ -165,11 +165,12 @@ class _Setup:
             return cameras.LiveCamera(name, self.clocks, size_px=size_px), None
         if not options.pace > 0:
             raise VariantError("--pace must be above 0")
-        if self.link is not None and not options.recorded_telemetry:
+        path = Path(options.source)
+        if self.link is not None and path.is_dir() and not options.recorded_telemetry:
             due_ns = cameras.autopilot_pace(self.link.boot_ns, self.clocks, options.pace)
-        else:
+        else:  # a video has no times of an autopilot
             due_ns = cameras.own_pace(self.clocks, options.pace)
-        images = cameras.recorded_images(Path(options.source))
+        images = cameras.recorded_images(path)
         return cameras.Playback(images, due_ns, self.clocks, self.stopping.is_set), None
 
     def _ros2(self) -> "tuple[Any, Ros2Publisher]":
