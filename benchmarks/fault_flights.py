@@ -34,8 +34,7 @@ from orthonav.onboard.cameras import LiveCamera, NewestImage
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.latency import LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
-from orthonav.onboard.messages.estimate import Clock
-from orthonav.onboard.messages.gate import Gate, GateRules
+from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.outputs import Messenger, Publisher
 from orthonav.onboard.run import Locator
 from orthonav.onboard.telemetry import TelemetryBuffer
@@ -276,7 +275,7 @@ class FaultFlight:
         clocks = self.time.clocks
         self.port, self.autopilot, self.other = Port(), Autopilot(), Autopilot(2)
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)  # type: ignore[arg-type]  # a fake of it
-        self.gate = Gate(GateRules(), Clock.BOOT)
+        self.gate = Gate()
         messenger = Messenger(self.gate, self.link, clocks)
         publisher = Publisher(self.gate, clocks, messenger=messenger)
         self._camera = LiveCamera(0, clocks, capture=lambda _: Stream(self._seen))
@@ -284,7 +283,7 @@ class FaultFlight:
         self.runner = Runner(
             self._newest,
             CAMERA,
-            locator(self),
+            lambda: locator(self),
             publisher,
             FlyOptions(map_change=map_change),
             clocks,

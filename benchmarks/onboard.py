@@ -34,7 +34,7 @@ class Scene:
 
     def arguments(self, name: str, camera: Path, port: int) -> list[str]:
         """Command line as on an aircraft, except that pictures come from a folder."""
-        made = [str(self.map_path), str(camera), "--file-clock", "autopilot"]
+        made = [str(self.map_path), str(camera)]
         made += ["--autopilot", f"udpin:{port}", "--log-views", "thumbnails"]
         for option, file in (("--jsonl", "lines.jsonl"), ("--state", "state.json")):
             made += [option, str(self.scratch / f"{name}-{file}")]

@@ -41,7 +41,7 @@ def measure(options: argparse.Namespace) -> Section:
     lap = rendered(work, present, frame, LoopedFlight(SMALL_CAMERA, RATE_HZ))
     views, lines = round(minutes * 60 * RATE_HZ), work / "lines.jsonl"
     folder = played(lap, work / "flight", views, lead_s=LEAD_S * pace)
-    command = [str(map_path), str(folder), "--file-clock", "autopilot"]
+    command = [str(map_path), str(folder)]
     command += ["--pace", str(pace), "--autopilot", f"udpin:{port}", "--jsonl", str(lines)]
     command += ["--log", str(work / "log.mcap"), "--log-views", "thumbnails"]
     command += ["--log-max-mb", str(LOG_MB), "--state", str(work / "state.json")]

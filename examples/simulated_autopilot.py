@@ -4,7 +4,7 @@
 
 beside
 
-    orthonav fly area.onav flight --file-clock autopilot --autopilot udpin:14550
+    orthonav fly area.onav flight --autopilot udpin:14550
 
 It answers TIMESYNC, sends HEARTBEAT, ATTITUDE, DISTANCE_SENSOR and LOCAL_POSITION_NED over UDP (and
 GPS_RAW_INT where the folder has a `gnss.csv`), and compares the positions that it receives with the

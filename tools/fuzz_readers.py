@@ -44,7 +44,6 @@ from orthonav.ground.view.run import Run, ViewRequest
 from orthonav.ground.view.server import Pages, Server, load_assets
 from orthonav.onboard import state
 from orthonav.onboard.link import AutopilotLink
-from orthonav.onboard.ros2.arguments import ros_arguments
 from orthonav.onboard.telemetry import TelemetryBuffer
 
 Make, Read = Callable[[Path], list[Path]], Callable[[Path], object]
@@ -201,7 +200,6 @@ SMALL: dict[str, Read] = {
     "mount": mount.read_mount,
     "latency": mount.read_latency,
     "state": lambda path: (state.load(path), state.learnt_biases(path)),
-    "ros": lambda path: ros_arguments(["--params-file", str(path)], {}),
 }
 
 

@@ -33,10 +33,9 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import MAP_STD_M, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import FrozenCheck
-from orthonav.onboard.gnss.biases import DIFFERENTIAL
+from orthonav.onboard.gnss.monitor import DIFFERENTIAL
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
 from orthonav.onboard.messages.estimate import (
-    Clock,
     FilterCovariance,
     NavigationEstimate,
     estimate_from_result,
@@ -182,7 +181,7 @@ class Sight:
         seed: int,
     ) -> None:
         self._area, self._scenario, self._rule, self._seed = area, scenario, rule, seed
-        self._tracker, self.gate = Tracker(area.localizer), Gate(clock=Clock.BOOT)
+        self._tracker, self.gate = Tracker(area.localizer), Gate()
         self._solutions: deque[GnssSample] = deque()
         self._watch = GnssWatch(area.frame, live_solutions(self._solutions))
         self._frozen, self._covariance = FrozenCheck(), FilterCovariance()
@@ -219,8 +218,8 @@ class Sight:
             self._watch.tick(telemetry.time_ns)
             result = self._watch.view(result, telemetry.time_ns)
             outcome = result.outcome
-            made = estimate_from_result(result, clock=Clock.BOOT, processing_s=LATENCY_S)
-        admitted = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
+            made = estimate_from_result(result, processing_s=LATENCY_S)
+        admitted, _ = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
         stated = None if admitted is None else self.stated(admitted, telemetry.time_ns)
         return self._judged(time_s, truth, estimate, outcome, stated), admitted
 

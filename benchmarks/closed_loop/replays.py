@@ -42,9 +42,8 @@ from orthonav.core.records import (
 )
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.simulate.render import ViewEffects
-from orthonav.onboard.cameras import GAP_S
-from orthonav.onboard.latency import MISMATCH, UNKNOWN, UNSTEADY, Latency, LatencyMonitor
-from orthonav.onboard.messages.estimate import Clock, estimate_from_result
+from orthonav.onboard.latency import MISMATCH, LatencyMonitor
+from orthonav.onboard.messages.estimate import estimate_from_result
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
 from orthonav.onboard.telemetry import (
@@ -347,8 +346,6 @@ class Monitored:
     track: Tracker
     buffer: TelemetryBuffer
     monitor: LatencyMonitor = field(default_factory=lambda: LatencyMonitor(LATENCY_S))
-    interruptions: int = 0
-    arrived_ns: int | None = None
     tracked_ns: int | None = None
 
     @property
@@ -360,18 +357,6 @@ class Monitored:
 
     def locate(self, view: View) -> Fix | NoFix:
         """Position of a view; a `NoFix` with the monitor's reason where it is withheld."""
-        before_ns = self.arrived_ns
-        self.arrived_ns = arrived_ns = view.telemetry.time_ns + round(LATENCY_S * 1e9)
-        self.interruptions += before_ns is not None and arrived_ns - before_ns > GAP_S * 1e9
-        try:
-            return self._located(view, self.monitor.latency(arrived_ns, self.interruptions))
-        finally:
-            known = self.buffer.at, self.buffer.covered_ns
-            self.monitor.observe(arrived_ns, view.grey, view.camera, *known)
-
-    def _located(self, view: View, latency: Latency) -> Fix | NoFix:
-        if not latency.may_locate:
-            return NoFix(latency.reason or "", latency.detail)
         telemetry, before_ns = view.telemetry, self.tracked_ns
         self.tracked_ns = time_ns = telemetry.time_ns
         if before_ns is not None and time_ns - before_ns > LONG_GAP_NS:
@@ -379,10 +364,10 @@ class Monitored:
             view = replace(view, telemetry=replace(telemetry, vel_en_mps=mean))
         outcome = self.track.locate(view)
         result = ViewResult("", time_ns, outcome, 0.0, self.state_name)
-        doubt = latency.reason
         if result.is_recognized and isinstance(outcome, Fix):
             place = outcome.lat_deg, outcome.lon_deg
-            doubt = self.monitor.located(latency, place, outcome.std_m)
+            self.monitor.located(time_ns, place, outcome.std_m, self.buffer.mean_velocity)
+        doubt = next(iter(self.monitor.reasons()), None)
         return outcome if doubt is None else NoFix(doubt, "")
 
 
@@ -406,7 +391,7 @@ def replay(
         "track": Tracker(area.localizer),
         "fly": Monitored(Tracker(area.localizer), buffer),
     }
-    gates = {name: Gate(clock=Clock.BOOT) for name in methods}
+    gates = {name: Gate() for name in methods}
     autopilot, _, _ = flight.name.partition("_")
     rows, alone = [], 0
     for exposure, view in recorded.views(area, work / "views", partial(rule, autopilot), buffer):
@@ -438,7 +423,7 @@ def _row(
     outcome, latency_ms = locate_view(locator, view)
     state = locator.state_name
     result = ViewResult(str(exposure.number), exposure.time_ns, outcome, latency_ms, state)
-    admitted = gate.admit(estimate_from_result(result, clock=Clock.BOOT), exposure.time_ns)
+    admitted, _ = gate.admit(estimate_from_result(result), exposure.time_ns)
     error = cov = None
     confidence, velocity_off = 0.0, np.nan
     if isinstance(outcome, Fix):
@@ -506,7 +491,7 @@ def table(rows: Sequence[Row]) -> Table:
     return Table("Replays", HEADER, cells, notes)
 
 
-WITHHELD = (UNKNOWN, MISMATCH, UNSTEADY)
+WITHHELD = (MISMATCH,)
 WITHHELD_HEADER = (
     *("flight", "views", *WITHHELD, "longest s"),
     *("start s", "no images s", "300 m east s", "mirrored s"),

@@ -8,17 +8,34 @@ from orthonav.onboard.ros2.node import Node
 
 
 class MemoryNode(Node):
-    """`time` goes on while it waits in vain. `heard`: messages by topic. `mismatched`: topics whose
-    endpoints do not match. `latched`, `reliable`: topics with such a writer or reader of ours."""
+    """`time` goes on while it waits in vain. `heard`: messages by topic. `latched`, `reliable`:
+    topics with such a writer or reader of ours."""
 
-    def __init__(self, arguments):
-        self.time, self.heard, self.mismatched = Time(), defaultdict(list), {}
+    def __init__(self, words=(), distro=""):
+        pairs = zip(words[::2], words[1::2], strict=True)
+        self._given = {"-r": {}, "-p": {}}
+        for flag, text in pairs:
+            name, _, value = text.partition(":=")
+            self._given[flag][name] = value
+        self.time, self.heard = Time(), defaultdict(list)
         self.latched, self.reliable, self.kinds = set(), set(), {}
         self._handlers, self._waiting = {}, deque()
-        super().__init__(arguments)
+        super().__init__(words, distro)
 
-    def _join(self):
+    def _join(self, words):
         """Nobody to join."""
+        return "orthonav", "/orthonav"
+
+    def _declared(self, name, default):
+        given = self._given["-p"].get(name, default)
+        return given == "true" if name == "use_sim_time" else given
+
+    def resolved(self, topic):
+        expanded = topic.replace("~", "/orthonav")
+        return self._given["-r"].get(topic, f"/{expanded.removeprefix('/')}")
+
+    def is_remapped(self, topic):
+        return topic in self._given["-r"]
 
     def subscribe(self, topic, kind, handler, *, depth=5, reliable=False):
         self._handlers[topic], self.kinds[topic] = (kind, handler), kind
@@ -47,6 +64,3 @@ class MemoryNode(Node):
 
     def close(self):
         """Nothing to leave."""
-
-    def _mismatches(self):
-        return self.mismatched

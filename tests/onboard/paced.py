@@ -40,5 +40,6 @@ if __name__ == "__main__":
         whole = [json.loads(each) for each in found if each.endswith("\n")]
         return any("frame" in each and each["sent"] for each in whole)
 
-    cameras.own_pace, fly.TELEMETRY_WAIT_S = pace_by(lines, is_held), 10.0
+    cameras.own_pace, fly.TELEMETRY_WAIT_S, fly.MAX_AGE_S = pace_by(lines, is_held), 10.0, 60.0
+    cameras.autopilot_pace = lambda boot_ns, clocks, factor: cameras.own_pace(clocks, factor)
     sys.exit(main(sys.argv[3:]))

@@ -52,7 +52,6 @@ from orthonav.onboard.console import Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.health import Level
 from orthonav.onboard.link import AutopilotLink
-from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.outputs import JsonOut, Messenger, Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
@@ -110,7 +109,7 @@ class Flight:
         self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
         clocks = self.time.clocks
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
-        self.gate = Gate(rules or GateRules(), Clock.BOOT)
+        self.gate = Gate(rules)
         self.lines, self.said, self.newest = tmp_path / "lines.jsonl", Said(), NewestImage()
         narrator = Narrator(
             *(self.said, clocks, self.newest, "images from 0", self.link, "udpin:1"),
@@ -123,18 +122,20 @@ class Flight:
             lines=[JsonOut(self.lines), narrator],
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()
-        rest = {name: options.pop(name) for name in ("start", "fresh") if name in options}
-        options = FlyOptions(**options)
+        start, fresh = options.pop("start", lambda: None), options.pop("fresh", None)
+        gnss = options.pop("gnss", None)
+        locators = iter([self.locator, fresh])
         self.runner = Runner(
             self.newest,
             CAMERA,
-            self.locator,
+            lambda: next(locators),
             publisher,
-            options,
+            FlyOptions(**options),
             clocks,
             link=self.link,
             sink=self.log,
-            **rest,
+            start=start,
+            gnss=gnss,
         )
         self.number, self.yaw_deg, self.agl_m, self.talks = 0, 30.0, 100.0, True
         self.rng = np.random.default_rng(0)
@@ -565,7 +566,7 @@ def test_health_goes_to_the_ground_station(flight):
 @pytest.mark.parametrize(("least", "confident"), [(0.9, True), (0.99, False)])
 def test_results_are_confident_by_the_criterion_of_the_flight(begin, least, confident):
     """Of a fix with 0.97."""
-    flight = begin(min_confidence=least)
+    flight = begin(accept=Acceptance("confidence", least))
     result = flight.views(3)[-1]
     assert reason_of(result) == "fix" and result.is_confident is confident
 
@@ -637,7 +638,7 @@ def test_the_first_located_view_gets_the_start_position(begin):
 def test_time_that_goes_back_begins_the_track_again(begin, caplog):
     """A bag that is played in a loop: the second pass knows nothing of the first but the start."""
     start, second = Prior(48.0, 2.0, 5.0), FakeLocator()
-    flight = begin(recorded=True, start=lambda: start, fresh=lambda: second)
+    flight = begin(recorded=True, start=lambda: start, fresh=second)
     for number, time_s in enumerate((100, 101, 100.5, 50, 51)):
         flight.recorded(Telemetry(round(time_s * S), 1.0, 2.0, 3.0, 50.0), number)
     first = flight.locator.seen
@@ -646,6 +647,10 @@ def test_time_that_goes_back_begins_the_track_again(begin, caplog):
     for seen in (first, second.seen):
         assert [each.prior for each in seen][:2] == [start, None]
     assert caplog.text.count("time went back by 50.5 s") == 1
+
+
+def level(lat_deg, lon_deg):
+    return np.full(np.shape(lat_deg), 300.0)
 
 
 def test_a_map_with_terrain_gives_heights_above_ground(begin):
@@ -668,10 +673,7 @@ def test_a_map_with_terrain_gives_heights_above_ground(begin):
 
 
 def test_over_an_unknown_datum_heights_above_sea_give_no_fix(begin):
-    def terrain(lat_deg, lon_deg):
-        return np.full(np.shape(lat_deg), 300.0)
-
-    heights = FlownHeights(terrain, (np.zeros(2), np.zeros(2)), datum_known=False)
+    heights = FlownHeights(level, (np.zeros(2), np.zeros(2)), datum_known=False)
     flight = begin(recorded=True, heights=heights, start=[None].pop)
     above_sea = Telemetry(5, 1.0, 2.0, 3.0, math.nan, amsl_m=400.0)
     refused = flight.recorded(above_sea).outcome
@@ -683,10 +685,7 @@ def test_over_an_unknown_datum_heights_above_sea_give_no_fix(begin):
 
 
 def test_gps_input_has_the_altitude_by_the_terrain_where_the_autopilot_knows_none(begin):
-    def terrain(lat_deg, lon_deg):
-        return np.full(np.shape(lat_deg), 300.0)
-
-    heights = FlownHeights(terrain, (np.zeros(2), np.zeros(2)), take_off=(48.0, 2.0, 5.0))
+    heights = FlownHeights(level, (np.zeros(2), np.zeros(2)), take_off=(48.0, 2.0, 5.0))
     flight = begin(heights=heights)
     flight.views(3)  # 100 m above the place of take-off
     (message,) = flight.port.sent("GPS_INPUT")
@@ -895,7 +894,13 @@ def views_in(path):
 def paced(monkeypatch):
     """Function that makes a playback wait until a line was written for every earlier image."""
 
-    return lambda lines: monkeypatch.setattr(cameras, "own_pace", pace_by(lines))
+    def pace(lines):
+        paced = pace_by(lines)
+        monkeypatch.setattr(cameras, "own_pace", paced)
+        monkeypatch.setattr(cameras, "autopilot_pace", lambda _, *given: paced(*given))
+        monkeypatch.setattr(loop, "MAX_AGE_S", 60.0)
+
+    return pace
 
 
 def test_a_flight_from_end_to_end(flown, autopilot, paced, monkeypatch, tmp_path):
@@ -908,7 +913,6 @@ def test_a_flight_from_end_to_end(flown, autopilot, paced, monkeypatch, tmp_path
     code = main(
         [
             *("fly", str(path), str(folder), "--autopilot", f"udpin:{autopilot.port}"),
-            *("--deadline-ms", "60000"),
             *("--send", "global-position", "--send", "gps-input"),
             *("--jsonl", str(lines), "--state", str(state)),
         ]
@@ -956,7 +960,7 @@ def test_gnss_of_a_recording_is_compared(flown, paced, run, tmp_path):
         )
     command = [
         *("fly", path, folder, "--recorded-telemetry", "--gnss", "watch", "--jsonl", lines),
-        *("--deadline-ms", "60000", "--log", tmp_path / "log.mcap"),
+        *("--log", tmp_path / "log.mcap"),
     ]
     done = run(*command)
     assert done.code == 1 and "gnss.csv" in done.err
@@ -986,7 +990,7 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
         arguments = [
             *(lines, tmp_path / "release", "fly", path, images),
             *("--state", state, "--jsonl", lines),
-            *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
+            *("--autopilot", f"udpin:{autopilot.port}"),
         ]
         return subprocess.Popen([sys.executable, PACED, *map(str, arguments)])
 
@@ -1028,7 +1032,7 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
     release = tmp_path / "release"
     arguments = [
         *(lines, release, "fly", area, folder, "--state", state, "--jsonl", lines),
-        *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
+        *("--autopilot", f"udpin:{autopilot.port}"),
     ]
     process = subprocess.Popen(
         [sys.executable, PACED, *map(str, arguments)], stderr=subprocess.PIPE, text=True
@@ -1107,7 +1111,7 @@ def test_a_dry_run_of_a_recording_speaks_on_stderr_and_its_data_stay_alone_on_st
 ):
     path, folder, _, _ = flown
     paced(tmp_path / "lines.jsonl")
-    command = ("fly", path, folder, "--recorded-telemetry", "--dry-run", "--deadline-ms", "60000")
+    command = ("fly", path, folder, "--recorded-telemetry", "--dry-run")
     done = run(*command, "--jsonl", "-", "--jsonl", tmp_path / "lines.jsonl")
     views = [each for each in map(json.loads, done.out.splitlines()) if "frame" in each]
     assert done.code == 0 and views
@@ -1137,8 +1141,8 @@ def test_a_stderr_that_takes_nothing_delays_no_flight(flown, tmp_path, how):
         while True:
             os.write(writer, bytes(4096))
     os.set_blocking(writer, True)
-    options = ("--recorded-telemetry", "--pace", "10", "--jsonl", lines, "--deadline-ms", "60000")
-    command = (sys.executable, "-m", "orthonav", "fly", path, folder, *options)
+    options = ("--recorded-telemetry", "--jsonl", lines)
+    command = (sys.executable, PACED, lines, tmp_path, "fly", path, folder, *options)
     script = f"exec {shlex.join(map(str, command))}{' 2>&-' if how == 'closed' else ''}"
     done = subprocess.run(["sh", "-c", script], stderr=writer, timeout=240, check=False)
     assert done.returncode == 0

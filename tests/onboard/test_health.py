@@ -3,43 +3,82 @@
 import math
 import os
 import socket
+from collections import Counter
+from types import SimpleNamespace
 
 import pytest
-from fake_autopilot import S
+from fake_autopilot import S, fix
 
-from orthonav.onboard.health import (
-    Health,
-    HealthReporter,
-    Level,
-    judge,
-    notify,
+from orthonav.core.records import Telemetry
+from orthonav.onboard.health import Health, HealthReporter, Level, judge, notify
+from orthonav.onboard.monitors import (
+    CameraMonitor,
+    EventCounter,
+    LinkMonitor,
+    OutputMonitor,
+    ProgramMonitor,
+    TrackMonitor,
 )
 
-COUNTS = {"taken": 50, "processed": 50, "confident": 50}
+
+class Judged:
+    """All monitors of a flight, at `running_s` after its start."""
+
+    def __init__(self, running_s=60.0, **seen):
+        self.now_ns = round(running_s * S)
+        self.events = EventCounter(0)
+        counts = {"taken": 50, "processed": 50, "confident": 50, **seen.pop("counts", {})}
+        for name in Counter(counts).elements():
+            self.events.add(self.now_ns, name)
+        self.events.add_latency(self.now_ns, seen.pop("latency_s", 0.1))
+        ages = {name: seen.pop(f"{name}_age_s", 0.0) for name in ("heard", "attitude")}
+        link = SimpleNamespace(
+            sync=SimpleNamespace(is_exact=seen.pop("synced", True)),
+            origin=seen.pop("origin", "known"),
+            heard_age_s=ages["heard"],
+            attitude_age_s=ages["attitude"],
+        )
+        gate = SimpleNamespace(is_unavailable=seen.pop("unavailable", False))
+        publisher = SimpleNamespace(gate=gate, messenger=SimpleNamespace(needs_origin=True))
+        state, change = seen.pop("state", "tracking"), seen.pop("map_change", None)
+        camera = CameraMonitor(self.events)
+        camera.taken_ns = self._before(seen.pop("image_age_s", 0.0))
+        self.track = TrackMonitor(self.events, publisher, lambda: state)
+        self.track.confident_ns = self._before(seen.pop("low_confidence_s", 0.0))
+        self.monitors = [
+            camera,
+            LinkMonitor(self.events, link, recorded=False),
+            ProgramMonitor(self.events, lambda: change),
+            OutputMonitor(self.events, publisher, link),
+            self.track,
+        ]
+        assert not seen
+
+    def _before(self, age_s):
+        return None if math.isinf(age_s) else self.now_ns - round(age_s * S)
+
+    def health(self):
+        return judge(self.monitors, self.now_ns)
 
 
 def counted(**counts):
-    return {"counts": {**COUNTS, **counts}}
-
-
-def judged(running_s=60.0, **seen):
-    return judge(running_s, **{"counts": COUNTS, "latency_s": 0.1, **seen})
+    return {"counts": counts}
 
 
 FAILED = {
     "no_camera": {"image_age_s": 4.0},
-    "link_down": {"link_age_s": 6.0},
-    "no_telemetry": {"telemetry_age_s": 4.0},
+    "link_down": {"heard_age_s": 6.0},
+    "no_telemetry": {"attitude_age_s": 4.0},
     "wrong_camera": counted(wrong_camera=1),
     "internal_errors": counted(internal_error=30),
-    "map_file_changed": {"map_intact": False},
+    "map_file_changed": {"map_change": "5 bytes instead of 9"},
 }
 DEGRADED = {
-    "heading_mismatch": {"mismatch": (-170.0, 0.0)},
-    "height_mismatch": {"mismatch": (0.0, math.log(0.5))},
     "lost": {"state": "lost"},
     "searching": {"state": "searching"},
+    "coasting": {"state": "coasting", "low_confidence_s": 3.0},
     "low_confidence": {"low_confidence_s": 11.0},
+    "unavailable": {"low_confidence_s": 11.0, "unavailable": True},
     "frozen_image": counted(frozen=20),
     "bad_images": counted(bad_image=20),
     "telemetry_gaps": counted(no_telemetry=20),
@@ -47,7 +86,7 @@ DEGRADED = {
     "clock_jumped": counted(clock_jump=1),
     "not_synchronized": {"synced": False},
     "slow_vision": counted(slow_vision=3),
-    "no_origin": {"has_origin": False},
+    "no_origin": {"origin": None},
     "incomplete_message": counted(incomplete=3),
     "output_failed": counted(output_failed=1),
     "log_failed": counted(log_failed=1),
@@ -58,7 +97,7 @@ DEGRADED = {
 
 
 def test_without_faults_health_is_ok():
-    assert judged() == Health(Level.OK)
+    assert Judged().health() == Health(Level.OK)
 
 
 @pytest.mark.parametrize(
@@ -70,24 +109,42 @@ def test_without_faults_health_is_ok():
     ],
 )
 def test_every_fault_has_a_reason(level, reason, seen):
-    assert judged(**seen) == Health(level, (reason,))
+    assert Judged(**seen).health() == Health(level, (reason,))
+
+
+@pytest.mark.parametrize(
+    ("heading_deg", "agl_m", "reason"),
+    [(190.0, 100.0, "heading_mismatch"), (0.0, 50.0, "height_mismatch")],
+)
+def test_a_fix_may_contradict_heading_and_height(heading_deg, agl_m, reason):
+    seen = Judged()
+    telemetry = Telemetry(0, 0.0, 0.0, 0.0, 100.0)
+    seen.track.found(fix(heading_deg=heading_deg, agl_m=agl_m), telemetry, seen.now_ns)
+    assert seen.health() == Health(Level.DEGRADED, (reason,))
 
 
 def test_reasons_of_failed_come_first():
-    seen = judged(image_age_s=4.0, state="lost")
-    assert seen == Health(Level.FAILED, ("no_camera", "lost"))
+    seen = Judged(attitude_age_s=4.0, counts={"bad_image": 20}).health()
+    assert seen == Health(Level.FAILED, ("no_telemetry", "bad_images"))
 
 
 def test_few_faults_are_ok():
     few = counted(frozen=5, bad_image=5, late=5, no_telemetry=5)
-    assert judged(**few).level is Level.OK
+    assert Judged(**few).health().level is Level.OK
 
 
 def test_missing_inputs_are_no_reason_right_after_the_start():
-    missing = {"image_age_s": 9.0, "telemetry_age_s": math.inf, "link_age_s": math.inf}
-    assert judged(2.0, **missing, synced=False).level is Level.OK
-    old = judged(6.0, **missing, synced=False)
+    ages = dict.fromkeys(("image_age_s", "attitude_age_s", "heard_age_s"), math.inf)
+    assert Judged(2.0, **ages, synced=False).health().level is Level.OK
+    old = Judged(6.0, **ages, synced=False).health()
     assert old.reasons == ("no_camera", "link_down", "no_telemetry")
+
+
+def test_numbers_that_grow_are_events():
+    events = EventCounter(0)
+    for now_ns, total in ((0, 0), (1, 3), (2, 3), (3, 4)):
+        events.follow(now_ns, {"log_failed": total})
+    assert events.total == {"log_failed": 2}
 
 
 def test_changes_are_reported_at_most_every_five_seconds():

@@ -16,7 +16,7 @@ from fake_autopilot import UTC_NS, S, Time, fix
 from orthonav.core.errors import VariantError
 from orthonav.core.flight.fixes import result_from_json
 from orthonav.core.records import NoFix, ViewResult
-from orthonav.onboard.messages.estimate import Clock, NavigationEstimate, messages_averaged
+from orthonav.onboard.messages.estimate import NavigationEstimate, messages_averaged
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.messages.mavlink import Autopilot, Origin, Packer, Target, north_east_m
 from orthonav.onboard.outputs import (
@@ -32,7 +32,7 @@ from wire import decode
 
 ORIGIN = Origin(48.0, 2.0, 100.0)
 ESTIMATE = NavigationEstimate(
-    48.01, 2.01, np.eye(2) * 9.0, 0.97, utc_ns=UTC_NS, boot_ns=1, vel_en_mps=(3.0, 4.0)
+    48.01, 2.01, np.eye(2) * 9.0, 0.97, utc_ns=UTC_NS, time_ns=1, vel_en_mps=(3.0, 4.0)
 )
 VEHICLE = VehicleState(np.eye(3), 100.0, (4.0, 3.0, 0.1), -90.0)
 
@@ -43,14 +43,11 @@ class Sending:
     def __init__(self, *kinds, rules=None, **options):
         self.time, self.frames, self.is_open = Time(), [], True
         self.kind, self.target, self.armed = Autopilot.PX4, Target(1, 1), False
-        self.origin, self.boot_time_ns = ORIGIN, 61 * S
-        self.gate = Gate(rules or GateRules(), Clock.BOOT)
+        self.origin = ORIGIN
+        self.gate = Gate(rules)
         kinds = kinds or ("global-position",)
         self.messenger = Messenger(self.gate, self, self.time.clocks, kinds=kinds, **options)
         self.packer = Packer()
-
-    def boot_ns(self, mono_ns):
-        return self.boot_time_ns
 
     def send(self, message):
         self.frames.append(decode(self.packer.pack(message)))
@@ -64,7 +61,8 @@ class Sending:
 
 def test_every_message_has_the_position():
     sending = Sending(*KINDS)
-    assert sending.publish() == tuple(KINDS.values())
+    assert sending.publish() == (tuple(KINDS.values()), None)
+    assert sending.gate.sent == dict.fromkeys(KINDS.values(), 1)
     read = {each["name"]: each for each in sending.frames}
     sensor, gps, command = (read[n] for n in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT", "COMMAND_INT"))
     assert (sensor["lat"], sensor["lon"]) == (gps["lat"], gps["lon"]) == (480100000, 20100000)
@@ -76,47 +74,34 @@ def test_every_message_has_the_position():
         assert place == pytest.approx((north, east, -90.0), rel=1e-5)
 
 
-def test_dead_reckoning_is_sent_by_the_message_that_can_mark_it_only():
-    sending = Sending(*KINDS)
-    coasting = replace(ESTIMATE, state="coasting", confidence=0.4, dead_reckoned=True)
-    assert sending.publish(coasting) == ("GLOBAL_POSITION_SENSOR",)
-    (sensor,) = sending.frames
-    assert sensor["flags"] == 1 and (sensor["lat"], sensor["lon"]) == (480100000, 20100000)
-    assert sensor["eph"] == pytest.approx(3.0)
-    assert sending.messenger.incomplete == 0
-
-
 def test_times_are_those_of_exposure_and_sending():
     sending = Sending("global-position", "gps-input")
     sending.publish(age_s=0.25)
     sensor, gps = sending.frames
     assert sensor["processing_time"] == 250_000
     assert (sensor["time_usec"], gps["time_usec"]) == (UTC_NS // 1000 + 250_000, UTC_NS // 1000)
-    boot = Sending("gps-input", clock=Clock.BOOT)
-    boot.publish()
-    assert boot.frames[0]["time_usec"] == 61_000_000 and boot.frames[0]["time_week"] > 2000
 
 
-def test_no_stamp_by_an_unknown_clock_of_the_autopilot(caplog):
-    boot = Sending(clock=Clock.BOOT)
-    for _ in range(2):
-        assert boot.publish(boot_time_ns=None) == () and boot.frames == []
-    assert boot.messenger.incomplete == 2 and len(caplog.messages) == 1
-    assert "boot" in caplog.text
-
-
-def test_local_messages_wait_for_the_origin_and_the_height():
+def test_local_messages_wait_for_the_origin_and_the_height(caplog):
     sending = Sending("odometry", "global-position")
-    assert sending.publish(origin=None) == ("GLOBAL_POSITION_SENSOR",)
-    assert sending.publish(telemetry=VehicleState(None), origin=ORIGIN) == (
-        "GLOBAL_POSITION_SENSOR",
-    )
-    assert sending.messenger.incomplete == 2
+    without = ("GLOBAL_POSITION_SENSOR",), "not_made:ODOMETRY"
+    assert sending.publish(origin=None) == without
+    assert sending.publish(telemetry=VehicleState(None), origin=ORIGIN) == without
+    assert sending.messenger.incomplete == 2 == len(caplog.messages)
     assert sending.gate.withheld == {"not_made:ODOMETRY": 2}
-    assert sending.publish(kind=Autopilot.ARDUPILOT) == tuple(
-        KINDS[kind] for kind in ("odometry", "global-position")
+    assert sending.publish(kind=Autopilot.ARDUPILOT) == (
+        ("ODOMETRY", "GLOBAL_POSITION_SENSOR"),
+        None,
     )
     assert sending.frames[-2]["frame_id"] == 20  # as ArduPilot reads it
+
+
+def test_messages_that_the_link_does_not_take_are_not_counted_as_sent():
+    sending = Sending("gps-input", rules=GateRules(min_interval_s={"GPS_INPUT": 1.0}))
+    assert sending.publish(is_open=False) == ((), None)
+    assert sending.gate.sent == {} and not sending.gate.withheld
+    assert sending.publish(is_open=True) == ((), "rate:GPS_INPUT")
+    assert sending.gate.withheld == {"rate:GPS_INPUT": 1}
 
 
 def find_origin(sending, seconds, known=None, *, armed=False):
@@ -191,7 +176,7 @@ def test_the_gate_judges_the_accuracy_of_the_fix():
     sending = Sending(rules=GateRules(max_std_m=4.0))
     for _ in range(3):
         now_ns = sending.time.now_ns
-        sending.publish(sending.gate.admit(replace(ESTIMATE, boot_ns=now_ns), now_ns))
+        sending.publish(sending.gate.admit(replace(ESTIMATE, time_ns=now_ns), now_ns).estimate)
         sending.time.go(0.2)
     assert len(sending.frames) == 3 and not sending.gate.withheld
     assert sending.frames[-1]["eph"] > 4.0
@@ -255,7 +240,7 @@ class Written:
 
 def test_nmea_times_are_those_of_exposures_and_never_step_back():
     time, sink = Time(), Written()
-    gate = Gate(GateRules(), Clock.BOOT)
+    gate = Gate()
     publisher = Publisher(gate, time.clocks, nmea=[NmeaOut(sink)])
     begin_ns = time.now_ns
     ages_s = [(0.1, False), (0.4, True), (0.1, True), (0.3, False), (0.2, True)]

@@ -23,7 +23,11 @@ from helpers import wait_for
 
 pytestmark = pytest.mark.long
 PEER = Path(__file__).with_name("rclpy_peer.py")
-FLY = "-c", "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))", "fly"
+PROGRAM = (
+    "import sys; from orthonav.cli import main; from orthonav.onboard import fly;"
+    "fly.MAX_AGE_S = 5.0; sys.exit(main(sys.argv[1:]))"
+)
+FLY = "-c", PROGRAM, "fly"
 HEADING, SPEED_MPS, COUNT, EVERY_S = 60.0, 14.0, 40, 0.4
 ENOUGH = 5
 LONGEST_S = 120.0
@@ -139,7 +143,7 @@ def test_a_flight_in_a_graph(flown, fly, hear, tmp_path, simulated):
     ros = [*INPUTS, "-p", "covariance:=fix", "-p", "altitude:=321"]
     ros += ["-p", f"use_sim_time:={str(simulated).lower()}"]
     outputs = "--log", tmp_path / "log.mcap", "--jsonl", lines
-    flying = fly(path, "--deadline-ms", "5000", *outputs, ros=ros)
+    flying = fly(path, *outputs, ros=ros)
     reminder = "no message on /cam/camera_info"
     flying.wait_for(lambda: reminder in flying.said())
 
@@ -177,16 +181,14 @@ def test_a_flight_in_a_graph(flown, fly, hear, tmp_path, simulated):
 
 
 def test_types_and_qos_that_do_not_match_are_named(flown, env, fly, distribution):
-    """A camera with best effort where every part is wanted, a number in place of a range, a
-    subscriber that wants positions of before it came."""
+    """By `rclpy`: a camera with best effort where every part is wanted, a subscriber that wants
+    positions of before it came."""
     flying = fly(flown[0], ros=[*INPUTS, "-p", "image_reliability:=reliable"])
     words = [distribution[1], PEER, "odd", "--seconds", str(LONGEST_S)]
     odd = subprocess.Popen(words, env=env, stderr=subprocess.PIPE, text=True)
-    qos = "has QoS that does not match ours:"
     named = (
-        f"topic /cam/image_raw a publisher {qos} reliability",
-        "topic /range is of type std_msgs/msg/Float64; expected sensor_msgs/msg/Range",
-        f"topic /orthonav/fix a subscriber {qos} durability",
+        "'/cam/image_raw', offering incompatible QoS",
+        "'/orthonav/fix', requesting incompatible",
     )
 
     def all_named():
@@ -199,6 +201,28 @@ def test_types_and_qos_that_do_not_match_are_named(flown, env, fly, distribution
         finally:
             odd.kill()
     assert flying.stop() == 0, flying.said()
+
+
+def test_names_follow_the_namespace_and_parameters_the_file(flown, fly, tmp_path):
+    params = tmp_path / "params.yaml"
+    params.write_text("/**:\n  ros__parameters: {image_transport: compressed, altitude: 12.5}\n")
+    words = [*INPUTS, "-r", "__ns:=/uav", "-r", "__node:=down", "--params-file", params]
+    flying = fly(flown[0], ros=list(map(str, words)))
+    flying.wait_for(lambda: "no message on /cam/camera_info" in flying.said())
+    assert flying.stop() == 0, flying.said()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["-r", "image"], 1, "Couldn't parse remap rule: '-r image'"),
+        (["-p", "covariance:=mine"], 2, "filter or fix, got 'mine'"),
+    ],
+)
+def test_invalid_arguments_are_one_line(flown, fly, words, code, said):
+    flying = fly(flown[0], ros=words)
+    assert flying.process.wait(LONGEST_S) == code, flying.said()
+    assert said in flying.said().splitlines()[-1] and "Traceback" not in flying.said()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -40,20 +40,20 @@ def test_the_age_does_not_depend_on_utc_within_one_boot():
 
 
 def test_the_prior_grows_with_time():
-    assert prior_of(SAVED, 0.0, 300.0).std_m == 4.0
-    grown = prior_of(SAVED, 5.0, 300.0)
+    assert prior_of(SAVED, 0.0).std_m == 4.0
+    grown = prior_of(SAVED, 5.0)
     assert (grown.lat_deg, grown.lon_deg) == (48.1, 2.3)
     assert grown.std_m == pytest.approx(math.hypot(4.0, 150.0))
 
 
 @pytest.mark.parametrize("age_s", [301.0, -1.0, math.nan])
 def test_old_or_future_states_are_not_used(age_s):
-    assert prior_of(SAVED, age_s, 300.0) is None
+    assert prior_of(SAVED, age_s) is None
 
 
 def test_without_a_position_there_is_no_prior():
-    assert prior_of(SavedState(signing_timestamp_10us=5), 1.0, 300.0) is None
-    assert prior_of(replace(SAVED, std_m=math.nan), 1.0, 300.0) is None
+    assert prior_of(SavedState(signing_timestamp_10us=5), 1.0) is None
+    assert prior_of(replace(SAVED, std_m=math.nan), 1.0) is None
 
 
 @pytest.mark.parametrize(
@@ -114,8 +114,8 @@ def test_what_was_learnt_of_maps_is_saved_and_survives_without_the_monitor(tmp_p
 def test_what_was_learnt_of_many_maps_fits_into_the_file(tmp_path):
     path = tmp_path / "state.json"
     third = replace(unknown("0" * 16), mean=np.full(5, 1 / 30), cov=unknown().cov / 3)
-    save(path, SAVED, {f"{number:064d}": third.to_plain() for number in range(state.MAX_MAPS + 5)})
-    assert len(learnt_biases(path)) == state.MAX_MAPS and load(path) == SAVED
+    save(path, SAVED, {f"{number:064d}": third.to_plain() for number in range(105)})
+    assert len(learnt_biases(path)) == 100 and load(path) == SAVED
 
 
 GOOD = unknown().to_plain()

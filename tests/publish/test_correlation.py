@@ -17,7 +17,7 @@ from orthonav.onboard.messages.estimate import (
 
 S = 10**9
 COV = np.array([[25.0, 6.0], [6.0, 16.0]])
-ESTIMATE = NavigationEstimate(48.0, 2.0, COV, 0.97, utc_ns=0)
+ESTIMATE = NavigationEstimate(48.0, 2.0, COV, 0.97, time_ns=0)
 
 
 @pytest.mark.parametrize("interval_s, count", [(0.2, 15.0), (1.0, 3.0), (3.0, 1.0), (60.0, 1.0)])

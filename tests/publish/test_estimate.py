@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from orthonav.core.records import Fix, NoFix, ViewResult, error_ellipse
 from orthonav.onboard.messages.estimate import (
-    Clock,
     EstimateError,
     NavigationEstimate,
     estimate_from_result,
@@ -18,7 +17,7 @@ from orthonav.onboard.messages.estimate import (
 from orthonav.onboard.messages.mavlink import gps_time
 
 COV = np.array([[16.0, 3.0], [3.0, 9.0]])
-PLAIN = NavigationEstimate(48.0, -4.0, COV, 0.95, utc_ns=1_789_000_000_000_000_000)
+PLAIN = NavigationEstimate(48.0, -4.0, COV, 0.95, time_ns=5)
 VELOCITY = {"vel_east_mps": 12.0, "vel_north_mps": -3.5}
 
 
@@ -32,12 +31,12 @@ def unix_ns(text: str) -> int:
 
 
 def test_a_fix_becomes_an_estimate() -> None:
-    made = estimate_from_result(a_result("tracking", **VELOCITY), utc_minus_boot_ns=4 * 10**9)
+    made = estimate_from_result(a_result("tracking", **VELOCITY), utc_ahead_ns=4 * 10**9)
     assert made is not None
     assert (made.lat_deg, made.lon_deg, made.confidence) == (48.1, -4.3, 0.93)
     assert made.state == "tracking"
     assert made.vel_en_mps == (12.0, -3.5) and made.vel_cov_en is None
-    assert (made.utc_ns, made.boot_ns) == (5 * 10**9, 10**9)
+    assert (made.utc_ns, made.time_ns) == (9 * 10**9, 5 * 10**9)
     assert made.processing_s == 0.08
     assert math.isnan(made.alt_amsl_m) and math.isnan(made.alt_std_m)
 
@@ -59,15 +58,11 @@ def test_an_incomplete_velocity_is_unknown(state: str | None, evidence: dict[str
     assert made is not None and made.vel_en_mps is None
 
 
-def test_times_of_both_clocks_are_separate() -> None:
-    utc = estimate_from_result(a_result())
-    boot = estimate_from_result(a_result(), clock=Clock.BOOT, utc_minus_boot_ns=10**18)
-    assert utc is not None and boot is not None
-    assert (utc.utc_ns, utc.boot_ns) == (5 * 10**9, None)
-    assert (boot.utc_ns, boot.boot_ns) == (10**18 + 5 * 10**9, 5 * 10**9)
-    assert boot.sent_ns(Clock.BOOT) - boot.exposed_ns(Clock.BOOT) == 80_000_000
-    with pytest.raises(EstimateError, match="'boot'"):
-        utc.exposed_ns(Clock.BOOT)
+def test_utc_is_stamped() -> None:
+    made = estimate_from_result(a_result(), utc_ahead_ns=10**18)
+    assert made is not None and made.sent_ns - made.stamp_ns == 80_000_000
+    with pytest.raises(EstimateError, match="UTC"):
+        _ = replace(made, utc_ns=None).stamp_ns
 
 
 angles = st.floats(0, math.pi)
@@ -117,7 +112,6 @@ def test_a_confident_estimate_is_of_high_confidence_and_tracking(
         ({"processing_s": math.inf}, "processing time"),
         ({"alt_std_m": -1.0}, "altitude"),
         ({"reset_counter": 256}, "reset counter"),
-        ({"utc_ns": None}, "time of exposure"),
     ],
 )
 def test_an_invalid_value_is_named(change: dict[str, object], said: str) -> None:

@@ -20,7 +20,7 @@ FRAME = LocalFrame(48.0, -4.0)
 def estimate_at(seconds: float, east_m: float = 0.0, north_m: float = 0.0, **more: object):
     lat, lon = FRAME.latlon_from_en((east_m, north_m))
     made = NavigationEstimate(
-        float(lat), float(lon), np.eye(2) * 4.0, 0.95, utc_ns=START_NS + round(seconds * 1e9)
+        float(lat), float(lon), np.eye(2) * 4.0, 0.95, time_ns=START_NS + round(seconds * 1e9)
     )
     return replace(made, **more)
 
@@ -46,34 +46,35 @@ def now(seconds: float) -> int:
 )
 def test_positions_in_doubt_are_withheld_and_counted(reason, change, later_s) -> None:
     gate = Gate()
-    assert gate.admit(estimate_at(0.0, **change), now(later_s)) is None
+    assert gate.admit(estimate_at(0.0, **change), now(later_s)) == (None, reason)
     assert gate.withheld == {reason: 1}
 
 
 @pytest.mark.parametrize("level_m", [35.1, math.inf, math.nan])
 def test_a_protection_level_above_the_alert_limit_is_withheld(level_m) -> None:
-    gate = Gate(GateRules(alert_limit_m=35.0, send_coasting=True))
-    for state in ("tracking", "coasting"):
+    gate = Gate(GateRules(alert_limit_m=35.0))
+    for state in ("tracking", None):
         estimate = estimate_at(0.0, protection_level_m=level_m, state=state)
-        assert gate.admit(estimate, now(0.1)) is None
-    assert gate.withheld == {"alert_limit": 2}
+        assert gate.admit(estimate, now(0.1)) == (None, "alert_limit")
+    assert gate.withheld == {"alert_limit": 2} and gate.is_unavailable
     assert gate.availability(now(3.1))["unavailable_s"] == 3.0
-    assert gate.admit(estimate_at(1.0, protection_level_m=35.0), now(1.0)) is not None
+    assert gate.admit(estimate_at(1.0, protection_level_m=35.0), now(1.0)).reason is None
+    assert not gate.is_unavailable
     assert unavailable_text(gate.availability(now(1.0))) == ""
 
 
 def test_views_out_of_order_are_withheld() -> None:
     gate = Gate()
-    assert gate.admit(estimate_at(0.5), now(0.6)) is not None
-    assert gate.admit(estimate_at(0.5), now(0.7)) is None
-    assert gate.admit(estimate_at(0.4), now(0.7)) is None
+    assert gate.admit(estimate_at(0.5), now(0.6)).reason is None
+    assert gate.admit(estimate_at(0.5), now(0.7)).reason == "out_of_order"
+    assert gate.admit(estimate_at(0.4), now(0.7)).reason == "out_of_order"
     assert gate.withheld == {"out_of_order": 2}
 
 
 def test_positions_pass_again_after_a_clock_was_set_back() -> None:
     gate = Gate()
     gate.admit(estimate_at(3600.0), now(3600.0))
-    passed = [gate.admit(estimate_at(float(second)), now(second)) for second in range(3)]
+    passed = [gate.admit(estimate_at(float(second)), now(second)).estimate for second in range(3)]
     assert [None if each is None else each.reset_counter for each in passed] == [None, None, 1]
 
 
@@ -81,11 +82,11 @@ def test_a_track_found_again_is_a_reset() -> None:
     gate = Gate()
     counters = []
     for second, state in enumerate(["tracking", "tracking", "lost", "searching", "tracking"]):
-        passed = gate.admit(estimate_at(second, state=state), now(second))
+        passed = gate.admit(estimate_at(second, state=state), now(second)).estimate
         counters.append(None if passed is None else passed.reset_counter)
     assert counters == [0, 0, None, None, 1]
     gate.admit(None, now(5))
-    again = gate.admit(estimate_at(6, state="tracking"), now(6))
+    again = gate.admit(estimate_at(6, state="tracking"), now(6)).estimate
     assert again is not None and again.reset_counter == 2 == gate.resets
 
 
@@ -94,19 +95,10 @@ def test_a_view_in_doubt_is_no_reset(doubt) -> None:
     gate = Gate()
     tracking = {"state": "tracking"}
     views = enumerate([tracking, {**tracking, **doubt}, tracking])
-    passed = [gate.admit(estimate_at(second, **view), now(second)) for second, view in views]
+    passed = [
+        gate.admit(estimate_at(second, **view), now(second)).estimate for second, view in views
+    ]
     assert [None if each is None else each.reset_counter for each in passed] == [0, None, 0]
-
-
-def test_dead_reckoning_is_admitted_and_marked_where_asked_for() -> None:
-    gate = Gate(GateRules(send_coasting=True))
-    gate.admit(estimate_at(0, state="tracking"), now(0))
-    passed = gate.admit(estimate_at(1, state="coasting", confidence=0.3), now(1))
-    assert passed is not None and passed.dead_reckoned
-    jumped = gate.admit(estimate_at(2, east_m=500.0, state="coasting"), now(2))
-    assert jumped is None and gate.withheld == {"jump": 1}
-    again = gate.admit(estimate_at(3, state="tracking"), now(3))
-    assert again is not None and not again.dead_reckoned and again.reset_counter == 0
 
 
 def jumped(gate: Gate, east_m: float, views: int, **more: object) -> list[int | None]:
@@ -114,7 +106,7 @@ def jumped(gate: Gate, east_m: float, views: int, **more: object) -> list[int | 
     gate.admit(estimate_at(0.0, **more), now(0))
     counters = []
     for second in range(1, views + 1):
-        passed = gate.admit(estimate_at(second, east_m=east_m, **more), now(second))
+        passed = gate.admit(estimate_at(second, east_m=east_m, **more), now(second)).estimate
         counters.append(None if passed is None else passed.reset_counter)
     return counters
 
@@ -133,7 +125,7 @@ def test_a_single_view_elsewhere_is_withheld_for_good() -> None:
     gate = Gate()
     east_m = [0.0, 500.0, 0.0, 900.0, -700.0, 1500.0, 0.0]
     passed = [
-        gate.admit(estimate_at(0.2 * step, east_m=east), now(0.2 * step))
+        gate.admit(estimate_at(0.2 * step, east_m=east), now(0.2 * step)).estimate
         for step, east in enumerate(east_m)
     ]
     assert [each is not None for each in passed] == [east == 0.0 for east in east_m]
@@ -154,7 +146,7 @@ def test_the_reset_counter_wraps_after_255() -> None:
     gate = Gate()
     for number in range(601):
         state = "lost" if number % 2 else "tracking"
-        passed = gate.admit(estimate_at(number, state=state), now(number))
+        passed = gate.admit(estimate_at(number, state=state), now(number)).estimate
     assert gate.resets == 300
     assert passed is not None and passed.reset_counter == 300 - 256
 
@@ -164,7 +156,7 @@ def test_poles_and_the_antimeridian_are_no_jump(place: tuple[float, float]) -> N
     gate = Gate()
     lat, lon = place
     gate.admit(estimate_at(0.0, lat_deg=lat, lon_deg=lon), now(0))
-    passed = gate.admit(estimate_at(1.0, lat_deg=lat, lon_deg=-lon), now(1))
+    passed = gate.admit(estimate_at(1.0, lat_deg=lat, lon_deg=-lon), now(1)).estimate
     assert passed is not None and passed.reset_counter == 0
 
 

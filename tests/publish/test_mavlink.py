@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from orthonav.core.errors import MissingExtraError
-from orthonav.onboard.messages.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
 from orthonav.onboard.messages.mavlink import (
     Autopilot,
     LocalPose,
@@ -44,7 +44,7 @@ ESTIMATE = NavigationEstimate(
     np.array([[16.0, 3.0], [3.0, 9.0]]),
     0.95,
     utc_ns=UTC_NS,
-    boot_ns=61_500_000_000,
+    time_ns=61_500_000_000,
     processing_s=0.08,
     vel_en_mps=(12.0, -3.5),
     state="tracking",
@@ -147,23 +147,20 @@ def test_the_definitions_have_not_changed() -> None:
 
 
 def test_a_global_position_has_all_known_values() -> None:
-    read = sent(global_position_sensor(ESTIMATE, sensor_id=4, target=Target(9, 1)))
-    assert (read["target_system"], read["target_component"], read["id"]) == (9, 1, 4)
+    read = sent(global_position_sensor(ESTIMATE, target=Target(9, 1)))
+    assert (read["target_system"], read["target_component"], read["id"]) == (9, 1, 1)
     assert (read["lat"], read["lon"]) == (481234567, -43210987)
     assert (read["source"], read["flags"], read["processing_time"]) == (2, 0, 80_000)
     assert read["time_usec"] == UTC_NS // 1000 + 80_000  # of sending
     assert read["eph"] == pytest.approx(EPH, rel=1e-6)
     assert all(math.isnan(read[field]) for field in ("alt_ellipsoid", "alt", "epv"))
-    high = sent(global_position_sensor(WITH_ALTITUDE, clock=Clock.BOOT))
+    high = sent(global_position_sensor(WITH_ALTITUDE))
     assert (high["alt"], high["epv"]) == (134.5, 2.5)
-    assert high["time_usec"] == 61_580_000
 
 
-def test_a_dead_reckoned_position_is_marked_and_needs_an_accuracy() -> None:
-    coasting = replace(ESTIMATE, state="coasting", confidence=0.3, dead_reckoned=True)
-    assert sent(global_position_sensor(coasting))["flags"] == 1
-    with pytest.raises(EstimateError, match="accuracy"):
-        global_position_sensor(replace(coasting, cov_en_m2=np.full((2, 2), math.nan)))
+def test_a_global_position_needs_an_accuracy() -> None:
+    with pytest.raises(EstimateError):
+        global_position_sensor(replace(ESTIMATE, cov_en_m2=np.full((2, 2), math.nan)))
 
 
 def test_a_gps_input_marks_what_is_not_known() -> None:
@@ -180,30 +177,31 @@ def test_a_gps_input_marks_what_is_not_known() -> None:
 
 def test_a_gps_input_has_all_known_values() -> None:
     estimate = replace(WITH_ALTITUDE, vel_cov_en=np.diag([0.04, 0.09]))
-    read = sent(gps_input(estimate, satellites=10, hdop_m=2.0))
-    assert read["ignore_flags"] == 4 | 16
-    assert (read["alt"], read["vert_accuracy"], read["satellites_visible"]) == (134.5, 2.5, 10)
-    assert read["hdop"] == pytest.approx(EPH / 2, rel=1e-6)
+    read = sent(gps_input(estimate))
+    assert read["ignore_flags"] == 2 | 4 | 16
+    assert (read["alt"], read["vert_accuracy"], read["satellites_visible"]) == (134.5, 2.5, 0)
     assert read["speed_accuracy"] == pytest.approx(0.3)
     assert sent(gps_input(replace(estimate, vel_en_mps=None)))["ignore_flags"] & 8
 
 
 @pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
 def test_a_gps_input_of_low_confidence_is_no_fix(estimate: NavigationEstimate) -> None:
-    read = sent(gps_input(estimate, hdop_m=1.0))
+    read = sent(gps_input(estimate))
     assert (read["fix_type"], read["ignore_flags"]) == (1, 255)
     assert [read[field] for field in ("lat", "lon", "alt", "vn", "ve", "yaw")] == [0] * 6
     assert (read["horiz_accuracy"], read["hdop"]) == (0.0, UINT16_MAX)
 
 
 def test_a_single_fix_is_a_command() -> None:
-    read = sent(external_position_estimate(ESTIMATE, clock=Clock.BOOT))
+    read = sent(external_position_estimate(ESTIMATE))
     assert (read["command"], read["frame"]) == (43003, 0)
     assert (read["x"], read["y"]) == (481234567, -43210987)
-    assert read["param1"] == pytest.approx(61.58) and read["param2"] == pytest.approx(0.08)
+    assert read["param1"] == pytest.approx((UTC_NS / 1e9 + 0.08) % 250, abs=1e-3) and read[
+        "param2"
+    ] == pytest.approx(0.08)
     assert read["param3"] == pytest.approx(EPH) and math.isnan(read["z"])
-    late = replace(ESTIMATE, boot_ns=250 * 10**9 - 60_000_000)
-    wrapped = sent(external_position_estimate(late, clock=Clock.BOOT))
+    late = replace(ESTIMATE, utc_ns=250 * 10**9 - 60_000_000)
+    wrapped = sent(external_position_estimate(late))
     assert wrapped["param1"] == pytest.approx(0.02, abs=1e-5)
 
 
@@ -327,15 +325,15 @@ def test_values_are_clamped_not_wrapped(alt, alt_std, east, north, processing_s,
         vel_en_mps=(east, north),
         processing_s=processing_s,
         utc_ns=utc_ns,
-        boot_ns=0,
+        time_ns=0,
         cov_en_m2=np.eye(2) * 1e80,
     )
-    read, gps = sent(global_position_sensor(estimate)), sent(gps_input(estimate, satellites=999))
+    read, gps = sent(global_position_sensor(estimate)), sent(gps_input(estimate, gps_id=999))
     sent_us = (utc_ns + round(processing_s * 1e9)) // 1000
     assert read["time_usec"] == min(max(sent_us, 0), 2**64 - 1)
     assert abs(read["processing_time"] - min(max(processing_s * 1e6, 0), 2**32 - 1)) <= 1
     assert gps["time_usec"] == min(max(utc_ns // 1000, 0), 2**64 - 1)
-    assert gps["satellites_visible"] == 255 and read["eph"] == np.finfo(np.float32).max
+    assert gps["gps_id"] == 255 and read["eph"] == np.finfo(np.float32).max
     if math.isfinite(alt):
         assert read["alt"] == pytest.approx(np.clip(alt, -3.4028235e38, 3.4028235e38), rel=1e-6)
         assert not gps["ignore_flags"] & 1
@@ -408,8 +406,6 @@ def test_a_wrong_signing_is_refused(wrong: dict) -> None:
     [
         lambda: Packer(system_id=0),
         lambda: Packer(component_id=256),
-        lambda: global_position_sensor(ESTIMATE, sensor_id=0),
-        lambda: gps_input(ESTIMATE, hdop_m=0.0),
         lambda: gps_input(replace(ESTIMATE, utc_ns=None)),
     ],
 )

@@ -20,6 +20,7 @@ ESTIMATE = NavigationEstimate(
     -4.3210987,
     np.array([[16.0, 3.0], [3.0, 9.0]]),
     0.95,
+    time_ns=1,
     utc_ns=UTC_NS,
     alt_amsl_m=134.56,
     alt_std_m=2.5,
@@ -126,6 +127,7 @@ def test_values_are_limited_to_their_fields(
         alt_std_m=abs(deviation),
         vel_en_mps=(east, north),
         cov_en_m2=np.eye(2) * 1e10,
+        time_ns=1,
         utc_ns=utc_ns,
     )
     fix = read(gga(estimate, quality=Quality.AUTONOMOUS))
@@ -137,7 +139,7 @@ def test_values_are_limited_to_their_fields(
 
 
 def test_an_unknown_time_is_an_empty_field() -> None:
-    at_boot = replace(ESTIMATE, utc_ns=None, boot_ns=61 * 10**9)
+    at_boot = replace(ESTIMATE, utc_ns=None)
     assert rmc(at_boot).startswith(b"$GPRMC,,V,4807.40740,N")
     assert read(gga(at_boot)).time == ""
 

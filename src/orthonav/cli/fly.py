@@ -39,12 +39,10 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     add("--camera-latency-ms", metavar="MS|FILE", help=f"{text} (`orthonav calibrate --latency`)")
 
     add = parser.add_argument_group("playback of recordings").add_argument
-    text = "use the telemetry of the flight folder; no autopilot is needed"
+    text = "use the telemetry of the flight folder; else its times are those of the autopilot"
     add("--recorded-telemetry", action="store_true", help=text)
     text = "playback speed (default 1: real time)"
     add("--pace", type=float, default=1.0, metavar="FACTOR", help=text)
-    text = "whose times recorded ones are: playback starts at once (own, default), or autopilot"
-    add("--file-clock", choices=("own", "autopilot"), default="own", help=text)
 
     add = parser.add_argument_group("autopilot").add_argument
     text = "udpin:[HOST:]PORT (default HOST: loopback), udpout:HOST:PORT, tcp:HOST:PORT or "
@@ -77,29 +75,16 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     text = "maximum rate of each message (default: one per view)"
     add("--send-rate-hz", type=float, metavar="HZ", help=text)
     add_acceptance(group)
-    text = "largest standard deviation of a position that is sent (default 50; with "
-    text += "--alert-limit-m any)"
-    add("--max-std-m", type=float, metavar="M", help=text)
-    text = "also send dead-reckoned positions, as GLOBAL_POSITION_SENSOR with the flag UNHEALTHY"
-    add("--send-coasting", action="store_true", help=f"{text}, which PX4 ignores")
     text = "lower bound of the standard deviation that messages state (default 0)"
     add("--min-std-m", type=float, default=0.0, metavar="M", help=text)
     add("--dry-run", action="store_true", help="send nothing to the autopilot")
 
     add = parser.add_argument_group("fields of messages").add_argument
-    text = "clock of the timestamps: UTC (default), or the autopilot's time since boot"
-    add("--stamp", choices=("utc", "boot"), default="utc", help=text)
     text = "origin of the local frame (degrees, m above sea level): for odometry and vision set "
     text += "where the autopilot has none; with --ros2: of the map frame"
     triple = "LAT,LON,ALT_M"
     add("--origin", type=numbers(3, triple), metavar=triple, help=text)
-    text = "id of GLOBAL_POSITION_SENSOR, as EKF2_AGP0_ID (default 1)"
-    add("--sensor-id", type=int, default=1, metavar="N", help=text)
     add("--gps-id", type=int, default=0, metavar="N", help="gps_id of GPS_INPUT (default 0)")
-    text = "satellites_visible of GPS_INPUT (default 0)"
-    add("--satellites", type=int, default=0, metavar="N", help=text)
-    text = "hdop of GPS_INPUT: standard deviation divided by this many metres (default: ignored)"
-    add("--hdop-m", type=float, metavar="M", help=text)
     text = "NMEA quality 1 and RMC status A (GPS fix) instead of 6 and V (estimated)"
     add("--nmea-as-gps", action="store_true", help=text)
 
@@ -112,17 +97,11 @@ def _add_flight(parser: argparse.ArgumentParser) -> None:
     text += "over a map with terrain also the take-off position"
     triple = "LAT,LON,STD_M"
     add("--start", type=numbers(3, triple), metavar=triple, help=text)
-    text = "save the last position to this file and start from it after a restart"
+    text = "save the last position to this file and start from it after a restart within 300 s"
     add("--state", type=Path, metavar="FILE", help=text)
-    text = "largest age of a saved position that a flight starts from (default 300)"
-    add("--state-max-age-s", type=float, default=300.0, metavar="S", help=text)
     text = "watch: compare GNSS with the map, report faults, learn displacement, mount and "
     text += "latency, and correct positions by the displacement (default off)"
     add("--gnss", choices=("off", "watch"), default="off", help=text)
-    text = "largest age of a view when its processing starts; older ones are dropped (default 500)"
-    add("--deadline-ms", type=float, default=500.0, metavar="MS", help=text)
-    text = "height above ground from which views are located (default: 60 pixels of the map across)"
-    add("--min-agl-m", type=float, metavar="M", help=text)
 
     add = parser.add_argument_group("flight log").add_argument
     text = "write a flight log that can be replayed"

@@ -7,21 +7,20 @@ import math
 import os
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import acceptance, checked_signature, search_plan
 from orthonav.cli.source import FAR_M, distance_from_map, far_text, map_heights
-from orthonav.core.errors import CameraError, OutputError, UsageError, VariantError
+from orthonav.core.errors import CameraError, OutputError, UsageError
 from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_camera
 from orthonav.core.flight.fixes import Identity
-from orthonav.core.flight.gnss import FILE, GnssSample, read_gnss
+from orthonav.core.flight.gnss import FILE, read_gnss
 from orthonav.core.flight.heights import DATUM_ADVICE
 from orthonav.core.flight.mount import MOST_MS, CameraLatency, Mount, read_latency, read_mount
 from orthonav.core.geo.camera import Camera
@@ -31,7 +30,7 @@ from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import MapFile, open_map
-from orthonav.core.records import CONFIDENT, Prior
+from orthonav.core.records import Prior
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard import cameras, outputs, state
 from orthonav.onboard.cameras import NewestImage, read_in_thread
@@ -39,9 +38,8 @@ from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases
 from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
-from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
+from orthonav.onboard.latency import MIN_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
-from orthonav.onboard.messages.estimate import Clock
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.messages.mavlink import Origin, Signing, signing_timestamp
 from orthonav.onboard.messages.nmea import Quality
@@ -54,143 +52,219 @@ if TYPE_CHECKING:
     from orthonav.onboard.ros2.publisher import Ros2Publisher
 
 log = logging.getLogger(__name__)
-LEAST_VIEW_PX = 60.0
+MIN_VIEW_PX = 60.0
 """Narrower views (pixels of the map across) are seldom confident, and slow."""
-START_OFF_M, START_SIGMAS = 3000.0, 3.0
+MAX_START_OFF_M, START_SIGMAS = 3000.0, 3.0
 """A start farther off the map than this distance and so many deviations ends the program."""
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
-    clocks = Clocks()
-    console = Console(sys.stderr, clocks, quiet=options.quiet)
-    stack.callback(console.close)
-    stack.enter_context(console.in_place_of_stderr())
-    opened = _opened(options)
-    accept = acceptance(options)
-    least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
-    sent_least = 0.0 if options.alert_limit_m else least  # monitors need a confidence all the same
-    mount = read_mount(options.mount) if options.mount else None
-    camera = _camera(options)
-    localizer = Localizer(opened, plan=search_plan(options))
-    start = start_of(options, clocks, localizer)
-    heading_known = options.heading == "known"
-    model = model_of(mount) if mount else None
+    return _Setup(options, stopping, stack).runner()
 
-    def locator() -> Locator:
-        tracker = Tracker(localizer, heading_known=heading_known, model=model)
+
+class _Setup:
+    """Makes the parts of one flight; `stack` closes them."""
+
+    def __init__(
+        self, options: argparse.Namespace, stopping: threading.Event, stack: ExitStack
+    ) -> None:
+        self.options, self.stopping, self.stack = options, stopping, stack
+        self.clocks = Clocks()
+        self.console = Console(sys.stderr, self.clocks, quiet=options.quiet)
+        stack.callback(self.console.close)
+        stack.enter_context(self.console.in_place_of_stderr())
+        self.opened = _opened(options)
+        self.digest = self.opened.manifest.sha256
+        self.localizer = Localizer(self.opened, plan=search_plan(options))
+        self.start = start_of(options, self.clocks, self.localizer)
+        self.link = _link(options, self.clocks)
+        self.fly = self._fly_options()
+
+    def runner(self) -> Runner:
+        options, newest = self.options, NewestImage()
+        source, graph = self._source()
+        for line in plan_lines(options, self.opened, self.fly.accept):
+            self.console.say(line)
+        camera = _camera(options) or source.wait_for_camera()
+        if options.mask is not None:
+            camera = masked(camera, options.mask)
+        self.console.say(camera_line(options, camera))
+        gnss = None if options.gnss == "off" else self._gnss(camera, source)
+        publisher = self._publisher(newest, graph)
+        if self.link is not None:
+            self.stack.callback(LinkThread(self.link).stop)
+        sink = _sink(options, camera, self.digest)
+        if sink is not None and options.ros2:
+            source.log_gnss = sink.gnss  # messages as received
+        elif sink is not None and gnss is not None:
+            gnss.log = sink.gnss
+        self.stack.callback(read_in_thread(newest, source, self.stopping))
+        return Runner(
+            newest,
+            camera,
+            self._locator,
+            publisher,
+            replace(self.fly, min_agl_m=self._min_agl_m(camera)),
+            self.clocks,
+            link=self.link,
+            sink=sink,
+            start=self.start,
+            gnss=gnss,
+            latency=_latency(options),
+        )
+
+    def _fly_options(self) -> FlyOptions:
+        options = self.options
+        take_off = tuple(options.start) if options.start else None
+        heights = map_heights(self.opened, take_off=take_off)
+        only_amsl = set(options.height or ()) == {"amsl"}
+        if heights is not None and not heights.datum_known and only_amsl:
+            raise UsageError(
+                "--height amsl needs the height of the ground above the sea, and the vertical "
+                f"datum of the map's terrain is unknown: {DATUM_ADVICE}"
+            )
+        mount = read_mount(options.mount) if options.mount else None
+        return FlyOptions(
+            mount_deg=tuple(options.mount_deg),
+            mount=mount,
+            heights=heights,
+            heading_known=options.heading == "known",
+            recorded=options.ros2 or options.recorded_telemetry,
+            accept=acceptance(options),
+            map_change=self.opened.change,
+            state_path=options.state,
+            logged_options=_logged_options(options, mount),
+        )
+
+    @property
+    def _min_sent(self) -> float:
+        """Confidence of positions that are sent; an alert limit replaces it."""
+        return 0.0 if self.options.alert_limit_m else self.fly.min_confidence
+
+    def _min_agl_m(self, camera: Camera) -> float:
+        """On the ground a dry run shows what it would do in flight."""
+        if self.options.dry_run:
+            return 0.0
+        return MIN_VIEW_PX * self.localizer.grid.gsd_m / math.sqrt(math.prod(camera.extent))
+
+    def _locator(self) -> Locator:
+        mount = self.fly.mount
+        model = model_of(mount) if mount else None
+        tracker = Tracker(self.localizer, heading_known=self.fly.heading_known, model=model)
         return MountCorrected(tracker, mount) if mount else tracker
 
-    heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
-    if heights is not None and not heights.datum_known and set(options.height or ()) == {"amsl"}:
-        raise UsageError(
-            "--height amsl needs the height of the ground above the sea, and the vertical datum of "
-            f"the map's terrain is unknown: {DATUM_ADVICE}"
+    def _source(self) -> "tuple[Any, Ros2Publisher | None]":
+        """Source of the images, and the publisher of a ROS 2 graph."""
+        options = self.options
+        if options.ros2:
+            return self._ros2()
+        if cameras.is_live(options.source):
+            camera = _camera(options)
+            size_px = None if camera is None else (camera.width_px, camera.height_px)
+            name = cameras.live_name(options.source)
+            return cameras.LiveCamera(name, self.clocks, size_px=size_px), None
+        if not options.pace > 0:
+            raise UsageError("--pace must be above 0")
+        path = Path(options.source)
+        if self.link is not None and path.is_dir() and not options.recorded_telemetry:
+            due_ns = cameras.autopilot_pace(self.link.boot_ns, self.clocks, options.pace)
+        else:  # a video has no times of an autopilot
+            due_ns = cameras.own_pace(self.clocks, options.pace)
+        images = cameras.recorded_images(path)
+        return cameras.Playback(images, due_ns, self.clocks, self.stopping.is_set), None
+
+    def _ros2(self) -> "tuple[Any, Ros2Publisher]":
+        """Reader and publisher of a new node. The centre of the map is the origin of the ROS map
+        frame unless `--origin` is given."""
+        from orthonav.onboard.ros2.node import Node, Rosout
+        from orthonav.onboard.ros2.publisher import Ros2Publisher
+        from orthonav.onboard.ros2.reader import Ros2Reader
+
+        options = self.options
+        node = Node(options.ros_args, os.environ.get("ROS_DISTRO", ""))
+        self.stack.callback(node.close)
+        if "--disable-rosout-logs" not in options.ros_args:
+            rosout, logger = Rosout(node), logging.getLogger("orthonav")
+            logger.addHandler(rosout)
+            self.stack.callback(logger.removeHandler, rosout)
+        reader = Ros2Reader(
+            node,
+            TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
+            self.clocks,
+            self.stopping.is_set,
+            mount_deg=self.fly.mount_deg,
         )
-    link = _link(options, clocks)
-    if options.ros2:
-        source, graph = _ros2(options, clocks, stopping, stack, localizer.sheet.frame, sent_least)
-    else:
-        source, graph = _source(options, clocks, link, camera, stopping), None
-    for line in plan_lines(options, opened, accept):
-        console.say(line)
-    camera = camera or source.wait_for_camera()
-    if options.mask is not None:
-        camera = masked(camera, options.mask)
-    console.say(camera_line(options, camera))
-    digest = opened.manifest.sha256
-    gnss = None
-    if options.gnss != "off":
-        queue = source.gnss if options.ros2 else None if link is None else link.gnss
-        used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
-        gnss = gnss_watch(options, localizer.sheet.frame, digest, used, queue, least, clocks)
-    newest = NewestImage()
-    wanted = None if options.ros2 else f"images from {options.source}"  # ROS 2 has its own text
-    narrator = Narrator(
-        *(console, clocks, newest, wanted, link, options.autopilot),
-        sends=not options.dry_run and (link is not None or graph is not None),
-    )
-    publisher = _publisher(options, clocks, link, sent_least, graph, narrator, digest)
-    if link is not None:
-        stack.callback(LinkThread(link).stop)
-    sink = _sink(options, camera, digest)
-    if sink is not None and options.ros2:
-        source.log_gnss = sink.gnss  # messages as received
-    elif sink is not None and gnss is not None:
-        gnss.log = sink.gnss
-    stack.callback(read_in_thread(newest, source, stopping))
-    least_agl_m = LEAST_VIEW_PX * localizer.grid.gsd_m / math.sqrt(math.prod(camera.extent))
-    fly = FlyOptions(
-        mount_deg=tuple(options.mount_deg),
-        mount=mount,
-        heights=heights,
-        heading_known=heading_known,
-        deadline_s=options.deadline_ms / 1e3,
-        min_agl_m=least_agl_m if options.min_agl_m is None else options.min_agl_m,
-        recorded=options.ros2 or options.recorded_telemetry,
-        accept=accept if accept.criterion != "confidence" else None,
-        min_confidence=least,
-        risk=accept.risk,
-        map_change=opened.change,
-        state_path=options.state,
-        logged_options=_logged_options(options, mount),
-    )
-    return Runner(
-        newest,
-        camera,
-        locator(),
-        publisher,
-        fly,
-        clocks,
-        link=link,
-        sink=sink,
-        start=start,
-        fresh=locator,
-        gnss=gnss,
-        latency=_latency(options, heading_known=heading_known),
-    )
+        origin = options.origin
+        publisher = Ros2Publisher(
+            node,
+            LocalFrame(*origin[:2]) if origin else self.localizer.sheet.frame,
+            reader.now_ns,
+            origin_alt_m=origin[2] if origin else math.nan,
+            min_std_m=options.min_std_m,
+            min_confidence=self._min_sent,
+            silent=options.dry_run,
+        )
+        reader.report_wait = lambda why: publisher.health(
+            {"health": "FAILED", "reasons": ["no_camera"], "waiting": why}
+        )
+        return reader, publisher
 
+    def _publisher(self, newest: NewestImage, graph: "Ros2Publisher | None") -> outputs.Publisher:
+        options, clocks, link = self.options, self.clocks, self.link
+        rules = GateRules(self._min_sent, min_interval_s=_intervals_s(options))
+        if options.alert_limit_m:
+            rules = replace(rules, max_std_m=math.inf, alert_limit_m=options.alert_limit_m)
+        gate = Gate(rules)
+        messenger = None
+        if link is not None:
+            messenger = outputs.Messenger(
+                *(gate, link, clocks),
+                kinds=_kinds(options),
+                gps_id=options.gps_id,
+                min_std_m=options.min_std_m,
+                min_confidence=self._min_sent,
+                origin=Origin(*options.origin) if options.origin else None,
+            )
+        # ROS 2 names what it waits for itself.
+        wanted = None if options.ros2 else f"images from {options.source}"
+        narrator = Narrator(
+            *(self.console, clocks, newest, wanted, link, options.autopilot),
+            sends=not options.dry_run and (link is not None or graph is not None),
+        )
+        nmea, lines = _opened_outputs(options, self.digest)
+        return outputs.Publisher(
+            gate,
+            clocks,
+            messenger=messenger,
+            nmea=nmea,
+            lines=[*lines, narrator],
+            graph=graph,
+            min_confidence=self._min_sent,
+            min_std_m=options.min_std_m,
+        )
 
-def _ros2(
-    options: argparse.Namespace,
-    clocks: Clocks,
-    stopping: threading.Event,
-    stack: ExitStack,
-    frame: LocalFrame,
-    min_confidence: float,
-) -> "tuple[Any, Ros2Publisher]":
-    """Reader and publisher of a new node, which `stack` closes. The centre of `frame` is the origin
-    of the ROS map frame unless `--origin` is given."""
-    from orthonav.onboard.ros2.arguments import ros_arguments
-    from orthonav.onboard.ros2.node import Node, Rosout
-    from orthonav.onboard.ros2.publisher import Ros2Publisher
-    from orthonav.onboard.ros2.reader import Ros2Reader
-
-    node = Node(ros_arguments(options.ros_args, os.environ))
-    stack.callback(node.close)
-    if "--disable-rosout-logs" not in node.arguments.passed:
-        rosout, logger = Rosout(node), logging.getLogger("orthonav")
-        logger.addHandler(rosout)
-        stack.callback(logger.removeHandler, rosout)
-    reader = Ros2Reader(
-        node,
-        TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
-        clocks,
-        stopping.is_set,
-        mount_deg=tuple(options.mount_deg),
-    )
-    publisher = Ros2Publisher(
-        node,
-        LocalFrame(*options.origin[:2]) if options.origin else frame,
-        reader.now_ns,
-        origin_alt_m=options.origin[2] if options.origin else math.nan,
-        min_std_m=options.min_std_m,
-        min_confidence=min_confidence,
-        silent=options.dry_run,
-    )
-    reader.report_wait = lambda why: publisher.health(
-        {"health": "FAILED", "reasons": ["no_camera"], "waiting": why}
-    )
-    return reader, publisher
+    def _gnss(self, camera: Camera, source: Any) -> GnssWatch:
+        """GNSS monitor over the solutions that are received, or over `gnss.csv` of the flight
+        folder. After a change of camera, mount or latency, what that adds is learnt again."""
+        options, clocks = self.options, self.clocks
+        recorded = options.recorded_telemetry and not options.ros2
+        if recorded:
+            solutions = recorded_solutions(read_gnss(Path(options.source) / FILE))
+        else:
+            heard: Any = source if options.ros2 else self.link
+            solutions = live_solutions(heard.gnss)
+        used = camera, options.mount_deg, self.fly.mount, _stated(options.camera_latency_ms)
+        return GnssWatch(
+            self.localizer.sheet.frame,
+            solutions,
+            digest=self.digest,
+            known=state.learnt_biases(options.state) if options.state else {},
+            reference=_interrupted(options, self.digest, clocks),
+            setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
+            recorded=recorded,
+            min_confidence=self.fly.min_confidence,
+            utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
+        )
 
 
 def _opened(options: argparse.Namespace) -> MapFile:
@@ -212,28 +286,25 @@ def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLo
     return FlightLog(options.log, camera, info, views=options.log_views, max_bytes=most)
 
 
-def _latency(options: argparse.Namespace, *, heading_known: bool) -> LatencyMonitor | None:
+def _latency(options: argparse.Namespace) -> LatencyMonitor | None:
     """Monitor of the latency of a live camera; None for recordings and ROS, which have times."""
     if options.ros2 or not cameras.is_live(options.source):
         return None
     stated = _stated(options.camera_latency_ms)
-    return LatencyMonitor(
-        None if stated is None else stated.latency_ms / 1e3,
-        STATED_STD_S if stated is None else max(stated.std_ms / 1e3, STATED_STD_S),
-        mount_deg=tuple(options.mount_deg),
-        heading_known=heading_known,
-    )
+    if stated is None:
+        return LatencyMonitor()
+    return LatencyMonitor(stated.latency_ms / 1e3, stated.std_ms / 1e3)
 
 
 def _stated(text: str | None) -> CameraLatency | None:
     if text is None:
         return None
     try:
-        stated = CameraLatency(float(text), STATED_STD_S * 1e3)
+        stated = CameraLatency(float(text), MIN_STD_S * 1e3)
     except ValueError:
         return read_latency(Path(text))
     if not 0 <= stated.latency_ms <= MOST_MS:
-        raise VariantError(f"--camera-latency-ms must be 0 to {MOST_MS:g}, got {text}")
+        raise UsageError(f"--camera-latency-ms must be 0 to {MOST_MS:g}, got {text}")
     return stated
 
 
@@ -248,27 +319,6 @@ def _camera(options: argparse.Namespace) -> Camera | None:
     return read_camera(path)[0]
 
 
-def _source(
-    options: argparse.Namespace,
-    clocks: Clocks,
-    link: AutopilotLink | None,
-    camera: Camera | None,
-    stopping: threading.Event,
-) -> Any:
-    if cameras.is_live(options.source):
-        size_px = None if camera is None else (camera.width_px, camera.height_px)
-        return cameras.LiveCamera(cameras.live_name(options.source), clocks, size_px=size_px)
-    if not options.pace > 0:
-        raise VariantError("--pace must be above 0")
-    due_ns: Callable[[int], int | None] = cameras.own_pace(clocks, options.pace)
-    if options.file_clock == "autopilot":
-        if link is None:
-            raise VariantError("--file-clock autopilot needs --autopilot")
-        due_ns = cameras.autopilot_pace(link.boot_ns, clocks, options.pace)
-    images = cameras.recorded_images(Path(options.source))
-    return cameras.Playback(images, due_ns, clocks, stopping.is_set)
-
-
 def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
     if options.autopilot is None:
         return None
@@ -279,8 +329,7 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         system_id=options.system_id,
         signing=_signing(options, clocks),
         silent=options.dry_run,
-        stamp=Clock(options.stamp),
-        own_receiver=options.gps_id if "gps-input" in (options.send or ()) else None,
+        own_receiver=options.gps_id if "gps-input" in _kinds(options) else None,
     )
 
 
@@ -293,7 +342,7 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
         try:
             key = bytes.fromhex(text.decode("ascii"))
         except ValueError:
-            raise VariantError(
+            raise UsageError(
                 f"signing key: expected 32 bytes or 64 hexadecimal digits: {options.signing_key}"
             ) from None
     saved = state.load(options.state) if options.state else None
@@ -301,58 +350,23 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
     return Signing(key, max(stamp, saved.signing_timestamp_10us + 1 if saved else 0))
 
 
-def _publisher(
-    options: argparse.Namespace,
-    clocks: Clocks,
-    link: AutopilotLink | None,
-    least: float,
-    graph: "Ros2Publisher | None",
-    narrator: Narrator,
-    digest: str,
-) -> outputs.Publisher:
-    alert_limit_m = options.alert_limit_m or math.inf
-    max_std_m = options.max_std_m
-    if max_std_m is None:
-        max_std_m = math.inf if options.alert_limit_m else GateRules().max_std_m
-    rules = GateRules(
-        least,
-        max_std_m,
-        min_interval_s=_intervals_s(options),
-        send_coasting=options.send_coasting,
-        alert_limit_m=alert_limit_m,
-    )
-    gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
+def _kinds(options: argparse.Namespace) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(options.send or ["global-position"]))
+
+
+def _opened_outputs(
+    options: argparse.Namespace, digest: str
+) -> tuple[list[outputs.NmeaOut], list[outputs.JsonOut]]:
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [outputs.NmeaOut(outputs.open_sink(url), quality=quality) for url in options.nmea]
-        lines: list[Any] = [
+        lines = [
             outputs.JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
             for each in options.jsonl
         ]
     except OSError as error:
         raise OutputError(f"output cannot be opened: {error}") from error
-    messenger = None
-    if link is not None:
-        messenger = outputs.Messenger(
-            *(gate, link, clocks),
-            kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
-            clock=Clock(options.stamp),
-            sensor_id=options.sensor_id,
-            gps={name: getattr(options, name) for name in ("gps_id", "satellites", "hdop_m")},
-            min_std_m=options.min_std_m,
-            min_confidence=least,
-            origin=Origin(*options.origin) if options.origin else None,
-        )
-    return outputs.Publisher(
-        gate,
-        clocks,
-        messenger=messenger,
-        nmea=nmea,
-        lines=[*lines, narrator],
-        graph=graph,
-        min_confidence=least,
-        min_std_m=options.min_std_m,
-    )
+    return nmea, lines
 
 
 def _intervals_s(options: argparse.Namespace) -> dict[str, float]:
@@ -360,8 +374,8 @@ def _intervals_s(options: argparse.Namespace) -> dict[str, float]:
     if rate_hz is None:
         return {}
     if not rate_hz > 0:
-        raise VariantError("--send-rate-hz must be above 0")
-    local = [outputs.KINDS[kind] for kind in options.send or () if kind in outputs.LOCAL]
+        raise UsageError("--send-rate-hz must be above 0")
+    local = [outputs.KINDS[kind] for kind in _kinds(options) if kind in outputs.LOCAL]
     if local and rate_hz * outputs.PX4_VISION_S <= 1:
         log.warning(
             f"PX4 fuses {' and '.join(local)} only at more than {1 / outputs.PX4_VISION_S:g} Hz, "
@@ -398,8 +412,7 @@ def plan_lines(options: argparse.Namespace, opened: MapFile, accept: Acceptance)
         ground += " with houses and trees" if sheet.surface is not None else ""
     recorded = f"recorded telemetry of {options.source}" if options.recorded_telemetry else None
     telemetry = ", ".join(each for each in (options.autopilot, recorded) if each)
-    kinds = dict.fromkeys(options.send or ["global-position"])
-    sent = [outputs.KINDS[kind] for kind in kinds] if options.autopilot else []
+    sent = [outputs.KINDS[kind] for kind in _kinds(options)] if options.autopilot else []
     sent += ["ROS 2 topics"] if options.ros2 else []
     if options.dry_run and sent:
         sent = ["nothing to the autopilot (--dry-run)"]
@@ -437,46 +450,14 @@ def camera_line(options: argparse.Namespace, camera: Camera) -> str:
     return f"camera: {size} ({given}); images from {source}{pace}"
 
 
-def gnss_watch(
-    options: argparse.Namespace,
-    frame: LocalFrame,
-    digest: str,
-    used: tuple[Any, ...],
-    queue: deque[GnssSample] | None,
-    min_confidence: float,
-    clocks: Clocks,
-) -> GnssWatch:
-    """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder. After a
-    change of what is `used` (camera, mount, latency), what that adds is learnt again."""
-    recorded = options.recorded_telemetry and not options.ros2
-    if recorded:
-        source = recorded_solutions(read_gnss(Path(options.source) / FILE))
-    elif queue is None:
-        raise VariantError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
-    else:
-        source = live_solutions(queue)
-
-    return GnssWatch(
-        frame,
-        source,
-        digest=digest,
-        known=state.learnt_biases(options.state) if options.state else {},
-        reference=_interrupted(options, digest, clocks),
-        setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
-        recorded=recorded,
-        min_confidence=min_confidence,
-        utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
-    )
-
-
 def _interrupted(options: argparse.Namespace, digest: str, clocks: Clocks) -> Biases | None:
-    """Reference of the flight that this one continues: its last position is at most
-    `--state-max-age-s` old, or of unknown age because a clock was set back."""
+    """Reference of the flight that this one continues: its last position is recent, or of unknown
+    age because a clock was set back."""
     saved = state.load(options.state) if options.state else None
     if saved is None:
         return None
     age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
-    if age_s > options.state_max_age_s:
+    if age_s > state.MAX_AGE_S:
         return None
     return state.reference_biases(options.state, digest)
 
@@ -493,7 +474,7 @@ def start_of(
         if last is None:
             return given
         age_s = last.age_s(clocks.utc_ns(), clocks.mono_ns(), state.boot_id())
-        return state.prior_of(last, age_s, options.state_max_age_s) or given
+        return state.prior_of(last, age_s) or given
 
     return prior
 
@@ -503,16 +484,16 @@ def given_start(options: argparse.Namespace, localizer: Localizer) -> Prior | No
         return None
     start, place = Prior.known(*options.start), options.start[:2]
     if start is None or abs(start.lon_deg) > 180 or start.std_m == 0:
-        raise VariantError(
+        raise UsageError(
             "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a standard "
             f"deviation above 0 m, got {','.join(f'{value:g}' for value in options.start)}"
             f"{swapped_hint(*place)}"
         )
     far_m, hint = distance_from_map(place, localizer)
-    most_m = START_OFF_M + START_SIGMAS * start.std_m
+    most_m = MAX_START_OFF_M + START_SIGMAS * start.std_m
     if far_m > most_m:
-        raise VariantError(
-            f"--start is {far_m / 1000:,.1f} km from the map, more than {START_OFF_M / 1000:g} "
+        raise UsageError(
+            f"--start is {far_m / 1000:,.1f} km from the map, more than {MAX_START_OFF_M / 1000:g} "
             f"km and {START_SIGMAS:g} times its deviation; check the map and the position{hint}"
         )
     if far_m > FAR_M:

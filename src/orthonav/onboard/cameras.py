@@ -5,12 +5,10 @@ A thread reads; the consumer gets the newest image, and replaced images are coun
 
 import logging
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any, Protocol
 
 import cv2
@@ -21,18 +19,11 @@ from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.files import require_file
 from orthonav.core.flight import open_flight
 from orthonav.core.records import NoFix, Telemetry, grey_levels
+from orthonav.onboard.ports import retry_s
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
-RETRY_S = (0.5, 1.0, 2.0, 5.0)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
-GAP_S, GAP_INTERVALS = 3.0, 3.0
-"""A longer time without images, also in usual intervals, may change the latency. After a shorter
-one, images can be late by as much: positions show it (`orthonav.onboard.latency.PositionCheck`)."""
-FROZEN_LEVELS = 0.25
-"""Mean difference in grey levels below which two images are the same; noise is four times that."""
-FROZEN_SIDE_PX = 64
-Y16 = cv2.VideoWriter.fourcc(*"Y16 ")  # grey of 16 bits, as of thermal cameras
 Grey = NDArray[np.uint8]
 
 
@@ -43,8 +34,7 @@ class CameraImage:
     `exposed_ns`: by our monotonic clock; of a live camera the arrival, from which the flight loop
     subtracts the latency. `time_ns`: written to results: UTC of a live camera, else that of the
     recording. `grey`: (H, W), None where the image could not be decoded. `telemetry`, `vehicle`:
-    that came with it, from a recording or ROS. `interruptions`: of a live camera: how often images
-    stopped for a while, or it was opened again; the latency may have changed.
+    that came with it, from a recording or ROS.
     """
 
     number: int
@@ -55,7 +45,6 @@ class CameraImage:
     problem: NoFix | None = None
     telemetry: Telemetry | None = None
     vehicle: VehicleState | None = None
-    interruptions: int | None = None
 
 
 class CameraGoneError(CameraError):
@@ -85,9 +74,6 @@ class LiveCamera:
         self._opener = capture or _capture
         self._capture: Any = None
         self._number = 0
-        self._interruptions = 0
-        self._last_ns: int | None = None
-        self._intervals_s: deque[float] = deque([GAP_S / GAP_INTERVALS], maxlen=31)
         # UTC may be set in flight; the times of views must not jump with it.
         self._utc_minus_mono_ns = clocks.utc_ns() - clocks.mono_ns()
 
@@ -98,7 +84,6 @@ class LiveCamera:
             self.close()
             raise CameraGoneError(f"camera delivers no images: {self._shown}")
         arrived_ns = self._clocks.mono_ns()
-        self._count_interruptions(arrived_ns)
         found, frame = self._capture.retrieve()
         self._number += 1
         grey, why = None, "image could not be decoded"
@@ -114,22 +99,12 @@ class LiveCamera:
             arrived_ns + self._utc_minus_mono_ns,
             grey,
             problem,
-            interruptions=self._interruptions,
         )
 
     def close(self) -> None:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
-            self._interruptions += 1
-
-    def _count_interruptions(self, arrived_ns: int) -> None:
-        before_ns, self._last_ns = self._last_ns, arrived_ns
-        if before_ns is None:
-            return
-        gap_s = (arrived_ns - before_ns) / 1e9
-        self._interruptions += gap_s > max(GAP_S, GAP_INTERVALS * median(self._intervals_s))
-        self._intervals_s.append(gap_s)
 
     def _open(self) -> Any:
         capture = self._opener(self._name)
@@ -140,7 +115,7 @@ class LiveCamera:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        if int(capture.get(cv2.CAP_PROP_FOURCC)) == Y16:
+        if int(capture.get(cv2.CAP_PROP_FOURCC)) == cv2.VideoWriter.fourcc(*"Y16 "):
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits
         return capture
 
@@ -328,7 +303,7 @@ def read_into(
                     expected = isinstance(error, CameraGoneError)
                     log.warning("camera: %s", error, exc_info=not expected)
                 source.close()
-                pause(RETRY_S[min(failures, len(RETRY_S) - 1)])
+                pause(retry_s(failures))
                 failures += 1
                 continue
             if image is None:
@@ -363,12 +338,13 @@ class FrozenCheck:
         self.repeats = 0
 
     def is_repeat(self, grey: Grey) -> bool:
-        step = max(1, min(grey.shape) // FROZEN_SIDE_PX)
+        step = max(1, min(grey.shape) // 64)
         sample = np.ascontiguousarray(grey[step // 2 :: step, step // 2 :: step])
         before, self._before = self._before, sample
         same = False
         if before is not None and before.shape == sample.shape:
             off = np.abs(before.astype(np.int16) - sample)
-            same = not off.any() or (off.mean() < FROZEN_LEVELS and sample.std() > 0)
+            # Noise of a camera makes four times as many grey levels.
+            same = not off.any() or (off.mean() < 0.25 and sample.std() > 0)
         self.repeats = self.repeats + 1 if same else 0
         return bool(same)

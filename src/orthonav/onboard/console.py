@@ -39,7 +39,6 @@ _FAULTS = {
     "link_down": "no message from the autopilot",
     "no_telemetry": "no attitude; set the stream rates of the autopilot",
     "wrong_camera": "images do not fit --camera",
-    "motion_mismatch": "check the camera, --mount-deg, height and heading",
     "heading_mismatch": "check the compass and --mount-deg, or use --heading unknown",
     "height_mismatch": "check --height and the focal length",
     "start_mismatch": "the ground contradicts the start position",

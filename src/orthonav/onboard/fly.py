@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, MapChangedError, MapFileError
 from orthonav.core.flight.heights import (
@@ -26,26 +25,25 @@ from orthonav.core.flight.mount import Mount
 from orthonav.core.flight.recording import LONG_GAP_NS, fitted
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles
 from orthonav.core.geo.camera import Camera
-from orthonav.core.limits import DEFAULT_RISK
-from orthonav.core.localize.confidence import Acceptance
+from orthonav.core.localize.confidence import ALERT_LIMIT, Acceptance
 from orthonav.core.localize.view import check_picture
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, FrozenCheck, NewestImage
 from orthonav.onboard.gnss.watch import GnssWatch
-from orthonav.onboard.health import (
-    EventCounter,
-    Health,
-    HealthReporter,
-    StartCheck,
-    judge,
-    mismatch,
-    notify,
-)
-from orthonav.onboard.latency import Latency, LatencyMonitor
+from orthonav.onboard.health import Health, HealthReporter, Monitor, judge, notify
+from orthonav.onboard.latency import UNKNOWN, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.gate import unavailable_text
 from orthonav.onboard.messages.mavlink import dialect, status_texts
+from orthonav.onboard.monitors import (
+    CameraMonitor,
+    EventCounter,
+    LinkMonitor,
+    OutputMonitor,
+    ProgramMonitor,
+    TrackMonitor,
+)
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, VehicleState
@@ -54,20 +52,10 @@ if TYPE_CHECKING:
     from orthonav.onboard.log import FlightLog
 
 log = logging.getLogger(__name__)
-TICK_NS = 10**9
-"""Interval of health and state."""
-UTC_JUMP_NS = 200_000_000
-"""UTC that moves by more than this against the monotonic clock within a tick has been set."""
-WITHHELD_NS = 80_000_000
-"""Views that are withheld are logged at most so often, for `orthonav calibrate --latency`."""
+MAX_AGE_S = 0.5
+"""Images that are older when their processing starts are dropped; live ones count from arrival."""
 TELEMETRY_WAIT_S = 0.15
 """Longest wait for telemetry after the exposure: three attitudes at 20 Hz, the least rate."""
-JUMP_NS = 10**9
-"""Recorded images that are earlier than the one before by more belong to another run."""
-ASSUMED_MPS = 20.0
-"""Speed assumed in the error of the latency where none is known."""
-_POLL_S = 0.001
-Grey = NDArray[np.uint8]
 Velocity = tuple[float, float]
 
 
@@ -76,26 +64,31 @@ class FlyOptions:
     """Options of the flight loop.
 
     `mount_deg`: yaw, pitch, roll of the camera in the body. `mount`: calibrated one, for the health
-    only: the locator applies it. `heights`: None where the map has no terrain. `deadline_s`: older
-    images are dropped. `min_agl_m`: lower views are not located. `recorded`: telemetry comes with
-    the image, from a recording or ROS. `min_confidence`: of fixes that monitors use and that are
-    accepted. `accept`: in addition; an alert limit replaces it for acceptance. `map_change`: how
-    the open map file was changed in place. `logged_options`: for a replay of the log.
+    only: the locator applies it. `heights`: None where the map has no terrain. `min_agl_m`: lower
+    views are not located. `recorded`: telemetry comes with the image, from a recording or ROS.
+    `accept`: of fixes that are accepted; `map_change`: how the open map file was changed in place.
+    `logged_options`: for a replay of the log.
     """
 
     mount_deg: Angles = LOOKS_DOWN
     mount: Mount | None = None
     heights: FlownHeights | None = None
     heading_known: bool = True
-    deadline_s: float = 0.5
     min_agl_m: float = 0.0
     recorded: bool = False
-    accept: Acceptance | None = None
-    min_confidence: float = CONFIDENT
-    risk: float = DEFAULT_RISK
+    accept: Acceptance = field(default_factory=lambda: Acceptance("confidence", CONFIDENT))
     map_change: Callable[[], str | None] = lambda: None
     state_path: Path | None = None
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def min_confidence(self) -> float:
+        """Of fixes that monitors use; also of accepted ones, unless an alert limit decides."""
+        return self.accept.threshold if self.accept.criterion == "confidence" else CONFIDENT
+
+    def accepts(self, fix: Fix) -> bool:
+        by_limit = self.accept.criterion == ALERT_LIMIT
+        return self.accept.accepts(fix) and (by_limit or fix.confidence >= self.min_confidence)
 
 
 class Runner:
@@ -105,7 +98,7 @@ class Runner:
         self,
         newest: NewestImage,
         camera: Camera,
-        locator: Locator,
+        locator: Callable[[], Locator],
         publisher: Publisher,
         options: FlyOptions,
         clocks: Clocks,
@@ -113,36 +106,41 @@ class Runner:
         link: AutopilotLink | None = None,
         sink: "FlightLog | None" = None,
         start: Callable[[], Prior | None] = lambda: None,
-        fresh: Callable[[], Locator] | None = None,
         gnss: GnssWatch | None = None,
         latency: LatencyMonitor | None = None,
     ) -> None:
-        """`start` gives the prior of the first view; `fresh` makes a locator where time goes back.
-        `latency`: of a live camera; None where images carry the time of their exposure."""
-        self._newest, self._camera, self._locator = newest, camera, locator
+        """`locator` makes one, again where the time of a recording goes back; `start` gives the
+        prior of the first view. `latency`: of a live camera; None where images carry the time of
+        their exposure."""
+        self._newest, self._camera = newest, camera
+        self._new_locator, self._locator = locator, locator()
         self._publisher, self.options, self._clocks = publisher, options, clocks
-        self._link, self._sink = link, sink
-        self._latency = latency
-        self._start: Callable[[], Prior | None] | None = start
-        self._start_check: StartCheck | None = None
-        self._begin, self._fresh = start, fresh
-        self._time_ns = 0
-        self._gnss = gnss
-        self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
+        self._link, self._sink, self._gnss, self._latency = link, sink, gnss, latency
+        self._begin, self._start = start, True
+        self.counter, self._reporter = EventCounter(clocks.mono_ns()), HealthReporter()
+        self._camera_monitor = CameraMonitor(self.counter)
+        self._track = TrackMonitor(
+            self.counter,
+            publisher,
+            lambda: self._locator.state_name,
+            heading_known=options.heading_known,
+        )
+        self._monitors: list[Monitor] = [
+            *([] if latency is None else [latency]),
+            self._camera_monitor,
+            LinkMonitor(self.counter, link, recorded=options.recorded),
+            ProgramMonitor(self.counter, options.map_change),
+            OutputMonitor(self.counter, publisher, link),
+            *([] if gnss is None else [gnss]),
+            self._track,
+        ]
         self.health: Health | None = None
-        self._begun_ns = self._confident_ns = clocks.mono_ns()
-        self._tick_ns = 0
-        self._image_taken_ns: int | None = None
+        self._frozen, self._heights_said, self._texts = FrozenCheck(), False, 0
+        self._time_ns = self._tick_ns = self._withheld_ns = self._saved_ns = 0
         self._tracked_ns: int | None = None
-        self._withheld_ns = 0
-        self._heights_said = False
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
-        self._saved_ns = 0
-        self._mismatch = 0.0, 0.0
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
-        self._seen: dict[str, int] = {}
-        self._texts = 0
         self._boot_id = states.boot_id()
 
     def run(self, stopping: threading.Event) -> None:
@@ -168,56 +166,47 @@ class Runner:
         result = None if image is None else self._process(image)
         now_ns = self._clocks.mono_ns()
         if now_ns >= self._tick_ns or (image is None and self._newest.is_over):
-            self._tick_ns = now_ns + TICK_NS
+            self._tick_ns = now_ns + 10**9
             self._tick(now_ns)
         return result
 
     def _process(self, image: CameraImage) -> ViewResult | None:
-        now_ns = self._image_taken_ns = self._clocks.mono_ns()
+        now_ns = self._camera_monitor.taken_ns = self._clocks.mono_ns()
         self._count("taken")
-        latency = None
-        if self._latency is not None and image.interruptions is not None:
-            latency = self._latency.latency(image.exposed_ns, image.interruptions)
-        if now_ns - image.exposed_ns > self.options.deadline_s * 1e9:
+        if now_ns - image.exposed_ns > MAX_AGE_S * 1e9:
             self._count("late")
             return None
-        if latency is not None:
-            delay_ns = round(latency.delay_s * 1e9)
+        if self._latency is not None:
+            delay_ns = round(self._latency.delay_s * 1e9)
             exposed_ns, time_ns = image.exposed_ns - delay_ns, image.time_ns - delay_ns
             image = replace(image, exposed_ns=exposed_ns, time_ns=time_ns)
         self._restart_after_jump(image.time_ns)
-        vehicle, camera = VehicleState(None), self._camera
         refused = self._map_changed() or self._bad_image(image)
-        if refused is None and image.grey is not None:
-            try:
-                height, width = image.grey.shape
-                camera = fitted(camera, width, height, image.frame)
-            except CameraError as error:
-                refused = self._refusal("wrong_camera", "wrong_camera", str(error))
         if refused is not None or image.grey is None:
-            refused = refused or NoFix("bad_image", "no image")
-            is_frozen = refused.reason == "frozen_image"
-            if is_frozen and latency is not None and self._latency is not None:
-                self._latency.frozen(latency.arrived_ns)
-            return self._refused(image, refused, vehicle)
+            unusable = refused or NoFix("bad_image", "no image")
+            return self._refused(image, unusable, VehicleState(None))
         try:
-            vehicle, telemetry = self._telemetry(image)
-            view = View(image.grey, camera, telemetry)
-            if latency is not None and not latency.may_locate:
-                return self._withheld(image, view, vehicle, latency)
-            refused = self._unusable(telemetry)
-            if refused is not None:
-                return self._refused(image, refused, vehicle)
-            return self._located(image, view, vehicle, latency)
-        finally:
-            self._observe(image.grey, camera, latency)
+            camera = fitted(self._camera, image.grey.shape[1], image.grey.shape[0], image.frame)
+        except CameraError as error:
+            wrong = self._refusal("wrong_camera", "wrong_camera", str(error))
+            return self._refused(image, wrong, VehicleState(None))
+        vehicle, telemetry = self._telemetry(image)
+        view = View(image.grey, camera, telemetry)
+        if self._latency is not None and not self._latency.is_known:
+            return self._undated(image, view, vehicle, self._latency)
+        refused = self._unusable(telemetry)
+        if refused is not None:
+            return self._refused(image, refused, vehicle)
+        return self._located(image, view, vehicle)
 
     def _restart_after_jump(self, time_ns: int) -> None:
+        """Begin again where a recorded image is earlier than the one before by over a second: it
+        belongs to another run."""
         before_ns, self._time_ns = self._time_ns, time_ns
-        if self._fresh is None or not self.options.recorded or time_ns > before_ns - JUMP_NS:
+        if not self.options.recorded or time_ns > before_ns - 10**9:
             return
         log.warning("time went back by %.1f s: the track begins again", (before_ns - time_ns) / 1e9)
-        self._locator, self._start, self._start_check = self._fresh(), self._begin, None
+        self._locator, self._start = self._new_locator(), True
         self._tracked_ns = None
         if self.options.heights is not None:
             self.options.heights.observe(time_ns, NoFix("searching", ""), "searching")
@@ -228,41 +217,29 @@ class Runner:
         self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
         return result
 
-    def _withheld(
-        self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency
+    def _undated(
+        self, image: CameraImage, view: View, vehicle: VehicleState, latency: LatencyMonitor
     ) -> ViewResult:
-        # Its time of exposure is in doubt: the track must not get it.
-        reason = latency.reason or ""
-        self._count(reason)
-        result = self._result(image, NoFix(reason, latency.detail), math.nan)
-        if latency.arrived_ns - self._withheld_ns >= WITHHELD_NS:
-            self._withheld_ns = latency.arrived_ns
-            self._log_view(image, view, latency, withheld=True)
+        """A view whose time of exposure is not known: the track must not get it. Some are logged,
+        for `orthonav calibrate --latency`."""
+        self._count(UNKNOWN)
+        result = self._result(image, NoFix(UNKNOWN, latency.detail()), math.nan)
+        if image.exposed_ns - self._withheld_ns >= 80_000_000:
+            self._withheld_ns = image.exposed_ns
+            self._log_view(image, view, withheld=True)
             self._log(lambda sink: sink.result(result))
-        self._publisher.publish(
-            result, image.exposed_ns, vehicle, judged=False, withheld=latency.reason
-        )
+        self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=UNKNOWN)
         return result
 
-    def _observe(self, grey: Grey, camera: Camera, latency: Latency | None) -> None:
-        if latency is not None and self._latency is not None and self._link is not None:
-            reported = self._link.state_at, self._link.covered_ns
-            self._latency.observe(latency.arrived_ns, grey, camera, *reported)
-
-    def _log_view(
-        self, image: CameraImage, view: View, latency: Latency | None, *, withheld: bool
-    ) -> None:
-        # Where the latency is not stated, the telemetry is that of the arrival.
-        used_ms = None if latency is None else latency.delay_s * 1e3
+    def _log_view(self, image: CameraImage, view: View, *, withheld: bool) -> None:
+        used_ms = None if self._latency is None else self._latency.delay_s * 1e3
         self._log(
             lambda sink: sink.view(
                 image.number, image.frame, view.grey, view.telemetry, used_ms, withheld
             )
         )
 
-    def _located(
-        self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency | None
-    ) -> ViewResult:
+    def _located(self, image: CameraImage, view: View, vehicle: VehicleState) -> ViewResult:
         view = self._from_start(view)
         self._say_heights(view.telemetry)
         known = self._above_ground(view.telemetry)
@@ -272,42 +249,38 @@ class Runner:
         above_sea = heights is None or heights.datum_known
         if known.below is not None and above_sea and math.isnan(vehicle.amsl_m):
             vehicle = replace(vehicle, amsl_m=known.below.height_m + known.agl_m)
-        reported, telemetry = known, self._over_gap(known, image.exposed_ns)
+        telemetry = self._over_gap(known, image.exposed_ns)
         view = replace(view, telemetry=telemetry)
-        self._log_view(image, view, latency, withheld=False)
+        self._log_view(image, view, withheld=False)
         is_search = self._locator.state_name in ("searching", "lost")
-        outcome, latency_ms = self._placed(view, reported)
+        outcome, latency_ms = self._placed(view, known)
         self._tracked_ns = image.exposed_ns
         self._count("processed")
         vehicle = self._with_altitude(vehicle, outcome, known)
-        if latency is not None and isinstance(outcome, Fix):
-            outcome = _with_latency(outcome, reported, latency.std_s)
+        if self._latency is not None and isinstance(outcome, Fix):
+            outcome = _with_latency(outcome, known, self._latency.std_s)
         result = self._result(image, outcome, latency_ms)
-        doubt = self._doubt(result, latency)
+        doubt = self._doubt(result, image.exposed_ns)
         if doubt is not None:
             self._count(doubt)
-            self._log(lambda sink: sink.result(result))
-            self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=doubt)
-            return result
-        if self.options.heights is not None:
-            self.options.heights.observe(telemetry.time_ns, outcome, result.state)
-        self._publisher.publish(result, image.exposed_ns, vehicle, judged=True)
-        now_ns = self._clocks.mono_ns()
-        if not is_search:  # on the whole map, which takes its time
-            self.counter.add_latency(now_ns, (now_ns - image.exposed_ns) / 1e9)
+        elif heights is not None:
+            heights.observe(telemetry.time_ns, outcome, result.state)
+        self._publisher.publish(result, image.exposed_ns, vehicle, judged=True, withheld=doubt)
         self._log(lambda sink: sink.result(result))
-        self._note(result, telemetry, image.exposed_ns)
+        if doubt is None:
+            now_ns = self._clocks.mono_ns()
+            if not is_search:  # on the whole map, which takes its time
+                self.counter.add_latency(now_ns, (now_ns - image.exposed_ns) / 1e9)
+            self._note(result, telemetry, image.exposed_ns)
         return result
 
     def _from_start(self, view: View) -> View:
         telemetry = view.telemetry
-        if self._start is not None:
-            prior, self._start = self._start(), None
+        if self._start:
+            prior, self._start = self._begin(), False
             view = replace(view, telemetry=replace(telemetry, prior=prior or telemetry.prior))
-            if prior is not None:
-                self._start_check = StartCheck(prior, telemetry.time_ns)
-        if self._start_check is not None:
-            self._start_check.moved(telemetry)
+            self._track.started(prior, telemetry.time_ns)
+        self._track.moved(telemetry)
         return view
 
     def _with_altitude(
@@ -341,53 +314,39 @@ class Runner:
             outcome = _at_exposure(outcome, view.telemetry.vel_en_mps, reported.vel_en_mps)
         return outcome, latency_ms
 
-    def _doubt(self, result: ViewResult, latency: Latency | None) -> str | None:
-        fix = result.outcome
-        if self._latency is None or latency is None:
+    def _doubt(self, result: ViewResult, exposed_ns: int) -> str | None:
+        """Why a position is withheld although it was found: the latency does not fit the track."""
+        fix, latency, link = result.outcome, self._latency, self._link
+        if latency is None:
             return None
-        if not isinstance(fix, Fix) or not result.is_recognized:
-            return latency.reason
-        return self._latency.located(latency, (fix.lat_deg, fix.lon_deg), fix.std_m)
-
-    def _confident_fix(self, result: ViewResult) -> Fix | None:
-        fix = result.outcome
-        if not isinstance(fix, Fix) or not fix.confidence >= self.options.min_confidence:
-            return None
-        return fix if result.state in (None, "tracking") else None
+        if isinstance(fix, Fix) and result.is_recognized and link is not None:
+            place = fix.lat_deg, fix.lon_deg
+            latency.located(exposed_ns, place, fix.std_m, link.mean_velocity)
+        return next(iter(latency.reasons()), None)
 
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
-        now_ns = self._clocks.mono_ns()
+        now_ns, fix, mount = self._clocks.mono_ns(), result.outcome, self.options.mount
         if result.is_recognized:
-            self._confident_ns = now_ns
+            self._track.confident_ns = now_ns
             self._count("confident")
-        fix = self._confident_fix(result)
-        if fix is None:
+        is_tracking = result.state in (None, "tracking")
+        if not isinstance(fix, Fix) or not is_tracking:
             return
-        if self._start_check is not None:
-            self._start_check.found(fix, now_ns)
-        mount = self.options.mount
-        self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
-        if not self.options.heading_known:
-            self._mismatch = 0.0, self._mismatch[1]
+        if not fix.confidence >= self.options.min_confidence:
+            return
+        self._track.found(fix, mount.corrected(telemetry) if mount else telemetry, now_ns)
         utc_ns = exposed_ns + self._clocks.utc_ns() - self._clocks.mono_ns()
         self._last = states.SavedState(
             fix.lat_deg, fix.lon_deg, fix.std_m, utc_ns, exposed_ns, self._boot_id
         )
 
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
-        state, risk = self._locator.state_name, self.options.risk
+        state, risk = self._locator.state_name, self.options.accept.risk
         result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, risk=risk)
         if self._gnss is not None:
             result = self._gnss.view(result, image.exposed_ns)
         fix = result.outcome
-        return replace(result, accepted=self._accepts(fix) if isinstance(fix, Fix) else None)
-
-    def _accepts(self, fix: Fix) -> bool:
-        accept = self.options.accept
-        if accept is not None and math.isfinite(accept.alert_limit_m):
-            return accept.accepts(fix)
-        confident = fix.confidence >= self.options.min_confidence
-        return confident and (accept is None or accept.accepts(fix))
+        return replace(result, accepted=self.options.accepts(fix) if isinstance(fix, Fix) else None)
 
     def _map_changed(self) -> NoFix | None:
         # Parts in memory would still give positions; stopping shows the fault at once.
@@ -414,7 +373,7 @@ class Runner:
             return image.vehicle or VehicleState(None), image.telemetry or nothing
         until_ns = self._clocks.mono_ns() + round(TELEMETRY_WAIT_S * 1e9)
         while (self._link.covered_ns or 0) < image.exposed_ns and self._clocks.mono_ns() < until_ns:
-            self._clocks.sleep(_POLL_S)
+            self._clocks.sleep(0.001)
         vehicle = self._link.state_at(image.exposed_ns)
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
 
@@ -473,12 +432,13 @@ class Runner:
             self._count("log_failed")
 
     def _tick(self, now_ns: int) -> None:
-        self._count_changes()
+        """Once a second: health and state."""
+        self._follow(now_ns)
         self._save_state()
         texts = [] if self._gnss is None else self._gnss.tick(now_ns)
-        start_off_m = 0.0 if self._start_check is None else self._start_check.off_m(now_ns)
-        health = self.health = self._judged(now_ns, start_off_m)
-        plain = self._plain(health, start_off_m)
+        detail = unavailable_text(self._publisher.gate.availability(now_ns))
+        health = self.health = judge(self._monitors, now_ns, detail)
+        plain = self._plain(health, now_ns)
         self._publisher.health(plain)
         self._log(lambda sink: sink.health(plain))
         notify("WATCHDOG=1", f"STATUS={health.text()}")
@@ -487,23 +447,24 @@ class Runner:
         self._link.system_status = health.level.value
         if self._link.target is not None:
             if self._reporter.due(health, now_ns):
-                self._send_text(health.level.severity, health.text())
+                texts = [(health.level.severity, health.text()), *texts]
             for severity, text in texts:
-                self._send_text(severity, text)
+                self._send_text(self._link, severity, text)
             if self._gnss is not None:
                 _send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:
             self._publisher.messenger.find_origin()
 
-    def _send_text(self, severity: int, text: str) -> None:
+    def _send_text(self, link: AutopilotLink, severity: int, text: str) -> None:
         self._texts += 1
         for each in status_texts(severity, text, self._texts):
-            if self._link is not None:
-                self._link.send(each)
+            link.send(each)
 
-    def _count_changes(self) -> None:
+    def _follow(self, now_ns: int) -> None:
+        """Count what others counted since the tick before, and a clock of the computer that was
+        set."""
         messenger = self._publisher.messenger
-        now = {
+        totals = {
             "clock_jump": 0 if self._link is None else self._link.sync.jumps,
             "camera_lost": self._newest.outages,
             "output_failed": self._publisher.failed,
@@ -511,57 +472,27 @@ class Runner:
             "slow_vision": 0 if messenger is None else messenger.too_slow,
             "incomplete": 0 if messenger is None else messenger.incomplete,
         }
-        for name, value in now.items():
-            if value > self._seen.get(name, 0):
-                self._count(name)
-        self._seen = now
+        self.counter.follow(now_ns, totals)
         ahead_ns = self._clocks.utc_ns() - self._clocks.mono_ns()
-        if abs(ahead_ns - self._utc_ahead_ns) > UTC_JUMP_NS:
+        if abs(ahead_ns - self._utc_ahead_ns) > 200_000_000:
             self._count("clock_jump")
         self._utc_ahead_ns = ahead_ns
 
-    def _judged(self, now_ns: int, start_off_m: float) -> Health:
-        counts = self.counter.counts(now_ns)
-        link, messenger = self._link, self._publisher.messenger
-        needs_origin = link is not None and messenger is not None and messenger.needs_origin
-        taken_ns = self._image_taken_ns
-        image_ns = self._begun_ns if taken_ns is None else taken_ns
-        state = self._locator.state_name
-        if state is None and taken_ns is None:
-            state = "searching"
-        return judge(
-            (now_ns - self._begun_ns) / 1e9,
-            counts,
-            image_age_s=(now_ns - image_ns) / 1e9,
-            telemetry_age_s=link.attitude_age_s if link and not self.options.recorded else 0.0,
-            link_age_s=link.heard_age_s if link else 0.0,
-            low_confidence_s=(now_ns - self._confident_ns) / 1e9,
-            latency_s=self.counter.latency_s(0.95),
-            state=state,
-            synced=link is None or link.sync.is_exact,
-            map_intact=self.options.map_change() is None,
-            mismatch=self._mismatch,
-            start_off_m=start_off_m,
-            gnss=() if self._gnss is None else self._gnss.reasons,
-            has_origin=not needs_origin or (link is not None and link.origin is not None),
-            latency=None if self._latency is None or taken_ns is None else self._latency.reason,
-            unavailable=unavailable_text(self._publisher.gate.availability(now_ns)),
-        )
-
-    def _plain(self, health: Health, start_off_m: float) -> dict[str, Any]:
-        total = self.counter.total
+    def _plain(self, health: Health, now_ns: int) -> dict[str, Any]:
+        total, gate = self.counter.total, self._publisher.gate
+        start_off_m = self._track.start_off_m(now_ns)
         return {
             "health": health.level.name,
             "reasons": list(health.reasons),
             "utc_s": round(self._clocks.utc_ns() / 1e9, 3),
             "state": self._locator.state_name,
             "counts": {**dict(sorted(total.items())), "replaced": self._newest.replaced},
-            "withheld": dict(sorted(self._publisher.gate.withheld.items())),
-            "sent": dict(sorted(self._publisher.gate.sent.items())),
+            "withheld": dict(sorted(gate.withheld.items())),
+            "sent": dict(sorted(gate.sent.items())),
             "age_p50_ms": round(self.counter.latency_s(0.5) * 1e3, 1),
             "age_p95_ms": round(self.counter.latency_s(0.95) * 1e3, 1),
             **({"start_off_m": round(start_off_m, 1)} if start_off_m else {}),
-            **self._publisher.gate.availability(self._clocks.mono_ns()),
+            **gate.availability(self._clocks.mono_ns()),
             **({} if self._gnss is None else {"gnss": self._gnss.plain()}),
             **({} if self._latency is None else self._latency.plain()),
         }
@@ -596,12 +527,12 @@ def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
     """Fix whose covariance and confidence include the distance flown in the standard deviation of
-    the latency, in all directions where the velocity is not known."""
+    the latency; where the velocity is not known, at 20 m/s in all directions."""
     evidence = fix.evidence
     own = evidence.get("vel_east_mps", math.nan), evidence.get("vel_north_mps", math.nan)
     velocity = np.array(telemetry.vel_en_mps or own)
     if not np.isfinite(velocity).all():
-        return fix.with_covariance(fix.cov_en_m2 + (std_s * ASSUMED_MPS) ** 2 * np.eye(2))
+        return fix.with_covariance(fix.cov_en_m2 + (std_s * 20.0) ** 2 * np.eye(2))
     return fix.with_covariance(fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
 
 

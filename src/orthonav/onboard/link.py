@@ -12,7 +12,7 @@ from typing import Any
 from orthonav.core.extras import needed
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.attitude import wxyz_of_angles
-from orthonav.onboard.messages.estimate import Clock, EstimateError
+from orthonav.onboard.messages.estimate import EstimateError
 from orthonav.onboard.messages.mavlink import (
     DOWNWARD,
     KINDS,
@@ -29,7 +29,7 @@ from orthonav.onboard.messages.mavlink import (
     repeats_height,
     signing_timestamp,
 )
-from orthonav.onboard.ports import Transport
+from orthonav.onboard.ports import Transport, retry_s
 from orthonav.onboard.telemetry import (
     Aiding,
     Clocks,
@@ -39,23 +39,10 @@ from orthonav.onboard.telemetry import (
 )
 
 log = logging.getLogger(__name__)
-RETRY_S = (0.5, 1.0, 2.0, 5.0)
-"""Pauses before a port is opened again; the last one repeats."""
-HEARTBEAT_NS, TIMESYNC_NS = 10**9, 10**9
-"""Intervals; 1 Hz is what the MAVLink heartbeat and TIMESYNC protocols expect."""
-LIMITED_NS = 5 * 10**9  # RANGEFINDER repeats a DISTANCE_SENSOR that looked down meanwhile
-RESIGN_NS = 10 * 10**9
-"""Interval at which signature timestamps are set to the current time."""
-_MOST_READS = 200
-_MOST_OTHERS = 10
-_BOARD, _AUTOPILOT_COMPONENT = 18, 1
-_FAR_NS = 60 * 10**9
-_ARMED = 128
-_LATE_NS = 2 * 10**9
-"""Timestamps of GNSS solutions that differ more from their arrival are of another clock."""
-_UNKNOWN_16 = 65535
-HDOP_STD_M = 3.0
-"""Standard deviation of a GNSS position per unit of HDOP, where no accuracy is stated."""
+INTERVAL_NS = 10**9
+"""Between heartbeats and TIMESYNC requests: 1 Hz is what these protocols expect."""
+LIMITED_NS = 5 * 10**9
+"""RANGEFINDER repeats a DISTANCE_SENSOR that looked down meanwhile."""
 
 
 class AutopilotLink:
@@ -70,14 +57,12 @@ class AutopilotLink:
         system_id: int | None = None,
         signing: Signing | None = None,
         silent: bool = False,
-        stamp: Clock = Clock.UTC,
         own_receiver: int | None = None,
     ) -> None:
         """`system_id`: by default that of the first autopilot heard. `signing`: sign outgoing
-        messages and require incoming ones to be signed with the same key. `stamp`: clock of the
-        timestamps, with which TIMESYNC is answered. `own_receiver`: number of the GNSS receiver
-        that orthonav stands for. Raises `MissingExtraError` where pymavlink is missing or old.
-        """
+        messages and require incoming ones to be signed with the same key. `own_receiver`: number
+        of the GNSS receiver that orthonav stands for. Raises `MissingExtraError` where pymavlink is
+        missing or old."""
         dialect()
         self._opener, self._clocks = opener, clocks
         self.buffer, self.sync = buffer, ClockSync()
@@ -85,7 +70,7 @@ class AutopilotLink:
         self.aiding = Aiding(own_receiver)
         self._lock = threading.RLock()
         self._wanted, self._silent = system_id, silent
-        self._signing, self._stamp = signing, stamp
+        self._signing = signing
         self._incoming = _decoder(signing)
         self._transport: Transport | None = None
         self._retry_ns, self._failures = 0, 0
@@ -114,7 +99,7 @@ class AutopilotLink:
         understood = 0
         with self._lock:
             try:
-                for _ in range(_MOST_READS):
+                for _ in range(200):
                     data = transport.read()
                     if not data:
                         break
@@ -206,7 +191,7 @@ class AutopilotLink:
                 log.warning("link to the autopilot: %s", error)
             self.counts["error"] += 1
             self.close()
-            pause_s = RETRY_S[min(self._failures, len(RETRY_S) - 1)]
+            pause_s = retry_s(self._failures)
             self._failures += 1
             self._retry_ns = self._clocks.mono_ns() + round(pause_s * 1e9)
 
@@ -219,7 +204,7 @@ class AutopilotLink:
                 self._signing = replace(self._signing, timestamp_10us=stamp)
             system_id = self.target.system_id if self.target else self._wanted or 1
             self._packer = Packer(system_id, sequence=self._sequence, signing=self._signing)
-            self._packed, self._resign_ns = 0, now_ns + RESIGN_NS
+            self._packed, self._resign_ns = 0, now_ns + 10 * 10**9
         frame = self._packer.pack(message)
         self._sequence, self._packed = (self._sequence + 1) % 256, self._packed + 1
         return frame
@@ -254,9 +239,9 @@ class AutopilotLink:
         heartbeat = message.get_type() == "HEARTBEAT" and is_of_autopilot(message)
         if not heartbeat or system_id == 0:
             return False
-        heard = Target(system_id, component_id or _AUTOPILOT_COMPONENT)
+        heard = Target(system_id, component_id or 1)
         if self.target is not None or self._wanted not in (None, system_id):
-            if heard not in self.others and len(self.others) < _MOST_OTHERS:
+            if heard not in self.others and len(self.others) < 10:
                 self.others.append(heard)
             return False
         self.target = heard
@@ -283,7 +268,7 @@ class AutopilotLink:
 
     def _heartbeat(self, message: Message, now_ns: int) -> None:
         self.kind = KINDS.get(message.autopilot, self.kind)
-        self.armed = bool(message.base_mode & _ARMED)
+        self.armed = bool(message.base_mode & 128)
 
     def _attitude(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
@@ -316,7 +301,7 @@ class AutopilotLink:
         arrived_ns, reported_ns = self.sync.boot_ns(now_ns), int(message.time_usec) * 1000
         if arrived_ns is None:
             return
-        time_ns = reported_ns if abs(reported_ns - arrived_ns) < _FAR_NS else arrived_ns
+        time_ns = reported_ns if abs(reported_ns - arrived_ns) < 60 * 10**9 else arrived_ns
         # `altitude_terrain` of PX4 is the height of the terrain above its origin, and
         # `bottom_clearance` the one above ground (src/modules/mavlink/streams/ALTITUDE.hpp).
         if message.bottom_clearance > 0:
@@ -367,10 +352,7 @@ class AutopilotLink:
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request: answer with the clock that stamps our messages
-            by_utc = self._stamp is Clock.UTC
-            stamp_ns = self._clocks.utc_ns() if by_utc else self.boot_ns(now_ns)
-            if stamp_ns is not None:
-                self.send(dialect().MAVLink_timesync_message(stamp_ns, message.ts1))
+            self.send(dialect().MAVLink_timesync_message(self._clocks.utc_ns(), message.ts1))
         elif message.ts1 in self._asked:
             self._asked.remove(message.ts1)
             if self.sync.exchange(message.ts1, now_ns, message.tc1):
@@ -380,14 +362,19 @@ class AutopilotLink:
         now_ns = self._clocks.mono_ns()
         with self._lock:
             if now_ns >= self._due["heartbeat"]:
-                self._due["heartbeat"] = now_ns + HEARTBEAT_NS
+                self._due["heartbeat"] = now_ns + INTERVAL_NS
                 self.send(
                     dialect().MAVLink_heartbeat_message(
-                        _BOARD, NO_AUTOPILOT, 0, 0, self.system_status, 3
+                        18,
+                        NO_AUTOPILOT,
+                        0,
+                        0,
+                        self.system_status,
+                        3,  # an onboard computer
                     )
                 )
             if now_ns >= self._due["timesync"] and self.target is not None:
-                self._due["timesync"] = now_ns + TIMESYNC_NS
+                self._due["timesync"] = now_ns + INTERVAL_NS
                 self._asked = [*self._asked[-4:], now_ns]
                 self.send(dialect().MAVLink_timesync_message(0, now_ns))
 
@@ -474,16 +461,17 @@ def gnss_sample(message: Any, arrived_ns: int, arrived_boot_ns: int | None) -> G
     is not known. The time of the solution is its timestamp where that is time since boot, else its
     arrival. `eph` is an HDOP; `h_acc`, an extension, is 0 where it is not known.
     """
+    unknown, hdop_std_m = 65535, 3.0
     stamp_ns = int(message.time_usec) * 1000
     late_ns = math.inf if arrived_boot_ns is None else arrived_boot_ns - stamp_ns
-    std_m = math.nan if message.eph == _UNKNOWN_16 else message.eph * 1e-2 * HDOP_STD_M
+    std_m = math.nan if message.eph == unknown else message.eph * 1e-2 * hdop_std_m
     std_m = message.h_acc * 1e-3 if message.h_acc > 0 else std_m
     velocity = None
-    if _UNKNOWN_16 not in (message.vel, message.cog):
+    if unknown not in (message.vel, message.cog):
         speed, course = message.vel * 1e-2, math.radians(message.cog * 1e-2)
         velocity = speed * math.sin(course), speed * math.cos(course)
     return GnssSample(
-        time_ns=arrived_ns - int(late_ns) if abs(late_ns) <= _LATE_NS else arrived_ns,
+        time_ns=arrived_ns - int(late_ns) if abs(late_ns) <= 2 * 10**9 else arrived_ns,
         arrived_ns=arrived_ns,
         lat_deg=message.lat * 1e-7,
         lon_deg=message.lon * 1e-7,

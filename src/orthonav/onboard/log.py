@@ -3,8 +3,8 @@
 The flight never waits for the log. Messages go into a bounded queue; a thread encodes them and
 writes a chunk about once a second. Where it falls behind or the disk is full, images are dropped
 first and other messages last. A chunk that cannot be written completely is truncated, so a file
-ends with a complete one. After a power cut the index that `finish` writes is missing: readers scan
-the file from the start. `docs/flights.md` describes the files.
+ends with a complete one. Then, and after a power cut, the index that `finish` writes is missing:
+readers scan the file from the start. `docs/flights.md` describes the files.
 """
 
 import contextlib
@@ -23,9 +23,7 @@ import cv2
 import numpy as np
 
 # Some functions of mcap have no types: calling them needs `type: ignore[no-untyped-call]`.
-from mcap.data_stream import RecordBuilder
-from mcap.records import DataEnd, Footer
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from orthonav import __version__
@@ -466,29 +464,11 @@ class Segment:
         """Truncate to complete chunks and close; a file without a chunk is removed."""
         with contextlib.suppress(OSError):
             os.ftruncate(self._file.fileno(), self.size_bytes)
-            if self.chunks:
-                os.lseek(self._file.fileno(), self.size_bytes, os.SEEK_SET)
-                _write_ending(self._file.fileno(), self.size_bytes)
         with contextlib.suppress(OSError):
             self._file.close()
         if not self.chunks:
             with contextlib.suppress(OSError):
                 self.path.unlink()
-
-
-def _write_ending(handle: int, size_bytes: int) -> None:
-    """Write the end records without an index; where that fails, restore the size."""
-    records = RecordBuilder()
-    DataEnd(0).write(records)
-    Footer(0, 0, 0).write(records)
-    ending = bytes(records.end()) + MCAP0_MAGIC  # type: ignore[no-untyped-call]
-    try:
-        whole = os.write(handle, ending) == len(ending)
-    except OSError:
-        whole = False
-    if not whole:
-        os.ftruncate(handle, size_bytes)
-    os.fsync(handle)
 
 
 def next_segment(folder: Path, name: str, needed_bytes: int, max_bytes: int | None) -> Segment:

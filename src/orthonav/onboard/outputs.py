@@ -6,10 +6,9 @@ import json
 import logging
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from orthonav.core.errors import VariantError
@@ -17,13 +16,12 @@ from orthonav.core.flight.fixes import UNKNOWN, Identity, result_to_json
 from orthonav.core.records import CONFIDENT, ViewResult
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import (
-    Clock,
     EstimateError,
     FilterCovariance,
     NavigationEstimate,
     estimate_from_result,
 )
-from orthonav.onboard.messages.gate import MAX_AGE_S, Gate
+from orthonav.onboard.messages.gate import MAX_AGE_S, Decision, Gate
 from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
     Autopilot,
@@ -55,16 +53,10 @@ KINDS = {
     "external-position": "EXTERNAL_POSITION_ESTIMATE",
 }
 LOCAL = ("odometry", "vision")
-ATTITUDE_STD_RAD = (math.radians(1.0), math.radians(1.0), math.radians(3.0))
-"""Standard deviations sent with the autopilot's own roll, pitch and yaw: assumed."""
-DOWN_STD_M, VEL_DOWN_STD_MPS = 3.0, 0.5
-"""Standard deviations sent with the autopilot's own height and vertical velocity: assumed."""
+DOWN_STD_M = 3.0
+"""Sent with the autopilot's own height: assumed."""
 PX4_VISION_S = 0.2
 """PX4 starts to fuse local messages only at shorter intervals (`EV_MAX_INTERVAL`)."""
-ORIGIN_NS, ORIGIN_REQUESTS = 2 * 10**9, 3
-"""Interval of requests for the origin, and their number after which the autopilot has none."""
-_GPS_GLOBAL_ORIGIN = 49
-_MOST_REASONS = 20
 
 
 class Messenger:
@@ -78,18 +70,16 @@ class Messenger:
         clocks: Clocks,
         *,
         kinds: Sequence[str] = ("global-position",),
-        clock: Clock = Clock.UTC,
-        sensor_id: int = 1,
-        gps: Mapping[str, Any] = MappingProxyType({}),
+        gps_id: int = 0,
         min_std_m: float = 0.0,
         min_confidence: float = CONFIDENT,
         origin: Origin | None = None,
     ) -> None:
-        """`kinds`: keys of `KINDS`. `gps`: fields of GPS_INPUT (docs/autopilots.md). `origin`: of
-        the local frame, set on the ground where the autopilot has none."""
+        """`kinds`: keys of `KINDS`. `gps_id`: of GPS_INPUT. `origin`: of the local frame, set on
+        the ground where the autopilot has none."""
         self._gate, self._link, self._clocks = gate, link, clocks
-        self._kinds, self._sensor_id, self._gps, self._own_origin = kinds, sensor_id, gps, origin
-        self._common: dict[str, Any] = {"clock": clock, "min_confidence": min_confidence}
+        self._kinds, self._gps_id, self._own_origin = kinds, gps_id, origin
+        self._min_confidence = min_confidence
         self._covariance = FilterCovariance(min_std_m)
         self.incomplete = self.too_slow = 0
         self._said: set[str] = set()
@@ -97,35 +87,43 @@ class Messenger:
 
     def publish(
         self, estimate: NavigationEstimate, vehicle: VehicleState, exposed_ns: int
-    ) -> tuple[str, ...]:
-        """Names of the messages sent."""
-        sent = []
-        boot_ns = self._link.boot_ns(exposed_ns)
+    ) -> tuple[tuple[str, ...], str | None]:
+        """Names of the messages sent, and why the first of the others was not; None without."""
+        sent, withheld = [], []
         for name in self._kinds:
-            if estimate.dead_reckoned and name != "global-position":
-                continue  # only this message can mark it
-            now_ns = self._clocks.mono_ns()
-            stamped = replace(estimate, boot_ns=boot_ns, processing_s=(now_ns - exposed_ns) / 1e9)
-            stated = self._covariance.prepare(name, stamped, exposed_ns)
-            try:
-                made = self._make(name, stated, vehicle)
-            except EstimateError as error:
-                self._not_made(name, error)
-                continue
-            if self._gate.due(KINDS[name], now_ns) and self._link.send(made):
+            reason = self._sent(name, estimate, vehicle, exposed_ns)
+            if reason is None:
                 sent.append(KINDS[name])
-                interval_s = self._covariance.interval_s(name, exposed_ns)
-                self._covariance.sent(name, exposed_ns)
-                if name in LOCAL and self._link.kind is not Autopilot.ARDUPILOT:
-                    self.too_slow += PX4_VISION_S <= interval_s < math.inf
-        return tuple(sent)
+            else:
+                withheld.append(reason)
+        return tuple(sent), next((each for each in withheld if each), None)
 
-    def _not_made(self, name: str, error: EstimateError) -> None:
-        """Count a message that could not be built, and log why, once for each reason."""
-        self.incomplete += 1
-        self._gate.withheld[f"not_made:{KINDS[name]}"] += 1
-        why = f"{KINDS[name]} cannot be made: {error}"
-        if why not in self._said and len(self._said) < _MOST_REASONS:
+    def _sent(
+        self, kind: str, estimate: NavigationEstimate, vehicle: VehicleState, exposed_ns: int
+    ) -> str | None:
+        """Why a message was not sent: "" where the link did not take it; None where it was."""
+        name, now_ns = KINDS[kind], self._clocks.mono_ns()
+        stamped = replace(estimate, processing_s=(now_ns - exposed_ns) / 1e9)
+        stated = self._covariance.prepare(kind, stamped, exposed_ns)
+        try:
+            made = self._make(kind, stated, vehicle)
+        except EstimateError as error:
+            self.incomplete += 1
+            self._say_once(f"{name} cannot be made: {error}")
+            return self._gate.withhold(f"not_made:{name}").reason
+        if not self._gate.due(name, now_ns):
+            return f"rate:{name}"
+        if not self._link.send(made):
+            return ""
+        self._gate.sent[name] += 1
+        interval_s = self._covariance.interval_s(kind, exposed_ns)
+        self._covariance.sent(kind, exposed_ns)
+        if kind in LOCAL and self._link.kind is not Autopilot.ARDUPILOT:
+            self.too_slow += PX4_VISION_S <= interval_s < math.inf
+        return None
+
+    def _say_once(self, why: str) -> None:
+        if why not in self._said and len(self._said) < 20:
             self._said.add(why)
             log.warning("%s", why)
 
@@ -143,26 +141,24 @@ class Messenger:
             return
         if not self.needs_origin or link.target is None or now_ns < self._origin_due_ns:
             return
-        self._origin_due_ns = now_ns + ORIGIN_NS
-        if origin is not None and link.armed is False and self._requests >= ORIGIN_REQUESTS:
+        self._origin_due_ns = now_ns + 2 * 10**9
+        if origin is not None and link.armed is False and self._requests >= 3:
             link.send(set_gps_global_origin(origin, target_system=link.target.system_id))
-        self._requests += link.send(request_message(_GPS_GLOBAL_ORIGIN, link.target))
+        self._requests += link.send(request_message(49, link.target))  # GPS_GLOBAL_ORIGIN
 
     def _make(self, name: str, estimate: NavigationEstimate, vehicle: VehicleState) -> Message:
-        common, target = self._common, self._link.target or AUTOPILOT
+        least, target = self._min_confidence, self._link.target or AUTOPILOT
         if name == "global-position":
-            return global_position_sensor(
-                estimate, sensor_id=self._sensor_id, target=target, **common
-            )
+            return global_position_sensor(estimate, target=target, min_confidence=least)
         if name == "gps-input":
             if math.isfinite(vehicle.amsl_m) and math.isnan(estimate.alt_amsl_m):
                 estimate = replace(estimate, alt_amsl_m=vehicle.amsl_m, alt_std_m=DOWN_STD_M)
-            return gps_input(estimate, **self._gps, **common)
+            return gps_input(estimate, gps_id=self._gps_id, min_confidence=least)
         if name == "external-position":
-            return external_position_estimate(estimate, target=target, **common)
+            return external_position_estimate(estimate, target=target, min_confidence=least)
         make = odometry if name == "odometry" else vision_position_estimate
         pose = _pose(vehicle, self._link.origin)
-        return make(estimate, pose, self._link.kind or Autopilot.PX4, **common)
+        return make(estimate, pose, self._link.kind or Autopilot.PX4, min_confidence=least)
 
 
 def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
@@ -173,9 +169,9 @@ def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
         down_m=vehicle.down_m,
         down_std_m=DOWN_STD_M,
         attitude_rad=vehicle.attitude_rad(),
-        attitude_std_rad=ATTITUDE_STD_RAD,
+        attitude_std_rad=(math.radians(1.0), math.radians(1.0), math.radians(3.0)),  # assumed
         vel_down_mps=vehicle.velocity_ned_mps[2],
-        vel_down_std_mps=VEL_DOWN_STD_MPS,
+        vel_down_std_mps=0.5,  # assumed
     )
 
 
@@ -224,9 +220,9 @@ class NmeaOut:
     def write(
         self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
     ) -> None:
-        options: dict[str, Any] = {"utc_ns": utc_ns, "min_confidence": min_confidence}
-        sentences = [make(estimate, quality=self._quality, **options) for make in (gga, rmc)]
-        self._sink.write(b"".join([*sentences, gst(estimate, **options)]))
+        given = estimate, utc_ns, min_confidence
+        sentences = gga(*given, self._quality), rmc(*given, self._quality), gst(*given)
+        self._sink.write(b"".join(sentences))
 
     def close(self) -> None:
         self._sink.close()
@@ -310,26 +306,26 @@ class Publisher:
     ) -> tuple[str, ...]:
         """Send a position that the gate admits; the names of the messages. Only a view that was
         processed (`judged`) gives one: the prediction of a track is not a measurement."""
-        estimate: NavigationEstimate | None = None
         sent: tuple[str, ...] = ()
         now_ns = self._clocks.mono_ns()
         ahead_ns = self._clocks.utc_ns() - now_ns
+        decision = Decision(None)
         if withheld is not None:
-            self.gate.withheld[withheld] += 1
+            decision = self.gate.withhold(withheld)
         elif judged:
             by_our_clock = replace(result, time_ns=exposed_ns)
-            made = estimate_from_result(by_our_clock, clock=Clock.BOOT, utc_minus_boot_ns=ahead_ns)
-            before = self.gate.withheld.copy()
-            estimate = self.gate.admit(made, now_ns)
-            if estimate is not None:
-                if self.messenger is not None:
-                    sent = self.messenger.publish(estimate, vehicle, exposed_ns)
-                if not estimate.dead_reckoned:  # messages of ROS cannot mark it
-                    sent += self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
-            withheld = None if sent else next(iter(self.gate.withheld - before), None)
+            made = estimate_from_result(by_our_clock, utc_ahead_ns=ahead_ns)
+            decision = self.gate.admit(made, now_ns)
+        estimate, withheld = decision
+        if estimate is not None:
+            if self.messenger is not None:
+                sent, withheld = self.messenger.publish(estimate, vehicle, exposed_ns)
+            sent_here, rate = self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
+            sent, withheld = sent + sent_here, withheld or rate
         self._write_nmea(estimate, exposed_ns + ahead_ns)
         age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
-        self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))
+        why = None if sent else withheld
+        self._each(self._lines, lambda out: out.view(result, age_ms, sent, why))
         return sent
 
     def health(self, plain: dict[str, Any]) -> None:
@@ -340,25 +336,32 @@ class Publisher:
 
     def _to_graph(
         self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState, stamp_ns: int
-    ) -> tuple[str, ...]:
+    ) -> tuple[tuple[str, ...], str | None]:
+        """Names of the topics, and why nothing was published there; None without."""
         sent: list[str] = []
-        if self._graph and self.gate.due("ROS2", self._clocks.mono_ns()):
-            stated = self._covariance.prepare("ROS2", estimate, exposed_ns)
-            self._each(
-                self._graph,
-                lambda out: sent.extend(
-                    out.position(stated if out.for_filter else estimate, vehicle, stamp_ns)
-                ),
-            )
-            self._covariance.sent("ROS2", exposed_ns)
-        return tuple(sent)
+        if not self._graph:
+            return (), None
+        if not self.gate.due("ROS2", self._clocks.mono_ns()):
+            return (), "rate:ROS2"
+        stated = self._covariance.prepare("ROS2", estimate, exposed_ns)
+        self._each(
+            self._graph,
+            lambda out: sent.extend(
+                out.position(stated if out.for_filter else estimate, vehicle, stamp_ns)
+            ),
+        )
+        self.gate.sent["ROS2"] += bool(sent)
+        self._covariance.sent("ROS2", exposed_ns)
+        return tuple(sent), None
 
     def _write_nmea(self, estimate: NavigationEstimate | None, utc_ns: int) -> None:
         # Farther behind, the clock was set back.
         goes_back = 0 < self._nmea_ns - utc_ns <= MAX_AGE_S * 1e9
         if self._nmea and not goes_back and self.gate.due("NMEA", self._clocks.mono_ns()):
             self._nmea_ns = utc_ns
+            failed = self.failed
             self._each(self._nmea, lambda out: out.write(estimate, utc_ns, self._least))
+            self.gate.sent["NMEA"] += self.failed == failed
 
     def _each(self, outs: Sequence[Any], call: Callable[[Any], None]) -> None:
         for out in outs:

@@ -16,8 +16,11 @@ from collections.abc import Callable
 from orthonav.core.errors import VariantError
 
 LOOPBACK = "127.0.0.1"
-DEFAULT_BAUD = 57_600
-_MAX_BYTES = 4096
+
+
+def retry_s(failures: int) -> float:
+    """Pause before a device is opened again after so many failures."""
+    return (0.5, 1.0, 2.0, 5.0)[min(failures, 3)]
 
 
 class Udp:
@@ -71,7 +74,7 @@ class Descriptor:
     def read(self) -> bytes:
         """Available data; raises `OSError` at the end of the stream."""
         try:
-            data = os.read(self._fd, _MAX_BYTES)
+            data = os.read(self._fd, 4096)
         except BlockingIOError:
             return b""
         if not data:
@@ -158,4 +161,4 @@ def device_baud(text: str, url: str) -> tuple[str, int]:
             "expected udpin:[HOST:]PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE:BAUD, "
             f"got '{url}'"
         )
-    return device, int(baud) if baud else DEFAULT_BAUD
+    return device, int(baud) if baud else 57_600

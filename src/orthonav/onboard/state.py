@@ -23,13 +23,12 @@ from orthonav.onboard.gnss.biases import Biases, biases_from_plain
 
 VERSION = 1
 MAX_BYTES = 100_000
-MAX_MAPS = 100
-"""Maps of which something is stored, the latest."""
+MAX_AGE_S = 300.0
+"""Of a saved position from which a flight starts."""
 SAVE_S = 10.0
 """A state is saved again after so long without a new position, for the signing timestamp."""
 SPEED_MPS = 30.0
 """Standard deviation of the speed of the aircraft since the position was saved: assumed."""
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 log = logging.getLogger(__name__)
 
 
@@ -59,15 +58,15 @@ class SavedState:
 
 def boot_id() -> str:
     try:
-        return _BOOT_ID.read_text(encoding="ascii").strip()
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
         return ""
 
 
-def prior_of(saved: SavedState, age_s: float, max_age_s: float) -> Prior | None:
+def prior_of(saved: SavedState, age_s: float) -> Prior | None:
     """Prior from a saved position, its deviation grown with age; None where it is too old."""
     known = abs(saved.lat_deg) <= 90 and abs(saved.lon_deg) <= 180 and saved.std_m > 0
-    if not known or not 0 <= age_s <= max_age_s:
+    if not known or not 0 <= age_s <= MAX_AGE_S:
         return None
     return Prior(saved.lat_deg, saved.lon_deg, math.hypot(saved.std_m, SPEED_MPS * age_s))
 
@@ -78,7 +77,7 @@ def save(path: Path, saved: SavedState, maps: Mapping[str, Any] | None = None) -
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "w", encoding="ascii") as stream:
-            latest = dict(list(maps.items())[-MAX_MAPS:])
+            latest = dict(list(maps.items())[-100:])
             json.dump({"version": VERSION, **asdict(saved), "maps": latest}, stream)
         Path(name).replace(path)
     except BaseException:

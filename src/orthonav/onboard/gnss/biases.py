@@ -33,7 +33,6 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.records import MAP_STD_M
 
 Array = NDArray[np.float64]
-NANOSECONDS = 1e-9
 
 
 class Fault(Enum):
@@ -68,16 +67,6 @@ _PRIOR_STD = np.array([30.0, 30.0, math.radians(1.5), math.radians(1.5), 0.2])
 was aligned by eye to 3 deg and a latency of 0.4 s are 2 sigma."""
 _BETWEEN_STD = np.array([0.0, 0.0, math.radians(0.3), math.radians(0.3), 0.03])
 """Change from flight to flight: a camera that was taken off, a latency that was measured again."""
-MOST_DISPLACED_M = 2 * MAP_STD_M  # by which fixes are corrected
-_TRACK_STD = np.array([MAP_STD_M, MAP_STD_M, *_BETWEEN_STD[2:]])
-"""Of what a track leaves: its covariance includes the displacement, it estimates the mount."""
-PLAUSIBLE_SIGMAS = 5.0
-"""A displacement beyond so many of the standard deviations that every fix includes for it
-(`MAP_STD_M`) is that of a wrong map, or of a spoofed receiver."""
-_LEAST_EIGENVALUE = 1e-12
-_MOST_VARIANCE = 4.0
-"""Of what is assumed where nothing was learnt: a larger variance is damage."""
-_MOST_AGREED_S = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,23 +102,26 @@ class Biases:
 
     @property
     def is_plausible(self) -> bool:
-        """Whether the displacement may be that of a map as accurate as fixes state."""
-        largest_m = PLAUSIBLE_SIGMAS * MAP_STD_M + 2 * self.std_m
+        """Whether the displacement is within five of the standard deviations that fixes include for
+        it. Else the map is wrong, or the receiver spoofed."""
+        largest_m = 5.0 * MAP_STD_M + 2 * self.std_m
         return float(np.hypot(*self.en_m)) <= largest_m
 
     @property
     def displacement(self) -> tuple[Array, Array]:
         """That of a map as accurate as fixes state: mean (2,) and covariance (2, 2), metres.
 
-        The mean is at most `MOST_DISPLACED_M`, then with the covariance of fixes: no spoofed
-        receiver moves a position by more."""
-        known = np.linalg.inv(self.cov)
+        The mean is at most twice their standard deviation, then with the covariance of fixes: no
+        spoofed receiver moves a position by more."""
+        known, limit_m = np.linalg.inv(self.cov), 2 * MAP_STD_M
+        # What a track leaves: its covariance includes the displacement, it estimates the mount.
+        track_std = np.array([MAP_STD_M, MAP_STD_M, *_BETWEEN_STD[2:]])
         # They were learnt from a wider prior, which that of a track replaces.
-        cov = np.linalg.inv(known + np.diag(_TRACK_STD**-2 - _PRIOR_STD**-2))
+        cov = np.linalg.inv(known + np.diag(track_std**-2 - _PRIOR_STD**-2))
         mean = (cov @ known @ self.mean)[:2]
         length_m = float(np.hypot(*mean))
-        if length_m > MOST_DISPLACED_M:
-            return mean * (MOST_DISPLACED_M / length_m), np.eye(2) * MAP_STD_M**2
+        if length_m > limit_m:
+            return mean * (limit_m / length_m), np.eye(2) * MAP_STD_M**2
         return mean, np.asarray(cov[:2, :2])
 
     def variance_m2(self, design: Array) -> float:
@@ -165,13 +157,13 @@ def biases_from_plain(plain: Mapping[str, Any]) -> Biases:
         raise ValueError("wrong number of values")
     if not (np.isfinite(lower).all() and (np.abs(mean) <= LIMITS).all()):
         raise ValueError("value out of range")
-    if not (0 <= agreed_s <= _MOST_AGREED_S and isinstance(setup, str)):
+    if not (0 <= agreed_s <= 1e9 and isinstance(setup, str)):
         raise ValueError("time of agreement or setup is invalid")
     cov = np.zeros((count, count))
     cov[np.tril_indices(count)] = lower
     cov += np.tril(cov, -1).T
     scaled = cov / np.multiply.outer(_PRIOR_STD, _PRIOR_STD)
-    if np.linalg.eigvalsh(scaled)[0] < _LEAST_EIGENVALUE or np.diag(scaled).max() > _MOST_VARIANCE:
+    if np.linalg.eigvalsh(scaled)[0] < 1e-12 or np.diag(scaled).max() > 4.0:
         raise ValueError("not a covariance")
     return Biases(mean, cov, agreed_s, setup)
 
@@ -220,20 +212,11 @@ def design(heading_rad: ArrayLike, agl_m: ArrayLike, vel_en_mps: Array) -> Array
     return made
 
 
-BIN_S = 1.0
-"""Differences within this time are one value, their median."""
-FINE_S, MERGED = 12.0, 3
-"""Older values than this are merged, so many into one: a tenth of the work, for the same delays."""
-
-
 # Errors and tests, chosen by `benchmarks/gnss_watch.py` unless noted.
 WINDOW_S = 60.0
 GNSS_STD_M, GNSS_TAU_S = 3.0, 120.0
 """Least standard deviation per axis of the slowly varying error of GNSS (receivers state less), and
 its correlation time."""
-DIFFERENTIAL, DIFFERENTIAL_STD_M = 4, 1.0
-"""From which GPS_FIX_TYPE on corrections by SBAS or a reference station are used, and that least
-deviation with them, where biases are learnt."""
 MAP_TAU_S, MOUNT_TAU_S = 60.0, 600.0
 """Correlation times of the map's local errors, and of the part that turns with the aircraft."""
 MOUNT_SHARE, WHITE_SHARE = 0.4, 0.2
@@ -242,10 +225,6 @@ independent from view to view."""
 LOCAL_SHARE = 1 - MOUNT_SHARE - WHITE_SHARE
 MULTIPATH_M, FAULT_SIGMAS = 8.0, 5.0
 """Change of the difference that is no fault; in addition, standard deviations from which it is."""
-STEP_AGES = (2, 3, 4, 5, 6, 8)
-"""Onsets of a step, in values before the newest, less than `FINE_S`."""
-RAMP_AGES_S = (12.0, 18.0, 24.0, 32.0, 40.0, 50.0)
-"""Onsets of a ramp, in seconds before the newest value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,37 +269,21 @@ class DifferenceWindow:
     """Differences of the last minute and their tests. Mutable; deterministic."""
 
     def __init__(self) -> None:
-        self._old: deque[Difference] = deque()
-        self._new: deque[Difference] = deque()
-
-    @property
-    def values(self) -> list[Difference]:
-        """Values of the window in the order of time, the older ones merged."""
-        return [*self._old, *self._new]
+        self.values: deque[Difference] = deque()
 
     def add(self, value: Difference) -> None:
         """Add a value; older ones than the window are dropped."""
-        self._new.append(value)
-        if len(self._new) > MERGED and self._new[MERGED].time_s < value.time_s - FINE_S:
-            merged = [self._new.popleft() for _ in range(MERGED)]
-            mean = np.mean([each.en_m for each in merged], axis=0)
-            rolling_m = max(each.rolling_std_m for each in merged)
-            self._old.append(replace(merged[MERGED // 2], en_m=mean, rolling_std_m=rolling_m))
-        while self._old and self._old[0].time_s < value.time_s - WINDOW_S:
-            self._old.popleft()
+        self.values.append(value)
+        while self.values[0].time_s < value.time_s - WINDOW_S:
+            self.values.popleft()
 
     def widen(self, rolling_std_m: float) -> None:
-        if self._new:
-            self._new[-1] = self._new[-1].rolling(rolling_std_m)
-
-    def clear(self) -> None:
-        self._old.clear()
-        self._new.clear()
+        if self.values:
+            self.values[-1] = self.values[-1].rolling(rolling_std_m)
 
     def recent(self, seconds: float) -> list[Difference]:
-        # Less than `FINE_S`.
-        begin = self._new[-1].time_s - seconds if self._new else 0.0
-        return [each for each in self._new if each.time_s > begin]
+        begin = self.values[-1].time_s - seconds if self.values else 0.0
+        return [each for each in self.values if each.time_s > begin]
 
     def finding(self, known: Biases) -> Finding | None:
         """The likeliest change that is a fault; None without one."""
@@ -354,13 +317,14 @@ class DifferenceWindow:
         return Finding(fault, onset, (east, north))
 
     def _signatures(self, times: Array) -> tuple[Array, list[tuple[Fault, float]]]:
-        """Unit changes (N, K): constant, steps, and ramps that end at 1; their names and onsets."""
+        """Unit changes (N, K): constant, steps by values before the newest, and ramps by seconds,
+        which end at 1; their names and onsets."""
         columns, named = [np.ones(len(times))], [(Fault.OFFSET, float(times[0]))]
-        for age in STEP_AGES:
+        for age in (2, 3, 4, 5, 6, 8):
             if age < len(times):
                 columns.append((np.arange(len(times)) >= len(times) - age).astype(np.float64))
                 named.append((Fault.STEP, float(times[-age])))
-        for age_s in RAMP_AGES_S:
+        for age_s in (12.0, 18.0, 24.0, 32.0, 40.0, 50.0):
             onset = times[-1] - age_s
             if onset >= times[0]:
                 columns.append(np.maximum(times - onset, 0.0) / age_s)
@@ -391,55 +355,37 @@ def _covariance(values: Sequence[Difference]) -> Array:
     return blocks.reshape(2 * len(times), -1)
 
 
-LARGEST_GAP_S = 2.0
-"""Values farther apart do not show how the aircraft turned between them."""
-LEAST_DEG_S2 = 3.0
-"""Change of the turn rate per second from which the aircraft rolls; less is noise of headings."""
 LATENCY_STD_S = 0.08
 """Standard deviation of the latency of the images beyond the learnt one. With more, a step of GNSS
 in a turn is named after more than 5 s; with less, images that are 0.3 s late look like steps."""
-GRAVITY_MPS2 = 9.81
 
 
-class Rolling:
-    """Recognizes rolling by the change of the turn rate. Mutable; deterministic."""
+def rolling_std_m(values: Sequence[Difference], known: Biases) -> float:
+    """Standard deviation of the error of the last of three values while the aircraft rolls, by the
+    change of its turn rate; 0 where it does not, or values are missing or too far apart.
 
-    def __init__(self) -> None:
-        self._before: deque[Difference] = deque(maxlen=2)
-
-    def std_m(self, value: Difference, known: Biases) -> float:
-        """Standard deviation of the error of a value, the next after those before; 0 without.
-
-        `known`: for the latency that it may be due to.
-        """
-        values = [*self._before, value]
-        self._before.append(value)
-        change = _change_of_rate(*values) if len(values) == 3 else 0.0
-        if change <= math.radians(LEAST_DEG_S2):
-            return 0.0
-        # in a coordinated turn the tangent of the bank is speed times turn rate over gravity
-        bank_rate = float(np.hypot(*value.vel_en_mps)) * change / GRAVITY_MPS2
-        latency_s = math.hypot(known.mean[4], LATENCY_STD_S)
-        return latency_s * bank_rate * value.agl_m
-
-
-def _change_of_rate(first: Difference, middle: Difference, last: Difference) -> float:
+    `known`: for the latency that it may be due to.
+    """
+    if len(values) < 3:
+        return 0.0
+    first, middle, last = values
     before_s, after_s = middle.time_s - first.time_s, last.time_s - middle.time_s
-    if not (0 < before_s <= LARGEST_GAP_S and 0 < after_s <= LARGEST_GAP_S):
+    if not (0 < before_s <= 2.0 and 0 < after_s <= 2.0):
         return 0.0
     before = math.remainder(middle.heading_rad - first.heading_rad, math.tau) / before_s
     after = math.remainder(last.heading_rad - middle.heading_rad, math.tau) / after_s
-    return 2 * abs(after - before) / (before_s + after_s)
+    change = 2 * abs(after - before) / (before_s + after_s)
+    if change <= math.radians(3.0):  # per second: less is noise of headings
+        return 0.0
+    # in a coordinated turn the tangent of the bank is speed times turn rate over gravity
+    bank_rate = float(np.hypot(*last.vel_en_mps)) * change / 9.81
+    return math.hypot(known.mean[4], LATENCY_STD_S) * bank_rate * last.agl_m
 
 
 QUARANTINE_S = 180.0
 """Time that a value waits before it counts: longer than a drift of 0.25 m/s needs to be named."""
 SETTLED_S = 1800.0
 """Time of agreement after which biases count as known."""
-OUTLIER = 13.8
-"""Squared Mahalanobis distance of an outlier: chi-square of two axes, 99.9 %."""
-LARGEST_STEP_S = 2.0
-"""Most time of agreement that one value counts."""
 _WALK = np.array([0.02, 0.02, math.radians(0.003), math.radians(0.003), 5e-4])
 """Random walk of the biases, per root second, so that old values are forgotten over an hour: the
 displacement of a map is not the same everywhere, the track corrects part of the tilt."""
@@ -516,10 +462,10 @@ class _Filter:
         off = value.en_m - shown @ mean
         gain = np.linalg.solve(spread, shown @ cov).T
         self._mean, self._cov, self._time_s = mean, cov, value.time_s
-        if off @ np.linalg.solve(spread, off) <= OUTLIER:
+        if off @ np.linalg.solve(spread, off) <= 13.8:  # chi-square of two axes, 99.9 %
             self._mean, cov = mean + gain @ off, cov - gain @ spread @ gain.T
             self._cov = (cov + cov.T) / 2
-            agreed_s = self.biases.agreed_s + min(max(elapsed_s, 0.0), LARGEST_STEP_S)
+            agreed_s = self.biases.agreed_s + min(max(elapsed_s, 0.0), 2.0)
             self.biases = replace(self.biases, agreed_s=agreed_s)
         bounded = np.clip(self._mean[_BIAS], -LIMITS, LIMITS)
         length = float(np.hypot(*bounded[:2]))

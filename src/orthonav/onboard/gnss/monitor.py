@@ -15,15 +15,11 @@ import numpy as np
 from orthonav.core.flight.gnss import FAULTS, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import (
-    BIN_S,
-    DIFFERENTIAL,
-    DIFFERENTIAL_STD_M,
     FAULT_SIGMAS,
     GNSS_STD_M,
     GNSS_TAU_S,
     LARGEST_M,
     MULTIPATH_M,
-    NANOSECONDS,
     Array,
     Biases,
     BiasLearner,
@@ -31,10 +27,12 @@ from orthonav.onboard.gnss.biases import (
     DifferenceWindow,
     Fault,
     Finding,
-    Rolling,
+    rolling_std_m,
     unknown,
 )
 
+DIFFERENTIAL = 4
+"""GPS_FIX_TYPE from which on corrections are used."""
 RETURNING = FAULTS[-1]
 """Reason in health while GNSS agrees again, but not yet for long enough."""
 
@@ -99,26 +97,17 @@ class GnssStatus:
         return 0 if self.reason is None else FAULTS.index(self.reason) + 1
 
 
-LOST_STD_M = 50.0
-"""Stated standard deviation from which a position counts as none: that of `--max-std-m`."""
 SILENCE_S = 3.0
 """Time without a message after which a receiver counts as lost; streams are 1 to 10 Hz."""
 STILL_S = 3.0
 """Time with an equal position or timestamp after which a receiver counts as frozen."""
-MOVING_MPS = 3.0
-"""Speed from which an unchanged position is a fault."""
 GAP_S = 2.0
 """Samples farther apart are not compared with each other."""
-JUMP_S, JUMP_M = 3.0, 15.0
-"""Positions that leave the integrated velocity by more than this, within this time, have jumped:
-multipath makes steps of up to 10 m."""
+JUMP_M = 15.0
+"""Positions that leave the integrated velocity by more than this within 3 s have jumped: multipath
+makes steps of up to 10 m."""
 VELOCITY_S = 20.0
 """Span over which velocity and positions are compared."""
-VELOCITY_STD_MPS = 0.3
-"""Standard deviation of a constant error of Doppler velocities: those of receivers are 0.05 to
-0.2 m/s."""
-ACCELERATION_MPS2 = 10.0
-"""Largest acceleration of an aircraft, where the receiver reports no velocity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,9 +143,9 @@ class Receiver:
             self._latlon_deg, self._moved_ns = latlon, sample.arrived_ns
         if sample.stamp_ns is None or sample.stamp_ns != self._stamp_ns:
             self._stamp_ns, self._stamped_ns = sample.stamp_ns, sample.arrived_ns
-        accurate = not sample.std_m > LOST_STD_M
+        accurate = not sample.std_m > 50.0
         self._usable = sample.has_fix and accurate and bool(np.isfinite(en_m).all())
-        time_s = sample.time_ns * NANOSECONDS
+        time_s = sample.time_ns / 1e9
         points = self._points
         if self._usable and points and -GAP_S < time_s - points[-1].time_s <= 0:
             return False  # a repeated solution
@@ -175,14 +164,14 @@ class Receiver:
         """
         if self._heard_ns is None:
             return None
-        if not self._usable or (now_ns - self._heard_ns) * NANOSECONDS > SILENCE_S:
+        if not self._usable or (now_ns - self._heard_ns) / 1e9 > SILENCE_S:
             return Fault.LOST
-        if (self._heard_ns - self._stamped_ns) * NANOSECONDS >= STILL_S:
+        if (self._heard_ns - self._stamped_ns) / 1e9 >= STILL_S:
             return Fault.FROZEN
         own = self._points[-1].vel_en_mps if self._points else None
         speed_mps = np.fmax(speed_mps, math.nan if own is None else float(np.hypot(*own)))
-        still_s = (self._heard_ns - self._moved_ns) * NANOSECONDS
-        if still_s >= STILL_S and speed_mps > MOVING_MPS:
+        still_s = (self._heard_ns - self._moved_ns) / 1e9
+        if still_s >= STILL_S and speed_mps > 3.0:
             return Fault.FROZEN
         return Fault.JUMP if self._has_jumped() else None
 
@@ -222,8 +211,8 @@ class Receiver:
         if last.vel_en_mps is None:
             seconds = last.time_s - points[-2].time_s
             off_m = float(np.hypot(*(last.residual_m - points[-2].residual_m)))
-            return off_m > JUMP_M + ACCELERATION_MPS2 * seconds**2
-        first = points[bisect_left(points, last.time_s - JUMP_S, key=_time_s)]
+            return off_m > JUMP_M + 10.0 * seconds**2  # the largest acceleration, m/s2
+        first = points[bisect_left(points, last.time_s - 3.0, key=_time_s)]
         return float(np.hypot(*(last.residual_m - first.residual_m))) > JUMP_M
 
 
@@ -237,14 +226,8 @@ CLEAR_S = 2.0
 """Time without a fault of the receiver after which its alarm ends."""
 RECENT_S = 10.0
 """Differences of this time are averaged for what is reported and for agreement."""
-AGREE_SIGMAS, AGREE_M = 2.0, 10.0
-"""GNSS agrees within this many standard deviations, at least this distance."""
-MAP_JUMP_M, MAP_JUMP_SIGMAS = 15.0, 3.0
-"""The map jumped where its position leaves the track's velocity by more than both together."""
-MAP_JUMP_S = 60.0
-"""A change so soon after a jump of the map is not attributed to GNSS."""
-BEFORE_S = 5.0
-"""Values so long before the onset of a fault show what GNSS has to agree with after it."""
+AGREE_SIGMAS = 2.0
+"""GNSS agrees within this many standard deviations, at least 10 m."""
 _LEFT = {
     Fault.JUMP: Fault.STEP,
     Fault.LOST: Fault.OFFSET,
@@ -252,10 +235,6 @@ _LEFT = {
     Fault.VELOCITY: Fault.OFFSET,
 }
 """Name of a difference that is left where a fault of the receiver itself has ended."""
-SOLVED = 30
-"""Solutions that are stored for exposures before the newest: 3 s at 10 Hz."""
-PENDING = 100
-"""Most map positions that wait for the GNSS solution after them."""
 
 
 class GnssMonitor:
@@ -266,9 +245,9 @@ class GnssMonitor:
         self._frame = frame
         self._receiver, self._window = Receiver(), DifferenceWindow()
         self._learner = BiasLearner(start or unknown(), reference)
-        self._rolling = Rolling()
-        self._pending: deque[MapPosition] = deque(maxlen=PENDING)
-        self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=SOLVED)
+        self._judged: deque[Difference] = deque(maxlen=3)
+        self._pending: deque[MapPosition] = deque(maxlen=100)
+        self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=30)  # 3 s at 10 Hz
         self._bin: list[Difference] = []
         self._map: MapPosition | None = None
         self._held: MapPosition | None = None
@@ -320,7 +299,7 @@ class GnssMonitor:
     def tick(self, now_ns: int) -> GnssStatus:
         fault = self._receiver.fault(now_ns, self._speed_mps(now_ns))
         named = self.status.fault in (None, Fault.VELOCITY)  # a jump contradicts the velocity too
-        if fault is None and named and (now_ns - self._velocity_ns) * NANOSECONDS >= BIN_S:
+        if fault is None and named and (now_ns - self._velocity_ns) / 1e9 >= 1.0:
             self._velocity_ns = now_ns
             fault = self._velocity_fault()
         if fault is not None:
@@ -340,7 +319,7 @@ class GnssMonitor:
                 continue
             earlier, earlier_m = self._solved[max(after - 1, 0)]
             interval_ns = sample.time_ns - earlier.time_ns
-            if interval_ns * NANOSECONDS > GAP_S:
+            if interval_ns / 1e9 > GAP_S:
                 continue
             ahead_ns = position.time_ns - earlier.time_ns
             weight = ahead_ns / interval_ns if interval_ns else 1.0
@@ -351,10 +330,11 @@ class GnssMonitor:
         velocity = position.vel_en_mps
         if velocity is None:
             velocity = np.array(sample.vel_en_mps or (0.0, 0.0))
-        least_m = GNSS_STD_M if sample.fix_type < DIFFERENTIAL else DIFFERENTIAL_STD_M
+        # Corrections by SBAS or a reference station (GPS_FIX_TYPE) make 1 m.
+        least_m = GNSS_STD_M if sample.fix_type < DIFFERENTIAL else 1.0
         std_m = max(sample.std_m, least_m) if math.isfinite(sample.std_m) else GNSS_STD_M
         heading = math.radians(position.heading_deg)
-        time_s = position.time_ns * NANOSECONDS
+        time_s = position.time_ns / 1e9
         made = Difference(
             time_s,
             off_en_m,
@@ -364,17 +344,18 @@ class GnssMonitor:
             velocity,
             position.agl_m,
         )
-        if self._bin and math.floor(self._bin[0].time_s / BIN_S) != math.floor(time_s / BIN_S):
+        if self._bin and math.floor(self._bin[0].time_s) != math.floor(time_s):
             value, self._bin = _median(self._bin), []
             self._judge(value, now_ns)
         self._bin.append(made)
 
     def _judge(self, value: Difference, now_ns: int) -> None:
         if value.time_s <= self._newest_s:
-            self._window.clear()  # the clock went back
+            self._window.values.clear()  # the clock went back
             self._learner.discard()
         self._newest_s = value.time_s
-        rolling_m = self._rolling.std_m(value, self._learner.learnt)
+        self._judged.append(value)
+        rolling_m = rolling_std_m(self._judged, self._learner.learnt)
         if rolling_m:  # headings show it a second later than the bank
             value = value.rolling(rolling_m)
             self._window.widen(rolling_m)
@@ -383,7 +364,7 @@ class GnssMonitor:
         recent = self._window.recent(RECENT_S)
         east, north = np.mean([each.en_m for each in recent], axis=0).tolist()
         self.status = replace(self.status, difference_en_m=(east, north))
-        if (now_ns - self._fault_ns) * NANOSECONDS < CLEAR_S:
+        if (now_ns - self._fault_ns) / 1e9 < CLEAR_S:
             return  # the receiver has a fault by itself
         if self.status.state in (GnssState.WAITING, GnssState.GOOD):
             found = (
@@ -400,7 +381,7 @@ class GnssMonitor:
 
     def _count_agreement(self, recent: list[Difference], value: Difference, now_ns: int) -> None:
         anchor = self._learner.learnt if self.status.state is GnssState.GOOD else self._anchor
-        limit_m = max(AGREE_M, AGREE_SIGMAS * self._std_m(value, anchor))
+        limit_m = max(10.0, AGREE_SIGMAS * self._std_m(value, anchor))
         if self.status.state is GnssState.WAITING and anchor.agreed_s == 0:
             limit_m = max(limit_m, LARGEST_M)  # nothing is known of the map
         if float(np.hypot(*_residual(recent, anchor))) > limit_m:
@@ -413,7 +394,7 @@ class GnssMonitor:
                 self.status = replace(self.status, fault=named)
                 self._enter(GnssState.ALARM, now_ns)
             return
-        self._agreed_s += BIN_S
+        self._agreed_s += 1.0
         if self.status.state is GnssState.ALARM and self._agreed_s >= RECENT_S:
             self._enter(GnssState.RETURNING, now_ns)
         if self.status.state is not GnssState.GOOD and self._agreed_s >= RETURN_S:
@@ -423,11 +404,12 @@ class GnssMonitor:
     def _alarm(self, fault: Fault, now_ns: int, found: Finding | None) -> None:
         """Raise an alarm: learning stops, and what waits to be learnt is discarded."""
         if self.status.state in (GnssState.WAITING, GnssState.GOOD):
-            begin_s = now_ns * NANOSECONDS if found is None else found.onset_s
+            begin_s = now_ns / 1e9 if found is None else found.onset_s
             if fault is Fault.OFFSET:
                 self._learner.restore()
             is_old = found is not None and found.fault is Fault.OFFSET
-            self._anchor = self._learner.until(-math.inf if is_old else begin_s - BEFORE_S)
+            # Values so long before the onset show what GNSS has to agree with after it.
+            self._anchor = self._learner.until(-math.inf if is_old else begin_s - 5.0)
         if self.status.state is GnssState.ALARM and (
             self.status.fault is fault or (fault is Fault.JUMP and self.status.fault is Fault.STEP)
         ):
@@ -445,12 +427,12 @@ class GnssMonitor:
             self.status = replace(self.status, state=state, since_ns=now_ns)
 
     def _forget(self) -> None:
-        self._window.clear()
+        self._window.values.clear()
         self._bin = []
 
     def _attributed(self, found: Finding, now_ns: int) -> Fault:
         jumped = self._map_jump_ns
-        if jumped is not None and (now_ns - jumped) * NANOSECONDS <= MAP_JUMP_S:
+        if jumped is not None and (now_ns - jumped) / 1e9 <= 60.0:
             return Fault.DISAGREES
         return found.fault
 
@@ -480,7 +462,8 @@ class GnssMonitor:
 
     def _velocity_fault(self) -> Fault | None:
         gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-VELOCITY_S / GNSS_TAU_S))
-        drift_m2 = (VELOCITY_STD_MPS * VELOCITY_S) ** 2
+        # Constant errors of Doppler velocities are 0.05 to 0.2 m/s.
+        drift_m2 = (0.3 * VELOCITY_S) ** 2
         own_m = self._receiver.residual_over(VELOCITY_S)
         if own_m > MULTIPATH_M + FAULT_SIGMAS * math.sqrt(gnss_m2 + drift_m2):
             return Fault.VELOCITY
@@ -491,19 +474,19 @@ class GnssMonitor:
         last = self._map
         if last is None or last.vel_en_mps is None:
             return math.nan
-        if (now_ns - last.time_ns) * NANOSECONDS > GAP_S:
+        if (now_ns - last.time_ns) / 1e9 > GAP_S:
             return math.nan
         return float(np.hypot(*last.vel_en_mps))
 
 
 def _jumped(before: MapPosition, now: MapPosition) -> bool:
-    seconds = (now.time_ns - before.time_ns) * NANOSECONDS
+    seconds = (now.time_ns - before.time_ns) / 1e9
     velocities = [v for v in (before.vel_en_mps, now.vel_en_mps) if v is not None]
     if not 0 < seconds <= GAP_S or not velocities:
         return False
     moved = np.mean(velocities, axis=0) * seconds
     off_m = float(np.hypot(*(now.en_m - before.en_m - moved)))
-    return off_m > MAP_JUMP_M + MAP_JUMP_SIGMAS * max(before.std_m, now.std_m)
+    return off_m > 15.0 + 3.0 * max(before.std_m, now.std_m)
 
 
 def _residual(values: list[Difference], known: Biases) -> Array:

@@ -18,23 +18,13 @@ from orthonav.core.flight.gnss import BIASES, GnssSample
 from orthonav.core.flight.logged import gnss_message
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT, MAP_STD_M, Fix, ViewResult
-from orthonav.onboard.gnss.biases import (
-    NANOSECONDS,
-    Array,
-    Biases,
-    at_start,
-)
+from orthonav.onboard.gnss.biases import Array, Biases, at_start
 from orthonav.onboard.gnss.monitor import GnssMonitor, GnssState, GnssStatus, MapPosition
 
 log = logging.getLogger(__name__)
 DISPLACED = "map_displaced"
 """Reason in health: the learnt displacement is larger than that of a map as accurate as fixes
 state, or GNSS was spoofed since the first flight over it."""
-SHOWN_S = 1.0
-"""Age up to which a solution is extrapolated to an exposure, for display only."""
-ALARM_SEVERITY, RETURN_SEVERITY = 2, 5  # MAV_SEVERITY_CRITICAL, MAV_SEVERITY_NOTICE
-
-
 Solutions = Callable[[int], list[GnssSample]]
 """Gives the solutions that arrived until a time, each once, in order."""
 
@@ -154,8 +144,8 @@ class GnssWatch:
                 texts.append(text)
         return texts
 
-    @property
-    def reasons(self) -> tuple[str, ...]:
+    def reasons(self, now_ns: int = 0) -> tuple[str, ...]:
+        """Reasons of health by the last judgements."""
         found = [monitor.status.reason for monitor in self._monitors.values()]
         if not self._learnt.is_plausible:
             found.append(DISPLACED)
@@ -187,7 +177,7 @@ class GnssWatch:
 
     def plain(self) -> list[dict[str, Any]]:
         return [
-            _plain(number, each.status, self._now_ns) | _plain_biases(each.learnt)
+            _plain(number, each.status, self._now_ns) | {"agreed_s": round(each.learnt.agreed_s)}
             for number, each in sorted(self._monitors.items())
         ]
 
@@ -229,8 +219,8 @@ class GnssWatch:
         last = self._last
         if last is None or not last.is_valid:
             return made
-        seconds = (now_ns - last.time_ns) * NANOSECONDS
-        if abs(seconds) > SHOWN_S:
+        seconds = (now_ns - last.time_ns) / 1e9
+        if abs(seconds) > 1.0:
             return made
         en_m = np.asarray(self._frame.en_from_latlon(last.lat_deg, last.lon_deg))
         en_m = en_m + seconds * np.array(last.vel_en_mps or (0.0, 0.0))
@@ -253,12 +243,12 @@ def _change(name: str, before: GnssStatus, now: GnssStatus) -> GnssText | None:
         before.state is not GnssState.ALARM or before.fault != now.fault
     ):
         kind = now.fault.value.removeprefix("gnss_") if now.fault else "fault"
-        return ALARM_SEVERITY, f"orthonav {name} {kind}{_size(now.fault_en_m)}"
+        return 2, f"orthonav {name} {kind}{_size(now.fault_en_m)}"
     if now.state is GnssState.GOOD and before.state in (
         GnssState.ALARM,
         GnssState.RETURNING,
     ):
-        return RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size(now.difference_en_m)}"
+        return 5, f"orthonav {name} agrees, jump{_size(now.difference_en_m)}"
     return None
 
 
@@ -279,33 +269,18 @@ def _plain(number: int, status: GnssStatus, now_ns: int) -> dict[str, Any]:
     return {
         "receiver": number,
         "state": status.state.value,
-        "for_s": round((now_ns - status.since_ns) * NANOSECONDS, 1) if status.since_ns else None,
+        "for_s": round((now_ns - status.since_ns) / 1e9, 1) if status.since_ns else None,
         "fault": status.fault.value if status.fault else None,
         "difference_m": round(length, 2) if known else None,
         "bearing_deg": round(bearing, 1) if known else None,
     }
 
 
-def _shown(learnt: Biases) -> list[tuple[float, float]]:
+def _bias_evidence(learnt: Biases) -> dict[str, float]:
     """Each bias and its standard deviation, in the units of `BIASES`."""
     scale = np.array([1.0, 1.0, math.degrees(1.0), math.degrees(1.0), 1e3])
-    return list(zip((scale * learnt.mean).tolist(), (scale * learnt.stds).tolist(), strict=True))
-
-
-def _bias_evidence(learnt: Biases) -> dict[str, float]:
     made: dict[str, float] = {}
-    for (key, std_key), (value, std) in zip(BIASES, _shown(learnt), strict=True):
-        made |= {key: round(value, 3), std_key: round(std, 3)}
+    for names, values in zip(BIASES, np.transpose([learnt.mean, learnt.stds]), strict=True):
+        shown = np.round(values * scale[len(made) // 2], 3).tolist()
+        made |= dict(zip(names, shown, strict=True))
     return made
-
-
-def _plain_biases(learnt: Biases) -> dict[str, Any]:
-    (east, _), (north, _), pitch, roll, latency = _shown(learnt)
-    place = {"east_m": east, "north_m": north, "std_m": learnt.std_m, "agreed_s": learnt.agreed_s}
-    mount = dict(zip(("pitch_deg", "pitch_std_deg"), pitch, strict=True))
-    mount |= dict(zip(("roll_deg", "roll_std_deg"), roll, strict=True))
-    times = dict(zip(("ms", "std_ms"), latency, strict=True))
-    parts = {"displacement": place, "mount": mount, "latency": times}
-    return {
-        name: {key: round(value, 2) for key, value in part.items()} for name, part in parts.items()
-    }

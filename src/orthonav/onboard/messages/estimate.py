@@ -3,7 +3,6 @@ number that looks like a measurement."""
 
 import math
 from dataclasses import dataclass, field, replace
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +10,9 @@ from numpy.typing import NDArray
 from orthonav.core.errors import OrthonavError
 from orthonav.core.records import CONFIDENT, Fix, ViewResult, error_ellipse
 
-AVERAGING_S = 3.0
-"""Over which the filters of autopilots average positions (docs/decisions/correlated-errors.md)."""
-
 
 class EstimateError(OrthonavError, ValueError):
     """An estimate is invalid, or the requested message cannot represent it."""
-
-
-class Clock(Enum):
-    """Clock of the timestamps. A link uses one clock: receivers estimate its offset."""
-
-    UTC = "utc"
-    """Since 1970-01-01 UTC."""
-    BOOT = "boot"
-    """Time since boot of the autopilot (from TIMESYNC or the timestamps of its messages)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,21 +23,20 @@ class NavigationEstimate:
     `confidence`: 0 to 1; NaN: not known.
     `protection_level_m`: the error exceeds it with the risk of the result; infinite: not known.
     `accepted`: whether it met a criterion beside the rules of the gate.
-    `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
+    `time_ns`: time of exposure by a steady clock; `utc_ns`: UTC, None: not known.
     `processing_s`: from exposure until the message is sent.
     `alt_amsl_m`, `alt_std_m`: above mean sea level; NaN where not known.
     `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
     `state`: state of the track; None for views that are located one by one.
     `reset_counter`: 0 to 255; changes when the position jumped.
-    `dead_reckoned`: the view did not show the map; only a message that can mark it is made.
     """
 
     lat_deg: float
     lon_deg: float
     cov_en_m2: NDArray[np.float64]
     confidence: float
+    time_ns: int
     utc_ns: int | None = None
-    boot_ns: int | None = None
     processing_s: float = 0.0
     alt_amsl_m: float = math.nan
     alt_std_m: float = math.nan
@@ -58,7 +44,6 @@ class NavigationEstimate:
     vel_cov_en: NDArray[np.float64] | None = None
     state: str | None = None
     reset_counter: int = 0
-    dead_reckoned: bool = False
     protection_level_m: float = math.inf
     accepted: bool = True
 
@@ -80,18 +65,18 @@ class NavigationEstimate:
         for name, applies in invalid.items():
             if applies:
                 raise EstimateError(f"the {name} of an estimate is out of range")
-        if self.utc_ns is None and self.boot_ns is None:
-            raise EstimateError("the time of exposure is missing: give utc_ns or boot_ns")
 
-    def exposed_ns(self, clock: Clock) -> int:
-        """Time of exposure by `clock`; raises `EstimateError` where it is not known."""
-        time_ns = self.utc_ns if clock is Clock.UTC else self.boot_ns
-        if time_ns is None:
-            raise EstimateError(f"the time of exposure is not known by the clock {clock.value!r}")
-        return time_ns
+    @property
+    def stamp_ns(self) -> int:
+        """UTC of exposure, which messages state; raises `EstimateError` where it is not known."""
+        if self.utc_ns is None:
+            raise EstimateError("the UTC time of exposure is not known")
+        return self.utc_ns
 
-    def sent_ns(self, clock: Clock) -> int:
-        return self.exposed_ns(clock) + round(self.processing_s * 1e9)
+    @property
+    def sent_ns(self) -> int:
+        """UTC of sending; raises as `stamp_ns`."""
+        return self.stamp_ns + round(self.processing_s * 1e9)
 
     def horizontal_std_m(self) -> float:
         """Standard deviation along the worst direction; NaN where the covariance is invalid.
@@ -111,15 +96,11 @@ class NavigationEstimate:
 
 
 def estimate_from_result(
-    result: ViewResult,
-    *,
-    clock: Clock = Clock.UTC,
-    utc_minus_boot_ns: int | None = None,
-    processing_s: float | None = None,
+    result: ViewResult, *, utc_ahead_ns: int = 0, processing_s: float | None = None
 ) -> NavigationEstimate | None:
     """Estimate of the fix of a view; None where there is no fix.
 
-    `clock`: clock of `result.time_ns`; with `utc_minus_boot_ns` both clocks are filled in.
+    `utc_ahead_ns`: UTC minus the clock of `result.time_ns`.
     `processing_s`: time from exposure to sending; by default the latency of the fix, without the
     latency of the camera.
     """
@@ -128,19 +109,13 @@ def estimate_from_result(
         return None
     if processing_s is None:
         processing_s = result.latency_ms / 1e3 if math.isfinite(result.latency_ms) else 0.0
-    utc_ns: int | None = result.time_ns
-    boot_ns: int | None = result.time_ns
-    if clock is Clock.UTC:
-        boot_ns = None if utc_minus_boot_ns is None else result.time_ns - utc_minus_boot_ns
-    else:
-        utc_ns = None if utc_minus_boot_ns is None else result.time_ns + utc_minus_boot_ns
     return NavigationEstimate(
         lat_deg=fix.lat_deg,
         lon_deg=fix.lon_deg,
         cov_en_m2=fix.cov_en_m2,
         confidence=fix.confidence,
-        utc_ns=utc_ns,
-        boot_ns=boot_ns,
+        time_ns=result.time_ns,
+        utc_ns=result.time_ns + utc_ahead_ns,
         processing_s=processing_s,
         vel_en_mps=_velocity(fix) if result.state is not None else None,
         vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,
@@ -168,16 +143,17 @@ def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
     return np.eye(2) * std_mps**2 if math.isfinite(std_mps) else None
 
 
-def messages_averaged(interval_s: float) -> float:
+def messages_averaged(interval_s: float, averaging_s: float = 3.0) -> float:
     """Number of messages, 1 or more, that a receiver averages.
 
-    Errors of consecutive fixes (of the map, the tilt, the track) last longer than that: a receiver
-    that takes n of them as independent claims n times too small a variance.
+    Errors of consecutive fixes (of the map, the tilt, the track) last longer than the filters of
+    autopilots average (docs/decisions/correlated-errors.md): a receiver that takes n of them as
+    independent claims n times too small a variance.
 
     `interval_s`: since the message before; infinite for the first. After a clock was set back it
     counts as infinite.
     """
-    return max(AVERAGING_S / interval_s, 1.0) if interval_s > 0 else 1.0
+    return max(averaging_s / interval_s, 1.0) if interval_s > 0 else 1.0
 
 
 def for_filter(

@@ -1,7 +1,6 @@
 """Decides which positions are sent, and counts the reasons why others are withheld.
 
-A wrong position leads an autopilot astray; a missing one does not, because the autopilot notices
-it. The gate therefore withholds positions in doubt.
+An autopilot detects missing positions, not wrong ones: the gate withholds positions in doubt.
 """
 
 import math
@@ -9,32 +8,17 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT, error_ellipse
-from orthonav.onboard.messages.estimate import (
-    Clock,
-    EstimateError,
-    NavigationEstimate,
-)
+from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
 
-FUTURE_S = 0.1
-"""Tolerance for exposures in the future, before the clocks are taken to disagree."""
-JITTER = 0.1
-"""Fraction of an interval by which a message may be early: views with a small jitter all pass."""
-VELOCITY_STD_MPS = 1.0
-"""Standard deviation of a velocity that has no covariance."""
 MAX_AGE_S = 1.0
 """Longest time since exposure."""
-JUMP_SIGMAS, JUMP_VIEWS = 5.0, 3
-"""A position is a jump where it differs from the prediction by more standard deviations, beyond the
-possible manoeuvre; it is withheld until so many views in a row agree on the new place."""
-MAX_ACCEL_MPS2, MAX_SPEED_MPS = 10.0, 60.0
-"""Possible manoeuvre where the velocity is known, and where it is not."""
-_MOST_NORTH_DEG = 89.8
 Array = NDArray[np.float64]
 
 
@@ -43,15 +27,26 @@ class GateRules:
     """Limits of the gate.
 
     `min_confidence`: 0 to 1. `max_std_m`: along the worst direction. `min_interval_s`: shortest
-    time between two messages, by name. `send_coasting`: admit dead reckoning; messages mark it.
-    `alert_limit_m`: of the protection level, above 0; infinite: none.
+    time between two messages, by name. `alert_limit_m`: of the protection level, above 0;
+    infinite: none. `max_ahead_s`: of an exposure before our clock. `jitter`: fraction of an
+    interval by which a message may be early.
+
+    A position is a jump where it differs from the prediction by more than `jump_sigmas` beyond the
+    possible manoeuvre: `max_accel_mps2` where the velocity is known, with `velocity_std_mps` where
+    it has no covariance, else `max_speed_mps`. It is withheld until `jump_views` in a row agree.
     """
 
     min_confidence: float = CONFIDENT
     max_std_m: float = 50.0
     min_interval_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    send_coasting: bool = False
     alert_limit_m: float = math.inf
+    max_ahead_s: float = 0.1
+    jitter: float = 0.1
+    jump_sigmas: float = 5.0
+    jump_views: int = 3
+    max_accel_mps2: float = 10.0
+    max_speed_mps: float = 60.0
+    velocity_std_mps: float = 1.0
 
     def __post_init__(self) -> None:
         limits = {
@@ -66,20 +61,27 @@ class GateRules:
             raise EstimateError(f"min_confidence must be 0 to 1, got {self.min_confidence}")
 
 
+class Decision(NamedTuple):
+    """`estimate`: to be sent, with its reset counter; None where it is withheld for `reason`."""
+
+    estimate: NavigationEstimate | None
+    reason: str | None = None
+
+
 class Gate:
     """Checks the estimates of one flight in order. Mutable; for one thread.
 
-    `withheld`: counts by reason: `no_fix`, `not_tracking`, `alert_limit`, `low_confidence`,
-    `no_covariance`, `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `coasting` for
-    dead reckoning, `jump` for an impossible one that no other view has confirmed, `rate:NAME` for a
-    message that would exceed its rate, and the reasons of views that the flight loop does not
-    locate.
-    `resets`: number of admitted jumps of the position, and of tracks found again.
+    Reasons: `no_fix`, `not_tracking`, `alert_limit`, `low_confidence`, `no_covariance`,
+    `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `coasting` for dead reckoning,
+    `jump` for an impossible one that no other view has confirmed, and `rate:NAME` for a message
+    that would exceed its rate.
+    `withheld`: counts by reason, also by those of the flight loop and of messages that cannot be
+    made. `sent`: counts of messages by name. `resets`: number of admitted jumps of the position,
+    and of tracks found again.
     """
 
-    def __init__(self, rules: GateRules | None = None, clock: Clock = Clock.UTC) -> None:
+    def __init__(self, rules: GateRules | None = None) -> None:
         self.rules = rules or GateRules()
-        self.clock = clock
         self.withheld: Counter[str] = Counter()
         self.sent: Counter[str] = Counter()
         self.resets = 0
@@ -90,35 +92,31 @@ class Gate:
         self._protection_level_m = math.inf
         self._unavailable_ns: int | None = None
 
-    def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> NavigationEstimate | None:
-        """The estimate with its reset counter set, or None where it must not be sent.
-
-        Pass every view, also without a fix: it shows that a track was lost.
-        """
+    def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> Decision:
+        """Whether an estimate may be sent at a time of its steady clock. Pass every view, also
+        without a fix: it shows that a track was lost."""
         reason = self._reason(estimate, now_ns)
-        self._watch(estimate)
-        if estimate is not None:
-            self._protection_level_m = estimate.protection_level_m
-        if estimate is None or self._protection_level_m <= self.rules.alert_limit_m:
-            self._unavailable_ns = None
-        elif self._unavailable_ns is None:
-            self._unavailable_ns = now_ns
+        self._watch(estimate, now_ns)
         if estimate is None or reason is not None:
-            self.withheld[reason or "no_fix"] += 1
-            return None
-        coasting = estimate.state == "coasting"
+            return self.withhold(reason or "no_fix")
         jumped = self._last is not None and self._jumped(self._last, estimate)
-        if jumped and (coasting or not self._is_confirmed(estimate)):
-            self.withheld["jump"] += 1
-            return None
+        if jumped and not self._is_confirmed(estimate):
+            return self.withhold("jump")
         self._jumped_to = []
         if jumped or (self._last is not None and self._interrupted):
             self.resets += 1
         self._interrupted = False
-        made = replace(estimate, reset_counter=self.resets % 256, dead_reckoned=coasting)
-        if not coasting:
-            self._last = made
-        return made
+        self._last = replace(estimate, reset_counter=self.resets % 256)
+        return Decision(self._last)
+
+    def withhold(self, reason: str) -> Decision:
+        self.withheld[reason] += 1
+        return Decision(None, reason)
+
+    @property
+    def is_unavailable(self) -> bool:
+        """Whether the last protection level is above the alert limit."""
+        return self._unavailable_ns is not None and math.isfinite(self.rules.alert_limit_m)
 
     def availability(self, now_ns: int) -> dict[str, float | None]:
         """The alert limit, the last protection level (None: infinite), and for how long it has kept
@@ -140,76 +138,84 @@ class Gate:
         if self._jumped_to and self._jumped(self._jumped_to[-1], estimate):
             self._jumped_to = []
         self._jumped_to.append(estimate)
-        return len(self._jumped_to) >= JUMP_VIEWS
+        return len(self._jumped_to) >= self.rules.jump_views
 
     def due(self, message: str, now_ns: int) -> bool:
-        """Whether the rate of `message` allows sending now; counts it. The next one passes after a
-        clock was set back."""
+        """Whether the rate of `message` allows sending now, which the next call takes as sent. The
+        next one passes after a clock was set back."""
         interval_s = self.rules.min_interval_s.get(message)
-        if interval_s is not None:
-            interval_ns = round(interval_s * 1e9)
-            early_ns = round(interval_ns * JITTER)
-            due_ns = self._due_ns.get(message, now_ns)
-            if now_ns < due_ns - interval_ns - early_ns:  # before the last message
-                due_ns = now_ns
-            if now_ns < due_ns - early_ns:
-                self.withheld[f"rate:{message}"] += 1
-                return False
-            self._due_ns[message] = max(due_ns, now_ns - early_ns) + interval_ns
-        self.sent[message] += 1
+        if interval_s is None:
+            return True
+        interval_ns = round(interval_s * 1e9)
+        early_ns = round(interval_ns * self.rules.jitter)
+        due_ns = self._due_ns.get(message, now_ns)
+        if now_ns < due_ns - interval_ns - early_ns:  # before the last message
+            due_ns = now_ns
+        if now_ns < due_ns - early_ns:
+            self.withhold(f"rate:{message}")
+            return False
+        self._due_ns[message] = max(due_ns, now_ns - early_ns) + interval_ns
         return True
 
     def _reason(self, estimate: NavigationEstimate | None, now_ns: int) -> str | None:
         if estimate is None:
             return "no_fix"
-        exposed_ns, std_m = estimate.exposed_ns(self.clock), estimate.horizontal_std_m()
-        age_s = (now_ns - exposed_ns) / 1e9
+        std_m, age_s = estimate.horizontal_std_m(), (now_ns - estimate.time_ns) / 1e9
         behind_s = math.nan
         if self._last is not None:
-            behind_s = (self._last.exposed_ns(self.clock) - exposed_ns) / 1e9
+            behind_s = (self._last.time_ns - estimate.time_ns) / 1e9
         refusals = {
-            "coasting": estimate.state == "coasting" and not self.rules.send_coasting,
-            "not_tracking": estimate.state not in (None, "tracking", "coasting"),
+            "coasting": estimate.state == "coasting",
+            "not_tracking": estimate.state not in (None, "tracking"),
             "alert_limit": not estimate.protection_level_m <= self.rules.alert_limit_m,
-            "low_confidence": estimate.state != "coasting"
-            and not (estimate.accepted and estimate.confidence >= self.rules.min_confidence),
+            "low_confidence": not (
+                estimate.accepted and estimate.confidence >= self.rules.min_confidence
+            ),
             "no_covariance": math.isnan(std_m),
             "too_uncertain": std_m > self.rules.max_std_m,
-            "from_the_future": age_s < -FUTURE_S,
+            "from_the_future": age_s < -self.rules.max_ahead_s,
             "stale": age_s > MAX_AGE_S,
             # Farther behind, and not stale: the clock was set back.
-            "out_of_order": 0 <= behind_s <= MAX_AGE_S + FUTURE_S,
+            "out_of_order": 0 <= behind_s <= MAX_AGE_S + self.rules.max_ahead_s,
         }
         return next((reason for reason, applies in refusals.items() if applies), None)
 
-    def _watch(self, estimate: NavigationEstimate | None) -> None:
-        """Note the loss of a track: a view without a fix, searching or lost, after tracking."""
+    def _watch(self, estimate: NavigationEstimate | None, now_ns: int) -> None:
+        """Note since when the alert limit is exceeded, and the loss of a track: a view without a
+        fix, searching or lost, after tracking."""
+        if estimate is not None:
+            self._protection_level_m = estimate.protection_level_m
+        if estimate is None or self._protection_level_m <= self.rules.alert_limit_m:
+            self._unavailable_ns = None
+        elif self._unavailable_ns is None:
+            self._unavailable_ns = now_ns
         tracked = self._last is not None and self._last.state == "tracking"
         if tracked and (estimate is None or estimate.state not in ("tracking", "coasting")):
             self._interrupted = True
 
     def _jumped(self, before: NavigationEstimate, now: NavigationEstimate) -> bool:
-        seconds = (now.exposed_ns(self.clock) - before.exposed_ns(self.clock)) / 1e9
+        seconds = (now.time_ns - before.time_ns) / 1e9
         if seconds <= 0:
             return True
+        rules = self.rules
         velocities = [e.vel_en_mps for e in (before, now) if e.vel_en_mps is not None]
         moved = _moved_en_m(before, now)
         cov = np.asarray(before.cov_en_m2) + now.cov_en_m2
         if velocities:
             moved = moved - np.mean(velocities, axis=0) * seconds
             known = now.vel_cov_en if now.vel_cov_en is not None else before.vel_cov_en
-            spread = np.eye(2) * VELOCITY_STD_MPS**2 if known is None else known
+            spread = np.eye(2) * rules.velocity_std_mps**2 if known is None else known
             cov = cov + np.asarray(spread) * seconds**2
-            free_m = MAX_ACCEL_MPS2 * seconds**2 / 2
+            free_m = rules.max_accel_mps2 * seconds**2 / 2
         else:
-            free_m = MAX_SPEED_MPS * seconds
-        allowed_m = JUMP_SIGMAS * error_ellipse(cov)[0] + free_m
+            free_m = rules.max_speed_mps * seconds
+        allowed_m = rules.jump_sigmas * error_ellipse(cov)[0] + free_m
         return not float(np.hypot(*moved)) <= allowed_m  # true for an invalid covariance, too
 
 
 def _moved_en_m(before: NavigationEstimate, now: NavigationEstimate) -> Array:
-    limited = min(max(before.lat_deg, -_MOST_NORTH_DEG), _MOST_NORTH_DEG)
-    frame = LocalFrame(limited, before.lon_deg)
+    # A frame has no longitudes at a pole.
+    frame = LocalFrame(min(max(before.lat_deg, -89.8), 89.8), before.lon_deg)
     start = frame.en_from_latlon(before.lat_deg, before.lon_deg)
     return np.asarray(frame.en_from_latlon(now.lat_deg, now.lon_deg) - start)
 

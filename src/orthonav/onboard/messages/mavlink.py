@@ -10,7 +10,7 @@ Height, attitude and vertical velocity of messages in the autopilot's local fram
 
 import math
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, IntFlag
 from typing import Any
 
 import numpy as np
@@ -21,37 +21,27 @@ from orthonav.core.extras import needed
 from orthonav.core.geo.attitude import matrices_of_wxyz, wxyz_of_angles
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.records import CONFIDENT, error_ellipse
-from orthonav.onboard.messages.estimate import (
-    Clock,
-    EstimateError,
-    NavigationEstimate,
-)
+from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
 
 Message = Any
 """A `MAVLink_message` of pymavlink, which has no types."""
-COMPONENT_ID = 197
-"""MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY (common.xml)."""
-WRAP_S = 250.0
-"""Period of `transmission_time`, by its definition in common.xml."""
-UNKNOWN_DOP = 65535.0
-_UINT16_MAX = 2**16 - 1
-_UINT32_MAX, _UINT64_MAX = 2**32 - 1, 2**64 - 1
-_FLOAT32_MAX = (2 - 2**-23) * 2.0**127
-_SIGNING_EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01
-_SOURCE_VISION = 2
-_UNHEALTHY = 1
-_NO_FIX, _FIX_3D = 1, 3
-_IGNORE_ALT, _IGNORE_HDOP, _IGNORE_VDOP = 1, 2, 4
-_IGNORE_VEL_HORIZ, _IGNORE_VEL_VERT, _IGNORE_SPEED_ACC = 8, 16, 32
-_IGNORE_HORIZ_ACC, _IGNORE_VERT_ACC = 64, 128
-_IGNORE_ALL = 255
-_FRAME_GLOBAL = 0
-_CMD_EXTERNAL_POSITION_ESTIMATE, _CMD_REQUEST_MESSAGE = 43003, 512
-TEXT_MAX = 50
+MAX_TEXT = 50
 """Characters of one STATUSTEXT."""
-_GPS_EPOCH_UNIX_S, _LEAP_S, _LEAP_UNIX_S = 315_964_800, 18, 1_483_228_800
-"""1980-01-06; GPS time minus UTC, and since when: a new leap second (IERS Bulletin C) changes
-both."""
+LEAP_S, LEAP_UNIX_S = 18, 1_483_228_800
+"""GPS time minus UTC, and since when: a new leap second (IERS Bulletin C) changes both."""
+
+
+class _Ignore(IntFlag):
+    """GPS_INPUT_IGNORE_FLAGS (common.xml)."""
+
+    ALT = 1
+    HDOP = 2
+    VDOP = 4
+    VEL_HORIZ = 8
+    VEL_VERT = 16
+    SPEED_ACCURACY = 32
+    HORIZ_ACCURACY = 64
+    VERT_ACCURACY = 128
 
 
 @dataclass(frozen=True)
@@ -83,7 +73,8 @@ class Signing:
 
 def signing_timestamp(utc_ns: int) -> int:
     """Tens of microseconds since 2015-01-01 of a time in ns since 1970, UTC; 0 before."""
-    return max(utc_ns // 10_000 - _SIGNING_EPOCH_UNIX_S * 100_000, 0)
+    epoch_unix_s = 1_420_070_400  # 2015-01-01
+    return max(utc_ns // 10_000 - epoch_unix_s * 100_000, 0)
 
 
 class Packer:
@@ -92,7 +83,7 @@ class Packer:
     def __init__(
         self,
         system_id: int = 1,
-        component_id: int = COMPONENT_ID,
+        component_id: int = 197,  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
         *,
         sequence: int = 0,
         signing: Signing | None = None,
@@ -116,32 +107,26 @@ class Packer:
 def global_position_sensor(
     estimate: NavigationEstimate,
     *,
-    clock: Clock = Clock.UTC,
-    sensor_id: int = 1,
     target: Target = AUTOPILOT,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, stamped at sending.
 
-    A dead-reckoned estimate is UNHEALTHY. `sensor_id` is 1 to 255 (PX4 reads 0 as "off"). Raises
-    `EstimateError` for an estimate of low confidence or without accuracy: PX4 reads no flag, takes
-    coordinates that mean "unknown" for a place, and an unknown accuracy for a good one.
+    Raises `EstimateError` for an estimate of low confidence or without accuracy: PX4 reads no
+    flag, takes coordinates that mean "unknown" for a place, and an unknown accuracy for a good one.
     """
-    if not 1 <= sensor_id <= 255:
-        raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
-    if not estimate.dead_reckoned:
-        require_confident(estimate, min_confidence, "GLOBAL_POSITION_SENSOR")
+    require_confident(estimate, min_confidence, "GLOBAL_POSITION_SENSOR")
     eph_m = estimate.horizontal_std_m()
     if math.isnan(eph_m):
         raise EstimateError("GLOBAL_POSITION_SENSOR needs the accuracy of the position")
     return dialect().MAVLink_global_position_sensor_message(
         target_system=target.system_id,
         target_component=target.component_id,
-        id=sensor_id,
-        time_usec=microseconds(estimate.sent_ns(clock)),
-        processing_time=clamped(estimate.processing_s * 1e6, 0, _UINT32_MAX),
-        source=_SOURCE_VISION,
-        flags=_UNHEALTHY if estimate.dead_reckoned else 0,
+        id=1,  # that of EKF2_AGP0_ID
+        time_usec=microseconds(estimate.sent_ns),
+        processing_time=clamped(estimate.processing_s * 1e6, 0, 2**32 - 1),
+        source=2,  # vision
+        flags=0,
         lat=deg_e7(estimate.lat_deg),
         lon=deg_e7(estimate.lon_deg),
         alt_ellipsoid=math.nan,
@@ -154,49 +139,45 @@ def global_position_sensor(
 def gps_input(
     estimate: NavigationEstimate,
     *,
-    clock: Clock = Clock.UTC,
     gps_id: int = 0,
-    satellites: int = 0,
-    hdop_m: float | None = None,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """GPS_INPUT (message 232): the position as that of a GPS receiver, stamped at exposure.
 
-    Unknown values are marked in `ignore_flags` and sent as 0: the vertical velocity always,
-    altitude and speed accuracy unless the estimate has them. `fix_type` is 3 for a confident
-    estimate, else 1 with all fields ignored. `satellites`: 0 is true, but some checks refuse it.
-    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored.
+    Unknown values are marked in `ignore_flags` and sent as 0: the vertical velocity and dilutions
+    of precision always, altitude and speed accuracy unless the estimate has them. `fix_type` is 3
+    for a confident estimate, else 1 with all fields ignored. There are 0 satellites.
     """
     confident = estimate.is_confident(min_confidence)
     eph_m = estimate.horizontal_std_m()
     vel_cov = estimate.vel_cov_en
     speed_std_mps = math.nan if vel_cov is None else error_ellipse(vel_cov)[0]
-    flags = _ignored(estimate, speed_std_mps, hdop_m) if confident else _IGNORE_ALL
-    week, week_ms = (0, 0) if estimate.utc_ns is None else gps_time(estimate.utc_ns)
+    flags = _ignored(estimate, speed_std_mps) if confident else ~_Ignore(0)
+    week, week_ms = gps_time(estimate.stamp_ns)
     vel_east, vel_north = estimate.vel_en_mps or (0.0, 0.0)
 
-    def unless(bit: int, value: float, ignored: float = 0.0) -> float:
-        return ignored if flags & bit else float32(value)
+    def unless(bit: _Ignore, value: float) -> float:
+        return 0.0 if flags & bit else float32(value)
 
     return dialect().MAVLink_gps_input_message(
-        time_usec=microseconds(estimate.exposed_ns(clock)),
+        time_usec=microseconds(estimate.stamp_ns),
         gps_id=clamped(gps_id, 0, 255),
-        ignore_flags=flags,
+        ignore_flags=int(flags),
         time_week_ms=week_ms,
-        time_week=clamped(week, 0, _UINT16_MAX),
-        fix_type=_FIX_3D if confident else _NO_FIX,
+        time_week=clamped(week, 0, 2**16 - 1),
+        fix_type=3 if confident else 1,
         lat=deg_e7(estimate.lat_deg) if confident else 0,
         lon=deg_e7(estimate.lon_deg) if confident else 0,
-        alt=unless(_IGNORE_ALT, estimate.alt_amsl_m),
-        hdop=unless(_IGNORE_HDOP, _hdop(eph_m, hdop_m), UNKNOWN_DOP),
-        vdop=UNKNOWN_DOP,
-        vn=unless(_IGNORE_VEL_HORIZ, vel_north),
-        ve=unless(_IGNORE_VEL_HORIZ, vel_east),
+        alt=unless(_Ignore.ALT, estimate.alt_amsl_m),
+        hdop=65535.0,
+        vdop=65535.0,
+        vn=unless(_Ignore.VEL_HORIZ, vel_north),
+        ve=unless(_Ignore.VEL_HORIZ, vel_east),
         vd=0.0,
-        speed_accuracy=unless(_IGNORE_SPEED_ACC, speed_std_mps),
-        horiz_accuracy=unless(_IGNORE_HORIZ_ACC, eph_m),
-        vert_accuracy=unless(_IGNORE_VERT_ACC, estimate.alt_std_m),
-        satellites_visible=clamped(satellites, 0, 255),
+        speed_accuracy=unless(_Ignore.SPEED_ACCURACY, speed_std_mps),
+        horiz_accuracy=unless(_Ignore.HORIZ_ACCURACY, eph_m),
+        vert_accuracy=unless(_Ignore.VERT_ACCURACY, estimate.alt_std_m),
+        satellites_visible=0,
         yaw=0,  # the camera need not point forward
     )
 
@@ -204,19 +185,18 @@ def gps_input(
 def external_position_estimate(
     estimate: NavigationEstimate,
     *,
-    clock: Clock = Clock.UTC,
     target: Target = AUTOPILOT,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) as COMMAND_INT: a single fix while dead reckoning.
     Raises `EstimateError` for an estimate of low confidence, which it cannot mark."""
     require_confident(estimate, min_confidence, "MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
-    wrapped_ns = estimate.sent_ns(clock) % round(WRAP_S * 1e9)
+    wrapped_ns = estimate.sent_ns % (250 * 10**9)  # by the definition of the field
     return dialect().MAVLink_command_int_message(
         target_system=target.system_id,
         target_component=target.component_id,
-        frame=_FRAME_GLOBAL,
-        command=_CMD_EXTERNAL_POSITION_ESTIMATE,
+        frame=0,  # global
+        command=43003,
         current=0,
         autocontinue=0,
         param1=float32(wrapped_ns / 1e9),
@@ -234,7 +214,7 @@ def request_message(number: int, target: Target = AUTOPILOT) -> Message:
     return dialect().MAVLink_command_long_message(
         target.system_id,
         target.component_id,
-        _CMD_REQUEST_MESSAGE,
+        512,
         0,
         *(float(number), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     )
@@ -248,11 +228,11 @@ def status_texts(severity: int, text: str, number: int) -> list[Message]:
     """
     data = text.encode("ascii", "replace")
     make = dialect().MAVLink_statustext_message
-    if len(data) <= TEXT_MAX:
+    if len(data) <= MAX_TEXT:
         return [make(severity, data)]
-    starts = range(0, len(data) + 1, TEXT_MAX)
-    identity = number % _UINT16_MAX + 1  # 0 marks a single chunk
-    return [make(severity, data[at : at + TEXT_MAX], identity, at // TEXT_MAX) for at in starts]
+    starts = range(0, len(data) + 1, MAX_TEXT)
+    identity = number % (2**16 - 1) + 1  # 0 marks a single chunk
+    return [make(severity, data[at : at + MAX_TEXT], identity, at // MAX_TEXT) for at in starts]
 
 
 def require_confident(estimate: NavigationEstimate, min_confidence: float, message: str) -> None:
@@ -282,7 +262,7 @@ def deg_e7(degrees: float) -> int:
 
 def microseconds(time_ns: int) -> int:
     """Time in whole microseconds, clamped to 64 bits without sign."""
-    return min(max(time_ns // 1000, 0), _UINT64_MAX)
+    return min(max(time_ns // 1000, 0), 2**64 - 1)
 
 
 def clamped(value: float, low: int, high: int) -> int:
@@ -293,49 +273,36 @@ def float32(value: float) -> float:
     """`value` clamped to the range of a 32-bit float; NaN ("not known") where it is not finite."""
     if not math.isfinite(value):
         return math.nan
-    return min(max(value, -_FLOAT32_MAX), _FLOAT32_MAX)
+    largest = (2 - 2**-23) * 2.0**127
+    return min(max(value, -largest), largest)
 
 
-def _ignored(estimate: NavigationEstimate, speed_std_mps: float, hdop_m: float | None) -> int:
-    flags = _IGNORE_VDOP | _IGNORE_VEL_VERT
-    flags |= 0 if math.isfinite(estimate.alt_amsl_m) else _IGNORE_ALT | _IGNORE_VERT_ACC
-    flags |= 0 if math.isfinite(estimate.alt_std_m) else _IGNORE_VERT_ACC
-    flags |= 0 if hdop_m is not None else _IGNORE_HDOP
-    known = estimate.vel_en_mps is not None and all(map(math.isfinite, estimate.vel_en_mps))
-    flags |= 0 if known else _IGNORE_VEL_HORIZ | _IGNORE_SPEED_ACC
-    return flags | (0 if math.isfinite(speed_std_mps) else _IGNORE_SPEED_ACC)
-
-
-def _hdop(eph_m: float, hdop_m: float | None) -> float:
-    """HDOP of a standard deviation, at most 99.99: ArduPilot stores hundredths in 16 bits."""
-    if hdop_m is None:
-        return UNKNOWN_DOP
-    if not hdop_m > 0:
-        raise EstimateError(f"hdop_m must be metres per unit, above 0, got {hdop_m}")
-    return min(eph_m / hdop_m, 99.99)
-
-
-_WEEK_MS = 7 * 86_400_000
+def _ignored(estimate: NavigationEstimate, speed_std_mps: float) -> _Ignore:
+    flags = _Ignore.HDOP | _Ignore.VDOP | _Ignore.VEL_VERT
+    if not math.isfinite(estimate.alt_amsl_m):
+        flags |= _Ignore.ALT | _Ignore.VERT_ACCURACY
+    if not math.isfinite(estimate.alt_std_m):
+        flags |= _Ignore.VERT_ACCURACY
+    if estimate.vel_en_mps is None or not all(map(math.isfinite, estimate.vel_en_mps)):
+        flags |= _Ignore.VEL_HORIZ | _Ignore.SPEED_ACCURACY
+    if not math.isfinite(speed_std_mps):
+        flags |= _Ignore.SPEED_ACCURACY
+    return flags
 
 
 def gps_time(utc_ns: int) -> tuple[int, int]:
     """GPS week (without rollover) and time of week in ms; (0, 0), not known, before 2017."""
-    if utc_ns < _LEAP_UNIX_S * 10**9:  # a computer whose clock was not set
+    if utc_ns < LEAP_UNIX_S * 10**9:  # a computer whose clock was not set
         return 0, 0
-    return divmod(utc_ns // 1_000_000 + 1000 * (_LEAP_S - _GPS_EPOCH_UNIX_S), _WEEK_MS)
+    epoch_unix_s = 315_964_800  # 1980-01-06
+    return divmod(utc_ns // 1_000_000 + 1000 * (LEAP_S - epoch_unix_s), 7 * 86_400_000)
 
 
 # In the local frame of the autopilot.
 
-_LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20
-_ESTIMATOR_VISION = 2
-_INT32_MIN, _INT32_MAX = -(2**31), 2**31 - 1
 _NAN3 = (math.nan, math.nan, math.nan)
 Triple = tuple[float, float, float]
 Array = NDArray[np.float64]
-PX4_RADIUS_M = 6371000.0
-ARDUPILOT_M_PER_DEG = 0.011131884502145034 * 1e7
-_LEAST_SCALE = 0.01  # ArduPilot's, near the poles
 
 
 class Autopilot(Enum):
@@ -344,25 +311,26 @@ class Autopilot(Enum):
 
 
 KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
-NO_AUTOPILOT, DOWNWARD, _GIMBAL, _CAMERA, _INVALID_SIGNAL, _SAME_MM = 8, 25, 26, 30, 1, 50
+NO_AUTOPILOT, DOWNWARD = 8, 25
+"""MAV_AUTOPILOT_INVALID, MAV_SENSOR_ROTATION_PITCH_270."""
 
 
 def is_of_autopilot(heartbeat: Message) -> bool:
     """Whether an autopilot sends it; some gimbals and cameras name one as theirs."""
-    return heartbeat.autopilot != NO_AUTOPILOT and heartbeat.type not in (_GIMBAL, _CAMERA)
+    return heartbeat.autopilot != NO_AUTOPILOT and heartbeat.type not in (26, 30)
 
 
 def is_height(sensor: Message) -> bool:
     """Whether a DISTANCE_SENSOR measures downward, within its limits."""
     within = sensor.min_distance < sensor.current_distance < sensor.max_distance
-    valid = within and getattr(sensor, "signal_quality", 0) != _INVALID_SIGNAL
+    valid = within and getattr(sensor, "signal_quality", 0) != 1  # invalid
     return bool(valid and sensor.orientation == DOWNWARD)
 
 
 def repeats_height(position: Message) -> bool:
     """Whether both heights of GLOBAL_POSITION_INT are one: PX4 without a home repeats that above
     the sea, ArduPilot without an altitude by GNSS counts that from its start."""
-    return bool(abs(position.relative_alt - position.alt) <= _SAME_MM)
+    return bool(abs(position.relative_alt - position.alt) <= 50)  # mm
 
 
 @dataclass(frozen=True)
@@ -404,7 +372,6 @@ def odometry(
     pose: LocalPose,
     autopilot: Autopilot,
     *,
-    clock: Clock = Clock.UTC,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """ODOMETRY (message 331) as `autopilot` reads it, stamped at exposure.
@@ -417,12 +384,12 @@ def odometry(
     require_confident(estimate, min_confidence, "ODOMETRY")
     position, variance = _position(estimate, pose, autopilot, "ODOMETRY")
     velocity_ned = _velocity_ned(estimate, pose)
-    frames = (_LOCAL_NED, _LOCAL_NED)
+    frames = 1, 1  # MAV_FRAME_LOCAL_NED
     velocity, velocity_cov = velocity_ned, _velocity_covariance(estimate, pose)
     if autopilot is Autopilot.ARDUPILOT:
         roll, pitch, yaw = pose.attitude_rad
         body_from_ned = matrices_of_wxyz(wxyz_of_angles([yaw, pitch, roll])).T
-        frames = (_LOCAL_FRD, _BODY_FRD)
+        frames = 20, 12  # MAV_FRAME_LOCAL_FRD, MAV_FRAME_BODY_FRD
         velocity = body_from_ned @ velocity_ned
         velocity_cov = body_from_ned @ velocity_cov @ body_from_ned.T
         if not np.isfinite(velocity).all():
@@ -431,7 +398,7 @@ def odometry(
                 "send VISION_POSITION_ESTIMATE"
             )
     return dialect().MAVLink_odometry_message(
-        time_usec=microseconds(estimate.exposed_ns(clock)),
+        time_usec=microseconds(estimate.stamp_ns),
         frame_id=frames[0],
         child_frame_id=frames[1],
         x=float32(position[0]),
@@ -447,7 +414,7 @@ def odometry(
         pose_covariance=_triangle(variance, pose.attitude_std_rad),
         velocity_covariance=_triangle(velocity_cov, _NAN3),
         reset_counter=estimate.reset_counter,
-        estimator_type=_ESTIMATOR_VISION,
+        estimator_type=2,  # vision
         quality=clamped(estimate.confidence * 100, 1, 100),
     )
 
@@ -457,7 +424,6 @@ def vision_position_estimate(
     pose: LocalPose,
     autopilot: Autopilot,
     *,
-    clock: Clock = Clock.UTC,
     min_confidence: float = CONFIDENT,
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
@@ -470,7 +436,7 @@ def vision_position_estimate(
         raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude of the autopilot")
     roll, pitch, yaw = pose.attitude_rad
     return dialect().MAVLink_vision_position_estimate_message(
-        usec=microseconds(estimate.exposed_ns(clock)),
+        usec=microseconds(estimate.stamp_ns),
         x=float32(x),
         y=float32(y),
         z=float32(z),
@@ -488,7 +454,7 @@ def set_gps_global_origin(origin: Origin, *, target_system: int = 1) -> Message:
         target_system=target_system,
         latitude=deg_e7(origin.lat_deg),
         longitude=deg_e7(origin.lon_deg),
-        altitude=clamped(origin.alt_amsl_m * 1000, _INT32_MIN, _INT32_MAX),
+        altitude=clamped(origin.alt_amsl_m * 1000, -(2**31), 2**31 - 1),
         time_usec=0,
     )
 
@@ -553,9 +519,9 @@ def north_east_m(
     if autopilot is Autopilot.PX4:
         return _px4(origin, lat_deg, lon_deg)
     turned_deg = (lon_deg - origin.lon_deg + 180.0) % 360.0 - 180.0
-    scale = max(math.cos(math.radians((lat_deg + origin.lat_deg) / 2)), _LEAST_SCALE)
-    north_m = (lat_deg - origin.lat_deg) * ARDUPILOT_M_PER_DEG
-    return north_m, turned_deg * ARDUPILOT_M_PER_DEG * scale
+    scale = max(math.cos(math.radians((lat_deg + origin.lat_deg) / 2)), 0.01)  # near the poles
+    m_per_deg = 0.011131884502145034 * 1e7
+    return (lat_deg - origin.lat_deg) * m_per_deg, turned_deg * m_per_deg * scale
 
 
 def ardupilot_variance(std_m: float) -> float:
@@ -575,5 +541,5 @@ def _px4(origin: Origin, lat_deg: float, lon_deg: float) -> tuple[float, float]:
     east = math.cos(lat) * math.sin(turned)
     along = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(turned)
     across = math.hypot(north, east)
-    scale = math.atan2(across, along) / across if across > 0 else 1.0
-    return north * scale * PX4_RADIUS_M, east * scale * PX4_RADIUS_M
+    radius_m = 6_371_000.0 * (math.atan2(across, along) / across if across > 0 else 1.0)
+    return north * radius_m, east * radius_m

@@ -29,10 +29,9 @@ class Quality(Enum):
 
 def gga(
     estimate: NavigationEstimate | None,
-    *,
-    quality: Quality = Quality.ESTIMATED,
     utc_ns: int | None = None,
     min_confidence: float = CONFIDENT,
+    quality: Quality = Quality.ESTIMATED,
 ) -> bytes:
     """GGA: time, position, quality, altitude above mean sea level where known; 00 satellites.
 
@@ -48,10 +47,9 @@ def gga(
 
 def rmc(
     estimate: NavigationEstimate | None,
-    *,
-    quality: Quality = Quality.ESTIMATED,
     utc_ns: int | None = None,
     min_confidence: float = CONFIDENT,
+    quality: Quality = Quality.ESTIMATED,
 ) -> bytes:
     """RMC: time and date, status, position, speed in knots and course where velocity is known."""
     time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
@@ -66,7 +64,6 @@ def rmc(
 
 def gst(
     estimate: NavigationEstimate | None,
-    *,
     utc_ns: int | None = None,
     min_confidence: float = CONFIDENT,
 ) -> bytes:

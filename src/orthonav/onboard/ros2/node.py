@@ -13,7 +13,7 @@ from typing import Any
 
 from orthonav.core.errors import MissingExtraError, OutputError, described
 from orthonav.core.extras import needed
-from orthonav.onboard.ros2.arguments import RosArguments
+from orthonav.onboard.ros2.parameters import Parameters, declared
 
 log = logging.getLogger(__name__)
 TIME_NS = 10**9
@@ -79,43 +79,62 @@ class Definitions:
 class Node:
     """Reads and writes topics. `spin` is for one thread, writers are for any.
 
-    `problems` says by topic why little or nothing can flow there: another type, QoS that does not
-    match. `undecodable` counts damaged messages by topic.
+    `problems` says by topic why little flows there; `rclpy` logs types and QoS that do not match.
+    `undecodable` counts damaged messages by topic.
     """
 
-    def __init__(self, arguments: RosArguments) -> None:
-        """Raises `MissingExtraError`, or `OutputError` where the middleware cannot join."""
-        self.arguments, self.definitions = arguments, Definitions(arguments.distro)
+    def __init__(self, words: Sequence[str] = (), distro: str = "") -> None:
+        """`words`: those after `--ros-args`. `distro`: whose message definitions, see there.
+
+        Raises `MissingExtraError`, `VariantError` for an invalid parameter, or `OutputError` where
+        the middleware cannot join or does not take the words.
+        """
+        self.definitions = Definitions(distro)
         self.problems: dict[str, str] = {}
         self.undecodable: Counter[str] = Counter()
         self._said: set[tuple[str, str]] = set()
-        self._subscriptions: list[tuple[Any, str]] = []
-        self._publishers: list[tuple[Any, str]] = []
+        self._subscriptions: list[Any] = []
         self._handled = 0
-        self._join()
+        self.name, self.full_name = self._join(words)
+        self.parameters: Parameters = declared(self._declared)
 
-    def _join(self) -> None:
+    def _join(self, words: Sequence[str]) -> tuple[str, str]:
+        """Name of the node, and with its namespace."""
         rclpy, self._qos = _ros_module("rclpy"), _ros_module("rclpy.qos")
         signals, executors = _ros_module("rclpy.signals"), _ros_module("rclpy.executors")
-        arguments = self.arguments
+        self._context = rclpy.Context()
         try:
-            self._context = rclpy.Context()
             rclpy.init(
-                args=["--ros-args", *arguments.passed],
+                args=["--ros-args", *words],
                 context=self._context,
                 signal_handler_options=signals.SignalHandlerOptions.NO,
             )
             self._node = rclpy.create_node(
-                arguments.node,
-                namespace=arguments.namespace,
+                "orthonav",
                 context=self._context,
-                use_global_arguments=False,  # names are resolved already
                 enable_rosout=False,  # see `Rosout`
             )
-        except Exception as error:  # of the middleware
+        except Exception as error:  # of the middleware, and of its parser of arguments
             raise OutputError(f"cannot join the ROS graph: {described(error)}") from error
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
+        return self._node.get_name(), self._node.get_fully_qualified_name()
+
+    def _declared(self, name: str, default: Any) -> Any:
+        """Value of a parameter, which may be given in another type."""
+        if self._node.has_parameter(name):
+            return self._node.get_parameter(name).value
+        messages = _ros_module("rcl_interfaces.msg")
+        descriptor = messages.ParameterDescriptor(dynamic_typing=True)
+        return self._node.declare_parameter(name, default, descriptor).value
+
+    def resolved(self, topic: str) -> str:
+        """Absolute name of a topic after remapping."""
+        return str(self._node.resolve_topic_name(topic))
+
+    def is_remapped(self, topic: str) -> bool:
+        expanded = self._node.resolve_topic_name(topic, only_expand=True)
+        return bool(self._node.resolve_topic_name(topic) != expanded)
 
     def subscribe(
         self, topic: str, kind: str, handler: Handler, *, depth: int = 5, reliable: bool = False
@@ -134,7 +153,7 @@ class Node:
             made = self._node.create_subscription(message, topic, take, qos, raw=True)
         except Exception as error:  # of the middleware
             raise OutputError(f"cannot subscribe to {topic}: {described(error)}") from error
-        self._subscriptions.append((made, kind))
+        self._subscriptions.append(made)
 
     def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
         """A writer of `topic` (resolved already): reliable, and transient local if `latched`.
@@ -149,14 +168,13 @@ class Node:
             return lambda message: None
         except Exception as error:  # of the middleware
             raise OutputError(f"cannot publish on {topic}: {described(error)}") from error
-        self._publishers.append((made, kind))
         return self._writing(topic, made.publish)
 
     def spin(self, timeout_s: float) -> int:
         """Wait at most so long for messages and handle those that are there; how many."""
         self._handled = 0
         self._executor.spin_once(timeout_s)
-        for made, _ in self._subscriptions:  # spin_once handles one message
+        for made in self._subscriptions:  # spin_once handles one message
             with made.handle:
                 for _ in range(made.qos_profile.depth):
                     taken = made.handle.take_message(made.msg_type, True)
@@ -171,37 +189,13 @@ class Node:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def check_graph(self, others: Mapping[str, str]) -> None:
-        """Look for endpoints that cannot match now, beside `others`, further problems by topic;
-        each problem is logged once."""
-        self.problems = {**others, **self._mismatches()}
-        for topic, text in self.problems.items():
+    def note(self, problems: Mapping[str, str]) -> None:
+        """Take these problems by topic as the present ones; each is logged once."""
+        self.problems = dict(problems)
+        for topic, text in problems.items():
             if (topic, text) not in self._said:
                 self._said.add((topic, text))
                 log.warning("topic %s %s", topic, text)
-
-    def _mismatches(self) -> dict[str, str]:
-        """Topics whose endpoints cannot match now, and why."""
-        found: dict[str, str] = {}
-        for made, kind in self._subscriptions:
-            for other in self._node.get_publishers_info_by_topic(made.topic_name):
-                why = self._mismatch(other.qos_profile, made.qos_profile, "a publisher")
-                _note(found, made.topic_name, kind, other.topic_type, why)
-        for made, kind in self._publishers:
-            for other in self._node.get_subscriptions_info_by_topic(made.topic_name):
-                why = self._mismatch(made.qos_profile, other.qos_profile, "a subscriber")
-                _note(found, made.topic_name, kind, other.topic_type, why)
-        return found
-
-    def _mismatch(self, offered: Any, requested: Any, other: str) -> str:
-        """Why a subscription does not match a publisher; "" where it does."""
-        reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
-        policy = ""
-        if requested.reliability == reliability.RELIABLE != offered.reliability:
-            policy = "reliability"
-        elif requested.durability == durability.TRANSIENT_LOCAL != offered.durability:
-            policy = "durability"
-        return f"{other} has QoS that does not match ours: {policy}" if policy else ""
 
     def _made_qos(self, depth: int, *, reliable: bool, latched: bool = False) -> Any:
         reliability, durability = self._qos.ReliabilityPolicy, self._qos.DurabilityPolicy
@@ -231,14 +225,6 @@ class Node:
             self.undecodable[topic] += 1
 
 
-def _note(found: dict[str, str], topic: str, kind: str, other_kind: str, why: str) -> None:
-    """Note that an endpoint of our topic has another type, or `why` it does not match."""
-    if other_kind != kind:
-        why = f"is of type {other_kind}; expected {kind}"
-    if why:
-        found.setdefault(topic, why)
-
-
 def _message(kind: str) -> Any:
     package, _, name = kind.split("/")
     return getattr(_ros_module(f"{package}.msg"), name)
@@ -250,9 +236,7 @@ class Rosout(logging.Handler):
     def __init__(self, node: Node) -> None:
         super().__init__()
         self._node = node
-        self._write = node.advertise(
-            node.arguments.resolved("/rosout"), _LOG, depth=100, latched=True
-        )
+        self._write = node.advertise(node.resolved("/rosout"), _LOG, depth=100, latched=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         definitions = self._node.definitions
@@ -261,7 +245,7 @@ class Rosout(logging.Handler):
                 _LOG,
                 stamp=definitions.time(round(record.created * 1e9)),
                 level=min(record.levelno, logging.CRITICAL),
-                name=self._node.arguments.full_name.strip("/").replace("/", "."),
+                name=self._node.full_name.strip("/").replace("/", "."),
                 msg=record.getMessage(),
                 file=record.pathname,
                 function=record.funcName or "",

@@ -47,8 +47,8 @@ class Ros2Publisher:
         self._node, self._frame, self._now_ns = node, origin, now_ns
         self._floor_m, self._least, self._silent = min_std_m, min_confidence, silent
         self._origin_alt_m = origin_alt_m
-        resolved = node.arguments.resolved
-        self._parameters = node.arguments.parameters
+        resolved = node.resolved
+        self._parameters = node.parameters
         self.for_filter = self._parameters.covariance == "filter"
         self._fix = node.advertise(resolved("~/fix"), "sensor_msgs/msg/NavSatFix")
         pose = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -88,7 +88,7 @@ class Ros2Publisher:
         status = new(
             "diagnostic_msgs/msg/DiagnosticStatus",
             level=max(level, 1) if problems else level,
-            name=f"{self._node.arguments.node}: position",
+            name=f"{self._node.name}: position",
             message=", ".join([*plain["reasons"], *problems]) or "OK",
             hardware_id="orthonav",
             values=values,

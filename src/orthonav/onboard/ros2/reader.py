@@ -135,7 +135,7 @@ class Ros2Reader:
             self._spin()
             if self._images and self._is_ready(self._images[0]):
                 return self._camera_image(self._images.popleft())
-            if self._node.arguments.parameters.use_sim_time and self._clock is None:
+            if self._node.parameters.use_sim_time and self._clock is None:
                 self._remind("use_sim_time is true and nothing came on /clock")
             elif not self._images and self._number == 0:
                 self._remind(f"no images on {self._image_topic}")
@@ -150,15 +150,14 @@ class Ros2Reader:
         return 0 if ahead_ns is None else self._clocks.mono_ns() + ahead_ns
 
     def _subscribe(self) -> None:
-        node, parameters = self._node, self._node.arguments.parameters
-        resolved = node.arguments.resolved
+        node, parameters = self._node, self._node.parameters
+        resolved = node.resolved
         image, kind = resolved("image"), IMAGES[parameters.image_transport]
         compressed = parameters.image_transport == "compressed"
         self._image_topic = f"{image}/compressed" if compressed else image
         beside = f"{image.rpartition('/')[0]}/camera_info"
-        remapped = resolved("camera_info")
-        is_default = remapped == node.arguments.expanded("camera_info")
-        self._info_topic = beside if is_default else remapped
+        is_remapped = node.is_remapped("camera_info")
+        self._info_topic = resolved("camera_info") if is_remapped else beside
         reliable = parameters.image_reliability == "reliable"
         node.subscribe(self._image_topic, kind, self._take_image, reliable=reliable)
         for topic, kind, handler in (
@@ -179,11 +178,11 @@ class Ros2Reader:
         if now_ns - self._checked_ns >= TIME_NS:
             self._checked_ns = now_ns
             lost = loses_images(self._image_stamps, self._info_stamps)
-            self._node.check_graph({self._image_topic: _LOSES} if lost else {})
+            self._node.note({self._image_topic: _LOSES} if lost else {})
 
     def _ahead_ns(self) -> int | None:
         """ROS time minus our monotonic clock; None before the first `/clock`."""
-        if not self._node.arguments.parameters.use_sim_time:
+        if not self._node.parameters.use_sim_time:
             return self._clocks.utc_ns() - self._clocks.mono_ns()
         return None if self._clock is None else self._clock[0] - self._clock[1]
 

@@ -1,4 +1,4 @@
-"""Motion of the picture between consecutive images, as seen and as the autopilot reports it.
+"""Motion of the picture between consecutive images, as seen and as the telemetry reports it.
 
 Both are given as the rotation about the optical axis and the displacement of the centre of the
 picture, so that they can be compared. Corners are tracked (Shi and Tomasi 1994; Lucas and Kanade in
@@ -17,32 +17,17 @@ from orthonav.core.geo.camera import Camera, undistort
 
 SIDE_PX = 240
 """Longer side of compared images: corners are found to 0.1 px, 0.03 deg for a usual lens."""
-CORNERS, LEAST_CORNERS, LEAST_SHARE = 90, 20, 0.5
-"""Corners that are sought; those that must be found again, by number and share."""
-RETURN_PX = 0.5
-"""A corner tracked forth and back must return within this distance (Kalal et al., 2010)."""
-RANSAC_PX = 1.0
-EVENED_PX, LEAST_CONTRAST = 41, 2.0
-"""Brightness and contrast (grey levels) are evened within squares of this size: of an exposure that
-varies by 5 %, 65 % of the pairs were found without it, 99 % with it (benchmarks.faults)."""
-SHORTEST_S, LONGEST_S = 0.08, 1.2
-"""Images closer than this are skipped, and not compared if they are further apart."""
-FARTHEST_TILT_COS = 0.3
-"""Cosine of the largest angle between optical axis and vertical for which motion is predicted."""
+MIN_CORNERS = 20
+"""Corners that must be found again, and at least half of those sought."""
+LONGEST_S = 1.2
+"""Images farther apart are not compared."""
 TURN_STD_RAD, SHIFT_STD = 0.003, 0.004
 """Least standard deviations of differences: attitudes of autopilots jitter by about 0.1 deg, and
 corners are found to 0.1 px where the focal length is 200 px."""
-TRIMMED = 0.2
-"""Fraction of the pairs, those that fit worst, that is left out of the explained share."""
-KEEP_S = 60.0
-"""States are kept for so long: the longest latency, 30 s of motion, and some more."""
-GAP_S = 0.3
-"""Longest interval between states that is interpolated, unless the history says otherwise."""
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 Corners = NDArray[np.float32]
-_WINDOW = (17, 17)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +54,7 @@ class PictureOdometry:
 
     def motion(self, grey: Grey, camera: Camera, arrived_ns: int) -> ImageMotion | None:
         """Motion since the image before; None where it is too close, too far away, or differs."""
-        if self._before is not None and 0 <= arrived_ns - self._arrived_ns < SHORTEST_S * 1e9:
+        if self._before is not None and 0 <= arrived_ns - self._arrived_ns < 80_000_000:
             return None
         share = min(1.0, SIDE_PX / max(grey.shape))
         size = (max(8, round(grey.shape[1] * share)), max(8, round(grey.shape[0] * share)))
@@ -90,11 +75,13 @@ class PictureOdometry:
 
 
 def _evened(grey: Grey) -> Grey:
-    square = (EVENED_PX, EVENED_PX)
+    """Brightness and contrast evened within squares: of an exposure that varies by 5 %, 65 % of the
+    pairs were found without it, 99 % with it (benchmarks.faults)."""
+    square = (41, 41)
     varying = np.asarray(grey, np.float32)
     varying = varying - cv2.blur(varying, square)
     contrast = np.sqrt(cv2.blur(np.square(varying), square))
-    scaled = 128 + 25 * varying / np.maximum(contrast, LEAST_CONTRAST)
+    scaled = 128 + 25 * varying / np.maximum(contrast, 2.0)
     return np.asarray(np.clip(scaled, 0, 255), np.uint8)
 
 
@@ -102,19 +89,20 @@ def _corners(grey: Grey, mask: Grey | None) -> Corners | None:
     """Where the mask of the camera shows ground; its rim is an edge that does not move."""
     if mask is not None:
         mask = np.asarray(cv2.erode(mask, np.ones((9, 9), np.uint8), borderValue=255), np.uint8)
-    found: Any = cv2.goodFeaturesToTrack(grey, CORNERS, 0.02, SIDE_PX / 30, mask=mask, blockSize=5)
+    found: Any = cv2.goodFeaturesToTrack(grey, 90, 0.02, SIDE_PX / 30, mask=mask, blockSize=5)
     return None if found is None else np.asarray(found, np.float32)
 
 
 def _tracked(before: Grey, now: Grey, corners: Corners) -> tuple[Corners, Corners] | None:
-    """Corners (N, 2) in both images; None where too few are found again."""
-    options = {"winSize": _WINDOW, "maxLevel": 3}
+    """Corners (N, 2) in both images; None where too few are found again. Tracked forth and back,
+    one must return within half a pixel (Kalal et al., 2010)."""
+    options = {"winSize": (17, 17), "maxLevel": 3}
     # The stubs of OpenCV require the argument that is None.
     ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, **options)  # type: ignore[call-overload]
     back, returned, _ = cv2.calcOpticalFlowPyrLK(now, before, ahead, None, **options)  # type: ignore[call-overload]
     off = np.abs(back - corners).reshape(-1, 2).max(axis=1)
-    good = (found.ravel() == 1) & (returned.ravel() == 1) & (off < RETURN_PX)
-    if good.sum() < max(LEAST_CORNERS, LEAST_SHARE * len(corners)):
+    good = (found.ravel() == 1) & (returned.ravel() == 1) & (off < 0.5)
+    if good.sum() < max(MIN_CORNERS, 0.5 * len(corners)):
         return None
     return corners.reshape(-1, 2)[good], ahead.reshape(-1, 2)[good]
 
@@ -125,11 +113,11 @@ def _motion(
     focal_px = math.sqrt(camera.fx_px * camera.fy_px)
     start, end = _plane(start_px, camera), _plane(end_px, camera)
     sound = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
-    if sound.sum() < LEAST_CORNERS:
+    if sound.sum() < MIN_CORNERS:
         return None
     cv2.setRNGSeed(0)  # the same images give the same motion
-    found, inliers = cv2.findHomography(start[sound], end[sound], cv2.RANSAC, RANSAC_PX / focal_px)
-    if found is None or inliers.sum() < max(LEAST_CORNERS, LEAST_SHARE * len(start_px)):
+    found, inliers = cv2.findHomography(start[sound], end[sound], cv2.RANSAC, 1.0 / focal_px)
+    if found is None or inliers.sum() < max(MIN_CORNERS, 0.5 * len(start_px)):
         return None
     turn, shift = centre_motion(np.asarray(found, np.float64)[None])
     if not np.isfinite(turn[0] + shift[0].sum()):
@@ -168,7 +156,7 @@ def reported_motion(
     """
     turned = np.einsum("nji,njk->nik", end_enu, start_enu)
     down = -start_enu[:, 2, 2]
-    turned = np.where((down > FARTHEST_TILT_COS)[:, None, None], turned, np.nan)
+    turned = np.where((down > 0.3)[:, None, None], turned, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         turn, tilt_shift = centre_motion(turned)
         # A ground point at the ray r of the first camera lies at height / -r_up along it.
@@ -181,7 +169,8 @@ def reported_motion(
 
 
 class StateHistory:
-    def __init__(self, gap_s: float = GAP_S) -> None:
+    def __init__(self, gap_s: float) -> None:
+        """`gap_s`: longest interval between states that is interpolated."""
         self._gap_ns = round(gap_s * 1e9)
         self._times: Times = np.zeros(0, np.int64)
         self._rows: Array = np.zeros((0, 13))
@@ -206,7 +195,7 @@ class StateHistory:
         if velocity_enu_mps is not None:
             row[9:12] = velocity_enu_mps
         row[12] = height_m if height_m > 0 else math.nan
-        first = int(np.searchsorted(self._times, time_ns - round(KEEP_S * 1e9)))
+        first = int(np.searchsorted(self._times, time_ns - 60 * 10**9))
         self._times = np.append(self._times[first:], time_ns)
         self._rows = np.concatenate([self._rows[first:], row[None]])
 
@@ -216,12 +205,6 @@ class StateHistory:
         velocity, height = (start[:, 9:12] + end[:, 9:12]) / 2, start[:, 12]
         before, after = (each[:, :9].reshape(-1, 3, 3) for each in (start, end))
         return reported_motion(before, after, velocity, height, seconds)
-
-    def velocity(self, times_ns: Times) -> Array:
-        return self._at(times_ns)[:, 9:11]
-
-    def height_m(self, times_ns: Times) -> Array:
-        return self._at(times_ns)[:, 12]
 
     def _at(self, times_ns: Times) -> Array:
         if len(self._times) < 2:
@@ -240,12 +223,12 @@ def varying(values: Array, seconds: Array) -> Array:
     return np.asarray(values - rates * seconds[:, None])
 
 
-def explained_part(seen: Array, off: Array, least: float, least_off: float = 0.0) -> float:
-    """Share of seen motion (N, K) that is explained, `off`: seen less reported; NaN where neither
-    is at least `least`, or `off` is less than `least_off`."""
+def explained_part(seen: Array, off: Array, least: float) -> float:
+    """Share of seen motion (N, K) that is explained, without the fifth that fits worst. `off`: seen
+    less reported; NaN where neither is at least `least`."""
     seen2, off2 = np.square(seen).sum(axis=1), np.square(off).sum(axis=1)
     modelled2 = np.square(seen - off).sum(axis=1)  # reported motion that is not seen counts too
-    used = np.argsort(off2)[: round((1 - TRIMMED) * len(off2))]
+    used = np.argsort(off2)[: round(0.8 * len(off2))]
     moved = max(float(seen2[used].mean()), float(modelled2[used].mean()))
     left = float(off2[used].mean())
-    return 1 - left / moved if moved > least**2 and left >= least_off**2 else math.nan
+    return 1 - left / moved if moved > least**2 else math.nan
