@@ -58,7 +58,7 @@ class SheetSearch:
                 len(new),
             )
         file = partial(index_file, atlas, manifest)
-        self._policy = DEFAULT_PLAN.policy
+        self._policy = DEFAULT_PLAN
         self._embedder, quantizers = load_learnt(file(LEARNT), manifest.recipe)
         self._representation = make_variant(represent.TABLE, EDGES)
         self._index = ShardedIndex(file, manifest.shards, quantizers)
