@@ -162,8 +162,8 @@ def _outline(path: Path) -> tuple[LocalFrame, Extent]:
     corners = Mosaic.open([path]).outline_latlon_deg
     frame = LocalFrame(*((corners.min(axis=0) + corners.max(axis=0)) / 2).round(7).tolist())
     points = frame.en_from_latlon(corners[:, 0], corners[:, 1])
-    west, south, east, north = *points.min(axis=0).tolist(), *points.max(axis=0).tolist()
-    return frame, (west, south, east, north)
+    (west, south), (east, north) = points.min(axis=0), points.max(axis=0)
+    return frame, (float(west), float(south), float(east), float(north))
 
 
 def _box_deg(frame: LocalFrame, low: Array, high: Array) -> tuple[float, float, float, float]:
