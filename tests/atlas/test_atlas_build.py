@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthonav.core.errors import AreaError, AtlasError, StorageError, VariantError, WorkerError
+from orthonav.core.errors import (
+    AreaError,
+    AtlasError,
+    StorageError,
+    UsageError,
+    VariantError,
+    WorkerError,
+)
 from orthonav.core.mapfile import open_map
 from orthonav.ground.atlas import build as building
 from orthonav.ground.atlas.build import (
@@ -165,7 +172,7 @@ def test_other_recipes_are_refused_with_the_differences(built, ortho):
     "recipe", [{"tile_px": 50}, {"tile_px": 2048}, {"overlap": 1.0}, {"coarse": {"tile_px": 33}}]
 )
 def test_impossible_recipes_leave_no_atlas(ortho, tmp_path, recipe):
-    with pytest.raises((AreaError, AtlasError)):
+    with pytest.raises((AreaError, AtlasError, UsageError)):
         made(tmp_path / "atlas", ortho, recipe={**SMALL, **recipe})
     assert not (tmp_path / "atlas").exists()
     with pytest.raises(AtlasError, match="impossible"):

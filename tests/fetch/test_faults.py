@@ -13,7 +13,7 @@ import rasterio
 import servers
 import terrain
 
-from orthonav.core.errors import FetchError, OutputError
+from orthonav.core.errors import FetchError, OutputError, UsageError
 from orthonav.ground.planning.area import Area
 
 NOISE = np.random.default_rng(1).integers(1, 255, (256, 256, 3), dtype=np.uint8)
@@ -167,7 +167,7 @@ def test_an_error_of_a_service_that_quotes_the_key_does_not_show_it(take, protoc
 def test_limits_end_a_fetch_before_it_starts(take, tmp_path, names_below, options, words):
     (tmp_path / "folder.tif").mkdir()
     with servers.serving(servers.tiles) as server:
-        with pytest.raises((FetchError, OutputError), match=words):
+        with pytest.raises((FetchError, OutputError, UsageError), match=words):
             take(source(server), **options)
         assert not server.log
     assert names_below(tmp_path) == ["folder.tif"]

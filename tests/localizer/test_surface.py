@@ -23,12 +23,21 @@ from orthonav.core.localize.systematic import ERRORS
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import Telemetry, View
+from orthonav.core.register.pose import Pose
 from orthonav.ground.build.lean import as_shown
 from orthonav.ground.simulate.render import Raster
 
 SIDE_M, FINEST_M, BASE_M = 700.0, 0.5, 100.0
 ATTITUDE = (70.0, 30.0, 0.0)
 PLACE = np.array([30.0, -90.0])
+
+
+def pose_of(registration, view, camera_state):
+    """The inverse of `camera_state`."""
+    x, y = registration.px_of(camera_state[:2])
+    turn, log_scale = camera_state[2:].tolist()
+    moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
+    return Pose(x - float(moved[0]), y - float(moved[1]), turn, log_scale)
 
 
 def raster(values):
@@ -102,7 +111,7 @@ def test_the_camera_is_approached_from_metres_and_degrees(opened, town, view):
     seen = ViewOverGround(registration.ground, prepared, registration.reference)
     below = float(ground.at(PLACE[:1], PLACE[1:])[0])
     off = np.array([PLACE[0] + 2.0, PLACE[1] - 1.5, np.radians(ATTITUDE[0] + 1.0), np.log(0.98)])
-    pose = registration.pose_of(prepared, off)
+    pose = pose_of(registration, prepared, off)
     found = approached(seen, pose)
     start = seen.orientation(pose)
     truth = np.array([*PLACE, below + AGL_M / 2])
@@ -121,7 +130,7 @@ def test_a_camera_that_the_picture_does_not_show_among_houses_is_not_found(opene
         for picture, found in ((view.grey, True), (other, shown)):
             prepared = registration.prepared(replace(view, grey=picture), True)
             seen = ViewOverGround(registration.ground, prepared, registration.reference)
-            pose = registration.pose_of(prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
+            pose = pose_of(registration, prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
             camera = camera_of(seen, pose, 1.0, 0.0)
             assert (camera is not None) == found
 
@@ -133,7 +142,7 @@ def test_houses_that_lean_on_the_map_are_seen_where_they_stand(opened, town, vie
     registration = on(opened, ground, Heights(shown(above, lean)), lean).registration
     prepared = registration.prepared(view, True)
     seen = ViewOverGround(registration.ground, prepared, registration.reference)
-    pose = registration.pose_of(prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
+    pose = pose_of(registration, prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
     nodes, on_map = seen._nodes_m(pose, 0, (120, 160), smooth=False)
     level_m = registration.ground.terrain.at_en_m(on_map[..., :2])
     high_m = nodes[..., 2] - level_m
@@ -166,7 +175,7 @@ def test_an_unknown_height_at_the_rim_hides_nothing_less(opened, town, view):
         seen = ViewOverGround(
             registration.ground, registration.prepared(view, True), registration.reference
         )
-        pose = registration.pose_of(seen.view, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
+        pose = pose_of(registration, seen.view, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
         nodes, _ = seen._nodes_m(pose, 0, (200, 260), smooth=False)
         assert np.isfinite(nodes[..., :2]).all()
         hides.append(hidden(nodes, seen.orientation(pose).position_m))

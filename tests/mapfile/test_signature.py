@@ -285,7 +285,7 @@ def test_the_commands(tmp_path, run):
     assert run("sign", path, "--key", tmp_path / "key" / "private.pem").code == 0
     done = run("localize", path, tmp_path, "--out", tmp_path / "out", "--require-signed", public)
     assert "expected a flight folder" in done.err  # the next thing that is wrong
-    assert "no camera calibration: give --camera FILE" in run(*fly).err  # likewise
+    assert "map cannot be flown" in run(*fly).err  # likewise
     signed = run("verify", path, "--public-key", public).out
     assert "serial " in signed and "signed " in signed
     for command in (("verify", path, "--public-key", public), (*fly, "--state", tmp_path / "s")):

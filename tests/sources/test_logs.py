@@ -259,6 +259,15 @@ def test_the_receiver_with_a_fix_in_a_dataflash_log(tmp_path):
         read_log(path, DOWN, {"velocity": "GPS[1]"})
 
 
+def test_rangefinders_of_ardupilot_3_6(tmp_path, monkeypatch):
+    old = 132, "QCBCB", "TimeUS,Dist1,Orient1,Dist2,Orient2"
+    monkeypatch.setitem(recorders.DATAFLASH, "RFND", old)
+    monkeypatch.setattr(recorders, "rangefinder", lambda us, t: (us, 300, 0, 9_550, 25))
+    track = read_log(dataflash(tmp_path / "a.bin"), DOWN)
+    assert track.telemetry((START_S + 3) * 10**9).agl_m == 95.5
+    assert "height: using RFND[1], not RFND[0] (no valid message)" in track.choices[0]
+
+
 @pytest.mark.parametrize("write", [dataflash, tlog])
 def test_an_attitude_of_zeros_is_none(tmp_path, monkeypatch, write):
     monkeypatch.setattr(recorders, "flown", lambda seconds: [(t, 0, 0, 0) for t in range(9)])

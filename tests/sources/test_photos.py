@@ -32,6 +32,8 @@ LEVEL_GROUND = (
 )
 FILM_NOTE = "focal length 44 px, good to 3 %: 35 mm equivalent of EXIF"
 
+SOFTWARE, FIRMWARE, VIEWER = 0x0131, "v01.43.0039", "Microsoft Windows Photo Viewer 10.0"
+
 
 def series(folder, *each, first=20, **common):
     """Photographs 0.jpg, 1.jpg, .. a second apart, of what differs and what does not."""
@@ -508,6 +510,29 @@ def test_whole_values_of_xmp_are_read_and_others_named(text, value):
     unread = (f"Camera:Yaw='{text}'",) if value is None else ()
     for packet_of in (f'<a Camera:Yaw="{text}"/>', f"<Camera:Yaw>{text}</Camera:Yaw>"):
         assert Xmp.of(packet_of).values == expected and Xmp.of(packet_of).unread == unread
+
+
+# Photographs that an editor has written.
+
+
+@pytest.mark.parametrize(
+    "programs, edited",
+    [
+        ([FIRMWARE, VIEWER, FIRMWARE], [1]),
+        ([FIRMWARE, "v01.50.0000", ""], []),
+        (["Camera App", "Camera App", "Camera App"], []),
+        ([FIRMWARE, "Some Program", FIRMWARE], [1]),
+        (["", "", "GIMP 2.10"], [2]),
+    ],
+)
+def test_an_editor_may_have_turned_a_photograph(tmp_path, programs, edited):
+    for number, program in enumerate(programs):
+        first, time = {SOFTWARE: program} if program else {}, f"2023:11:14 22:13:2{number}"
+        photo(tmp_path / f"p/{number}.jpg", time, xmp=dji(), first=first)
+    recording = open_source(tmp_path / "p")
+    stds = {number: view.telemetry.yaw_std_deg for number, view in enumerate(recording.views)}
+    assert [number for number in stds if stds[number] == 180.0] == edited
+    assert ("1 of 3 photographs were written by an editor" in recording.warnings[0]) == bool(edited)
 
 
 # Photographs of another size, and without a time.

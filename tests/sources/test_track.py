@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import UsageError
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.flight.telemetry_track import (
     GAP_NS,
@@ -180,7 +180,7 @@ def test_a_message_states_its_horizon_or_a_placeholder(variances, expected):
     ],
 )
 def test_impossible_options_are_refused(change, message):
-    with pytest.raises(FlightError, match=message):
+    with pytest.raises(UsageError, match=message):
         SourceOptions(**change)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.errors import AreaError, VariantError
+from orthonav.core.errors import UsageError, VariantError
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.cells import MICRO, CellLayout
 from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
@@ -143,7 +143,7 @@ def test_views_of_another_shape_are_refused(place, shape):
 
 @pytest.mark.parametrize("tile_px", [16, 100, 127])
 def test_tiles_that_cannot_be_divided_are_refused(tile_px):
-    with pytest.raises(AreaError, match=f"multiple of {MICRO}"):
+    with pytest.raises(UsageError, match=f"multiple of {MICRO}"):
         CellLayout.for_tiles(tile_px, 16)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import orthonav
 from orthonav.cli.common import add_options, print_json
-from orthonav.cli.source import open_recording
+from orthonav.cli.source import add_source, open_source
 from orthonav.cli.version import require_extras
 from orthonav.core.errors import FlightError, OrthonavError, UsageError
 
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from orthonav.ground.evaluate.tables import FlightReport
 
 EXAMPLE = "fixes.jsonl --flight flight --map area.onav --report report"
+EVERYDAY = (
+    *("--flight", "--truth", "--map", "--report", "--radius-m", "--alert-limit-m", "--risk"),
+    "--json",
+)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -39,6 +43,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "largest horizontal error that the mission allows: availability and false fixes at it"
     add_options(parser, "--alert-limit-m", help=text)
     add_options(parser, "--risk", "--radius-m", "--json")
+    add_source(parser, dem=False)
+    parser.set_defaults(skip_bad_images=True)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -90,7 +96,7 @@ def _measured(
         local, place = sheet.frame, (sheet.frame.lat_deg, sheet.frame.lon_deg)
         background = Background(preview(opened), sheet.grid.extent_en_m)
     sources = dict.fromkeys(options.flight)
-    recorded = {path: _recorded(path, needed=not options.truth) for path in sources}
+    recorded = {path: _recorded(path, options) for path in sources}
     names = [path.stem for path in options.fixes]
     if len(set(names)) < len(names):
         names = [str(path) for path in options.fixes]
@@ -118,17 +124,15 @@ def _measured(
     return flights
 
 
-def _recorded(path: Path, *, needed: bool) -> "tuple[Positions, str]":
+def _recorded(path: Path, options: argparse.Namespace) -> "tuple[Positions, str]":
     """Recorded positions of what was localized, by frame, and its digest."""
     from orthonav.core.flight.fixes import FlightDigest
-    from orthonav.ground.recordings import SourceOptions
 
     digest = FlightDigest()
-    how = SourceOptions(fov_deg=60.0, agl_m=100.0, skip_bad_images=True)  # any: not used here
-    views = digest.watching(open_recording(path, how).views)
+    views = digest.watching(open_source(path, options).views)
     places = {view.frame: view.truth_latlon_deg for view in views}
     known = {name: at for name, at in places.items() if at is not None}
-    if needed and not known:
+    if not (known or options.truth):
         raise FlightError(f"no positions were recorded; give --truth: {path}")
     return known, digest.sha256
 

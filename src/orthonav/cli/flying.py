@@ -252,6 +252,8 @@ class _Setup:
             solutions = recorded_solutions(read_gnss(Path(options.source) / FILE))
         else:
             heard: Any = source if options.ros2 else self.link
+            if heard is None:
+                raise UsageError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
             solutions = live_solutions(heard.gnss)
         used = camera, options.mount_deg, self.fly.mount, _stated(options.camera_latency_ms)
         return GnssWatch(

@@ -281,13 +281,6 @@ class PreparedMap:
         """Of the camera (4,): m east and north, heading (rad), log scale."""
         return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
 
-    def pose_of(self, view: PreparedView, camera_state: NDArray[np.float64]) -> Pose:
-        """The inverse of `camera_state`."""
-        x, y = self.px_of(camera_state[:2])
-        turn, log_scale = camera_state[2:].tolist()
-        moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
-        return Pose(x - float(moved[0]), y - float(moved[1]), turn, log_scale)
-
     def camera_covariance(
         self, view: PreparedView, pose: Pose, covariance: NDArray[np.float64]
     ) -> NDArray[np.float64]:

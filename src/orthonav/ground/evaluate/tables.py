@@ -55,7 +55,24 @@ def metrics_to_json(metrics: Metrics) -> Plain:
         plain |= {f"{prefix}{radius_key(radius_m)}": each for radius_m, each in shares.items()}
     plain["covariance"] = _consistency_to_json(metrics.consistency)
     del plain["consistency"]
-    return plain
+    if metrics.integrity is None:
+        del plain["integrity"]
+    gap, confident, standard = metrics.gap, metrics.of_confident, metrics.standard
+    shown: Plain = to_plain(
+        {
+            "n_low_confidence": metrics.n_fixes - metrics.n_confident,
+            "longest_gap_s": gap.seconds_s,
+            "longest_gap_m": gap.path_m,
+            "confident_error_median_m": confident.cep50_m,
+            "confident_error_p95_m": confident.cep95_m,
+            "confident_error_max_m": confident.ape.max_m,
+            "error_median_m": standard.cep50_m,
+            "error_p95_m": standard.cep95_m,
+            "error_mean_m": standard.ape.mean_m,
+            "error_max_m": standard.ape.max_m,
+        }
+    )
+    return plain | shown
 
 
 def _consistency_to_json(found: Consistency) -> Plain:

@@ -216,6 +216,7 @@ class Photo:
     """DJI's calibration of a picture that is as the lens made it: fx, fy, and the principal point
     from the middle, px; k1, k2, p1, p2, k3."""
     turned: bool  # whether other programs show it turned, by the orientation of EXIF
+    software: str  # programs that wrote the file; of a camera its firmware
     agl_m: float = math.nan  # height above ground, where a table states it
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
@@ -281,6 +282,7 @@ def read_photo(path: Path) -> Photo:
         optics=_optics(tags),
         lens=xmp.lens if xmp.first("drone-dji:DewarpFlag") == 0 else None,
         turned=tags.get("Orientation", 1) not in (0, 1),
+        software=", ".join(filter(None, dict.fromkeys((_word(tags.get("Software")), xmp.writer)))),
         doubts=tuple(filter(None, (*doubts, void, doubt))),
     )
 
@@ -397,6 +399,7 @@ class Xmp:
 
     values: Mapping[str, float]
     time_ns: int | None  # UTC at exposure
+    writer: str = ""  # program that wrote the packet, empty where it is not named
     lens: tuple[float, ...] | None = None  # `DewarpData`, see `Photo`
     unread: tuple[str, ...] = ()
     """Angles, heights and positions that are not numbers, as name and value."""
@@ -415,9 +418,10 @@ class Xmp:
             if _ANGLE_OR_PLACE.match(name)
         )
         exposed = texts.get("drone-dji:UTCAtExposure") or texts.get("sensefly:UTCTime", "")
-        return cls(
-            values, _exposed_ns(exposed), _lens(texts.get("drone-dji:DewarpData", "")), unread
-        )
+        writer = re.search(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})", text)
+        name = writer[1].strip() if writer else ""
+        lens = _lens(texts.get("drone-dji:DewarpData", ""))
+        return cls(values, _exposed_ns(exposed), name, lens, unread)
 
     def first(self, *names: str) -> float:
         return next((self.values[name] for name in names if name in self.values), math.nan)

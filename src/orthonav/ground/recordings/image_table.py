@@ -7,7 +7,7 @@ counts it, where -90 looks straight down; any other is in the convention of orth
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -295,3 +295,12 @@ def _doubts(
         yield UNRECORDED
     elif gimbal and "gimbal" not in columns["pitch"][0].lower():
         yield "pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight down"
+
+
+def names_images(path: Path, names: Collection[str]) -> bool:
+    """Whether a text names some of these images, in lower case."""
+    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        text = stream.read(64_000).decode("utf-8", errors="replace").lower()
+    return not set(re.split(r"[\s,;\"/\\]+", text)).isdisjoint(names)

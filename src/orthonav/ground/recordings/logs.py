@@ -129,10 +129,13 @@ def _from_dataflash(collected: _Collected, message: Any, time_ns: int) -> None:
     elif kind == "POS":
         collected.above_home.add(time_ns, message.RelHomeAlt)
     elif kind == "RFND":
-        down = getattr(message, "Orient", mavlink.DOWNWARD) == mavlink.DOWNWARD
-        sound = getattr(message, "Stat", 4) == 4 and down and message.Dist > 0  # 4: good
-        name = f"RFND[{getattr(message, 'Instance', 0)}]"
-        _add(collected.distances, name, sound, time_ns, message.Dist)
+        good = getattr(message, "Stat", 4) == 4  # of the states the one of a valid range
+        for number in ("", "1", "2"):  # numbered up to ArduPilot 3.6
+            if (distance_m := getattr(message, f"Dist{number}", None)) is not None:
+                instance = int(number) - 1 if number else getattr(message, "Instance", 0)
+                down = getattr(message, f"Orient{number}", mavlink.DOWNWARD) == mavlink.DOWNWARD
+                sound = good and down and distance_m > 0
+                _add(collected.distances, f"RFND[{instance}]", sound, time_ns, distance_m)
     else:
         receiver = f"GPS[{message.I}]" if hasattr(message, "I") else kind
         course = math.radians(message.GCrs)

@@ -27,6 +27,7 @@ from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, re
 from orthonav.ground.recordings.image_table import (
     ImageTable,
     is_image_table,
+    names_images,
     read_image_table,
 )
 from orthonav.ground.recordings.logs import read_log
@@ -49,6 +50,13 @@ log = logging.getLogger(__name__)
 ZONE_STEP_NS, MAX_LAG_NS = 900 * 10**9, 20 * 10**9
 """Zones are quarters of an hour; a clock that is off by more than the latter is corrected."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+_EDITOR = re.compile(
+    r"microsoft|windows|photo\s*(?:viewer|shop|gallery|scape)|lightroom|gimp|picasa|paint|irfan"
+    r"|acdsee|xnview|magick|digikam|darktable|rawtherapee|affinity|capture one|snapseed|preview"
+    r"|pixelmator|faststone|zoner|corel|gthumb|shotwell|polarr|gwenview|nomacs|apple|google",
+    re.IGNORECASE,
+)
+"""Programs that show, turn or develop photographs."""
 ROUNDED = 0.02  # focal lengths of EXIF that differ by less, as a fraction, are of one lens
 
 
@@ -104,13 +112,16 @@ def chosen_photos(sources: Sequence[Path], options: SourceOptions) -> ChosenPhot
 def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
     """The table that lies in a folder and names some of these photographs below it."""
     names = [path.relative_to(folder).as_posix() for path in photos]
-    found = []
-    for path in filter(is_image_table, sorted(folder.iterdir())):
-        table = read_image_table(path)
-        if any(table.row(name) for name in names):
-            found.append(table)
-        else:
-            log.warning("table that names none of the photographs is not used: %s", path)
+    ends, found = {path.name.lower() for path in photos}, []
+    for path in sorted(folder.iterdir()):
+        if is_image_table(path):
+            table = read_image_table(path)
+            if any(table.row(name) for name in names):
+                found.append(table)
+            else:
+                log.warning("table that names none of the photographs is not used: %s", path)
+        elif names_images(path, ends):
+            log.warning("not read, for want of a header such as file,yaw,pitch,roll,agl: %s", path)
     if len(found) > 1:
         several = ", ".join(table.path.name for table in found[:5])
         raise FlightError(
@@ -139,10 +150,31 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
             f"gimbal angles of {sum(lost)} photographs are all 0, so they were not recorded: "
             "heading of the aircraft and a camera that looks straight down assumed"
         )
+    if edited := _edited(photos):
+        warnings.append(
+            f"{len(edited)} of {len(photos)} photographs were written by an editor "
+            f"({photos[edited[0]].software}); one that was turned there has kept its angles, so "
+            "the heading of these is taken as unknown"
+        )
+    for number in edited:
+        poses[number]["yaw_std_deg"] = 180.0
     return [
         replace(photo, pose={**pose, **(photo.row.pose if photo.row else {})})
         for photo, pose in zip(photos, poses, strict=True)
     ], warnings
+
+
+def _edited(photos: Sequence[Photo]) -> list[int]:
+    """Numbers of the photographs that an editor has written, which may have turned them."""
+    usual, count = Counter(photo.software for photo in photos).most_common(1)[0]
+    firmware = re.compile(r"[vV]?\d+(?:\.\d+)+")
+    named = firmware.match(usual) is not None and 2 * count > len(photos)
+    return [
+        number
+        for number, photo in enumerate(photos)
+        if _EDITOR.search(photo.software)
+        or (named and photo.software and not firmware.match(photo.software))
+    ]
 
 
 def _pose(photo: Photo, gimbal_unrecorded: bool, turns: bool) -> dict[str, Any]:
@@ -403,10 +435,10 @@ def _camera(photos: Sequence[Photo], options: SourceOptions) -> tuple[Camera, st
 
 
 def _factory_camera(photos: Sequence[Photo], focal: FocalLength) -> Camera | None:
-    """The camera as DJI calibrated it; None where not all photographs state the same one, and
-    where it is of another size by EXIF."""
+    """The camera as DJI calibrated it; None where not all photographs state the same one, where an
+    editor may have turned or dewarped them, and where it is of another size by EXIF."""
     lens, size = photos[0].lens, (photos[0].width_px, photos[0].height_px)
-    if lens is None or any(each.lens != lens for each in photos):
+    if lens is None or any(each.lens != lens for each in photos) or _edited(photos):
         return None
     # A larger difference from the focal length of EXIF means another size of the picture.
     if size[0] < size[1] or abs(lens[0] / focal.px - 1) > 3.0 * focal.std:
