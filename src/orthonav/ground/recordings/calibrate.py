@@ -33,7 +33,7 @@ from orthonav.core.records import (
     ViewResult,
 )
 from orthonav.ground.recordings.flightlog import LoggedFlight
-from orthonav.ground.recordings.motion import (
+from orthonav.onboard.motion import (
     LONGEST_S,
     SHIFT_STD,
     TURN_STD_RAD,
