@@ -74,6 +74,21 @@ def test_images_of_a_live_camera_carry_their_arrival():
     assert device.settings[cv2.CAP_PROP_FRAME_WIDTH] == 320
 
 
+def test_images_that_stop_for_a_while_are_interruptions():
+    def interruptions(intervals_s):
+        time, device = Time(), Device([noisy(0)] * len(intervals_s))
+        camera, found = LiveCamera(0, time.clocks, capture=lambda _: device), []
+        for each in intervals_s:
+            time.go(each)
+            found.append(camera.read().interruptions)
+        return found
+
+    assert interruptions([0.1, 0.2] * 20) == [0] * 40
+    assert interruptions([0.1] * 10 + [2.0] + [0.1] * 5) == [0] * 16  # positions show it
+    assert interruptions([0.1] * 10 + [4.0] + [0.1] * 5) == [0] * 10 + [1] * 6
+    assert interruptions([1.0] * 10) == [0] * 10  # a slow camera
+
+
 def test_a_camera_that_stops_comes_back():
     time, opened = Time(), []
     lives = [[noisy(0), "dead"], ["absent"], ["absent"], [noisy(1), noisy(2), "dead"]]
@@ -89,7 +104,7 @@ def test_a_camera_that_stops_comes_back():
     assert pauses[:3] == [0.5, 1.0, 2.0] and pauses[3] == 0.5
     assert all(each.released for each in opened)
     last = newest.take(0)
-    assert last.number == 3 and newest.is_over
+    assert last.number == 3 and last.interruptions > 0 and newest.is_over
 
 
 def test_a_camera_is_retried_after_a_fault_of_its_driver(caplog):
