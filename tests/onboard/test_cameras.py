@@ -157,6 +157,18 @@ def test_a_recording_can_follow_the_clock_of_the_autopilot():
     assert [source.read().exposed_ns for _ in range(2)] == [102 * S, 102 * S + S // 2]
 
 
+@pytest.mark.parametrize("first_s", [150.0, 1.7e9])
+def test_times_of_another_clock_than_the_autopilots_are_named(first_s, caplog):
+    time = Time()
+    due_ns = autopilot_pace(lambda _: 100 * S, time.clocks, 1.0)
+    ahead_s = round(first_s - 100)
+    assert [due_ns(round(each * S)) - time.now_ns for each in (first_s, first_s + 70)] == [
+        ahead_s * S,
+        (ahead_s + 70) * S,
+    ]
+    assert caplog.text.count("first image is due in") == (first_s > 160)
+
+
 def test_flight_folders_have_times_and_telemetry(tmp_path):
     camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
     rows = [Telemetry(n * S + n, 10.0 * n, 1.0, -2.0, 100.0 + n) for n in range(3)]

@@ -204,12 +204,25 @@ def own_pace(clocks: Clocks, pace: float) -> Callable[[int], int]:
 def autopilot_pace(
     boot_ns: Callable[[int], int | None], clocks: Clocks, pace: float
 ) -> Callable[[int], int | None]:
-    """Playback by the autopilot's clock, which `boot_ns` gives; None: not yet known."""
+    """Playback by the autopilot's clock, which `boot_ns` gives; None: not yet known. A warning says
+    where the first image is due so late that its time is probably of another clock."""
+    warned: list[int] = []
 
     def due_ns(time_ns: int) -> int | None:
         now_ns = clocks.mono_ns()
         there_ns = boot_ns(now_ns)
-        return None if there_ns is None else now_ns + round(time_ns / pace) - there_ns
+        if there_ns is None:
+            return None
+        ahead_ns = round(time_ns / pace) - there_ns
+        if not warned:
+            warned.append(ahead_ns)
+            if ahead_ns > 60e9:
+                log.warning(
+                    "the first image is due in %.0f s: are the times of the flight folder those of "
+                    "the autopilot since it started? (--recorded-telemetry plays without it)",
+                    ahead_ns / 1e9,
+                )
+        return now_ns + ahead_ns
 
     return due_ns
 
