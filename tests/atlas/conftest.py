@@ -1,6 +1,7 @@
 """An atlas with its index, and a flight over it in another year."""
 
 import dataclasses
+import shutil
 
 import pytest
 
@@ -36,17 +37,38 @@ def ortho(make_ortho, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def atlas(area, made_once):
-    from orthonav.ground.atlas.build import AtlasRequest, build_atlas
-    from orthonav.ground.atlas.catalog import Atlas, CoarseRecipe
-    from orthonav.ground.atlas.cluster import SerialRunner
+    from orthonav.ground.atlas.catalog import Atlas
+
+    made = made_once("searched-atlas", lambda folder: build_searched(folder, [area.past]))
+    return Atlas.open(made / "atlas")
+
+
+@pytest.fixture(scope="module")
+def twins(area, made_once):
+    """An atlas with the same imagery at two places, 6 km apart."""
+    import rasterio
+    from affine import Affine
+
+    from orthonav.ground.atlas.catalog import Atlas
 
     def make(folder):
-        recipe = {**RECIPE, "coarse": dataclasses.asdict(CoarseRecipe(*COARSE))}
-        with SerialRunner() as runner:
-            request = AtlasRequest(str(folder / "atlas"), [area.past], recipe)
-            assert not build_atlas(request, runner).failed
+        copy = shutil.copy(area.past, folder / area.past.name)
+        with rasterio.open(copy, "r+") as moved:
+            moved.transform = Affine.translation(6000.0, 0.0) * moved.transform
+        build_searched(folder, [area.past, copy])
 
-    return Atlas.open(made_once("searched-atlas", make) / "atlas")
+    return Atlas.open(made_once("twin-atlas", make) / "atlas")
+
+
+def build_searched(folder, orthos):
+    from orthonav.ground.atlas.build import AtlasRequest, build_atlas
+    from orthonav.ground.atlas.catalog import CoarseRecipe
+    from orthonav.ground.atlas.cluster import SerialRunner
+
+    recipe = {**RECIPE, "coarse": dataclasses.asdict(CoarseRecipe(*COARSE))}
+    with SerialRunner() as runner:
+        request = AtlasRequest(str(folder / "atlas"), orthos, recipe)
+        assert not build_atlas(request, runner).failed
 
 
 @pytest.fixture(scope="module")

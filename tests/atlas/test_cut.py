@@ -251,6 +251,20 @@ def test_a_missing_sheet_under_the_route_is_an_error(atlas, names, middle, tmp_p
     assert done.manifest.sheets[0].tiles > 0
 
 
+def test_missing_sheets_are_named_where_the_others_show_nothing(
+    atlas, names, middle, tmp_path, caplog, monkeypatch
+):
+    atlas.retire(names[3])
+    there = 0.4 * middle.en_from_latlon(*centre_of(names[3]))
+    area, out = Area.from_route(line(middle, there, there + 10), 40), tmp_path / "o.onav"
+    monkeypatch.setattr(Warp, "reaches", lambda *_: False)
+    with pytest.raises(AtlasError, match=rf"100 % of the route .*{names[3]}.*--allow-holes"):
+        cut_map(atlas, out, area, workers=1)
+    with pytest.raises(AreaError, match="no tile"):
+        cut_map(atlas, out, area, workers=1, allow_holes=True)
+    assert names[3] in caplog.text
+
+
 def centre_of(name):
     west, south, east, north = RECIPE.sheets.bounds_deg(name)
     return (south + north) / 2, (west + east) / 2

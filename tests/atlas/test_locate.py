@@ -14,9 +14,10 @@ from safetensors.numpy import load_file, save_file
 
 pytest.importorskip("faiss", reason="without it an atlas has no index: orthonav[atlas]")
 
-from orthonav.core.errors import AtlasError, MapFileError
+from orthonav.core.errors import AtlasError, MapFileError, StorageError
 from orthonav.core.flight.folder import open_flight, read_truth
 from orthonav.core.geo.frames import LocalFrame, distances_m
+from orthonav.core.mapfile import open_map, write_map
 from orthonav.core.records import Fix, NoFix, View
 from orthonav.core.track import State
 from orthonav.ground.atlas import locate
@@ -133,6 +134,7 @@ def test_a_track_continues_on_the_next_sheet(atlas, locator, views, places, monk
 def test_a_track_that_is_lost_at_two_views_ends(locator, views, monkeypatch):
     locator.locate(views[0])
     monkeypatch.setattr(locator._search, "sheets", lambda *_: [])
+    locator._state = State.TRACKING
     trackers = [track._tracker for track in locator._tracks]
     for state, left in ((State.COASTING, True), (State.LOST, True), (State.LOST, False)):
         for each in trackers:
@@ -142,12 +144,50 @@ def test_a_track_that_is_lost_at_two_views_ends(locator, views, monkeypatch):
     assert locator.state_name == "lost"
 
 
-def test_a_sheet_that_cannot_be_used_is_left_out(copied, views, caplog):
-    for sheet in copied.sheets().values():
-        path = copied.path(sheet)
+def test_a_track_ends_where_the_aircraft_may_be_anywhere(locator, views, places, monkeypatch):
+    """After a long gap one view, even where it is expected, is no fix."""
+    for view in views[:3]:
+        fix = locator.locate(view)
+    assert error_m(fix, places[2]) < 25
+    late = dataclasses.replace(views[3].telemetry, time_ns=views[3].telemetry.time_ns + 600 * 10**9)
+    monkeypatch.setattr(locator._search, "sheets", lambda *_: [])
+    assert isinstance(locator.locate(dataclasses.replace(views[3], telemetry=late)), NoFix)
+    assert (locator.state_name, locator._tracks) == ("lost", [])
+
+
+@pytest.mark.long
+def test_no_sheet_is_believed_while_another_shows_the_same(twins, views):
+    locator = AtlasLocator(SheetSearch(twins))
+    assert [type(locator.locate(view)) for view in views] == [NoFix] * len(views)
+    assert locator.state_name == "searching"
+
+
+@pytest.mark.parametrize("lacks", ["its bytes", "a registration layer"])
+def test_a_sheet_that_cannot_be_used_is_left_out(
+    copied, views, tmp_path, caplog, monkeypatch, lacks
+):
+    sheet = next(iter(copied.sheets().values()))
+    opened, path = open_map(copied.path(sheet)), tmp_path / "sheet.onav"
+    parts = {name: part for name, part in opened.arrays.items() if "/grey" not in name}
+    info = dataclasses.replace(opened.manifest.sheets[0], grey=None)
+    bare = dataclasses.replace(opened.manifest, sheets=(info,), registration=None)
+    write_map(path, bare, parts)
+    if lacks == "its bytes":
         path.write_bytes(path.read_bytes()[:-1])
+    monkeypatch.setattr(copied, "path", lambda _: path)
     outcome = AtlasLocator(SheetSearch(copied)).locate(views[0])
     assert outcome.reason == "searching" and "cannot be used" in caplog.text
+
+
+def test_a_sheet_that_cannot_be_fetched_is_an_error(copied, views, monkeypatch):
+    locator = AtlasLocator(SheetSearch(copied))
+
+    def unreachable(_):
+        raise StorageError("cannot read the atlas: timeout")
+
+    monkeypatch.setattr(copied, "path", unreachable)
+    with pytest.raises(StorageError, match="timeout"):
+        locator.locate(views[0])
 
 
 def test_a_track_on_a_damaged_sheet_ends(locator, views, monkeypatch):

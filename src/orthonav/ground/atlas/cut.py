@@ -11,6 +11,7 @@ whose box holds it; where that sheet shows nothing, from neighbours that reach o
 import json
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -458,7 +459,8 @@ def cut_map(
     reader = SheetReader(
         mosaic, area, grid, representation, NoCrops(grid.tile_px), registration=True
     )
-    reader.read(progress, workers)
+    with suppress(AreaError):  # no imagery at all: `check_shown` names the sheets that are missing
+        reader.read(progress, workers)
     check_shown(area, grid, reader.cells, atlas, allow_holes)
     progress("learn", 0.0)
     written = write_map(out, *_learnt(reader, recipe, members, workers))

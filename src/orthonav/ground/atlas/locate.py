@@ -2,8 +2,10 @@
 
 Each view is sought among the coarse tiles of the whole atlas. The sheets with the most similar ones
 are opened as maps, and a tracker begins on each: the ordinary one, which knows that the aircraft
-may be anywhere in the atlas. One that has confirmed a place by several views continues alone, from
-sheet to sheet. A view that it does not recognize is sought in the whole atlas too."""
+may be anywhere in the atlas. All of them take in every view and compete: one that has confirmed a
+place by several views has a fix unless another recognizes the views elsewhere. Once the others are
+unlikely it continues alone, from sheet to sheet. A view that it does not recognize is sought in the
+whole atlas too."""
 
 import logging
 import math
@@ -13,12 +15,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from orthonav.core.errors import AtlasError, MapFileError, StorageError
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.errors import AtlasError, MapFileError
+from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import Fix, NoFix, Telemetry, View
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.core.track import Model, State
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.atlas.catalog import Atlas
@@ -26,11 +28,14 @@ from orthonav.ground.atlas.search import SheetSearch
 
 log = logging.getLogger(__name__)
 
-MODEL = Model(wide_m=1700.0, most_agreement=1.0)
+MAX_REACH_M = 5_000.0  # a track whose aircraft may be farther from where it is expected ends
+SIGMAS = 3.0  # standard deviations of a position within which the aircraft is
+MODEL = Model(wide_m=MAX_REACH_M / SIGMAS, most_agreement=1.0)
 """Views of a flight without a prior may be far apart in time: their positions are never predicted
 well. So each must show the map by itself, however well it agrees with the prediction, and a wide
 prediction is no reason to confirm the track again (docs/atlas.md)."""
 MIN_CONFIDENCE = 0.5  # of a fix, by the view alone too
+MAX_UNSEEN = 2  # views in a row without which a place still rules out a fix at another one
 MAX_TRACKS = 3  # the least likely are dropped
 MAX_NEW_TRACKS = 2  # at a view: opening and searching a sheet takes a second
 
@@ -47,16 +52,20 @@ class SheetMaps:
         return self._atlas.recipe.sheets.name_at(lat_deg, lon_deg)
 
     def _opened(self, name: str) -> Localizer | None:
-        """None where there is no such sheet, or it cannot be used."""
+        """None where there is no such sheet, or it cannot be used. Raises `StorageError` where it
+        cannot be fetched."""
         sheet = self._atlas.sheets().get(name)
         if sheet is None:
             return None
+        path = self._atlas.path(sheet)
         try:
-            localizer = Localizer(open_map(self._atlas.path(sheet)))
-        except (AtlasError, MapFileError, StorageError) as error:
+            localizer = Localizer(open_map(path))
+            if localizer.registration is None:
+                raise MapFileError(f"map has no registration layer: {path}")
+        except (AtlasError, MapFileError) as error:
             log.warning("sheet %s cannot be used: %s", name, error)
             return None
-        if localizer.registration is not None and localizer.registration.confidence is None:
+        if localizer.registration.confidence is None:
             localizer.registration.confidence = DEFAULT_CONFIDENCE
         return localizer
 
@@ -65,7 +74,8 @@ class SheetTrack:
     """One track, on the sheet where the aircraft is expected. Mutable.
 
     `fix`: at the last view; None unless the track is confirmed and that view shows the map there.
-    `has_ended`: lost at two views in a row."""
+    `unseen`: views in a row, up to now, in which it did not recognize the map. `has_ended`: lost at
+    two views in a row, or the aircraft may be too far away."""
 
     def __init__(self, maps: SheetMaps, sheet: str, localizer: Localizer, first: View, **how: bool):
         self.sheet, self._maps = sheet, maps
@@ -76,6 +86,7 @@ class SheetTrack:
         )
         self._last: tuple[Fix, int] | None = None
         self.fix: Fix | None = None
+        self.unseen = MAX_UNSEEN
         self.has_ended = False
 
     @property
@@ -83,28 +94,54 @@ class SheetTrack:
         return self._tracker.state
 
     @property
-    def belief(self) -> float:
-        """Probability that the aircraft is at any of the places of this track."""
-        return 1 - self._tracker.mixture.elsewhere
+    def odds(self) -> float:
+        """That the aircraft is at any of the places of this track."""
+        elsewhere = max(self._tracker.mixture.elsewhere, 1e-9)
+        return (1 - elsewhere) / elsewhere
+
+    def is_elsewhere(self, fix: Fix) -> bool:
+        """Whether the aircraft cannot be both at a fix and at the likeliest place of this track."""
+        if self._last is None:
+            return True
+        here = self._last[0]
+        off_m = distances_m([(here.lat_deg, here.lon_deg)], [(fix.lat_deg, fix.lon_deg)])[0]
+        near_m = here.radius_m + fix.radius_m + SIGMAS * math.hypot(here.std_m, fix.std_m)
+        return bool(off_m > near_m)
 
     def locate(self, view: View) -> None:
         was_lost = self.state is State.LOST
-        self._change_sheet(view.telemetry.time_ns)
-        self._take(self._tracker.locate(view), view.telemetry)
+        if self._ends(view.telemetry.time_ns):
+            return
+        seen = self._tracker.locate(view)
+        self._take(seen, view.telemetry)
+        is_seen = isinstance(seen, Fix) and seen.evidence["recognized"] >= MIN_CONFIDENCE
+        self.unseen = 0 if is_seen else self.unseen + 1
         self.has_ended = was_lost and self.state is State.LOST
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> None:
-        self._take(self._tracker.passed(telemetry, reason), telemetry)
+        if not self._ends(telemetry.time_ns):
+            self._take(self._tracker.passed(telemetry, reason), telemetry)
 
-    def _change_sheet(self, time_ns: int) -> None:
-        """Continue on the sheet where the aircraft is expected by now, if there is one."""
+    def _ends(self, time_ns: int) -> bool:
+        """True where the aircraft may be too far from where it is expected by now. Else the track
+        continues on the sheet there, if there is one."""
         if self._last is None:
-            return
+            return False
         fix, before_ns = self._last
+        seconds = max((time_ns - before_ns) / 1e9, 0.0)
         velocity = np.array([fix.evidence["vel_east_mps"], fix.evidence["vel_north_mps"]])
-        moved_m = velocity * min(max((time_ns - before_ns) / 1e9, 0.0), 600.0)
-        lat, lon = LocalFrame(fix.lat_deg, fix.lon_deg).latlon_from_en(moved_m)
-        name = self._maps.name_at(float(lat), float(lon))
+        # It may change by half and by 10 m/s. One less certain than that is unknown.
+        fastest_mps = 120.0  # beyond the aircraft that this program is for
+        speed_mps = min(float(np.hypot(*velocity)) / 2 + 10.0, fastest_mps)
+        if fix.evidence["vel_std_mps"] > 10.0:
+            velocity, speed_mps = np.zeros(2), fastest_mps
+        self.has_ended = SIGMAS * fix.std_m + speed_mps * seconds > MAX_REACH_M
+        if not self.has_ended:
+            lat, lon = LocalFrame(fix.lat_deg, fix.lon_deg).latlon_from_en(velocity * seconds)
+            self._change_sheet(self._maps.name_at(float(lat), float(lon)))
+        return self.has_ended
+
+    def _change_sheet(self, name: str) -> None:
         if name != self.sheet and (localizer := self._maps.open(name)) is not None:
             self._tracker.continue_on(localizer)
             self.sheet = name
@@ -114,10 +151,9 @@ class SheetTrack:
         if isinstance(seen, NoFix):
             return
         self._last = seen, telemetry.time_ns
-        most = seen.evidence["recognized"]
-        confidence, place = min(seen.confidence, most), min(seen.place_probability, most)
-        if self.state is State.TRACKING and confidence >= MIN_CONFIDENCE:
-            self.fix = replace(seen, confidence=confidence, place_probability=place)
+        fix = _limited(seen, seen.evidence["recognized"])
+        if self.state is State.TRACKING and fix.confidence >= MIN_CONFIDENCE:
+            self.fix = fix
 
 
 class AtlasLocator:
@@ -127,6 +163,7 @@ class AtlasLocator:
         self._search, self._heading_known = search, heading_known
         self._maps = SheetMaps(search.atlas)
         self._tracks: list[SheetTrack] = []  # the likeliest first
+        self._believed: SheetTrack | None = None  # the one whose fix was published last
         self._state = State.SEARCHING
 
     @property
@@ -134,62 +171,95 @@ class AtlasLocator:
         return self._state.value
 
     def locate(self, view: View) -> Fix | NoFix:
-        self._follow(lambda track: track.locate(view))
-        if self._fix is not None:
-            return self._outcome()
+        self._tracks = _followed(self._tracks, lambda track: track.locate(view))
+        best, reason = self._best(), None
+        if best is None or best is not self._believed:
+            reason = self._begin(view)
+        return self._outcome(reason)
+
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+        self._tracks = _followed(self._tracks, lambda track: track.passed(telemetry, reason))
+        return self._outcome(reason)
+
+    def _begin(self, view: View) -> NoFix | None:
+        """Begin tracks on the sheets that a view may show; `NoFix` where it cannot be searched."""
         sheets = self._search.sheets(view, self._heading_known)
         if isinstance(sheets, NoFix):
-            return self._outcome(sheets)
-        searched = {each.sheet for each in self._tracks if each.state is State.SEARCHING}
+            return sheets
+        taken = (each for each in self._tracks if each.fix or each.state is State.SEARCHING)
+        searched = {each.sheet for each in taken}
         begun = [
             SheetTrack(self._maps, name, localizer, view, heading_known=self._heading_known)
             for name in [name for name in sheets if name not in searched][:MAX_NEW_TRACKS]
             if (localizer := self._maps.open(name)) is not None
         ]
-        before, self._tracks = self._tracks, begun
-        self._follow(lambda track: track.locate(view))
-        self._tracks = _likeliest([*before, *self._tracks])
-        return self._outcome()
+        begun = _followed(begun, lambda track: track.locate(view))
+        self._tracks = _likeliest([*self._tracks, *begun])
+        return None
 
-    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
-        self._follow(lambda track: track.passed(telemetry, reason))
-        return self._outcome(reason)
+    def _best(self) -> SheetTrack | None:
+        """The likeliest track with a fix; None where another recognized a view elsewhere lately."""
+        fixed = [each for each in self._tracks if each.fix is not None]
+        best = max(fixed, key=lambda each: each.odds, default=None)
+        if best is None or any(each.unseen < MAX_UNSEEN for each in self._rivals(best)):
+            return None
+        return best
 
-    @property
-    def _fix(self) -> Fix | None:
-        return next((each.fix for each in self._tracks if each.fix is not None), None)
+    def _rivals(self, best: SheetTrack) -> list[SheetTrack]:
+        fix = best.fix
+        return [each for each in self._tracks if fix is not None and each.is_elsewhere(fix)]
 
-    def _follow(self, take_in: Callable[[SheetTrack], None]) -> None:
-        """Where one has a fix all others end."""
-        left = []
-        for each in self._tracks:
-            try:
-                take_in(each)
-            except MapFileError as error:
-                log.warning("sheet %s cannot be used: %s", each.sheet, error)
-                continue
-            if each.fix is not None:
-                left = [each]
-                break
-            if not each.has_ended:
-                left.append(each)
-        self._tracks = left
+    def _published(self) -> Fix | None:
+        """The fix of the best track, as probable as it is among all tracks. Once it is confident
+        the others end."""
+        best = self._best()
+        if best is None or best.fix is None:
+            return None
+        others = sum(each.odds for each in self._rivals(best))
+        most = best.odds / (1 + best.odds + others)
+        fix = _limited(best.fix, most)
+        if fix.confidence < MIN_CONFIDENCE:
+            return None
+        self._believed = best
+        if most >= CONFIDENT:
+            self._tracks = [best]
+        return fix
 
     def _outcome(self, reason: NoFix | None = None) -> Fix | NoFix:
-        fix = self._fix
+        fix = self._published()
         if fix is not None:
             self._state = State.TRACKING
-        elif any(each.state.is_followed for each in self._tracks):
-            self._state = State.COASTING
         elif self._state is not State.SEARCHING:
-            self._state = State.LOST
+            is_followed = any(each.state.is_followed for each in self._tracks)
+            self._state = State.COASTING if is_followed else State.LOST
         text = f"no place is confirmed by several views; {len(self._tracks)} sheets are possible"
         return fix or reason or NoFix("searching", text)
 
 
+def _limited(fix: Fix, most: float) -> Fix:
+    confidence, place = min(fix.confidence, most), min(fix.place_probability, most)
+    return replace(fix, confidence=confidence, place_probability=place)
+
+
+def _followed(
+    tracks: Sequence[SheetTrack], take_in: Callable[[SheetTrack], None]
+) -> list[SheetTrack]:
+    """Those that have not ended after a view."""
+    left = []
+    for each in tracks:
+        try:
+            take_in(each)
+        except MapFileError as error:
+            log.warning("sheet %s cannot be used: %s", each.sheet, error)
+            continue
+        if not each.has_ended:
+            left.append(each)
+    return left
+
+
 def _likeliest(tracks: Sequence[SheetTrack]) -> list[SheetTrack]:
     """At most `MAX_TRACKS`, and on each sheet one that was never confirmed."""
-    ordered = sorted(tracks, key=lambda each: -each.belief)
+    ordered = sorted(tracks, key=lambda each: -each.odds)
     searching = [each for each in ordered if each.state is State.SEARCHING]
     best = {each.sheet: each for each in reversed(searching)}
     left = [each for each in ordered if each not in searching or best[each.sheet] is each]
