@@ -18,7 +18,7 @@ from orthonav.core.flight.fixes import Identity, flight_digest, read_identity, r
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import Telemetry, View, grey_levels
+from orthonav.core.records import Prior, Telemetry, View, grey_levels
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 NADIR = Telemetry(0, 0.0, 0.0, 0.0, 100.0)
@@ -82,6 +82,8 @@ def test_swapped_true_positions_end_every_command(run, fixes, few, map_path, tmp
     swapped = tmp_path / "swapped.csv"
     swapped.write_text("\n".join(",".join([row[0], row[2], row[1]]) for row in rows[1:]))
     swapped.write_text("frame,lat_deg,lon_deg\n" + swapped.read_text() + "\n")
+    turned = shutil.copytree(few, tmp_path / "turned")
+    shutil.copy(swapped, turned / "truth.csv")
     none = tmp_path / "none.jsonl"
     none.write_text(fixes.read_text().replace('"status": "fix"', '"status": "no_fix"'))
     none.write_text(none.read_text().replace('"reason": null', '"reason": "blank"'))
@@ -89,10 +91,38 @@ def test_swapped_true_positions_end_every_command(run, fixes, few, map_path, tmp
         ["evaluate", fixes, "--truth", swapped],
         ["evaluate", none, "--truth", swapped, "--map", map_path],
         ["view", fixes, "--map", map_path, "--truth", swapped, "--no-browser"],
+        ["calibrate", map_path, turned, "--out", tmp_path / "m", "--prior-std-m", 5],
     ):
         done = run(*command)
         assert (done.code, done.out) == (1, ""), command
         assert "latitude and longitude seem to be swapped" in done.err
+
+
+def test_only_recorded_positions_calibrate_a_mount(run, few, map_path, tmp_path, monkeypatch):
+    """Other priors of a flight are guesses, and no measurements."""
+    flight = shutil.copytree(few, tmp_path / "flight")
+    header, *rows = (flight / "truth.csv").read_text().splitlines()
+    (flight / "truth.csv").write_text("\n".join([header, *rows[:2]]) + "\n")
+    table = (flight / "telemetry.csv").read_text().splitlines()
+    priors = ["prior_lat_deg,prior_lon_deg,prior_std_m", *["46.5,2.5,5000"] * len(table[1:])]
+    joined = [f"{row},{prior}" for row, prior in zip(table, priors, strict=True)]
+    (flight / "telemetry.csv").write_text("\n".join(joined) + "\n")
+    tracked = []
+
+    def located(_, tracker, flight, views, shown, heights):
+        tracked.extend(view.telemetry.prior for view in views)
+        raise FlightError("enough")
+
+    monkeypatch.setattr("orthonav.cli.calibrate.located", located)
+    calibrate = ["calibrate", map_path, flight, "--out", tmp_path / "mount.json"]
+    assert "enough" in run(*calibrate, "--prior-std-m", 5).err
+    measured = [tuple(map(float, row.split(",")[1:3])) for row in rows[:2]]
+    assert tracked == [*(Prior(*place, 5.0) for place in measured), None, None]
+    tracked.clear()
+    assert "enough" in run(*calibrate).err and tracked == [None] * 4
+    (flight / "truth.csv").unlink()
+    done = run(*calibrate, "--prior-std-m", 5)
+    assert done.code == 2 and "no view has one" in done.err
 
 
 def test_lines_of_health_are_skipped(run, fixes, few, tmp_path):

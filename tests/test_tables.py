@@ -46,6 +46,16 @@ def test_a_line_of_many_fields_is_refused(tmp_path, at, name, head, row, read, e
     assert str(path) in str(caught.value)
 
 
+def test_a_table_may_end_within_its_last_row(tmp_path):
+    path = tmp_path / "table.csv"
+    rows = ["0,1,2,46.5,2.5", "1,1,2,46.5,2.5", "2,1"]
+    path.write_text(TABLE.rstrip() + ",lat_deg,lon_deg\n" + "\n".join(rows))
+    assert read_table(path).attitude.time_ns.tolist() == [0, 10**9]
+    path.write_text(path.read_text().removesuffix("2,1") + "x,1")
+    with pytest.raises(FlightError, match="line 4: time_s is not a time"):
+        read_table(path)
+
+
 def test_tables_of_a_flight_have_at_most_so_many_rows(tmp_path, monkeypatch):
     monkeypatch.setattr(folders, "MAX_VIEWS", 3)
     path = tmp_path / "truth.csv"

@@ -42,7 +42,8 @@ from orthonav.core.records import (
 )
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.simulate.render import ViewEffects
-from orthonav.onboard.latency import MISMATCH, LatencyMonitor
+from orthonav.onboard.cameras import GAP_S
+from orthonav.onboard.latency import MISMATCH, UNKNOWN, LatencyMonitor
 from orthonav.onboard.messages.estimate import estimate_from_result
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
@@ -346,6 +347,8 @@ class Monitored:
     track: Tracker
     buffer: TelemetryBuffer
     monitor: LatencyMonitor = field(default_factory=lambda: LatencyMonitor(LATENCY_S))
+    interruptions: int = 0
+    arrived_ns: int | None = None
     tracked_ns: int | None = None
 
     @property
@@ -357,6 +360,19 @@ class Monitored:
 
     def locate(self, view: View) -> Fix | NoFix:
         """Position of a view; a `NoFix` with the monitor's reason where it is withheld."""
+        before_ns = self.arrived_ns
+        self.arrived_ns = arrived_ns = view.telemetry.time_ns + round(LATENCY_S * 1e9)
+        self.interruptions += before_ns is not None and arrived_ns - before_ns > GAP_S * 1e9
+        self.monitor.arrived(arrived_ns, self.interruptions)
+        try:
+            return self._located(view)
+        finally:
+            known = self.buffer.at, self.buffer.covered_ns
+            self.monitor.observe(arrived_ns, view.grey, view.camera, *known)
+
+    def _located(self, view: View) -> Fix | NoFix:
+        if not self.monitor.may_locate:
+            return NoFix(self.monitor.reasons()[0], self.monitor.detail())
         telemetry, before_ns = view.telemetry, self.tracked_ns
         self.tracked_ns = time_ns = telemetry.time_ns
         if before_ns is not None and time_ns - before_ns > LONG_GAP_NS:
@@ -491,7 +507,7 @@ def table(rows: Sequence[Row]) -> Table:
     return Table("Replays", HEADER, cells, notes)
 
 
-WITHHELD = (MISMATCH,)
+WITHHELD = (UNKNOWN, MISMATCH)
 WITHHELD_HEADER = (
     *("flight", "views", *WITHHELD, "longest s"),
     *("start s", "no images s", "300 m east s", "mirrored s"),

@@ -158,6 +158,14 @@ def test_several_runs_have_a_row_and_files_of_their_own(tmp_path: Path, no_plots
     assert page.count("<table>") == page.count("aria-label") - 1
 
 
+def test_true_positions_without_a_result_are_counted(tmp_path: Path, no_plots) -> None:
+    flight = made_flight(12)
+    metrics = replace(flight.metrics, n_without_truth=3, n_without_result=2)
+    html = write_report(tmp_path, [replace(flight, metrics=metrics)]).read_text("utf-8")
+    assert "3 results have no true position" in html
+    assert "2 true positions have no result" in html and "errors are not defined" not in html
+
+
 def test_a_rerun_leaves_no_stale_figures_and_all_other_files(tmp_path: Path, no_plots) -> None:
     write_report(tmp_path, [made_flight(12, name="one"), made_flight(12, name="two")])
     (tmp_path / "notes.txt").write_text("mine")
@@ -169,7 +177,7 @@ def test_a_rerun_leaves_no_stale_figures_and_all_other_files(tmp_path: Path, no_
 def test_a_flight_without_any_fix_is_reported(tmp_path: Path, coarse) -> None:
     flight = made_flight(1, share_fixed=0.0)
     html = write_report(tmp_path, [flight]).read_text("utf-8")
-    assert "No view has a fix" in html
+    assert "No view has a fix, so errors are not defined." in html
     assert "nan" not in re.sub(r"base64,[^\"]+", "", html).lower()
     assert "nan" not in text([flight]).lower()
     json.dumps(metrics_to_json(flight.metrics), allow_nan=False)

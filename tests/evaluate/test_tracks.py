@@ -263,6 +263,35 @@ def test_views_placed_one_by_one_have_no_track(tmp_path: Path, no_plots) -> None
     assert "Track" not in html and html.count("<figure") == 3
 
 
+def test_json_has_names_that_scripts_read() -> None:
+    states = ["searching", *["tracking"] * 5]
+    comparison, results = flown([(3.0, 4.0)] * 6, states)
+    track = measure_track(comparison, results, 15.0)
+    plain = runs_to_json([FlightReport("f", comparison, measure(comparison), track=track)])
+    assert not plain.keys() & {"gap", "of_confident", "consistency", "integrity"}
+    statistics = {"n", "rmse_m", "mean_m", "median_m", "std_m", "max_m"}
+    for standard in (plain["standard"], plain["standard_of_confident"]):
+        assert list(standard) == ["rmse_m", "cep50_m", "cep95_m", "ape", "rpe"]
+        assert standard["rmse_m"] == pytest.approx(5.0) and set(standard["ape"]) == statistics
+        assert [(each["delta"], each["unit"]) for each in standard["rpe"]] == [
+            (1, "frames"),
+            (100.0, "m"),
+        ]
+        assert set(standard["rpe"][0]) == statistics | {"delta", "unit"}
+    nees = {"nees_mean", "nees_within_95", "n_effective", "effective_low", "effective_high"}
+    covariance, consistency = plain["covariance"], plain["track"]["consistency"]
+    counts = {"n_right", "n_nees", "n_without_covariance", "n_unusable_covariance"}
+    within = {"nees_median", "nees_within_50", "nees_within_90", "nees_within_99"}
+    assert covariance.keys() >= counts | nees | within
+    assert (covariance["n_right"], covariance["n_nees"]) == (6, 6)
+    assert consistency.keys() >= {"n_views", "n_left_out", "verdict"} | nees
+    assert (consistency["n_views"], consistency["n_left_out"]) == (5, 0)
+    for name in ("along", "across"):
+        assert list(plain["track"][name]) == ["n_views", "mean_m", "std_m", "rmse_m"]
+    assert plain["track"]["first_view"] == 2 and plain["track"]["after"]["acc_at_25m"] == 1.0
+    assert not plain["track"].keys() & {"series"} and "seconds_s" in plain["track"]["over_time"]
+
+
 def test_runs_of_one_flight_are_compared_and_never_counted_together() -> None:
     """Views twice would halve the bound of the rate of false fixes."""
     runs = []

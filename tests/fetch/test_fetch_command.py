@@ -145,9 +145,10 @@ def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
 
 @pytest.mark.parametrize("broken", [False, True])
 def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, caplog, broken):
-    """In place of a terrain of Copernicus."""
+    """In place of a terrain of Copernicus, which is fetched where the surface cannot be."""
     found, url, asked_for = terrain.surface_file(tmp_path), [], []
     out, dsm_path = tmp_path / "ortho.tif", tmp_path / "ortho_dsm.tif"
+    dem_path = tmp_path / "ortho_dem.tif"
     if broken:
         found = terrain.height_files(tmp_path)[0]
     answer = servers.searching(found, url, asked_for)
@@ -164,17 +165,21 @@ def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, capl
         fetch = (area, "--source", "town", "--gsd-m", 1, "--out", out, "--with-surface")
         dry = json.loads(command(*fetch, "--dry-run", "--json", terrain=True)[1])
         assert dry["surface"] == "swisssurface3d" and dry["terrain"] is None
-        assert "copernicus" not in command(*fetch, "--dry-run", terrain=True)[1]
+        assert "terrain from copernicus-dem where" in command(*fetch, "--dry-run", terrain=True)[1]
+        assert "copernicus" not in command(*fetch, "--dry-run")[1]
         code, stdout, _ = command(*fetch, "--json", terrain=True)
         plain = json.loads(stdout)
-        assert code == 0 and plain["terrain"] is None
+        assert code == 0 and (plain["terrain"] is None) == (plain["surface"] is not None)
         code, stdout, _ = command(*fetch, terrain=True)
-        assert code == 0 and not (tmp_path / "ortho_dem.tif").exists()
+        assert code == 0 and dem_path.exists() == broken
+        dem_path.unlink(missing_ok=True)
+        assert command(*fetch)[0] == 0 and not dem_path.exists()  # --no-terrain
     line = f"orthonav build --ortho {out} "
     if broken:
         assert "no surface was fetched" in caplog.text and "--source swisssurf" in caplog.text
         assert out.is_file() and not dsm_path.exists() and plain["surface"] is None
-        assert f"{line}--bounds" in stdout and "--surface" not in stdout
+        assert plain["terrain"]["out"] == str(dem_path)
+        assert f"{line}--dem " in stdout and "--surface" not in stdout
         return
     assert plain["surface"]["out"] == str(dsm_path) and plain["surface"]["datum"] == "EPSG:5728"
     assert f"{line}--surface {dsm_path} " in stdout and "--dem" not in stdout

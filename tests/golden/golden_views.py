@@ -175,7 +175,13 @@ def prepare(name: str, folder: Path) -> None:
 
 
 def locate(name: str, folder: Path) -> list[Row]:
-    """Results of the views of a flight that is prepared in a folder."""
+    """Rows of the views of a flight that is prepared in a folder."""
+    results, frame = results_of(name, folder)
+    return [row_of(result, frame) for result in results]
+
+
+def results_of(name: str, folder: Path) -> tuple[list[ViewResult], LocalFrame]:
+    """Results of the views of such a flight, and the frame of its map."""
     flight = FLIGHTS[name]
     place = folder / flight.area
     opened = open_map(place / "map.onav")
@@ -185,7 +191,7 @@ def locate(name: str, folder: Path) -> list[Row]:
     )
     flown = open_flight(place / f"flight{flight.seed}")
     results = localize_flight(locator, flown, heights=map_heights(opened))
-    return [row_of(result, opened.manifest.sheets[0].frame) for result in results]
+    return list(results), opened.manifest.sheets[0].frame
 
 
 def _build(area: Area, folder: Path) -> None:

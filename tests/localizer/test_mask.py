@@ -17,7 +17,7 @@ from orthonav.core.localize.rectify import (
     rectify_footprint,
 )
 from orthonav.core.records import Telemetry, View
-from orthonav.ground.recordings.motion import PictureOdometry
+from orthonav.onboard.motion import PictureOdometry
 
 LENS = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 BARREL = replace(LENS, distortion=(-0.1, 0.01, 0.0, 0.0))

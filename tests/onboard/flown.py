@@ -23,6 +23,8 @@ class Flown:
         seconds,
         *,
         turns=True,
+        turns_until_s=np.inf,
+        then_deg_s=0.0,
         turbulence_deg=1.0,
         speed=15.0,
         agl_m=120.0,
@@ -40,6 +42,7 @@ class Flown:
                 inside = (self.times > at) & (self.times < at + long)
                 rate[inside] = rng.choice([-1, 1]) * np.radians(rng.uniform(8.0, 16.0))
                 at += long + rng.uniform(5.0, 12.0)
+        rate[self.times > turns_until_s] = np.radians(then_deg_s)
         kernel = np.hanning(76)
         rate = np.convolve(rate, kernel / kernel.sum(), mode="same")
         bank = np.degrees(np.arctan(speed * rate / G))

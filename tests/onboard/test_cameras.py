@@ -74,6 +74,21 @@ def test_images_of_a_live_camera_carry_their_arrival():
     assert device.settings[cv2.CAP_PROP_FRAME_WIDTH] == 320
 
 
+def test_images_that_stop_for_a_while_are_interruptions():
+    def interruptions(intervals_s):
+        time, device = Time(), Device([noisy(0)] * len(intervals_s))
+        camera, found = LiveCamera(0, time.clocks, capture=lambda _: device), []
+        for each in intervals_s:
+            time.go(each)
+            found.append(camera.read().interruptions)
+        return found
+
+    assert interruptions([0.1, 0.2] * 20) == [0] * 40
+    assert interruptions([0.1] * 10 + [2.0] + [0.1] * 5) == [0] * 16  # positions show it
+    assert interruptions([0.1] * 10 + [4.0] + [0.1] * 5) == [0] * 10 + [1] * 6
+    assert interruptions([1.0] * 10) == [0] * 10  # a slow camera
+
+
 def test_a_camera_that_stops_comes_back():
     time, opened = Time(), []
     lives = [[noisy(0), "dead"], ["absent"], ["absent"], [noisy(1), noisy(2), "dead"]]
@@ -89,7 +104,7 @@ def test_a_camera_that_stops_comes_back():
     assert pauses[:3] == [0.5, 1.0, 2.0] and pauses[3] == 0.5
     assert all(each.released for each in opened)
     last = newest.take(0)
-    assert last.number == 3 and newest.is_over
+    assert last.number == 3 and last.interruptions > 0 and newest.is_over
 
 
 def test_a_camera_is_retried_after_a_fault_of_its_driver(caplog):
@@ -140,6 +155,18 @@ def test_a_recording_can_follow_the_clock_of_the_autopilot():
     due_ns = autopilot_pace(boot_ns, time.clocks, 2.0)
     source = Playback(entries(14.0, 15.0), due_ns, time.clocks, lambda: False)
     assert [source.read().exposed_ns for _ in range(2)] == [102 * S, 102 * S + S // 2]
+
+
+@pytest.mark.parametrize("first_s", [150.0, 1.7e9])
+def test_times_of_another_clock_than_the_autopilots_are_named(first_s, caplog):
+    time = Time()
+    due_ns = autopilot_pace(lambda _: 100 * S, time.clocks, 1.0)
+    ahead_s = round(first_s - 100)
+    assert [due_ns(round(each * S)) - time.now_ns for each in (first_s, first_s + 70)] == [
+        ahead_s * S,
+        (ahead_s + 70) * S,
+    ]
+    assert caplog.text.count("first image is due in") == (first_s > 160)
 
 
 def test_flight_folders_have_times_and_telemetry(tmp_path):

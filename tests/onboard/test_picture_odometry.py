@@ -5,7 +5,7 @@ import pytest
 from fake_autopilot import S
 from flown import SMALL, Flown
 
-from orthonav.ground.recordings.motion import PictureOdometry
+from orthonav.onboard.motion import PictureOdometry
 
 COUNT, RATE_HZ = 25, 6.0
 

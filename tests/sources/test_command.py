@@ -236,7 +236,7 @@ def test_what_was_localized_is_evaluated_and_viewed_as_it_is(run, tmp_path, came
         add_gps(path, place(*PLACE))
     fixes = tmp_path / "fixes.jsonl"
     assert run("localize", MAP, source, "--out", fixes, *given).code == 0
-    done = run("evaluate", fixes, "--flight", source, "--map", MAP, "--json")
+    done = run("evaluate", fixes, "--flight", source, "--map", MAP, *given, "--json")
     assert done.code == 0 and "another flight" not in done.err
     plain = json.loads(done.out)
     assert plain["n_views"] > 1 and plain["standard"]["cep95_m"] < 5
@@ -249,7 +249,7 @@ def test_what_was_localized_is_evaluated_and_viewed_as_it_is(run, tmp_path, came
     opened = Run(request)
     assert opened.truth_name == "p" and opened.any_known("err") and opened.raw_jpeg(0)
     photographs(source)
-    none = run("evaluate", fixes, "--flight", source)
+    none = run("evaluate", fixes, "--flight", source, *given)
     assert none.code == 1 and "no positions were recorded; give --truth" in none.err
 
 

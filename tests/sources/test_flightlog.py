@@ -1,5 +1,6 @@
 """A flight log is flown again bit for bit, and what is broken or crafted is one line at most."""
 
+import json
 import math
 import struct
 import tracemalloc
@@ -18,6 +19,7 @@ from orthonav.core.errors import FlightError, OrthonavError
 from orthonav.core.flight import logged as png_module
 from orthonav.core.flight.fixes import read_results, result_to_json
 from orthonav.core.flight.logged import (
+    FORMAT,
     PROFILE,
     TOPICS,
     LoggedView,
@@ -99,7 +101,7 @@ def crafted(path, messages, profile=PROFILE, compression=CompressionType.ZSTD):
 
 
 def session(**changes):
-    plain = {"format": 1, "run": "a", "views": "full", "camera": CAMERA.numbers()}
+    plain = {"format": FORMAT, "run": "a", "views": "full", "camera": CAMERA.numbers()}
     return TOPICS.session, 0, to_json({**plain, **changes})
 
 
@@ -406,6 +408,22 @@ def test_invalid_telemetry_is_left_out(tmp_path, data):
 
 @pytest.mark.parametrize(
     "changes",
+    [{"agl_m": "270"}, {"agl_m": "inf"}, {"agl_m": True}, {"agl_m": [1]}, {"agl_m": 10**400},
+     {"yaw_std_deg": "2"}, {"vel_en_mps": [1, 2, 3]}, {"vel_en_mps": [1]}, {"vel_en_mps": "12"},
+     {"camera_latency_ms": "9"}, {"prior": {"lat_deg": True, "lon_deg": 1, "std_m": 1}}],
+)  # fmt: skip
+def test_only_numbers_are_numbers(changes):
+    plain = json.loads(reported()[2])
+    assert view_of(json.dumps(plain).encode()).telemetry == telemetry(0)
+    with pytest.raises(FlightError, match="telemetry of the log is damaged"):
+        view_of(json.dumps(plain | changes).encode())
+    beyond = json.dumps(plain | {"agl_m": 1234.5}).replace("1234.5", "1e999")
+    with pytest.raises(FlightError, match="not a number"):
+        view_of(beyond.encode())
+
+
+@pytest.mark.parametrize(
+    "changes",
     [{"width_px": 0}, {"width_px": 2**70}, {"fx_px": "NaN"}, {"fx_px": None}, {"distortion": 3},
      {"distortion": [0.1] * 10**4}, {"model": []}],
 )  # fmt: skip
@@ -418,7 +436,8 @@ def test_invalid_cameras_are_rejected(tmp_path, changes):
 @pytest.mark.parametrize(
     "messages, words",
     [
-        ([session(format=2), reported(), shown()], r"format 2.*update orthonav"),
+        ([session(format=3), reported(), shown()], r"format 3.*update orthonav"),
+        ([session(format=1), reported(), shown()], r"format 1.*images are stored in another way"),
         ([session(), reported(), shown(), reported(1), shown(1)], "appears twice"),
         ([session(), *(reported(n, f"{n}.png") for n in range(5)), shown()], "more than 3 views"),
         ([session(), reported(), shown(), *[(TOPICS.health, 0, b"")] * 60], "more than 3 views"),

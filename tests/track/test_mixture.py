@@ -88,7 +88,7 @@ def _flown(seed, views=60, false_share=0.3, history=None):
         error = estimate.mean[:2] - flight.place
         rows.append((*error, estimate.confidence, estimate))
         if history is not None:
-            history.record(mixture)
+            history.record(mixture, view)
             rows[-1] += (flight.place,)
     return flight, mixture, rows
 
@@ -253,10 +253,10 @@ def test_a_reported_start_holds_until_views_contradict_it():
 
 def test_smoothing_does_not_believe_what_no_view_was_believed_for():
     flight, mixture, history = Flight(5), Mixture(MODEL, EXTENT), History()
-    for away_m in [(0.0, 0.0)] * 11 + [EAST] * 8:
+    for number, away_m in enumerate([(0.0, 0.0)] * 11 + [EAST] * 8):
         mixture.update(flight.reported(), [flight.sighting(4.0, flight.place + np.array(away_m))])
         mixture.estimate(RADIUS_M)
-        history.record(mixture)
+        history.record(mixture, number)
         mixture.predict(1.0, ReportedVelocity(SPEED, None, 1.0), flight.moved())
     beliefs = [each.belief for each in history.smoothed()]
     assert min(beliefs[:11]) > 0.99 and max(beliefs[11:]) <= 0.8

@@ -2,27 +2,40 @@
 the view before again."""
 
 import copy
+import inspect
 import math
+import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from benchmarks.fakes import Time
 
-from orthonav.core.errors import MapFileError
+from faulty_calls import FaultyCalls
+from orthonav.core.errors import ArgumentError, CameraError
 from orthonav.core.flight import open_flight
 from orthonav.core.flight.mount import Bias, Mount
+from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View, ViewResult
-from orthonav.core.track import Model
+from orthonav.core.track import Mixture, Model
 from orthonav.core.track import tracker as tracker_module
+from orthonav.core.track.smooth import History
 from orthonav.core.track.tracker import Tracker
+from orthonav.onboard import fly, run
+from orthonav.onboard.cameras import CameraImage
+from orthonav.onboard.fly import FlyOptions, Runner
+from orthonav.onboard.messages.gate import Gate
+from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MountCorrected, locate_view
 
 GOLDEN = Path(__file__).parents[1] / "data" / "golden_flight"
-FIRST, BROKEN = 12, 3
+FIRST, BROKEN = 10, 3
 """Views before the first at which a part raises an error, and number of those."""
 
 
@@ -40,7 +53,7 @@ def seen():
 @pytest.fixture(scope="module")
 def confirmed(localizer, seen):
     """A tracker before the first broken view, and its last position; not to be changed."""
-    tracker = Tracker(localizer)
+    tracker = Tracker(localizer, smooth=True, lag=2)
     rows = results(tracker, seen[:FIRST])
     assert all(result.is_recognized for result, _ in rows[-2:])
     return tracker, rows[-1][0]
@@ -48,7 +61,10 @@ def confirmed(localizer, seen):
 
 @pytest.fixture
 def tracker(localizer, confirmed):
-    """A copy of it."""
+    return copied(localizer, confirmed)
+
+
+def copied(localizer, confirmed):
     tracker, _ = confirmed
     shared = (localizer, localizer.registration, tracker._before)
     return copy.deepcopy(tracker, {id(each): each for each in shared})
@@ -59,22 +75,17 @@ class Faults:
 
     def __init__(self, monkeypatch):
         self._monkeypatch = monkeypatch
-        self.error, self.raised = None, 0
+        self.error = None
 
-    def at(self, owner, name, calls=None):
-        """`calls`: the first so many of a view; None: all."""
+    def at(self, owner, name):
         whole = getattr(owner, name)
 
         def part(*arguments, **named):
-            if self.error is None or (calls is not None and self.raised >= calls):
+            if self.error is None:
                 return whole(*arguments, **named)
-            self.raised += 1
             raise self.error
 
         self._monkeypatch.setattr(owner, name, part)
-
-    def set(self, error):
-        self.error, self.raised = error, 0
 
 
 @pytest.fixture
@@ -88,7 +99,7 @@ def results(locator, seen, faults=None, error=None):
     for number, view in enumerate(seen):
         failures = []
         if faults is not None:
-            faults.set(error if number < BROKEN else None)
+            faults.error = error if number < BROKEN else None
         outcome, _ = locate_view(locator, view, lambda failures=failures: failures.append(1))
         result = ViewResult("", view.telemetry.time_ns, outcome, 0.0, locator.state_name)
         rows.append((result, len(failures)))
@@ -106,70 +117,128 @@ def expected_m(seen, number):
     return np.array(now.vel_en_mps) * (now.time_ns - before.time_ns) / 1e9
 
 
-def owner_of(tracker, part):
-    """The object of a dotted name, or the module, and the name of its function."""
-    if hasattr(tracker_module, part):
-        return tracker_module, part
-    *owners, name = part.split(".")
-    for each in owners:
-        tracker = getattr(tracker, each)
-    return tracker, name
-
-
-PARTS = [
-    # of `_predict`
-    "mixture.bias",
-    "_odometry_view",
-    "_telemetry_noise",
-    "_reported_velocity",
-    "_expected_displacement",
-    "_displacement",
-    "_learn_velocity",
-    "mixture.predict",
-    "mixture._predictions",
-    # of `_update`
-    "mixture.estimate",
-    "_must_compete",
-    "_search_area",
-    "_prior",
-    "_correction",
-    "_registration.search",
-    "sightings",
-    "mixture.update",
-    "mixture._updated",
-    "mixture._merge",
-    # of the outcome
-    "_fix",
+PARTS_OF_A_VIEW = [
+    *[(Tracker, name) for name in ("locate", "_predict", "_update", "_outcome", "_fix")],
+    *[(Mixture, name) for name in ("predict", "update", "estimate", "_merge")],
+    *[(History, name) for name in ("record", "smoothed")],
 ]
 
 
-@pytest.mark.parametrize("error", [MapFileError("damaged"), ValueError("odd")], ids=["map", "bug"])
-@pytest.mark.parametrize("part", PARTS)
-def test_after_an_error_the_position_moves_with_the_velocity(
-    localizer, confirmed, tracker, seen, faults, part, error
+def moved_with_velocity(localizer, confirmed, seen, result):
+    """Whether a position is that of the last view before the errors, moved since by the velocity
+    reported."""
+    if isinstance(result.outcome, NoFix):
+        return False
+    number = [view.telemetry.time_ns for view in seen].index(result.time_ns)
+    moved_m = en_m(localizer, result) - en_m(localizer, confirmed[1])
+    since = sum(expected_m(seen, each) for each in range(FIRST, number + 1))
+    return np.hypot(*(moved_m - since)) < 12.0
+
+
+def broken(promises):
+    """Names of the promises of each call that are not held."""
+    names = {call: [name for name, held in each.items() if not held] for call, each in promises}
+    return {call: each for call, each in names.items() if each}
+
+
+@pytest.mark.parametrize(("owner", "name"), PARTS_OF_A_VIEW)
+def test_after_an_error_in_any_call_the_position_moves_with_the_velocity(
+    localizer, confirmed, seen, owner, name, monkeypatch
 ):
-    faults.at(*owner_of(tracker, part), calls=1)
-    rows = results(tracker, seen[FIRST:], faults, error)
-    assert rows[0][1] == rows[BROKEN - 1][1] == 1  # a view without odometry does not need all parts
-    _, before = confirmed
-    for number, (result, failures) in enumerate(rows[:BROKEN], FIRST):
-        assert isinstance(result.outcome, Fix)
-        if failures:
-            assert not result.is_recognized and result.state != "tracking"
-            assert result.outcome.confidence <= 0.8
-            assert result.outcome.evidence["recognized"] == 0.0
-        moved_m = en_m(localizer, result) - en_m(localizer, before)
-        assert moved_m == pytest.approx(expected_m(seen, number), abs=6.0)
-        before = result
-    assert any(result.is_recognized for result, _ in rows[BROKEN:])
+    """And the next view is located again."""
+    moved = partial(moved_with_velocity, localizer, confirmed, seen)
+
+    def held():
+        tracker = copied(localizer, confirmed)
+        (bridged, failures), (good, others) = results(tracker, seen[FIRST : FIRST + 2])
+        return {
+            "counted": (failures, others) == (1, 0),
+            "not recognized": not bridged.is_recognized and bridged.state != "tracking",
+            "not frozen": moved(bridged),
+            "located again": good.is_recognized and moved(good),
+            "smoothed": len(tracker.smoothed_track()) == FIRST + 2,
+        }
+
+    assert not broken(FaultyCalls(monkeypatch, owner, name).each(held))
 
 
-@pytest.mark.parametrize("part", ["mixture.predict", "mixture._predictions", "_reported_velocity"])
+class Flown:
+    """Views of a recording for the flight loop: the camera, and what listens to positions."""
+
+    for_filter, outages, replaced, now = False, 0, 0, None
+
+    def __init__(self, tracker, seen):
+        self.time, self.left, self.published, self.said = Time(), [*seen], [], []
+        publisher = Publisher(Gate(), self.time.clocks, lines=[self], graph=self)
+        options = FlyOptions(recorded=True)
+        parts = self, seen[0].camera, lambda: tracker, publisher, options, self.time.clocks
+        self.runner = Runner(*parts, sink=MagicMock(lost={}))
+
+    def take(self, _):
+        self.time.go(1.2)
+        self.now = view = None if self.is_over else self.left.pop(0)
+        return view and CameraImage(
+            *(1, "", self.time.now_ns, view.telemetry.time_ns, view.grey), telemetry=view.telemetry
+        )
+
+    @property
+    def is_over(self):
+        return not self.left
+
+    def position(self, estimate, vehicle, stamp_ns):
+        self.published.append(stamp_ns)
+        return ("fix",)
+
+    def view(self, result, *_):
+        self.said.append(result)
+
+    def health(self, _): ...
+
+    def close(self): ...
+
+
+LOOP = [(Runner, each) for each, whole in vars(Runner).items() if inspect.isfunction(whole)]
+LOOP += [(run, "finite"), (run, "_is_finite"), (fly, "locate_view"), (Publisher, "publish")]
+LOOP = [each for each in LOOP if each[1] not in ("__init__", "run")]
+
+
+@pytest.mark.parametrize(("owner", "name"), LOOP, ids=[name for _, name in LOOP])
+def test_an_error_in_any_call_of_the_flight_loop_costs_one_view(
+    localizer, confirmed, seen, owner, name, monkeypatch
+):
+    """At most: nothing of it is published after the error; the next view is located again."""
+    moved = partial(moved_with_velocity, localizer, confirmed, seen)
+    counters = "internal_error", "log_failed", "output_failed"
+
+    def held():
+        flown = Flown(copied(localizer, confirmed), seen[FIRST : FIRST + 2])
+        before = []
+        calls.raised = lambda: before.extend([flown.now, *flown.published])
+        flown.runner.run(threading.Event())
+        total, published = flown.runner.counter.total, flown.published
+        withheld = [
+            view.telemetry.time_ns for view in before[:1] if view and total["internal_error"]
+        ]
+        return {
+            "counted": sum(total[each] for each in counters) == 1,
+            "not published": not set(withheld) & set(published[len(before) - 1 :]),
+            "not frozen": all(moved(each) for each in flown.said),
+            "located again": seen[FIRST + 1].telemetry.time_ns in published,
+        }
+
+    calls = FaultyCalls(monkeypatch, owner, name)
+    assert not broken(calls.each(held))
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [(Mixture, "predict"), (Mixture, "_predictions"), (Tracker, "_reported_velocity")],
+)
 def test_without_dead_reckoning_there_is_no_position_until_the_next_view(
-    localizer, confirmed, tracker, seen, faults, part
+    localizer, confirmed, tracker, seen, faults, owner, name
 ):
     """The next prediction covers the time since the last one."""
-    faults.at(*owner_of(tracker, part))
+    faults.at(owner, name)
     rows = results(tracker, seen[FIRST:], faults, ValueError("odd"))
     for result, failures in rows[:BROKEN]:
         assert isinstance(result.outcome, NoFix) and failures == 1
@@ -209,55 +278,75 @@ def test_a_passed_view_moves_the_track_although_the_clock_stands_still(
     assert np.hypot(*moved_m) > 10.0 and passed.std_m > before.std_m
 
 
-UNKNOWN = {
-    **{
-        name: (math.nan, math.inf)
-        for name in (
-            *("yaw_std_deg", "agl_std_m", "tilt_std_deg", "mount_std_deg", "vel_std_mps"),
-            *("home_m", "amsl_m", "hae_m"),
-        )
-    },
-    "vel_en_mps": ((math.nan, 2.0), (2.0, math.nan)),
-    "prior": (Prior(48.0, 48.0, math.inf),),
-    "below": (Ground(math.nan, 1.0, 1.0), Ground(30.0, math.nan, 1.0)),
-}
-VALUES = [(name, value) for name, values in UNKNOWN.items() for value in values]
+NUMBERS = [
+    (record, name, kind)
+    for record in (Telemetry, Camera, Prior, Ground, View.of)
+    for name, kind in inspect.get_annotations(record).items()
+    if kind is int or "float" in str(kind)
+]
 
 
-@pytest.mark.parametrize(("name", "value"), VALUES)
-def test_what_is_not_finite_is_unknown(name, value):
-    assert getattr(Telemetry(0, 1.0, 2.0, 3.0, 100.0, **{name: value}), name) is None
-    assert Telemetry(0, math.nan, 2.0, 3.0, 100.0).missing() == ["yaw_deg"]
+def with_number(view, record, name, value):
+    """The view with a number of it, of its camera, of its prior or of the ground below."""
+    reported, change = view.telemetry, {name: value}
+    if record == View.of:
+        usual = {
+            "agl_m": reported.agl_m,
+            "heading_deg": reported.yaw_deg,
+            "pitch_deg": reported.pitch_deg,
+            "roll_deg": reported.roll_deg,
+            "time_s": reported.time_ns / 1e9,
+            "vel_en_mps": reported.vel_en_mps,
+        }
+        return View.of(view.grey, view.camera, **usual | change)
+    if record is Camera:
+        return replace(view, camera=replace(view.camera, **change))
+    if record is Prior:
+        change = {"prior": replace(Prior(46.5, 3.0, 9.0), **change)}
+    if record is Ground:
+        change = {"below": replace(Ground(30.0, 1.0, 1.0), **change)}
+    return replace(view, telemetry=replace(reported, **change))
 
 
-@pytest.mark.parametrize("name", [each for each in UNKNOWN if "_std_" in each])
+@pytest.fixture(scope="module")
+def usual(localizer, confirmed, seen):
+    """The third view after that, without faults."""
+    return results(copied(localizer, confirmed), seen[FIRST : FIRST + 3])[-1][0]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, None])
+@pytest.mark.parametrize(
+    ("record", "name", "kind"),
+    NUMBERS,
+    ids=[f"{each[0].__qualname__}-{each[1]}" for each in NUMBERS],
+)
+def test_what_is_no_number_is_named_or_unknown(
+    localizer, tracker, usual, seen, record, name, kind, value
+):
+    """Then the view has a finite position or none, and two views later the track is as usual."""
+    many = {"tuple[float, float]": 2, "tuple[float, ...]": 4}
+    value = next(((value,) * count for word, count in many.items() if word in str(kind)), value)
+    try:
+        odd = with_number(seen[FIRST], record, name, value)
+    except (ArgumentError, CameraError) as error:
+        assert name in str(error).partition("Camera(")[0]
+        return
+    if record is Telemetry:
+        assert getattr(odd.telemetry, name) is None or name in odd.telemetry.missing()
+    for outcome in (localizer.locate(odd, prior=odd.telemetry.prior), tracker.locate(odd)):
+        if isinstance(outcome, Fix):
+            assert np.isfinite([outcome.lat_deg, outcome.lon_deg, outcome.std_m]).all()
+            assert 0 <= outcome.confidence <= outcome.place_probability <= 1
+            reported = outcome.heading_deg, outcome.agl_m, outcome.pitch_deg, outcome.roll_deg
+            assert np.isfinite(reported).sum() == 4 - len(odd.telemetry.missing())
+    *_, (later, _) = results(tracker, seen[FIRST + 1 : FIRST + 3])
+    assert later.is_recognized
+    assert en_m(localizer, later) == pytest.approx(en_m(localizer, usual), abs=5.0)
+
+
+@pytest.mark.parametrize("name", [each for each in Telemetry.__slots__ if "_std_" in each])
 def test_a_negative_deviation_is_unknown_not_exact(name):
     assert getattr(Telemetry(0, 1.0, 2.0, 3.0, 100.0, **{name: -1.0}), name) is None
-
-
-def test_every_optional_field_is_covered():
-    optional = [name for name in Telemetry.__slots__ if name in UNKNOWN]
-    assert len(optional) == len(UNKNOWN) == len(Telemetry.__slots__) - 5
-
-
-@pytest.mark.parametrize("name", UNKNOWN)
-def test_views_with_nan_are_tracked_like_views_without_the_value(tracker, localizer, seen, name):
-    other = copy.deepcopy(
-        tracker, {id(each): each for each in (localizer, tracker._registration, tracker._before)}
-    )
-    found = []
-    for each, value in ((tracker, UNKNOWN[name][0]), (other, None)):
-        views = [
-            replace(view, telemetry=replace(view.telemetry, **{name: value}))
-            if not number
-            else view
-            for number, view in enumerate(seen[FIRST : FIRST + 2])
-        ]
-        found.append(results(each, views))
-    for (nan, failures), (none, _) in zip(*found, strict=True):
-        assert failures == 0 and nan.state == none.state
-        assert nan.outcome.confidence == none.outcome.confidence
-        assert (en_m(localizer, nan) == en_m(localizer, none)).all()
 
 
 def test_a_tilt_without_deviation_has_the_usual_one_again(tracker, seen):

@@ -1,7 +1,7 @@
 """`orthonav calibrate`: estimate constant errors of mount, compass and height from a flight."""
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +13,11 @@ from orthonav.cli.source import (
     flight_heights,
     located,
     open_source,
-    warn_if_far_from_map,
 )
 from orthonav.core.errors import UsageError
 
 if TYPE_CHECKING:
+    from orthonav.ground.recordings import Recording
     from orthonav.ground.recordings.calibrate import MountCalibration
 
 EXAMPLE = "area.onav flight --out mount.json"
@@ -79,21 +79,39 @@ def _calibrated(options: argparse.Namespace) -> "MountCalibration":
     dem, opened = dem_of(options), orthonav.open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
     flight = open_source(options.flight, options, over_terrain=over_terrain)
-    localizer, measured = orthonav.Localizer(opened), options.prior_std_m is not None
-    options.prior = "telemetry" if measured else "none"
-    if measured:
-        warn_if_far_from_map(flight, localizer)
+    priors = _measured(options, flight, opened) if options.prior_std_m is not None else {}
     tracker = orthonav.Tracker(
-        localizer,
+        orthonav.Localizer(opened),
         heading_known=options.heading == "known",
-        use_prior=measured,
-        every_prior=measured,
+        use_prior=bool(priors),
+        every_prior=bool(priors),
         smooth=True,
+    )
+    views = (
+        replace(view, telemetry=replace(view.telemetry, prior=priors.get(view.frame)))
+        for view in flight.views
     )
     heights = flight_heights(options, opened, flight, dem)
     with progress(options) as shown:
-        results = located(options, tracker, flight, flight.views, shown, heights=heights)
+        results = located(options, tracker, flight, views, shown, heights=heights)
     return calibrate_mount(smoothed_track(tracker, results, None))
+
+
+def _measured(
+    options: argparse.Namespace, flight: "Recording", opened: orthonav.MapFile
+) -> dict[str, orthonav.Prior]:
+    """Priors by frame, of recorded positions only: other priors are no measurements."""
+    from orthonav.ground.evaluate.metrics import check_truth
+
+    recorded = {view.frame: view.truth_latlon_deg for view in flight.views}
+    places = {frame: place for frame, place in recorded.items() if place is not None}
+    if not places:
+        raise UsageError(
+            f"--prior-std-m needs recorded positions, and no view has one: {options.flight}"
+        )
+    centre = opened.manifest.sheets[0].frame
+    check_truth(places, (), (centre.lat_deg, centre.lon_deg), options.flight)
+    return {frame: orthonav.Prior(*place, options.prior_std_m) for frame, place in places.items()}
 
 
 def _run_latency(options: argparse.Namespace) -> None:

@@ -71,6 +71,7 @@ def run(options: argparse.Namespace) -> None:
     if options.source is None or (options.out is None and not options.dry_run):
         raise UsageError("give a --source (--list shows the known ones) and an --out")
     require_extras("fetch --source")
+    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
     from orthonav.ground.fetch.run import estimate_fetch, fetch, holds_heights
 
     request = _request(options)
@@ -85,6 +86,8 @@ def run(options: argparse.Namespace) -> None:
     for kind, name in names.items():
         if name is not None and imagery:
             found |= _heights(options, request, kind, name)
+    if _falls_back(options, names) and imagery and not found:
+        found = _heights(options, request, "terrain", DEFAULT_TERRAIN)
     if options.json:
         more: dict[str, object] = dict.fromkeys(names)
         more |= {kind: {"out": str(out), **got.describe()} for kind, (out, got) in found.items()}
@@ -109,13 +112,22 @@ def _heights_presets(options: argparse.Namespace) -> dict[str, str | None]:
     return {"terrain": terrain, "surface": surface}
 
 
+def _falls_back(options: argparse.Namespace, names: dict[str, str | None]) -> bool:
+    """Whether the default terrain is fetched where the surface cannot be had."""
+    return bool(options.terrain and names["surface"] and names["terrain"] is None)
+
+
 def _print_estimate(
     options: argparse.Namespace, estimate: "CostEstimate", names: dict[str, str | None]
 ) -> None:
+    from orthonav.ground.fetch.presets import DEFAULT_TERRAIN
+
     if options.json:
         print_json(vars(estimate) | {"provenance": vars(estimate.provenance), **names})
     else:
         more = "".join(f", and {kind} from {name}" for kind, name in names.items() if name)
+        if _falls_back(options, names):
+            more += f" (terrain from {DEFAULT_TERRAIN} where that cannot be had)"
         print(f"would fetch {estimate.text()}{more}")
 
 

@@ -110,7 +110,7 @@ class _Setup:
             sink=sink,
             start=self.start,
             gnss=gnss,
-            latency=_latency(options),
+            latency=_latency(options, heading_known=self.fly.heading_known),
         )
 
     def _fly_options(self) -> FlyOptions:
@@ -288,14 +288,17 @@ def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> "FlightLo
     return FlightLog(options.log, camera, info, views=options.log_views, max_bytes=most)
 
 
-def _latency(options: argparse.Namespace) -> LatencyMonitor | None:
+def _latency(options: argparse.Namespace, *, heading_known: bool) -> LatencyMonitor | None:
     """Monitor of the latency of a live camera; None for recordings and ROS, which have times."""
     if options.ros2 or not cameras.is_live(options.source):
         return None
     stated = _stated(options.camera_latency_ms)
-    if stated is None:
-        return LatencyMonitor()
-    return LatencyMonitor(stated.latency_ms / 1e3, stated.std_ms / 1e3)
+    return LatencyMonitor(
+        None if stated is None else stated.latency_ms / 1e3,
+        MIN_STD_S if stated is None else stated.std_ms / 1e3,
+        mount_deg=tuple(options.mount_deg),
+        heading_known=heading_known,
+    )
 
 
 def _stated(text: str | None) -> CameraLatency | None:

@@ -51,6 +51,8 @@ def add_source(parser: argparse.ArgumentParser, *, dem: bool = True) -> None:
     add("--topic", type=topic, action="append", default=[], help=text, **names)
     text = "views per second taken from a recording: of a video (default 1)"
     add("--rate-hz", type=float, default=1.0, help=text)
+    text = "longer side of the sensor of photographs, for the focal length"
+    add("--sensor-width-mm", type=float, metavar="MM", help=text)
     text = "field of view across the width of the images, where the camera is not known"
     add("--fov-deg", type=float, help=text)
     add_options(group, "--agl-m", help="height above ground of all views, not the recorded one")

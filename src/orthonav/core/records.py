@@ -130,7 +130,8 @@ class Telemetry(ByValue):
     """What the autopilot reported for the exposure of one view.
 
     NaN and None stand for unknown: an optional field that is not finite becomes None. Angles are
-    degrees. A view without heading, pitch, roll or height gives a `NoFix`.
+    degrees. A view without heading, pitch, roll or height gives a `NoFix`. Raises `ArgumentError`
+    without a time.
 
     - `time_ns`: of the exposure, whole nanoseconds of any clock. `agl_m`: height above ground, m.
     - `yaw_deg`: heading of the top of the picture, clockwise from true north: `heading_deg` of
@@ -167,13 +168,19 @@ class Telemetry(ByValue):
     below: Ground | None = None
 
     def __post_init__(self) -> None:
+        if self.time_ns is None or not math.isfinite(self.time_ns):
+            raise ArgumentError(f"time_ns must be whole nanoseconds, got {self.time_ns}")
+        for name in _NEEDED:
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, math.nan)
         for name in _OPTIONAL:
             value: Any = getattr(self, name)
             if isinstance(value, Prior | Ground):
                 value = vars(value).values()
             parts = value if hasattr(value, "__iter__") else () if value is None else (value,)
             least = 0.0 if "_std_" in name else -math.inf
-            if not all(math.isfinite(each) and each >= least for each in parts):
+            known = (each is not None and math.isfinite(each) and each >= least for each in parts)
+            if not all(known):
                 object.__setattr__(self, name, None)
 
     @property
@@ -185,10 +192,10 @@ class Telemetry(ByValue):
 
     def missing(self) -> list[str]:
         """Names of the fields without which a view cannot be rectified, empty if all are there."""
-        needed = "yaw_deg", "pitch_deg", "roll_deg", "agl_m"
-        return [name for name in needed if not math.isfinite(getattr(self, name))]
+        return [name for name in _NEEDED if not math.isfinite(getattr(self, name))]
 
 
+_, *_NEEDED = tuple(each.name for each in fields(Telemetry))[:5]
 _OPTIONAL = tuple(each.name for each in fields(Telemetry))[5:]
 
 

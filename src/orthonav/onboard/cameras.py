@@ -5,10 +5,12 @@ A thread reads; the consumer gets the newest image, and replaced images are coun
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any, Protocol
 
 import cv2
@@ -24,6 +26,9 @@ from orthonav.onboard.telemetry import Clocks, VehicleState
 
 log = logging.getLogger(__name__)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
+GAP_S = 3.0
+"""A longer time without images, also in usual intervals, may change the latency. After a shorter
+one, images can be late by as much: positions show it (`orthonav.onboard.latency`)."""
 Grey = NDArray[np.uint8]
 
 
@@ -34,7 +39,8 @@ class CameraImage:
     `exposed_ns`: by our monotonic clock; of a live camera the arrival, from which the flight loop
     subtracts the latency. `time_ns`: written to results: UTC of a live camera, else that of the
     recording. `grey`: (H, W), None where the image could not be decoded. `telemetry`, `vehicle`:
-    that came with it, from a recording or ROS.
+    that came with it, from a recording or ROS. `interruptions`: of a live camera: how often images
+    stopped for a while, or it was opened again; the latency may have changed.
     """
 
     number: int
@@ -45,6 +51,7 @@ class CameraImage:
     problem: NoFix | None = None
     telemetry: Telemetry | None = None
     vehicle: VehicleState | None = None
+    interruptions: int | None = None
 
 
 class CameraGoneError(CameraError):
@@ -73,7 +80,9 @@ class LiveCamera:
         self._shown = f"/dev/video{name}" if isinstance(name, int) else name
         self._opener = capture or _capture
         self._capture: Any = None
-        self._number = 0
+        self._number = self._interruptions = 0
+        self._last_ns: int | None = None
+        self._intervals_s: deque[float] = deque([1.0], maxlen=31)
         # UTC may be set in flight; the times of views must not jump with it.
         self._utc_minus_mono_ns = clocks.utc_ns() - clocks.mono_ns()
 
@@ -84,6 +93,7 @@ class LiveCamera:
             self.close()
             raise CameraGoneError(f"camera delivers no images: {self._shown}")
         arrived_ns = self._clocks.mono_ns()
+        self._count_interruptions(arrived_ns)
         found, frame = self._capture.retrieve()
         self._number += 1
         grey, why = None, "image could not be decoded"
@@ -99,12 +109,22 @@ class LiveCamera:
             arrived_ns + self._utc_minus_mono_ns,
             grey,
             problem,
+            interruptions=self._interruptions,
         )
 
     def close(self) -> None:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+            self._interruptions += 1
+
+    def _count_interruptions(self, arrived_ns: int) -> None:
+        before_ns, self._last_ns = self._last_ns, arrived_ns
+        if before_ns is None:
+            return
+        gap_s = (arrived_ns - before_ns) / 1e9
+        self._interruptions += gap_s > max(GAP_S, 3.0 * median(self._intervals_s))
+        self._intervals_s.append(gap_s)
 
     def _open(self) -> Any:
         capture = self._opener(self._name)
@@ -184,12 +204,25 @@ def own_pace(clocks: Clocks, pace: float) -> Callable[[int], int]:
 def autopilot_pace(
     boot_ns: Callable[[int], int | None], clocks: Clocks, pace: float
 ) -> Callable[[int], int | None]:
-    """Playback by the autopilot's clock, which `boot_ns` gives; None: not yet known."""
+    """Playback by the autopilot's clock, which `boot_ns` gives; None: not yet known. A warning says
+    where the first image is due so late that its time is probably of another clock."""
+    warned: list[int] = []
 
     def due_ns(time_ns: int) -> int | None:
         now_ns = clocks.mono_ns()
         there_ns = boot_ns(now_ns)
-        return None if there_ns is None else now_ns + round(time_ns / pace) - there_ns
+        if there_ns is None:
+            return None
+        ahead_ns = round(time_ns / pace) - there_ns
+        if not warned:
+            warned.append(ahead_ns)
+            if ahead_ns > 60e9:
+                log.warning(
+                    "the first image is due in %.0f s: are the times of the flight folder those of "
+                    "the autopilot since it started? (--recorded-telemetry plays without it)",
+                    ahead_ns / 1e9,
+                )
+        return now_ns + ahead_ns
 
     return due_ns
 

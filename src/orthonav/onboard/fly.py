@@ -32,7 +32,7 @@ from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, FrozenCheck, NewestImage
 from orthonav.onboard.gnss.watch import GnssWatch
 from orthonav.onboard.health import Health, HealthReporter, Monitor, judge, notify
-from orthonav.onboard.latency import UNKNOWN, LatencyMonitor
+from orthonav.onboard.latency import LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.gate import unavailable_text
 from orthonav.onboard.messages.mavlink import dialect, status_texts
@@ -173,17 +173,22 @@ class Runner:
     def _process(self, image: CameraImage) -> ViewResult | None:
         now_ns = self._camera_monitor.taken_ns = self._clocks.mono_ns()
         self._count("taken")
+        if self._latency is not None and image.interruptions is not None:
+            self._latency.arrived(image.exposed_ns, image.interruptions)
         if now_ns - image.exposed_ns > MAX_AGE_S * 1e9:
             self._count("late")
             return None
-        if self._latency is not None:
-            delay_ns = round(self._latency.delay_s * 1e9)
+        arrived_ns, latency = image.exposed_ns, self._latency
+        if latency is not None:
+            delay_ns = round(latency.delay_s * 1e9)
             exposed_ns, time_ns = image.exposed_ns - delay_ns, image.time_ns - delay_ns
             image = replace(image, exposed_ns=exposed_ns, time_ns=time_ns)
         self._restart_after_jump(image.time_ns)
         refused = self._map_changed() or self._bad_image(image)
         if refused is not None or image.grey is None:
             unusable = refused or NoFix("bad_image", "no image")
+            if latency is not None and unusable.reason == "frozen_image":
+                latency.frozen(arrived_ns)
             return self._refused(image, unusable, VehicleState(None))
         try:
             camera = fitted(self._camera, image.grey.shape[1], image.grey.shape[0], image.frame)
@@ -192,12 +197,17 @@ class Runner:
             return self._refused(image, wrong, VehicleState(None))
         vehicle, telemetry = self._telemetry(image)
         view = View(image.grey, camera, telemetry)
-        if self._latency is not None and not self._latency.is_known:
-            return self._undated(image, view, vehicle, self._latency)
-        refused = self._unusable(telemetry)
-        if refused is not None:
-            return self._refused(image, refused, vehicle)
-        return self._located(image, view, vehicle)
+        try:
+            if latency is not None and not latency.may_locate:
+                return self._withheld(image, view, vehicle, latency)
+            refused = self._unusable(telemetry)
+            if refused is not None:
+                return self._refused(image, refused, vehicle)
+            return self._located(image, view, vehicle)
+        finally:
+            if latency is not None and self._link is not None:
+                reported = self._link.state_at, self._link.covered_ns
+                latency.observe(arrived_ns, image.grey, camera, *reported)
 
     def _restart_after_jump(self, time_ns: int) -> None:
         """Begin again where a recorded image is earlier than the one before by over a second: it
@@ -217,18 +227,19 @@ class Runner:
         self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
         return result
 
-    def _undated(
+    def _withheld(
         self, image: CameraImage, view: View, vehicle: VehicleState, latency: LatencyMonitor
     ) -> ViewResult:
-        """A view whose time of exposure is not known: the track must not get it. Some are logged,
+        """A view whose time of exposure is in doubt: the track must not get it. Some are logged,
         for `orthonav calibrate --latency`."""
-        self._count(UNKNOWN)
-        result = self._result(image, NoFix(UNKNOWN, latency.detail()), math.nan)
+        reason = latency.reasons()[0]
+        self._count(reason)
+        result = self._result(image, NoFix(reason, latency.detail()), math.nan)
         if image.exposed_ns - self._withheld_ns >= 80_000_000:
             self._withheld_ns = image.exposed_ns
             self._log_view(image, view, withheld=True)
             self._log(lambda sink: sink.result(result))
-        self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=UNKNOWN)
+        self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=reason)
         return result
 
     def _log_view(self, image: CameraImage, view: View, *, withheld: bool) -> None:
@@ -315,7 +326,7 @@ class Runner:
         return outcome, latency_ms
 
     def _doubt(self, result: ViewResult, exposed_ns: int) -> str | None:
-        """Why a position is withheld although it was found: the latency does not fit the track."""
+        """Why a position is withheld although it was found: the latency is in doubt."""
         fix, latency, link = result.outcome, self._latency, self._link
         if latency is None:
             return None

@@ -254,10 +254,11 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
 
 
 def csv_rows(
-    path: Path, needed: tuple[str, ...], most_rows: int | None = None
+    path: Path, needed: tuple[str, ...], most_rows: int | None = None, *, short: bool = False
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """Line number and fields of each row of a CSV that must have the columns `needed`; it has at
-    most `most_rows`, by default `MAX_VIEWS`."""
+    most `most_rows`, by default `MAX_VIEWS`. `short`: whether missing fields at the end of a row
+    are empty instead of an error."""
     if path.stat().st_size > MAX_TEXT_BYTES:
         raise FlightError(f"file is larger than {MAX_TEXT_BYTES // 10**6} MB: {path}")
     try:
@@ -267,7 +268,7 @@ def csv_rows(
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
             for row in rows:
-                if any(row[name] is None for name in needed):
+                if not short and any(row[name] is None for name in needed):
                     raise FlightError(f"line {rows.line} has too few fields: {path}")
                 yield rows.line, {k: v or "" for k, v in row.items() if isinstance(k, str)}
     except TableError as error:

@@ -27,7 +27,7 @@ from orthonav.core.geo.ground import Ground
 from orthonav.core.records import Fix, Prior, Telemetry
 
 PROFILE = "orthonav"  # profile in the header of an MCAP file that marks a flight log of orthonav
-FORMAT = 1
+FORMAT = 2  # of the messages; 1 had images as foxglove_msgs/CompressedImage
 MAX_CHUNK_BYTES = 128 * 2**20  # largest chunk, uncompressed; readers refuse those that claim more
 MAX_PICTURE_BYTES = MAX_CHUNK_BYTES // 2
 MAX_JSON_BYTES = 2**20
@@ -211,23 +211,37 @@ def view_of(data: bytes) -> LoggedView:
         velocity, latency = plain["vel_en_mps"], plain.get("camera_latency_ms")
         telemetry = Telemetry(
             time_ns,
-            **{name: float(plain[name]) for name in (*_REPORTED, *known)},
+            **{name: _number(plain[name]) for name in (*_REPORTED, *known)},
             prior=_record(Prior, plain["prior"]),
-            vel_en_mps=None if velocity is None else (float(velocity[0]), float(velocity[1])),
+            vel_en_mps=None if velocity is None else _pair(velocity),
             below=_record(Ground, plain.get("below")),
         )
         frame, picture = plain["frame"], plain["picture"]
-        latency_ms = None if latency is None else float(latency)
+        latency_ms = None if latency is None else _number(latency)
         if not isinstance(frame, str) or picture not in PICTURES:
             raise ValueError("invalid frame or picture")
-    except (IndexError, *BROKEN) as error:
+    except BROKEN as error:
         raise FlightError(f"telemetry of the log is damaged: {described(error)}") from error
     withheld = plain.get("withheld") is True
     return LoggedView(index, number, frame, telemetry, picture, latency_ms, withheld)
 
 
 def _record(kind: Any, plain: Any) -> Any:
-    return None if plain is None else kind(*(float(plain[each.name]) for each in fields(kind)))
+    return None if plain is None else kind(*(_number(plain[each.name]) for each in fields(kind)))
+
+
+def _number(value: Any) -> float:
+    """Inverse of `to_json` for one number. Raises `TypeError` or `ValueError` for other values."""
+    if value in ("NaN", "Infinity", "-Infinity"):
+        return float(value)
+    if type(value) not in (int, float) or not math.isfinite(value):
+        raise TypeError(f"{value!r:.40} is not a number of float64")
+    return float(value)
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    first, second = values
+    return _number(first), _number(second)
 
 
 def camera_of(plain: Any) -> Camera:

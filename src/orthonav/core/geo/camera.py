@@ -67,16 +67,18 @@ class Camera:
 
     def _impossible(self) -> str:
         mask, size = self.mask, (self.width_px, self.height_px)
-        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
         is_fisheye = self.model == "fisheye"
         names = "k1,k2,k3,k4" if is_fisheye else "k1,k2,p1,p2[,k3]"
-        if not all(1 <= side <= 65_535 and side == int(side) for side in size):
+        if not all(_is_finite(side) and side == int(side) and 1 <= side < 2**16 for side in size):
             return "width_px and height_px must be whole, 1 to 65535"
         if mask is not None and (mask.dtype != np.uint8 or mask.shape != size[::-1]):
             got = f"got {mask.dtype} of {mask.shape[::-1]}"
             return f"mask must be uint8 of {size}, as Camera.masked makes it, {got}"
-        if not all(math.isfinite(number) for number in numbers):
-            return "has a value that is not finite"
+        for name in ("fx_px", "fy_px", "cx_px", "cy_px", "focal_std"):
+            if not _is_finite(getattr(self, name)):
+                return f"{name} is not finite"
+        if not all(map(_is_finite, self.distortion)):
+            return "distortion is not finite"
         if self.fx_px <= 0 or self.fy_px <= 0:
             return "focal length must be above 0 px"
         if not 0 <= self.focal_std <= 0.5:
@@ -241,6 +243,13 @@ class Camera:
             cx_px=self.cx_px * sx,
             cy_px=self.cy_px * sy,
         )
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except TypeError:
+        return False
 
 
 @lru_cache(maxsize=64)

@@ -124,7 +124,7 @@ class Mixture:
     ) -> None:
         """Continue between two views in another plane, on a map of this extent there."""
         self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
-        self.trust.moved(lambda each: moved(each, plane, other))
+        self.trust = self.trust.moved(lambda each: moved(each, plane, other))
         self._set_extent(extent_en_m)
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
@@ -169,22 +169,25 @@ class Mixture:
         overlap: float = 0.0,
     ) -> None:
         """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
-        (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`."""
+        (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`. An error
+        leaves all as it was."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
-        self._measured = None
         stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
         made = [one for each in self.hypotheses for one in self._split(each, *moves)]
         blind_s = seconds if camera is None else 0.0
-        self.trust.moved(lambda each: self._dead_reckoned(each, 1 - overlap, *moves), blind_s)
+        trust = self.trust.moved(
+            lambda each: self._dead_reckoned(each, 1 - overlap, *moves), blind_s
+        )
         elsewhere = self.elsewhere
-        if self.trust.rival is not None and self.trust.track is not None:
+        if trust.rival is not None and trust.track is not None:
             total = sum(each.share for each in made) + elsewhere
             followed = sum(each.share for each in made if each.shown.followed)
             added = max(1 - UNCONFIRMED - followed / total, 0.0)
             made = [replace(each, share=each.share * (1 - added)) for each in made]
             elsewhere *= 1 - added
-            made.append(replace(self.trust.track.place, share=total * added))
-        self.hypotheses = [replace(each, share=each.share * stays) for each in made]
+            made.append(replace(trust.track.place, share=total * added))
+        made = [replace(each, share=each.share * stays) for each in made]
+        self.hypotheses, self.trust, self._measured = made, trust, None
         self.elsewhere = elsewhere + (1 - stays) * (1 - elsewhere)
         self._new, self._is_rival_searched, self._is_split = 1 - overlap, False, True
 

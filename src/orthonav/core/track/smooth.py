@@ -52,7 +52,9 @@ class History:
         self._views: list[dict[int, _Kept]] = []
         self._most: list[float] = []  # largest belief that each view allows
 
-    def record(self, mixture: Mixture) -> None:
+    def record(self, mixture: Mixture, number: int) -> None:
+        """The view with this number, from 0, in place of what an error left of it."""
+        del self._views[number:], self._most[number:]
         self._views.append({each.number: self._kept(each) for each in mixture.hypotheses})
         self._most.append(mixture.trust.most)
         self._forget()

@@ -275,12 +275,17 @@ class Tracker:
             if not self._heading_known:
                 outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
         if self._history is not None:
-            self._history.record(self.mixture)
-            self._outcomes.append((outcome, telemetry))
-            if self._lag is not None and len(self._outcomes) > self._lag:
-                smoothed = self._history.smoothed(self._lag + 1)[0]
-                self._lagged.append(self._smoothed_fix(smoothed, self._outcomes[-self._lag - 1]))
+            self._record(self._history, outcome, telemetry)
         return outcome
+
+    def _record(self, history: History, outcome: Fix | NoFix, telemetry: Telemetry) -> None:
+        """For the smoother; once, also where an error in here makes `passed` begin again."""
+        seen, lag = len(self._outcomes), self._lag
+        if lag is not None and len(self._lagged) < seen - lag:
+            smoothed = history.smoothed(lag + 1)[0]
+            self._lagged.append(self._smoothed_fix(smoothed, self._outcomes[-lag - 1]))
+        history.record(self.mixture, seen)
+        self._outcomes.append((outcome, telemetry))
 
     def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
         """NaN where the view was not registered at the fix."""
@@ -309,7 +314,8 @@ class Tracker:
         if self._time_ns is None:
             if prior is not None:
                 self.mixture.start(*self._position_of(prior))
-            self._stand(telemetry, None, now)
+            self._time_ns = self._predicted_ns = telemetry.time_ns
+            self._velocity, self._before = None, now
             return 0.0, 1.0
         seconds = (telemetry.time_ns - self._time_ns) / 1e9
         if not 0 < seconds < LONGEST_GAP_S:
@@ -328,18 +334,12 @@ class Tracker:
             ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
         # An image that is not used makes no error independent.
         self.mixture.predict(seconds, velocity, camera, noise, 1.0 if view is None else 1 - ground)
-        self._stand(telemetry, velocity, now)
+        # No call comes between: it could raise an error.
+        self._time_ns = self._predicted_ns = telemetry.time_ns
+        self._velocity, self._before = (None if velocity is None else velocity.now_en_mps), now
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
         return 0.0 if moved is None else moved.overlap, ground
-
-    def _stand(
-        self, telemetry: Telemetry, velocity: ReportedVelocity | None, view: OdometryView | None
-    ) -> None:
-        """What the next view is predicted from."""
-        self._time_ns = self._predicted_ns = telemetry.time_ns
-        self._velocity = None if velocity is None else velocity.now_en_mps
-        self._before = view
 
     def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
         """By the expected displacement or the largest usual speed."""

@@ -4,6 +4,7 @@ The mixture filters; its best place is judged here after every view. States and 
 docs/tracking.md, with the evidence for the values."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
@@ -127,15 +128,17 @@ class Trust:
         self.track = None if place is None else Claim(place, REPORTED)
         self.rival = None
 
-    def moved(self, step: "Callable[[Hypothesis], Hypothesis]", blind_s: float = 0.0) -> None:
-        """Dead-reckoned, or to another plane. `blind_s`: time that no odometry covers."""
+    def moved(self, step: "Callable[[Hypothesis], Hypothesis]", blind_s: float = 0.0) -> "Trust":
+        """One dead-reckoned, or to another plane. `blind_s`: time that no odometry covers."""
         track, rival = (
             None if each is None else each._replace(place=step(each.place))
             for each in (self.track, self.rival)
         )
         if track is not None:
             track = track._replace(ground=track.ground * 0.5 ** (blind_s / HALVED_S))
-        self.track, self.rival = track, rival
+        made = copy(self)
+        made.track, made.rival = track, rival
+        return made
 
     def viewed(self, newness: float, *, shown: bool) -> None:
         """After a view; `newness`: share that counts as new evidence."""

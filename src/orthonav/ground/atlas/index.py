@@ -207,7 +207,7 @@ def vectors_of(embedder: WhitenedEmbedder, features: Features) -> NDArray[np.flo
 
 def half_whitened(embedder: WhitenedEmbedder, embedded: NDArray[np.float32]) -> NDArray[np.float32]:
     """Whitened to the power 0.5: fully whitened vectors do not recognize a place an eighth of a
-    tile off (docs/decisions/atlas.md)."""
+    tile off (docs/atlas.md)."""
     norms = np.linalg.norm(embedder.basis.astype(np.float32), axis=0)
     weighed = embedded * (norms / norms.max()) ** -0.5
     lengths = np.linalg.norm(weighed, axis=1, keepdims=True)

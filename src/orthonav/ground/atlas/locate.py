@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 MODEL = Model(wide_m=1700.0, most_agreement=1.0)
 """Views of a flight without a prior may be far apart in time: their positions are never predicted
 well. So each must show the map by itself, however well it agrees with the prediction, and a wide
-prediction is no reason to confirm the track again (docs/decisions/atlas.md)."""
+prediction is no reason to confirm the track again (docs/atlas.md)."""
 MIN_CONFIDENCE = 0.5  # of a fix, by the view alone too
 MAX_TRACKS = 3  # the least likely are dropped
 MAX_NEW_TRACKS = 2  # at a view: opening and searching a sheet takes a second

@@ -131,6 +131,8 @@ def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
         "verdict_kind": "bad" if metrics.n_confident_wrong else "good" * (metrics.n_confident > 0),
         "cards": _cards(metrics),
         "n_without_truth": metrics.n_without_truth,
+        "n_without_result": metrics.n_without_result,
+        "n_fixes": metrics.n_fixes,
         "view_command": flight.view_command,
         "figures": [
             Figure(f"{prefix}{name}", f"{flight.name}: {alt}", caption, drawing)

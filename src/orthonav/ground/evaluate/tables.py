@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from orthonav.core.flight.fixes import STATES
@@ -14,6 +14,7 @@ from orthonav.ground.evaluate.statistics import (
     ErrorStatistics,
     FloatArray,
     Longest,
+    StandardFigures,
     nees_bound,
     percentile,
     share,
@@ -49,20 +50,20 @@ class FlightReport:
 
 
 def metrics_to_json(metrics: Metrics) -> Plain:
-    plain: Plain = to_plain(metrics)
-    for name, prefix in (("acc_at_m", ""), ("acc_fixes_at_m", "fixes_")):
-        shares = plain.pop(name)
-        plain |= {f"{prefix}{radius_key(radius_m)}": each for radius_m, each in shares.items()}
-    plain["covariance"] = _consistency_to_json(metrics.consistency)
-    del plain["consistency"]
+    apart = ("acc_at_m", "acc_fixes_at_m", "gap", "consistency", "standard", "of_confident")
+    values = {name: each for name, each in vars(metrics).items() if name not in apart}
     if metrics.integrity is None:
-        del plain["integrity"]
-    gap, confident, standard = metrics.gap, metrics.of_confident, metrics.standard
-    shown: Plain = to_plain(
+        del values["integrity"]
+    confident, standard = metrics.of_confident, metrics.standard
+    found = metrics.consistency
+    plain: Plain = to_plain(
         {
+            **values,
+            **{radius_key(r): share for r, share in metrics.acc_at_m.items()},
+            **{f"fixes_{radius_key(r)}": share for r, share in metrics.acc_fixes_at_m.items()},
             "n_low_confidence": metrics.n_fixes - metrics.n_confident,
-            "longest_gap_s": gap.seconds_s,
-            "longest_gap_m": gap.path_m,
+            "longest_gap_s": metrics.gap.seconds_s,
+            "longest_gap_m": metrics.gap.path_m,
             "confident_error_median_m": confident.cep50_m,
             "confident_error_p95_m": confident.cep95_m,
             "confident_error_max_m": confident.ape.max_m,
@@ -70,17 +71,43 @@ def metrics_to_json(metrics: Metrics) -> Plain:
             "error_p95_m": standard.cep95_m,
             "error_mean_m": standard.ape.mean_m,
             "error_max_m": standard.ape.max_m,
+            "standard": _standard_to_json(standard),
+            "standard_of_confident": _standard_to_json(confident),
+            "covariance": {
+                "n_right": found.n,
+                "n_nees": found.nees.size,
+                "n_without_covariance": found.n_without,
+                "n_unusable_covariance": found.n_unusable,
+                **_nees_to_json(found),
+            },
         }
     )
-    return plain | shown
+    return plain
 
 
-def _consistency_to_json(found: Consistency) -> Plain:
-    plain: Plain = to_plain(found)
-    within = plain.pop("within").items()
-    plain |= {f"nees_within_{100 * level:g}": each for level, each in within}
-    plain["n_nees"] = len(plain.pop("nees"))
-    return {**plain, "verdict": found.verdict or None}
+def _standard_to_json(standard: StandardFigures) -> Plain:
+    return {
+        "rmse_m": standard.ape.rmse_m,
+        "cep50_m": standard.cep50_m,
+        "cep95_m": standard.cep95_m,
+        "ape": standard.ape,
+        "rpe": [
+            {"delta": 1, "unit": "frames", **asdict(standard.rpe_frames)},
+            {"delta": RPE_DISTANCE_M, "unit": "m", **asdict(standard.rpe_distance)},
+        ],
+    }
+
+
+def _nees_to_json(found: Consistency) -> Plain:
+    return {
+        "nees_mean": found.nees_mean,
+        "nees_median": found.nees_median,
+        **{f"nees_within_{100 * level:g}": share for level, share in found.within.items()},
+        "n_effective": found.n_effective,
+        "effective_low": found.low,
+        "effective_high": found.high,
+        "verdict": found.verdict or None,
+    }
 
 
 def runs_to_json(runs: Sequence[FlightReport]) -> Plain:
@@ -93,14 +120,32 @@ def runs_to_json(runs: Sequence[FlightReport]) -> Plain:
 
 
 def track_to_json(track: TrackMetrics) -> Plain:
-    plain: Plain = to_plain({name: each for name, each in vars(track).items() if name != "series"})
-    plain["first_view"] = plain["first_view"] and int(plain["first_view"])
-    plain["consistency"] = _consistency_to_json(track.consistency)
-    after = plain["after"]
-    after |= {radius_key(r): share for r, share in after.pop("acc_at_m").items()}
+    found, after = track.consistency, track.after
+    within = {radius_key(radius_m): share for radius_m, share in after.acc_at_m.items()}
+    plain: Plain = to_plain(
+        {
+            **vars(track),
+            "first_view": int(track.first_view) if math.isfinite(track.first_view) else None,
+            "after": {name: each for name, each in vars(after).items() if name != "acc_at_m"}
+            | within,
+            "along": _spread_to_json(track.along),
+            "across": _spread_to_json(track.across),
+            "consistency": {
+                "n_views": found.nees.size,
+                "n_left_out": found.n_without + found.n_unusable,
+                **_nees_to_json(found),
+            },
+        }
+    )
+    del plain["series"]
     names = ("seconds_s", "sigma_m", "bound_95_m", "along_m", "across_m")
     plain["over_time"] = to_plain({name: getattr(track.series, name) for name in names}, 3)
     return plain
+
+
+def _spread_to_json(errors: ErrorStatistics) -> Plain:
+    values = errors.n, errors.mean_m, errors.std_m, errors.rmse_m
+    return dict(zip(("n_views", "mean_m", "std_m", "rmse_m"), values, strict=True))
 
 
 def gnss_to_json(found: GnssMetrics) -> Plain:

@@ -30,7 +30,7 @@ from orthonav.core.flight.recording import Flight, RecordedView
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.ground.recordings.flightlog import LoggedFlight
-from orthonav.ground.recordings.motion import (
+from orthonav.onboard.motion import (
     LONGEST_S,
     SHIFT_STD,
     TURN_STD_RAD,

@@ -121,7 +121,7 @@ def _found(
     """By the best of the rules. Focal lengths of EXIF are rounded to 1 or 2 digits: 2 to 3 %."""
     if sensor_width_mm is not None and optics.focal_mm > 0:
         px = optics.focal_mm / sensor_width_mm * max(width_px, height_px)
-        return FocalLength(px, 0.02, "EXIF and the width of the sensor")
+        return FocalLength(px, 0.02, "EXIF and --sensor-width-mm")
     make = optics.make.upper()
     sensor = _SENSORS.get((make, optics.model.upper().removeprefix(f"{make} ")))
     if sensor is not None and (known := _of_sensor(sensor, optics, width_px, height_px)):

@@ -260,10 +260,10 @@ def _warnings_of_file(file: McapFile, content: LogContent) -> list[str]:
 def _session(data: bytes, path: Path) -> dict[str, Any]:
     plain = from_json(data)
     number = plain.get("format")
-    if isinstance(number, int) and number > FORMAT:
+    if isinstance(number, int) and number != FORMAT:
+        update = "update orthonav" if number > FORMAT else "its images are stored in another way"
         raise BrokenLogError(
-            f"flight log has format {number!s:.20}, this program reads up to {FORMAT}; update "
-            f"orthonav: {path}"
+            f"flight log has format {number!s:.20}, this program reads {FORMAT}; {update}: {path}"
         )
     if not isinstance(plain.get("camera"), dict):
         raise FlightError("session of the log is damaged")

@@ -430,7 +430,8 @@ def read_table(path: Path) -> RecordedTrack:
     """
     attitude, position = Samples(3), Samples(3)
     others = {name: Samples(len(columns)) for name, columns in _COLUMNS.items()}
-    for line, row in csv_rows(path, ("time_s", "pitch_deg", "roll_deg"), MAX_ROWS):
+    needed = "time_s", "pitch_deg", "roll_deg"
+    for line, row in csv_rows(path, needed, MAX_ROWS, short=True):
         time_ns = time_ns_of(row["time_s"])
         if time_ns is None:
             raise FlightError(f"line {line}: time_s is not a time: {path}")

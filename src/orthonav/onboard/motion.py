@@ -1,19 +1,25 @@
 """Motion of the picture between consecutive images, as seen and as the telemetry reports it.
 
 Both are given as the rotation about the optical axis and the displacement of the centre of the
-picture, so that they can be compared. Corners are tracked (Shi and Tomasi 1994; Lucas and Kanade in
-a pyramid, Bouguet 2001) in a small picture, independently of the odometry of the localizer.
+picture, so that they can be compared, in flight by `MotionCheck`. Corners are tracked (Shi and
+Tomasi 1994; Lucas and Kanade in a pyramid, Bouguet 2001) in a small picture, independently of the
+odometry of the localizer.
 """
 
 import math
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 from orthonav.core.geo.camera import Camera, undistort
+from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.onboard.telemetry import VehicleState
 
 SIDE_PX = 240
 """Longer side of compared images: corners are found to 0.1 px, 0.03 deg for a usual lens."""
@@ -24,6 +30,12 @@ LONGEST_S = 1.2
 TURN_STD_RAD, SHIFT_STD = 0.003, 0.004
 """Least standard deviations of differences: attitudes of autopilots jitter by about 0.1 deg, and
 corners are found to 0.1 px where the focal length is 200 px."""
+WINDOW_S, MIN_PAIRS = 4.0, 12
+"""Pairs of so many seconds are compared with the report, at least so many."""
+MIN_EXPLAINED = 0.6
+"""Fraction of the motion common to images and report from which they agree."""
+SUMMED, SIGMAS = 4, 3.0
+"""Successive pairs that are summed; their motion counts from so many least standard deviations."""
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 Grey = NDArray[np.uint8]
@@ -223,12 +235,135 @@ def varying(values: Array, seconds: Array) -> Array:
     return np.asarray(values - rates * seconds[:, None])
 
 
-def explained_part(seen: Array, off: Array, least: float) -> float:
+def explained_part(seen: Array, off: Array, least: float, least_off: float = 0.0) -> float:
     """Share of seen motion (N, K) that is explained, without the fifth that fits worst. `off`: seen
-    less reported; NaN where neither is at least `least`."""
+    less reported; NaN where neither is at least `least`, or `off` is less than `least_off`."""
     seen2, off2 = np.square(seen).sum(axis=1), np.square(off).sum(axis=1)
     modelled2 = np.square(seen - off).sum(axis=1)  # reported motion that is not seen counts too
     used = np.argsort(off2)[: round(0.8 * len(off2))]
     moved = max(float(seen2[used].mean()), float(modelled2[used].mean()))
     left = float(off2[used].mean())
-    return 1 - left / moved if moved > least**2 else math.nan
+    return 1 - left / moved if moved > least**2 and left >= least_off**2 else math.nan
+
+
+class Compared(NamedTuple):
+    """Whether images move as reported, steady turns apart, and whether they move otherwise: neither
+    where little moved. `is_reported`: the aircraft moved by the report."""
+
+    agree: bool = False
+    contradict: bool = False
+    is_reported: bool = False
+
+
+class MotionCheck:
+    """Compares the motion of the images of the last seconds with the report. Mutable."""
+
+    def __init__(
+        self, delay_s: float, mount_deg: Angles = LOOKS_DOWN, *, heading_known: bool = True
+    ) -> None:
+        """`delay_s`: from exposure to arrival. `heading_known`: the heading gives that of the
+        velocity."""
+        self._delay_ns, self._mount_deg = round(delay_s * 1e9), mount_deg
+        self._heading_known = heading_known
+        self.clear()
+
+    def clear(self) -> None:
+        self.odometry = PictureOdometry()
+        self._waiting: deque[ImageMotion] = deque(maxlen=100)
+        self._rows: deque[tuple[int, Array]] = deque(maxlen=100)
+
+    def add(
+        self,
+        arrived_ns: int,
+        grey: Grey,
+        camera: Camera,
+        state_at: Callable[[int], VehicleState],
+        covered_ns: int,
+    ) -> None:
+        """Add an image; its motion counts once states are known, to `covered_ns`, at its end."""
+        motion = self.odometry.motion(grey, camera, arrived_ns)
+        if motion is not None:
+            self._waiting.append(motion)
+        while self._waiting and self._waiting[0].end_ns - self._delay_ns <= covered_ns:
+            row = self._row(self._waiting[0], state_at)
+            end_ns = self._waiting.popleft().end_ns
+            if np.isfinite(row[:7]).all():
+                self._rows.append((end_ns, row))
+        while self._rows and self._rows[0][0] < self._rows[-1][0] - WINDOW_S * 1e9:
+            self._rows.popleft()
+
+    def _row(self, seen: ImageMotion, state_at: Callable[[int], VehicleState]) -> Array:
+        """Seconds; turn and shift (2) as seen; turn, shift by the attitude (2), shift by the
+        velocity (2) and height (m) as reported: (10,)."""
+        start, end = (state_at(each - self._delay_ns) for each in (seen.start_ns, seen.end_ns))
+        velocity = (_velocity(start) + _velocity(end)) / 2
+        height_m = np.array([start.height_m if start.height_m > 0 else math.nan])
+        poses = self._enu_from_camera(start)[None], self._enu_from_camera(end)[None]
+        reported = reported_motion(*poses, velocity[None], height_m, seen.seconds)
+        turn, tilt, shift = (each[0] for each in reported)
+        return np.array([seen.seconds, seen.turn_rad, *seen.shift, turn, *tilt, *shift, *height_m])
+
+    def _enu_from_camera(self, state: VehicleState) -> Array:
+        turn = state.ned_from_body
+        if turn is None:
+            return np.full((3, 3), math.nan)
+        return enu_from_body_camera(turn, self._mount_deg)
+
+    @property
+    def is_filled(self) -> bool:
+        return len(self._rows) >= MIN_PAIRS
+
+    def compared(self) -> Compared:
+        if not self.is_filled:
+            return Compared()
+        pairs = np.array([row for _, row in self._rows])
+        unknown = ~np.isfinite(pairs).all(axis=1)  # without the velocity only turns can be compared
+        pairs[np.ix_(unknown, [2, 3, 5, 6, 7, 8])] = 0.0
+        pairs = _sound(pairs)
+        # Sums over successive pairs: jitter of the attitudes cancels, motion adds up.
+        rows = np.lib.stride_tricks.sliding_window_view(pairs, SUMMED, axis=0).sum(axis=-1)
+        seconds, seen_turn, reported_turn = rows[:, 0], rows[:, 1:2], rows[:, 4:5]
+        tilt, velocity = rows[:, 5:7], rows[:, 7:9]
+        turn_off, by_velocity = seen_turn - reported_turn, rows[:, 2:4] - tilt
+        # The constant part of the shift depends on height and heading, which may be off.
+        shift = varying(rows[:, 2:4], seconds), varying(by_velocity - velocity, seconds)
+        reported_shift = varying(tilt + velocity, seconds)
+        min_turn, min_shift = SIGMAS * TURN_STD_RAD, SIGMAS * SHIFT_STD
+        turning = varying(seen_turn, seconds), varying(turn_off, seconds)
+        mps = np.median(pairs[:, 9]) / rows[:, :1]
+        contradict = (
+            explained_part(seen_turn, turn_off, min_turn) < 0.4
+            # Errors of pitch and roll of PX4 without GNSS made up to 0.0143 (docs/closed-loop.md).
+            or explained_part(*shift, min_shift, least_off=0.016) < MIN_EXPLAINED
+            or self._differs(mps * by_velocity, mps * velocity)
+        )
+        explained = explained_part(*turning, min_turn), explained_part(*shift, min_shift)
+        agree = not contradict and bool(np.fmin(*explained) >= MIN_EXPLAINED)
+        turned2 = np.square(reported_turn).mean()
+        shifted2 = np.square(reported_shift).sum(axis=1).mean()
+        return Compared(agree, contradict, bool(turned2 > min_turn**2 or shifted2 > min_shift**2))
+
+    def _differs(self, seen: Array, reported: Array) -> bool:
+        """Whether velocities (N, 2) in m/s differ by more than errors of the reported one, and of
+        height and heading, which make the speed 0.4 to 2.5 times as large."""
+        seen, reported = np.median(seen, axis=0), np.median(reported, axis=0)
+        speed, seen_speed = (float(np.hypot(*each)) for each in (reported, seen))
+        along = float(seen @ reported) / speed if self._heading_known and speed else seen_speed
+        usual = SIGMAS * usual_velocity_std_mps(speed)
+        return min(speed, abs(along - speed)) > usual and not 0.4 < along / speed < 2.5
+
+
+def _velocity(state: VehicleState) -> Array:
+    north, east, down = state.velocity_ned_mps
+    return np.array([east, north, -down])
+
+
+def _sound(pairs: Array) -> Array:
+    """Pairs (N, 10) without the worst, up to a tenth, beyond 6 standard deviations."""
+    off = np.concatenate([pairs[:, 1:2] - pairs[:, 4:5], pairs[:, 2:4] - pairs[:, 5:7]], axis=1)
+    off[:, 1:] -= pairs[:, 7:9]
+    off = np.abs(off - np.median(off, axis=0))
+    least = np.array([TURN_STD_RAD, SHIFT_STD, SHIFT_STD])
+    worst = (off / np.maximum(least, 1.4826 * np.median(off, axis=0))).max(axis=1)
+    limit = max(6.0, float(np.sort(worst)[-math.ceil(0.1 * len(pairs)) - 1]))
+    return np.asarray(pairs[worst <= limit])
