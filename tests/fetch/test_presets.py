@@ -97,6 +97,26 @@ def test_rows_of_an_own_table_replace_those_of_the_same_name(tmp_path):
         ('[a]\nprotocol = "ftp"\nurl = "https://a/"', "protocol of a must be one of wmts"),
         ('[a]\nprotocol = "wms"\nurl = "https://a/"\nlair = "b"', "lair"),
         ('[a]\nprotocol = "wms"\nurl = "file:///etc/passwd"', "only http"),
+        *(
+            (f'[a]\nprotocol = "wms"\nurl = "https://a/"\n{line}', words)
+            for line, words in (
+                ("url = 1", "cannot be used"),
+                ("style = 1", "a: style must be a text, got 1"),
+                ('gsd_m = "fine"', "a: gsd_m must be a number above 0, got 'fine'"),
+                ("gsd_m = nan", "gsd_m must be a number above 0"),
+                ("tile_px = 256.0", "tile_px must be a whole number from 1, got 256.0"),
+                ("max_zoom = true", "max_zoom must be a whole number from 1, got True"),
+                ('empty = "red"', "empty must be black or white, got 'red'"),
+                ('bands = "1,2"', "bands must be a list of numbers from 1"),
+                ("bands = [0]", "bands must be a list of numbers from 1"),
+                ('layers = ["x"]', "layers must be tables"),
+                (
+                    '[[a.layers]]\nid = "x"\nyears = 2020',
+                    r"a\.layers: years must be a list of years",
+                ),
+                ('[[a.layers]]\nid = "x"\ndate = "June"', "date must be YYYY"),
+            )
+        ),
     ],
 )
 def test_unusable_tables_are_errors(tmp_path, text, words):

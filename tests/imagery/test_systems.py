@@ -4,12 +4,13 @@ import re
 
 import numpy as np
 import pytest
-from geotiffs import FRAME, LAMBERT, placed, read, smooth_scene, write
+from geotiffs import FRAME, LAMBERT, placed, read, sheet_of, smooth_scene, write
 from pyproj import Transformer
 from pyproj.transformer import TransformerGroup
 
 from orthonav.core.errors import ImageryError, UsageError
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.ground.imagery import systems
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.systems import plate_shift_deg, plate_shift_m
 from orthonav.ground.imagery.terrain import open_dem
@@ -109,6 +110,20 @@ def test_an_epoch_moves_the_imagery(tmp_path):
     other = write(tmp_path / "b.tif", smooth_scene(), crs="EPSG:32631")
     with pytest.raises(ImageryError, match="not for EPSG:32631"):
         Mosaic.open([other], 2026.9)
+
+
+def test_a_conversion_that_fails_is_an_error_and_no_hole(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.tif", smooth_scene())
+    sheet, sources = sheet_of(path), Mosaic.open([path]).sources
+
+    def fails(*args):
+        raise RuntimeError("PROJ: no grid")
+
+    monkeypatch.setattr(systems, "transform_coordinates", fails)
+    with pytest.raises(ImageryError, match=r"does not fit its coordinate system.*a\.tif"):
+        sheet.read(0, 0, 8, 8)
+    with pytest.raises(ImageryError, match=r"does not fit its coordinate system.*a\.tif"):
+        systems.at_epoch(sources, 2026.9)
 
 
 @pytest.mark.long

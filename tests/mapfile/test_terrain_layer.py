@@ -1,5 +1,6 @@
 """The terrain layer of a map: what was encoded is read, and nothing damaged is believed."""
 
+import zlib
 from dataclasses import replace
 
 import cv2
@@ -116,6 +117,14 @@ def png(values):
     return cv2.imencode(".png", values)[1].tobytes()
 
 
+def with_text(png, before):
+    """A PNG with a text that inflates to 1 MB before one of its parts."""
+    text = b"zTXt" + b"a\0\0" + zlib.compress(bytes(10**6), 9)
+    part = (len(text) - 4).to_bytes(4, "big") + text + zlib.crc32(text).to_bytes(4, "big")
+    at = png.index(before) - 4
+    return png[:at] + part + png[at:]
+
+
 SIDES = CHUNK, CHUNK
 NOISE = png(np.random.default_rng(0).integers(1, 500, SIDES).astype(np.uint16))
 DAMAGED = {
@@ -125,6 +134,10 @@ DAMAGED = {
     "8 bits": png(np.ones(SIDES, np.uint8)),
     "colours": png(np.ones((*SIDES, 3), np.uint16)),
     "cut": NOISE[:-60],
+    "a text before the samples": with_text(png(np.ones(SIDES, np.uint16)), b"IDAT"),
+    "a text after the samples": with_text(png(np.ones(SIDES, np.uint16)), b"IEND"),
+    "bytes after the end": NOISE + bytes(12),
+    "interlaced": NOISE[:28] + b"\1" + NOISE[29:],
     "many bytes": NOISE + bytes(4 * CHUNK * CHUNK + 2000),
     "too high": png(np.full(SIDES, 65_535, np.uint16)),
 }

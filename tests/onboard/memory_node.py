@@ -9,16 +9,16 @@ from orthonav.onboard.ros2.node import Node
 
 class MemoryNode(Node):
     """`time` goes on while it waits in vain. `heard`: messages by topic. `latched`, `reliable`:
-    topics with such a writer or reader of ours."""
+    topics with such a writer or reader of ours. `types`: those of others, by topic."""
 
     def __init__(self, words=(), distro=""):
         pairs = zip(words[::2], words[1::2], strict=True)
-        self._given = {"-r": {}, "-p": {}}
+        self._given_words = {"-r": {}, "-p": {}}
         for flag, text in pairs:
             name, _, value = text.partition(":=")
-            self._given[flag][name] = value
+            self._given_words[flag][name] = value
         self.time, self.heard = Time(), defaultdict(list)
-        self.latched, self.reliable, self.kinds = set(), set(), {}
+        self.latched, self.reliable, self.types = set(), set(), defaultdict(set)
         self._handlers, self._waiting = {}, deque()
         super().__init__(words, distro)
 
@@ -27,15 +27,21 @@ class MemoryNode(Node):
         return "orthonav", "/orthonav"
 
     def _declared(self, name, default):
-        given = self._given["-p"].get(name, default)
+        given = self._given_words["-p"].get(name, default)
         return given == "true" if name == "use_sim_time" else given
+
+    def _given(self):
+        return [*self._given_words["-p"]]
+
+    def _types_of_others(self, topic):
+        return self.types[topic]
 
     def resolved(self, topic):
         expanded = topic.replace("~", "/orthonav")
-        return self._given["-r"].get(topic, f"/{expanded.removeprefix('/')}")
+        return self._given_words["-r"].get(topic, f"/{expanded.removeprefix('/')}")
 
     def is_remapped(self, topic):
-        return topic in self._given["-r"]
+        return topic in self._given_words["-r"]
 
     def subscribe(self, topic, kind, handler, *, depth=5, reliable=False):
         self._handlers[topic], self.kinds[topic] = (kind, handler), kind

@@ -83,6 +83,7 @@ class Peer:
 
     def odd(self, seconds):
         self.node.create_publisher(Image, "/cam/image_raw", qos_profile_sensor_data)
+        self.node.create_publisher(Float64, "/range", 10)
         self.node.create_subscription(NavSatFix, "/orthonav/fix", self.fix, LATCHED)
         self.spin(time.monotonic() + seconds)
 

@@ -30,6 +30,7 @@ from orthonav.onboard.messages.estimate import (
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.ros2.node import Rosout
+from orthonav.onboard.ros2.parameters import declared
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader, loses_images
 from orthonav.onboard.telemetry import TelemetryBuffer, VehicleState
@@ -509,6 +510,38 @@ def test_the_origin_is_latched_for_later_subscribers():
 def test_invalid_parameters_are_named(given, said):
     with pytest.raises(VariantError, match=said):
         MemoryNode(["-p", given])
+
+
+def test_a_time_that_is_neither_true_nor_false_is_named():
+    with pytest.raises(VariantError, match="use_sim_time is true or false, got 'no'"):
+        declared(lambda name, default: {"use_sim_time": "no"}.get(name, default), [])
+
+
+def test_unknown_parameters_are_named(caplog):
+    MemoryNode(["-p", "covarance:=fix", "-p", "qos_overrides./fix.publisher.depth:=1"])
+    (record,) = caplog.records
+    assert record.getMessage().startswith("parameter covarance is ignored; parameters are use_sim")
+
+
+def test_a_node_that_cannot_begin_leaves_the_graph(monkeypatch):
+    left = []
+    monkeypatch.setattr(MemoryNode, "close", lambda node: left.append(node))
+    with pytest.raises(VariantError):
+        MemoryNode(["-p", "altitude:=high"])
+    assert len(left) == 1
+
+
+def test_topics_of_another_type_are_named_once_and_while_that_lasts(caplog):
+    flying = Reading()
+    flying.node.types[IMAGE] = {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"}
+    flying.node.types[IMU] = {"sensor_msgs/msg/Imu"}
+    flying.read(2.5)
+    said = "is of type sensor_msgs/msg/CompressedImage; expected sensor_msgs/msg/Image"
+    assert flying.node.problems == {IMAGE: said}
+    assert caplog.text.count(f"topic {IMAGE} {said}") == 1
+    flying.node.types.clear()
+    flying.read(1.5)
+    assert not flying.node.problems
 
 
 def test_health_is_a_diagnostic():

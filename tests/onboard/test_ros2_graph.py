@@ -181,14 +181,16 @@ def test_a_flight_in_a_graph(flown, fly, hear, tmp_path, simulated):
 
 
 def test_types_and_qos_that_do_not_match_are_named(flown, env, fly, distribution):
-    """By `rclpy`: a camera with best effort where every part is wanted, a subscriber that wants
-    positions of before it came."""
-    flying = fly(flown[0], ros=[*INPUTS, "-p", "image_reliability:=reliable"])
+    """A camera with best effort where every part is wanted, a number in place of a range, a
+    subscriber that wants positions of before it came, and a parameter that there is not."""
+    flying = fly(flown[0], ros=[*INPUTS, "-p", "image_reliability:=reliable", "-p", "odd:=1"])
     words = [distribution[1], PEER, "odd", "--seconds", str(LONGEST_S)]
     odd = subprocess.Popen(words, env=env, stderr=subprocess.PIPE, text=True)
     named = (
         "'/cam/image_raw', offering incompatible QoS",
         "'/orthonav/fix', requesting incompatible",
+        "topic /range is of type std_msgs/msg/Float64; expected sensor_msgs/msg/Range",
+        "parameter odd is ignored; parameters are use_sim_time, image_transport",
     )
 
     def all_named():
@@ -215,7 +217,8 @@ def test_names_follow_the_namespace_and_parameters_the_file(flown, fly, tmp_path
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (["-r", "image"], 1, "Couldn't parse remap rule: '-r image'"),
+        (["-r", "image"], 2, "--ros-args cannot be used: "),
+        (["--unknown"], 2, "'--unknown'"),
         (["-p", "covariance:=mine"], 2, "filter or fix, got 'mine'"),
     ],
 )

@@ -222,12 +222,15 @@ def test_the_first_error_is_raised_and_no_thread_stays(workers):
 
 def test_what_others_keep_in_the_folder_stays(tmp_path):
     folder = tmp_path / "map.onav.work"
-    cache = BlockCache(folder, "ab12")
+    cache = BlockCache(folder, "ab12" * 6)
     cache.store(Block(0, 0, 4, 4), {"grey": np.zeros(3)})
-    (folder / "checkpoints").mkdir()
+    for name in ("checkpoints", "blocks-of-wood"):
+        (folder / name).mkdir()
     (folder / "mine.npz").write_bytes(b"mine")
-    later = BlockCache(folder, "cd34")
+    later = BlockCache(folder, "cd34" * 6)
     assert later.load(Block(0, 0, 4, 4)) is None and not list(folder.rglob("r0*"))
     later.store(Block(0, 0, 4, 4), {"grey": np.zeros(3)})
     later.discard()
-    assert sorted(each.name for each in folder.iterdir()) == ["checkpoints", "mine.npz"]
+    assert sorted(each.name for each in folder.iterdir()) == [
+        *("blocks-of-wood", "checkpoints", "mine.npz")
+    ]

@@ -25,7 +25,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_options(parser, "--json")
     add_options(parser, "--seed", default=0)
     parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR", help="to write")
-    add_options(parser, "--speed-mps", default=25.0, help="ground speed (default 25)")
+    add_options(parser, "--speed-mps", default=25.0, help="airspeed; the air is still (default 25)")
     number = partial(parser.add_argument, type=float)
     text = "angle by which the camera looks ahead of straight down, 0 to 65; reported (default 0)"
     number("--camera-pitch-deg", default=0.0, help=text)

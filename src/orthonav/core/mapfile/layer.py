@@ -16,7 +16,7 @@ from orthonav.core.errors import MapFileError
 from orthonav.core.mapfile.manifest import GreyInfo
 from orthonav.core.mapfile.reader import Blobs, MapFile
 
-CACHE_BYTES = 64 * 2**20  # 64 km2 at 1 m without masks
+CACHE_BYTES = 64 * 2**20  # grey and mask of 33 km2 at 1 m
 MAX_PREVIEW_PX = 384
 
 Chunk = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
@@ -75,7 +75,7 @@ class GreyLayer:
         self._jpegs = Blobs(opened, names["bytes"], names["offsets"], self._table.count)
         self._masks = Blobs(opened, names["mask_bytes"], names["mask_offsets"], self._table.count)
         decode = partial(_read_chunk, self._jpegs, self._masks, self._table, self._path)
-        self._decoded = lru_cache(cache_bytes // info.chunk_px**2)(decode)
+        self._decoded = lru_cache(cache_bytes // (2 * info.chunk_px**2))(decode)
 
     @classmethod
     def of(

@@ -1,6 +1,7 @@
 """The layers of heights of a map (`docs/map-format.md`): the terrain, and the surface above it.
 
-A chunk is a grey PNG of 16 bits. Untrusted, so its size is checked before it is decoded."""
+A chunk is a grey PNG of 16 bits. Untrusted, so its size and parts are checked before it is
+decoded."""
 
 from functools import lru_cache, partial
 from itertools import product
@@ -134,9 +135,11 @@ def decode_terrain(data: NDArray[np.uint8], shape: tuple[int, int], info: Terrai
     rows, cols = shape
     if data.size > 4 * rows * cols + 1024:
         raise MapFileError(f"{data.size} bytes for {rows} x {cols} samples")
-    head = _png_head(rows, cols)
-    if data[: len(head)].tobytes() != head:
+    png = data.tobytes()
+    if not png.startswith(_png_head(rows, cols)):
         raise MapFileError(f"a grey PNG of 16 bits, {rows} x {cols} px, was expected")
+    if not _is_plain_png(png):
+        raise MapFileError("a PNG of IHDR, IDAT and IEND only was expected")
     try:
         values = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -163,6 +166,19 @@ def encode_terrain(heights: Heights, info: TerrainInfo) -> bytes:
 
 
 def _png_head(rows: int, cols: int) -> bytes:
-    """The first bytes of a grey PNG of 16 bits."""
+    """The first bytes of a grey PNG of 16 bits, not interlaced."""
     size = cols.to_bytes(4, "big") + rows.to_bytes(4, "big")
-    return b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + size + b"\x10\0"
+    return b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + size + b"\x10\0\0\0\0"
+
+
+def _is_plain_png(png: bytes) -> bool:
+    """True if IHDR, IDAT and IEND fill it: text and profiles could inflate to any size."""
+    kinds, at = [], 8
+    while at + 12 <= len(png):
+        kinds.append(png[at + 4 : at + 8])
+        at += 12 + int.from_bytes(png[at : at + 4], "big")
+    return (
+        at == len(png)
+        and (kinds[0], kinds[-1]) == (b"IHDR", b"IEND")
+        and set(kinds[1:-1]) == {b"IDAT"}
+    )

@@ -11,6 +11,7 @@ import hashlib
 import json
 import logging
 import math
+import re
 import shutil
 import zipfile
 from collections import deque
@@ -310,10 +311,12 @@ class BlockCache:
     """
 
     def __init__(self, folder: Path, request: str) -> None:
-        """`request`: digest of everything that determines the blocks; removes other blocks."""
+        """`request`: 24 hexadecimal digits of the digest of everything that determines the blocks;
+        removes other blocks."""
         self._folder, self._blocks = folder, folder / f"blocks-{request}"
         for other in folder.glob("blocks-*"):
-            if other != self._blocks:
+            is_cache = re.fullmatch(r"blocks-[0-9a-f]{24}", other.name) and other.is_dir()
+            if is_cache and other != self._blocks:
                 shutil.rmtree(other)
         if found := len(list(self._blocks.glob("*.npz"))):
             log.warning("resuming: %d blocks are cached in %s", found, folder)

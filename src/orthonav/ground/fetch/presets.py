@@ -4,6 +4,7 @@ The table is `presets.toml`, with one of the user's own in the same form beside 
 is what a service is asked for, `Provenance` what travels with the imagery. Needs no extra.
 """
 
+import math
 import os
 import re
 import tomllib
@@ -192,7 +193,9 @@ def presets(own: Path | None = None) -> dict[str, Preset]:
 def _preset(name: str, values: dict[str, Any]) -> Preset:
     options = {each.name for each in fields(ImageryOptions)}
     layers: dict[str, PresetLayer] = {}
+    _require_kinds(name, values)
     for entry in values.get("layers", [{"id": CURRENT}]):
+        _require_kinds(f"{name}.layers", entry)
         for year in map(str, entry.get("years", [""])):
             filled: dict[str, Any] = {
                 key: value.replace("{year}", year) if isinstance(value, str) else value
@@ -204,6 +207,8 @@ def _preset(name: str, values: dict[str, Any]) -> Preset:
                 asked["bands"] = tuple(asked["bands"])
             about = {key: value for key, value in filled.items() if key not in options}
             layer = PresetLayer(options=ImageryOptions(**asked), **about)
+            if layer.date is not None:
+                _check_date(layer.date)
             if layer.id in layers:
                 raise ValueError(f"{name} has {layer.id} twice")
             layers[layer.id] = layer
@@ -212,6 +217,41 @@ def _preset(name: str, values: dict[str, Any]) -> Preset:
     if preset.protocol not in PROTOCOLS:
         raise ValueError(f"protocol of {name} must be one of {', '.join(PROTOCOLS)}")
     return preset
+
+
+def _require_kinds(where: str, values: dict[str, Any]) -> None:
+    """Raise `ValueError` for a value of a table that its field cannot have."""
+    classes = Preset, PresetLayer, ImageryOptions
+    kinds = {each.name: each.type for cls in classes for each in fields(cls)}
+    kinds["years"] = list
+    for name in kinds.keys() & values.keys():
+        fits, expected = _fits(name, kinds[name], values[name])
+        if not fits:
+            raise ValueError(f"{where}: {name} must be {expected}, got {values[name]!r}")
+
+
+def _fits(name: str, kind: Any, value: Any) -> tuple[bool, str]:
+    """Whether a value is one that its field can have, and what that is."""
+    items = value if isinstance(value, list) else []
+    match name:
+        case "layers":
+            return bool(items) and all(isinstance(each, dict) for each in items), "tables"
+        case "years":
+            return bool(items), "a list of years"
+        case "bands":
+            return bool(items) and all(map(_is_whole, items)), "a list of numbers from 1"
+        case "empty":
+            return value in ("black", "white"), "black or white"
+    if kind == int | None:
+        return _is_whole(value), "a whole number from 1"
+    if kind == float | None:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        return is_number and 0 < value < math.inf, "a number above 0"
+    return isinstance(value, str), "a text"
+
+
+def _is_whole(value: Any) -> bool:
+    return type(value) is int and value >= 1
 
 
 def terrain_preset(text: str, own: Path | None = None) -> str | None:

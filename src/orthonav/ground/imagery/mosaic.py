@@ -37,7 +37,7 @@ from orthonav.ground.imagery.source import (
     sources_in,
     unreadable,
 )
-from orthonav.ground.imagery.systems import at_epoch, converted
+from orthonav.ground.imagery.systems import at_epoch, converted, unfit
 from orthonav.ground.planning.area import outline
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
@@ -506,19 +506,18 @@ class SheetRaster:
         except MemoryError:
             raise
         except Exception as error:  # rasterio exports no class of the errors of GDAL it raises here
-            raise ImageryError(
-                "orthophoto does not fit its coordinate system; assign the correct one (for "
-                f"example: gdal_edit.py -a_srs EPSG:2154 FILE): {first.path}"
-            ) from error
+            raise unfit(first.path) from error
         return np.ascontiguousarray(out.transpose(1, 2, 0))
 
     def _source_window(
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]
     ) -> Window | None:
-        """Pixels of a lattice that a window needs; None for none."""
+        """Pixels of a lattice that a window needs; None for none. Raises `ImageryError`."""
         east, north = target * outline((0, 0, shape[1], shape[0]), 8).T
         lat, lon = self._frame.latlon_from_en(np.stack([east, north], axis=1))
         x, y = converted("EPSG:4326", lattice.first.system, lon, lat)
+        if np.isnan(x).all():
+            raise unfit(lattice.first.path)
         col, row = ~lattice.transform * (x, y)
         if not (np.isfinite(col).all() and np.isfinite(row).all()):
             return None

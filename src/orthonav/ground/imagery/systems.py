@@ -44,7 +44,7 @@ FRAMES = (
 def converted(
     source: Any, target: Any, x: ArrayLike, y: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coordinates in another system, by rasterio's PROJ; NaN where there are none.
+    """Coordinates in another system, by rasterio's PROJ; all NaN where it fails.
 
     In degrees the longitude comes first."""
     try:
@@ -52,6 +52,14 @@ def converted(
     except Exception:  # rasterio exports no class of the errors of GDAL that it raises here
         return np.full(np.size(x), np.nan), np.full(np.size(x), np.nan)
     return np.asarray(found[0], np.float64), np.asarray(found[1], np.float64)
+
+
+def unfit(path: Path) -> ImageryError:
+    """The error of a raster whose coordinates PROJ cannot convert."""
+    return ImageryError(
+        "orthophoto does not fit its coordinate system; assign the correct one (for example: "
+        f"gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
+    )
 
 
 def accuracy_of(
@@ -153,6 +161,8 @@ def _moved(
 ) -> "Source":
     lon, lat = [lon_deg, lon_deg + shift_deg[1]], [lat_deg, lat_deg + shift_deg[0]]
     x, y = converted("EPSG:4326", source.system, lon, lat)
+    if not np.isfinite([x, y]).all():
+        raise unfit(source.path)
     return replace(
         source,
         transform=Affine.translation(x[1] - x[0], y[1] - y[0]) * source.transform,

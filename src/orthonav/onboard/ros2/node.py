@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from orthonav.core.errors import MissingExtraError, OutputError, described
+from orthonav.core.errors import MissingExtraError, OutputError, UsageError, described
 from orthonav.core.extras import needed
 from orthonav.onboard.ros2.parameters import Parameters, declared
 
@@ -79,24 +79,31 @@ class Definitions:
 class Node:
     """Reads and writes topics. `spin` is for one thread, writers are for any.
 
-    `problems` says by topic why little flows there; `rclpy` logs types and QoS that do not match.
-    `undecodable` counts damaged messages by topic.
+    `problems` says by topic why little or nothing flows there; `rclpy` logs QoS that does not
+    match. `undecodable` counts damaged messages by topic, `kinds` are the types of ours.
     """
 
     def __init__(self, words: Sequence[str] = (), distro: str = "") -> None:
         """`words`: those after `--ros-args`. `distro`: whose message definitions, see there.
 
-        Raises `MissingExtraError`, `VariantError` for an invalid parameter, or `OutputError` where
-        the middleware cannot join or does not take the words.
+        Raises `MissingExtraError`, `UsageError` for words that are none of ROS, `VariantError` for
+        an invalid parameter, or `OutputError` where the middleware cannot join.
         """
         self.definitions = Definitions(distro)
         self.problems: dict[str, str] = {}
         self.undecodable: Counter[str] = Counter()
+        self.kinds: dict[str, str] = {}
+        self._written: set[str] = set()
         self._said: set[tuple[str, str]] = set()
         self._subscriptions: list[Any] = []
         self._handled = 0
-        self.name, self.full_name = self._join(words)
-        self.parameters: Parameters = declared(self._declared)
+        self._opened = contextlib.ExitStack()
+        try:
+            self.name, self.full_name = self._join(words)
+            self.parameters: Parameters = declared(self._declared, self._given())
+        except BaseException:
+            self.close()
+            raise
 
     def _join(self, words: Sequence[str]) -> tuple[str, str]:
         """Name of the node, and with its namespace."""
@@ -109,14 +116,17 @@ class Node:
                 context=self._context,
                 signal_handler_options=signals.SignalHandlerOptions.NO,
             )
+            self._opened.callback(self._context.try_shutdown)
             self._node = rclpy.create_node(
                 "orthonav",
                 context=self._context,
                 enable_rosout=False,  # see `Rosout`
             )
         except Exception as error:  # of the middleware, and of its parser of arguments
-            raise OutputError(f"cannot join the ROS graph: {described(error)}") from error
+            raise _joining_error(error) from error
+        self._opened.callback(self._node.destroy_node)
         self._executor = executors.SingleThreadedExecutor(context=self._context)
+        self._opened.callback(self._executor.shutdown)
         self._executor.add_node(self._node)
         return self._node.get_name(), self._node.get_fully_qualified_name()
 
@@ -127,6 +137,11 @@ class Node:
         messages = _ros_module("rcl_interfaces.msg")
         descriptor = messages.ParameterDescriptor(dynamic_typing=True)
         return self._node.declare_parameter(name, default, descriptor).value
+
+    def _given(self) -> list[str]:
+        """Names of the parameters that were given, but for those that `rclpy` declares itself."""
+        given = getattr(self._node, "_parameter_overrides", {})  # has no public name
+        return [name for name in given if not self._node.has_parameter(name)]
 
     def resolved(self, topic: str) -> str:
         """Absolute name of a topic after remapping."""
@@ -154,6 +169,7 @@ class Node:
         except Exception as error:  # of the middleware
             raise OutputError(f"cannot subscribe to {topic}: {described(error)}") from error
         self._subscriptions.append(made)
+        self.kinds[topic] = kind
 
     def advertise(self, topic: str, kind: str, *, depth: int = 10, latched: bool = False) -> Writer:
         """A writer of `topic` (resolved already): reliable, and transient local if `latched`.
@@ -168,6 +184,8 @@ class Node:
             return lambda message: None
         except Exception as error:  # of the middleware
             raise OutputError(f"cannot publish on {topic}: {described(error)}") from error
+        self.kinds[topic] = kind
+        self._written.add(topic)
         return self._writing(topic, made.publish)
 
     def spin(self, timeout_s: float) -> int:
@@ -185,9 +203,23 @@ class Node:
 
     def close(self) -> None:
         """Leave the graph."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        self._opened.close()
+
+    def wrong_types(self) -> dict[str, str]:
+        """By topic, where the others there have another type: nothing flows from or to them."""
+        found = {}
+        for topic, kind in self.kinds.items():
+            others = self._types_of_others(topic) - {kind}
+            if others:
+                found[topic] = f"is of type {', '.join(sorted(others))}; expected {kind}"
+        return found
+
+    def _types_of_others(self, topic: str) -> set[str]:
+        """Of those who write what we read, and read what we write."""
+        find = self._node.get_publishers_info_by_topic
+        if topic in self._written:
+            find = self._node.get_subscriptions_info_by_topic
+        return {each.topic_type for each in find(topic)}
 
     def note(self, problems: Mapping[str, str]) -> None:
         """Take these problems by topic as the present ones; each is logged once."""
@@ -223,6 +255,13 @@ class Node:
             if not self.undecodable[topic]:
                 log.warning("message on %s cannot be used (%s)", topic, described(error))
             self.undecodable[topic] += 1
+
+
+def _joining_error(error: Exception) -> UsageError | OutputError:
+    """`rclpy` has an exception of its own only for some of the words it does not understand."""
+    if type(error).__name__.endswith("ROSArgsError") or "Couldn't parse" in str(error):
+        return UsageError(f"--ros-args cannot be used: {described(error)}")
+    return OutputError(f"cannot join the ROS graph: {described(error)}")
 
 
 def _message(kind: str) -> Any:

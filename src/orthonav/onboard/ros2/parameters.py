@@ -1,11 +1,14 @@
 """Parameters of the ROS 2 node (`-p NAME:=VALUE`), which `rclpy` reads."""
 
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
 from orthonav.core.errors import VariantError
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -45,10 +48,17 @@ class Parameters:
             )
 
 
-def declared(declare: Callable[[str, Any], Any]) -> Parameters:
-    """Parameters whose values are what `declare` gives for a name and a default."""
+def declared(declare: Callable[[str, Any], Any], given: Iterable[str]) -> Parameters:
+    """Parameters whose values are what `declare` gives for a name and a default.
+
+    Warns of names among those `given` that are no parameters. Raises `VariantError`."""
     values = {each.name: declare(each.name, each.default) for each in fields(Parameters)}
-    use_sim_time = bool(values.pop("use_sim_time"))
+    for name in given:
+        if name not in values and not name.startswith("qos_overrides."):  # those are of `rclpy`
+            log.warning("parameter %s is ignored; parameters are %s", name, ", ".join(values))
+    use_sim_time = values.pop("use_sim_time")
+    if not isinstance(use_sim_time, bool):
+        raise VariantError(f"parameter use_sim_time is true or false, got '{use_sim_time}'")
     return Parameters(use_sim_time, **{name: str(value) for name, value in values.items()})
 
 

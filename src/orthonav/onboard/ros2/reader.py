@@ -178,7 +178,8 @@ class Ros2Reader:
         if now_ns - self._checked_ns >= TIME_NS:
             self._checked_ns = now_ns
             lost = loses_images(self._image_stamps, self._info_stamps)
-            self._node.note({self._image_topic: _LOSES} if lost else {})
+            losing = {self._image_topic: _LOSES} if lost else {}
+            self._node.note({**losing, **self._node.wrong_types()})
 
     def _ahead_ns(self) -> int | None:
         """ROS time minus our monotonic clock; None before the first `/clock`."""
