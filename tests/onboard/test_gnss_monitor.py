@@ -21,8 +21,8 @@ from orthonav.onboard.gnss.biases import (
     unknown,
 )
 from orthonav.onboard.gnss.monitor import (
-    RETURN_S,
-    SILENCE_S,
+    AGREEMENT,
+    RECEIVER,
     GnssMonitor,
     GnssState,
     MapPosition,
@@ -95,7 +95,7 @@ def test_agreement_is_reached_and_the_displacement_learnt():
         ("frozen:stale=1", 5.0, {Fault.FROZEN}),
         ("jumping:metres=40", 5.0, {Fault.JUMP, Fault.STEP}),
         ("jam", 0.5, {Fault.LOST}),
-        ("jam:silent=1", SILENCE_S + 1.5, {Fault.LOST}),
+        ("jam:silent=1", RECEIVER.silence_s + 1.5, {Fault.LOST}),
     ],
 )
 def test_a_fault_is_named_in_time(text, seconds, names):
@@ -186,7 +186,7 @@ def test_a_return_is_announced_after_agreement_only():
     assert air.fly(300, gnss_m=(35.0, 0.0)).state is GnssState.ALARM  # it does not heal by itself
     status = air.fly(30)
     assert (status.state, status.reason) == (GnssState.RETURNING, "gnss_returning")
-    status = air.fly(int(RETURN_S) + 10)
+    status = air.fly(int(AGREEMENT.return_s) + 10)
     assert (status.state, status.fault) == (GnssState.GOOD, None)
     assert np.hypot(*status.difference_en_m) < 3
 
@@ -198,7 +198,7 @@ def test_an_outage_needs_agreement_too():
     assert air.fly(5, fix_type=1).fault is Fault.LOST
     assert air.fly(8).state is GnssState.ALARM
     assert air.fly(8).state is GnssState.RETURNING
-    assert air.fly(int(RETURN_S) + 10).state is GnssState.GOOD
+    assert air.fly(int(AGREEMENT.return_s) + 10).state is GnssState.GOOD
     air.fly(5, fix_type=1)
     assert air.fly(30, gnss_m=(50.0, 0.0)).reason == "gnss_offset"  # it came back elsewhere
 

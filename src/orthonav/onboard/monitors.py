@@ -3,6 +3,7 @@
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,15 +14,31 @@ from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.state import SPEED_MPS
 
-WINDOW_S = 10.0
-"""Events of so many seconds count."""
-SETTLED_S = 5.0
-"""Missing inputs are no reason for so long after the start."""
-SHARE = 0.2
-"""Fraction of images unusable, late or without telemetry, and of seconds with incomplete or slow
-messages, from which they are a reason."""
-SIGMAS = 3.0
-"""A place farther from the start than this many deviations contradicts it."""
+
+@dataclass(frozen=True)
+class HealthLimits:
+    """From where on what is observed is a reason of health (docs/onboard.md)."""
+
+    window_s: float = 10.0  # events of so many seconds count
+    settled_s: float = 5.0  # after the start, in which missing inputs are no reason
+    share: float = 0.2
+    """Fraction of images unusable, late or without telemetry, and of seconds with incomplete or
+    slow messages."""
+    error_share: float = 0.5  # of processed images, with an internal error
+    image_age_s: float = 3.0  # without an image: beyond this a camera counts as missing
+    link_age_s: float = 5.0  # without a message: several heartbeats, which come once a second
+    telemetry_age_s: float = 3.0  # without an attitude
+    heading_deg: float = 20.0  # estimated less reported heading
+    log_scale: float = 0.2  # logarithm of estimated over reported height: a factor of 1.22
+    coasting_s: float = 2.0  # without a confident position while views do not show the map,
+    low_confidence_s: float = 10.0  # and while they do
+    latency_s: float = 0.5  # from exposure to message, 95th percentile
+    start_sigmas: float = 3.0
+    """A place farther from the start than this many deviations contradicts it,"""
+    start_shown_s: float = 30.0  # which is reported for so long
+
+
+LIMITS = HealthLimits()
 
 
 class EventCounter:
@@ -49,7 +66,7 @@ class EventCounter:
         self._followed = totals
 
     def counts(self, now_ns: int) -> Counter[str]:
-        begin = now_ns - round(WINDOW_S * 1e9)
+        begin = now_ns - round(LIMITS.window_s * 1e9)
         while self._events and self._events[0][0] < begin:
             self._events.popleft()
         while self._latencies and self._latencies[0][0] < begin:
@@ -57,9 +74,9 @@ class EventCounter:
         return Counter(name for _, name in self._events)
 
     def many(self, now_ns: int) -> set[str]:
-        """Names of events at more than `SHARE` of the images."""
+        """Names of events at more than `HealthLimits.share` of the images."""
         counts = self.counts(now_ns)
-        return {name for name in counts if counts[name] > SHARE * max(counts["taken"], 1)}
+        return {name for name in counts if counts[name] > LIMITS.share * max(counts["taken"], 1)}
 
     def latency_s(self, quantile: float) -> float:
         """Quantile (0 to 1) of the latencies within the window; 0 where there are none."""
@@ -67,7 +84,7 @@ class EventCounter:
         return float(np.quantile(values, quantile)) if values else 0.0
 
     def is_settled(self, now_ns: int) -> bool:
-        return now_ns - self._begun_ns > SETTLED_S * 1e9
+        return now_ns - self._begun_ns > LIMITS.settled_s * 1e9
 
     def age_s(self, now_ns: int, then_ns: int | None) -> float:
         """Time since `then_ns`, None: since the start."""
@@ -81,7 +98,8 @@ class CameraMonitor:
 
     def reasons(self, now_ns: int) -> Iterator[str]:
         counts, many = self._events.counts(now_ns), self._events.many(now_ns)
-        if self._events.is_settled(now_ns) and self._events.age_s(now_ns, self.taken_ns) > 3.0:
+        age_s = self._events.age_s(now_ns, self.taken_ns)
+        if self._events.is_settled(now_ns) and age_s > LIMITS.image_age_s:
             yield "no_camera"
         elif counts["camera_lost"]:
             yield "camera_lost"
@@ -101,10 +119,11 @@ class LinkMonitor:
 
     def reasons(self, now_ns: int) -> Iterator[str]:
         link, settled = self._link, self._events.is_settled(now_ns)
-        is_down = settled and link is not None and link.heard_age_s > 5.0
+        is_down = settled and link is not None and link.heard_age_s > LIMITS.link_age_s
         if is_down:
             yield "link_down"
-        if settled and link is not None and not self._recorded and link.attitude_age_s > 3.0:
+        attitude_age_s = 0.0 if link is None or self._recorded else link.attitude_age_s
+        if settled and attitude_age_s > LIMITS.telemetry_age_s:
             yield "no_telemetry"
         elif "no_telemetry" in self._events.many(now_ns):
             yield "telemetry_gaps"
@@ -152,17 +171,17 @@ class TrackMonitor:
         return 0.0 if self._start is None else self._start.off_m(now_ns)
 
     def reasons(self, now_ns: int) -> Iterator[str]:
-        if abs(self._off_deg) > 20.0:
+        if abs(self._off_deg) > LIMITS.heading_deg:
             yield "heading_mismatch"
-        if abs(self._off_log_scale) > 0.2:
+        if abs(self._off_log_scale) > LIMITS.log_scale:
             yield "height_mismatch"
         if self.start_off_m(now_ns):
             yield "start_mismatch"
         state, low_s = self._state(), self._events.age_s(now_ns, self.confident_ns)
         unavailable = self._publisher.gate.is_unavailable
-        if state in ("lost", "searching") or (state == "coasting" and low_s > 2.0):
+        if state in ("lost", "searching") or (state == "coasting" and low_s > LIMITS.coasting_s):
             yield state
-        elif state != "coasting" and low_s > 10.0 and not unavailable:
+        elif state != "coasting" and low_s > LIMITS.low_confidence_s and not unavailable:
             yield "low_confidence"
         if unavailable:
             yield "unavailable"
@@ -178,7 +197,7 @@ class ProgramMonitor:
         counts = self._events.counts(now_ns)
         if self._map_change() is not None:
             yield "map_file_changed"
-        if counts["internal_error"] > 0.5 * max(counts["processed"], 1):
+        if counts["internal_error"] > LIMITS.error_share * max(counts["processed"], 1):
             yield "internal_errors"
         elif counts["internal_error"]:
             yield "internal_error"
@@ -195,13 +214,13 @@ class OutputMonitor:
         messenger, link = self._publisher.messenger, self._link
         needs_origin = messenger is not None and link is not None and messenger.needs_origin
         has_origin = not needs_origin or (link is not None and link.origin is not None)
-        if events.latency_s(0.95) > 0.5 or "late" in events.many(now_ns):
+        if events.latency_s(0.95) > LIMITS.latency_s or "late" in events.many(now_ns):
             yield "slow"
-        if counts["slow_vision"] > SHARE * WINDOW_S:
+        if counts["slow_vision"] > LIMITS.share * LIMITS.window_s:
             yield "slow_vision"
         if not has_origin and events.is_settled(now_ns):
             yield "no_origin"
-        if has_origin and counts["incomplete"] > SHARE * WINDOW_S:
+        if has_origin and counts["incomplete"] > LIMITS.share * LIMITS.window_s:
             yield "incomplete_message"
         for event, reason in (
             ("output_failed", "output_failed"),
@@ -230,7 +249,7 @@ class StartCheck:
             return
         std_mps = telemetry.vel_std_mps or usual_velocity_std_mps(math.hypot(*velocity))
         self._moved_en_m += np.array(velocity) * seconds
-        self._free_m += SIGMAS * std_mps * seconds
+        self._free_m += LIMITS.start_sigmas * std_mps * seconds
 
     def found(self, fix: Fix, now_ns: int) -> None:
         """Only the first place counts: later an aircraft may have come to any from the start."""
@@ -239,10 +258,11 @@ class StartCheck:
             start_en_m = plane.en_from_latlon(self._start.lat_deg, self._start.lon_deg)
             off_m = float(np.hypot(*(start_en_m + self._moved_en_m)))
             std_m = math.hypot(self._start.std_m, fix.radius_m)
-            self._off_m = off_m if off_m > SIGMAS * std_m + self._free_m else 0.0
+            self._off_m = off_m if off_m > LIMITS.start_sigmas * std_m + self._free_m else 0.0
             self._found_ns = now_ns
 
     def off_m(self, now_ns: int) -> float:
-        """Distance by which the place contradicts the start; 0 within the deviations, and 30 s
-        later."""
-        return self._off_m or 0.0 if now_ns - self._found_ns < 30 * 10**9 else 0.0
+        """Distance by which the place contradicts the start; 0 within the deviations, and once it
+        was shown for `start_shown_s`."""
+        shown_ns = LIMITS.start_shown_s * 1e9
+        return self._off_m or 0.0 if now_ns - self._found_ns < shown_ns else 0.0

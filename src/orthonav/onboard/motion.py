@@ -25,8 +25,6 @@ SIDE_PX = 240
 """Longer side of compared images: corners are found to 0.1 px, 0.03 deg for a usual lens."""
 MIN_CORNERS = 20
 """Corners that must be found again, and at least half of those sought."""
-LONGEST_S = 1.2
-"""Images farther apart are not compared."""
 TURN_STD_RAD, SHIFT_STD = 0.003, 0.004
 """Least standard deviations of differences: attitudes of autopilots jitter by about 0.1 deg, and
 corners are found to 0.1 px where the focal length is 200 px."""
@@ -40,6 +38,17 @@ Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 Corners = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PairInterval:
+    """Time between two images that are compared."""
+
+    min_s: float = 0.08  # closer ones are skipped
+    max_s: float = 1.2  # images farther apart are not compared
+
+
+PAIR_INTERVAL = PairInterval()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +75,8 @@ class PictureOdometry:
 
     def motion(self, grey: Grey, camera: Camera, arrived_ns: int) -> ImageMotion | None:
         """Motion since the image before; None where it is too close, too far away, or differs."""
-        if self._before is not None and 0 <= arrived_ns - self._arrived_ns < 80_000_000:
+        min_ns = PAIR_INTERVAL.min_s * 1e9
+        if self._before is not None and 0 <= arrived_ns - self._arrived_ns < min_ns:
             return None
         share = min(1.0, SIDE_PX / max(grey.shape))
         size = (max(8, round(grey.shape[1] * share)), max(8, round(grey.shape[0] * share)))
@@ -78,7 +88,7 @@ class PictureOdometry:
         self._corners = _corners(small, fitted.mask)
         if before is None or corners is None or before.shape != small.shape:
             return None
-        if not 0 < arrived_ns - start_ns <= LONGEST_S * 1e9:
+        if not 0 < arrived_ns - start_ns <= PAIR_INTERVAL.max_s * 1e9:
             return None
         pairs = _tracked(before, small, corners)
         if pairs is None:

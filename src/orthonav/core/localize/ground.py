@@ -33,7 +33,7 @@ from orthonav.core.localize.view import LIMITS, PreparedView
 from orthonav.core.mapfile.manifest import Lean, SheetInfo, TerrainInfo
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import DEFAULT_AGL_STD
-from orthonav.core.register.pose import SIGMAS, Pose, PosePrior, ScaleMap, rotation
+from orthonav.core.register.pose import COMPARED, Pose, PosePrior, ScaleMap, rotation
 from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
 from orthonav.core.register.window import GreyPyramid, Reference
@@ -189,10 +189,11 @@ class GroundModel:
             own_m = math.sqrt(max(telemetry.agl_std_m**2 - std_m**2, 0.0))
         focal_std = view.view.camera.focal_std
         std = max(math.hypot(own_m / agl_m, focal_std), LIMITS.min_agl_std)
-        reach = min(float(np.abs(values).max()) + SIGMAS * std, SIGMAS * prior.log_scale_std)
+        sigmas = COMPARED.sigmas
+        reach = min(float(np.abs(values).max()) + sigmas * std, sigmas * prior.log_scale_std)
         if std_m / agl_m > std:
-            reach = float(np.abs(values).max()) + SIGMAS * std
-        widest = min(reach / SIGMAS, SAMPLING.max_scale_std)
+            reach = float(np.abs(values).max()) + sigmas * std
+        widest = min(reach / sigmas, SAMPLING.max_scale_std)
         return replace(
             prior,
             log_scale_std=max(widest, LIMITS.min_agl_std),

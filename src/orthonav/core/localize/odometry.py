@@ -40,7 +40,8 @@ class OdometryLimits:
     """Right ones have at least 0.56, wrong ones at most 0.11 (docs/tracking.md)."""
     expected_correlation: float = 0.6
     """An expected displacement that fits this well ends the search (docs/tracking.md)."""
-    expected_steps: int = 5  # of it at each level, at most
+    expected_steps: int = 5  # of it at each level, at most,
+    small_step_px: float = 0.1  # and the step that ends them
     noise_px: float = 0.4  # per axis: in pixels,
     noise_share: float = 0.01  # and as a fraction of its length
     tilt_share: float = 0.6
@@ -358,7 +359,8 @@ def _as_expected(
     x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)
     pose = replace(turned, x_px=float(x), y_px=float(y))
     for level in range(refiner.levels.mid, refiner.levels.final - 1, -1):
-        fit = refiner.refiner(level).place(pose, ODOMETRY.expected_steps, 0.1)
+        steps = ODOMETRY.expected_steps, ODOMETRY.small_step_px
+        fit = refiner.refiner(level).place(pose, *steps)
         pose = fit.pose
     return fit
 

@@ -57,7 +57,17 @@ def even_scale(log_scale: float) -> float:
     return math.exp(log_scale / 2)
 
 
-SIGMAS = 3.0  # scales compared at a place, in standard deviations
+@dataclass(frozen=True)
+class ComparedScales:
+    """Which scales of a bank are compared at a place: those near the scale expected there."""
+
+    sigmas: float = 3.0  # in standard deviations of the expected log scale,
+    step: float = 0.14
+    """and half of this farther: rounded up from the largest step of a bank on terrain (log scale
+    0.13, `policy.SearchPlan.coarse_steps`), so that the nearest of its scales is among them."""
+
+
+COMPARED = ComparedScales()
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +96,7 @@ class ScaleMap:
 
     def reach(self, log_scale: float) -> tuple[float, float]:
         """Least and greatest expected log scale of the places where `log_scale` is compared."""
-        off = SIGMAS * self.std + 0.07  # half a step of the bank farther
+        off = COMPARED.sigmas * self.std + COMPARED.step / 2
         return log_scale - off, log_scale + off
 
 

@@ -8,6 +8,7 @@ import math
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -26,6 +27,17 @@ Array = NDArray[np.float32]
 POSES_AT_ONCE = 6
 PLACES_AT_ONCE = 50
 WIDE = 8  # columns or rows that the kernel transforms together
+
+
+@dataclass(frozen=True)
+class EnergyFloor:
+    """Least values that channels of the map are divided by."""
+
+    share: float = 0.3  # of the typical energy, so that blank ground is not amplified
+    count: float = 0.1  # of the valid share around a pixel, so that none is divided by zero
+
+
+FLOOR = EnergyFloor()
 
 
 def bank(
@@ -134,10 +146,10 @@ def _by_local_energy(channels: Array, counts: Array, view_px: int) -> Array:
     """Root of the mean energy in windows as large as views."""
     energy = np.einsum("ijc,ijc->ij", channels, channels)
     side = min(max(3, view_px // 2), 2 * min(energy.shape) - 1)
-    local = cv2.blur(energy, (side, side)) / np.maximum(cv2.blur(counts, (side, side)), 0.1)
+    valid = np.maximum(cv2.blur(counts, (side, side)), FLOOR.count)
+    local = cv2.blur(energy, (side, side)) / valid
     typical = float(energy.sum() / max(counts.sum(), 1.0))
-    # The floor keeps blank ground from being amplified.
-    return np.asarray(channels / np.sqrt(local + 0.3 * typical + 1e-12)[..., None])
+    return np.asarray(channels / np.sqrt(local + FLOOR.share * typical + 1e-12)[..., None])
 
 
 class SearchWindows:

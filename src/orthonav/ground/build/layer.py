@@ -9,7 +9,7 @@ import logging
 import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -172,8 +172,6 @@ def _jpeg(grey: NDArray[np.uint8]) -> bytes:
 POSTING_M = 10.0
 """Distance of samples; that of the terrain model where it is coarser."""
 TERRAIN_CHUNK_PX = 128
-MAX_SURFACE_M = 3.0
-"""Coarsest surface model: wider samples do not show houses."""
 log = logging.getLogger(__name__)
 
 
@@ -212,16 +210,34 @@ def _no_height(what: str, area: Area, dem: Dem) -> AreaError:
     )
 
 
+@dataclass(frozen=True)
+class SurfaceLimits:
+    """What a surface model must be, and where it shows bare ground; metres."""
+
+    max_gsd_m: float = 3.0  # wider samples do not show houses
+    bare_percent: float = 5.0  # at least so much of a surface is bare ground
+    offset_samples: int = 256  # across the area, that show it
+    max_off_m: float = 10.0
+    """Largest height of bare ground above or below a terrain model of a known datum,"""
+    max_datum_m: float = 120.0
+    """and of an unknown one: heights above ellipsoid and geoid differ by up to 107 m."""
+    envelope_m: float = 2.0  # samples of the lower envelope that stands for bare earth,
+    widest_m: float = 40.0  # without narrower houses and trees
+
+
+SURFACE_LIMITS = SurfaceLimits()
+
+
 class Surface:
     """Heights of surface models, earlier ones before later ones, in the plane of an area."""
 
     def __init__(self, models: Sequence[Dem], area: Area) -> None:
         """Raises `ImageryError` for models that show no houses."""
         for each in models:
-            if each.gsd_m > MAX_SURFACE_M:
+            if each.gsd_m > SURFACE_LIMITS.max_gsd_m:
                 raise ImageryError(
                     f"surface model has a height every {each.gsd_m:.3g} m, which shows no houses; "
-                    f"give it as --dem ({MAX_SURFACE_M:g} m at most): {each.path}"
+                    f"give it as --dem ({SURFACE_LIMITS.max_gsd_m:g} m at most): {each.path}"
                 )
         self.models, self.area = models, area
         self.gsd_m = min(each.gsd_m for each in models)
@@ -243,18 +259,17 @@ class Surface:
 
     def above_m(self, dem: Dem) -> float:
         """Height of bare ground above that of a terrain model, where the datum of either is not
-        known: at least 5 % of a surface are bare. Raises `ImageryError` for more than can be, as
-        with other units."""
+        known. Raises `ImageryError` for more than can be, as with other units."""
         known = all(each.datum.is_known for each in (dem, *self.models))
         west, south, east, north = self.area.extent_en_m
-        posting_m = max(east - west, north - south) / 256
+        posting_m = max(east - west, north - south) / SURFACE_LIMITS.offset_samples
         rows, cols = (max(round(side / posting_m), 1) for side in (north - south, east - west))
         off_m = self.sampled(west, north, posting_m, rows, cols)
         off_m -= dem.in_plane(self.area.frame, west, north, posting_m, rows, cols)
         if not np.isfinite(off_m).any():
             return 0.0
-        low_m = float(np.nanpercentile(off_m, 5))
-        if abs(low_m) > (10.0 if known else 120.0):
+        low_m = float(np.nanpercentile(off_m, SURFACE_LIMITS.bare_percent))
+        if abs(low_m) > (SURFACE_LIMITS.max_off_m if known else SURFACE_LIMITS.max_datum_m):
             raise ImageryError(
                 f"bare ground of the surface lies {low_m:.0f} m above the terrain: check unit and "
                 f"vertical datum of {self.name} and {dem.path.name}"
@@ -267,11 +282,11 @@ class Surface:
     def envelope(
         self, west_m: float, north_m: float, posting_m: float, rows: int, cols: int
     ) -> NDArray[np.float64]:
-        """The same of bare earth: the surface without what is narrower than 40 m, by a
+        """The same of bare earth: the surface without what is narrower than `widest_m`, by a
         morphological opening."""
-        fine = round(posting_m / max(2.0, self.gsd_m))
+        fine = round(posting_m / max(SURFACE_LIMITS.envelope_m, self.gsd_m))
         fine_m = posting_m / fine
-        side = 2 * math.ceil(40.0 / fine_m / 2) + 1
+        side = 2 * math.ceil(SURFACE_LIMITS.widest_m / fine_m / 2) + 1
         shape = rows * fine + 2 * side, cols * fine + 2 * side
         corner = west_m - side * fine_m, north_m + side * fine_m
         heights = self.sampled(*corner, fine_m, *shape).astype(np.float32)

@@ -31,7 +31,7 @@ from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.records import CONFIDENT, Fix, ViewResult
 from orthonav.ground.recordings.flightlog import LoggedFlight
 from orthonav.onboard.motion import (
-    LONGEST_S,
+    PAIR_INTERVAL,
     SHIFT_STD,
     TURN_STD_RAD,
     ImageMotion,
@@ -380,10 +380,10 @@ def _agreed(estimates: list[LatencyEstimate | None], intervals: list[float]) -> 
         "or more or banking every 10 s, and log at least 2 views a second (`orthonav fly --log`)"
     )
     usual_s = float(np.median(intervals)) if intervals else math.inf
-    if usual_s > LONGEST_S / 2:
+    if usual_s > PAIR_INTERVAL.max_s / 2:
         raise FlightError(
             f"views are {usual_s:.1f} s apart; the latency of a camera needs views at most "
-            f"{LONGEST_S / 2:g} s apart: {advice}"
+            f"{PAIR_INTERVAL.max_s / 2:g} s apart: {advice}"
         )
     found, least = [each for each in estimates if each is not None], 3
     if len(found) < least:

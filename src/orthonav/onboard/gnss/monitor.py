@@ -97,17 +97,30 @@ class GnssStatus:
         return 0 if self.reason is None else FAULTS.index(self.reason) + 1
 
 
-SILENCE_S = 3.0
-"""Time without a message after which a receiver counts as lost; streams are 1 to 10 Hz."""
-STILL_S = 3.0
-"""Time with an equal position or timestamp after which a receiver counts as frozen."""
-GAP_S = 2.0
-"""Samples farther apart are not compared with each other."""
-JUMP_M = 15.0
-"""Positions that leave the integrated velocity by more than this within 3 s have jumped: multipath
-makes steps of up to 10 m."""
-VELOCITY_S = 20.0
-"""Span over which velocity and positions are compared."""
+@dataclass(frozen=True)
+class ReceiverLimits:
+    """From where on a receiver has a fault by itself."""
+
+    lost_std_m: float = 50.0
+    """Stated standard deviation from which a position counts as none."""
+    silence_s: float = 3.0
+    """Time without a message after which a receiver counts as lost; streams are 1 to 10 Hz."""
+    still_s: float = 3.0
+    """Time with an equal position or timestamp after which a receiver counts as frozen,"""
+    moving_mps: float = 3.0  # with an equal position only from this speed on
+    gap_s: float = 2.0  # samples farther apart are not compared with each other
+    jump_m: float = 15.0
+    """Positions that leave the integrated velocity by more than this have jumped: multipath makes
+    steps of up to 10 m;"""
+    jump_s: float = 3.0  # within this time
+    acceleration_mps2: float = 10.0
+    """Largest of an aircraft, where the receiver reports no velocity."""
+    velocity_s: float = 20.0  # span over which velocity and positions are compared
+    velocity_std_mps: float = 0.3
+    """Of a constant error of Doppler velocities: those of receivers are 0.05 to 0.2 m/s."""
+
+
+RECEIVER = ReceiverLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,18 +156,19 @@ class Receiver:
             self._latlon_deg, self._moved_ns = latlon, sample.arrived_ns
         if sample.stamp_ns is None or sample.stamp_ns != self._stamp_ns:
             self._stamp_ns, self._stamped_ns = sample.stamp_ns, sample.arrived_ns
-        accurate = not sample.std_m > 50.0
+        accurate = not sample.std_m > RECEIVER.lost_std_m
         self._usable = sample.has_fix and accurate and bool(np.isfinite(en_m).all())
         time_s = sample.time_ns / 1e9
         points = self._points
-        if self._usable and points and -GAP_S < time_s - points[-1].time_s <= 0:
+        if self._usable and points and -RECEIVER.gap_s < time_s - points[-1].time_s <= 0:
             return False  # a repeated solution
-        if not self._usable or (points and not 0 < time_s - points[-1].time_s <= GAP_S):
+        if not self._usable or (points and not 0 < time_s - points[-1].time_s <= RECEIVER.gap_s):
             points.clear()
         if self._usable:
             points.append(self._point(time_s, en_m, sample.vel_en_mps))
-            if points[0].time_s < time_s - 2 * VELOCITY_S:  # rarely: deleting moves the list
-                del points[: bisect_left(points, time_s - VELOCITY_S - GAP_S, key=_time_s)]
+            span_s = RECEIVER.velocity_s
+            if points[0].time_s < time_s - 2 * span_s:  # rarely: deleting moves the list
+                del points[: bisect_left(points, time_s - span_s - RECEIVER.gap_s, key=_time_s)]
         return self._usable
 
     def fault(self, now_ns: int, speed_mps: float) -> Fault | None:
@@ -164,14 +178,14 @@ class Receiver:
         """
         if self._heard_ns is None:
             return None
-        if not self._usable or (now_ns - self._heard_ns) / 1e9 > SILENCE_S:
+        if not self._usable or (now_ns - self._heard_ns) / 1e9 > RECEIVER.silence_s:
             return Fault.LOST
-        if (self._heard_ns - self._stamped_ns) / 1e9 >= STILL_S:
+        if (self._heard_ns - self._stamped_ns) / 1e9 >= RECEIVER.still_s:
             return Fault.FROZEN
         own = self._points[-1].vel_en_mps if self._points else None
         speed_mps = np.fmax(speed_mps, math.nan if own is None else float(np.hypot(*own)))
         still_s = (self._heard_ns - self._moved_ns) / 1e9
-        if still_s >= STILL_S and speed_mps > 3.0:
+        if still_s >= RECEIVER.still_s and speed_mps > RECEIVER.moving_mps:
             return Fault.FROZEN
         return Fault.JUMP if self._has_jumped() else None
 
@@ -211,23 +225,35 @@ class Receiver:
         if last.vel_en_mps is None:
             seconds = last.time_s - points[-2].time_s
             off_m = float(np.hypot(*(last.residual_m - points[-2].residual_m)))
-            return off_m > JUMP_M + 10.0 * seconds**2  # the largest acceleration, m/s2
-        first = points[bisect_left(points, last.time_s - 3.0, key=_time_s)]
-        return float(np.hypot(*(last.residual_m - first.residual_m))) > JUMP_M
+            return off_m > RECEIVER.jump_m + RECEIVER.acceleration_mps2 * seconds**2
+        first = points[bisect_left(points, last.time_s - RECEIVER.jump_s, key=_time_s)]
+        return float(np.hypot(*(last.residual_m - first.residual_m))) > RECEIVER.jump_m
 
 
 def _time_s(point: _Point) -> float:
     return point.time_s
 
 
-RETURN_S = 60.0
-"""Time of agreement after which a return is announced."""
-CLEAR_S = 2.0
-"""Time without a fault of the receiver after which its alarm ends."""
-RECENT_S = 10.0
-"""Differences of this time are averaged for what is reported and for agreement."""
-AGREE_SIGMAS = 2.0
-"""GNSS agrees within this many standard deviations, at least 10 m."""
+@dataclass(frozen=True)
+class AgreementLimits:
+    """When GNSS and map agree, and when a change is attributed to the map."""
+
+    return_s: float = 60.0  # time of agreement after which a return is announced
+    clear_s: float = 2.0  # time without a fault of the receiver after which its alarm ends
+    recent_s: float = 10.0
+    """Differences of this time are averaged for what is reported and for agreement."""
+    sigmas: float = 2.0  # GNSS agrees within this many standard deviations,
+    min_m: float = 10.0  # and always within this distance
+    before_s: float = 5.0
+    """Values so long before the onset of a fault show what GNSS has to agree with after it."""
+    map_jump_m: float = 15.0
+    """The map jumped where its position leaves the track's velocity by more than this distance"""
+    map_jump_sigmas: float = 3.0  # and this many standard deviations together
+    map_jump_s: float = 60.0
+    """A change so soon after a jump of the map is not attributed to GNSS."""
+
+
+AGREEMENT = AgreementLimits()
 _LEFT = {
     Fault.JUMP: Fault.STEP,
     Fault.LOST: Fault.OFFSET,
@@ -319,7 +345,7 @@ class GnssMonitor:
                 continue
             earlier, earlier_m = self._solved[max(after - 1, 0)]
             interval_ns = sample.time_ns - earlier.time_ns
-            if interval_ns / 1e9 > GAP_S:
+            if interval_ns / 1e9 > RECEIVER.gap_s:
                 continue
             ahead_ns = position.time_ns - earlier.time_ns
             weight = ahead_ns / interval_ns if interval_ns else 1.0
@@ -361,10 +387,10 @@ class GnssMonitor:
             self._window.widen(rolling_m)
             self._learner.widen(rolling_m)
         self._window.add(value)
-        recent = self._window.recent(RECENT_S)
+        recent = self._window.recent(AGREEMENT.recent_s)
         east, north = np.mean([each.en_m for each in recent], axis=0).tolist()
         self.status = replace(self.status, difference_en_m=(east, north))
-        if (now_ns - self._fault_ns) / 1e9 < CLEAR_S:
+        if (now_ns - self._fault_ns) / 1e9 < AGREEMENT.clear_s:
             return  # the receiver has a fault by itself
         if self.status.state in (GnssState.WAITING, GnssState.GOOD):
             found = (
@@ -381,7 +407,7 @@ class GnssMonitor:
 
     def _count_agreement(self, recent: list[Difference], value: Difference, now_ns: int) -> None:
         anchor = self._learner.learnt if self.status.state is GnssState.GOOD else self._anchor
-        limit_m = max(10.0, AGREE_SIGMAS * self._std_m(value, anchor))
+        limit_m = max(AGREEMENT.min_m, AGREEMENT.sigmas * self._std_m(value, anchor))
         if self.status.state is GnssState.WAITING and anchor.agreed_s == 0:
             limit_m = max(limit_m, LARGEST_M)  # nothing is known of the map
         if float(np.hypot(*_residual(recent, anchor))) > limit_m:
@@ -395,9 +421,9 @@ class GnssMonitor:
                 self._enter(GnssState.ALARM, now_ns)
             return
         self._agreed_s += 1.0
-        if self.status.state is GnssState.ALARM and self._agreed_s >= RECENT_S:
+        if self.status.state is GnssState.ALARM and self._agreed_s >= AGREEMENT.recent_s:
             self._enter(GnssState.RETURNING, now_ns)
-        if self.status.state is not GnssState.GOOD and self._agreed_s >= RETURN_S:
+        if self.status.state is not GnssState.GOOD and self._agreed_s >= AGREEMENT.return_s:
             self._enter(GnssState.GOOD, now_ns)
             self.status = replace(self.status, fault=None, fault_en_m=(math.nan, math.nan))
 
@@ -408,8 +434,8 @@ class GnssMonitor:
             if fault is Fault.OFFSET:
                 self._learner.restore()
             is_old = found is not None and found.fault is Fault.OFFSET
-            # Values so long before the onset show what GNSS has to agree with after it.
-            self._anchor = self._learner.until(-math.inf if is_old else begin_s - 5.0)
+            until_s = -math.inf if is_old else begin_s - AGREEMENT.before_s
+            self._anchor = self._learner.until(until_s)
         if self.status.state is GnssState.ALARM and (
             self.status.fault is fault or (fault is Fault.JUMP and self.status.fault is Fault.STEP)
         ):
@@ -432,7 +458,7 @@ class GnssMonitor:
 
     def _attributed(self, found: Finding, now_ns: int) -> Fault:
         jumped = self._map_jump_ns
-        if jumped is not None and (now_ns - jumped) / 1e9 <= 60.0:
+        if jumped is not None and (now_ns - jumped) / 1e9 <= AGREEMENT.map_jump_s:
             return Fault.DISAGREES
         return found.fault
 
@@ -440,7 +466,7 @@ class GnssMonitor:
         others = self._learner.learnt.without_displacement()
         east, north = _residual(recent, others).tolist()
         off_m, std_m = math.hypot(east, north), self._std_m(value, others)
-        if len(recent) < RECENT_S / 2 or off_m < LARGEST_M + AGREE_SIGMAS * std_m:
+        if len(recent) < AGREEMENT.recent_s / 2 or off_m < LARGEST_M + AGREEMENT.sigmas * std_m:
             return None
         begin_s = self._window.values[0].time_s
         return Finding(Fault.OFFSET, begin_s, (east, north))
@@ -461,10 +487,9 @@ class GnssMonitor:
         return math.sqrt(known.variance_m2(value.design) + gnss_m**2 + value.map_std_m**2)
 
     def _velocity_fault(self) -> Fault | None:
-        gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-VELOCITY_S / GNSS_TAU_S))
-        # Constant errors of Doppler velocities are 0.05 to 0.2 m/s.
-        drift_m2 = (0.3 * VELOCITY_S) ** 2
-        own_m = self._receiver.residual_over(VELOCITY_S)
+        gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-RECEIVER.velocity_s / GNSS_TAU_S))
+        drift_m2 = (RECEIVER.velocity_std_mps * RECEIVER.velocity_s) ** 2
+        own_m = self._receiver.residual_over(RECEIVER.velocity_s)
         if own_m > MULTIPATH_M + FAULT_SIGMAS * math.sqrt(gnss_m2 + drift_m2):
             return Fault.VELOCITY
         return None
@@ -474,7 +499,7 @@ class GnssMonitor:
         last = self._map
         if last is None or last.vel_en_mps is None:
             return math.nan
-        if (now_ns - last.time_ns) / 1e9 > GAP_S:
+        if (now_ns - last.time_ns) / 1e9 > RECEIVER.gap_s:
             return math.nan
         return float(np.hypot(*last.vel_en_mps))
 
@@ -482,11 +507,12 @@ class GnssMonitor:
 def _jumped(before: MapPosition, now: MapPosition) -> bool:
     seconds = (now.time_ns - before.time_ns) / 1e9
     velocities = [v for v in (before.vel_en_mps, now.vel_en_mps) if v is not None]
-    if not 0 < seconds <= GAP_S or not velocities:
+    if not 0 < seconds <= RECEIVER.gap_s or not velocities:
         return False
     moved = np.mean(velocities, axis=0) * seconds
     off_m = float(np.hypot(*(now.en_m - before.en_m - moved)))
-    return off_m > 15.0 + 3.0 * max(before.std_m, now.std_m)
+    std_m = max(before.std_m, now.std_m)
+    return off_m > AGREEMENT.map_jump_m + AGREEMENT.map_jump_sigmas * std_m
 
 
 def _residual(values: list[Difference], known: Biases) -> Array:
