@@ -123,11 +123,11 @@ class Flight:
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()
         start, fresh = options.pop("start", lambda: None), options.pop("fresh", None)
-        gnss = options.pop("gnss", None)
+        gnss, camera = options.pop("gnss", None), options.pop("camera", CAMERA)
         locators = iter([self.locator, fresh])
         self.runner = Runner(
             self.newest,
-            CAMERA,
+            camera,
             lambda: next(locators),
             publisher,
             FlyOptions(**options),
@@ -428,6 +428,22 @@ def test_unusable_images_give_no_fix(flight, kind):
     assert "bad_images" in flight.reasons()
     flight.view()
     assert flight.gate.resets == 0  # an interruption is no jump
+
+
+def test_a_view_that_is_blank_beside_the_mask_of_the_camera_is_a_bad_image(begin):
+    """What is behind the mask, as a landing gear, does not make a picture of fog usable."""
+    gear = np.full((240, 320), 255, np.uint8)
+    gear[120:] = 0
+    flight = begin(camera=CAMERA.masked(gear))
+    grey = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
+    assert reason_of(flight.views(2)[1]) == "fix"
+    grey[:120] = 120
+    results = flight.views(30, grey=grey)
+    assert {reason_of(each) for each in results} == {"blank"}
+    assert flight.runner.counter.total["bad_image"] == 30
+    assert "bad_images" in flight.reasons()
+    large = np.repeat(np.repeat(grey, 2, axis=0), 2, axis=1)
+    assert reason_of(flight.view(large)) == "blank"  # the mask is that of its size
 
 
 def test_an_image_of_other_proportions_fails_and_one_of_another_size_does_not(flight):

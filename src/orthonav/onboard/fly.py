@@ -44,6 +44,7 @@ from orthonav.onboard.monitors import (
     ProgramMonitor,
     TrackMonitor,
 )
+from orthonav.onboard.motion import PAIR_INTERVAL, Grey
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, VehicleState
@@ -57,6 +58,22 @@ MAX_AGE_S = 0.5
 TELEMETRY_WAIT_S = 0.15
 """Longest wait for telemetry after the exposure: three attitudes at 20 Hz, the least rate."""
 Velocity = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class LoopParameters:
+    """Of the clocks, the log of withheld views, and the error of the latency."""
+
+    utc_jump_s: float = 0.2
+    """UTC that moves by more than this against the monotonic clock within a second was set."""
+    withheld_s: float = PAIR_INTERVAL.min_s
+    """Withheld views are logged at most so often: `orthonav calibrate --latency` compares them."""
+    assumed_mps: float = 20.0
+    """Speed, usual for small aircraft, that turns an error of the latency into a distance where
+    none is known."""
+
+
+LOOP = LoopParameters()
 
 
 @dataclass(frozen=True)
@@ -184,19 +201,14 @@ class Runner:
             exposed_ns, time_ns = image.exposed_ns - delay_ns, image.time_ns - delay_ns
             image = replace(image, exposed_ns=exposed_ns, time_ns=time_ns)
         self._restart_after_jump(image.time_ns)
-        refused = self._map_changed() or self._bad_image(image)
-        if refused is not None or image.grey is None:
-            unusable = refused or NoFix("bad_image", "no image")
-            if latency is not None and unusable.reason == "frozen_image":
+        usable = self._map_changed() or self._usable(image)
+        if isinstance(usable, NoFix):
+            if latency is not None and usable.reason == "frozen_image":
                 latency.frozen(arrived_ns)
-            return self._refused(image, unusable, VehicleState(None))
-        try:
-            camera = fitted(self._camera, image.grey.shape[1], image.grey.shape[0], image.frame)
-        except CameraError as error:
-            wrong = self._refusal("wrong_camera", "wrong_camera", str(error))
-            return self._refused(image, wrong, VehicleState(None))
+            return self._refused(image, usable, VehicleState(None))
+        grey, camera = usable
         vehicle, telemetry = self._telemetry(image)
-        view = View(image.grey, camera, telemetry)
+        view = View(grey, camera, telemetry)
         try:
             if latency is not None and not latency.may_locate:
                 return self._withheld(image, view, vehicle, latency)
@@ -207,7 +219,7 @@ class Runner:
         finally:
             if latency is not None and self._link is not None:
                 reported = self._link.state_at, self._link.covered_ns
-                latency.observe(arrived_ns, image.grey, camera, *reported)
+                latency.observe(arrived_ns, grey, camera, *reported)
 
     def _restart_after_jump(self, time_ns: int) -> None:
         """Begin again where a recorded image is earlier than the one before by over a second: it
@@ -235,7 +247,7 @@ class Runner:
         reason = latency.reasons()[0]
         self._count(reason)
         result = self._result(image, NoFix(reason, latency.detail()), math.nan)
-        if image.exposed_ns - self._withheld_ns >= 80_000_000:
+        if image.exposed_ns - self._withheld_ns >= LOOP.withheld_s * 1e9:
             self._withheld_ns = image.exposed_ns
             self._log_view(image, view, withheld=True)
             self._log(lambda sink: sink.result(result))
@@ -364,19 +376,25 @@ class Runner:
         change = self.options.map_change()
         return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
 
-    def _bad_image(self, image: CameraImage) -> NoFix | None:
-        if image.grey is None:
+    def _usable(self, image: CameraImage) -> tuple[Grey, Camera] | NoFix:
+        """Picture, with the camera at its size."""
+        grey = image.grey
+        if grey is None:
             self._count("bad_image")
             return image.problem or NoFix("bad_image", "image could not be decoded")
-        shown = check_picture(image.grey)
-        repeat = self._frozen.is_repeat(image.grey)
+        repeat = self._frozen.is_repeat(grey)
+        try:
+            camera = fitted(self._camera, grey.shape[1], grey.shape[0], image.frame)
+        except CameraError as error:
+            return self._refusal("wrong_camera", "wrong_camera", str(error))
+        shown = check_picture(grey, camera.mask)
         if shown is not None:
             self._count("bad_image")
             return shown
         if repeat:
             detail = f"{self._frozen.repeats + 1} identical images in a row"
             return self._refusal("frozen", "frozen_image", detail)
-        return None
+        return grey, camera
 
     def _telemetry(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
         if self.options.recorded or self._link is None:
@@ -485,7 +503,7 @@ class Runner:
         }
         self.counter.follow(now_ns, totals)
         ahead_ns = self._clocks.utc_ns() - self._clocks.mono_ns()
-        if abs(ahead_ns - self._utc_ahead_ns) > 200_000_000:
+        if abs(ahead_ns - self._utc_ahead_ns) > LOOP.utc_jump_s * 1e9:
             self._count("clock_jump")
         self._utc_ahead_ns = ahead_ns
 
@@ -538,12 +556,13 @@ def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
     """Fix whose covariance and confidence include the distance flown in the standard deviation of
-    the latency; where the velocity is not known, at 20 m/s in all directions."""
+    the latency; where the velocity is not known, at `assumed_mps` in all directions."""
     evidence = fix.evidence
     own = evidence.get("vel_east_mps", math.nan), evidence.get("vel_north_mps", math.nan)
     velocity = np.array(telemetry.vel_en_mps or own)
     if not np.isfinite(velocity).all():
-        return fix.with_covariance(fix.cov_en_m2 + (std_s * 20.0) ** 2 * np.eye(2))
+        off_m = std_s * LOOP.assumed_mps
+        return fix.with_covariance(fix.cov_en_m2 + off_m**2 * np.eye(2))
     return fix.with_covariance(fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
 
 
