@@ -300,7 +300,8 @@ def _rules(scene: Scene, localizer: Localizer, seen: Grounds) -> dict[str, Any]:
     """Views within 15 m by each rule of position, with scalar product and cosine.
 
     "We use the position of the reference embedding leading to the highest scalar product, as we
-    observed that it yields better results than the weighted average" (section Methodology).
+    observed that (in our setting) it yields better results than the weighted average" (section
+    Methodology).
     """
     placer, gsd_m, agl_m = localizer.tiles, localizer.grid.gsd_m, scene.trajectory.agl_m
     camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)

@@ -2,7 +2,7 @@
 
 The paper's numbers of views are those of tile steps along its trajectories, and its figures at 15 m
 can only be had where views lie on the tile grid. So every figure here comes for views *along the
-route*, one per tile step, for views *on the grid* all over the search band, and *anywhere*.
+route*, at most one per tile step, for views *on the grid* all over the search band, and *anywhere*.
 """
 
 import math
@@ -38,7 +38,7 @@ from orthonav.ground.simulate.render import ViewEffects, render_view
 Array = NDArray[np.float64]
 SEED = 1
 AGL_M = 2000.0
-"""Told height over imagery that no trajectory of the paper is flown over; any would do."""
+"""Reported height over imagery that no trajectory of the paper is flown over; any would do."""
 REAL = {
     "naip-2012": ("naip", "20090818", "20120731"),
     "naip-2018": ("naip", "20090818", "20180716"),
@@ -178,7 +178,7 @@ def _box_deg(frame: LocalFrame, low: Array, high: Array) -> tuple[float, float, 
 VIEW_SEED = 7
 PLACEMENTS = ("route", "grid", "anywhere")
 NO_EFFECTS = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
-HEADING_TOLD_DEG = 0.001
+REPORTED_HEADING_STD_DEG = 0.001
 """With this deviation only the reported heading is tried."""
 
 
@@ -273,5 +273,5 @@ def view_of(
 def telemetry_at(agl_m: float, *, exact: bool = True) -> Telemetry:
     """Telemetry of every view: north up, nominal height, straight down without an error of pitch
     and roll; `exact` tries no other heading."""
-    std = HEADING_TOLD_DEG if exact else None
+    std = REPORTED_HEADING_STD_DEG if exact else None
     return Telemetry(0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=std, tilt_std_deg=0.0)

@@ -93,7 +93,7 @@ def scenes(results: Sequence[Result]) -> list[Table]:
     )
     notes = (
         "upper bound: accuracy at 15 m, anywhere, of a method that always finds the correct tile; "
-        "views: along the route (one per tile step), on the grid of tiles, anywhere",
+        "views: along the route (at most one per tile step), on the grid of tiles, anywhere",
     )
     return [Table("Table 1: trajectories and scenes", header, rows, notes)] if rows else []
 

@@ -109,7 +109,7 @@ def weighed(counts: NDArray[Any], idf: NDArray[Any], similarity: str, tfidf: int
 
 def placed(scores: Array, correct: Sequence[int], centres_en_m: NDArray[Any]) -> dict[str, Any]:
     """Views within 15 m of all, by scores (V, N), and the median share of tiles above the correct
-    one, 0 to 1: a half for a guess."""
+    one, 0 to 1: a half by chance."""
     away = np.hypot(*(centres_en_m[scores.argmax(axis=1)] - centres_en_m[correct]).T)
     own = scores[np.arange(len(correct)), correct]
     above = (scores > own[:, None]).mean(axis=1)
@@ -138,7 +138,7 @@ def table() -> Table:
     notes = (
         "views on the grid: accuracy at 15 m in % with its standard error; features: most SIFT "
         "features of a picture; tiles above: median share of the tiles with a higher score than "
-        "the correct one, in %, 50 for a guess",
+        "the correct one, in %, 50 by chance",
         "SIFT features of a view whose most similar feature of the tile is within 3 px, in %, same "
         f"date / other date / another tile: {'; '.join(again)}",
         f"made by `{found[0]['command']}` at {about['commit'][:10]}, {about['date'][:10]}",

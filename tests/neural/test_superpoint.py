@@ -10,7 +10,7 @@ import torch
 import transformers
 
 from orthonav.core.errors import MissingFileError, VariantError
-from orthonav.research.pretrained import SuperPoint
+from orthonav.research.superpoint import SuperPoint
 
 BORDER_PX = 4
 

@@ -147,3 +147,42 @@ def test_triplet_loss_of_three_embeddings(margin, loss):
     apart = torch.tensor([[False, True], [False, False]])  # the second has no negative
     anchors, positives = torch.stack([anchor, negative]), torch.stack([positive, negative])
     assert float(triplet_loss(anchors, positives, apart, margin=margin, semi_hard=False)) == loss
+
+
+@pytest.mark.parametrize("semi_hard, rows", [(False, [1, 0, 1]), (True, [2, 0, 0])])
+def test_the_hardest_negative_is_the_nearest_one(semi_hard, rows):
+    """At 0, 1 and 3 on a line; semi-hard: squared distances above 4, where there are any."""
+    import torch
+
+    from orthonav.research.triplet import hard_negatives
+
+    anchors = torch.tensor([[0.0], [1], [3]])
+    near, apart = torch.full((3,), 4.0), ~torch.eye(3, dtype=torch.bool)
+    made = hard_negatives(anchors, near, apart, semi_hard=semi_hard)
+    assert made.tolist() == rows
+
+
+def test_words_are_the_centres_of_clusters():
+    """Of descriptors 0, 2, 10 and 12: the means 1 and 11."""
+    from orthonav.research import words as learning
+
+    faiss = pytest.importorskip("faiss")
+    drawn = np.array([[0], [2], [10], [12]], np.float32)
+    centres = learning._clustered(faiss, drawn, 2, 0, lambda share: None)
+    assert sorted(centres.ravel().tolist()) == [1, 11]
+
+
+@pytest.mark.parametrize(
+    "recipe, kind, later", [(AutoEncoderRecipe(), "AdamW", 1.5e-4), (TripletRecipe(), "Adam", 1e-3)]
+)
+def test_the_rate_of_the_auto_encoder_is_halved_on_a_plateau(recipe, kind, later):
+    """ "AdamW", "ReduceLROnPlateau [..] with a factor of 0.5", "Adam"; the loss does not fall."""
+    import torch
+
+    from orthonav.research.training import TrainingState
+
+    state = TrainingState(torch.nn.Linear(1, 1), recipe, torch.amp.GradScaler(enabled=False))
+    for _ in range(12):
+        state.end_epoch(0.5)
+    assert type(state.optimizer).__name__ == kind
+    assert state.optimizer.param_groups[0]["lr"] == pytest.approx(later)

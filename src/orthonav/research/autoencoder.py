@@ -11,6 +11,8 @@ The text leaves kernels and widths open. The count comes out exactly with stride
 3 x 3 and widths 64, 128, 256, 512, 512: five, as in the authors' released code, not four; a dense
 layer from 8 x 8 x 512 to 1024 numbers and one back to 16 x 16 x 512; and transposed convolutions of
 2 x 2 to 256, 128, 64 and 1 channels, each but the last normalized and rectified.
+
+Its parameters are those of `core.tiles.network.AutoEncoderRecipe`.
 """
 
 from itertools import pairwise

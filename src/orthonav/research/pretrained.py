@@ -1,23 +1,15 @@
-"""Pretrained networks from Hugging Face folders, and SuperPoint (DeTone et al., CVPRW 2018).
+"""Pretrained networks of the `transformers` library (Apache-2.0), from Hugging Face folders.
 
-SuperPoint is the second detector of the bag of words in Di Piazza et al. 2024, section Methodology,
-Considered methods. The network is that of the `transformers` library (Apache-2.0). Its weights are
-not part of orthonav and it never downloads them: their licence forbids commercial use. They are
-published as `magic-leap-community/superpoint` on the Hugging Face hub. This module needs PyTorch.
-It never flies.
+Nothing is downloaded: weights are taken by path. This module needs PyTorch and never flies.
 """
 
 import importlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError
 
 from orthonav.core.errors import MissingFileError, VariantError
@@ -27,73 +19,6 @@ try:
     import torch
 except ImportError as error:
     raise missing_extra("a neural network", "train", "torch", error) from error
-
-CELL_PX = 8
-DIMS = 256
-WHERE = (
-    "the folder of magic-leap-community/superpoint (config.json and model.safetensors) from the "
-    "Hugging Face hub; mind its licence, which forbids commercial use"
-)
-
-
-@dataclass(frozen=True)
-class SuperPoint:
-    """Keypoints and descriptors of grey pictures.
-
-    Thresholds are those of the folder's config.json.
-
-    - `weights`: path of a Hugging Face folder.
-    - `max_points`: largest number of points per picture, the strongest first; 0 for all.
-    - `device`: "auto" (a GPU if there is one), "cpu" or "cuda".
-    """
-
-    weights: str = ""
-    max_points: int = 0
-    device: str = "auto"
-
-    def __post_init__(self) -> None:
-        if not self.weights:
-            raise VariantError(f"superpoint needs weights=PATH: {WHERE}")
-        if self.max_points < 0:
-            raise VariantError(f"superpoint max_points must be 0 or more, got {self.max_points}")
-        require_device(self.device)
-
-    def describe(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Points (N, 2) and unit descriptors (N, 256) of a picture (H, W), strongest first.
-
-        A point is (x, y) in pixels from the outer corner of the first pixel, whose centre is
-        (0.5, 0.5). A picture without keypoints gives N = 0. Raises `MissingFileError` or
-        `VariantError` where the weights are missing or not SuperPoint's.
-        """
-        device = chosen_device(self.device)
-        model = _model(self.weights, weights_stamp(self.weights, WHERE), str(device))
-        height, width = grey.shape
-        padded = np.pad(grey, ((0, _padding(height)), (0, _padding(width))), mode="edge")
-        pixels = torch.from_numpy(padded.astype(np.float32) / np.float32(255)).to(device)
-        with torch.inference_mode():
-            found = model(pixels[None, None].expand(1, 3, -1, -1))
-        size = torch.tensor([padded.shape[1], padded.shape[0]], device=device)
-        points = (found.keypoints[0] * size).round().cpu().numpy()
-        # The library clears its border on the left and at the top only.
-        border = model.config.border_removal_distance
-        inside = (points[:, 0] < width - border) & (points[:, 1] < height - border)
-        inside &= found.mask[0].cpu().numpy() > 0
-        order = np.flatnonzero(inside)
-        scores = found.scores[0].cpu().numpy()[order]
-        order = order[np.argsort(-scores, kind="stable")][: self.max_points or None]
-        descriptors = found.descriptors[0].cpu().numpy()[order]
-        return (points[order] + 0.5).astype(np.float32), descriptors.astype(np.float32)
-
-
-def _padding(size: int) -> int:
-    """Padding in pixels up to a multiple of the network's cell, and to two cells at least."""
-    return max(-size % CELL_PX, 2 * CELL_PX - size)
-
-
-@lru_cache(maxsize=1)
-def _model(weights: str, stamp: tuple[int, ...], device: str) -> Any:
-    del stamp  # part of the key only: files may change
-    return pretrained(weights, "superpoint", "SuperPointForKeypointDetection").to(device)
 
 
 def require_device(device: str) -> None:

@@ -10,6 +10,8 @@ Model), which is FaceNet's (Schroff et al., CVPR 2015).
 The paper leaves open the margin alpha, how negatives are mined and where a training set of one year
 gets its positives. Here the margin is 1 by default, negatives are other places in the batch, and
 positives are the same tiles of further dates or simulated ageing.
+
+Its parameters are those of `core.tiles.network.TripletRecipe`.
 """
 
 from collections.abc import Callable, Sequence

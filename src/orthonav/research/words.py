@@ -50,7 +50,7 @@ class SuperPointDetector:
 
     def __call__(self, grey: Grey) -> tuple[Array, Array, Array]:
         """Points (N, 2) from the outer corner, radii (N,) and unit descriptors (N, 256)."""
-        from orthonav.research.pretrained import SuperPoint  # only here is PyTorch needed
+        from orthonav.research.superpoint import SuperPoint  # only here is PyTorch needed
 
         points, descriptors = SuperPoint(self.weights, max_points=self.most).describe(grey)
         radii = np.full(len(points), SUPERPOINT_RADIUS_PX, dtype=np.float32)
