@@ -98,15 +98,13 @@ class Tracker:
         use_prior: bool = True,
         every_prior: bool = False,
         smooth: bool = False,
-        lag: int | None = None,
         area_m2: float = 0.0,
     ) -> None:
         """`localizer`: or an opened map. `model`: None: the usual one, with a mount as good as the
         height asks for. `area_m2`: where the aircraft may be, if that is more than the map.
 
         With `use_prior` the track starts at the first view's prior; with `every_prior` all priors
-        are position measurements, such as GNSS. `smooth` records the history for `smoothed_track`;
-        with `lag` each view is smoothed over those before it and so many after it.
+        are position measurements, such as GNSS. `smooth` records the history for `smoothed_track`.
 
         Raises `MapFileError` where the map has no registration layer or no confidence."""
         if not isinstance(localizer, Localizer):
@@ -125,9 +123,7 @@ class Tracker:
         self._whole_map = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if smooth else None
-        self._lag = lag
         self._outcomes: list[tuple[Fix | NoFix, Telemetry]] = []
-        self._lagged: list[Fix | NoFix] = []
         self.state = State.SEARCHING
 
     def _use(self, localizer: Localizer) -> tuple[float, float, float, float]:
@@ -233,12 +229,8 @@ class Tracker:
         """Positions at all views so far, each estimated from the views after it too."""
         if self._history is None:
             raise ValueError("smoothing needs a tracker made with smooth=True")
-        left = len(self._outcomes) - len(self._lagged)
-        smoothed = self._history.smoothed(left) if left else []
-        return self._lagged + [
-            self._smoothed_fix(*pair)
-            for pair in zip(smoothed, self._outcomes[len(self._lagged) :], strict=True)
-        ]
+        smoothed = self._history.smoothed()
+        return [self._smoothed_fix(*pair) for pair in zip(smoothed, self._outcomes, strict=True)]
 
     def _smoothed_fix(
         self, smoothed: Smoothed | None, filtered: tuple[Fix | NoFix, Telemetry]
@@ -274,18 +266,10 @@ class Tracker:
             outcome = self._fix(mean, covariance, place, telemetry, more)
             if not self._heading_known:
                 outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
-        if self._history is not None:
-            self._record(self._history, outcome, telemetry)
+        if self._history is not None:  # once, also where an error makes `passed` begin again
+            self._history.record(self.mixture, len(self._outcomes))
+            self._outcomes.append((outcome, telemetry))
         return outcome
-
-    def _record(self, history: History, outcome: Fix | NoFix, telemetry: Telemetry) -> None:
-        """For the smoother; once, also where an error in here makes `passed` begin again."""
-        seen, lag = len(self._outcomes), self._lag
-        if lag is not None and len(self._lagged) < seen - lag:
-            smoothed = history.smoothed(lag + 1)[0]
-            self._lagged.append(self._smoothed_fix(smoothed, self._outcomes[-lag - 1]))
-        history.record(self.mixture, seen)
-        self._outcomes.append((outcome, telemetry))
 
     def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
         """NaN where the view was not registered at the fix."""
