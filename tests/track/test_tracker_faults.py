@@ -53,7 +53,7 @@ def seen():
 @pytest.fixture(scope="module")
 def confirmed(localizer, seen):
     """A tracker before the first broken view, and its last position; not to be changed."""
-    tracker = Tracker(localizer, smooth=True, lag=2)
+    tracker = Tracker(localizer, smooth=True)
     rows = results(tracker, seen[:FIRST])
     assert all(result.is_recognized for result, _ in rows[-2:])
     return tracker, rows[-1][0]
@@ -66,7 +66,7 @@ def tracker(localizer, confirmed):
 
 def copied(localizer, confirmed):
     tracker, _ = confirmed
-    shared = (localizer, localizer.registration, tracker._before)
+    shared = (localizer, localizer.registration, tracker._past)
     return copy.deepcopy(tracker, {id(each): each for each in shared})
 
 
@@ -118,7 +118,7 @@ def expected_m(seen, number):
 
 
 PARTS_OF_A_VIEW = [
-    *[(Tracker, name) for name in ("locate", "_predict", "_update", "_outcome", "_fix")],
+    *[(Tracker, name) for name in ("locate", "_predict", "_step", "_update", "_outcome", "_fix")],
     *[(Mixture, name) for name in ("predict", "update", "estimate", "_merge")],
     *[(History, name) for name in ("record", "smoothed")],
 ]
