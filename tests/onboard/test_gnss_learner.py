@@ -115,7 +115,7 @@ def test_values_wait_in_quarantine_and_an_alarm_discards_them():
         learner.add(difference(second, true=2 * TRUE))
     assert learner.learnt.agreed_s == 0 and not learner.learnt.mean.any()
     assert learner.until(math.inf).en_m @ TRUE[:2] > 500  # a comparison uses them
-    learner.discard()
+    learner.waiting.clear()
     for second in range(200, 450):
         learner.add(difference(second, true=np.zeros(5)))
     assert 0 < learner.learnt.agreed_s < 100

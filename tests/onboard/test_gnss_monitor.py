@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from benchmarks.gnss_watch import FRAME, MAPS, delay, false_alarms, fed, lawnmower, map_positions
 
-from orthonav.core.flight.gnss import GnssSample
+from orthonav.core.flight.gnss import Fault, GnssSample
 from orthonav.ground.simulate.receiver import receiver_of, solutions
 from orthonav.onboard.gnss.biases import (
     Biases,
     Difference,
     DifferenceWindow,
-    Fault,
     _Filter,
     unknown,
 )

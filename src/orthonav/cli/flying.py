@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -37,7 +38,7 @@ from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases
-from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
+from orthonav.onboard.gnss.watch import GnssWatch
 from orthonav.onboard.latency import MIN_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.gate import Gate, GateRules
@@ -249,12 +250,13 @@ class _Setup:
         options, clocks = self.options, self.clocks
         recorded = options.recorded_telemetry and not options.ros2
         if recorded:
-            solutions = recorded_solutions(read_gnss(Path(options.source) / FILE))
+            recording = read_gnss(Path(options.source) / FILE)
+            solutions = deque(sorted(recording, key=lambda each: each.arrived_ns))
         else:
             heard: Any = source if options.ros2 else self.link
             if heard is None:
                 raise UsageError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
-            solutions = live_solutions(heard.gnss)
+            solutions = heard.gnss
         used = camera, options.mount_deg, self.fly.mount, _stated(options.camera_latency_ms)
         return GnssWatch(
             self.localizer.sheet.frame,
