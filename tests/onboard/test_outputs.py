@@ -203,9 +203,9 @@ def test_nmea_over_udp():
         heard.bind(("127.0.0.1", 0))
         heard.settimeout(60)
         out = NmeaOut(open_sink(f"udp:127.0.0.1:{heard.getsockname()[1]}"))
-        out.write(ESTIMATE, UTC_NS, 0.9)
+        out.write(ESTIMATE, UTC_NS)
         gga, rmc, gst = sentences(heard.recv(500))
-        out.write(None, UTC_NS, 0.9)
+        out.write(None, UTC_NS)
         none, *_ = sentences(heard.recv(500))
         out.close()
     assert (gga.msgID, rmc.msgID, gst.msgID) == ("GGA", "RMC", "GST")
@@ -218,13 +218,13 @@ def test_nmea_over_a_serial_port_that_is_unplugged():
     ours, theirs = pty.openpty()
     name = os.ttyname(theirs)
     out = NmeaOut(open_sink(f"serial:{name}:115200"))
-    out.write(ESTIMATE, UTC_NS, 0.9)
+    out.write(ESTIMATE, UTC_NS)
     assert sentences(os.read(ours, 500))[0].quality == 6
     os.close(theirs)
     os.close(ours)
     for _ in range(2):
         with pytest.raises(OSError):
-            out.write(ESTIMATE, UTC_NS, 0.9)
+            out.write(ESTIMATE, UTC_NS)
     out.close()
 
 

@@ -202,7 +202,6 @@ class _Setup:
             reader.now_ns,
             origin_alt_m=origin[2] if origin else math.nan,
             min_std_m=options.min_std_m,
-            min_confidence=self._min_sent,
             silent=options.dry_run,
         )
         reader.report_wait = lambda why: publisher.health(
@@ -223,7 +222,6 @@ class _Setup:
                 kinds=_kinds(options),
                 gps_id=options.gps_id,
                 min_std_m=options.min_std_m,
-                min_confidence=self._min_sent,
                 origin=Origin(*options.origin) if options.origin else None,
             )
         # ROS 2 names what it waits for itself.
@@ -240,7 +238,6 @@ class _Setup:
             nmea=nmea,
             lines=[*lines, narrator],
             graph=graph,
-            min_confidence=self._min_sent,
             min_std_m=options.min_std_m,
         )
 

@@ -22,7 +22,8 @@ class NavigationEstimate:
     `cov_en_m2`: covariance (2, 2) of east and north, given that the fix is correct.
     `confidence`: 0 to 1; NaN: not known.
     `protection_level_m`: the error exceeds it with the risk of the result; infinite: not known.
-    `accepted`: whether it met a criterion beside the rules of the gate.
+    `accepted`: whether it met a criterion beside the rules of the gate. `min_confidence`: from
+    which on it is confident, by the rules of the gate that admitted it.
     `time_ns`: time of exposure by a steady clock; `utc_ns`: UTC, None: not known.
     `processing_s`: from exposure until the message is sent.
     `alt_amsl_m`, `alt_std_m`: above mean sea level; NaN where not known.
@@ -46,6 +47,7 @@ class NavigationEstimate:
     reset_counter: int = 0
     protection_level_m: float = math.inf
     accepted: bool = True
+    min_confidence: float = CONFIDENT
 
     def __post_init__(self) -> None:
         if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # NaN too
@@ -86,13 +88,23 @@ class NavigationEstimate:
         """
         return error_ellipse(self.cov_en_m2)[0]
 
-    def is_confident(self, min_confidence: float = CONFIDENT) -> bool:
+    @property
+    def is_confident(self) -> bool:
         """Whether it is confident, with a valid covariance, and of no track or one that tracks."""
         return (
-            self.confidence >= min_confidence  # False for NaN
+            self.confidence >= self.min_confidence  # False for NaN
             and self.state in (None, "tracking")
             and not math.isnan(self.horizontal_std_m())
         )
+
+    def require_confident(self, message: str) -> None:
+        """Raise `EstimateError` unless it is confident, as `message` cannot mark it."""
+        if not self.is_confident:
+            raise EstimateError(
+                f"{message} cannot mark a position of low confidence (confidence "
+                f"{self.confidence:.3g}, state {self.state}, standard deviation "
+                f"{self.horizontal_std_m():.3g} m): do not send it"
+            )
 
 
 def estimate_from_result(

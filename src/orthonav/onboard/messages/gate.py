@@ -106,7 +106,8 @@ class Gate:
         if jumped or (self._last is not None and self._interrupted):
             self.resets += 1
         self._interrupted = False
-        self._last = replace(estimate, reset_counter=self.resets % 256)
+        least, resets = self.rules.min_confidence, self.resets % 256
+        self._last = replace(estimate, reset_counter=resets, min_confidence=least)
         return Decision(self._last)
 
     def withhold(self, reason: str) -> Decision:

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from orthonav.core.flight.logged import NO_ALTITUDE_M2
 from orthonav.core.geo.attitude import ros_xyzw_from_ned
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import CONFIDENT
 from orthonav.onboard.messages.estimate import NavigationEstimate, floored
-from orthonav.onboard.messages.mavlink import require_confident
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import VehicleState
 
@@ -38,14 +36,13 @@ class Ros2Publisher:
         *,
         origin_alt_m: float = math.nan,
         min_std_m: float = 0.0,
-        min_confidence: float = CONFIDENT,
         silent: bool = False,
     ) -> None:
         """`origin`: origin of the map frame, `origin_alt_m` its altitude. `now_ns`: reads ROS time.
         `min_std_m`: lower bound of the standard deviation in any direction. `silent`: send no
         positions."""
         self._node, self._frame, self._now_ns = node, origin, now_ns
-        self._floor_m, self._least, self._silent = min_std_m, min_confidence, silent
+        self._floor_m, self._silent = min_std_m, silent
         self._origin_alt_m = origin_alt_m
         resolved = node.resolved
         self._parameters = node.parameters
@@ -64,7 +61,7 @@ class Ros2Publisher:
         self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
     ) -> tuple[str, ...]:
         """The names of the topics. Raises `EstimateError`, also for a low confidence."""
-        require_confident(estimate, self._least, "NavSatFix")
+        estimate.require_confident("NavSatFix")
         if self._silent:
             return ()
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
