@@ -17,6 +17,7 @@ from typing import Any
 from orthonav.core.errors import CameraError, FlightError, StoppedError
 from orthonav.core.flight.gnss import FIX_3D, GnssSample
 from orthonav.core.flight.ros_messages import (
+    TIME_NS,
     attitude_of_message,
     camera_of_info,
     grey_of_message,
@@ -30,7 +31,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.records import NoFix
 from orthonav.core.tilt import AUTOPILOT
 from orthonav.onboard.cameras import CameraImage
-from orthonav.onboard.ros2.node import TIME_NS, Node
+from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import FIX_NS, Clocks, TelemetryBuffer
 
 log = logging.getLogger(__name__)
