@@ -122,8 +122,8 @@ class Flight:
             lines=[JsonOut(self.lines), narrator],
         )
         self.locator, self.log = locator or FakeLocator(), BoundedLog()
-        start, fresh = options.pop("start", lambda: None), options.pop("fresh", None)
-        gnss, camera = options.pop("gnss", None), options.pop("camera", CAMERA)
+        fresh, gnss = options.pop("fresh", None), options.pop("gnss", None)
+        camera = options.pop("camera", CAMERA)
         locators = iter([self.locator, fresh])
         self.runner = Runner(
             self.newest,
@@ -131,10 +131,8 @@ class Flight:
             lambda: next(locators),
             publisher,
             FlyOptions(**options),
-            clocks,
             link=self.link,
             sink=self.log,
-            start=start,
             gnss=gnss,
         )
         self.number, self.yaw_deg, self.agl_m, self.talks = 0, 30.0, 100.0, True

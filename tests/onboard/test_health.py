@@ -4,6 +4,7 @@ import math
 import os
 import socket
 from collections import Counter
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -12,12 +13,12 @@ from fake_autopilot import S, fix
 from orthonav.core.records import Telemetry
 from orthonav.onboard.health import Health, HealthReporter, Level, judge, notify
 from orthonav.onboard.monitors import (
-    CameraMonitor,
     EventCounter,
-    LinkMonitor,
-    OutputMonitor,
-    ProgramMonitor,
     TrackMonitor,
+    camera_reasons,
+    link_reasons,
+    output_reasons,
+    program_reasons,
 )
 
 
@@ -41,21 +42,18 @@ class Judged:
         gate = SimpleNamespace(is_unavailable=seen.pop("unavailable", False))
         publisher = SimpleNamespace(gate=gate, messenger=SimpleNamespace(needs_origin=True))
         state, change = seen.pop("state", "tracking"), seen.pop("map_change", None)
-        camera = CameraMonitor(self.events)
-        camera.taken_ns = self._before(seen.pop("image_age_s", 0.0))
+        for name, age in (("taken", "image_age_s"), ("confident", "low_confidence_s")):
+            age_s = seen.pop(age, 0.0)
+            self.events.last_ns[name] = 0 if math.isinf(age_s) else self.now_ns - round(age_s * S)
         self.track = TrackMonitor(self.events, publisher, lambda: state)
-        self.track.confident_ns = self._before(seen.pop("low_confidence_s", 0.0))
         self.monitors = [
-            camera,
-            LinkMonitor(self.events, link, recorded=False),
-            ProgramMonitor(self.events, lambda: change),
-            OutputMonitor(self.events, publisher, link),
-            self.track,
+            partial(camera_reasons, self.events),
+            partial(link_reasons, self.events, link, False),
+            partial(program_reasons, self.events, lambda: change),
+            partial(output_reasons, self.events, publisher, link),
+            self.track.reasons,
         ]
         assert not seen
-
-    def _before(self, age_s):
-        return None if math.isinf(age_s) else self.now_ns - round(age_s * S)
 
     def health(self):
         return judge(self.monitors, self.now_ns)

@@ -171,7 +171,7 @@ class Flown:
         self.time, self.left, self.published, self.said = Time(), [*seen], [], []
         publisher = Publisher(Gate(), self.time.clocks, lines=[self], graph=self)
         options = FlyOptions(recorded=True)
-        parts = self, seen[0].camera, lambda: tracker, publisher, options, self.time.clocks
+        parts = self, seen[0].camera, lambda: tracker, publisher, options
         self.runner = Runner(*parts, sink=MagicMock(lost={}))
 
     def take(self, _):

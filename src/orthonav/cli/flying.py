@@ -77,7 +77,6 @@ class _Setup:
         self.opened = _opened(options)
         self.digest = self.opened.manifest.sha256
         self.localizer = Localizer(self.opened, plan=search_plan(options))
-        self.start = start_of(options, self.clocks, self.localizer)
         self.link = _link(options, self.clocks)
         self.fly = self._fly_options()
 
@@ -106,10 +105,8 @@ class _Setup:
             self._locator,
             publisher,
             replace(self.fly, min_agl_m=self._min_agl_m(camera)),
-            self.clocks,
             link=self.link,
             sink=sink,
-            start=self.start,
             gnss=gnss,
             latency=_latency(options, heading_known=self.fly.heading_known),
         )
@@ -133,6 +130,7 @@ class _Setup:
             recorded=options.ros2 or options.recorded_telemetry,
             accept=acceptance(options),
             map_change=self.opened.change,
+            start=start_of(options, self.clocks, self.localizer),
             state_path=options.state,
             logged_options=_logged_options(options, mount),
         )

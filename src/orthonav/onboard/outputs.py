@@ -282,8 +282,7 @@ class Publisher:
         min_std_m: float = 0.0,
     ) -> None:
         """`min_std_m`: lower bound of the standard deviation of a fix that `graph` publishes."""
-        self.gate, self._clocks = gate, clocks
-        self.messenger = messenger
+        self.gate, self.clocks, self.messenger = gate, clocks, messenger
         self._nmea, self._lines = nmea, lines
         self._graph = [] if graph is None else [graph]
         self._covariance = FilterCovariance(min_std_m)
@@ -302,8 +301,8 @@ class Publisher:
         """Send a position that the gate admits; the names of the messages. Only a view that was
         processed (`judged`) gives one: the prediction of a track is not a measurement."""
         sent: tuple[str, ...] = ()
-        now_ns = self._clocks.mono_ns()
-        ahead_ns = self._clocks.utc_ns() - now_ns
+        now_ns = self.clocks.mono_ns()
+        ahead_ns = self.clocks.utc_ns() - now_ns
         decision = Decision(None)
         if withheld is not None:
             decision = self.gate.withhold(withheld)
@@ -318,7 +317,7 @@ class Publisher:
             sent_here, rate = self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
             sent, withheld = sent + sent_here, withheld or rate
         self._write_nmea(estimate, exposed_ns + ahead_ns)
-        age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
+        age_ms = (self.clocks.mono_ns() - exposed_ns) / 1e6
         why = None if sent else withheld
         self._each(self._lines, lambda out: out.view(result, age_ms, sent, why))
         return sent
@@ -336,7 +335,7 @@ class Publisher:
         sent: list[str] = []
         if not self._graph:
             return (), None
-        if not self.gate.due("ROS2", self._clocks.mono_ns()):
+        if not self.gate.due("ROS2", self.clocks.mono_ns()):
             return (), "rate:ROS2"
         stated = self._covariance.prepare("ROS2", estimate, exposed_ns)
         self._each(
@@ -352,7 +351,7 @@ class Publisher:
     def _write_nmea(self, estimate: NavigationEstimate | None, utc_ns: int) -> None:
         # Farther behind, the clock was set back.
         goes_back = 0 < self._nmea_ns - utc_ns <= MAX_AGE_S * 1e9
-        if self._nmea and not goes_back and self.gate.due("NMEA", self._clocks.mono_ns()):
+        if self._nmea and not goes_back and self.gate.due("NMEA", self.clocks.mono_ns()):
             self._nmea_ns = utc_ns
             failed = self.failed
             self._each(self._nmea, lambda out: out.write(estimate, utc_ns))
