@@ -227,13 +227,11 @@ class NmeaOut:
 class JsonOut:
     """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld`; the health."""
 
-    def __init__(
-        self, path: Path | None, stream: TextIO | None = None, identity: Identity = UNKNOWN
-    ) -> None:
-        """Append to a file, or write to `stream` (stdout) where `path` is None; the first view
-        states `identity`."""
+    def __init__(self, path: Path | None, identity: Identity = UNKNOWN) -> None:
+        """Append to a file, or write to stdout where `path` is None; the first view states
+        `identity`."""
         self._path, self._identity = path, identity
-        self._stream: TextIO | None = stream or sys.stdout
+        self._stream: TextIO | None = sys.stdout
         if path is not None:
             self._stream = path.open("a", encoding="ascii")
 
