@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from benchmarks.fakes import Stream
 from fake_autopilot import UTC_NS, S, Time, write_flight
 
 from orthonav.core.errors import FlightError, MissingFileError
@@ -31,8 +32,8 @@ def image(number, grey=None):
     return CameraImage(number, str(number), number * S, number * S, grey)
 
 
-class Device:
-    """A camera as OpenCV gives it."""
+class Device(Stream):
+    """A camera as OpenCV gives it, that may be "absent" or "dead"."""
 
     def __init__(self, frames):
         self.frames, self.released, self.settings = list(frames), False, {}
@@ -46,9 +47,6 @@ class Device:
     def retrieve(self):
         frame = self.frames.pop(0)
         return frame is not None, frame
-
-    def get(self, name):
-        return self.settings.get(name, 0.0)
 
     def set(self, name, value):
         self.settings[name] = value

@@ -24,13 +24,6 @@ def test_an_undisturbed_flight_sends_everything_after_its_start(flown):
     assert len(sent(images)) == len(images)
 
 
-def test_without_a_stated_latency_nothing_is_sent():
-    flight = ComputedFlight(Flown(60, seed=1), None, lambda at_s: 0.12)
-    assert {reason for _, reason, _ in flight.fly(30)} == {"latency_unknown"}
-    plain = flight.monitor.plain()
-    assert plain["latency_ms"] is None and "--camera-latency-ms" in plain["latency"]
-
-
 def test_false_motions_for_some_seconds_withhold_until_they_are_over():
     flight = ComputedFlight(straight(70), 0.12, lambda at_s: 0.12)
     flight.fly(20)

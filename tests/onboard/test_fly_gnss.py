@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_autopilot import MS, FakeLocator, S, fix
+from fake_autopilot import AHEAD_NS, MS, FakeLocator, S, fix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from test_fly import AHEAD_NS, Flight
+from test_fly import Flight
 
 from orthonav.cli.flying import _interrupted
 from orthonav.core.flight.gnss import FAULTS, GnssSample

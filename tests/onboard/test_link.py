@@ -6,7 +6,7 @@ import pty
 import socket
 
 import pytest
-from fake_autopilot import MS, UTC_NS, Autopilot, Port, S, Time
+from fake_autopilot import AHEAD_NS, MS, UTC_NS, Autopilot, Linked, S, Time
 
 from helpers import wait_for
 from orthonav.core.errors import VariantError
@@ -18,23 +18,9 @@ from orthonav.onboard.telemetry import TelemetryBuffer
 from wire import decode
 
 KEY = bytes(range(32))
-AHEAD_NS = -90 * S  # the autopilot was switched on at 90 s of our clock
 
 
-class Flying:
-    """A link between a port and clocks of the test."""
-
-    def __init__(self, **options):
-        self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
-        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), self.time.clocks, **options)
-
-    def boot_ns(self):
-        return self.time.now_ns + AHEAD_NS
-
-    def hear(self, *frames):
-        self.port.coming.extend(frames)
-        return self.link.poll()
-
+class Flying(Linked):
     def telemetry(self, **options):
         return self.link.state_at(self.time.now_ns).telemetry(0, **options)
 
