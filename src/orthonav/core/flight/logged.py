@@ -320,9 +320,7 @@ def stamp(time_ns: int) -> dict[str, int]:
 def picture_message(data: bytes, kind: str, time_ns: int) -> bytes:
     """The message of `Topics.view` and `Topics.thumbnail`: `data` encoded as `kind`."""
     header, pixels = _ros().header(time_ns, FRAME_ID), np.frombuffer(data, dtype=np.uint8)
-    return _ros().encoded(
-        _ros().new(TOPICS.view.schema, header=header, format=kind, data=pixels)
-    )
+    return _ros().encoded(_ros().new(TOPICS.view.schema, header=header, format=kind, data=pixels))
 
 
 def picture_of(message: bytes) -> tuple[bytes, str]:

@@ -104,9 +104,7 @@ class Packer:
         return frame
 
 
-def global_position_sensor(
-    estimate: NavigationEstimate, *, target: Target = AUTOPILOT
-) -> Message:
+def global_position_sensor(estimate: NavigationEstimate, *, target: Target = AUTOPILOT) -> Message:
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, stamped at sending.
 
     Raises `EstimateError` for an estimate of low confidence or without accuracy: PX4 reads no
