@@ -120,7 +120,7 @@ def expected_m(seen, number):
 PARTS_OF_A_VIEW = [
     *[(Tracker, name) for name in ("locate", "_predict", "_step", "_update", "_outcome", "_fix")],
     *[(Mixture, name) for name in ("predict", "update", "estimate", "_merge")],
-    *[(History, name) for name in ("record", "smoothed")],
+    (History, "record"),
 ]
 
 
@@ -232,7 +232,7 @@ def test_an_error_in_any_call_of_the_flight_loop_costs_one_view(
 
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(Mixture, "predict"), (Mixture, "_predictions"), (Tracker, "_reported_velocity")],
+    [(Mixture, "predict"), (Mixture, "_predictions"), (tracker_module, "_reported_velocity")],
 )
 def test_without_dead_reckoning_there_is_no_position_until_the_next_view(
     localizer, confirmed, tracker, seen, faults, owner, name
