@@ -8,9 +8,8 @@ from functools import partial
 from types import SimpleNamespace
 
 import pytest
-from fake_autopilot import S, fix
+from fake_autopilot import S
 
-from orthonav.core.records import Telemetry
 from orthonav.onboard.health import Health, HealthReporter, Level, judge, notify
 from orthonav.onboard.monitors import (
     EventCounter,
@@ -108,17 +107,6 @@ def test_without_faults_health_is_ok():
 )
 def test_every_fault_has_a_reason(level, reason, seen):
     assert Judged(**seen).health() == Health(level, (reason,))
-
-
-@pytest.mark.parametrize(
-    ("heading_deg", "agl_m", "reason"),
-    [(190.0, 100.0, "heading_mismatch"), (0.0, 50.0, "height_mismatch")],
-)
-def test_a_fix_may_contradict_heading_and_height(heading_deg, agl_m, reason):
-    seen = Judged()
-    telemetry = Telemetry(0, 0.0, 0.0, 0.0, 100.0)
-    seen.track.found(fix(heading_deg=heading_deg, agl_m=agl_m), telemetry, seen.now_ns)
-    assert seen.health() == Health(Level.DEGRADED, (reason,))
 
 
 def test_reasons_of_failed_come_first():
