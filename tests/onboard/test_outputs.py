@@ -182,6 +182,16 @@ def test_the_gate_judges_the_accuracy_of_the_fix():
     assert sending.frames[-1]["eph"] > 4.0
 
 
+def test_messages_are_confident_by_the_rules_of_the_gate():
+    """Where an alert limit decides, they have no least confidence of their own."""
+    sending = Sending("global-position", "gps-input", rules=GateRules(min_confidence=0.0))
+    low = replace(ESTIMATE, confidence=0.5, time_ns=sending.time.now_ns)
+    assert sending.publish(low)[1] == "not_made:GLOBAL_POSITION_SENSOR"
+    admitted = sending.gate.admit(low, sending.time.now_ns).estimate
+    assert sending.publish(admitted) == (("GLOBAL_POSITION_SENSOR", "GPS_INPUT"), None)
+    assert sending.frames[-1]["fix_type"] == 3
+
+
 @pytest.mark.parametrize(
     "kind, interval_s, too_slow",
     [(Autopilot.PX4, 0.2, 4), (Autopilot.PX4, 0.125, 0), (Autopilot.ARDUPILOT, 0.5, 0)],
