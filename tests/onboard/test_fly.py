@@ -189,11 +189,15 @@ class Flight(Linked):
 
 @pytest.fixture
 def begin(tmp_path):
-    """Function that starts a flight, which ends after the test."""
+    yield from beginning(Flight, tmp_path)
+
+
+def beginning(kind, tmp_path):
+    """Function that starts a flight of a kind, which ends after the test."""
     made = []
 
     def flight(*arguments, **options):
-        made.append(Flight(tmp_path, *arguments, **options))
+        made.append(kind(tmp_path, *arguments, **options))
         return made[-1]
 
     yield flight

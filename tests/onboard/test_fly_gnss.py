@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fake_autopilot import AHEAD_NS, MS, FakeLocator, S, fix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from test_fly import Flight
+from test_fly import Flight, beginning
 
 from orthonav.cli.flying import _interrupted
 from orthonav.core.flight.gnss import FAULTS, GnssSample
@@ -78,16 +78,7 @@ class Watched(Flight):
 
 @pytest.fixture
 def begin(tmp_path):
-    """Function that starts a watched flight, which ends after the test."""
-    made = []
-
-    def flight(**options):
-        made.append(Watched(tmp_path, **options))
-        return made[-1]
-
-    yield flight
-    for each in made:
-        each.runner._publisher.close()
+    yield from beginning(Watched, tmp_path)
 
 
 @pytest.mark.long

@@ -79,25 +79,20 @@ LOOP = LoopParameters()
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """Options of the flight loop.
+    """Options of the flight loop."""
 
-    `mount_deg`: yaw, pitch, roll of the camera in the body. `mount`: calibrated one, for the health
-    only: the locator applies it. `heights`: None where the map has no terrain. `min_agl_m`: lower
-    views are not located. `recorded`: telemetry comes with the image, from a recording or ROS.
-    `accept`: of fixes that are accepted; `map_change`: how the open map file was changed in place.
-    `start` gives the prior of the first view. `logged_options`: for a replay of the log.
-    """
-
-    mount_deg: Angles = LOOKS_DOWN
-    mount: Mount | None = None
-    heights: FlownHeights | None = None
+    mount_deg: Angles = LOOKS_DOWN  # yaw, pitch, roll of the camera in the body
+    mount: Mount | None = None  # calibrated, for the health only: the locator applies it
+    heights: FlownHeights | None = None  # None where the map has no terrain
     heading_known: bool = True
-    min_agl_m: float = 0.0
-    recorded: bool = False
+    min_agl_m: float = 0.0  # lower views are not located
+    recorded: bool = False  # telemetry comes with the image, from a recording or ROS
     accept: Acceptance = field(default_factory=lambda: Acceptance("confidence", CONFIDENT))
     map_change: Callable[[], str | None] = lambda: None
-    start: Callable[[], Prior | None] = lambda: None
+    """How the open map file was changed in place."""
+    start: Callable[[], Prior | None] = lambda: None  # the prior of the first view
     state_path: Path | None = None
+    # For a replay of the log.
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     @property

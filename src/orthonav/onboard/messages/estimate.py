@@ -17,37 +17,26 @@ class EstimateError(OrthonavError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class NavigationEstimate:
-    """Position of the aircraft at one exposure.
-
-    `cov_en_m2`: covariance (2, 2) of east and north, given that the fix is correct.
-    `confidence`: 0 to 1; NaN: not known.
-    `protection_level_m`: the error exceeds it with the risk of the result; infinite: not known.
-    `accepted`: whether it met a criterion beside the rules of the gate. `min_confidence`: from
-    which on it is confident, by the rules of the gate that admitted it.
-    `time_ns`: time of exposure by a steady clock; `utc_ns`: UTC, None: not known.
-    `processing_s`: from exposure until the message is sent.
-    `alt_amsl_m`, `alt_std_m`: above mean sea level; NaN where not known.
-    `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
-    `state`: state of the track; None for views that are located one by one.
-    `reset_counter`: 0 to 255; changes when the position jumped.
-    """
+    """Position of the aircraft at one exposure."""
 
     lat_deg: float
     lon_deg: float
-    cov_en_m2: NDArray[np.float64]
-    confidence: float
-    time_ns: int
-    utc_ns: int | None = None
-    processing_s: float = 0.0
-    alt_amsl_m: float = math.nan
+    cov_en_m2: NDArray[np.float64]  # (2, 2) of east and north, given that the fix is correct
+    confidence: float  # 0 to 1; NaN: not known
+    time_ns: int  # of exposure, by a steady clock
+    utc_ns: int | None = None  # of exposure; None: not known
+    processing_s: float = 0.0  # from exposure until the message is sent
+    alt_amsl_m: float = math.nan  # above mean sea level; NaN: not known
     alt_std_m: float = math.nan
-    vel_en_mps: tuple[float, float] | None = None
-    vel_cov_en: NDArray[np.float64] | None = None
-    state: str | None = None
-    reset_counter: int = 0
+    vel_en_mps: tuple[float, float] | None = None  # over ground, true east and north
+    vel_cov_en: NDArray[np.float64] | None = None  # (2, 2)
+    state: str | None = None  # of the track; None for views that are located one by one
+    reset_counter: int = 0  # 0 to 255; changes when the position jumped
     protection_level_m: float = math.inf
-    accepted: bool = True
+    """The error exceeds it with the risk of the result; infinite: not known."""
+    accepted: bool = True  # whether it met a criterion beside the rules of the gate
     min_confidence: float = CONFIDENT
+    """From which on it is confident, by the rules of the gate that admitted it."""
 
     def __post_init__(self) -> None:
         if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # NaN too

@@ -329,16 +329,12 @@ class Origin:
 
 @dataclass(frozen=True)
 class LocalPose:
-    """State that the autopilot reported for the exposure, in its local frame. NaN: not known.
-
-    `down_m`, `down_std_m`: below the origin; needed where the estimate has no altitude.
-    `attitude_rad`, `attitude_std_rad`: roll, pitch, yaw of the body from NED (rotations ZYX).
-    """
+    """State that the autopilot reported for the exposure, in its local frame. NaN: not known."""
 
     origin: Origin
-    down_m: float = math.nan
+    down_m: float = math.nan  # below the origin; needed where the estimate has no altitude
     down_std_m: float = math.nan
-    attitude_rad: Triple = _NAN3
+    attitude_rad: Triple = _NAN3  # roll, pitch, yaw of the body from NED (rotations ZYX)
     attitude_std_rad: Triple = _NAN3
     vel_down_mps: float = math.nan
     vel_down_std_mps: float = math.nan
