@@ -982,21 +982,21 @@ def test_gnss_of_a_recording_is_compared(flown, paced, run, tmp_path):
     assert b"/orthonav/gnss" in log
 
 
+def in_process(autopilot, path, images, *, lines, state, **how):
+    """A flight in a process of its own, held from its first message on until `release` is there."""
+    release = lines.parent / "release"
+    words = [lines, release, "fly", path, images, "--state", state, "--jsonl", lines]
+    words += ["--autopilot", f"udpin:{autopilot.port}"]
+    return subprocess.Popen([sys.executable, PACED, *map(str, words)], **how)
+
+
 @pytest.mark.long
 def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp_path):
     """A process is killed in flight; the next one starts from the position that it saved."""
     path, folder, _, _ = flown
     state = tmp_path / "state.json"
 
-    def start(lines, images):
-        arguments = [
-            *(lines, tmp_path / "release", "fly", path, images),
-            *("--state", state, "--jsonl", lines),
-            *("--autopilot", f"udpin:{autopilot.port}"),
-        ]
-        return subprocess.Popen([sys.executable, PACED, *map(str, arguments)])
-
-    first = start(tmp_path / "1.jsonl", folder)
+    first = in_process(autopilot, path, folder, lines=tmp_path / "1.jsonl", state=state)
     try:
         wait_for(state.exists, process=first)
     finally:
@@ -1008,7 +1008,7 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
     names, *views = (rest / "telemetry.csv").read_text().splitlines()
     flown_views = (tmp_path / "1.jsonl").read_text().count('"frame"')
     (rest / "telemetry.csv").write_text("\n".join([names, *views[flown_views:]]) + "\n")
-    second = start(tmp_path / "2.jsonl", rest)
+    second = in_process(autopilot, path, rest, lines=tmp_path / "2.jsonl", state=state)
     try:
         wait_for(lambda: len(autopilot.named("GLOBAL_POSITION_SENSOR")) > heard, process=second)
     finally:
@@ -1031,14 +1031,8 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
     path, folder, _, _ = flown
     area, lines, state = tmp_path / "area.onav", tmp_path / "lines.jsonl", tmp_path / "state.json"
     area.write_bytes(path.read_bytes())
-    release = tmp_path / "release"
-    arguments = [
-        *(lines, release, "fly", area, folder, "--state", state, "--jsonl", lines),
-        *("--autopilot", f"udpin:{autopilot.port}"),
-    ]
-    process = subprocess.Popen(
-        [sys.executable, PACED, *map(str, arguments)], stderr=subprocess.PIPE, text=True
-    )
+    how = {"stderr": subprocess.PIPE, "text": True}
+    process = in_process(autopilot, area, folder, lines=lines, state=state, **how)
     try:
         wait_for(state.exists, process=process)  # a confident position was found
         size = area.stat().st_size
@@ -1047,7 +1041,7 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
                 stream.write(bytes(size + 1))  # another size, as another map has
         else:
             os.truncate(area, size // 3 if how == "truncated" else 0)
-        release.touch()
+        (tmp_path / "release").touch()
         wait_for(lambda: '"reason": "map_file_changed"' in lines.read_text(), process=process)
     finally:
         process.send_signal(signal.SIGTERM)
