@@ -232,7 +232,7 @@ def tracking(localizer):
 def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, tracking, picture):
     """The views overlap, and the reported velocity is reversed."""
     before, ahead = tracking
-    shared = (localizer, localizer.registration, before._before)
+    shared = (localizer, localizer.registration, before._past)
     tracker = copy.deepcopy(before, {id(each): each for each in shared})
     rng = np.random.default_rng(5)
     cloud = cv2.GaussianBlur(rng.normal(0, 900, (240, 320)), (0, 0), 12) + 190
@@ -294,7 +294,7 @@ def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
     whole = tracker._update
 
     def sometimes(*arguments):
-        if tracker._time_ns == 5 * 10**9:
+        if tracker._past.time_ns == 5 * 10**9:
             raise RuntimeError("a bug")
         return whole(*arguments)
 
@@ -325,26 +325,6 @@ def test_odometry_measures_the_displacement(moved, expected):
     seen = displacement(*footprints, 0.0, heading_scale_noise, expected)
     assert seen.displacement.moved_en_m == pytest.approx(moved, abs=0.7)
     assert 0 < seen.overlap < 1
-
-
-@pytest.mark.long
-def test_a_fixed_lag_uses_the_views_after_each(localizer, usual):
-    seen, whole, _ = usual
-    lagged = Tracker(localizer, smooth=True, lag=3)
-    followed(lagged, localizer, seen)
-    found, all_of_them = lagged.smoothed_track(), whole.smoothed_track()
-    assert len(found) == len(all_of_them) == 22
-    off = [
-        np.hypot(*(place_of(localizer, a) - place_of(localizer, b)))
-        for a, b in zip(found, all_of_them, strict=True)
-    ]
-    assert max(off[-4:]) == 0 and max(off[4:]) < 5
-    errors = [np.hypot(*(place_of(localizer, a) - s[2])) for a, s in zip(found, seen, strict=True)]
-    assert max(errors) < 8
-    at_once = Tracker(localizer, smooth=True, lag=0)
-    rows = followed(at_once, localizer, seen[:6])
-    for now, then in zip(rows, at_once.smoothed_track(), strict=True):
-        assert place_of(localizer, now[3]) == pytest.approx(place_of(localizer, then), abs=3.0)
 
 
 def test_gnss_of_a_first_leg_calibrates_the_mount(localizer):
