@@ -24,7 +24,7 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix
 from orthonav.ground.report.drawing import Drawing
 
-WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "2"]
+WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75"]
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--no-registration"]
 
 

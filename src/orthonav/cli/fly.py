@@ -62,11 +62,22 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARGS", help=text)
 
 
+def _message(text: str) -> str:
+    name, colon, gps_id = text.partition(":")
+    has_id = name == "gps-input" and gps_id.isdecimal() and int(gps_id) < 256
+    if name not in SEND or (colon and not has_id):
+        raise argparse.ArgumentTypeError(
+            f"expected {', '.join(SEND)} or gps-input:0 to gps-input:255, got '{text}'"
+        )
+    return text
+
+
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("outputs")
     add = group.add_argument
-    text = "message to send to the autopilot (default global-position); can be repeated"
-    add("--send", action="append", choices=SEND, help=text)
+    text = f"message to send to the autopilot: {', '.join(SEND)} (default the first; can be "
+    text += "repeated); gps-input:1 states the gps_id 1 (default 0)"
+    add("--send", action="append", type=_message, metavar="MESSAGE", help=text)
     text = "NMEA to udp:HOST:PORT or serial:DEVICE:BAUD; can be repeated. RMC has status V, which "
     text += "most displays ignore: see --nmea-as-gps"
     add("--nmea", action="append", default=[], metavar="URL", help=text)
@@ -84,7 +95,6 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     text += "where the autopilot has none; with --ros2: of the map frame"
     triple = "LAT,LON,ALT_M"
     add("--origin", type=numbers(3, triple), metavar=triple, help=text)
-    add("--gps-id", type=int, default=0, metavar="N", help="gps_id of GPS_INPUT (default 0)")
     text = "NMEA quality 1 and RMC status A (GPS fix) instead of 6 and V (estimated)"
     add("--nmea-as-gps", action="store_true", help=text)
 

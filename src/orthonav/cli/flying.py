@@ -220,7 +220,7 @@ class _Setup:
             messenger = outputs.Messenger(
                 *(gate, link, clocks),
                 kinds=_kinds(options),
-                gps_id=options.gps_id,
+                gps_id=_gps_id(options),
                 min_std_m=options.min_std_m,
                 min_confidence=self._min_sent,
                 origin=Origin(*options.origin) if options.origin else None,
@@ -251,9 +251,7 @@ class _Setup:
         if recorded:
             solutions = recorded_solutions(read_gnss(Path(options.source) / FILE))
         else:
-            heard: Any = source if options.ros2 else self.link
-            if heard is None:
-                raise UsageError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
+            heard: Any = source if options.ros2 else self.link  # one of them: see `fly._check`
             solutions = live_solutions(heard.gnss)
         used = camera, options.mount_deg, self.fly.mount, _stated(options.camera_latency_ms)
         return GnssWatch(
@@ -334,7 +332,7 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         system_id=options.system_id,
         signing=_signing(options, clocks),
         silent=options.dry_run,
-        own_receiver=options.gps_id if "gps-input" in _kinds(options) else None,
+        own_receiver=_gps_id(options) if "gps-input" in _kinds(options) else None,
     )
 
 
@@ -356,7 +354,12 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
 
 
 def _kinds(options: argparse.Namespace) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(options.send or ["global-position"]))
+    asked = options.send or ["global-position"]
+    return tuple(dict.fromkeys(each.partition(":")[0] for each in asked))
+
+
+def _gps_id(options: argparse.Namespace) -> int:
+    return max((int(each.partition(":")[2] or 0) for each in options.send or ()), default=0)
 
 
 def _opened_outputs(

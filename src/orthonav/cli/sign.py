@@ -9,7 +9,7 @@ EXAMPLE = "area.onav --key keys/private.pem"
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", nargs="?", help="map to sign")
     how = parser.add_mutually_exclusive_group(required=True)
-    how.add_argument("--key", type=Path, metavar="private.pem", help="Ed25519 private key (PEM)")
+    how.add_argument("--key", type=Path, metavar="KEY.pem", help="Ed25519 private key (PEM)")
     text = "create private.pem and public.pem in this folder, and sign the map if one is given"
     how.add_argument("--new-key", type=Path, metavar="DIR", help=text)
     text = "serial number in the signature (default: seconds since 1970, which increase)"

@@ -29,8 +29,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     add("--truth", type=Path, metavar="truth.csv", help=text)
     add_options(parser, "--mount", "--radius-m")
     add("--port", type=_port, default=0, help="port of the server (default: any free port)")
-    text = "print the address without opening a browser"
-    add("--no-browser", action="store_true", help=text)
     add_source(parser, dem=False)
 
 
@@ -43,19 +41,19 @@ def run(options: argparse.Namespace) -> None:
     pages = Pages(Run(request), load_assets())
     server = Server(pages, options.port)
     with server:
-        _announce(server, options)
+        _announce(server)
         try:
             server.serve_forever(poll_interval=0.2)
         except KeyboardInterrupt:
             print("ended", flush=True)
 
 
-def _announce(server: "Server", options: argparse.Namespace) -> None:
+def _announce(server: "Server") -> None:
     address = server.url()
     print(f"{address}  (Ctrl-C ends)", flush=True)
     # Without a screen a text browser would cover the output.
     screen = not sys.platform.startswith("linux") or {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}
-    if not options.no_browser and sys.stdout.isatty() and screen:
+    if sys.stdout.isatty() and screen:
         import threading
         import webbrowser
 
