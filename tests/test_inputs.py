@@ -276,20 +276,3 @@ def test_a_camera_is_scaled_to_the_image():
     assert half.camera == CAMERA.resized(32, 24)
     assert View(GREY, CAMERA, NADIR).camera is CAMERA
     assert replace(half, grey=GREY).camera == CAMERA
-
-
-def test_paths_may_be_text(map_path, few, area, tmp_path):
-    from orthonav.ground.build import BuildRequest, build_map
-    from orthonav.ground.recordings import SourceOptions, open_source
-    from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
-    from orthonav.ground.view.run import ViewRequest
-
-    made = str(tmp_path / "small.onav")
-    small = {"tile_px": 64, "gsd_m": 5.0, "registration": False}
-    build_map(BuildRequest([str(area.past)], made, **small))
-    assert open_map(made).manifest.sheets[0].tiles > 0
-    out = str(tmp_path / "flight")
-    simulate_flight(SimulateRequest([str(area.present)], out, random=1, agl_m=area.agl_m))
-    assert open_flight(out).views and open_source(str(few)).expected == 4
-    assert SourceOptions(camera="a.json").camera == Path("a.json")
-    assert ViewRequest("fixes.jsonl", made).map_path == Path(made)
