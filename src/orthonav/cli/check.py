@@ -3,7 +3,6 @@
 import argparse
 import shlex
 import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -86,8 +85,7 @@ def run(options: argparse.Namespace) -> int:
     require_free(options.out)
     request = _request(options)
     with progress(options) as shown:
-        is_shown = options.quiet or sys.stderr.isatty()
-        result, opened = check_map(request, shown if is_shown else _Lines())
+        result, opened = check_map(request, shown)
     page = write_check(result, opened, options.out)
     if options.json:
         print_json(check_to_plain(result))
@@ -95,25 +93,6 @@ def run(options: argparse.Namespace) -> int:
         print(text(result))
         print(f"\nreport: {page}")
     return result.verdict.word.exit_code
-
-
-class _Lines:
-    """Prints on stderr how long the check will take, and every 10 s how far it is."""
-
-    def __init__(self) -> None:
-        self._first: tuple[float, float] | None = None
-        self._next_s = 0.0
-
-    def __call__(self, stage: str, share: float) -> None:
-        now_s = time.monotonic()
-        if self._first is None:  # without the start of the workers
-            self._first, self._next_s = (now_s, share), now_s + 4
-        done = share - self._first[1]
-        if now_s < self._next_s or done < 0.03 or share >= 1:
-            return
-        left_s = (now_s - self._first[0]) * (1 - share) / done
-        print(f"{stage}: {100 * share:.0f} %, about {left_s:.0f} s left", file=sys.stderr)
-        self._next_s = now_s + 10
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
