@@ -109,17 +109,12 @@ def export_encoder(
     return Exported(plain, "float32", cosine, enough, sizes)
 
 
-def cosines(first: Array, second: Array) -> Array:
-    """Cosines (N,) between embeddings (N, D) of the same tiles; 1 for two zero vectors."""
+def least_cosine_between(first: Array, second: Array) -> float:
+    """Smallest cosine between embeddings (N, D) of the same tiles; 1 for two zero vectors."""
     norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
     products = np.einsum("nd,nd->n", first, second)
     both_zero = np.maximum(np.abs(first).max(axis=1), np.abs(second).max(axis=1)) == 0
-    return np.asarray(np.where(both_zero, 1, products / np.maximum(norms, 1e-30)), np.float32)
-
-
-def least_cosine_between(first: Array, second: Array) -> float:
-    """Smallest cosine between embeddings (N, D) of the same tiles."""
-    return float(cosines(first, second).min())
+    return float(np.where(both_zero, 1, products / np.maximum(norms, 1e-30)).min())
 
 
 def encoder_graph(encoder: nn.Module, shape: tuple[int, ...]) -> Any:
