@@ -129,13 +129,6 @@ def test_a_place_that_cannot_be_written_is_refused(tmp_path, writer):
         pytest.fail("no work is done for a place that cannot be written")
 
 
-def test_a_file_does_not_replace_a_folder(tmp_path):
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(OutputError, match="cannot write"):
-        write_text(tmp_path / "folder", "text")
-    assert names_in(tmp_path) == ["folder"]
-
-
 @pytest.mark.parametrize("exists", [False, True], ids=["new", "empty"])
 def test_a_folder_takes_its_place_at_the_end(out, exists):
     if exists:

@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> None:
     for kind, name in names.items():
         if name is not None and imagery:
             found |= _heights(options, request, kind, name)
-    if _falls_back(options, names) and imagery and not found:
+    if _falls_back(names) and imagery and not found:
         found = _heights(options, request, "terrain", DEFAULT_TERRAIN)
     if options.json:
         more: dict[str, object] = dict.fromkeys(names)
@@ -111,7 +111,7 @@ def _heights_presets(options: argparse.Namespace) -> dict[str, str | None]:
     return {"terrain": terrain, "surface": surface}
 
 
-def _falls_back(options: argparse.Namespace, names: dict[str, str | None]) -> bool:
+def _falls_back(names: dict[str, str | None]) -> bool:
     """Whether the default terrain is fetched where the surface cannot be had."""
     return names["surface"] is not None and names["terrain"] is None
 
@@ -125,7 +125,7 @@ def _print_estimate(
         print_json(vars(estimate) | {"provenance": vars(estimate.provenance), **names})
     else:
         more = "".join(f", and {kind} from {name}" for kind, name in names.items() if name)
-        if _falls_back(options, names):
+        if _falls_back(names):
             more += f" (terrain from {DEFAULT_TERRAIN} where that cannot be had)"
         print(f"would fetch {estimate.text()}{more}")
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_options, given
+from orthonav.cli.common import add_options, given, within
 from orthonav.cli.source import add_source, source_options
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "ground truth: the true positions (default: those that --flight has, if any)"
     add("--truth", type=Path, metavar="truth.csv", help=text)
     add_options(parser, "--mount", "--radius-m")
-    add("--port", type=_port, default=0, help="port of the server (default: any free port)")
+    port, text = within(0, 65535, int), "port of the server (default: any free port)"
+    add("--port", type=port, default=0, metavar="N", help=text)
     add_source(parser, dem=False)
 
 
@@ -59,10 +60,3 @@ def _announce(server: "Server") -> None:
 
         # Some browsers return only when closed.
         threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-
-
-def _port(text: str) -> int:
-    port = int(text)
-    if not 0 <= port <= 65535:
-        raise argparse.ArgumentTypeError(f"a port must be 0 to 65535, got {text}")
-    return port
