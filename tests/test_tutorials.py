@@ -4,6 +4,7 @@ import importlib
 import re
 import shlex
 import sys
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -20,26 +21,12 @@ PAGES = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 EXAMPLES = ROOT / "examples"
 
 
-def calls(command):
-    """The simple commands of a line of shell, as words: split at pipes, `;`, `&&` and `&`."""
-    line = re.sub(r"\d>&\d", "", command.replace("\\\n", " "))
+def words_of(line):
+    """The words of the first simple command of a line of shell."""
+    line = re.sub(r"\d>&\d", "", line)
     lexer = shlex.shlex(line, posix=True, punctuation_chars="|;&<>")
     lexer.whitespace_split = True
-    words: list[str] = []
-    skipped = False
-    for word in lexer:
-        if word and set(word) <= set("|;&"):
-            if words:
-                yield words
-            words = []
-        elif word and set(word) <= set("<>&"):
-            skipped = True  # the name of a file comes next
-        elif skipped:
-            skipped = False
-        else:
-            words.append(word)
-    if words:
-        yield words
+    return list(takewhile(lambda word: not set(word) <= set("|;&<>"), lexer))
 
 
 def shown_commands(page):
@@ -49,7 +36,7 @@ def shown_commands(page):
     commands = "\n".join(block for block in blocks if not block.startswith("```text"))
     for line in commands.splitlines():
         if re.match(r" *(orthonav [a-z]|python -m experiments.paper( |$))", line):
-            yield from (words for words in calls(line) if words[0] in ("orthonav", "python"))
+            yield words_of(line)
 
 
 def test_every_command_of_every_page_is_understood_as_it_stands():

@@ -37,7 +37,9 @@ def picture(shape=(96, 120), seed=0):
 
 
 def describe(weights, grey, **parameters):
-    return SuperPoint(str(weights), device="cpu", **parameters).describe(grey)
+    points, radii, descriptors = SuperPoint(str(weights), device="cpu", **parameters)(grey)
+    assert radii.tolist() == [8.0] * len(points)
+    return points, descriptors
 
 
 def test_points_and_unit_descriptors(weights):

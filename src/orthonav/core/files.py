@@ -111,8 +111,8 @@ def _beside(path: Path, suffix: str, *, folder: bool = False) -> Iterator[Path]:
                 each.rmdir()
 
 
-def _made_file(**how: Any) -> str:
-    handle, name = tempfile.mkstemp(**how)
+def _made_file(prefix: str, suffix: str, dir: Path) -> str:
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=dir)
     os.close(handle)
     return name
 
