@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_options, given, print_json, progress
+from orthonav.cli.common import add_options, camera_of, given, print_result, progress
 from orthonav.core.limits import CAMERA_KINDS
 from orthonav.core.tilt import UNSTATED
 
@@ -87,30 +87,23 @@ def run(options: argparse.Namespace) -> int:
     with progress(options) as shown:
         result, opened = check_map(request, shown)
     page = write_check(result, opened, options.out)
-    if options.json:
-        print_json(check_to_plain(result))
-    else:
-        print(text(result))
-        print(f"\nreport: {page}")
+    print_result(options, check_to_plain(result), text(result), f"\nreport: {page}")
     return result.verdict.word.exit_code
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
     from orthonav.core.errors import UsageError
-    from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.check.records import CheckRequest
     from orthonav.ground.planning.route import read_route
-    from orthonav.ground.planning.spacing import DEFAULT_CAMERA
 
     if options.band_m is not None and options.route is None:
         raise UsageError("--band-m is the width of a band around a route; give --route too")
     route = read_route(options.route) if options.route else None
     agl_m, origin = _agl_m(options, route)
-    camera = DEFAULT_CAMERA if options.camera is None else read_camera_file(options.camera)
     more = {
         "map_path": options.map,
         "route": route,
-        "camera": camera,
+        "camera": camera_of(options),
         "agl_m": agl_m,
         "yaw_std_deg": None if options.heading == "unknown" else options.yaw_std_deg,
         "prior_std_m": None if options.prior == "none" else options.prior_std_m,

@@ -20,6 +20,7 @@ from orthonav.core.limits import ALERT_LIMITS_M, DEFAULT_RISK, RISKS
 from orthonav.ground import planning
 
 if TYPE_CHECKING:
+    from orthonav.core.geo.camera import Camera
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.localize.policy import SearchPlan
     from orthonav.core.mapfile.signature import Signature
@@ -366,5 +367,21 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
+def camera_of(options: argparse.Namespace) -> "Camera":
+    """The camera of `--camera`, else the usual one."""
+    from orthonav.core.geo.camera import Camera
+
+    own = options.camera
+    return planning.DEFAULT_CAMERA if own is None else Camera.from_file(own)
+
+
 def print_json(plain: Any) -> None:
     print(json.dumps(plain, indent=1, allow_nan=False))
+
+
+def print_result(options: argparse.Namespace, plain: Any, *lines: str) -> None:
+    """Print plain values with `--json`, else lines for people."""
+    if options.json:
+        print_json(plain)
+    else:
+        print(*lines, sep="\n")

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_options, print_json
+from orthonav.cli.common import add_options, print_result
 
 if TYPE_CHECKING:
     from orthonav.core.mapfile.manifest import Manifest, SheetInfo
@@ -24,10 +24,7 @@ def run(options: argparse.Namespace) -> None:
 
     opened = open_map(options.map)
     plain = summary(opened.manifest, opened.size_bytes, options.map)
-    if options.json:
-        print_json(plain)
-    else:
-        print(summary_text(plain))
+    print_result(options, plain, summary_text(plain))
 
 
 def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]:
