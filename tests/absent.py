@@ -5,16 +5,18 @@ counts as absent only where it really is, so that a test which hides an installe
 """
 
 import re
+import tomllib
 from collections.abc import Iterator
-from importlib import metadata
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
 from orthonav.core.extras import module_of, packages
 
 EXTRA_OF = {"lz4": "flights", "zstandard": "flights"}  # that mcap brings
-for extra in metadata.metadata("orthonav").get_all("Provides-Extra") or ():
+TABLE = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
+for extra in TABLE["project"]["optional-dependencies"]:
     for package in packages(extra) if extra != "ros2" else ():  # no test imports rclpy
         EXTRA_OF.setdefault(module_of(package.name).partition(".")[0], extra)
 

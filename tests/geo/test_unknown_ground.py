@@ -17,10 +17,5 @@ def test_slope_and_tilt_are_told_apart_by_what_is_known_of_each():
         assert unknown_slope_share(1, relief) == pytest.approx(exact)
 
 
-def test_the_default_costs_three_percent_without_tilt_and_half_of_it_with():
-    assert unknown_slope_share(3) == pytest.approx(0.03, abs=0.001)
-    assert unknown_slope_share(1) == pytest.approx(0.0157, abs=0.0005)
-
-
 def test_the_command_line_offers_all_reliefs():
     assert OPTIONS["--relief"]["choices"] == tuple(RELIEF_SLOPES)

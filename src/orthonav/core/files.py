@@ -90,10 +90,11 @@ def require_writable(path: Path, *, folder: bool = False) -> None:
 def _beside(path: Path, suffix: str, *, folder: bool = False) -> Iterator[Path]:
     """A temporary file or folder beside `path`, removed in the end, as are folders that were made
     for it and stay empty."""
-    missing = [each for each in (path.parent, *path.parent.parents) if not each.exists()]
+    missing: list[Path] = []
     make = tempfile.mkdtemp if folder else _made_file
     try:
         try:
+            missing = [each for each in (path.parent, *path.parent.parents) if not each.exists()]
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary = Path(make(prefix=f".{path.name}.", suffix=suffix, dir=path.parent))
         except OSError as error:
