@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import add_area, add_options, given, print_json, progress
+from orthonav.cli.info import summary, summary_text
 
 if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
@@ -73,7 +74,6 @@ def asked(options: argparse.Namespace, request: type) -> dict[str, Any]:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.cli.info import summary, summary_text
     from orthonav.ground.build import BuildRequest, build_map
 
     start = time.perf_counter()

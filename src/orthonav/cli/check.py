@@ -8,7 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from orthonav import __version__
 from orthonav.cli.common import add_options, camera_of, given, print_result, progress
+from orthonav.cli.info import imagery_text, recipe_text, texts
+from orthonav.cli.source import dem_of, is_above_sea
+from orthonav.core.errors import CheckError, RouteError, UsageError
 from orthonav.core.limits import CAMERA_KINDS
 from orthonav.core.tilt import UNSTATED
 
@@ -92,7 +96,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
-    from orthonav.core.errors import UsageError
     from orthonav.ground.check.records import CheckRequest
     from orthonav.ground.planning.route import read_route
 
@@ -117,8 +120,6 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
 
     Raises `CheckError` where the heights of the route are not above ground and no terrain is known.
     """
-    from orthonav.cli.source import dem_of, is_above_sea
-    from orthonav.core.errors import CheckError, RouteError
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.ground.planning.spacing import flown_agl_m
@@ -155,8 +156,6 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
 
 
 def _checked_inputs(options: argparse.Namespace, route: "Route | None") -> "CheckedInputs":
-    from orthonav import __version__
-    from orthonav.cli.info import imagery_text, recipe_text, texts
     from orthonav.core.mapfile import open_map
     from orthonav.ground.check.records import CheckedInputs
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import orthonav
 from orthonav.cli.common import add_options, print_result
+from orthonav.cli.info import imagery_text, recipe_text
 from orthonav.cli.source import add_source, open_source
 from orthonav.cli.version import require_extras
 from orthonav.core.errors import FlightError, OrthonavError, UsageError
@@ -146,7 +147,6 @@ def _digest_of(folder: Path) -> str | None:
 def _write_report(
     out: Path, flights: "list[FlightReport]", opened: "orthonav.MapFile | None"
 ) -> None:
-    from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.ground.evaluate.report import write_report
 
     manifest = opened.manifest if opened else None

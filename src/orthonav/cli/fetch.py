@@ -17,7 +17,7 @@ from orthonav.cli.common import (
     say,
 )
 from orthonav.cli.version import require_extras
-from orthonav.core.errors import FetchError, UsageError
+from orthonav.core.errors import AreaError, FetchError, OutputError, UsageError
 
 if TYPE_CHECKING:
     from orthonav.ground.fetch.run import CostEstimate, FetchRequest, FetchResult
@@ -134,7 +134,6 @@ def _heights(
     options: argparse.Namespace, imagery: "FetchRequest", kind: str, name: str
 ) -> "dict[str, tuple[Path, FetchResult]]":
     """Nothing, with a warning, where they cannot be had: the imagery is kept."""
-    from orthonav.core.errors import AreaError, OutputError
     from orthonav.ground.fetch.presets import DEFAULT_TERRAIN, ImageryOptions, parse_source
     from orthonav.ground.fetch.run import fetch_heights, heights_request
 

@@ -1,11 +1,15 @@
 """`orthonav fly`: position messages to an autopilot, from a live camera or a recording."""
 
 import argparse
+import gc
 import logging
+import signal
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 
 from orthonav.cli.common import add_acceptance, add_options, numbers
+from orthonav.core.errors import StoppedError, VariantError
 
 EXAMPLE = "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550"
 EVERYDAY = (
@@ -124,12 +128,6 @@ def _add_flight(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fly until SIGTERM, SIGINT or the end of a recording."""
-    import gc
-    import signal
-    import threading
-
-    from orthonav.core.errors import StoppedError
-
     _check(options)
     stopping = threading.Event()
     before = {}
@@ -155,8 +153,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import VariantError
-
     if options.ros2 and (options.source or options.autopilot):
         raise VariantError("--ros2 replaces SOURCE and --autopilot: give one or the other")
     if options.ros_args and not options.ros2:

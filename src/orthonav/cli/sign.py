@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from orthonav.core.errors import UsageError
+
 EXAMPLE = "area.onav --key keys/private.pem"
 
 
@@ -17,7 +19,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import UsageError
     from orthonav.core.mapfile.signature import PRIVATE_NAME, PUBLIC_NAME, new_key, sign_map
 
     key = options.key
