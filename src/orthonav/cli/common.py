@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, redirect_stdout
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -315,14 +315,9 @@ def watched(items: Iterable[T], expected: int | None, stage: str, shown: Progres
             shown(stage, min(1.0, number / expected))
 
 
-@contextmanager
-def progress(options: argparse.Namespace) -> Iterator[Progress]:
+def progress(options: argparse.Namespace) -> AbstractContextManager[Progress]:
     """Progress bars of a command, closed on success and on errors."""
-    shown = Progress(options.quiet)
-    try:
-        yield shown
-    finally:
-        shown.close()
+    return closing(Progress(options.quiet))
 
 
 def reporter(options: argparse.Namespace) -> Callable[[str], None]:

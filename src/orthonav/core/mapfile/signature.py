@@ -23,7 +23,7 @@ from orthonav.core.errors import (
     described,
 )
 from orthonav.core.extras import missing_extra
-from orthonav.core.files import replacing, require_file, write_text
+from orthonav.core.files import require_file, write_text
 from orthonav.core.mapfile.reader import map_digest, open_map
 
 if TYPE_CHECKING:
@@ -109,8 +109,7 @@ def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
     encoded = base64.b64encode(private.sign(made.message)).decode()
     plain = {**KIND, **asdict(made), "signature": encoded}
     out = signature_path(path)
-    with replacing(out) as temporary:
-        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="ascii")
+    write_text(out, json.dumps(plain, indent=1) + "\n")
     return out
 
 
@@ -153,14 +152,12 @@ def _least(text: str) -> int | datetime:
 
 def _require_not_older(found: Signature, least: int | datetime, text: str, path: Path) -> None:
     if isinstance(least, int):
-        if found.serial < least:
-            raise MapFileError(
-                f"map is too old: serial number {found.serial}, --not-before {text}: {path}"
-            )
-    elif datetime.strptime(found.signed_utc, _TIME).replace(tzinfo=UTC) < least:
-        raise MapFileError(
-            f"map is too old: signed {found.signed_utc}, --not-before {text}: {path}"
-        )
+        is_older, said = found.serial < least, f"serial number {found.serial}"
+    else:
+        signed = datetime.strptime(found.signed_utc, _TIME).replace(tzinfo=UTC)
+        is_older, said = signed < least, f"signed {found.signed_utc}"
+    if is_older:
+        raise MapFileError(f"map is too old: {said}, --not-before {text}: {path}")
 
 
 def _signature(path: Path) -> tuple[Signature, str]:
