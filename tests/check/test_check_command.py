@@ -11,7 +11,6 @@ from made_check import route_of
 from made_trials import lost, right
 
 from helpers import write_dem
-from orthonav.cli import check as check_command
 from orthonav.cli import main
 from orthonav.core.errors import AreaError, CameraError, UsageError
 from orthonav.core.geo.camera import Camera
@@ -171,18 +170,6 @@ def test_progress_counts_all_that_will_be_tried(untried, half_blank, monkeypatch
     request = CheckRequest(half_blank.map, camera=CAMERA, agl_m=130.0, effort=0.05)
     check_map(request, lambda _, share: shares.append(share))
     assert shares[0] == 0.5 and shares[-1] == 1.0 and shares.count(0.99) <= 1
-
-
-def test_without_a_terminal_lines_say_how_long_it_will_take(monkeypatch, capsys):
-    lines, now_s = check_command._Lines(), [0.0]
-    monkeypatch.setattr(check_command.time, "monotonic", lambda: now_s[0])
-    for now_s[0], share in ((100, 0.1), (102, 0.2), (105, 0.3), (106, 0.4), (116, 0.9), (130, 1)):
-        lines("trials", share)
-    first, second = capsys.readouterr().err.splitlines()
-    assert (first, second) == (
-        "trials: 30 %, about 18 s left",
-        "trials: 90 %, about 2 s left",
-    )
 
 
 @pytest.mark.parametrize(

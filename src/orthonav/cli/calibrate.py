@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import orthonav
-from orthonav.cli.common import add_options, beside, counted, print_json, progress, watched
+from orthonav.cli.common import add_options, beside, counted, print_result, progress, watched
 from orthonav.cli.source import (
     add_source,
     dem_of,
@@ -52,11 +52,7 @@ def run(options: argparse.Namespace) -> None:
     found = _calibrated(options)
     write_mount(options.out, found.mount)
     with beside(options.out):
-        if options.json:
-            more = {"first": found.first, "last": found.last, "moved": found.moved}
-            print_json(asdict(found.mount) | more)
-            return
-        print(f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}")
+        lines = [f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}"]
         for name, bias, unit in (
             ("heading, deg", found.mount.heading_deg, 1.0),
             ("height (or focal), %", found.mount.log_scale, 100.0),
@@ -64,11 +60,13 @@ def run(options: argparse.Namespace) -> None:
             ("roll, deg", found.mount.roll_deg, 1.0),
         ):
             value, std, scatter = (unit * each for each in (bias.value, bias.std, bias.scatter))
-            print(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
-        print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
+            lines.append(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
+        lines.append(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
         if found.moved:
-            print("the camera moved in its mount before these views; earlier views are not used")
-        print(f"written to {options.out}")
+            moved = "the camera moved in its mount before these views; earlier views are not used"
+            lines.append(moved)
+        more = {"first": found.first, "last": found.last, "moved": found.moved}
+        print_result(options, asdict(found.mount) | more, *lines, f"written to {options.out}")
 
 
 def _calibrated(options: argparse.Namespace) -> "MountCalibration":
@@ -124,8 +122,9 @@ def _run_latency(options: argparse.Namespace) -> None:
         found = calibrate_latency(flight.camera, views, heading_known=options.heading == "known")
     write_latency(options.out, found)
     with beside(options.out):
-        if options.json:
-            print_json(asdict(found))
-            return
-        print(f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms")
-        print(f"from {found.pairs} pairs of images; written to {options.out}")
+        print_result(
+            options,
+            asdict(found),
+            f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms",
+            f"from {found.pairs} pairs of images; written to {options.out}",
+        )

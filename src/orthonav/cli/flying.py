@@ -218,7 +218,7 @@ class _Setup:
             messenger = outputs.Messenger(
                 *(gate, link, clocks),
                 kinds=_kinds(options),
-                gps_id=options.gps_id,
+                gps_id=_gps_id(options),
                 min_std_m=options.min_std_m,
                 origin=Origin(*options.origin) if options.origin else None,
             )
@@ -248,9 +248,7 @@ class _Setup:
             recording = read_gnss(Path(options.source) / FILE)
             solutions = deque(sorted(recording, key=lambda each: each.arrived_ns))
         else:
-            heard: Any = source if options.ros2 else self.link
-            if heard is None:
-                raise UsageError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
+            heard: Any = source if options.ros2 else self.link  # one of them: see `fly._check`
             solutions = heard.gnss
         used = camera, options.mount_deg, self.fly.mount, _stated(options.camera_latency_ms)
         return GnssWatch(
@@ -331,7 +329,7 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         system_id=options.system_id,
         signing=_signing(options, clocks),
         silent=options.dry_run,
-        own_receiver=options.gps_id if "gps-input" in _kinds(options) else None,
+        own_receiver=_gps_id(options) if "gps-input" in _kinds(options) else None,
     )
 
 
@@ -353,7 +351,12 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
 
 
 def _kinds(options: argparse.Namespace) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(options.send or ["global-position"]))
+    asked = options.send or ["global-position"]
+    return tuple(dict.fromkeys(each.partition(":")[0] for each in asked))
+
+
+def _gps_id(options: argparse.Namespace) -> int:
+    return max((int(each.partition(":")[2] or 0) for each in options.send or ()), default=0)
 
 
 def _opened_outputs(

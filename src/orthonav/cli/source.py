@@ -115,16 +115,11 @@ def source_options(options: argparse.Namespace, **more: Any) -> "SourceOptions":
 def open_source(
     path: Path | list[Path], options: argparse.Namespace, *, over_terrain: bool = False
 ) -> "Recording":
-    """The open recording of the command line; its warnings are logged. `over_terrain`: whether a
-    terrain turns its heights into heights above ground."""
-    return open_recording(path, source_options(options, over_terrain=over_terrain))
+    """The open recording; its choices and warnings are logged. `over_terrain`: whether a terrain
+    turns its heights into heights above ground."""
+    from orthonav.ground import recordings
 
-
-def open_recording(path: Path | list[Path], how: "SourceOptions") -> "Recording":
-    """The open recording; its choices and warnings are logged."""
-    from orthonav.ground.recordings import open_source
-
-    recording = open_source(path, how)
+    recording = recordings.open_source(path, source_options(options, over_terrain=over_terrain))
     for said in (*recording.choices, *recording.warnings):
         log.warning("%s", said)
     return recording
