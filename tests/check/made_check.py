@@ -1,5 +1,7 @@
 """Synthetic check results for tests of the output files."""
 
+import math
+
 import numpy as np
 
 from orthonav.ground.check.findings import likely_outages
@@ -15,11 +17,13 @@ from orthonav.ground.check.records import (
     Verdict,
     Word,
 )
+from orthonav.ground.check.trials import Trial
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 
 FILES = {"index.html", "check.json", "check.tif", "check.geojson"}
-EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
+EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)>'
+EVIL += " & ünïcode \u202e\x1b[31m \udc80"
 DIGEST = "0123456789abcdef" * 4
 CONDITIONS = Conditions(
     width_m=240.0,
@@ -43,6 +47,15 @@ NO_GO = Verdict(
         Reason("mean", "The mean probability is high.", Word.GO),
     ),
 )
+
+
+def right(en_m, *, error_m=2.0, expected=0.5):
+    return Trial(tuple(en_m), error_m, expected, right=True)
+
+
+def lost(en_m, *, expected=0.5):
+    """A trial without a fix."""
+    return Trial(tuple(en_m), math.nan, expected)
 
 
 def route_of(frame, points_en_m, bands_m=()):

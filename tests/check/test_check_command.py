@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
-from made_check import route_of
-from made_trials import lost, right
+from made_check import lost, right, route_of
 
 from helpers import write_dem
 from orthonav.cli import check as check_command

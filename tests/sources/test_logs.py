@@ -2,6 +2,7 @@
 
 import math
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from recorders import (
     video,
 )
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import FlightError, MissingExtraError
 from orthonav.core.flight.telemetry_track import angles_at
 from orthonav.core.tilt import MOUNT_STD_DEG
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
@@ -380,4 +381,12 @@ def test_what_is_broken_is_one_error(tmp_path, how, capfd):
     with pytest.raises(FlightError, match=words) as caught:
         read_log(path, DOWN)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
-    assert capfd.readouterr() == ("", "")
+    print("heard")
+    assert capfd.readouterr() == ("heard\n", "")
+
+
+def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
+    path = ulog(tmp_path / "a.ulg", px4_topics())
+    monkeypatch.setitem(sys.modules, "pyulog.core", None)
+    with pytest.raises(MissingExtraError, match=r"PX4 logs needs pyulog: pip install 'orthonav\[f"):
+        read_log(path, DOWN)
