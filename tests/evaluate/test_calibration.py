@@ -17,7 +17,6 @@ from orthonav.ground.evaluate.statistics import (
     calibrate,
     check_covariance,
     is_covariance,
-    normalized_squared,
 )
 
 RADIUS_M = 20.0
@@ -82,15 +81,6 @@ def test_drawn_as_stated_is_calibrated_and_wilson_covers() -> None:
     assert sum(inside) >= 8
 
 
-def test_nees_against_an_inverse() -> None:
-    random = np.random.default_rng(2)
-    roots = random.normal(0.0, 5.0, (50, 2, 2))
-    cov = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(2)
-    errors = random.normal(0.0, 5.0, (50, 2))
-    expected = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(cov), errors)
-    np.testing.assert_allclose(normalized_squared(errors, cov), expected, rtol=1e-9)
-
-
 def test_right_covariance_is_consistent_and_a_halved_one_is_not() -> None:
     random = np.random.default_rng(4)
     cov = np.array([[25.0, 12.0], [12.0, 16.0]])
@@ -134,16 +124,6 @@ def test_an_invalid_covariance_is_counted_and_left_out(rows: list[list[float]]) 
     found = check_covariance(np.ones((2, 2)), cov, np.full(2, RADIUS_M), 15.0)
     assert (found.n, found.n_unusable, found.n_without) == (2, 1, 0)
     assert found.nees.tolist() == [2.0]
-
-
-def test_no_covariance_leaves_nothing_defined() -> None:
-    cov = np.full((3, 2, 2), math.nan)
-    found = check_covariance(np.ones((3, 2)), cov, np.full(3, RADIUS_M), 15.0)
-    assert (found.n, found.n_without, found.n_unusable, found.nees.size) == (3, 3, 0, 0)
-    figures = (found.nees_mean, found.nees_median, *found.within.values())
-    assert all(map(math.isnan, figures))
-    nothing = check_covariance(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0), 15.0)
-    assert nothing.n == 0 and math.isnan(nothing.nees_mean)
 
 
 CENTRE = LocalFrame(48.0, -4.5)
