@@ -160,7 +160,6 @@ def test_cameras(messages):
 @pytest.mark.parametrize(
     "model, lens, changes, error",
     [
-        ("rational_polynomial", (0.1, 0, 0, 0, 0, 0.2, 0, 0), {}, "more than k1"),
         ("thin_prism", (), {}, "not supported"),
         ("plumb_bob", (), {"k": np.zeros(9)}, "not calibrated: no matrix K"),
         ("plumb_bob", (), {"binning_x": 2}, "binning"),
