@@ -1,8 +1,6 @@
 """Calibration of confidence and consistency of covariance against cases worked out by hand."""
 
-import json
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -127,22 +125,6 @@ def test_an_invalid_covariance_is_counted_and_left_out(rows: list[list[float]]) 
 
 
 CENTRE = LocalFrame(48.0, -4.5)
-
-
-def test_the_command_compares_several_runs(tmp_path, run) -> None:
-    lat, lon = CENTRE.latlon_from_en(np.array([3.0, 4.0]))
-    fix = Fix(float(lat), float(lon), 25 * np.eye(2), 0.95, RADIUS_M, 0.0, 100.0)
-    unknown = replace(fix, confidence=math.nan, cov_en_m2=np.full((2, 2), math.nan))
-    truth = tmp_path / "truth.csv"
-    truth.write_text("frame,lat_deg,lon_deg\na.jpg,48.0,-4.5\n")
-    paths = [tmp_path / "one.jsonl", tmp_path / "two.jsonl"]
-    for path, known in zip(paths, (fix, unknown), strict=True):
-        path.write_text(result_to_json(ViewResult("a.jpg", 0, known, 10.0)) + "\n")
-    done = run("evaluate", *paths, "--truth", truth)
-    assert done.code == 0 and "nan" not in done.out.lower()
-    runs = json.loads(run("evaluate", *paths, "--truth", truth, "--json").out)["runs"]
-    assert runs["two"]["calibration"]["ece"] is None
-    assert runs["one"]["covariance"]["nees_mean"] == pytest.approx(1.0, rel=1e-3)
 
 
 def test_a_truth_by_which_most_confident_fixes_are_wrong_is_doubted(tmp_path, run) -> None:

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from test_flight import PLAIN, SMALL, plane_of, route_of
 
 from helpers import textured
-from orthonav.core.errors import UsageError
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
@@ -84,15 +83,6 @@ def test_biases_are_constant(fly):
         assert (a == b).all()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.77, 1.0])
-@pytest.mark.parametrize("count", [1, 7, 500])
-def test_the_share_of_views_with_clouds(count, share):
-    clouds = Clouds(share, count, 0)
-    degree = np.array([clouds.degree(number) for number in range(count)])
-    assert (degree > 0).sum() == round(share * count)
-    assert degree.min() >= 0 and degree.max() <= 1
-
-
 def test_clouds_hide_some_views_and_leave_the_others(fly):
     kinds = {"camera": SEEN, "spacing_m": 25.0, "seed": 3}
     clear, truth = fly("clear", **kinds)
@@ -107,19 +97,6 @@ def test_clouds_hide_some_views_and_leave_the_others(fly):
     spread = np.array([b.std() for _, b in pairs])
     assert (degree == 1).sum() >= 3 and spread[degree == 1].max() < 6
     assert spread[(degree > 0.3) & (degree < 0.7)].min() > 15
-
-
-@pytest.mark.parametrize(
-    "request_",
-    [
-        {"turn_radius_m": 10.0},
-        {"errors": Errors(velocity_drift=0.0)},
-    ],
-    ids=["turn_radius_m", "velocity_drift"],
-)
-def test_random_positions_refuse_route_options(fly, request, request_):
-    with pytest.raises(UsageError, match=f"{request.node.callspec.id}: only along a route"):
-        fly(route=None, random=3, **request_)
 
 
 def test_the_command(run, ortho, frame, tmp_path):
