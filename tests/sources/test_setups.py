@@ -93,9 +93,9 @@ def test_a_sample_of_the_doubted_views_is_kept(views):
 
     doubted = LowConfidenceViews(views[0].camera, lambda telemetry: telemetry)
     place = Fix(46.0, 3.0, np.eye(2), 0.4, 35.0, 0.0, 100.0)
-    for number, _ in enumerate(doubted.watching(map(Recorded, range(100)))):
+    for number in range(100):
         outcome = NoFix("blank", "") if number % 2 else replace(place, confidence=number / 100)
-        doubted.take(ViewResult("a", number, outcome, 1.0))
+        doubted.take(Recorded(number), ViewResult("a", number, outcome, 1.0))
     times = [view.telemetry.time_ns for view in doubted.views]
     assert SAMPLE // 2 <= len(times) <= SAMPLE and max(times) < 90  # those above are confident
     assert len(set(np.diff(times))) == 1
