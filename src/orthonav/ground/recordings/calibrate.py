@@ -238,8 +238,9 @@ class _Pairs:
     @classmethod
     def of(cls, pairs: Iterable[tuple[ImageMotion, Array]]) -> "_Pairs":
         seen, reported = zip(*pairs, strict=True)
-        columns = ([each.seconds, each.turn_rad, each.shift] for each in seen)
-        return cls(*map(np.array, zip(*columns, strict=True)), np.array(reported))
+        turns = [(each.seconds, each.turn_rad, *each.shift) for each in seen]
+        seconds, turn, *shift = np.array(turns, np.float64).T
+        return cls(seconds, turn, np.stack(shift, axis=1), np.array(reported))
 
     def least_noise(self) -> Array:
         """Least standard deviations (2,) of turn and shift."""
