@@ -100,6 +100,7 @@ def test_logs_without_gps_count_from_boot(tmp_path):
     del (estimated := px4_topics())["vehicle_gps_position"]
     track = read_log(ulog(tmp_path / "b.ulg", estimated), DOWN)
     assert track.latlon_deg(6 * 10**9) == (46.5, 2.5)  # the estimator's own, which aids nothing
+    assert track.warnings == ("positions are an estimate: the log has no receiver",)
     assert track.telemetry(6 * 10**9).horizon_std_deg == pytest.approx(3.0)
     ardupilot = read_log(dataflash(tmp_path / "a.bin", gps=False), DOWN)
     assert ardupilot.origin_ns == 3 * 10**9
@@ -302,12 +303,6 @@ def test_instances_of_a_ulog(tmp_path):
         assert any(line.startswith(f"{role}: using {used}") for line in track.choices)
     with pytest.raises(FlightError, match=r"distance_sensor\[1\] has no valid message"):
         read_log(path, DOWN, {"height": "distance_sensor[1]"})
-
-
-def test_positions_of_px4_without_a_receiver_are_called_an_estimate(tmp_path):
-    del (topics := px4_topics())["vehicle_gps_position"]
-    track = read_log(ulog(tmp_path / "a.ulg", topics), DOWN)
-    assert track.warnings == ("positions are an estimate: the log has no receiver",)
 
 
 def test_a_log_behind_a_ulog_is_not_read(tmp_path):
