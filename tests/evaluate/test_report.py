@@ -3,8 +3,6 @@
 import itertools
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,18 +166,3 @@ def test_a_flight_without_any_fix_is_reported(tmp_path: Path, coarse) -> None:
     assert "nan" not in re.sub(r"base64,[^\"]+", "", html).lower()
     assert "nan" not in text([flight]).lower()
     json.dumps(metrics_to_json(flight.metrics), allow_nan=False)
-
-
-@pytest.mark.long
-def test_matplotlib_is_imported_for_drawing_and_pyplot_never() -> None:
-    code = (
-        "import sys, orthonav.ground.evaluate.report\n"
-        "unwanted = {'matplotlib', 'jinja2', 'PIL', 'torch', 'rasterio', 'pyproj'}\n"
-        "assert not unwanted & set(sys.modules)\n"
-        "from orthonav.ground.evaluate import metrics, report\n"
-        "from orthonav.core.records import NoFix, ViewResult\n"
-        "result = ViewResult('a', 0, NoFix('blank', ''), 1.0)\n"
-        "report.map_picture(metrics.compare({'a': (48.0, -4.5)}, [result]), 15.0)\n"
-        "assert 'matplotlib.pyplot' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
