@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from blots import AGL_M, GROUND, Flat, Ground, place_of, rendered
 
-from orthonav.core.errors import CameraError, MapFileError
+from orthonav.core.errors import CameraError, MapChangedError, MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.ground import GroundModel
@@ -289,23 +289,39 @@ class MemoryView:
 
 
 def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
-    seen = list(views(9))
+    """Also where the map changed, or dead reckoning failed: the tracker has no record of these, and
+    smoothed positions are those of the same views."""
+    seen = list(views(14))
     tracker = Tracker(localizer, smooth=True)
-    whole = tracker._update
+    whole, passed = tracker._update, tracker.passed
 
     def sometimes(*arguments):
-        if tracker._past.time_ns == 5 * 10**9:
+        second = tracker._past.time_ns / 1e9
+        if second in (5, 6):
             raise RuntimeError("a bug")
+        if second == 7:
+            raise MapChangedError("rewritten")
         return whole(*arguments)
 
+    def sometimes_passed(telemetry, reason):
+        if telemetry.time_ns == 6 * 10**9:
+            raise RuntimeError("another bug")
+        return passed(telemetry, reason)
+
     monkeypatch.setattr(tracker, "_update", sometimes)
+    monkeypatch.setattr(tracker, "passed", sometimes_passed)
     flight = Recorded(seen, broken=(3,))
     results = list(localize_flight(tracker, flight, skip_bad_images=True))
-    assert [result.frame for result in results] == [f"{n}.png" for n in range(9)]
+    assert [result.frame for result in results] == [f"{n}.png" for n in range(14)]
     assert results[-1].state == "tracking" and isinstance(results[3].outcome, Fix)
     assert isinstance(results[5].outcome, Fix)
     again = smoothed_track(tracker, results, None)
-    assert len(again) == 9 and all(isinstance(each.outcome, Fix | NoFix) for each in again)
+    reasons = {"internal_error", "map_file_changed"}
+    assert {each.outcome.reason for each in again if isinstance(each.outcome, NoFix)} == reasons
+    assert [each.frame for each in again] == [each.frame for each in results]
+    for each, (_, _, place) in zip(again, seen, strict=True):
+        if isinstance(each.outcome, Fix):
+            assert np.hypot(*(place_of(localizer, each.outcome) - place)) < 25
 
 
 @pytest.mark.parametrize("expected", [None, (0.0, 0.0), (-29.0, 27.0), (300.0, 0.0)])

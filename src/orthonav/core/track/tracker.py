@@ -253,6 +253,11 @@ class Tracker:
         smoothed = self._history.smoothed()
         return [self._smoothed_fix(*pair) for pair in zip(smoothed, self._outcomes, strict=True)]
 
+    @property
+    def recorded_ns(self) -> list[int]:
+        """Times of the views of `smoothed_track`: those at which no error was raised."""
+        return [telemetry.time_ns for _, telemetry in self._outcomes]
+
     def _smoothed_fix(
         self, smoothed: Smoothed | None, filtered: tuple[Fix | NoFix, Telemetry]
     ) -> Fix | NoFix:
