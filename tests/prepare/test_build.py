@@ -2,13 +2,14 @@
 
 import errno
 import os
+import threading
 
 import cv2
 import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.errors import AreaError, OutputError, UsageError
+from orthonav.core.errors import AreaError, ImageryError, OutputError, UsageError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.localize.confidence import LogisticConfidence, RegisteredConfidence
@@ -16,6 +17,7 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import CALIBRATION
+from orthonav.ground.build.sheet import in_order
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
@@ -161,6 +163,33 @@ def test_blocks_do_not_matter(small_ortho, tmp_path, monkeypatch):
     )
     assert scores.min() > 0.995
     np.testing.assert_array_equal(centres_en_m(whole), centres_en_m(blocks))
+
+
+@pytest.mark.parametrize("tile_px", [64, 96], ids=["chunks in one block", "chunks over blocks"])
+def test_any_number_of_workers_gives_the_same_bytes(make_ortho, tmp_path, monkeypatch, tile_px):
+    grey = textured((300, 300))
+    grey[75:172, 98:142] = 0
+    ortho = make_ortho(tmp_path / "2019.tif", grey, nodata=0)
+    monkeypatch.setattr("orthonav.ground.build.sheet.BLOCK_PX", 128)
+    for workers in (1, 3):
+        built(ortho, tmp_path, f"{workers}.onav", tile_px=tile_px, workers=workers, **WITH_LAYER)
+    assert (tmp_path / "1.onav").read_bytes() == (tmp_path / "3.onav").read_bytes()
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_first_error_is_raised_and_no_thread_stays(workers):
+    before = threading.active_count()
+
+    def failing(item):
+        if item in (7, 8):
+            raise ImageryError(f"item {item}")
+        return item
+
+    found = []
+    with pytest.raises(ImageryError, match="item 7"):
+        for item in in_order(failing, range(20), workers):
+            found.append(item)
+    assert found == list(range(7)) and threading.active_count() == before
 
 
 def test_the_manifest(small_ortho, tmp_path):

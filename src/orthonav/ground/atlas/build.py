@@ -4,6 +4,8 @@ A sheet is finished when its item is written, so an interrupted build keeps its 
 the same command resumes it. The same imagery, recipe and versions give the same atlas byte for
 byte, with any number of workers, on processors that round alike."""
 
+import hashlib
+import json
 import logging
 import math
 import platform
@@ -30,7 +32,7 @@ from orthonav.ground.atlas.cut import box_around, box_deg, turned
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.build.build import BuildRequest, build_map, require_relief, require_surface
 from orthonav.ground.build.layer import rounded_gsd_m
-from orthonav.ground.build.sheet import digest, grid_of
+from orthonav.ground.build.sheet import grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area
@@ -140,7 +142,8 @@ def request_digest(
         depends.append(["surface", len(request.surface), request.true_ortho])
     if request.relief is not None:
         depends.append(request.relief)
-    return digest(depends)
+    text = json.dumps(depends, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def margin_m(recipe: AtlasRecipe) -> float:
