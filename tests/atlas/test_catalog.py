@@ -17,7 +17,6 @@ from orthonav.ground.atlas.catalog import (
     Sheet,
     StoredFile,
     canonical,
-    copy_sheets,
     read_item,
 )
 from orthonav.ground.atlas.integrity import check_atlas
@@ -199,6 +198,7 @@ def test_an_altered_catalogue_is_refused(near, change, words):
         ("coarse", {"width": 3}),
         ("coarse", {"gsd_m": -8.0, "tile_px": 128, "overlap": 0.5}),
         ("coarse", 5),
+        ("coarse", None),
     ],
     ids=str,
 )
@@ -393,20 +393,3 @@ def test_dates_become_times_of_stac(dates, times):
         times = {"datetime": None, "start_datetime": times[0], "end_datetime": times[1]}
     assert found == times
     assert read_item(sheet.item_name, canonical(sheet.to_item())) == sheet
-
-
-def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
-    source = Atlas.open_or_create(tmp_path / "source", RECIPE)
-    for sheet in (HERE, EAST):
-        source.put(files(sheet), described(sheet))
-    near.put(files(EAST), described(EAST))
-    assert copy_sheets(source, near) == ([HERE], [EAST])
-    assert contents(near.url) == {**contents(source.url), **contents(near.url)}
-    source.put(files("new"), described())
-    assert copy_sheets(source, near) == ([], [HERE, EAST])
-    assert copy_sheets(source, near, replace=True) == ([HERE], [EAST])
-    assert near.path(near.sheets()[HERE]).read_text() == "map of new"
-    assert check_atlas(near) == []
-    other = Atlas.open_or_create(tmp_path / "other", replace(RECIPE, overlap=0.5))
-    with pytest.raises(AtlasError, match=r"overlap: 0\.5, not 0\.875"):
-        copy_sheets(source, other)

@@ -27,7 +27,7 @@ from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.tiles.cells import CellLayout
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
-from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe
 from orthonav.ground.atlas.cluster import SerialRunner
 from orthonav.ground.atlas.cut import (
     Warp,
@@ -43,8 +43,9 @@ from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 
+COARSE = CoarseRecipe(gsd_m=4.0, tile_px=32, overlap=0.5)
 RECIPE = AtlasRecipe(
-    gsd_m=1.0, tile_px=64, overlap=0.75, calibration_views=2, sheet_km=0.3, coarse=None
+    gsd_m=1.0, tile_px=64, overlap=0.75, calibration_views=2, sheet_km=0.3, coarse=COARSE
 )
 SIDE_PX = 1100
 LAYOUT = CellLayout(2, 2)
@@ -74,12 +75,12 @@ def names(middle):
 @pytest.fixture(scope="module")
 def folder(ortho, names, middle, tmp_path_factory):
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
-    recipe = {name: value for name, value in asdict(RECIPE).items() if name != "coarse"}
     request = AtlasRequest(
         str(folder),
         [ortho],
-        recipe | {"coarse": None},
+        asdict(RECIPE),
         bounds_around(middle, 190),
+        index=False,
         dem=write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0),
         surface=[write_dem(folder.parent / "trees.tif", middle, wooded, half_m=900.0, px_m=2.0)],
         dem_datum="msl",

@@ -31,8 +31,7 @@ from orthonav.ground.atlas.index import (
     read_manifest,
     stale_sheets,
 )
-from orthonav.ground.atlas.locate import AtlasLocator
-from orthonav.ground.atlas.search import SheetSearch
+from orthonav.ground.atlas.locate import AtlasLocator, SheetSearch
 from orthonav.onboard.run import locate_view
 
 SILENT = NoFix("no_match", "shows nothing")

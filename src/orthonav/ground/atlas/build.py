@@ -148,8 +148,7 @@ def request_digest(
 
 def margin_m(recipe: AtlasRecipe) -> float:
     """A tile, and 64 pixels beyond it for gradients and resampling."""
-    coarse = recipe.coarse or recipe
-    return max((recipe.tile_px + 64) * recipe.gsd_m, (coarse.tile_px + 64) * coarse.gsd_m)
+    return max((each.tile_px + 64) * each.gsd_m for each in (recipe, recipe.coarse))
 
 
 class Imagery:
@@ -224,9 +223,8 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
         area, min(imagery_gsd_m, recipe.gsd_m), recipe.gsd_m, recipe.tile_px, recipe.overlap
     )
     CellLayout.for_tiles(grid.tile_px, grid.stride_px)
-    if recipe.coarse is not None:
-        coarse = coarse_grid(area, recipe.coarse)
-        CellLayout.for_tiles(coarse.tile_px, coarse.stride_px)
+    coarse = coarse_grid(area, recipe.coarse)
+    CellLayout.for_tiles(coarse.tile_px, coarse.stride_px)
 
 
 def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
@@ -327,7 +325,7 @@ def build_atlas(
     log.info("%d of %d sheets to build", len(missing), len(tasks))
     _build_sheets(missing, runner, result, progress)
     atlas.snapshot()
-    if request.index and recipe.coarse is not None and not result.failed:
+    if request.index and not result.failed:
         from orthonav.ground.atlas.index import make_index  # with FAISS
 
         make_index(atlas, progress=progress)
@@ -343,15 +341,15 @@ def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
             atlas.require_recipe(wanted)
             return wanted
         gsd_m = rounded_gsd_m(mosaic.gsd_m)
-        return AtlasRecipe(**{"gsd_m": gsd_m, **_requested(request, None)})
+        return AtlasRecipe(**{"gsd_m": gsd_m, **_requested(request, CoarseRecipe())})
     except (TypeError, AtlasError) as error:
         raise AtlasError(f"recipe of the atlas is impossible: {error}") from error
 
 
-def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, Any]:
+def _requested(request: AtlasRequest, coarse: CoarseRecipe) -> dict[str, Any]:
     fields = dict(request.recipe)
     if isinstance(fields.get("coarse"), Mapping):
-        fields["coarse"] = replace(coarse or CoarseRecipe(), **fields["coarse"])
+        fields["coarse"] = replace(coarse, **fields["coarse"])
     return fields
 
 
@@ -375,7 +373,7 @@ def build_sheet(task: SheetTask) -> Sheet | None:
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
     sheet, made, common = task.sheet, task.request, asdict(task.recipe)
     del common["sheet_km"], common["coarse"]
-    files = {"map": folder / f"{sheet.id}.onav"}
+    files = {"map": folder / f"{sheet.id}.onav", "coarse": folder / f"{sheet.id}.safetensors"}
     request = BuildRequest(
         orthos=made.orthos,
         out=files["map"],
@@ -394,9 +392,7 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
     except AreaError as error:  # the recipe was tried when the task was made: no imagery
         log.info("%s is empty: %s", sheet.id, error)
         return None
-    if task.recipe.coarse is not None:
-        files["coarse"] = folder / f"{sheet.id}.safetensors"
-        write_coarse(mosaic, sheet.bounds_deg, task.recipe.coarse, files["coarse"])
+    write_coarse(mosaic, sheet.bounds_deg, task.recipe.coarse, files["coarse"])
     described = replace(sheet, tiles=info.tiles, area_km2=info.area_km2)
     return Atlas.open(made.url).put(files, described)
 
