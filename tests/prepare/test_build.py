@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from helpers import textured
+from helpers import box_deg, textured, waypoints
 from orthonav.core.errors import AreaError, ImageryError, OutputError, UsageError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
@@ -64,15 +64,6 @@ def built(ortho, folder, name="map.onav", **request):
     return open_map(folder / name)
 
 
-def bounds_deg(frame, west_m, south_m, east_m, north_m):
-    lat, lon = frame.latlon_from_en([[west_m, south_m], [east_m, north_m]])
-    return float(lon[0]), float(lat[0]), float(lon[1]), float(lat[1])
-
-
-def route_of(frame, *points_en_m):
-    return Route(tuple(zip(*(c.tolist() for c in frame.latlon_from_en(points_en_m)), strict=True)))
-
-
 def centres_en_m(opened):
     return opened.array("sheet0/centres_en_m", np.float32, 2).astype(float)
 
@@ -126,7 +117,7 @@ def test_the_whole_imagery_is_covered(ortho, tmp_path, frame):
 def test_bounds_are_covered(ortho, tmp_path, frame, tile_px, overlap):
     box = (-120.0, -60.0, 77.3, 131.9)
     opened = built(
-        ortho, tmp_path, bounds_deg=bounds_deg(frame, *box), overlap=overlap, tile_px=tile_px
+        ortho, tmp_path, bounds_deg=box_deg(frame, *box), overlap=overlap, tile_px=tile_px
     )
     sheet = opened.manifest.sheets[0]
     # To whole micro-cells, of which 32 make a tile.
@@ -141,7 +132,9 @@ def test_bounds_are_covered(ortho, tmp_path, frame, tile_px, overlap):
 
 def test_a_band_around_a_route_is_covered(ortho, tmp_path, frame):
     a, b = np.array([-110.0, -90.0]), np.array([100.0, 60.0])
-    opened = built(ortho, tmp_path, route=route_of(frame, a, b), band_m=80.0, overlap=0.875)
+    opened = built(
+        ortho, tmp_path, route=Route(waypoints(frame, [a, b])), band_m=80.0, overlap=0.875
+    )
     points = random_points(-160, -140, 150, 110)
     near = inside_band(points, a, b, 40.0)
     stride_m = opened.manifest.sheets[0].grid.stride_m
@@ -233,7 +226,7 @@ REFUSED = [
 def test_what_cannot_be_built(ortho, tmp_path, frame, names_in, request_, message):
     box = request_.get("bounds_deg", (0,))
     if max(box) > 180:
-        request_ = {"bounds_deg": bounds_deg(frame, *box)}
+        request_ = {"bounds_deg": box_deg(frame, *box)}
     with pytest.raises((UsageError, AreaError), match=message):
         built(ortho, tmp_path, **request_)
     assert names_in(tmp_path) == []
