@@ -374,19 +374,10 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
     sheet, made, common = task.sheet, task.request, asdict(task.recipe)
     del common["sheet_km"], common["coarse"]
     files = {"map": folder / f"{sheet.id}.onav", "coarse": folder / f"{sheet.id}.safetensors"}
-    request = BuildRequest(
-        orthos=made.orthos,
-        out=files["map"],
-        bounds_deg=sheet.bounds_deg,
-        workers=1,
-        dem=made.dem,
-        surface=made.surface,
-        true_ortho=made.true_ortho,
-        dem_datum=made.dem_datum,
-        dem_needed=False,
-        relief=made.relief,
-        **common,
-    )
+    shared = ("orthos", "dem", "surface", "true_ortho", "dem_datum", "relief")
+    common |= {name: getattr(made, name) for name in shared}
+    place: dict[str, Any] = {"out": files["map"], "bounds_deg": sheet.bounds_deg}
+    request = BuildRequest(**place, **common, workers=1, dem_needed=False)
     try:
         info = build_map(request).manifest.sheets[0]
     except AreaError as error:  # the recipe was tried when the task was made: no imagery

@@ -172,7 +172,7 @@ def _corners(block: Block) -> Array:
 
 
 class SheetMosaic:
-    """Sheets read as one picture, a `Raster` of `SheetReader`."""
+    """Sheets read as one picture, a `GreyRaster` of `SheetReader`."""
 
     def __init__(self, members: Sequence[SheetSource], frame: LocalFrame, grid: TileGrid) -> None:
         self._warps = [Warp(each, frame, grid) for each in members]

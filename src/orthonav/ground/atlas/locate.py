@@ -228,13 +228,11 @@ class SheetTrack:
         self.has_ended = SIGMAS * fix.std_m + speed_mps * seconds > MAX_REACH_M
         if not self.has_ended:
             lat, lon = LocalFrame(fix.lat_deg, fix.lon_deg).latlon_from_en(velocity * seconds)
-            self._change_sheet(self._maps.name_at(float(lat), float(lon)))
+            name = self._maps.name_at(float(lat), float(lon))
+            if name != self.sheet and (localizer := self._maps.open(name)) is not None:
+                self._tracker.continue_on(localizer)
+                self.sheet = name
         return self.has_ended
-
-    def _change_sheet(self, name: str) -> None:
-        if name != self.sheet and (localizer := self._maps.open(name)) is not None:
-            self._tracker.continue_on(localizer)
-            self.sheet = name
 
     def _take(self, seen: Fix | NoFix, telemetry: Telemetry) -> None:
         self.fix = None

@@ -132,16 +132,13 @@ class Preview:
 
     def put(self, block: Block, grey: NDArray[np.uint8]) -> None:
         """A block in any resolution; nothing of it is shown if it is smaller than a pixel."""
-        y0, y1, x0, x1 = self._edges(block)
-        if y1 > y0 and x1 > x0:
-            size = x1 - x0, y1 - y0
-            self._grey[y0:y1, x0:x1] = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-
-    def _edges(self, block: Block) -> tuple[int, int, int, int]:
         rows, cols = self._grey.shape
         y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
         x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
-        return y0, min(y1, rows), x0, min(x1, cols)
+        y1, x1 = min(y1, rows), min(x1, cols)
+        if y1 > y0 and x1 > x0:
+            size = x1 - x0, y1 - y0
+            self._grey[y0:y1, x0:x1] = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
 
     def jpeg(self) -> NDArray[np.uint8]:
         encoded = cv2.imencode(".jpg", self._grey, [int(cv2.IMWRITE_JPEG_QUALITY), 70])[1]
@@ -281,7 +278,7 @@ BLOCK_PX = 1024
 """Least width: a few MB of memory per thread."""
 
 
-class Raster(Protocol):
+class GreyRaster(Protocol):
     """Imagery in the pixels of a sheet. Threads may share it."""
 
     def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> Pixels: ...
@@ -327,7 +324,7 @@ class SheetReader:
     def crops(self) -> list[Crop]:
         return [] if self._sampler is None else self._sampler.crops
 
-    def read(self, raster: Raster, progress: Progress, workers: int | None = None) -> None:
+    def read(self, raster: GreyRaster, progress: Progress, workers: int | None = None) -> None:
         """Read all blocks with `workers` threads (None: one per core)."""
         workers = usable_cores() if workers is None else workers
         recipe = variant_recipe(represent.TABLE, self.representation)
@@ -393,7 +390,7 @@ class SheetReader:
             found.append(drawn)
         return found
 
-    def _read_block(self, raster: Raster, block: Block) -> BlockContent | None:
+    def _read_block(self, raster: GreyRaster, block: Block) -> BlockContent | None:
         """None where it has no imagery."""
         outer = self._outer(block)
         pixels = raster.read_grey(*outer.window)
