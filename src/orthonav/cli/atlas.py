@@ -206,6 +206,7 @@ def _index(options: argparse.Namespace, atlas: "Atlas") -> None:
 
     with progress(options) as shown:
         made = make_index(atlas, progress=shown, rebuild=options.rebuild)
+    atlas.snapshot()
     if made is None:
         print(f"no sheet has coarse tiles, nothing to index: {atlas.store}")
         return
