@@ -3,12 +3,14 @@
 import errno
 import os
 import threading
+import time
 
 import cv2
 import numpy as np
 import pytest
 
 from helpers import box_deg, textured, waypoints
+from orthonav.core.cores import in_order
 from orthonav.core.errors import AreaError, ImageryError, OutputError, UsageError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
@@ -17,7 +19,6 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import CALIBRATION
-from orthonav.ground.build.sheet import in_order
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
@@ -174,6 +175,7 @@ def test_the_first_error_is_raised_and_no_thread_stays(workers):
     before = threading.active_count()
 
     def failing(item):
+        time.sleep(0.002 * (5 - item % 6))  # later ones are first
         if item in (7, 8):
             raise ImageryError(f"item {item}")
         return item

@@ -8,18 +8,16 @@ import contextlib
 import functools
 import logging
 import math
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.cores import usable_cores
+from orthonav.core.cores import in_order, usable_cores
 from orthonav.core.errors import AreaError, VariantError
 from orthonav.core.files import Progress, no_progress
 from orthonav.core.geo.grid import TileGrid
@@ -43,35 +41,6 @@ from orthonav.ground.imagery.mosaic import Mosaic, Pixels
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 from orthonav.research.tiles import SheetTiles
-
-Item = TypeVar("Item")
-Made = TypeVar("Made")
-AHEAD = 2
-"""Finished results that may wait for a slower one."""
-
-
-def in_order(
-    work: Callable[[Item], Made], items: Sequence[Item], workers: int
-) -> Generator[Made, None, None]:
-    """Results of `work` in the order of the items, at most `workers + AHEAD` ahead.
-
-    The first error, in that order, is raised. No thread runs once this is closed."""
-    workers = min(workers, len(items))
-    if workers <= 1:
-        yield from map(work, items)
-        return
-    waiting: deque[Future[Made]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) >= workers + AHEAD:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for result in waiting:
-                result.cancel()
 
 
 @dataclass(frozen=True)
