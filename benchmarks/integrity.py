@@ -36,6 +36,7 @@ from orthonav.core.localize.confidence import (
     FEATURES,
     Chances,
     RegisteredConfidence,
+    Scores,
     features_of,
 )
 from orthonav.core.records import CONFIDENT
@@ -71,7 +72,9 @@ class Judged:
     @classmethod
     def of(cls, rows: list[dict[str, Any]]) -> "Judged":
         """From the rows of `views_of` that have a fix."""
-        made = [features_of(each["evidence"], Chances(**each["chances"])) for each in rows]
+        made = [
+            features_of(Scores.of(each["evidence"]), Chances(**each["chances"])) for each in rows
+        ]
         features, right = np.stack(made), np.array([each["right"] for each in rows])
         scenes, place = np.array([each["scene"] for each in rows]), np.zeros(len(rows))
         for scene in np.unique(scenes):

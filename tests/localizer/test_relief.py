@@ -23,8 +23,8 @@ from lab.terrain import random_relief, seen_view
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.camera import FITTING
+from orthonav.core.localize.confidence import MAX_RATIO
 from orthonav.core.localize.ground import GroundModel, ViewOverGround
-from orthonav.core.localize.place import MAX_RATIO
 from orthonav.core.localize.rectify import Orientation
 from orthonav.core.localize.systematic import ERRORS
 from orthonav.core.mapfile import open_map

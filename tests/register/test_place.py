@@ -44,7 +44,7 @@ def searched(reference, templates, prior, level, count=24):
 
 def verified(refiner, candidates, level, **more):
     """From candidates to the best place."""
-    return refiner.finished(refiner.judge(candidates, level), len(candidates), **more)
+    return refiner.finished(refiner.judge(candidates, level), **more)
 
 
 def registered(reference, templates, prior, level=LEVELS.mid):
@@ -84,7 +84,7 @@ def test_a_view_is_found_and_stands_out(reference, level):
         assert abs(turned_rad(found.pose, pose)) < math.radians(0.2)
         assert abs(found.pose.log_scale - pose.log_scale) < 0.004
         assert found.fit.level == LEVELS.final
-        assert found.scores["peak_ratio"] > 1.8 and found.scores["look_ratio"] > 1.8
+        assert found.scores.peak_ratio > 1.8 and found.scores.mid_ratio > 1.8
         assert np.linalg.eigvalsh(found.fit.covariance).min() > 0
         assert found.fit.agreement > 0.9
 
@@ -93,8 +93,8 @@ def test_a_place_that_is_there_twice_is_not_sure():
     reference = reference_of(Twin(), SHAPE)
     found = registered(reference, templates_of(GROUND, ONE), prior_of(ONE))
     assert min(apart_px(found.pose, each) for each in (ONE, SAME_AGAIN)) < 0.1
-    assert found.scores["peak_ratio"] == pytest.approx(1, abs=0.05)
-    assert found.scores["look_ratio"] == pytest.approx(1, abs=0.05)
+    assert found.scores.peak_ratio == pytest.approx(1, abs=0.05)
+    assert found.scores.mid_ratio == pytest.approx(1, abs=0.05)
     assert found.fit.weighted > 0.9  # however well it fits
 
 
@@ -117,9 +117,9 @@ def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
         # A weak heading leaves a tie of both places, which OpenCV 4 and 5 round apart.
         right = (ONE, twin) if std_deg > 10.0 else (pose,)
         assert min(apart_px(found.pose, each) for each in right) < 0.1
-        ratios.append(found.scores["peak_ratio"])
+        ratios.append(found.scores.peak_ratio)
     assert min(ratios[:2]) > ratios[2] >= 0.99
-    assert found_with(NO_PRIOR).scores["peak_ratio"] == pytest.approx(1, abs=0.05)
+    assert found_with(NO_PRIOR).scores.peak_ratio == pytest.approx(1, abs=0.05)
 
 
 def test_a_view_of_elsewhere_stands_out_nowhere(reference):
@@ -127,7 +127,7 @@ def test_a_view_of_elsewhere_stands_out_nowhere(reference):
     for seed in (5, 6, 7):
         wrong = registered(reference, templates_of(Ground(seed=seed), HERE), prior_of(HERE))
         assert wrong.score < 0.5 * right.score
-        assert wrong.scores["peak_ratio"] < 1.5 and wrong.scores["look_ratio"] < 1.5
+        assert wrong.scores.peak_ratio < 1.5 and wrong.scores.mid_ratio < 1.5
         assert wrong.fit.weighted < 0.45
 
 
@@ -140,7 +140,7 @@ def test_blank_views_and_blank_maps_are_no_crash(reference, grey):
         refiner = CandidateRefiner(templates, LEVELS, prior_of(HERE), where)
         found = verified(refiner, candidates, LEVELS.coarse)
         assert abs(found.score) < 30 and np.isfinite(found.fit.covariance).all()
-        assert math.isfinite(found.scores["peak_ratio"] + found.scores["look_ratio"])
+        assert math.isfinite(found.scores.peak_ratio + found.scores.mid_ratio)
 
 
 def test_threads_may_share_a_sheet(reference):

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from orthonav.core.integrity import probability_within
 from orthonav.core.localize.camera import CameraEstimate, tilt_std_deg
 from orthonav.core.localize.ground import PreparedMap
-from orthonav.core.localize.place import Finished
+from orthonav.core.localize.place import BestPlace
 from orthonav.core.localize.rectify import off_nadir_deg
 from orthonav.core.localize.search import Search
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import RADIUS_SHARE, Fix
 
 
-def fix_of(search: Search, best: Finished) -> Fix:
+def fix_of(search: Search, best: BestPlace) -> Fix:
     """From the camera that the picture shows, else from the place alone."""
     sheet, ground, pose = search.sheet, search.over_ground, best.fit.pose
     camera = search.camera(best)
@@ -30,7 +30,7 @@ def fix_of(search: Search, best: Finished) -> Fix:
             middle_en_m = ground.middle_en_m(ground.sight_en_m(orientation), pose)
     place = math.nan if sheet.confidence is None else sheet.confidence(best.scores)
     radius_m = max(sheet.radius_m, RADIUS_SHARE * found.agl_m)
-    evidence = best.scores | found.stds
+    evidence = _evidence(search, best) | found.stds
     if found.middle_cov_en_m2 is not None:
         widest = float(np.linalg.eigvalsh(found.middle_cov_en_m2)[-1])
         evidence["middle_std_m"] = math.sqrt(widest)
@@ -63,6 +63,22 @@ def fix_of(search: Search, best: Finished) -> Fix:
     )
 
 
+def _evidence(search: Search, best: BestPlace) -> dict[str, float]:
+    """By the keys of `fixes.jsonl` (docs/reference/formats.md)."""
+    fit = best.fit
+    gradient, grey = fit.correlations
+    return {
+        "score": fit.weighted,
+        **best.scores.evidence(),
+        "gradient_correlation": gradient,
+        "grey_correlation": grey,
+        "blocks_t": fit.blocks_t,
+        "agreement": fit.agreement,
+        "overlap": fit.overlap,
+        "candidates": float(search.candidates),
+    }
+
+
 def _by_camera(view: PreparedView, camera: CameraEstimate) -> "_Exterior":
     """From the blocks of the view."""
     heading_deg, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
@@ -85,7 +101,7 @@ def _by_camera(view: PreparedView, camera: CameraEstimate) -> "_Exterior":
     )
 
 
-def _by_similarity(sheet: PreparedMap, view: PreparedView, best: Finished) -> "_Exterior":
+def _by_similarity(sheet: PreparedMap, view: PreparedView, best: BestPlace) -> "_Exterior":
     """Under the reported pitch and roll."""
     pose, covariance = best.pose, best.fit.covariance
     assert covariance is not None

@@ -346,8 +346,8 @@ def _registered(
     found = [each.pose for each in search(template, window, poses, ODOMETRY.candidates)]
     if not found:
         return None
-    best = refiner.finished(refiner.judge(found, level), len(found))
-    return best.fit if best.scores["peak_ratio"] >= ODOMETRY.min_score_ratio else None
+    best = refiner.finished(refiner.judge(found, level))
+    return best.fit if best.scores.peak_ratio >= ODOMETRY.min_score_ratio else None
 
 
 def _as_expected(

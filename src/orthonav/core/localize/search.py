@@ -1,10 +1,10 @@
-"""The search for the place of one view: steps that find candidates, and when they are enough.
+"""The search for the place of one view: stages that find candidates, and when they are enough.
 
-`policy` says what is tried and what it costs; each step finds candidates in its way, `place` judges
-them. A search ends as soon as the best place stands out or is proven by its confidence."""
+`policy` says what is tried and what it costs; each stage finds candidates in its way, `place`
+judges them. A search ends as soon as the best place stands out or is proven by its confidence."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from orthonav.core.localize.camera import CameraEstimate, camera_of
 from orthonav.core.localize.confidence import DEFAULT_CHANCES
 from orthonav.core.localize.ground import PreparedMap, ViewOverGround
-from orthonav.core.localize.place import REFINEMENT, CandidateRefiner, Finished, Judged
+from orthonav.core.localize.place import REFINEMENT, BestPlace, CandidateRefiner, Finished, Judged
 from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, NoFix, Prior
@@ -27,7 +27,7 @@ from orthonav.core.tiles.position import rows_within
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class Stage:
     """One way to find candidates, `count` at most, under `directions`, the most likely first.
 
     By FFT at `level`, or from tiles, whose candidates are refined at `level` first. `cost_ms`:
@@ -39,10 +39,17 @@ class Step:
     cost_ms: float
     from_tiles: bool = False
 
-    def part(self, directions: list[Direction]) -> "Step":
-        """The same under some of its directions only."""
-        cost_ms = self.cost_ms * len(directions) / len(self.directions)
-        return replace(self, directions=directions, cost_ms=cost_ms)
+    def likely_first(self, likely: int) -> list["Stage"]:
+        """The same under the first `likely` directions, then under the others."""
+        return [
+            replace(
+                self,
+                directions=some,
+                cost_ms=self.cost_ms * len(some) / len(self.directions),
+            )
+            for some in (self.directions[:likely], self.directions[likely:])
+            if some
+        ]
 
 
 class Search:
@@ -66,18 +73,18 @@ class Search:
         # With a prior few candidates are sought, by both kinds; `by_gradients` seeks the others.
         share = SOUGHT_SHARE if prior is None else math.inf
         self.sought = view.templates.weighing_grey(min(share, view.templates.grey_share))
-        self.found: list[tuple[Step, list[Pose]]] = []
+        self.found: list[tuple[Stage, list[Pose]]] = []
         self.budget = Budget(self.plan.budget_ms)
 
     @property
     def candidates(self) -> int:
         return sum(len(poses) for _, poses in self.found)
 
-    def run(self) -> Finished | NoFix:
+    def run(self) -> BestPlace | NoFix:
         """By the channels of the view alone; see `found_by`."""
         return self.outcome(self.best())
 
-    def outcome(self, best: Finished | None) -> Finished | NoFix:
+    def outcome(self, best: BestPlace | None) -> BestPlace | NoFix:
         """With its height counted from the ground below the camera."""
         if best is not None:
             return self.refiner.below_camera(best)
@@ -88,18 +95,15 @@ class Search:
             detail += "; a large map needs a prior, or views as large as its tiles"
         return NoFix("no_match", detail)
 
-    def best(self) -> Finished | None:
+    def best(self) -> BestPlace | None:
         """None where nothing was found."""
-        if not self.touches_map:
-            return None
-        for step in self.steps():
-            if early := self._proven_before(step):
-                return early
-            if not self.budget.allows(step.cost_ms):
+        stages = self.stages() if self.touches_map else []
+        for stage, following in zip(stages, [*stages[1:], None], strict=False):
+            if not self.budget.allows(stage.cost_ms):
                 break
-            self._take(step)
-            if clear := self._clear_after(step):
-                return clear
+            self._take(stage)
+            if found := self._ended(stage, following):
+                return found
         return self.concluded()
 
     def by_gradients(self) -> "Search":
@@ -109,73 +113,72 @@ class Search:
         made.budget = self.budget
         for each in self.found:
             made._judge(*each)
-        step = made._likeliest()
-        if math.isfinite(step.cost_ms) and self.budget.allows(step.cost_ms):
-            made._take(step)
+        stage = made._likeliest()
+        if math.isfinite(stage.cost_ms) and self.budget.allows(stage.cost_ms):
+            made._take(stage)
         return made
 
     def camera(self, place: Finished) -> CameraEstimate | None:
         """None where too few blocks of the view are seen."""
-        ratio = place.scores.get("local_ratio", 1.0)  # of the best place only
+        ratio = place.scores.local_ratio if isinstance(place, BestPlace) else 1.0
         floor_m = self.sheet.floor_m(self.view)
         return camera_of(self.over_ground, place.fit.pose, ratio, floor_m, place.camera)
 
     # What is tried
 
-    def steps(self) -> Iterator[Step]:
-        """To be run in this order until the search ends: on a small area the mid level, on a large
-        one coarse candidates first; the final level where that is cheap too."""
+    def stages(self) -> list[Stage]:
+        """In this order until the search ends: on a small area the mid level, on a large one coarse
+        candidates first; the final level where that is cheap too."""
         plan, levels = self.plan, self.levels
-        every, _ = self._directions(plan.mid_steps)
-        mid_ms, tried_all = self._fft_ms(levels.mid, len(every)), False
-        if mid_ms > plan.cheap_ms:
-            for step in self._on_large_area(mid_ms):
-                # Over relief the expected scale is another one at every place.
-                tried_all |= not step.from_tiles and self.view.prior.scale_map is None
-                yield from self._likely_first(step)
-        if mid_ms <= max(plan.last_ms, plan.cheap_ms):
-            yield from self._stages(tried_all)
-        final, _ = self._directions(plan.final_steps)
-        step = self._fft_step(levels.final, final, plan.final_candidates)
-        if levels.final < levels.mid and step.cost_ms <= plan.cheap_ms:
-            yield step
-
-    def _stages(self, tried_all: bool) -> Iterator[Step]:
-        """The mid level, by how likely headings and scales are; without the last stage where the
-        coarse level `tried_all` and it takes long."""
-        plan = self.plan
         every, nats = self._directions(plan.mid_steps)
+        mid_ms = self._fft_ms(levels.mid, len(every))
+        coarse = self._on_large_area(mid_ms) if mid_ms > plan.cheap_ms else []
+        stages = [part for each in coarse for part in each.likely_first(self._likely(each))]
+        if mid_ms <= max(plan.last_ms, plan.cheap_ms):
+            # Over relief the expected scale is another one at every place.
+            uniform = self.view.prior.scale_map is None
+            tried_all = uniform and any(not each.from_tiles for each in coarse)
+            stages += self._at_mid_level(every, nats, tried_all)
+        final, _ = self._directions(plan.final_steps)
+        stage = self._fft_stage(levels.final, final, plan.final_candidates)
+        is_cheap = levels.final < levels.mid and stage.cost_ms <= plan.cheap_ms
+        return [*stages, stage] if is_cheap else stages
+
+    def _at_mid_level(
+        self, every: Sequence[Direction], nats: Sequence[float], tried_all: bool
+    ) -> list[Stage]:
+        """By how likely headings and scales are; without the last stage where the coarse level
+        `tried_all` and it takes long."""
+        plan, stages = self.plan, []
         for least, most in pairwise(plan.stages_nats):
-            stage = [each for each, its in zip(every, nats, strict=True) if least < its <= most]
-            step = self._fft_step(self.levels.mid, stage, plan.candidates)
-            is_last = most == plan.stages_nats[-1]
-            if is_last and tried_all and step.cost_ms > plan.last_stage_ms:
-                return
-            if stage:
-                yield step
+            some = [each for each, its in zip(every, nats, strict=True) if least < its <= most]
+            if some:
+                stages.append(self._fft_stage(self.levels.mid, some, plan.candidates))
+        has_last = any(its > plan.stages_nats[-2] for its in nats)
+        if has_last and tried_all and stages[-1].cost_ms > plan.last_stage_ms:
+            stages.pop()
+        return stages
 
     def _directions(self, steps: tuple[float, float]) -> tuple[list[Direction], list[float]]:
         """Those to try, the most likely first, and their negative log densities."""
         rated = self.plan.directions(self.view.prior, steps)
         return [each for each, _ in rated], [nats for _, nats in rated]
 
-    def _on_large_area(self, mid_ms: float) -> Iterator[Step]:
+    def _on_large_area(self, mid_ms: float) -> list[Stage]:
         """The cheaper of the coarse ones where it is possible; the other only where the mid level
         takes too long, and this one does not."""
-        by_cost = sorted(self._coarse_steps(), key=lambda each: each.cost_ms)
-        affordable_ms = 0.0 if mid_ms <= self.plan.last_ms else self.plan.last_ms
-        for number, step in enumerate(by_cost):
-            if math.isinf(step.cost_ms) or (number and step.cost_ms > affordable_ms):
-                return
-            yield step
+        by_cost = sorted(self._coarse_stages(), key=lambda each: each.cost_ms)
+        most_ms = 0.0 if mid_ms <= self.plan.last_ms else self.plan.last_ms
+        others = [each for each in by_cost[1:] if each.cost_ms <= most_ms]
+        return [*by_cost[:1], *others] if math.isfinite(by_cost[0].cost_ms) else []
 
-    def _coarse_steps(self) -> list[Step]:
+    def _coarse_stages(self) -> list[Stage]:
         """The coarse level, or one above it where that takes too long; and tiles."""
         plan, level = self.plan, self.levels.coarse
         tried, _ = self._directions(plan.coarse_steps)
-        coarse = self._fft_step(level, tried, plan.candidates)
+        coarse = self._fft_stage(level, tried, plan.candidates)
         if coarse.cost_ms > plan.last_ms:
-            far = self._fft_step(level + 1, tried, plan.far_candidates)
+            far = self._fft_stage(level + 1, tried, plan.far_candidates)
             if not math.isinf(far.cost_ms):  # there is such a level
                 coarse = far
         if self.sheet.propose is None or not self.tiles:
@@ -183,63 +186,56 @@ class Search:
         count = plan.candidates_from(self.tiles)
         cost_ms = plan.tiles_ms(len(tried), self.tiles, self.sheet.propose.embedder.dims)
         cost_ms += plan.nearby_ms * count
-        return [coarse, Step(level, tried, count, cost_ms, from_tiles=True)]
+        return [coarse, Stage(level, tried, count, cost_ms, from_tiles=True)]
 
-    def _fft_step(self, level: int, directions: list[Direction], count: int) -> Step:
+    def _fft_stage(self, level: int, directions: list[Direction], count: int) -> Stage:
         cost_ms = self._fft_ms(level, len(directions))
         if level > self.levels.coarse:
             cost_ms += self.plan.nearby_ms * count
-        return Step(level, directions, count, cost_ms)
+        return Stage(level, directions, count, cost_ms)
 
-    def _likeliest(self) -> Step:
+    def _likeliest(self) -> Stage:
         """All directions at the mid level where that takes little, else the first stage of them, or
         the coarse level where even that takes too long."""
         plan = self.plan
         every, nats = self._directions(plan.mid_steps)
         first = every[: max(sum(each <= plan.stages_nats[1] for each in nats), 1)]
         for some, most_ms in ((every, plan.cheap_ms), (first, plan.last_ms)):
-            step = self._fft_step(self.levels.mid, some, plan.candidates)
-            if step.cost_ms <= most_ms:
-                return step
-        return self._coarse_steps()[0]
+            stage = self._fft_stage(self.levels.mid, some, plan.candidates)
+            if stage.cost_ms <= most_ms:
+                return stage
+        return self._coarse_stages()[0]
 
-    def _likely_first(self, step: Step) -> Iterator[Step]:
-        """Likely directions first; all at once where the heading is known."""
-        likely = len(step.directions)
-        if self.view.prior.turn_rad is None:
-            _, nats = self._directions(self.plan.coarse_steps)
-            likely = sum(each <= self.plan.likely_nats for each in nats)
-        for some in (step.directions[:likely], step.directions[likely:]):
-            if some:
-                yield step.part(some)
+    def _likely(self, stage: Stage) -> int:
+        """How many directions of a coarse stage come first: all where the heading is known."""
+        if self.view.prior.turn_rad is not None:
+            return len(stage.directions)
+        _, nats = self._directions(self.plan.coarse_steps)
+        return sum(each <= self.plan.likely_nats for each in nats)
 
     # Candidates
 
-    def _candidates(self, step: Step) -> list[Peak]:
-        """Best first."""
-        return self._from_tiles(step) if step.from_tiles else self._by_fft(step)
-
-    def _by_fft(self, step: Step) -> list[Peak]:
+    def _by_fft(self, stage: Stage) -> list[Peak]:
         """The peaks of correlation, of the sheet or of what the prior allows; those of a far level
         at their best places near by."""
-        view, level, windows = self.view, step.level, self.sheet.windows
+        view, level, windows = self.view, stage.level, self.sheet.windows
         recipe = view.levels.recipe(level)
         template = self.sought.at(level, recipe)
         if self.prior is None:
             window = windows.whole(level, recipe, view.side_px)
         else:
-            half_px = largest_half_px(template, step.directions)
+            half_px = largest_half_px(template, stage.directions)
             middle, reach = self.middle_px, self.reach_px
             window = windows.part(level, recipe, view.side_px, middle, reach, half_px)
         # Every thread has memory for a whole window.
         fits = math.prod(window.size) * self.plan.threads <= self.plan.max_search_px
         pool = self.sheet.pool if fits else None
-        found = search(template, window, step.directions, step.count, view.prior.scale_map, pool)
+        found = search(template, window, stage.directions, stage.count, view.prior.scale_map, pool)
         if level > view.levels.coarse:
             return self._allowed_nearby(found, self.plan.far_reach_px * 2**level)
         return self._promising(found)
 
-    def _from_tiles(self, step: Step) -> list[Peak]:
+    def _from_tiles(self, stage: Stage) -> list[Peak]:
         """The most similar tiles that no tile next to them exceeds, each at its best place near
         by."""
         grid, expected, propose = self.sheet.grid, self.view.prior, self.sheet.propose
@@ -247,13 +243,13 @@ class Search:
         # Over a terrain the telemetry predicts another scale at every place.
         if expected.scale_map is not None:
             expected = replace(expected, log_scale_std=math.inf)
-        nats = [expected.negative_log_density(*each) for each in step.directions]
+        nats = [expected.negative_log_density(*each) for each in stage.directions]
         tiles = propose.candidates(
             self.view.rectified_at(0),
-            step.directions,
+            stage.directions,
             1 - np.float32(self.plan.tile_share_per_nat) * np.array(nats, np.float32),
             self.tile_rows,
-            step.count,
+            stage.count,
         )
         return self._allowed_nearby(
             tiles, self.plan.tile_reach_strides * grid.stride_m / grid.gsd_m
@@ -380,51 +376,57 @@ class Search:
 
     # When it ends
 
-    def _take(self, step: Step) -> None:
-        self._judge(step, [each.pose for each in self._candidates(step)])
+    def _take(self, stage: Stage) -> None:
+        found = self._from_tiles(stage) if stage.from_tiles else self._by_fft(stage)
+        self._judge(stage, [each.pose for each in found])
 
-    def _judge(self, step: Step, found: list[Pose]) -> None:
-        self.found.append((step, found))
-        if step.level < self.levels.mid:
+    def _judge(self, stage: Stage, found: list[Pose]) -> None:
+        self.found.append((stage, found))
+        if stage.level < self.levels.mid:
             self.direct = self.refiner.direct(found)
         else:
-            level = min(step.level, self.levels.coarse)
+            level = min(stage.level, self.levels.coarse)
             self.places += self.refiner.judge(found, level, self.places)
 
-    def _clear_after(self, step: Step) -> Finished | None:
-        plan, levels = self.plan, self.levels
-        is_fine = step.from_tiles or step.level == levels.mid
-        margin = plan.clear_at_mid if is_fine else plan.clear
+    def _ended(self, stage: Stage, following: Stage | None) -> BestPlace | None:
+        """The best place so far, if it ends the search before the `following` stage: it stands out,
+        or a trial proves it."""
         if not self.places:
             return None
+        found = self._outstanding(stage)
+        return self._proven_by_trial(stage, following) if following and not found else found
+
+    def _outstanding(self, stage: Stage) -> BestPlace | None:
+        """It stands out from its rivals. Those from tiles or from far above are not all places:
+        there it must be proven too."""
+        plan, levels = self.plan, self.levels
+        is_fine = stage.from_tiles or stage.level == levels.mid
+        margin = plan.clear_at_mid if is_fine else plan.clear
         best, rival = self.refiner.best_and_rival(self.places)
         if best <= margin.strength * self.chances.look or best <= margin.mid_ratio * rival:
             return None  # before the cost of finishing it
         found = self._finished(self.places)
-        # Candidates from tiles or from far above are not all places: rivals alone prove too little.
-        compared_all = not step.from_tiles and step.level <= levels.coarse
+        compared_all = not stage.from_tiles and stage.level <= levels.coarse
         proven = compared_all or self._is_proven(found, plan.doubt)
         return found if proven and self._is_clear(found, margin) else None
 
-    def _proven_before(self, step: Step) -> Finished | None:
-        """The best place so far, if a trial before the next step proves it.
-
-        The best few are finished on the terrain; where that proves none, they are compared one
+    def _proven_by_trial(self, stage: Stage, following: Stage) -> BestPlace | None:
+        """The best few are finished on the terrain; where that proves none, they are compared one
         level finer. Where only a part of all places was compared, the best must stand out too. No
-        trial before a step that costs less, except the final level, before which all directions
+        trial before a stage that costs less, except the final level, before which all directions
         were tried."""
-        plan, last, levels = self.plan, self.found[-1][0] if self.found else None, self.levels
-        if last is None or self.sheet.confidence is None or levels.final == levels.mid:
-            return None
-        at_final, is_level = step.level < levels.mid, self.refiner.is_level
-        trial_ms = plan.trial_ms if is_level else plan.terrain_trial_ms
-        if not self.places or not (at_final or step.cost_ms > trial_ms):
+        plan, levels, is_flat = self.plan, self.levels, self.refiner.is_flat
+        at_final = following.level < levels.mid
+        trial_ms = plan.trial_ms if is_flat else plan.terrain_trial_ms
+        if self.sheet.confidence is None or levels.final == levels.mid:
             return None
         # Without time for it the search goes on, and is cut short only where that has no time.
-        if not (self.budget.fits(trial_ms) and self.budget.allows(trial_ms)):
+        if not (at_final or following.cost_ms > trial_ms) or not (
+            self.budget.fits(trial_ms) and self.budget.allows(trial_ms)
+        ):
             return None
         places = self.refiner.on_terrain(self.places, plan.trials)
-        compared_all = is_level and last.level == levels.mid and not last.from_tiles
+        compared_all = is_flat and stage.level == levels.mid and not stage.from_tiles
         doubt = plan.doubt if at_final else plan.trial_doubt
         for closer in (False, True):
             found = self._finished(places, plan.trials, closer=closer)
@@ -436,12 +438,13 @@ class Search:
                 return None
         return None
 
-    def concluded(self) -> Finished | None:
-        """After all steps. While none is proven, more are finished and compared one level finer."""
+    def concluded(self) -> BestPlace | None:
+        """After all stages. While none is proven, more are finished and compared one level
+        finer."""
         plan, levels, places = self.plan, self.levels, self.places
         if not places:
             return None
-        if not self.refiner.is_level and self.budget.allows(0.0):
+        if not self.refiner.is_flat and self.budget.allows(0.0):
             places = self.refiner.on_terrain(places, plan.terrain_candidates)
         found = self._finished(places)
         passes = plan.finer if levels.final > 0 else plan.finer[-1:]
@@ -450,36 +453,36 @@ class Search:
                 break
             found = self._finished(places, kept, closer=True)
         if self.budget.cut_short:
-            found.scores["cut_short"] = 1.0
+            found = replace(found, scores=replace(found.scores, cut_short=True))
         return found
 
     def _finished(
         self, places: Sequence[Judged], kept: int = REFINEMENT.to_finish, *, closer: bool = False
-    ) -> Finished:
-        return self.refiner.finished(places, self.candidates, self.direct, kept=kept, closer=closer)
+    ) -> BestPlace:
+        return self.refiner.finished(places, self.direct, kept=kept, closer=closer)
 
-    def _is_clear(self, best: Finished, margin: ClearMargin) -> bool:
+    def _is_clear(self, best: BestPlace, margin: ClearMargin) -> bool:
         scores = best.scores
         return (
-            scores["strength"] > margin.strength * self.chances.total
-            and scores["look_ratio"] > margin.mid_ratio
-            and scores["peak_ratio"] > margin.peak_ratio
+            scores.strength > margin.strength * self.chances.total
+            and scores.mid_ratio > margin.mid_ratio
+            and scores.peak_ratio > margin.peak_ratio
         )
 
-    def _is_proven(self, best: Finished, doubt: float) -> bool:
+    def _is_proven(self, best: BestPlace, doubt: float) -> bool:
         return self.likelihood(best) > 1 - doubt
 
-    def tentative(self) -> Finished | None:
+    def tentative(self) -> BestPlace | None:
         """The best place so far, not compared one level finer."""
         return self._finished(self.places) if self.places else None
 
-    def is_doubtful(self, best: Finished) -> bool:
+    def is_doubtful(self, best: BestPlace) -> bool:
         """Whether it is not recognized, and there is time to compare all candidates again."""
         doubtful = self.sheet.confidence is not None and self.likelihood(best) < CONFIDENT
         again_ms = self.plan.trial_ms + self.plan.nearby_ms * self.candidates
         return doubtful and not self.budget.cut_short and self.budget.allows(again_ms)
 
-    def likelihood(self, place: Finished | None) -> float:
+    def likelihood(self, place: BestPlace | None) -> float:
         """Probability that the place is right, 0 for none."""
         if place is None or self.sheet.confidence is None:
             return 0.0
@@ -490,7 +493,7 @@ class Found(NamedTuple):
     """A place, and the search that found it."""
 
     search: Search
-    place: Finished
+    place: BestPlace
 
 
 def found_by(search: Search) -> Found | NoFix:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.localize.camera import CameraEstimate
-from orthonav.core.localize.confidence import RegisteredConfidence, logit
+from orthonav.core.localize.confidence import RegisteredConfidence, Scores, logit
 from orthonav.core.localize.odometry import tilt_lever_m
-from orthonav.core.localize.place import Finished
+from orthonav.core.localize.place import BestPlace, Finished
 from orthonav.core.localize.search import Search
 from orthonav.core.records import Telemetry
 
@@ -48,7 +48,7 @@ class Sighting:
 
 
 def sightings(
-    search: Search, best: Finished, telemetry: Telemetry, log_scale: float, searched_share: float
+    search: Search, best: BestPlace, telemetry: Telemetry, log_scale: float, searched_share: float
 ) -> Iterator[Sighting]:
     """Of the best place and its rivals; the sheet has a confidence.
 
@@ -70,7 +70,7 @@ def sightings(
 
 
 def places_of(
-    best: Finished, confidence: RegisteredConfidence, near_px: float, searched_share: float
+    best: BestPlace, confidence: RegisteredConfidence, near_px: float, searched_share: float
 ) -> list[tuple[float, float, Finished]]:
     """Log odds, probability by the view alone, and place: the best, and rivals `near_px` apart.
 
@@ -78,20 +78,18 @@ def places_of(
     within the area times `searched_share`, or, if less, those of a whole search whose rivals are
     what chance makes (docs/tracking.md)."""
     share, chances = math.log(searched_share), confidence.chances
-    chance = {
-        "rival": chances.of_strength(best.scores),
-        "look_rival": chances.look,
-        "fine_rival": chances.fine,
-    }
     out: list[tuple[float, float, Finished]] = []
     for place in (best, *best.rivals):
         if any(place.pose.distance_px(other.pose) < near_px for *_, other in out):
             continue
         scores = _as_rival(best, place) if out else best.scores
-        alone = confidence(
-            scores
-            | {k: max(scores[k], least) for k, least in chance.items() if not math.isnan(scores[k])}
+        by_chance = replace(
+            scores,
+            rival=max(scores.rival, chances.of_strength(scores)),
+            mid_rival=max(scores.mid_rival, chances.look),
+            fine_rival=max(scores.fine_rival, chances.fine),  # NaN stays
         )
+        alone = confidence(by_chance)
         edge = LIMITS.min_probability
         log_odds = min(logit(confidence(scores), edge) + share, logit(alone, edge))
         if out:  # the best place may have won in detail, against stronger scores elsewhere
@@ -101,18 +99,18 @@ def places_of(
     return out
 
 
-def _as_rival(best: Finished, place: Finished) -> dict[str, float]:
+def _as_rival(best: BestPlace, place: Finished) -> Scores:
     """As if it were the best place, and the best one its rival."""
-    share = place.score / max(best.score, 1e-6)
-    look = best.scores["look"]
-    return best.scores | {
-        "strength": place.score,
-        "rival": best.score,
-        "look": look * share,
-        "look_rival": look,
-        "fine": math.nan,
-        "fine_rival": math.nan,
-    }
+    mid_score = best.scores.mid_score
+    return replace(
+        best.scores,
+        strength=place.score,
+        rival=best.score,
+        mid_score=mid_score * (place.score / max(best.score, 1e-6)),
+        mid_rival=mid_score,
+        fine=math.nan,
+        fine_rival=math.nan,
+    )
 
 
 def _by_camera(camera: CameraEstimate, telemetry: Telemetry) -> tuple[Array, Array]:

@@ -18,17 +18,16 @@ from orthonav.core.register.template import Template
 from orthonav.core.register.window import MapWindow, Reference, sampled_planes
 
 Array = NDArray[np.float32]
-MAX_RATIO = 10.0
 PHASE_FLOOR = 1e-3  # fraction of the mean power below which frequencies count less
 
 
 class Sharpness(NamedTuple):
-    """Over scores a little aside: `ratio` of all channels over the best, up to 10; 0 without
-    correlation; `gradients`, `phase` over the mean, in standard deviations."""
+    """Over scores a little aside: `local_ratio` of all channels over the best, up to 10; 0 without
+    correlation; `local_gradients`, `local_phase` over the mean, in standard deviations."""
 
-    ratio: float
-    gradients: float
-    phase: float
+    local_ratio: float
+    local_gradients: float
+    local_phase: float
 
 
 def sharpness(template: Template, reference: Reference, pose: Pose) -> Sharpness:
@@ -47,7 +46,7 @@ def sharpness(template: Template, reference: Reference, pose: Pose) -> Sharpness
 
 def _ratio(scores: Array, near: NDArray[np.bool_], aside: NDArray[np.bool_]) -> float:
     here, rival = float(scores[near].max()), float(scores[aside].max(initial=0.0))
-    return min(here / max(rival, 1e-6), MAX_RATIO) if here > 0 else 0.0
+    return min(here / max(rival, 1e-6), 10.0) if here > 0 else 0.0
 
 
 def _deviations(scores: Array, near: NDArray[np.bool_], aside: NDArray[np.bool_]) -> float:
