@@ -24,8 +24,7 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
-from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.whitened import CellSheet
+from orthonav.core.tiles.whitened import CellLayout, CellSheet
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
 from orthonav.ground.atlas.cluster import SerialRunner

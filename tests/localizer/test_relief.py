@@ -26,10 +26,10 @@ from orthonav.core.localize.camera import FITTING
 from orthonav.core.localize.confidence import MAX_RATIO
 from orthonav.core.localize.ground import GroundModel, ViewOverGround
 from orthonav.core.localize.rectify import Orientation
-from orthonav.core.localize.systematic import ERRORS
+from orthonav.core.localize.resection import ERRORS
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.window import Pose
 from orthonav.ground.simulate.render import Raster
 
 SIDE_M, POSTING_M = 700.0, 10.0

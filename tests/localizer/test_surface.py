@@ -19,11 +19,11 @@ from orthonav.core.localize.ground import (
     _smoothed,
 )
 from orthonav.core.localize.rectify import hidden
-from orthonav.core.localize.systematic import ERRORS
+from orthonav.core.localize.resection import ERRORS
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import Telemetry, View
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.window import Pose
 from orthonav.ground.build.lean import as_shown
 from orthonav.ground.simulate.render import Raster
 

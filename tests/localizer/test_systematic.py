@@ -10,7 +10,7 @@ from blots import ROUGH
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.localize.camera import ground_by_picture, picture_by_camera, picture_by_ground
 from orthonav.core.localize.rectify import Orientation
-from orthonav.core.localize.systematic import (
+from orthonav.core.localize.resection import (
     ERRORS,
     GroundErrors,
     field_modes,

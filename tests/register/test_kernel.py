@@ -12,18 +12,17 @@ from scenes import Ground, apart_px, as_grey, random_poses, reference_of, templa
 
 from orthonav.core.localize import resection
 from orthonav.core.localize.rectify import node_px
-from orthonav.core.register import blocks, channels, refine, search, sharpness, template
-from orthonav.core.register.channels import COARSE, FINE
+from orthonav.core.register import refine, search, template
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Refiner
 from orthonav.core.register.search import SearchWindow, bank, best_near
-from orthonav.core.register.window import MapWindow
+from orthonav.core.register.template import COARSE, FINE
+from orthonav.core.register.window import MapWindow, Pose, ScaleMap
 
 rectify_module = importlib.import_module("orthonav.core.localize.rectify")
 SHAPE = (256, 320)
 GROUND = Ground()
-SHARES = blocks.GREY_SHARE, blocks.MIN_SEEN, blocks.MIN_ENERGY
+SHARES = refine.BLOCK_GREY_SHARE, refine.MIN_SEEN, refine.MIN_ENERGY
 needs_kernel = pytest.mark.skipif(KERNEL is None, reason="the kernel was not compiled")
 
 
@@ -38,7 +37,7 @@ def reference():
 def both(monkeypatch, work):
     """What `work` makes with the kernel, and without it."""
     compiled = work()
-    for module in (blocks, channels, refine, search, sharpness, template):
+    for module in (refine, search, template):
         monkeypatch.setattr(module, "KERNEL", None)
     return compiled, work()
 
@@ -155,7 +154,7 @@ def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole
     seen = list(views(12, 8, level, view_valid))
 
     def work():
-        return [sharpness._moved_scores(made, reference, pose) for made, pose in seen]
+        return [refine._moved_scores(made, reference, pose) for made, pose in seen]
 
     for one, other in zip(*both(monkeypatch, work), strict=True):
         assert one.shape == other.shape
@@ -250,7 +249,7 @@ def test_scores_of_blocks_are_the_same(reference, monkeypatch, level, whole, cac
     seen = list(views(6, 9, level, valid_but_a_corner(whole)))
 
     def work():
-        return [blocks.block_scores(made, reference, pose, reach_px) for made, pose in seen]
+        return [refine.block_scores(made, reference, pose, reach_px) for made, pose in seen]
 
     for one, other in zip(*both(monkeypatch, work), strict=True):
         # OpenCV rounds positions, by which single pixels beside the hole count or not.
@@ -284,8 +283,8 @@ def test_scores_of_blocks_where_nothing_is_interpolated_are_exactly_those(
         rows, cols = shape if quarter % 2 == 0 else shape[::-1]
         pose = Pose(x + cols % 2 / 2, y + rows % 2 / 2, quarter * math.pi / 2, 0.0)
         window = MapWindow.of(view, reference, pose, 1, (reach_px, reach_px))
-        sums = blocks._compared(view, window, pose, reach_px)
-        plain, plain_pixels = blocks._correlated(*sums, math.prod(shape))
+        sums = refine._products_of_blocks(view, window, pose, reach_px)
+        plain, plain_pixels = refine._correlated(*sums, math.prod(shape))
         found, pixels = np.full_like(plain, math.nan), np.full_like(plain_pixels, math.nan)
         at = window.matrix(pose), pose.turn_rad, reach_px, SHARES
         KERNEL.blocks(window.made, view.planes, *at, found, pixels)
@@ -418,8 +417,8 @@ def test_channels_are_the_same(shape, valid, recipe):
         which[: shape[0] // 3, shape[1] // 2 :] = False
     elif valid == "scattered":
         which = rng.uniform(size=shape) > 0.1
-    compiled = channels.channel_planes(grey, which, recipe)
-    plain = np.stack(channels._planes(grey, which, recipe, bool(which.all())))
+    compiled = template.channel_planes(grey, which, recipe)
+    plain = np.stack(template._planes(grey, which, recipe, bool(which.all())))
     np.testing.assert_array_equal(compiled[3], plain[3])
     np.testing.assert_allclose(compiled, plain, atol=1e-4)
 
@@ -427,7 +426,7 @@ def test_channels_are_the_same(shape, valid, recipe):
 @needs_kernel
 def test_channels_of_a_uniform_picture_are_zero():
     grey = np.full((40, 50), 90, np.uint8)
-    compiled = channels.channel_planes(grey, np.ones(grey.shape, bool), FINE)
+    compiled = template.channel_planes(grey, np.ones(grey.shape, bool), FINE)
     assert not compiled[:3].any()
 
 

@@ -9,9 +9,9 @@ import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.localize.place import CandidateRefiner
-from orthonav.core.register.pose import Pose, PosePrior
 from orthonav.core.register.search import SearchWindows, bank, search
 from orthonav.core.register.template import Levels, ViewTemplates
+from orthonav.core.register.window import Pose, PosePrior
 
 SHAPE = (384, 448)
 VIEW = (96, 128)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
 
-from orthonav.core.register.channels import FINE, GREY_SHARE
-from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import SearchWindow, SearchWindows, bank, best_near, search
-from orthonav.core.register.template import Template
+from orthonav.core.register.template import FINE, GREY_SHARE, Template
+from orthonav.core.register.window import Pose
 
 SHAPE = (384, 448)
 GROUND = Ground()

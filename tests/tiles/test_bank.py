@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from helpers import textured
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_poses
-from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.core.tiles.whitened import CellLayout, CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import make_variant
 
 TILE_PX = 128

@@ -6,8 +6,7 @@ import pytest
 from helpers import textured
 from orthonav.core.errors import UsageError, VariantError
 from orthonav.core.tiles import embed, represent
-from orthonav.core.tiles.cells import MICRO, CellLayout
-from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.core.tiles.whitened import MICRO, CellLayout, CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import make_variant
 
 TILE_PX = 128

@@ -13,12 +13,19 @@ from numpy.typing import NDArray
 from orthonav.core.geo.camera import Camera, enu_from_camera, seen_px
 from orthonav.core.localize.ground import GroundModel, LevelTerrain, ViewOverGround
 from orthonav.core.localize.rectify import Orientation, is_oblique
-from orthonav.core.localize.resection import Blocks, Expected, Resection, values
-from orthonav.core.localize.systematic import GroundErrors, lens_px, systematic
+from orthonav.core.localize.resection import (
+    Blocks,
+    Expected,
+    GroundErrors,
+    Resection,
+    lens_px,
+    systematic,
+    values,
+)
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
-from orthonav.core.register.blocks import BlockScores, block_scores
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.refine import BlockScores, block_scores
 from orthonav.core.register.template import BLOCKS, ViewTemplates
+from orthonav.core.register.window import Pose
 
 Array = NDArray[np.float64]
 

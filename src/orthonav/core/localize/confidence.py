@@ -54,7 +54,7 @@ class Scores:
       mid level. `fine`: with one level finer, NaN: not compared there. `.._rival`: of the strongest
       rival, 0 for none.
     - `detail_ratio`: score at the final over that at the mid level, NaN where these are one.
-    - `local_..`: over the ground around, see `orthonav.core.register.sharpness`.
+    - `local_..`: over the ground around, see `orthonav.core.register.refine`.
     - `cut_short`: whether `--budget-ms` ended the search."""
 
     strength: float

@@ -22,7 +22,7 @@ from orthonav.core.localize.rectify import (
     orthorectified,
     rectified_level,
 )
-from orthonav.core.localize.systematic import (
+from orthonav.core.localize.resection import (
     GroundErrors,
     surface_errors,
     terrain_errors,
@@ -33,10 +33,17 @@ from orthonav.core.localize.view import LIMITS, PreparedView
 from orthonav.core.mapfile.manifest import Lean, SheetInfo, TerrainInfo
 from orthonav.core.mapfile.terrain import TerrainLayer
 from orthonav.core.records import DEFAULT_AGL_STD
-from orthonav.core.register.pose import COMPARED, Pose, PosePrior, ScaleMap, rotation
 from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
-from orthonav.core.register.window import GreyPyramid, Reference
+from orthonav.core.register.window import (
+    COMPARED,
+    GreyPyramid,
+    Pose,
+    PosePrior,
+    Reference,
+    ScaleMap,
+    rotation,
+)
 
 UNKNOWN_LEAN = Lean(0.0, 0.0, 0.15)  # up to 0.3 between the middles of overlapping pictures
 Array = NDArray[np.float64]

@@ -12,12 +12,10 @@ from orthonav.core.localize.place import CandidateRefiner
 from orthonav.core.localize.rectify import downsampled, rectify_footprint
 from orthonav.core.localize.view import check_footprint
 from orthonav.core.records import Telemetry, View
-from orthonav.core.register.channels import FINE, ChannelRecipe
-from orthonav.core.register.pose import Pose, PosePrior
 from orthonav.core.register.refine import Fit
 from orthonav.core.register.search import SearchWindows, bank, largest_half_px, search
-from orthonav.core.register.template import Levels, ViewTemplates
-from orthonav.core.register.window import Reference
+from orthonav.core.register.template import FINE, ChannelRecipe, Levels, ViewTemplates
+from orthonav.core.register.window import Pose, PosePrior, Reference
 
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)

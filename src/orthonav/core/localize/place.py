@@ -19,12 +19,10 @@ from orthonav.core.localize.camera import approached
 from orthonav.core.localize.confidence import Scores
 from orthonav.core.localize.ground import ViewOverGround
 from orthonav.core.localize.rectify import Orientation
-from orthonav.core.register.pose import Pose, PosePrior
-from orthonav.core.register.refine import Fit, Refiner
+from orthonav.core.register.refine import Fit, Refiner, sharpness
 from orthonav.core.register.search import Peak, SearchWindows, largest_half_px, search
-from orthonav.core.register.sharpness import sharpness
 from orthonav.core.register.template import Levels, ViewTemplates
-from orthonav.core.register.window import Reference
+from orthonav.core.register.window import Pose, PosePrior, Reference
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")

@@ -22,8 +22,8 @@ import time
 from dataclasses import dataclass
 from functools import lru_cache
 
-from orthonav.core.register.pose import PosePrior
 from orthonav.core.register.search import bank
+from orthonav.core.register.window import PosePrior
 
 Direction = tuple[float, float]
 """Heading (rad, clockwise from north) and natural logarithm of the scale."""

@@ -20,9 +20,9 @@ from orthonav.core.localize.place import REFINEMENT, BestPlace, CandidateRefiner
 from orthonav.core.localize.policy import Budget, ClearMargin, Direction
 from orthonav.core.localize.view import PreparedView
 from orthonav.core.records import CONFIDENT, PRIOR_SIGMAS, NoFix, Prior
-from orthonav.core.register.channels import SOUGHT_SHARE
-from orthonav.core.register.pose import Pose, rotation
 from orthonav.core.register.search import PLACES_AT_ONCE, Peak, best_near, largest_half_px, search
+from orthonav.core.register.template import SOUGHT_SHARE
+from orthonav.core.register.window import Pose, rotation
 from orthonav.core.tiles.position import rows_within
 
 

@@ -16,8 +16,8 @@ from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
 from orthonav.core.localize.view import check_rectified
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, TILE_YAW_STD_DEG, Fix, NoFix, Prior, Telemetry, View
-from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import Peak
+from orthonav.core.register.window import Pose
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import Representation, embed_poses
 from orthonav.core.tiles.embed import ViewEmbedder, embedder_of

@@ -24,8 +24,8 @@ from orthonav.core.records import (
     Telemetry,
     View,
 )
-from orthonav.core.register.pose import PosePrior
 from orthonav.core.register.template import Levels, ViewTemplates
+from orthonav.core.register.window import PosePrior
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import counted_from_centres
-from orthonav.core.register.channels import GROUPS, ChannelRecipe
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.pose import Pose, ScaleMap, even_scale, rotation
-from orthonav.core.register.template import Template, energy_of, turned_planes
-from orthonav.core.register.window import MAX_SIDE_PX, Reference, cut
+from orthonav.core.register.template import (
+    GROUPS,
+    ChannelRecipe,
+    Template,
+    energy_of,
+    turned_planes,
+)
+from orthonav.core.register.window import (
+    MAX_SIDE_PX,
+    Pose,
+    Reference,
+    ScaleMap,
+    cut,
+    even_scale,
+    rotation,
+)
 
 Array = NDArray[np.float32]
 POSES_AT_ONCE = 6

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.tiles.cells import MICRO
-from orthonav.core.tiles.whitened import WhitenedEmbedder, WhitenedRecipe
+from orthonav.core.tiles.whitened import MICRO, WhitenedEmbedder, WhitenedRecipe
 
 Array = NDArray[np.float32]
 Poses = NDArray[np.float64]

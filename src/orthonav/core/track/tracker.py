@@ -31,7 +31,7 @@ from orthonav.core.localize.sighting import Sighting, sightings
 from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
-from orthonav.core.register.pose import rotation
+from orthonav.core.register.window import rotation
 from orthonav.core.track import (
     Estimate,
     Mixture,

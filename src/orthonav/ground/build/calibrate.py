@@ -34,7 +34,7 @@ from orthonav.core.localize.confidence import (
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
-from orthonav.core.register.pose import rotation
+from orthonav.core.register.window import rotation
 from orthonav.core.tiles.embed import ViewEmbedder
 
 
