@@ -31,9 +31,9 @@ from benchmarks.scenes import all_pairs, chosen, place_of
 from orthonav.core.integrity import protection_levels_m
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.localize.confidence import (
-    ALONE,
     DEFAULT_CHANCES,
     FEATURES,
+    NEARBY,
     Chances,
     RegisteredConfidence,
     Scores,
@@ -121,15 +121,15 @@ def fit_judge(features: Array, right: Mask) -> RegisteredConfidence:
 
     def loss(parameters: Array) -> tuple[float, Array]:
         weights = parameters[2:]
-        fits = expit(parameters[0] + scaled[:, :-ALONE] @ weights[:-ALONE])
-        alone = expit(parameters[1] + scaled[:, -ALONE:] @ weights[-ALONE:])
+        fits = expit(parameters[0] + scaled[:, :-NEARBY] @ weights[:-NEARBY])
+        alone = expit(parameters[1] + scaled[:, -NEARBY:] @ weights[-NEARBY:])
         product = fits * alone
         both = np.clip(product, 1e-9, 1 - 1e-9)
         value = -np.log(np.where(right, both, 1 - both)).mean()
         # A limited loss has no slope: with one, searches along a line would fail.
         slope = np.where(right, -1.0, both / (1 - both)) * (both == product) / len(right)
         first, second = slope * (1 - fits), slope * (1 - alone)
-        slopes = scaled[:, :-ALONE].T @ first, scaled[:, -ALONE:].T @ second
+        slopes = scaled[:, :-NEARBY].T @ first, scaled[:, -NEARBY:].T @ second
         gradient = np.concatenate([[first.sum(), second.sum()], *slopes])
         gradient[2:] += 2 * RIDGE * weights
         return float(value + RIDGE * (weights**2).sum()), gradient
@@ -139,8 +139,8 @@ def fit_judge(features: Array, right: Mask) -> RegisteredConfidence:
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     weights = found[2:] / std
     biases = (
-        float(found[0] - weights[:-ALONE] @ mean[:-ALONE]),
-        float(found[1] - weights[-ALONE:] @ mean[-ALONE:]),
+        float(found[0] - weights[:-NEARBY] @ mean[:-NEARBY]),
+        float(found[1] - weights[-NEARBY:] @ mean[-NEARBY:]),
     )
     return RegisteredConfidence(biases, tuple(float(each) for each in weights), DEFAULT_CHANCES)
 

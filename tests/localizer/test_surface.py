@@ -277,7 +277,7 @@ def test_views_on_level_ground_know_the_surface_of_a_route(town, opened):
     from_m = grid.west_m + 0.7 * grid.width_px * grid.gsd_m
     parts = Heights(ground, from_m=from_m), Heights(above, from_m=from_m)
     relief = GroundModel(parts[0], grid, None, None, parts[1])
-    assert relief.levelled().level_errors.fields == (ERRORS.surface_m,)
+    assert relief.flattened().flat_errors.fields == (ERRORS.surface_m,)
 
 
 def test_a_surface_counts_where_most_of_it_is_known(town, opened):

@@ -11,14 +11,14 @@ from scenes import Ground, apart_px, random_poses, reference_of, templates_of, t
 from orthonav.core.localize.place import CandidateRefiner
 from orthonav.core.register.search import SearchWindows, bank, search
 from orthonav.core.register.template import Levels, ViewTemplates
-from orthonav.core.register.window import Pose, PosePrior
+from orthonav.core.register.window import DirectionPrior, Pose
 
 SHAPE = (384, 448)
 VIEW = (96, 128)
 VIEW_PX = math.sqrt(96 * 128)
 LEVELS = Levels.of(VIEW_PX, 3)
 GROUND = Ground()
-NO_PRIOR = PosePrior(None, 3.0, 0.1)
+NO_PRIOR = DirectionPrior(None, 3.0, 0.1)
 HERE = Pose(180.0, 200.0, 0.5, 0.0)
 
 
@@ -28,7 +28,7 @@ def reference():
 
 
 def prior_of(pose, std_deg=8.0):
-    return PosePrior(pose.turn_rad, math.radians(std_deg), 0.08)
+    return DirectionPrior(pose.turn_rad, math.radians(std_deg), 0.08)
 
 
 def searched(reference, templates, prior, level, count=24):

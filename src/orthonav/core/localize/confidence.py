@@ -24,7 +24,7 @@ FEATURES = (
     "log_alone_phase",
     "log_alone_gradients",
 )
-ALONE = 2  # the last two features say whether the view fits nowhere near as well
+NEARBY = 2  # the last features compare with the ground nearby: it fits nowhere near as well
 CHANCES = ("total", "look", "fine")
 
 
@@ -131,9 +131,9 @@ class RegisteredConfidence:
         return min(found, CONFIDENT - 0.01) if scores.cut_short else found
 
     def of(self, features: NDArray[np.float64]) -> float:
-        fits = self.biases[0] + float(np.dot(self.weights[:-ALONE], features[:-ALONE]))
-        alone = self.biases[1] + float(np.dot(self.weights[-ALONE:], features[-ALONE:]))
-        return probability(fits) * probability(alone)
+        fits = self.biases[0] + float(np.dot(self.weights[:-NEARBY], features[:-NEARBY]))
+        unlike = self.biases[1] + float(np.dot(self.weights[-NEARBY:], features[-NEARBY:]))
+        return probability(fits) * probability(unlike)
 
     @classmethod
     def usual(cls, chances: Chances) -> "RegisteredConfidence":

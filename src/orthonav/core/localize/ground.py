@@ -20,7 +20,7 @@ from orthonav.core.localize.rectify import (
     Orientation,
     node_px,
     orthorectified,
-    rectified_level,
+    rectified_flat,
 )
 from orthonav.core.localize.resection import (
     GroundErrors,
@@ -37,9 +37,9 @@ from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
 from orthonav.core.register.window import (
     COMPARED,
+    DirectionPrior,
     GreyPyramid,
     Pose,
-    PosePrior,
     Reference,
     ScaleMap,
     rotation,
@@ -54,7 +54,7 @@ class GroundSampling:
     """Where heights are taken, and what is too little to count."""
 
     map_nodes: int = 256  # of expected scales across the map, at most
-    levelled_nodes: int = 32  # across the map, for the slopes of its terrain
+    flattened_nodes: int = 32  # across the map, for the slopes of its terrain
     window_nodes: int = 9  # across a window, for its mean height
     slope_m: float = 10.0  # half the base over which slopes are measured
     max_scale_std: float = 0.3  # of log scales searched: three are 0.41 to 2.46
@@ -63,8 +63,8 @@ class GroundSampling:
     min_rise: float = 0.05
     """and least rise of the ground below it over that in the view, of the height, at which scales
     are expected by place."""
-    min_known: float = 0.5  # windows of which less is known are registered on level ground
-    level_px: float = 0.2  # relief that displaces less (pixels of the final level) is left out
+    min_known: float = 0.5  # windows of which less is known are registered on flat ground
+    unseen_px: float = 0.2  # relief that displaces less (pixels of the final level) is left out
     surface_node_m: float = 2.0  # largest spacing of heights among houses,
     surface_nodes: int = 320  # but at most so many across a view
     smooth_m: float = 10.0  # width over which these are smoothed for the search
@@ -78,7 +78,7 @@ class Terrain(Protocol):
         """Heights (...) above sea at points (..., 2); NaN where unknown."""
 
 
-class LevelTerrain:
+class FlatTerrain:
     def at_en_m(self, points_en_m: ArrayLike) -> Array:
         return np.zeros(np.shape(points_en_m)[:-1])
 
@@ -100,12 +100,12 @@ class GroundModel:
         self.terrain, self.grid, self.info, self.land = terrain, grid, info, land
         self.surface, self._lean = surface, lean or UNKNOWN_LEAN
         self.lean_en = np.array([self._lean.east, self._lean.north])
-        self.level_errors = unknown_ground(land)
+        self.flat_errors = unknown_ground(land)
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
     @property
-    def is_level(self) -> bool:
-        return isinstance(self.terrain, LevelTerrain)
+    def is_flat(self) -> bool:
+        return isinstance(self.terrain, FlatTerrain)
 
     @property
     def leans(self) -> bool:
@@ -146,7 +146,7 @@ class GroundModel:
 
     def slopes(self, ground_m: Array) -> Array:
         """Rise (N, 2) per metre east and north at (N, 3)."""
-        if self.is_level:
+        if self.is_flat:
             return np.zeros((len(ground_m), 2))
         steps = SAMPLING.slope_m * np.concatenate([np.eye(2), -np.eye(2)])
         ahead, behind = np.split(self.terrain.at_en_m(ground_m[:, None, :2] + steps), 2, axis=1)
@@ -154,27 +154,27 @@ class GroundModel:
 
     def errors(self, ground_m: Array, slopes: Array) -> GroundErrors:
         """Of the heights under a view, by points (N, 3) and slopes (N, 2) there."""
-        if self.is_level:
-            return self.level_errors
+        if self.is_flat:
+            return self.flat_errors
         above_m = self._above_m(ground_m)
         if above_m is None:
             return terrain_errors(self.info, slopes)
         return surface_errors(self._lean.std, above_m)
 
-    def levelled(self) -> "GroundModel":
+    def flattened(self) -> "GroundModel":
         """Level ground that is known as well as this: of simulated views."""
-        if self.is_level:
+        if self.is_flat:
             return self
         sides_px = self.grid.width_px, self.grid.height_px
-        nodes_px = [np.linspace(0.0, side, SAMPLING.levelled_nodes) for side in sides_px]
-        found = GroundModel(LevelTerrain(), self.grid, self.info, self.land)
+        nodes_px = [np.linspace(0.0, side, SAMPLING.flattened_nodes) for side in sides_px]
+        found = GroundModel(FlatTerrain(), self.grid, self.info, self.land)
         ground_m = self.ground_m(np.stack(np.meshgrid(*nodes_px), -1).reshape(-1, 2))
         if (known := np.isfinite(ground_m[:, 2])).any():  # others lie off the route of the map
             ground_m = ground_m[known]
-        found.level_errors = self.errors(ground_m, self.slopes(ground_m))
+        found.flat_errors = self.errors(ground_m, self.slopes(ground_m))
         return found
 
-    def expected(self, view: PreparedView) -> PosePrior:
+    def expected(self, view: PreparedView) -> DirectionPrior:
         """The view's prior, with scales by the height above sea at each place, or else by that of
         the ground below the camera over the ground in the view."""
         telemetry, prior = view.telemetry, view.prior
@@ -264,7 +264,7 @@ class PreparedMap:
         self.propose, self.plan = propose, plan
         info = None if terrain is None else terrain.info
         self.ground = GroundModel(
-            terrain or LevelTerrain(), self.grid, info, sheet.relief, surface, sheet.lean
+            terrain or FlatTerrain(), self.grid, info, sheet.relief, surface, sheet.lean
         )
 
     @property
@@ -350,9 +350,9 @@ class ViewOverGround:
         shape = round(rows * scale), round(cols * scale)
         picture, middle = self.view.picture_at(level), np.array([shape[1], shape[0]]) / 2
         made = None
-        if self.ground.is_level:
+        if self.ground.is_flat:
             en_from_window = self._en_from_window(pose, level, middle)
-            made = rectified_level(picture, orientation, en_from_window, shape)
+            made = rectified_flat(picture, orientation, en_from_window, shape)
         if made is None:
             smooth = smooth or level > final
             ground, shown = self._nodes_m(pose, level, shape, smooth=smooth)
@@ -410,7 +410,7 @@ class ViewOverGround:
 
     def reference_m(self, pose: Pose) -> float:
         """Mean height under the window; NaN where less than half is known."""
-        if self.ground.is_level:
+        if self.ground.is_flat:
             return 0.0
         heights = self._ground_m(pose)[:, 2]
         known = np.isfinite(heights)
@@ -430,9 +430,9 @@ class ViewOverGround:
             return self._ground_m(pose)
         return self.ground.surface_m(pose.map_px(self._reference_px))
 
-    def is_level(self, pose: Pose) -> bool:
+    def is_flat_at(self, pose: Pose) -> bool:
         """Whether relief displaces the window by less than is visible."""
-        if self.ground.is_level:
+        if self.ground.is_flat:
             return True
         ground = self._surface_m(pose)
         orientation = self.orientation(pose)
@@ -442,7 +442,7 @@ class ViewOverGround:
         rise = np.abs(ground[:, 2] - ground[:, 2].mean())
         shift_m = rise * np.hypot(offset[:, 0], offset[:, 1]) / np.maximum(-offset[:, 2], 1.0)
         pixel_m = self.ground.grid.gsd_m * 2.0**self.view.levels.final
-        return bool(shift_m.max() < SAMPLING.level_px * pixel_m)
+        return bool(shift_m.max() < SAMPLING.unseen_px * pixel_m)
 
     def moved_px(self, one: Pose, other: Pose) -> float:
         """At the rim of the window, pixels of level 0."""
@@ -479,9 +479,9 @@ class ViewOverGround:
         plane = undistort(camera, px / [camera.fx_px, camera.fy_px])
         ray = enu_from_camera(*orientation.attitude_deg.tolist()) @ [*plane.tolist(), 1.0]
         above_m = float(orientation.position_m[2])
-        if not ray[2] < -1e-6 or (self.ground.is_level and not above_m > 0):
+        if not ray[2] < -1e-6 or (self.ground.is_flat and not above_m > 0):
             return np.full(2, np.nan)
-        if self.ground.is_level:
+        if self.ground.is_flat:
             return np.asarray(orientation.position_m[:2] - ray[:2] / ray[2] * above_m)
 
         def above_sea_m(offset_en_m: Array) -> Array:

@@ -2,7 +2,7 @@
 
 Candidates are refined from coarse to fine, most are dropped early. The best few are finished: the
 view is orthorectified on the terrain under each pose and registered again until it stays, or on
-level ground where that is as good. Scores over those of the strongest rival say how far it stands
+flat ground where that is as good. Scores over those of the strongest rival say how far it stands
 out."""
 
 import math
@@ -22,7 +22,7 @@ from orthonav.core.localize.rectify import Orientation
 from orthonav.core.register.refine import Fit, Refiner, sharpness
 from orthonav.core.register.search import Peak, SearchWindows, largest_half_px, search
 from orthonav.core.register.template import Levels, ViewTemplates
-from orthonav.core.register.window import Pose, PosePrior, Reference
+from orthonav.core.register.window import DirectionPrior, Pose, Reference
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
@@ -49,7 +49,7 @@ class Refinement:
     small_step_px: float = 0.1  # ends a refinement
     apart: float = 0.25  # least distance of a rival from the best, over the side of the view
     rival_on_terrain: float = 0.75
-    """Rivals with less than this fraction of the best score are finished on level ground: chance
+    """Rivals with less than this fraction of the best score are finished on flat ground: chance
     fits as well there, at half the cost."""
     moved_px: float = 1.0  # a window moved by more (px of the level) is orthorectified again,
     rounds: int = 3  # at most so often
@@ -144,7 +144,7 @@ class CandidateRefiner:
         self,
         templates: ViewTemplates,
         levels: Levels,
-        prior: PosePrior,
+        prior: DirectionPrior,
         reference: Reference,
         *,
         pool: Executor | None = None,
@@ -153,7 +153,7 @@ class CandidateRefiner:
         """`pool` shares candidates; without `ground` it is flat, and no level is finer."""
         self.templates, self.levels, self.prior = templates, levels, prior
         self.reference, self._pool, self._ground = reference, pool, ground
-        self.is_flat = ground is None or ground.ground.is_level
+        self.is_flat = ground is None or ground.ground.is_flat
         self.remembered: dict[tuple[str, Any], Any] = {}
 
     @property
@@ -278,7 +278,7 @@ class CandidateRefiner:
     def _twin(self, place: Judged) -> Judged | None:
         """A place refined on the terrain; None where flat ground is as good."""
         pose = place.pose
-        if self._over_ground.is_level(pose):
+        if self._over_ground.is_flat_at(pose):
             return None
         made = self._over_ground.templates_at(pose, self.levels.mid)
         if made is None:

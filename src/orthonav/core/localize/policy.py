@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from orthonav.core.register.search import bank
-from orthonav.core.register.window import PosePrior
+from orthonav.core.register.window import DirectionPrior
 
 Direction = tuple[float, float]
 """Heading (rad, clockwise from north) and natural logarithm of the scale."""
@@ -104,7 +104,7 @@ class SearchPlan:
     last_stage_ms: float = 60.0
     """The last stage, one view in seven, is left out above after the coarse level."""
     nearby_ms: float = 0.2  # of one candidate from tiles or from above the coarse level
-    trial_ms: float = 25.0  # on level ground,
+    trial_ms: float = 25.0  # on flat ground,
     terrain_trial_ms: float = 60.0  # and on a terrain
     max_search_px: int = 8_000_000  # larger windows (some 300 MB) are left to tiles or a prior
     whole_window_px: int = 8_000_000
@@ -125,7 +125,7 @@ class SearchPlan:
         least, most = self.tile_candidates
         return max(least, min(most, round(tiles / self.tiles_per_candidate)))
 
-    def directions(self, prior: PosePrior, steps: Steps) -> list[tuple[Direction, float]]:
+    def directions(self, prior: DirectionPrior, steps: Steps) -> list[tuple[Direction, float]]:
         """With negative log densities in nats, the most likely first."""
         turn_std_rad = None if prior.turn_rad is None else prior.turn_std_rad
         rated = _likely_directions(turn_std_rad, prior.log_scale_std, steps, self.bank_sigmas)
@@ -149,7 +149,7 @@ def _likely_directions(
         turn_std_rad, log_scale_std, turn_step_rad=steps[0], scale_step=steps[1], sigmas=sigmas
     )
     known = turn_std_rad is not None
-    prior = PosePrior(0.0 if known else None, turn_std_rad or 0.0, log_scale_std)
+    prior = DirectionPrior(0.0 if known else None, turn_std_rad or 0.0, log_scale_std)
     cell = steps[0] / 2, steps[1] / 2
     rated = [(*pose, prior.negative_log_density(*pose, within=cell)) for pose in made]
     return sorted(rated, key=lambda each: each[2])

@@ -107,10 +107,10 @@ def _at_nodes(
     return np.where(valid, grey, 0).astype(np.uint8), np.asarray(valid, np.bool_)
 
 
-def rectified_level(
+def rectified_flat(
     view: View, orientation: Orientation, en_from_window: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], Mask] | None:
-    """As `orthorectified` over level ground at 0 m, by one homography; None where the lens or the
+    """As `orthorectified` over flat ground at 0 m, by one homography; None where the lens or the
     tilt needs more. `en_from_window` (3, 3): metres by pixels of the window, pixel-is-area."""
     if not view.camera.is_pinhole:
         return None

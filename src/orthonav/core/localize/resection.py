@@ -87,7 +87,7 @@ class GroundErrors:
 
 
 def unknown_ground(relief: str | None) -> GroundErrors:
-    """Errors of assumed level ground; `relief`: what the land is like, None: nobody said."""
+    """Errors of assumed flat ground; `relief`: what the land is like, None: nobody said."""
     slope = relief_slope(relief)
     per_slope_m, length_m = ERRORS.undulation_m
     return GroundErrors(slope / math.sqrt(2), ((per_slope_m * slope, length_m), ERRORS.objects_m))

@@ -55,19 +55,19 @@ class Stage:
 class Search:
     """The search for one view on one map, to be run once."""
 
-    def __init__(self, sheet: PreparedMap, view: PreparedView, prior: Prior | None) -> None:
-        self.sheet, self.view, self.prior = sheet, view, prior
-        self.plan, self.levels = sheet.plan, view.levels
-        self.over_ground = ViewOverGround(sheet.ground, view, sheet.reference)
+    def __init__(self, map: PreparedMap, view: PreparedView, prior: Prior | None) -> None:
+        self.map, self.view, self.prior = map, view, prior
+        self.plan, self.levels = map.plan, view.levels
+        self.over_ground = ViewOverGround(map.ground, view, map.reference)
         self.refiner = CandidateRefiner(
             view.templates,
             view.levels,
             view.prior,
-            sheet.reference,
-            pool=sheet.pool,
+            map.reference,
+            pool=map.pool,
             ground=self.over_ground,
         )
-        self.chances = sheet.confidence.chances if sheet.confidence else DEFAULT_CHANCES
+        self.chances = map.confidence.chances if map.confidence else DEFAULT_CHANCES
         self.places: list[Judged] = []
         self.direct: list[Judged] = []
         # With a prior few candidates are sought, by both kinds; `by_gradients` seeks the others.
@@ -109,7 +109,7 @@ class Search:
     def by_gradients(self) -> "Search":
         """The same candidates and the likeliest ones without grey levels, compared without them, in
         the time that is left."""
-        made = Search(self.sheet, self.view.by_gradients(), self.prior)
+        made = Search(self.map, self.view.by_gradients(), self.prior)
         made.budget = self.budget
         for each in self.found:
             made._judge(*each)
@@ -121,7 +121,7 @@ class Search:
     def camera(self, place: Finished) -> CameraEstimate | None:
         """None where too few blocks of the view are seen."""
         ratio = place.scores.local_ratio if isinstance(place, BestPlace) else 1.0
-        floor_m = self.sheet.floor_m(self.view)
+        floor_m = self.map.floor_m(self.view)
         return camera_of(self.over_ground, place.fit.pose, ratio, floor_m, place.camera)
 
     # What is tried
@@ -181,10 +181,10 @@ class Search:
             far = self._fft_stage(level + 1, tried, plan.far_candidates)
             if not math.isinf(far.cost_ms):  # there is such a level
                 coarse = far
-        if self.sheet.propose is None or not self.tiles:
+        if self.map.propose is None or not self.tiles:
             return [coarse]
         count = plan.candidates_from(self.tiles)
-        cost_ms = plan.tiles_ms(len(tried), self.tiles, self.sheet.propose.embedder.dims)
+        cost_ms = plan.tiles_ms(len(tried), self.tiles, self.map.propose.embedder.dims)
         cost_ms += plan.nearby_ms * count
         return [coarse, Stage(level, tried, count, cost_ms, from_tiles=True)]
 
@@ -218,7 +218,7 @@ class Search:
     def _by_fft(self, stage: Stage) -> list[Peak]:
         """The peaks of correlation, of the sheet or of what the prior allows; those of a far level
         at their best places near by."""
-        view, level, windows = self.view, stage.level, self.sheet.windows
+        view, level, windows = self.view, stage.level, self.map.windows
         recipe = view.levels.recipe(level)
         template = self.sought.at(level, recipe)
         if self.prior is None:
@@ -229,7 +229,7 @@ class Search:
             window = windows.part(level, recipe, view.side_px, middle, reach, half_px)
         # Every thread has memory for a whole window.
         fits = math.prod(window.size) * self.plan.threads <= self.plan.max_search_px
-        pool = self.sheet.pool if fits else None
+        pool = self.map.pool if fits else None
         found = search(template, window, stage.directions, stage.count, view.prior.scale_map, pool)
         if level > view.levels.coarse:
             return self._allowed_nearby(found, self.plan.far_reach_px * 2**level)
@@ -238,7 +238,7 @@ class Search:
     def _from_tiles(self, stage: Stage) -> list[Peak]:
         """The most similar tiles that no tile next to them exceeds, each at its best place near
         by."""
-        grid, expected, propose = self.sheet.grid, self.view.prior, self.sheet.propose
+        grid, expected, propose = self.map.grid, self.view.prior, self.map.propose
         assert propose is not None
         # Over a terrain the telemetry predicts another scale at every place.
         if expected.scale_map is not None:
@@ -262,8 +262,8 @@ class Search:
         """Where the prior expects the view, x and y at level 0."""
         assert self.prior is not None
         view = self.view
-        place = self.sheet.sheet.frame.en_from_latlon(self.prior.lat_deg, self.prior.lon_deg)
-        x, y = self.sheet.px_of(place)
+        place = self.map.sheet.frame.en_from_latlon(self.prior.lat_deg, self.prior.lon_deg)
+        x, y = self.map.px_of(place)
         if view.prior.turn_rad is None:
             return x, y
         moved = rotation(view.prior.turn_rad) @ view.camera_px
@@ -277,7 +277,7 @@ class Search:
         view = self.view
         tilt = float(np.hypot(*view.camera_px))
         turn = 2.0 if view.prior.turn_rad is None else 2 * view.prior.turn_std_rad
-        reach = PRIOR_SIGMAS * max(self.prior.std_m, 0.0) / self.sheet.grid.gsd_m
+        reach = PRIOR_SIGMAS * max(self.prior.std_m, 0.0) / self.map.grid.gsd_m
         return float(reach + tilt * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
 
     @property
@@ -285,14 +285,14 @@ class Search:
         if self.prior is None:
             return True
         (x, y), reach = self.middle_px, self.reach_px
-        rows, cols = self.sheet.reference.shape(0)
+        rows, cols = self.map.reference.shape(0)
         return -reach < x < cols + reach and -reach < y < rows + reach
 
     def _fft_ms(self, level: int, poses: int) -> float:
         """Of the sheet or what the prior allows; infinite where there is no such level."""
-        if level >= self.sheet.reference.levels:
+        if level >= self.map.reference.levels:
             return math.inf
-        rows, cols = self.sheet.reference.shape(level)
+        rows, cols = self.map.reference.shape(level)
         if self.prior is not None:
             across = 2 * self.reach_px / 2**level
             rows, cols = round(min(rows, across)), round(min(cols, across))
@@ -303,7 +303,7 @@ class Search:
 
     @cached_property
     def tiles(self) -> int:
-        propose, rows = self.sheet.propose, self.tile_rows
+        propose, rows = self.map.propose, self.tile_rows
         if propose is None or not propose.fits(self.view.side_px, self.plan.view_tiles):
             return 0
         return len(propose.tiles.centres_en_m) if rows is None else len(rows)
@@ -311,12 +311,12 @@ class Search:
     @cached_property
     def tile_rows(self) -> NDArray[np.intp] | None:
         """Of the tiles that the prior allows, None for all."""
-        if self.prior is None or self.sheet.propose is None:
+        if self.prior is None or self.map.propose is None:
             return None
-        grid, (x, y) = self.sheet.grid, self.middle_px
+        grid, (x, y) = self.map.grid, self.middle_px
         centre = np.array([grid.west_m + x * grid.gsd_m, grid.north_m - y * grid.gsd_m])
         reach_m = self.reach_px * grid.gsd_m + grid.stride_m
-        return rows_within(self.sheet.propose.tiles.centres_en_m, centre, reach_m)
+        return rows_within(self.map.propose.tiles.centres_en_m, centre, reach_m)
 
     # Near by
 
@@ -347,10 +347,10 @@ class Search:
         ]
 
     def _moved(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
-        level, windows = self.levels.coarse, self.sheet.windows
+        level, windows = self.levels.coarse, self.map.windows
         recipe, side_px = self.levels.recipe(level), self.view.templates.side_px
         template, whole = self.sought.at(level, recipe), None
-        if math.prod(self.sheet.reference.shape(level)) <= self.plan.whole_window_px:
+        if math.prod(self.map.reference.shape(level)) <= self.plan.whole_window_px:
             whole = windows.whole(level, recipe, side_px)
             whole.prepare_near(template)
 
@@ -418,7 +418,7 @@ class Search:
         plan, levels, is_flat = self.plan, self.levels, self.refiner.is_flat
         at_final = following.level < levels.mid
         trial_ms = plan.trial_ms if is_flat else plan.terrain_trial_ms
-        if self.sheet.confidence is None or levels.final == levels.mid:
+        if self.map.confidence is None or levels.final == levels.mid:
             return None
         # Without time for it the search goes on, and is cut short only where that has no time.
         if not (at_final or following.cost_ms > trial_ms) or not (
@@ -478,15 +478,15 @@ class Search:
 
     def is_doubtful(self, best: BestPlace) -> bool:
         """Whether it is not recognized, and there is time to compare all candidates again."""
-        doubtful = self.sheet.confidence is not None and self.likelihood(best) < CONFIDENT
+        doubtful = self.map.confidence is not None and self.likelihood(best) < CONFIDENT
         again_ms = self.plan.trial_ms + self.plan.nearby_ms * self.candidates
         return doubtful and not self.budget.cut_short and self.budget.allows(again_ms)
 
     def likelihood(self, place: BestPlace | None) -> float:
         """Probability that the place is right, 0 for none."""
-        if place is None or self.sheet.confidence is None:
+        if place is None or self.map.confidence is None:
             return 0.0
-        return self.sheet.confidence(place.scores)
+        return self.map.confidence(place.scores)
 
 
 class Found(NamedTuple):

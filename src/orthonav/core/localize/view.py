@@ -25,7 +25,7 @@ from orthonav.core.records import (
     View,
 )
 from orthonav.core.register.template import Levels, ViewTemplates
-from orthonav.core.register.window import PosePrior
+from orthonav.core.register.window import DirectionPrior
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class PreparedView:
     templates: ViewTemplates
     side_px: float
     camera_px: NDArray[np.float64]
-    prior: PosePrior
+    prior: DirectionPrior
     _pictures: dict[int, View]
 
     @property
@@ -208,12 +208,12 @@ def _rectified(picture: View, gsd_m: float, levels: Levels, level: int) -> Recti
     return rectify_footprint(picture, gsd_m=gsd_m * 2**level, multiple_px=multiple)
 
 
-def pose_prior(telemetry: Telemetry, heading_known: bool, focal_std: float = 0.0) -> PosePrior:
+def pose_prior(telemetry: Telemetry, heading_known: bool, focal_std: float = 0.0) -> DirectionPrior:
     yaw_std = _or_default(telemetry.yaw_std_deg, DEFAULT_YAW_STD_DEG)
     agl_std_m = telemetry.agl_std_m
     agl_std = None if agl_std_m is None else agl_std_m / telemetry.agl_m
     scale_std = math.hypot(_or_default(agl_std, DEFAULT_AGL_STD), focal_std)
-    return PosePrior(
+    return DirectionPrior(
         math.radians(telemetry.yaw_deg) if heading_known else None,
         math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
         min(max(scale_std, LIMITS.min_agl_std), LIMITS.max_agl_std),

@@ -117,7 +117,7 @@ class ScaleMap:
 
 
 @dataclass(frozen=True)
-class PosePrior:
+class DirectionPrior:
     """`turn_rad`: None: unknown. `scale_map`: None: 0 is expected everywhere."""
 
     turn_rad: float | None
@@ -129,7 +129,7 @@ class PosePrior:
         """Units of the score: one per nat (docs/decisions/registration.md)."""
         if self.scale_map is None:
             return self.negative_log_density(pose.turn_rad, pose.log_scale)
-        own = PosePrior(self.turn_rad, self.turn_std_rad, self.scale_map.std)
+        own = DirectionPrior(self.turn_rad, self.turn_std_rad, self.scale_map.std)
         expected = self.scale_map.at(pose.x_px, pose.y_px)
         return own.negative_log_density(pose.turn_rad, pose.log_scale - expected)
 

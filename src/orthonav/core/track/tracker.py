@@ -425,7 +425,7 @@ class Tracker:
             return None
         white = WHITE_SHARE * math.sqrt(telemetry_noise[2])
         made = displacement(before, now, white, telemetry_noise, expected_en_m)
-        if made is None or self._registration.ground.is_level:
+        if made is None or self._registration.ground.is_flat:
             return made
         heights_m = before.view.telemetry.agl_m, now.view.telemetry.agl_m
         ahead_en_m = (before.ahead_en_m + now.ahead_en_m) / 2
@@ -483,7 +483,7 @@ class Tracker:
         """The correction includes the error of the ground assumed before."""
         relief = self._registration.ground
         height_m = float(relief.terrain.at_en_m(place_en_m))
-        if relief.is_level or not math.isfinite(height_m):
+        if relief.is_flat or not math.isfinite(height_m):
             return replace(telemetry, below=None)
         return replace(telemetry, below=Ground(height_m, 0.0, 1.0))
 

@@ -12,7 +12,7 @@ from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_f
 from orthonav.core.localize.view import LIMITS, check_footprint, check_view, pose_prior
 from orthonav.core.records import NoFix, View
 from orthonav.core.tiles import represent
-from orthonav.core.tiles.bank import embed_poses
+from orthonav.core.tiles.bank import embed_directions
 from orthonav.core.variants import make_variant
 from orthonav.ground.atlas.catalog import Atlas, CoarseRecipe
 from orthonav.ground.atlas.coarse import EDGES
@@ -78,7 +78,7 @@ class SheetSearch:
         prior = pose_prior(view.telemetry, heading_known, view.camera.focal_std)
         directions = self._policy.directions(prior, self._policy.coarse_steps)
         poses = [pose for pose, nats in directions if nats <= self._policy.likely_nats]
-        embedded = embed_poses(
+        embedded = embed_directions(
             *(self._embedder, self._representation, coarse.grey, coarse.valid, poses),
             self.recipe.tile_px,
         )
