@@ -46,8 +46,8 @@ def embed_directions(
     """Unit embeddings (Q, D) of a view under `directions`; zero where one sees nothing.
 
     `grey`, `valid` (H, W): heading up, at the reported resolution. A direction: true heading (rad)
-    and log of true over reported resolution. Each is close to that of the tile about the view's middle,
-    up to a third of scale. Raises `ValueError` for a bad `tile_px` or an unknown kind of
+    and log of true over reported resolution. Each is close to that of the tile about the view's
+    middle, up to a third of scale. Raises `ValueError` for a bad `tile_px` or an unknown kind of
     representation."""
     channels = representation.channels
     if tile_px % MICRO or (channels > 1 and channels % 2 == 0):
