@@ -105,7 +105,7 @@ def test_a_flight_is_followed(usual):
     assert [row[2] for row in rows[10:]] == ["tracking"] * 12
     assert errors[4:].max() < 6 and all(row[1] > 0.9 for row in rows[10:])
     last = rows[-1][3]
-    assert last.evidence["vel_north_mps"] == pytest.approx(SPEED_MPS * math.cos(0.61), abs=3)
+    assert last.vel_en_mps[1] == pytest.approx(SPEED_MPS * math.cos(0.61), abs=3)
 
 
 def test_the_confidence_of_a_track_is_that_of_its_covariance_and_place(usual):

@@ -323,7 +323,10 @@ class Fix(Outcome):
     - `pose_cov` (6, 6): covariance of metres east, north and up and degrees of heading, pitch and
       roll; None where the six were not estimated together.
     - `place_probability`: that the place is right, 0..1, whatever the error there; NaN where the
-      method states only a confidence, which is then used for it."""
+      method states only a confidence, which is then used for it.
+    - `vel_en_mps`: velocity over ground of a track, east, north, m/s; `vel_std_mps`: its standard
+      deviation along the worst direction; None and NaN: unknown.
+    - `recognized`: probability that this view of a track shows the map, NaN: unknown."""
 
     lat_deg: float
     lon_deg: float
@@ -339,6 +342,9 @@ class Fix(Outcome):
     roll_deg: float = math.nan
     pose_cov: NDArray[np.float64] | None = None
     place_probability: float = math.nan
+    vel_en_mps: tuple[float, float] | None = None
+    vel_std_mps: float = math.nan
+    recognized: float = math.nan
 
     @property
     def is_confident(self) -> bool:

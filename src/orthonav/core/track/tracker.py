@@ -267,11 +267,11 @@ class Tracker:
             more = {
                 "hypotheses": float(len(self.mixture.hypotheses)),
                 "elsewhere": self.mixture.elsewhere,
-                "recognized": estimate.shown.now,
             }
             mean, covariance = estimate.mean, estimate.covariance
             place = estimate.place_probability
-            outcome = self._fix(mean, covariance, place, telemetry, more)
+            fix = self._fix(mean, covariance, place, telemetry, more)
+            outcome = replace(fix, recognized=estimate.shown.now)
             if not self._heading_known:
                 outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
         if self._history is not None:
@@ -551,9 +551,6 @@ class Tracker:
             "pitch_bias_deg": float(pitch),
             "roll_bias_deg": float(roll),
             **_bias_stds(covariance),
-            "vel_east_mps": float(mean[2]),
-            "vel_north_mps": float(mean[3]),
-            "vel_std_mps": math.sqrt(float(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1])),
             **more,
         }
         return Fix(
@@ -568,6 +565,8 @@ class Tracker:
             evidence=evidence,
             pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
             roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
+            vel_en_mps=(float(mean[2]), float(mean[3])),
+            vel_std_mps=math.sqrt(float(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1])),
         )
 
 

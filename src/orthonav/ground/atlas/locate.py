@@ -114,7 +114,7 @@ class SheetTrack:
             return
         seen = self._tracker.locate(view)
         self._take(seen, view.telemetry)
-        is_seen = isinstance(seen, Fix) and seen.evidence["recognized"] >= MIN_CONFIDENCE
+        is_seen = isinstance(seen, Fix) and seen.recognized >= MIN_CONFIDENCE
         self.unseen = 0 if is_seen else self.unseen + 1
         self.has_ended = was_lost and self.state is State.LOST
 
@@ -129,11 +129,11 @@ class SheetTrack:
             return False
         fix, before_ns = self._last
         seconds = max((time_ns - before_ns) / 1e9, 0.0)
-        velocity = np.array([fix.evidence["vel_east_mps"], fix.evidence["vel_north_mps"]])
+        velocity = np.array(fix.vel_en_mps)
         # It may change by half and by 10 m/s. One less certain than that is unknown.
         fastest_mps = 120.0  # beyond the aircraft that this program is for
         speed_mps = min(float(np.hypot(*velocity)) / 2 + 10.0, fastest_mps)
-        if fix.evidence["vel_std_mps"] > 10.0:
+        if fix.vel_std_mps > 10.0:
             velocity, speed_mps = np.zeros(2), fastest_mps
         self.has_ended = SIGMAS * fix.std_m + speed_mps * seconds > MAX_REACH_M
         if not self.has_ended:
@@ -151,7 +151,7 @@ class SheetTrack:
         if isinstance(seen, NoFix):
             return
         self._last = seen, telemetry.time_ns
-        fix = _limited(seen, seen.evidence["recognized"])
+        fix = _limited(seen, seen.recognized)
         if self.state is State.TRACKING and fix.confidence >= MIN_CONFIDENCE:
             self.fix = fix
 
