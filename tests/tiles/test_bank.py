@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from helpers import textured
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_directions
-from orthonav.core.tiles.whitened import CellLayout, CellSheet, WhitenedRecipe, learn
+from orthonav.core.tiles.whitened import CellLayout, CellSheet, WhitenedRecipe
 from orthonav.core.variants import make_variant
+from orthonav.ground.build.whitening import learn
 
 TILE_PX = 128
 GROUND_PX = 640

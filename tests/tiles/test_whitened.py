@@ -6,8 +6,9 @@ import pytest
 from helpers import textured
 from orthonav.core.errors import UsageError, VariantError
 from orthonav.core.tiles import embed, represent
-from orthonav.core.tiles.whitened import MICRO, CellLayout, CellSheet, WhitenedRecipe, learn
+from orthonav.core.tiles.whitened import MICRO, CellLayout, CellSheet, WhitenedRecipe
 from orthonav.core.variants import make_variant
+from orthonav.ground.build.whitening import learn
 
 TILE_PX = 128
 SHEET_PX = 384

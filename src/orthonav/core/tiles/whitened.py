@@ -14,14 +14,15 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from orthonav.core.errors import UsageError, VariantError
+from orthonav.core.errors import MapFileError, UsageError, VariantError
+from orthonav.core.variants import Part
 
 MICRO = 32  # along one side of a tile
 
@@ -77,12 +78,9 @@ def _sampled_means(
     return np.asarray(boxes, dtype=np.float32)[::spacing, ::spacing][:rows, :cols]
 
 
-MAX_LEARNT_TILES = 20_000  # 44 for each of 448 features
 PART_NOISE = 2.0
 """Where cells are missing, over the smallest variance kept (docs/decisions/embedding.md)."""
 Made = TypeVar("Made")
-Features = NDArray[np.float32]
-Work = Callable[[Features, Features], Made]
 
 
 @dataclass(frozen=True)
@@ -100,6 +98,15 @@ class WhitenedRecipe:
             raise VariantError(f"dims must be 1 to 4096, got {self.dims}")
         if not self.floor > 0:
             raise VariantError(f"floor must be above 0, got {self.floor}")
+
+    def embedder(self, part: Part, channels: int) -> "WhitenedEmbedder":
+        """From a map."""
+        mean, basis = part("mean", np.float16, 1), part("basis", np.float16, 2)
+        if not basis.shape[0] == mean.shape[0] == self.cells**2 * channels:
+            raise MapFileError("map's embedding parts do not fit together")
+        if not (np.isfinite(mean).all() and np.isfinite(basis).all()):
+            raise MapFileError("map's embedding is not finite")
+        return WhitenedEmbedder(self, mean, basis)
 
     @cached_property
     def pooling(self) -> NDArray[np.float32]:
@@ -259,7 +266,7 @@ class WhitenedEmbedder:
             features, weights = pooled_features(self.recipe, sheet, tiles_px[part])
             out[part] = self.features(features, weights)
 
-        for _ in _worked(fill, len(tiles_px), workers):
+        for _ in worked(fill, len(tiles_px), workers):
             pass
         return out
 
@@ -362,70 +369,8 @@ def _dots(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np
     return np.asarray(np.einsum("qd,qd->q", first, second)[:, None])
 
 
-def learn(
-    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp], workers: int = 1
-) -> WhitenedEmbedder:
-    """From at most `MAX_LEARNT_TILES` tiles, by any number of threads; fewer than `dims` components
-    where the tiles do not span more."""
-    taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
-
-    def over_batches(work: Work[Made]) -> Iterator[Made]:
-        return _worked(
-            lambda part: work(*pooled_features(recipe, sheet, taken[part])), len(taken), workers
-        )
-
-    return learn_in_two_passes(recipe, over_batches)
-
-
-class OverBatches(Protocol):
-    """Runs a function on features and weights (N, F) of every batch, in order."""
-
-    def __call__(self, work: "Work[Made]") -> Iterator[Made]:
-        pass
-
-
-def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> WhitenedEmbedder:
-    """One pass for the mean, one for scatter."""
-
-    def sums(features: Features, weights: Features) -> tuple[Any, Any]:
-        total = np.einsum("nf,nf->f", features, weights, dtype=np.float64)
-        return total, weights.sum(axis=0, dtype=np.float64)
-
-    total: Any = 0.0
-    weight: Any = 1e-9
-    for some, their_weight in over_batches(sums):
-        total, weight = total + some, weight + their_weight
-    mean = (total / weight).astype(np.float16)
-
-    def products(features: Features, weights: Features) -> tuple[Any, int]:
-        centred = (features - mean.astype(np.float32)) * weights
-        return (centred.T @ centred).astype(np.float64), len(features)
-
-    scatter: Any = 0.0
-    count = 0
-    for product, size in over_batches(products):
-        scatter, count = scatter + product, count + size
-    return _whitening(recipe, mean, scatter, count)
-
-
-def _whitening(
-    recipe: WhitenedRecipe, mean: NDArray[np.float16], scatter: NDArray[np.float64], count: int
-) -> WhitenedEmbedder:
-    """Of `count` features with mean (F,) and scatter matrix (F, F)."""
-    variances, vectors = np.linalg.eigh(scatter / count)
-    variances, vectors = variances[::-1], vectors[:, ::-1]
-    kept = int(np.count_nonzero(variances[: recipe.dims] > 1e-6 * max(variances[0], 1e-12)))
-    kept = max(1, min(kept, count))
-    scale = 1 / np.sqrt(np.maximum(variances[:kept], 1e-12))
-    basis = vectors[:, :kept] * (scale / scale.max())
-    # The sign of an eigenvector is arbitrary: the largest entry is made positive.
-    largest = np.abs(basis).argmax(axis=0)
-    basis *= np.sign(basis[largest, np.arange(kept)])
-    return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
-
-
-def _worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator[Made]:
-    """In order."""
+def worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator[Made]:
+    """Of slices of so many tiles, in order."""
     if workers <= 1:
         yield from map(work, _chunks(count))
         return
