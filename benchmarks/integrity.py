@@ -28,7 +28,6 @@ from scipy.special import expit
 from benchmarks.judged_views import prepare, views_of
 from benchmarks.record import Section, Table, percent, resumed, rows_path, run, say
 from benchmarks.scenes import all_pairs, chosen, place_of
-from orthonav.core.integrity import protection_levels_m
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.localize.confidence import (
     DEFAULT_CHANCES,
@@ -39,7 +38,7 @@ from orthonav.core.localize.confidence import (
     Scores,
     features_of,
 )
-from orthonav.core.records import CONFIDENT
+from orthonav.core.records import CONFIDENT, protection_levels_m
 from orthonav.ground.evaluate.statistics import calibrate, upper_bound
 
 NAME = "integrity"

@@ -7,7 +7,7 @@ import pytest
 from blots import CAMERA, GROUND, as_grey
 from lab.terrain import random_relief, seen_view
 
-from orthonav.core.localize.rectify import (
+from orthonav.core.localize.view import (
     Orientation,
     hidden,
     node_px,

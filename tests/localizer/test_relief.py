@@ -25,8 +25,8 @@ from orthonav.core.localize import Localizer
 from orthonav.core.localize.camera import FITTING
 from orthonav.core.localize.confidence import MAX_RATIO
 from orthonav.core.localize.ground import GroundModel, ViewOverGround
-from orthonav.core.localize.rectify import Orientation
 from orthonav.core.localize.resection import ERRORS
+from orthonav.core.localize.view import Orientation
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.register.window import Pose

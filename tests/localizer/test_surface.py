@@ -14,12 +14,12 @@ from orthonav.core.localize.camera import approached, camera_of
 from orthonav.core.localize.ground import (
     SAMPLING,
     GroundModel,
-    PreparedMap,
     ViewOverGround,
     _smoothed,
 )
-from orthonav.core.localize.rectify import hidden
 from orthonav.core.localize.resection import ERRORS
+from orthonav.core.localize.search import PreparedMap
+from orthonav.core.localize.view import hidden
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import Telemetry, View

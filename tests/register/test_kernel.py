@@ -11,7 +11,7 @@ import pytest
 from scenes import Ground, apart_px, as_grey, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.localize import resection
-from orthonav.core.localize.rectify import node_px
+from orthonav.core.localize.view import node_px
 from orthonav.core.register import refine, search, template
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.refine import Refiner
@@ -19,7 +19,7 @@ from orthonav.core.register.search import SearchWindow, bank, best_near
 from orthonav.core.register.template import COARSE, FINE
 from orthonav.core.register.window import MapWindow, Pose, ScaleMap
 
-rectify_module = importlib.import_module("orthonav.core.localize.rectify")
+rectify_module = importlib.import_module("orthonav.core.localize.view")
 SHAPE = (256, 320)
 GROUND = Ground()
 SHARES = refine.BLOCK_GREY_SHARE, refine.MIN_SEEN, refine.MIN_ENERGY

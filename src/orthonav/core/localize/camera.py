@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera, enu_from_camera, seen_px
 from orthonav.core.localize.ground import FlatTerrain, GroundModel, ViewOverGround
-from orthonav.core.localize.rectify import Orientation, is_oblique
 from orthonav.core.localize.resection import (
     Blocks,
     Expected,
@@ -22,6 +21,7 @@ from orthonav.core.localize.resection import (
     systematic,
     values,
 )
+from orthonav.core.localize.view import Orientation, is_oblique
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
 from orthonav.core.register.refine import BlockScores, block_scores
 from orthonav.core.register.template import BLOCKS, ViewTemplates

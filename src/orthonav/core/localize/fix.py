@@ -6,14 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.integrity import probability_within
 from orthonav.core.localize.camera import CameraEstimate, tilt_std_deg
-from orthonav.core.localize.ground import PreparedMap
 from orthonav.core.localize.place import BestPlace
-from orthonav.core.localize.rectify import off_nadir_deg
-from orthonav.core.localize.search import Search
-from orthonav.core.localize.view import PreparedView
-from orthonav.core.records import RADIUS_SHARE, Fix
+from orthonav.core.localize.search import PreparedMap, Search
+from orthonav.core.localize.view import PreparedView, off_nadir_deg
+from orthonav.core.records import RADIUS_SHARE, Fix, probability_within
 
 
 def fix_of(search: Search, best: BestPlace) -> Fix:

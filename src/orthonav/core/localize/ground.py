@@ -2,7 +2,6 @@
 window lies, its heading, and that the camera is `agl_m * exp(log_scale)` above its mean ground."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,32 +12,27 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.geo.camera import enu_from_camera, undistort
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import sight_on_ground
-from orthonav.core.localize.confidence import RegisteredConfidence
-from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.rectify import (
-    NODE_PX,
-    Orientation,
-    node_px,
-    orthorectified,
-    rectified_flat,
-)
 from orthonav.core.localize.resection import (
     GroundErrors,
     surface_errors,
     terrain_errors,
     unknown_ground,
 )
-from orthonav.core.localize.tiles import TileProposer
-from orthonav.core.localize.view import LIMITS, PreparedView
-from orthonav.core.mapfile.manifest import Lean, SheetInfo, TerrainInfo
-from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.localize.view import (
+    LIMITS,
+    NODE_PX,
+    Orientation,
+    PreparedView,
+    node_px,
+    orthorectified,
+    rectified_flat,
+)
+from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import DEFAULT_AGL_STD
-from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
 from orthonav.core.register.window import (
     COMPARED,
     DirectionPrior,
-    GreyPyramid,
     Pose,
     Reference,
     ScaleMap,
@@ -230,76 +224,6 @@ class GroundModel:
             with np.errstate(invalid="ignore", divide="ignore"):
                 self._means[key] = np.asarray(total / share, np.float32), step
         return self._means[key]
-
-
-class PreparedMap:
-    """A map and its imagery, made ready for all views; threads may share it."""
-
-    def __init__(
-        self,
-        sheet: SheetInfo,
-        layer: GreyPyramid,
-        *,
-        confidence: RegisteredConfidence | None,
-        radius_m: float,
-        floor_px: float,
-        propose: TileProposer | None = None,
-        plan: SearchPlan = DEFAULT_PLAN,
-        terrain: TerrainLayer | None = None,
-        surface: TerrainLayer | None = None,
-    ) -> None:
-        """`confidence`: None before it is learnt: no place is proven. `radius_m`: its error.
-
-        `floor_px`: standard deviation with which maps of two dates agree, pixels of level 0.
-        Without `propose` candidates come from FFT only; without `terrain` the ground is level."""
-        self.sheet, self.grid = sheet, sheet.grid
-        self.pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
-        self.reference = Reference(layer)
-        self.windows = SearchWindows(self.reference)
-        known_m2 = 0.0 if surface is None else surface.info.known_m2
-        imagery_px = 0 if sheet.grey is None else sheet.grey.valid_px
-        # Whether all views are compared one level finer than over bare ground.
-        self.is_finer = known_m2 > SAMPLING.min_known * imagery_px * self.grid.gsd_m**2
-        self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
-        self.propose, self.plan = propose, plan
-        info = None if terrain is None else terrain.info
-        self.ground = GroundModel(
-            terrain or FlatTerrain(), self.grid, info, sheet.relief, surface, sheet.lean
-        )
-
-    @property
-    def pyramid(self) -> GreyPyramid:
-        return self.reference.pyramid
-
-    def px_of(self, place_en_m: Array) -> tuple[float, float]:
-        """The inverse of `GroundModel.en_m`."""
-        (east, north), grid = place_en_m, self.grid
-        return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
-
-    def floor_m(self, view: PreparedView) -> float:
-        """Agreement of maps of two dates at the view's final level."""
-        # Coarse imagery of another date is displaced by more (docs/terrain.md).
-        return self.floor_px * self.grid.gsd_m * 2.0**view.levels.final
-
-    def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
-        """Of the camera (2,)."""
-        return self.ground.en_m(pose.map_px(view.camera_px))
-
-    def camera_state(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
-        """Of the camera (4,): m east and north, heading (rad), log scale."""
-        return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
-
-    def camera_covariance(
-        self, view: PreparedView, pose: Pose, covariance: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Of `camera_state`, by the covariance of the pose."""
-        moved = pose.linear @ view.camera_px
-        camera_from_pose = np.eye(4)
-        camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
-        spread = camera_from_pose @ covariance @ camera_from_pose.T
-        spread[:2, :2] += np.eye(2) * (self.floor_m(view) / self.grid.gsd_m) ** 2
-        metres = np.diag([self.grid.gsd_m, -self.grid.gsd_m, 1.0, 1.0])
-        return np.asarray(metres @ spread @ metres)
 
 
 def _smoothed(heights: Array, side: int) -> Array:

@@ -12,9 +12,14 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.fix import fix_of
-from orthonav.core.localize.ground import PreparedMap
-from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.search import Found, Search, found_by
+from orthonav.core.localize.search import (
+    DEFAULT_PLAN,
+    Found,
+    PreparedMap,
+    Search,
+    SearchPlan,
+    found_by,
+)
 from orthonav.core.localize.tiles import TileLocalizer, TileProposer
 from orthonav.core.localize.view import PreparedView, check_view, prepare
 from orthonav.core.mapfile.layer import GreyLayer

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.place import CandidateRefiner
-from orthonav.core.localize.rectify import downsampled, rectify_footprint
-from orthonav.core.localize.view import check_footprint
+from orthonav.core.localize.view import check_footprint, downsampled, rectify_footprint
 from orthonav.core.records import Telemetry, View
 from orthonav.core.register.refine import Fit
 from orthonav.core.register.search import SearchWindows, bank, largest_half_px, search
@@ -29,7 +28,7 @@ class OdometryLimits:
     levels: int = 3  # of a view that serves as the map of the next one
     turn_step_rad: float = math.radians(8.0)
     scale_step: float = 0.1
-    """Of the search from a coarse level: about that of `policy.SearchPlan`."""
+    """Of the search from a coarse level: about that of `SearchPlan`."""
     candidates: int = 8
     max_speed_mps: float = 80.0  # for which a displacement is sought
     min_score_ratio: float = 2.5

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from orthonav.core.localize.camera import approached
 from orthonav.core.localize.confidence import Scores
 from orthonav.core.localize.ground import ViewOverGround
-from orthonav.core.localize.rectify import Orientation
+from orthonav.core.localize.view import Orientation
 from orthonav.core.register.refine import Fit, Refiner, sharpness
 from orthonav.core.register.search import Peak, SearchWindows, largest_half_px, search
 from orthonav.core.register.template import Levels, ViewTemplates

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError, VariantError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.confidence import LogisticConfidence
-from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
-from orthonav.core.localize.view import check_rectified
+from orthonav.core.localize.view import RectifiedView, check_rectified, downsampled, rectify
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, TILE_YAW_STD_DEG, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.search import Peak

@@ -1,4 +1,4 @@
-/* Pictures made smaller, and rectified: orthonav.core.localize.rectify, compiled. */
+/* Pictures made smaller, and rectified: orthonav.core.localize.view, compiled. */
 
 #include "_kernel.h"
 

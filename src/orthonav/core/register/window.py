@@ -80,7 +80,7 @@ class ComparedScales:
     sigmas: float = 3.0  # in standard deviations of the expected log scale,
     step: float = 0.14
     """and half of this farther: rounded up from the largest step of a bank on terrain (log scale
-    0.13, `policy.SearchPlan.coarse_steps`), so that the nearest of its scales is among them."""
+    0.13, `SearchPlan.coarse_steps`), so that the nearest of its scales is among them."""
 
 
 COMPARED = ComparedScales()
@@ -167,6 +167,7 @@ class Reference:
 
     def __init__(self, pyramid: GreyPyramid) -> None:
         self.pyramid = pyramid
+        self._shapes = [pyramid.shape(level) for level in range(pyramid.levels)]
         self._whole: OrderedDict[tuple[int, ChannelRecipe], Array] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -175,7 +176,7 @@ class Reference:
         return self.pyramid.levels
 
     def shape(self, level: int) -> tuple[int, int]:
-        return self.pyramid.shape(level)
+        return self._shapes[level]
 
     def caches(self, level: int) -> bool:
         """Smaller levels are made ready whole, once (16 bytes each pixel)."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
-from orthonav.core.integrity import probability_within
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.localize.odometry import (
     CameraDisplacement,
@@ -30,7 +29,16 @@ from orthonav.core.localize.search import Found, found_by
 from orthonav.core.localize.sighting import Sighting, sightings
 from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
+from orthonav.core.records import (
+    PRIOR_SIGMAS,
+    RADIUS_SHARE,
+    Fix,
+    NoFix,
+    Prior,
+    Telemetry,
+    View,
+    probability_within,
+)
 from orthonav.core.register.window import rotation
 from orthonav.core.track import (
     Estimate,

@@ -7,9 +7,16 @@ from functools import partial
 import numpy as np
 
 from orthonav.core.errors import AtlasError
-from orthonav.core.localize.policy import DEFAULT_PLAN
-from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_footprint
-from orthonav.core.localize.view import LIMITS, check_footprint, check_view, pose_prior
+from orthonav.core.localize.search import DEFAULT_PLAN
+from orthonav.core.localize.view import (
+    LIMITS,
+    RectifiedView,
+    check_footprint,
+    check_view,
+    downsampled,
+    pose_prior,
+    rectify_footprint,
+)
 from orthonav.core.records import NoFix, View
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_directions

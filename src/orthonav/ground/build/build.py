@@ -21,7 +21,7 @@ from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import DEFAULT_TILE_CONFIDENCE
 from orthonav.core.localize.localizer import RegistrationLocalizer
-from orthonav.core.localize.policy import SearchPlan
+from orthonav.core.localize.search import SearchPlan
 from orthonav.core.localize.tiles import TileMatcher, TileProposer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 from orthonav.core.mapfile.reader import MapFile, write_map

@@ -19,8 +19,7 @@ from orthonav.core.geo.camera import (
     footprint_en_m,
 )
 from orthonav.core.localize.ground import FlatTerrain
-from orthonav.core.localize.rectify import MAX_REACH, downsampled, rectify
-from orthonav.core.localize.view import check_telemetry
+from orthonav.core.localize.view import MAX_REACH, check_telemetry, downsampled, rectify
 from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
