@@ -99,16 +99,6 @@ def test_without_a_compiler_views_are_placed_too(reference, monkeypatch):
 
 
 @needs_kernel
-@pytest.mark.parametrize("pose", [(1e9, 0, 0, 0), (math.nan, 0, 0, 0), (0, 0, 0, 80.0)])
-def test_a_pose_beyond_all_bounds_touches_no_memory(pose):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(0)
-    window = np.ones((20, 30, 4), np.float32)
-    limits = (0, 0, 1, 3, 0.01, 3.0, 1e-3, 0.08, 0.97)
-    found = KERNEL.refine(window, made.values, made.slopes, made.numbers, pose, limits)
-    assert found[1] == 0 or math.isnan(found[1])
-
-
-@needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("cached", [True, False])
@@ -132,19 +122,6 @@ def test_what_a_covariance_is_made_of_is_the_same(reference, monkeypatch, level,
 
 
 @needs_kernel
-@pytest.mark.parametrize("pose", [(1e9, 0, 0, 0), (math.nan, 0, 0, 0), (0, 0, 0, 80.0)])
-def test_sums_at_a_pose_beyond_all_bounds_touch_no_memory(pose):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(0)
-    images = np.ones((20, 30, 4), np.float32), made.values, made.slopes, made.numbers
-    limits = (0, 0, 1, 3, 0.01, 3.0, 1e-3, 0.08, 0.97)
-    out = np.full(2 * 16 + 36 * refine.BLOCK_SUMS, math.nan)
-    KERNEL.spread(*images, pose, limits, out)
-    assert not out[:16].any() and not out[32:].any()
-    with pytest.raises(ValueError, match="expected"):
-        KERNEL.spread(*images, pose, limits, out[:-1])
-
-
-@needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("cached", [True, False])
@@ -163,17 +140,6 @@ def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole
             assert np.unravel_index(mine.argmax(), mine.shape) == np.unravel_index(
                 plain.argmax(), plain.shape
             )
-
-
-@needs_kernel
-@pytest.mark.parametrize(
-    "matrix", [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
-)
-def test_moves_beyond_all_bounds_touch_no_memory(matrix):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    window, out = np.ones((20, 30, 4), np.float32), np.full((3, 7, 9), math.nan, np.float32)
-    KERNEL.moved(window, made.values, made.weights, matrix, 0.0, (3, 4), (60, 80), 1e-3, out)
-    assert not out.any()
 
 
 SIZES = [(256, 320), (97, 320), (256, 61), (17, 19), (130, 134)]
@@ -225,17 +191,6 @@ def test_the_best_place_near_by_is_the_same(reference, monkeypatch, reach_px):
     for one, other in zip(compiled, plain, strict=True):
         assert one.score == pytest.approx(other.score, abs=1e-4)
         assert one.score < 1e-3 or apart_px(one.pose, other.pose) < 1e-2
-
-
-@needs_kernel
-def test_near_poses_beyond_all_bounds_touch_no_memory():
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    channels = np.ones((20, 30, 3), np.float32)
-    beyond = [(1e300, 0, 0, 0), (math.nan, -1e300, 0, 0), (5, 5, 0, 80.0), (5, 5, 0, math.nan)]
-    places = np.array([*beyond, (3, 4, math.nan, 0)], np.float64)
-    out = np.full((5, 3), math.nan)
-    KERNEL.near(channels, made.values, made.weights, places, 2, out)
-    assert (out[:4, 0] == 0).all()
 
 
 @needs_kernel
@@ -293,18 +248,6 @@ def test_scores_of_blocks_where_nothing_is_interpolated_are_exactly_those(
         np.testing.assert_allclose(found, plain, atol=2e-4)
 
 
-@needs_kernel
-@pytest.mark.parametrize(
-    "matrix", [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
-)
-def test_blocks_beyond_all_bounds_touch_no_memory(matrix):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    found, pixels = np.full((36, 9, 9), math.nan), np.full(36, math.nan)
-    window = np.ones((20, 30, 4), np.float32)
-    KERNEL.blocks(window, made.planes, matrix, 0.0, 4, SHARES, found, pixels)
-    assert not found.any() and not pixels.any()
-
-
 def blocks_of(surfaces, levels, rng):
     """Blocks of so many levels with these correlations; some do not count."""
     pixels = rng.uniform(200, 900, len(surfaces)) * (rng.uniform(size=len(surfaces)) > 0.1)
@@ -350,16 +293,6 @@ LIMITS = SOLVER.min_correlation, SOLVER.max_correlation, SOLVER.pixels_per_numbe
 
 
 @needs_kernel
-@pytest.mark.parametrize("blur_px", [0.0, 1.0])
-def test_places_that_are_not_numbers_do_not_pull(blur_px):
-    out = np.full((3, 6), math.nan)
-    moved = np.array([[math.nan, 0.0], [0.0, math.inf], [-1e300, 1e300]])
-    weighted = resection._gaussian(5, blur_px), moved, np.ones(3), np.ones(3)
-    KERNEL.bend(np.ones((3, 5, 5)), *weighted, LIMITS, out)
-    assert not out.any()
-
-
-@needs_kernel
 @pytest.mark.parametrize("factor", [2, 3, 4, 7, 16, 37])
 def test_pictures_are_made_smaller_as_by_opencv(monkeypatch, factor):
     grey = np.random.default_rng(factor).integers(0, 256, (149, 203)).astype(np.uint8)
@@ -391,15 +324,6 @@ def test_pictures_are_rectified_as_without_the_kernel(monkeypatch, shape):
     # OpenCV rounds positions to 1/32 of a pixel.
     assert np.abs(compiled[both].astype(int) - plain[both]).max(initial=0) <= 2
     assert not compiled[~seen].any()
-
-
-@needs_kernel
-def test_nodes_beyond_all_bounds_touch_no_memory():
-    nodes = np.full((6, 6, 2), 1e30, np.float32)
-    nodes[:3], nodes[4] = np.nan, -np.inf
-    grey, valid = np.ones((20, 20), np.uint8), np.ones((20, 20), bool)
-    KERNEL.rectify(np.ones((9, 11), np.uint8), nodes, grey, valid)
-    assert not grey.any() and not valid.any()
 
 
 @needs_kernel
@@ -464,6 +388,48 @@ def given(name):
         "thin": (zeros(12, 16, of=np.uint8), 4, zeros(3, 4, of=np.uint8)),
         "rectify": (grey[:9], zeros(6, 9, 2), grey.copy(), valid),
     }[name]
+
+
+LIMITS_OF_STEPS = (0, 0, 1, 3, 0.01, 3.0, 1e-3, 0.08, 0.97)
+POSES = [(1e9, 0, 0, 0), (math.nan, 0, 0, 0), (0, 0, 0, 80.0)]
+MATRICES = [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
+PLACES = [(1e300, 0, 0, 0), (math.nan, -1e300, 0, 0), (5, 5, 0, 80.0), (5, 5, 0, math.nan)]
+OFF = [(math.nan, 0.0), (0.0, math.inf), (-1e300, 1e300), (0.0, -math.inf)]
+NODES = np.full((6, 9, 2), 1e30, np.float32)
+NODES[:3], NODES[4] = np.nan, -np.inf
+BEYOND = [
+    *[("refine", 4, pose) for pose in POSES],
+    *[("spread", 4, pose) for pose in POSES],
+    *[(name, at, matrix) for name, at in (("moved", 3), ("blocks", 2)) for matrix in MATRICES],
+    *[("near", 3, np.array([place])) for place in PLACES],
+    *[("bend", 2, np.array(OFF)), ("rectify", 1, NODES)],
+]
+
+
+@needs_kernel
+@pytest.mark.parametrize("name, at, beyond", BEYOND)
+def test_what_lies_beyond_all_bounds_touches_no_memory(name, at, beyond):
+    arguments = list(given(name))
+    arguments[0] = np.ones_like(arguments[0])
+    arguments[at] = beyond
+    if name in ("refine", "spread"):
+        arguments[5] = LIMITS_OF_STEPS
+    outputs = arguments[OUTPUTS.get(name, len(arguments)) :]
+    for each in outputs:
+        each[...] = 1 if each.dtype.kind in "bu" else math.nan
+    found = getattr(KERNEL, name)(*arguments)
+    if name == "refine":
+        assert found[1] == 0 or math.isnan(found[1])
+    elif name == "spread":
+        assert not outputs[0][:16].any() and not outputs[0][32:].any()
+    elif name == "near":
+        assert outputs[0][0, 0] == 0
+    else:
+        assert not any(each.any() for each in outputs)
+
+
+OUTPUTS = {"spread": 6, "near": 5, "moved": 8, "blocks": 6, "bend": 6, "rectify": 2}
+"""Number of the first argument that is written to."""
 
 
 def other_type(array):
