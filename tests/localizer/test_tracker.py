@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from blots import AGL_M, GROUND, Flat, Ground, place_of, rendered
 
-from orthonav.core.errors import CameraError, MapFileError
+from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.ground import GroundModel
@@ -375,9 +375,3 @@ def test_a_place_that_contradicts_the_start_is_found_and_not_believed_at_once(lo
     assert rows[0][0] > 100
     assert all(row[0] < 10 for row in rows if row[2] == "tracking" or row[1] > 0.8)
     assert rows[-1][0] < 10 and {row[2] for row in rows} == {"searching"}  # too little new ground
-
-
-def test_a_wrong_camera_is_refused(localizer):
-    grey, telemetry, _ = next(iter(views(1)))
-    with pytest.raises(CameraError, match="320 x 240"):
-        Tracker(localizer).locate(View(grey, replace(WIDE, width_px=640, cx_px=320.0), telemetry))

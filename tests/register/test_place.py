@@ -1,7 +1,6 @@
 """The best place of a view, and its rivals: confident where there are none, else less so."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -141,16 +140,3 @@ def test_blank_views_and_blank_maps_are_no_crash(reference, grey):
         found = verified(refiner, candidates, LEVELS.coarse)
         assert abs(found.score) < 30 and np.isfinite(found.fit.covariance).all()
         assert math.isfinite(found.scores.peak_ratio + found.scores.mid_ratio)
-
-
-def test_threads_may_share_a_sheet(reference):
-    poses = random_poses(4, SHAPE, 90, seed=3, log_scale=0.05)
-    alone = [registered(reference, templates_of(GROUND, pose), prior_of(pose)) for pose in poses]
-    cold = reference_of(GROUND, SHAPE)
-    with ThreadPoolExecutor(4) as pool:
-        shared = pool.map(
-            lambda pose: registered(cold, templates_of(GROUND, pose), prior_of(pose)), poses
-        )
-        for one, other in zip(alone, shared, strict=True):
-            assert one.scores == other.scores or str(one.scores) == str(other.scores)
-            assert one.pose == other.pose
