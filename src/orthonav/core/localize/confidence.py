@@ -97,6 +97,7 @@ class Scores:
 
 
 STORED = {"mid_score": "look", "mid_rival": "look_rival"}
+"""Keys of `fixes.jsonl` that differ from the names here."""
 MAX_RATIO = 10.0
 DEFAULT_CHANCES = Chances(32.0, 15.0, 48.0)
 """Of generated landscapes, for maps on which none were measured."""
