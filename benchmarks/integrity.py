@@ -28,17 +28,17 @@ from scipy.special import expit
 from benchmarks.judged_views import prepare, views_of
 from benchmarks.record import Section, Table, percent, resumed, rows_path, run, say
 from benchmarks.scenes import all_pairs, chosen, place_of
-from orthonav.core.integrity import protection_levels_m
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.localize.confidence import (
-    ALONE,
     DEFAULT_CHANCES,
     FEATURES,
+    NEARBY,
     Chances,
     RegisteredConfidence,
+    Scores,
     features_of,
 )
-from orthonav.core.records import CONFIDENT
+from orthonav.core.records import CONFIDENT, protection_levels_m
 from orthonav.ground.evaluate.statistics import calibrate, upper_bound
 
 NAME = "integrity"
@@ -71,7 +71,9 @@ class Judged:
     @classmethod
     def of(cls, rows: list[dict[str, Any]]) -> "Judged":
         """From the rows of `views_of` that have a fix."""
-        made = [features_of(each["evidence"], Chances(**each["chances"])) for each in rows]
+        made = [
+            features_of(Scores.of(each["evidence"]), Chances(**each["chances"])) for each in rows
+        ]
         features, right = np.stack(made), np.array([each["right"] for each in rows])
         scenes, place = np.array([each["scene"] for each in rows]), np.zeros(len(rows))
         for scene in np.unique(scenes):
@@ -118,15 +120,15 @@ def fit_judge(features: Array, right: Mask) -> RegisteredConfidence:
 
     def loss(parameters: Array) -> tuple[float, Array]:
         weights = parameters[2:]
-        fits = expit(parameters[0] + scaled[:, :-ALONE] @ weights[:-ALONE])
-        alone = expit(parameters[1] + scaled[:, -ALONE:] @ weights[-ALONE:])
+        fits = expit(parameters[0] + scaled[:, :-NEARBY] @ weights[:-NEARBY])
+        alone = expit(parameters[1] + scaled[:, -NEARBY:] @ weights[-NEARBY:])
         product = fits * alone
         both = np.clip(product, 1e-9, 1 - 1e-9)
         value = -np.log(np.where(right, both, 1 - both)).mean()
         # A limited loss has no slope: with one, searches along a line would fail.
         slope = np.where(right, -1.0, both / (1 - both)) * (both == product) / len(right)
         first, second = slope * (1 - fits), slope * (1 - alone)
-        slopes = scaled[:, :-ALONE].T @ first, scaled[:, -ALONE:].T @ second
+        slopes = scaled[:, :-NEARBY].T @ first, scaled[:, -NEARBY:].T @ second
         gradient = np.concatenate([[first.sum(), second.sum()], *slopes])
         gradient[2:] += 2 * RIDGE * weights
         return float(value + RIDGE * (weights**2).sum()), gradient
@@ -136,8 +138,8 @@ def fit_judge(features: Array, right: Mask) -> RegisteredConfidence:
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     weights = found[2:] / std
     biases = (
-        float(found[0] - weights[:-ALONE] @ mean[:-ALONE]),
-        float(found[1] - weights[-ALONE:] @ mean[-ALONE:]),
+        float(found[0] - weights[:-NEARBY] @ mean[:-NEARBY]),
+        float(found[1] - weights[-NEARBY:] @ mean[-NEARBY:]),
     )
     return RegisteredConfidence(biases, tuple(float(each) for each in weights), DEFAULT_CHANCES)
 

@@ -193,7 +193,7 @@ def _placed(
     far_m = max(far_m, RADIUS_SHARE * fix.agl_m)
     right = case.kind in ("found", "beside") and error_m <= far_m
     return {
-        "evidence": {name: float(f"{value:.5g}") for name, value in found.place.scores.items()},
+        "evidence": {name: float(f"{value:.5g}") for name, value in fix.evidence.items()},
         "chances": asdict(localizer.confidence.chances),
         "off_en_m": np.round(off_m, 3).tolist(),
         "cov_en_m2": [float(f"{each:.5g}") for each in fix.cov_en_m2[[0, 0, 1], [0, 1, 1]]],

@@ -310,7 +310,7 @@ def _ways(localizer: Localizer) -> Iterator[tuple[str, Any]]:
     def alone(view: View, gradients: bool) -> Fix | NoFix:
         search = registration.search(view)
         if isinstance(search, Search) and gradients:
-            search = Search(search.sheet, search.view.by_gradients(), None)
+            search = Search(search.map, search.view.by_gradients(), None)
         best = search if isinstance(search, NoFix) else search.run()
         if isinstance(search, NoFix) or isinstance(best, NoFix):
             return NoFix("no_match", "not placed")

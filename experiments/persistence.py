@@ -16,7 +16,7 @@ import numpy as np
 from lab.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 from numpy.typing import NDArray
 
-from orthonav.core.register.channels import FINE, channels_of
+from orthonav.core.register.template import FINE, channels_of
 from orthonav.ground.check.ageing import (
     PATCH_PX,
     PersistenceModel,

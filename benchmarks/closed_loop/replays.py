@@ -446,7 +446,7 @@ def _row(
         place = area.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
         error = place - area.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
         cov, confidence = outcome.cov_en_m2, outcome.confidence
-        own = [outcome.evidence.get(f"vel_{axis}_mps", np.nan) for axis in ("east", "north")]
+        own = np.array(outcome.vel_en_mps or (np.nan, np.nan))
         velocity_off = float(np.hypot(*(own - recorded.velocity_en_mps(exposure.time_s))))
     _, pitch_deg, roll_deg = exposure.attitude_deg
     tilt_off = view.telemetry.pitch_deg - pitch_deg, view.telemetry.roll_deg - roll_deg

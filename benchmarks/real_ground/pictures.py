@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.real_ground.rows import questions
 from orthonav.core.localize import Localizer
 from orthonav.core.records import NoFix, View
-from orthonav.core.register.blocks import block_scores
+from orthonav.core.register.refine import block_scores
 
 REACH_PX, LONGER, ENLARGED = 6, 10, 3
 LEAST_CORRELATION = 0.15

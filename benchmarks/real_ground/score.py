@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.record import number
 from benchmarks.scenes import FAR_M
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.integrity import protection_level_m
-from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, View
+from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, View, protection_level_m
 from orthonav.onboard.run import Locator, locate_view
 
 RISK = 0.001

@@ -9,7 +9,7 @@ from made_check import CONDITIONS as GIVEN
 from made_check import area_of
 
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.integrity import protection_level_m
+from orthonav.core.records import protection_level_m
 from orthonav.ground.check import flights
 from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.findings import likely_outages, predicted_along

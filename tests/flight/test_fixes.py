@@ -235,3 +235,12 @@ def test_a_guess_is_marked() -> None:
     assert not result_from_json(json.dumps({**NO_FIX_LINE, "confident": True})).is_confident
     with pytest.raises(FlightError, match="confident: expected true or false"):
         result_from_json(json.dumps({**FIX_LINE, "confident": "yes"}))
+
+
+def test_velocity_and_recognition_of_a_track_stand_in_its_evidence() -> None:
+    motion = {"vel_east_mps": 3.0, "vel_north_mps": -4.0, "vel_std_mps": 0.5, "recognized": 0.9}
+    plain = {**FIX_LINE, "evidence": {"peak_ratio": 1.8, **motion}}
+    read = result_from_json(json.dumps(plain))
+    assert isinstance(fix := read.outcome, Fix) and dict(fix.evidence) == FIX_LINE["evidence"]
+    assert (fix.vel_en_mps, fix.vel_std_mps, fix.recognized) == ((3.0, -4.0), 0.5, 0.9)
+    assert json.loads(result_to_json(read))["evidence"] == plain["evidence"]

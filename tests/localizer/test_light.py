@@ -11,7 +11,7 @@ from orthonav.core.localize import Localizer
 from orthonav.core.localize.search import Found, found_by
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
-from orthonav.core.register.blocks import block_scores
+from orthonav.core.register.refine import block_scores
 from orthonav.core.track.tracker import Tracker
 
 OTHER = Ground(seed=5)

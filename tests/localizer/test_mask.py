@@ -9,7 +9,7 @@ import pytest
 from orthonav.core.errors import CameraError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import masked
-from orthonav.core.localize.rectify import (
+from orthonav.core.localize.view import (
     Orientation,
     downsampled,
     node_px,

@@ -7,12 +7,12 @@ import pytest
 from blots import CAMERA, GROUND, as_grey
 from lab.terrain import random_relief, seen_view
 
-from orthonav.core.localize.rectify import (
+from orthonav.core.localize.view import (
     Orientation,
     hidden,
     node_px,
     orthorectified,
-    rectified_level,
+    rectified_flat,
 )
 from orthonav.core.records import Telemetry, View
 from orthonav.ground.simulate.render import Raster
@@ -126,7 +126,7 @@ def test_unknown_heights_and_ground_not_seen_are_not_valid(grey):
 def test_level_ground_is_rectified_by_one_homography_as_by_nodes(grey, attitude, shape):
     orientation, en_from_window = over_level_ground(attitude, shape)
     view = view_of(seen_view(grey, level(), CAMERA, attitude, ABOVE_M, finer=1)[0], CAMERA)
-    made, valid = rectified_level(view, orientation, en_from_window, shape)
+    made, valid = rectified_flat(view, orientation, en_from_window, shape)
     nodes = window(level(), MIDDLE_EN_M, shape)
     plain, seen = orthorectified(view, orientation, nodes, shape)
     assert (valid != seen).mean() < 0.01 and seen.mean() > 0.3
@@ -141,7 +141,7 @@ def test_a_lens_and_far_ground_need_more_than_a_homography(camera, tilt_deg):
     shape = (320, 320)
     orientation, en_from_window = over_level_ground((0.0, tilt_deg, 0.0), shape)
     view = view_of(np.zeros((camera.height_px, camera.width_px), np.uint8), camera)
-    assert rectified_level(view, orientation, en_from_window, shape) is None
+    assert rectified_flat(view, orientation, en_from_window, shape) is None
 
 
 ABOVE_M = np.array([MIDDLE_M - 30, MIDDLE_M + 10, 150.0])

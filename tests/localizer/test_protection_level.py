@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.integrity import DEGREES, probability_beyond, protection_level_m
-from orthonav.core.records import Fix
+from orthonav.core.records import ERROR_DEGREES, Fix, probability_beyond, protection_level_m
 
 COV = np.array([[9.0, 3.0], [3.0, 4.0]])
 FIX = Fix(48.0, 2.0, COV, 0.99, 35.0, 0.0, 200.0, place_probability=0.9999)
@@ -17,8 +16,8 @@ FIX = Fix(48.0, 2.0, COV, 0.99, 35.0, 0.0, 200.0, place_probability=0.9999)
 
 def test_errors_follow_a_student_distribution_of_the_covariance():
     rng = np.random.default_rng(1)
-    normal = rng.multivariate_normal([0, 0], COV * (DEGREES - 2) / DEGREES, 400_000)
-    errors = normal * np.sqrt(DEGREES / rng.chisquare(DEGREES, 400_000))[:, None]
+    normal = rng.multivariate_normal([0, 0], COV * (ERROR_DEGREES - 2) / ERROR_DEGREES, 400_000)
+    errors = normal * np.sqrt(ERROR_DEGREES / rng.chisquare(ERROR_DEGREES, 400_000))[:, None]
     assert np.cov(errors.T) == pytest.approx(COV, rel=0.1)
     lengths = np.hypot(*errors.T)
     for limit in (1.0, 5.0, 15.0):

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize.rectify import downsampled, rectify
+from orthonav.core.localize.view import downsampled, rectify
 from orthonav.core.records import Telemetry, View
 
 AGL_M, GSD_M, SIZE_PX = 100.0, 0.5, 160
@@ -195,7 +195,7 @@ def test_a_lens_at_some_pixels_is_as_good_as_at_all(monkeypatch, lens, attitude)
     grey = (40 * (grey - 100) / grey.std() / 2 + 120).clip(0, 255).astype(np.uint8)
     view = View(grey, LENSES[lens], Telemetry(0, *attitude, 100.0))
     quick = rectify(view, gsd_m=0.5, size_px=240)
-    module = importlib.import_module("orthonav.core.localize.rectify")
+    module = importlib.import_module("orthonav.core.localize.view")
     monkeypatch.setattr(module, "_is_smooth", lambda *_: False)
     exact = rectify(view, gsd_m=0.5, size_px=240)
     assert (quick.valid != exact.valid).mean() < 2e-3

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.core.errors import VariantError
-from orthonav.core.localize.confidence import CHANCES, FEATURES, Chances, RegisteredConfidence
+from orthonav.core.localize.confidence import (
+    CHANCES,
+    FEATURES,
+    Chances,
+    RegisteredConfidence,
+    Scores,
+)
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.build.calibrate import fit_registered
 
@@ -18,49 +25,40 @@ MODEL = RegisteredConfidence((-8.0, -3.0), (0.5, 11.0, 1.5, 2.0, 1.0, 2.0, 3.0),
 
 strengths = st.floats(1.0, 300.0)
 sometimes = st.one_of(st.just(math.nan), strengths)
-evidences = st.fixed_dictionaries(
-    {
-        **{name: strengths for name in ("strength", "rival", "look", "look_rival")},
-        **{name: sometimes for name in ("fine", "fine_rival")},
-        "local_phase": st.floats(-5, 80),
-        "local_gradients": st.floats(-5, 80),
-        "detail_ratio": st.one_of(st.just(math.nan), st.floats(1e-3, 1e3)),
-    }
+some_scores = st.builds(
+    Scores,
+    **{name: strengths for name in ("strength", "rival", "mid_score", "mid_rival")},
+    **{name: sometimes for name in ("fine", "fine_rival")},
+    local_ratio=st.just(2.0),
+    local_phase=st.floats(-5, 80),
+    local_gradients=st.floats(-5, 80),
+    detail_ratio=st.one_of(st.just(math.nan), st.floats(1e-3, 1e3)),
 )
-
-
-def evidence(strength=60.0, rival=30.0, look=35.0, look_rival=18.0, **more):
-    return {
-        "strength": strength,
-        "rival": rival,
-        "look": look,
-        "look_rival": look_rival,
-        "fine": math.nan,
-        "fine_rival": math.nan,
-        "local_phase": 10.0,
-        "local_gradients": 8.0,
-        "detail_ratio": 1.5,
-        **more,
-    }
+USUAL = Scores(60.0, 30.0, 35.0, 18.0, math.nan, math.nan, 1.5, 2.0, 8.0, 10.0)
 
 
 @pytest.mark.parametrize("value", [0.0, -30.0, 1e-300, 1e300])
 def test_absurd_evidence_gives_a_probability(value):
-    for name in ("strength", "rival", "look", "look_rival"):
-        assert 0 <= MODEL(evidence(**{name: value})) <= 1
+    for name in ("strength", "rival", "mid_score", "mid_rival"):
+        assert 0 <= MODEL(replace(USUAL, **{name: value})) <= 1
 
 
-@given(evidences, st.floats(1.0, 4.0))
+@given(some_scores)
+def test_evidence_of_a_fix_gives_the_same_scores(scores):
+    assert repr(Scores.of(scores.evidence())) == repr(scores)
+
+
+@given(some_scores, st.floats(1.0, 4.0))
 def test_better_evidence_never_lowers_it(plain, gain):
-    for name in ("strength", "look", "fine", "local_phase", "local_gradients", "detail_ratio"):
-        if math.isfinite(plain[name]):
-            assert MODEL({**plain, name: gain * plain[name]}) >= MODEL(plain) - 1e-12
+    for name in ("strength", "mid_score", "fine", "local_phase", "local_gradients", "detail_ratio"):
+        if math.isfinite(value := getattr(plain, name)):
+            assert MODEL(replace(plain, **{name: gain * value})) >= MODEL(plain) - 1e-12
 
 
 def test_a_search_that_was_cut_short_is_not_confident():
     model = RegisteredConfidence.usual(Chances(32.0, 15.0, 48.0))
-    clear = evidence(strength=200.0, look=90.0)
-    assert model(clear) > CONFIDENT > model({**clear, "cut_short": 1.0})
+    clear = replace(USUAL, strength=200.0, mid_score=90.0)
+    assert model(clear) > CONFIDENT > model(replace(clear, cut_short=True))
 
 
 def changed(value, *path):
@@ -101,7 +99,7 @@ def synthetic(count, seed, harder=0.0):
     look = 15 * np.exp(rng.normal(0.2, 0.2, count) + 0.2 * right + harder)
     local = np.exp(np.where(right, rng.normal(0.8, 0.4, count), rng.normal(0.1, 0.1, count)))
     views = [
-        evidence(s, s / r, k, k / r, local_phase=3 * a, local_gradients=3 * a)
+        Scores(s, s / r, k, k / r, math.nan, math.nan, 1.5, 2.0, 3 * a, 3 * a)
         for s, r, k, a in zip(strength, ratio, look, local, strict=True)
     ]
     return views, right

@@ -24,7 +24,7 @@ from blots import (
 
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.place import CandidateRefiner
-from orthonav.core.localize.policy import ClearMargin
+from orthonav.core.localize.search import ClearMargin
 from orthonav.core.mapfile import GreyLayer, open_map
 from orthonav.core.mapfile.layer import part_names
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View

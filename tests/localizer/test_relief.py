@@ -23,13 +23,13 @@ from lab.terrain import random_relief, seen_view
 from orthonav.core.geo.ground import Ground
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.camera import FITTING
+from orthonav.core.localize.confidence import MAX_RATIO
 from orthonav.core.localize.ground import GroundModel, ViewOverGround
-from orthonav.core.localize.place import MAX_RATIO
-from orthonav.core.localize.rectify import Orientation
-from orthonav.core.localize.systematic import ERRORS
+from orthonav.core.localize.resection import ERRORS
+from orthonav.core.localize.view import Orientation
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.window import Pose
 from orthonav.ground.simulate.render import Raster
 
 SIDE_M, POSTING_M = 700.0, 10.0
@@ -179,14 +179,14 @@ def test_the_camera_over_a_hole_of_the_terrain_is_found(opened, grey, relief):
 def test_simulated_level_ground_is_known_as_well_as_the_terrain(opened):
     localizer = on_terrain(opened, hills(0.05))
     known = localizer.registration.ground
-    assert known.levelled().level_errors.fields == (ERRORS.surface_m,)
+    assert known.flattened().flat_errors.fields == (ERRORS.surface_m,)
     known.info = replace(ROUGH, roughness_m=None, source_posting_m=30.0)
     known.surface = None
-    levelled, unknown = known.levelled(), Localizer(opened).registration.ground
-    assert levelled.is_level and levelled.level_errors.slope == 0 < unknown.level_errors.slope
-    (std_m, _), _ = levelled.level_errors.fields
+    flattened, unknown = known.flattened(), Localizer(opened).registration.ground
+    assert flattened.is_flat and flattened.flat_errors.slope == 0 < unknown.flat_errors.slope
+    (std_m, _), _ = flattened.flat_errors.fields
     assert 3.0 < std_m <= 5.5  # 100 m times the slope
-    assert unknown.levelled() is unknown
+    assert unknown.flattened() is unknown
 
 
 def test_level_ground_is_as_without_a_terrain(opened):
@@ -216,7 +216,7 @@ def test_formulas_for_level_ground_agree_with_those_for_any(opened, attitude):
         ViewOverGround(each, prepared, registration.reference)
         for each in (registration.ground, flat)
     )
-    assert seen.ground.is_level and not flat.is_level
+    assert seen.ground.is_flat and not flat.is_flat
     pose = Pose(300.0, 290.0, 0.3, 0.01)
     assert seen.reference_m(pose) == any_seen.reference_m(pose) == 0.0
     for above_m in (AGL_M, 0.0, -5.0):

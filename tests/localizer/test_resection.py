@@ -9,7 +9,7 @@ import pytest
 from blots import AGL_M, CAMERA, GROUND, Flat, as_grey, known_map, rendered
 
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize import Localizer, systematic
+from orthonav.core.localize import Localizer, resection
 from orthonav.core.localize.camera import camera_of
 from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.resection import _Marginal
@@ -174,8 +174,8 @@ def test_systematic_errors_are_marginalized():
 
 def test_a_place_that_stands_out_is_known_better(localizer, monkeypatch):
     none = (1e-3, 10.0)  # noise of blocks alone
-    errors = replace(systematic.ERRORS, surface_m=none, stretch_px=none)
-    monkeypatch.setattr(systematic, "ERRORS", errors)
+    errors = replace(resection.ERRORS, surface_m=none, stretch_px=none)
+    monkeypatch.setattr(resection, "ERRORS", errors)
     attitude = (20.0, 0.0, 0.0)
     view = View(
         as_grey(rendered(GROUND, np.zeros(2), attitude, AGL_M)),

@@ -14,16 +14,16 @@ from orthonav.core.localize.camera import approached, camera_of
 from orthonav.core.localize.ground import (
     SAMPLING,
     GroundModel,
-    PreparedMap,
     ViewOverGround,
     _smoothed,
 )
-from orthonav.core.localize.rectify import hidden
-from orthonav.core.localize.systematic import ERRORS
+from orthonav.core.localize.resection import ERRORS
+from orthonav.core.localize.search import PreparedMap
+from orthonav.core.localize.view import hidden
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import Telemetry, View
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.window import Pose
 from orthonav.ground.build.lean import as_shown
 from orthonav.ground.simulate.render import Raster
 
@@ -277,7 +277,7 @@ def test_views_on_level_ground_know_the_surface_of_a_route(town, opened):
     from_m = grid.west_m + 0.7 * grid.width_px * grid.gsd_m
     parts = Heights(ground, from_m=from_m), Heights(above, from_m=from_m)
     relief = GroundModel(parts[0], grid, None, None, parts[1])
-    assert relief.levelled().level_errors.fields == (ERRORS.surface_m,)
+    assert relief.flattened().flat_errors.fields == (ERRORS.surface_m,)
 
 
 def test_a_surface_counts_where_most_of_it_is_known(town, opened):

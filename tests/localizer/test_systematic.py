@@ -9,8 +9,7 @@ from blots import ROUGH
 
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.core.localize.camera import ground_by_picture, picture_by_camera, picture_by_ground
-from orthonav.core.localize.rectify import Orientation
-from orthonav.core.localize.systematic import (
+from orthonav.core.localize.resection import (
     ERRORS,
     GroundErrors,
     field_modes,
@@ -20,6 +19,7 @@ from orthonav.core.localize.systematic import (
     terrain_errors,
     unknown_ground,
 )
+from orthonav.core.localize.view import Orientation
 
 CAMERA = Camera(400, 300, 400.0, 400.0, 200.0, 150.0)
 AGL_M, BLOCK_M = 200.0, 30.0

@@ -4,7 +4,6 @@ flight folder, a locator."""
 import socket
 import threading
 import time
-from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -96,8 +95,8 @@ class LiveAutopilot(threading.Thread):
 
 def fix(lat_deg=48.0, lon_deg=2.0, confidence=0.97, std_m=2.0, heading_deg=0.0, agl_m=100.0):
     cov = np.eye(2) * std_m**2
-    evidence = MappingProxyType({"vel_east_mps": 0.0, "vel_north_mps": 10.0})
-    return Fix(lat_deg, lon_deg, cov, confidence, 35.0, heading_deg, agl_m, evidence)
+    stated = lat_deg, lon_deg, cov, confidence, 35.0, heading_deg, agl_m
+    return Fix(*stated, vel_en_mps=(0.0, 10.0))
 
 
 def write_flight(folder, camera, views):

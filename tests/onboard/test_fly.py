@@ -14,7 +14,6 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -371,8 +370,8 @@ def test_repeated_images_are_not_located(flight):
 
 def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
     """One velocity does not say how far an aircraft flew that turned while images were frozen."""
-    flight, own = begin(), {"vel_east_mps": 1.0, "vel_north_mps": 2.0, "vel_std_mps": 0.5}
-    flight.locator.outcome = lambda view: replace(fix(), evidence=MappingProxyType(own))
+    flight, own = begin(), (1.0, 2.0)
+    flight.locator.outcome = lambda view: replace(fix(), vel_en_mps=own, vel_std_mps=0.5)
 
     def views(count, north_mps, **options):
         results = []
@@ -383,7 +382,7 @@ def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
         return results
 
     frozen = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
-    assert views(20, 20.0)[-1].outcome.evidence == own
+    assert views(20, 20.0)[-1].outcome.vel_en_mps == own
     views(1, 20.0, grey=frozen)
     views(10, 20.0, grey=frozen)
     views(10, -10.0, grey=frozen)
@@ -391,9 +390,8 @@ def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
     mean, now = (each.vel_en_mps for each in flight.locator.seen[-2:])
     assert mean == (0.0, pytest.approx(5.0, abs=1.5)) and now == (0.0, -10.0)
     # The velocity of the fix is that of the moment: its error is that of the mean.
-    assert first.outcome.evidence["vel_north_mps"] == pytest.approx(2.0 + (-10.0 - mean[1]))
-    assert first.outcome.evidence["vel_east_mps"] == 1.0
-    assert second.outcome.evidence == own
+    assert first.outcome.vel_en_mps == (1.0, pytest.approx(2.0 + (-10.0 - mean[1])))
+    assert second.outcome.vel_en_mps == own
 
 
 BAD = {

@@ -18,11 +18,11 @@ from orthonav.onboard.messages.mavlink import gps_time
 
 COV = np.array([[16.0, 3.0], [3.0, 9.0]])
 PLAIN = NavigationEstimate(48.0, -4.0, COV, 0.95, time_ns=5)
-VELOCITY = {"vel_east_mps": 12.0, "vel_north_mps": -3.5}
+VELOCITY = (12.0, -3.5)
 
 
-def a_result(state: str | None = None, **evidence: float) -> ViewResult:
-    fix = Fix(48.1, -4.3, COV, 0.93, 15.0, 87.0, 121.0, evidence)
+def a_result(state: str | None = None, velocity: tuple[float, float] | None = None) -> ViewResult:
+    fix = Fix(48.1, -4.3, COV, 0.93, 15.0, 87.0, 121.0, vel_en_mps=velocity)
     return ViewResult("a.jpg", 5_000_000_000, fix, 80.0, state)
 
 
@@ -31,7 +31,7 @@ def unix_ns(text: str) -> int:
 
 
 def test_a_fix_becomes_an_estimate() -> None:
-    made = estimate_from_result(a_result("tracking", **VELOCITY), utc_ahead_ns=4 * 10**9)
+    made = estimate_from_result(a_result("tracking", VELOCITY), utc_ahead_ns=4 * 10**9)
     assert made is not None
     assert (made.lat_deg, made.lon_deg, made.confidence) == (48.1, -4.3, 0.93)
     assert made.state == "tracking"
@@ -46,15 +46,17 @@ def test_without_a_fix_there_is_no_estimate() -> None:
 
 
 @pytest.mark.parametrize(
-    ("state", "evidence"),
+    ("state", "velocity"),
     [
         (None, VELOCITY),  # a single view
-        ("tracking", {"vel_east_mps": 1.0}),
-        ("tracking", {**VELOCITY, "vel_east_mps": math.nan}),
+        ("tracking", None),
+        ("tracking", (math.nan, -3.5)),
     ],
 )
-def test_an_incomplete_velocity_is_unknown(state: str | None, evidence: dict[str, float]) -> None:
-    made = estimate_from_result(a_result(state, **evidence))
+def test_an_incomplete_velocity_is_unknown(
+    state: str | None, velocity: tuple[float, float] | None
+) -> None:
+    made = estimate_from_result(a_result(state, velocity))
     assert made is not None and made.vel_en_mps is None
 
 

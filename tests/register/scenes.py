@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 
-from orthonav.core.register.pose import Pose
 from orthonav.core.register.template import ViewTemplates
-from orthonav.core.register.window import Reference
+from orthonav.core.register.window import Pose, Reference
 
 
 class Ground:

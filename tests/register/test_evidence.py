@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.register.channels import COARSE, FINE, GROUPS, channels_of
+from orthonav.core.register.template import COARSE, FINE, GROUPS, channels_of
 
 RECIPES = {"fine": FINE, "coarse": COARSE}
 GRADIENT, GREY = GROUPS

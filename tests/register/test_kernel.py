@@ -11,19 +11,18 @@ import pytest
 from scenes import Ground, apart_px, as_grey, random_poses, reference_of, templates_of, turned_rad
 
 from orthonav.core.localize import resection
-from orthonav.core.localize.rectify import node_px
-from orthonav.core.register import blocks, channels, refine, search, sharpness, template
-from orthonav.core.register.channels import COARSE, FINE
+from orthonav.core.localize.view import node_px
+from orthonav.core.register import refine, search, template
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.pose import Pose, ScaleMap
 from orthonav.core.register.refine import Refiner
 from orthonav.core.register.search import SearchWindow, bank, best_near
-from orthonav.core.register.window import MapWindow
+from orthonav.core.register.template import COARSE, FINE
+from orthonav.core.register.window import MapWindow, Pose, ScaleMap
 
-rectify_module = importlib.import_module("orthonav.core.localize.rectify")
+rectify_module = importlib.import_module("orthonav.core.localize.view")
 SHAPE = (256, 320)
 GROUND = Ground()
-SHARES = blocks.GREY_SHARE, blocks.MIN_SEEN, blocks.MIN_ENERGY
+SHARES = refine.BLOCK_GREY_SHARE, refine.MIN_SEEN, refine.MIN_ENERGY
 needs_kernel = pytest.mark.skipif(KERNEL is None, reason="the kernel was not compiled")
 
 
@@ -38,7 +37,7 @@ def reference():
 def both(monkeypatch, work):
     """What `work` makes with the kernel, and without it."""
     compiled = work()
-    for module in (blocks, channels, refine, search, sharpness, template):
+    for module in (refine, search, template):
         monkeypatch.setattr(module, "KERNEL", None)
     return compiled, work()
 
@@ -100,16 +99,6 @@ def test_without_a_compiler_views_are_placed_too(reference, monkeypatch):
 
 
 @needs_kernel
-@pytest.mark.parametrize("pose", [(1e9, 0, 0, 0), (math.nan, 0, 0, 0), (0, 0, 0, 80.0)])
-def test_a_pose_beyond_all_bounds_touches_no_memory(pose):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(0)
-    window = np.ones((20, 30, 4), np.float32)
-    limits = (0, 0, 1, 3, 0.01, 3.0, 1e-3, 0.08, 0.97)
-    found = KERNEL.refine(window, made.values, made.slopes, made.numbers, pose, limits)
-    assert found[1] == 0 or math.isnan(found[1])
-
-
-@needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("cached", [True, False])
@@ -133,19 +122,6 @@ def test_what_a_covariance_is_made_of_is_the_same(reference, monkeypatch, level,
 
 
 @needs_kernel
-@pytest.mark.parametrize("pose", [(1e9, 0, 0, 0), (math.nan, 0, 0, 0), (0, 0, 0, 80.0)])
-def test_sums_at_a_pose_beyond_all_bounds_touch_no_memory(pose):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(0)
-    images = np.ones((20, 30, 4), np.float32), made.values, made.slopes, made.numbers
-    limits = (0, 0, 1, 3, 0.01, 3.0, 1e-3, 0.08, 0.97)
-    out = np.full(2 * 16 + 36 * refine.BLOCK_SUMS, math.nan)
-    KERNEL.spread(*images, pose, limits, out)
-    assert not out[:16].any() and not out[32:].any()
-    with pytest.raises(ValueError, match="expected"):
-        KERNEL.spread(*images, pose, limits, out[:-1])
-
-
-@needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("cached", [True, False])
@@ -155,7 +131,7 @@ def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole
     seen = list(views(12, 8, level, view_valid))
 
     def work():
-        return [sharpness._moved_scores(made, reference, pose) for made, pose in seen]
+        return [refine._moved_scores(made, reference, pose) for made, pose in seen]
 
     for one, other in zip(*both(monkeypatch, work), strict=True):
         assert one.shape == other.shape
@@ -164,17 +140,6 @@ def test_scores_a_little_aside_are_the_same(reference, monkeypatch, level, whole
             assert np.unravel_index(mine.argmax(), mine.shape) == np.unravel_index(
                 plain.argmax(), plain.shape
             )
-
-
-@needs_kernel
-@pytest.mark.parametrize(
-    "matrix", [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
-)
-def test_moves_beyond_all_bounds_touch_no_memory(matrix):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    window, out = np.ones((20, 30, 4), np.float32), np.full((3, 7, 9), math.nan, np.float32)
-    KERNEL.moved(window, made.values, made.weights, matrix, 0.0, (3, 4), (60, 80), 1e-3, out)
-    assert not out.any()
 
 
 SIZES = [(256, 320), (97, 320), (256, 61), (17, 19), (130, 134)]
@@ -229,17 +194,6 @@ def test_the_best_place_near_by_is_the_same(reference, monkeypatch, reach_px):
 
 
 @needs_kernel
-def test_near_poses_beyond_all_bounds_touch_no_memory():
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    channels = np.ones((20, 30, 3), np.float32)
-    beyond = [(1e300, 0, 0, 0), (math.nan, -1e300, 0, 0), (5, 5, 0, 80.0), (5, 5, 0, math.nan)]
-    places = np.array([*beyond, (3, 4, math.nan, 0)], np.float64)
-    out = np.full((5, 3), math.nan)
-    KERNEL.near(channels, made.values, made.weights, places, 2, out)
-    assert (out[:4, 0] == 0).all()
-
-
-@needs_kernel
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize("cached", [True, False])
@@ -250,7 +204,7 @@ def test_scores_of_blocks_are_the_same(reference, monkeypatch, level, whole, cac
     seen = list(views(6, 9, level, valid_but_a_corner(whole)))
 
     def work():
-        return [blocks.block_scores(made, reference, pose, reach_px) for made, pose in seen]
+        return [refine.block_scores(made, reference, pose, reach_px) for made, pose in seen]
 
     for one, other in zip(*both(monkeypatch, work), strict=True):
         # OpenCV rounds positions, by which single pixels beside the hole count or not.
@@ -284,26 +238,14 @@ def test_scores_of_blocks_where_nothing_is_interpolated_are_exactly_those(
         rows, cols = shape if quarter % 2 == 0 else shape[::-1]
         pose = Pose(x + cols % 2 / 2, y + rows % 2 / 2, quarter * math.pi / 2, 0.0)
         window = MapWindow.of(view, reference, pose, 1, (reach_px, reach_px))
-        sums = blocks._compared(view, window, pose, reach_px)
-        plain, plain_pixels = blocks._correlated(*sums, math.prod(shape))
+        sums = refine._products_of_blocks(view, window, pose, reach_px)
+        plain, plain_pixels = refine._correlated(*sums, math.prod(shape))
         found, pixels = np.full_like(plain, math.nan), np.full_like(plain_pixels, math.nan)
         at = window.matrix(pose), pose.turn_rad, reach_px, SHARES
         KERNEL.blocks(window.made, view.planes, *at, found, pixels)
         assert pixels.any()
         np.testing.assert_allclose(pixels, plain_pixels, rtol=1e-3, atol=1e-3)
         np.testing.assert_allclose(found, plain, atol=2e-4)
-
-
-@needs_kernel
-@pytest.mark.parametrize(
-    "matrix", [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
-)
-def test_blocks_beyond_all_bounds_touch_no_memory(matrix):
-    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(1)
-    found, pixels = np.full((36, 9, 9), math.nan), np.full(36, math.nan)
-    window = np.ones((20, 30, 4), np.float32)
-    KERNEL.blocks(window, made.planes, matrix, 0.0, 4, SHARES, found, pixels)
-    assert not found.any() and not pixels.any()
 
 
 def blocks_of(surfaces, levels, rng):
@@ -351,16 +293,6 @@ LIMITS = SOLVER.min_correlation, SOLVER.max_correlation, SOLVER.pixels_per_numbe
 
 
 @needs_kernel
-@pytest.mark.parametrize("blur_px", [0.0, 1.0])
-def test_places_that_are_not_numbers_do_not_pull(blur_px):
-    out = np.full((3, 6), math.nan)
-    moved = np.array([[math.nan, 0.0], [0.0, math.inf], [-1e300, 1e300]])
-    weighted = resection._gaussian(5, blur_px), moved, np.ones(3), np.ones(3)
-    KERNEL.bend(np.ones((3, 5, 5)), *weighted, LIMITS, out)
-    assert not out.any()
-
-
-@needs_kernel
 @pytest.mark.parametrize("factor", [2, 3, 4, 7, 16, 37])
 def test_pictures_are_made_smaller_as_by_opencv(monkeypatch, factor):
     grey = np.random.default_rng(factor).integers(0, 256, (149, 203)).astype(np.uint8)
@@ -395,15 +327,6 @@ def test_pictures_are_rectified_as_without_the_kernel(monkeypatch, shape):
 
 
 @needs_kernel
-def test_nodes_beyond_all_bounds_touch_no_memory():
-    nodes = np.full((6, 6, 2), 1e30, np.float32)
-    nodes[:3], nodes[4] = np.nan, -np.inf
-    grey, valid = np.ones((20, 20), np.uint8), np.ones((20, 20), bool)
-    KERNEL.rectify(np.ones((9, 11), np.uint8), nodes, grey, valid)
-    assert not grey.any() and not valid.any()
-
-
-@needs_kernel
 @pytest.mark.parametrize("recipe", [FINE, COARSE], ids=["fine", "coarse"])
 @pytest.mark.parametrize("valid", ["all", "none", "part", "scattered"])
 @pytest.mark.parametrize(
@@ -418,8 +341,8 @@ def test_channels_are_the_same(shape, valid, recipe):
         which[: shape[0] // 3, shape[1] // 2 :] = False
     elif valid == "scattered":
         which = rng.uniform(size=shape) > 0.1
-    compiled = channels.channel_planes(grey, which, recipe)
-    plain = np.stack(channels._planes(grey, which, recipe, bool(which.all())))
+    compiled = template.channel_planes(grey, which, recipe)
+    plain = np.stack(template._planes(grey, which, recipe, bool(which.all())))
     np.testing.assert_array_equal(compiled[3], plain[3])
     np.testing.assert_allclose(compiled, plain, atol=1e-4)
 
@@ -427,7 +350,7 @@ def test_channels_are_the_same(shape, valid, recipe):
 @needs_kernel
 def test_channels_of_a_uniform_picture_are_zero():
     grey = np.full((40, 50), 90, np.uint8)
-    compiled = channels.channel_planes(grey, np.ones(grey.shape, bool), FINE)
+    compiled = template.channel_planes(grey, np.ones(grey.shape, bool), FINE)
     assert not compiled[:3].any()
 
 
@@ -465,6 +388,48 @@ def given(name):
         "thin": (zeros(12, 16, of=np.uint8), 4, zeros(3, 4, of=np.uint8)),
         "rectify": (grey[:9], zeros(6, 9, 2), grey.copy(), valid),
     }[name]
+
+
+LIMITS_OF_STEPS = (0, 0, 1, 3, 0.01, 3.0, 1e-3, 0.08, 0.97)
+POSES = [(1e9, 0, 0, 0), (math.nan, 0, 0, 0), (0, 0, 0, 80.0)]
+MATRICES = [(math.nan,) * 6, (1e30, 0, 1e30, 0, 1e30, 1e30), (1, 0, -1e9, 0, 1, 1e9)]
+PLACES = [(1e300, 0, 0, 0), (math.nan, -1e300, 0, 0), (5, 5, 0, 80.0), (5, 5, 0, math.nan)]
+OFF = [(math.nan, 0.0), (0.0, math.inf), (-1e300, 1e300), (0.0, -math.inf)]
+NODES = np.full((6, 9, 2), 1e30, np.float32)
+NODES[:3], NODES[4] = np.nan, -np.inf
+BEYOND = [
+    *[("refine", 4, pose) for pose in POSES],
+    *[("spread", 4, pose) for pose in POSES],
+    *[(name, at, matrix) for name, at in (("moved", 3), ("blocks", 2)) for matrix in MATRICES],
+    *[("near", 3, np.array([place])) for place in PLACES],
+    *[("bend", 2, np.array(OFF)), ("rectify", 1, NODES)],
+]
+
+
+@needs_kernel
+@pytest.mark.parametrize("name, at, beyond", BEYOND)
+def test_what_lies_beyond_all_bounds_touches_no_memory(name, at, beyond):
+    arguments = list(given(name))
+    arguments[0] = np.ones_like(arguments[0])
+    arguments[at] = beyond
+    if name in ("refine", "spread"):
+        arguments[5] = LIMITS_OF_STEPS
+    outputs = arguments[OUTPUTS.get(name, len(arguments)) :]
+    for each in outputs:
+        each[...] = 1 if each.dtype.kind in "bu" else math.nan
+    found = getattr(KERNEL, name)(*arguments)
+    if name == "refine":
+        assert found[1] == 0 or math.isnan(found[1])
+    elif name == "spread":
+        assert not outputs[0][:16].any() and not outputs[0][32:].any()
+    elif name == "near":
+        assert outputs[0][0, 0] == 0
+    else:
+        assert not any(each.any() for each in outputs)
+
+
+OUTPUTS = {"spread": 6, "near": 5, "moved": 8, "blocks": 6, "bend": 6, "rectify": 2}
+"""Number of the first argument that is written to."""
 
 
 def other_type(array):

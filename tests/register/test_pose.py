@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.window import Pose
 
 poses = st.builds(
     Pose,

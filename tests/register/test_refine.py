@@ -16,11 +16,9 @@ from scenes import (
     turned_rad,
 )
 
-from orthonav.core.register.channels import COARSE, FINE
-from orthonav.core.register.pose import Pose
 from orthonav.core.register.refine import DESCENT, Refiner
-from orthonav.core.register.template import ViewTemplates
-from orthonav.core.register.window import Reference
+from orthonav.core.register.template import COARSE, FINE, ViewTemplates
+from orthonav.core.register.window import Pose, Reference
 
 SHAPE = (384, 448)
 VIEW = (96, 128)

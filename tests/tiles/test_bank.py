@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from helpers import textured
 from orthonav.core.tiles import represent
-from orthonav.core.tiles.bank import embed_poses
-from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.core.tiles.bank import embed_directions
+from orthonav.core.tiles.whitened import CellLayout, CellSheet, WhitenedRecipe
 from orthonav.core.variants import make_variant
+from orthonav.ground.build.whitening import learn
 
 TILE_PX = 128
 GROUND_PX = 640
@@ -67,7 +67,7 @@ class Place:
         return self.embedder.view(self.representation(north_up, seen), seen)
 
     def bank(self, grey, valid, poses):
-        return embed_poses(self.embedder, self.representation, grey, valid, poses, TILE_PX)
+        return embed_directions(self.embedder, self.representation, grey, valid, poses, TILE_PX)
 
     def likeness(self, grey, valid, poses):
         """Cosines (Q,) of bank and slow path."""

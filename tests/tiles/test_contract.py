@@ -6,6 +6,7 @@ import pytest
 from pictures import edge_network, everywhere, frozen, picture
 
 from orthonav.core.errors import VariantError
+from orthonav.core.tiles import embed
 from orthonav.core.tiles.represent import TABLE, Canny, Gray, OrientedGradients
 from orthonav.core.variants import make_variant
 from orthonav.research.segments import Segments
@@ -95,14 +96,6 @@ def test_canny_is_opencvs(low, high, kernel):
     np.testing.assert_array_equal(Canny(low, high, kernel)(grey, everywhere(grey))[0], expected)
 
 
-@pytest.mark.parametrize(
-    "text", ["canny:low=200,high=100", "canny:low=-1", "canny:kernel=4", "canny:kernel=9"]
-)
-def test_impossible_canny_is_refused(text):
-    with pytest.raises(VariantError, match="canny"):
-        make_variant(TABLE, text)
-
-
 def gradients(grey):
     return OrientedGradients()(grey, everywhere(grey))
 
@@ -137,7 +130,31 @@ def test_harmonics_of_a_known_edge(direction_deg):
         assert abs(np.degrees(off)) < 2 and abs(measured) > 0
 
 
-@pytest.mark.parametrize("sigma_px", [0, -1, 17])
-def test_impossible_gradients_are_refused(sigma_px):
-    with pytest.raises(VariantError, match="sigma_px"):
-        OrientedGradients(sigma_px)
+IMPOSSIBLE = {
+    "canny": ("low=200,high=100", "low=-1", "kernel=4", "kernel=9"),
+    "gradient": ("sigma_px=0", "sigma_px=-1", "sigma_px=17"),
+    "segments": ("scale=0", "scale=-1", "sigma=-0.1", "sigma=17", "min_size=0"),
+}
+IMPOSSIBLE_EMBEDDINGS = {
+    "gradient": ("cells=0", "cells=5", "cells=64", "dims=0", "dims=5000", "floor=0", "floor=-1"),
+    "bovw": (
+        *("words=255", "words=10001", "features=orb", "features=superpoint", "weights=somewhere"),
+        *("max_features=0", "similarity=l2", "tfidf=2"),
+    ),
+    "autoencoder": (
+        *("dims=0", "width=12", "epochs=0", "batch=0", "learning_rate=0.0", "similarity=best"),
+        "precision=int4",
+    ),
+}
+REFUSED = [
+    (table, f"{name}:{text}")
+    for table, texts in ((TABLE, IMPOSSIBLE), (embed.TABLE, IMPOSSIBLE_EMBEDDINGS))
+    for name, each in texts.items()
+    for text in each
+]
+
+
+@pytest.mark.parametrize("table, text", REFUSED, ids=[text for _, text in REFUSED])
+def test_impossible_parameters_are_refused(table, text):
+    with pytest.raises(VariantError, match=text.partition(":")[2].partition("=")[0]):
+        make_variant(table, text)

@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 import pytest
 
-from orthonav.core.errors import MapFileError, MissingExtraError, VariantError
+from orthonav.core.errors import MapFileError, MissingExtraError
 from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder
 
 helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT
@@ -216,20 +216,3 @@ def test_embeddings_that_are_not_finite_are_refused():
     endless = graph(weights=np.full_like(WEIGHTS, np.inf))
     with pytest.raises(MapFileError, match="not finite"):
         embedder(endless).views(maps(1))
-
-
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"dims": 0},
-        {"width": 12},
-        {"epochs": 0},
-        {"batch": 0},
-        {"learning_rate": 0.0},
-        {"similarity": "best"},
-        {"precision": "int4"},
-    ],
-)
-def test_impossible_auto_encoders_are_refused(fields):
-    with pytest.raises(VariantError, match=next(iter(fields))):
-        AutoEncoderRecipe(**fields)

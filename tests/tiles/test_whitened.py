@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.core.errors import UsageError, VariantError
-from orthonav.core.tiles import embed, represent
-from orthonav.core.tiles.cells import MICRO, CellLayout
-from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.core.errors import UsageError
+from orthonav.core.tiles import represent
+from orthonav.core.tiles.whitened import MICRO, CellLayout, CellSheet, WhitenedRecipe
 from orthonav.core.variants import make_variant
+from orthonav.ground.build.whitening import learn
 
 TILE_PX = 128
 SHEET_PX = 384
@@ -145,11 +145,3 @@ def test_views_of_another_shape_are_refused(place, shape):
 def test_tiles_that_cannot_be_divided_are_refused(tile_px):
     with pytest.raises(UsageError, match=f"multiple of {MICRO}"):
         CellLayout.for_tiles(tile_px, 16)
-
-
-@pytest.mark.parametrize(
-    "text", ["cells=0", "cells=5", "cells=64", "dims=0", "dims=5000", "floor=0", "floor=-1"]
-)
-def test_impossible_recipes_are_refused(text):
-    with pytest.raises(VariantError, match=text.partition("=")[0]):
-        make_variant(embed.TABLE, f"gradient:{text}")

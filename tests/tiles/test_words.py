@@ -11,7 +11,7 @@ from helpers import textured
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe, describe
-from orthonav.core.variants import Variant, make_variant
+from orthonav.core.variants import Variant
 from orthonav.research.words import SheetWords, learn_words
 
 TABLE = {"bovw": Variant("orthonav.core.tiles.words:WordsRecipe")}
@@ -168,21 +168,3 @@ print({name.partition(".")[0] for name in sys.modules} & {"torch", "faiss", "tra
         [sys.executable, "-B", "-c", script], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout.strip()) == (0, "set()"), done.stderr
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "words=255",
-        "words=10001",
-        "features=orb",
-        "features=superpoint",
-        "weights=somewhere",
-        "max_features=0",
-        "similarity=l2",
-        "tfidf=2",
-    ],
-)
-def test_impossible_parameters_are_refused(text):
-    with pytest.raises(VariantError, match=text.partition("=")[0]):
-        make_variant(TABLE, f"bovw:{text}")

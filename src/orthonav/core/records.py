@@ -1,4 +1,4 @@
-"""Telemetry, view, prior, fix, no fix."""
+"""Telemetry, view, prior, fix, no fix, and how far a fix may be off."""
 
 import math
 import os
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from orthonav.core.errors import ArgumentError, FlightError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
-from orthonav.core.integrity import probability_within, protection_level_m
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.tilt import UNSTATED
 
@@ -323,7 +322,10 @@ class Fix(Outcome):
     - `pose_cov` (6, 6): covariance of metres east, north and up and degrees of heading, pitch and
       roll; None where the six were not estimated together.
     - `place_probability`: that the place is right, 0..1, whatever the error there; NaN where the
-      method states only a confidence, which is then used for it."""
+      method states only a confidence, which is then used for it.
+    - `vel_en_mps`: velocity over ground of a track, east, north, m/s; `vel_std_mps`: its standard
+      deviation along the worst direction; None and NaN: unknown.
+    - `recognized`: probability that this view of a track shows the map, NaN: unknown."""
 
     lat_deg: float
     lon_deg: float
@@ -339,6 +341,9 @@ class Fix(Outcome):
     roll_deg: float = math.nan
     pose_cov: NDArray[np.float64] | None = None
     place_probability: float = math.nan
+    vel_en_mps: tuple[float, float] | None = None
+    vel_std_mps: float = math.nan
+    recognized: float = math.nan
 
     @property
     def is_confident(self) -> bool:
@@ -542,3 +547,65 @@ def error_ellipse(cov_en: NDArray[np.float64]) -> tuple[float, float, float]:
     direction_deg = math.degrees(math.atan2(east, north)) % 180.0 % 180.0  # -1e-20 gives 180
     minor, major = np.sqrt(np.maximum(values, 0.0)).tolist()
     return major, minor, direction_deg
+
+
+# Integrity: errors of right places have heavier tails than a Gaussian of the stated covariance.
+# They follow a bivariate Student distribution (docs/decisions/integrity.md).
+
+Array = NDArray[np.float64]
+ERROR_DEGREES = 5.0
+"""Degrees of freedom of the distribution of errors."""
+BISECTIONS = 40  # 1e-12 of the interval
+_QUADRANT = np.cos((np.arange(16) + 0.5) * np.pi / 32) ** 2
+
+
+def probability_beyond(cov_en_m2: Array, limit_m: float) -> float:
+    """That the error of a right place exceeds a limit; NaN for an unknown covariance."""
+    if not np.isfinite(cov_en_m2).all():
+        return math.nan
+    return float(_beyond(_scales_m2(np.asarray(cov_en_m2)[None]), np.array([limit_m]))[0])
+
+
+def probability_within(place_probability: float, cov_en_m2: Array, limit_m: float) -> float:
+    """That a place is right and its error at most a limit; NaN for an unknown covariance."""
+    return place_probability * (1 - probability_beyond(cov_en_m2, limit_m))
+
+
+def protection_level_m(place_probability: float, cov_en_m2: Array, risk: float) -> float:
+    """Smallest limit that the error exceeds with a probability of at most `risk`.
+
+    `place_probability`: that the place is right. Infinite where a wrong place alone is likelier
+    than that, and for an unknown covariance. Raises `ValueError` unless `risk` is 0 to 1."""
+    place, covs = np.array([place_probability]), np.asarray(cov_en_m2)[None]
+    return float(protection_levels_m(place, covs, risk)[0])
+
+
+def protection_levels_m(place_probability: Array, covs_en_m2: Array, risk: float) -> Array:
+    """The same (N,) of many: probabilities (N,) and covariances (N, 2, 2)."""
+    if not 0 <= risk <= 1:
+        raise ValueError(f"a risk is a probability, 0 to 1, got {risk}")
+    levels = np.full(len(place_probability), math.inf)
+    finite = np.isfinite(covs_en_m2).all(axis=(1, 2)) & (risk - (1 - place_probability) > 0)
+    place, scales = place_probability[finite], _scales_m2(covs_en_m2[finite])
+    allowed = np.minimum((risk - (1 - place)) / place, 1.0)
+    deviations = np.sqrt(ERROR_DEGREES * (allowed ** (-2 / ERROR_DEGREES) - 1))
+    low, high = (np.sqrt(each(axis=1)) * deviations for each in (scales.min, scales.max))
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        met = _beyond(scales, middle) <= allowed
+        low, high = np.where(met, low, middle), np.where(met, middle, high)
+    levels[finite] = high
+    return levels
+
+
+def _scales_m2(covs_en_m2: Array) -> Array:
+    """Squared scales (N, 16) of errors along directions that are equally likely."""
+    values = np.maximum(np.linalg.eigvalsh(covs_en_m2), 0.0)[:, :, None]
+    minor, major = values[:, 0], values[:, 1]
+    return np.asarray((minor + (major - minor) * _QUADRANT) * (ERROR_DEGREES - 2) / ERROR_DEGREES)
+
+
+def _beyond(scales_m2: Array, limits_m: Array) -> Array:
+    """Probability (N,) that errors of these scales (N, 16) exceed their limits (N,)."""
+    squares = limits_m[:, None] ** 2 / (ERROR_DEGREES * np.maximum(scales_m2, 1e-12))
+    return np.asarray(((1 + squares) ** (-ERROR_DEGREES / 2)).mean(axis=1))

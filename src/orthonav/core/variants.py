@@ -5,9 +5,11 @@ A frozen dataclass whose fields are its parameters, by a table of names; nothing
 import dataclasses
 import importlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 
@@ -22,6 +24,8 @@ class Variant:
 
 
 Table = Mapping[str, Variant]
+Part = Callable[[str, Any, int], NDArray[Any]]
+"""Gives a part of a map by name, type and number of dimensions."""
 
 
 def make_variant(table: Table, text: str) -> Any:

@@ -538,20 +538,17 @@ class Runner:
 
 def _at_exposure(fix: Fix, mean: Velocity | None, reported: Velocity | None) -> Fix:
     """The fix with the velocity at the exposure instead of the mean, which has the same error."""
-    if mean is None or reported is None or mean == reported:
+    own = fix.vel_en_mps
+    if own is None or mean is None or reported is None or mean == reported:
         return fix
-    own, names = fix.evidence, ("vel_east_mps", "vel_north_mps")
-    moved = zip(names, reported, mean, strict=True)
-    at_exposure = {key: own[key] + now - over for key, now, over in moved if key in own}
-    return replace(fix, evidence={**own, **at_exposure})
+    east, north = (a + now - over for a, now, over in zip(own, reported, mean, strict=True))
+    return replace(fix, vel_en_mps=(east, north))
 
 
 def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
     """Fix whose covariance and confidence include the distance flown in the standard deviation of
     the latency; where the velocity is not known, at `assumed_mps` in all directions."""
-    evidence = fix.evidence
-    own = evidence.get("vel_east_mps", math.nan), evidence.get("vel_north_mps", math.nan)
-    velocity = np.array(telemetry.vel_en_mps or own)
+    velocity = np.array(telemetry.vel_en_mps or fix.vel_en_mps or (math.nan, math.nan))
     if not np.isfinite(velocity).all():
         off_m = std_s * LOOP.assumed_mps
         return fix.with_covariance(fix.cov_en_m2 + off_m**2 * np.eye(2))

@@ -64,6 +64,12 @@ TRACK_KEYS = (
     "tracked",  # true: the position is estimated from all views so far
     "state",  # one of `STATES`
 )
+MOTION_KEYS = (  # in the evidence of a track
+    "vel_east_mps",
+    "vel_north_mps",
+    "vel_std_mps",
+    "recognized",
+)
 STATES = ("searching", "tracking", "coasting", "lost")
 MAX_LINE_BYTES = 2**20  # limit of a line; the evidence of a view takes about 1000 bytes
 MAX_RESULTS = 1_000_000  # limit of lines: as many as a flight folder may have views
@@ -164,7 +170,8 @@ def to_plain(record: Any, risk: float = DEFAULT_RISK) -> dict[str, Any]:
             values |= zip(TRACK_KEYS, (True, record.state), strict=True)
     else:
         values = _outcome_values(record)
-        values["evidence"] = {str(k): _or_none(v) for k, v in record.evidence.items()}
+        numbers = {**record.evidence, **(_motion(record) if isinstance(record, Fix) else {})}
+        values["evidence"] = {str(k): _or_none(v) for k, v in numbers.items()}
         if isinstance(record, Fix):
             stated = record.place_probability, record.protection_level_m(risk), risk
             values |= zip(INTEGRITY_KEYS, map(_or_none, stated), strict=True)
@@ -320,6 +327,12 @@ def _pose_values(fix: Fix) -> dict[str, Any]:
     return dict(zip(POSE_KEYS, (*angles, upper), strict=True))
 
 
+def _motion(fix: Fix) -> dict[str, float]:
+    velocity = fix.vel_en_mps or (math.nan, math.nan)
+    stated = dict(zip(MOTION_KEYS, (*velocity, fix.vel_std_mps, fix.recognized), strict=True))
+    return {key: value for key, value in stated.items() if not math.isnan(value)}
+
+
 def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
     return [[_or_none(value) for value in row] for row in cov]
 
@@ -336,6 +349,8 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
     if GROUND_KEYS[0] in values:
         ground = _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
     cov_en_m2 = _numbers(values, "cov_en_m2", (2, 2))
+    *velocity, vel_std_mps, recognized = (evidence.pop(key, math.nan) for key in MOTION_KEYS)
+    east_mps, north_mps = velocity
     # Absent in earlier files.
     values = {**dict.fromkeys((*INTEGRITY_KEYS, *GROUND_KEYS, *POSE_KEYS)), **values}
     return Fix(
@@ -353,6 +368,9 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
         roll_deg=_number(values, "roll_deg"),
         pose_cov=_pose_covariance(values),
         place_probability=_share(values, INTEGRITY_KEYS[0]),
+        vel_en_mps=None if math.isnan(east_mps + north_mps) else (east_mps, north_mps),
+        vel_std_mps=vel_std_mps,
+        recognized=recognized,
     )
 
 

@@ -3,11 +3,11 @@
 `Localizer.locate(view)` is the whole path. A file is a step, each can be read alone:
 
 1. `view` refuses what cannot be placed (missing telemetry, extreme tilt, a blank picture) and
-   rectifies the rest with its own heading up (`rectify`). Everything wrong with a view becomes a
+   rectifies the rest with its own heading up. Everything wrong with a view becomes a
    `NoFix` with a reason; nothing is raised but `CameraError`, for a camera of another size.
-2. `search.Search` runs steps that find candidates, the cheapest first: a correlation with the map
+2. `search.Search` runs stages that find candidates, the cheapest first: a correlation with the map
    by FFT, or the tiles whose embeddings are most similar (`tiles`). What is tried, what it costs
-   and when it ends are numbers in `policy`.
+   and when it ends are numbers of a `SearchPlan`.
 3. `place.CandidateRefiner` refines candidates from coarse to fine and compares the best place with
    its strongest rival; the search ends as soon as it stands out. On a map with a terrain the best
    are orthorectified on it first (`ground`). Where none is recognized, gradients alone decide
@@ -26,7 +26,7 @@ the places of a view with their odds, `odometry` the displacement between views,
 `orthonav.core.track.mixture` joins all of it to one track."""
 
 from orthonav.core.localize.localizer import Localizer
-from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
 from orthonav.core.localize.tiles import Match, TileMatcher
+from orthonav.core.localize.view import RectifiedView, downsampled, rectify
 
 __all__ = ["Localizer", "Match", "RectifiedView", "TileMatcher", "downsampled", "rectify"]

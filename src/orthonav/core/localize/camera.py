@@ -11,14 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera, enu_from_camera, seen_px
-from orthonav.core.localize.ground import GroundModel, LevelTerrain, ViewOverGround
-from orthonav.core.localize.rectify import Orientation, is_oblique
-from orthonav.core.localize.resection import Blocks, Expected, Resection, values
-from orthonav.core.localize.systematic import GroundErrors, lens_px, systematic
+from orthonav.core.localize.ground import FlatTerrain, GroundModel, ViewOverGround
+from orthonav.core.localize.resection import (
+    Blocks,
+    Expected,
+    GroundErrors,
+    Resection,
+    lens_px,
+    systematic,
+    values,
+)
+from orthonav.core.localize.view import Orientation, is_oblique
 from orthonav.core.records import DEFAULT_TILT_STD_DEG, Telemetry
-from orthonav.core.register.blocks import BlockScores, block_scores
-from orthonav.core.register.pose import Pose
+from orthonav.core.register.refine import BlockScores, block_scores
 from orthonav.core.register.template import BLOCKS, ViewTemplates
+from orthonav.core.register.window import Pose
 
 Array = NDArray[np.float64]
 
@@ -171,8 +178,8 @@ def camera_of(
 
     `local_ratio`: of the scores of the place. `floor_m`: standard deviation with which maps of two
     dates agree. `start`: `approached`, where it is known."""
-    if math.isnan(seen.reference_m(pose)):  # it was placed on level ground
-        level = GroundModel(LevelTerrain(), seen.ground.grid, land=seen.ground.land)
+    if math.isnan(seen.reference_m(pose)):  # it was placed on flat ground
+        level = GroundModel(FlatTerrain(), seen.ground.grid, land=seen.ground.land)
         seen, start = ViewOverGround(level, seen.view, seen.reference), None
     close = None if start is not None else _close(seen, pose)
     if close is not None:
@@ -343,8 +350,8 @@ def _compared(
 def _templates(
     seen: ViewOverGround, pose: Pose, level: int, orientation: Orientation, *, first: bool
 ) -> ViewTemplates | None:
-    """Rectified under an orientation; over level ground the first is the search's."""
-    if first and seen.is_level(pose) and not is_oblique(seen.view.view):
+    """Rectified under an orientation; over flat ground the first is the search's."""
+    if first and seen.is_flat_at(pose) and not is_oblique(seen.view.view):
         return seen.view.templates
     return seen.templates_at(pose, level, orientation, smooth=first)
 

@@ -5,7 +5,7 @@ scores from the map; weights of tiles are learnt when the map is built."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ FEATURES = (
     "log_alone_phase",
     "log_alone_gradients",
 )
-ALONE = 2  # the last two features say whether the view fits nowhere near as well
+NEARBY = 2  # the last features compare with the ground nearby: it fits nowhere near as well
 CHANCES = ("total", "look", "fine")
 
 
@@ -41,11 +41,64 @@ class Chances:
         if not all(0 < value < math.inf for value in (self.total, self.look, self.fine)):
             raise VariantError(f"chance values must be above 0 and finite: {self}")
 
-    def of_strength(self, evidence: Mapping[str, float]) -> float:
+    def of_strength(self, scores: "Scores") -> float:
         """By chance, of one level or of two."""
-        return self.look if math.isnan(evidence["detail_ratio"]) else self.total
+        return self.look if math.isnan(scores.detail_ratio) else self.total
 
 
+@dataclass(frozen=True)
+class Scores:
+    """How well a view fits its best place, and how far that stands out.
+
+    - `strength`: at the mid and the final level, less the cost of the prior. `mid_score`: at the
+      mid level. `fine`: with one level finer, NaN: not compared there. `.._rival`: of the strongest
+      rival, 0 for none.
+    - `detail_ratio`: score at the final over that at the mid level, NaN where these are one.
+    - `local_..`: over the ground around, see `orthonav.core.register.refine`.
+    - `cut_short`: whether `--budget-ms` ended the search."""
+
+    strength: float
+    rival: float
+    mid_score: float
+    mid_rival: float
+    fine: float
+    fine_rival: float
+    detail_ratio: float
+    local_ratio: float
+    local_gradients: float
+    local_phase: float
+    cut_short: bool = False
+
+    @property
+    def peak_ratio(self) -> float:
+        return min(MAX_RATIO, self.strength / max(self.rival, 1e-6))
+
+    @property
+    def mid_ratio(self) -> float:
+        return min(MAX_RATIO, self.mid_score / max(self.mid_rival, 1e-6))
+
+    def evidence(self) -> dict[str, float]:
+        """By the keys of `fixes.jsonl` (docs/reference/formats.md)."""
+        named = {STORED.get(name, name): value for name, value in asdict(self).items()}
+        ratios = {"peak_ratio": self.peak_ratio, "look_ratio": self.mid_ratio}
+        cut_short = {"cut_short": 1.0} if named.pop("cut_short") else {}
+        return named | ratios | cut_short
+
+    @classmethod
+    def of(cls, evidence: Mapping[str, float]) -> "Scores":
+        """The inverse of `evidence`; `local_ratio` is no part of older records."""
+        return cls(
+            **{
+                each.name: evidence.get(STORED.get(each.name, each.name), math.nan)
+                for each in fields(cls)[:-1]
+            },
+            cut_short=bool(evidence.get("cut_short")),
+        )
+
+
+STORED = {"mid_score": "look", "mid_rival": "look_rival"}
+"""Keys of `fixes.jsonl` that differ from the names here."""
+MAX_RATIO = 10.0
 DEFAULT_CHANCES = Chances(32.0, 15.0, 48.0)
 """Of generated landscapes, for maps on which none were measured."""
 
@@ -73,15 +126,15 @@ class RegisteredConfidence:
     weights: tuple[float, ...]
     chances: Chances
 
-    def __call__(self, evidence: Mapping[str, float]) -> float:
+    def __call__(self, scores: Scores) -> float:
         """Below `CONFIDENT` where `--budget-ms` ended the search before a place stood out."""
-        found = self.of(features_of(evidence, self.chances))
-        return min(found, CONFIDENT - 0.01) if evidence.get("cut_short") else found
+        found = self.of(features_of(scores, self.chances))
+        return min(found, CONFIDENT - 0.01) if scores.cut_short else found
 
     def of(self, features: NDArray[np.float64]) -> float:
-        fits = self.biases[0] + float(np.dot(self.weights[:-ALONE], features[:-ALONE]))
-        alone = self.biases[1] + float(np.dot(self.weights[-ALONE:], features[-ALONE:]))
-        return probability(fits) * probability(alone)
+        fits = self.biases[0] + float(np.dot(self.weights[:-NEARBY], features[:-NEARBY]))
+        unlike = self.biases[1] + float(np.dot(self.weights[-NEARBY:], features[-NEARBY:]))
+        return probability(fits) * probability(unlike)
 
     @classmethod
     def usual(cls, chances: Chances) -> "RegisteredConfidence":
@@ -114,23 +167,21 @@ class RegisteredConfidence:
         return cls(biases, weights, chances)
 
 
-def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.float64]:
+def features_of(scores: Scores, chances: Chances) -> NDArray[np.float64]:
     """Features (7,) of `RegisteredConfidence`."""
-    strength, look = max(evidence["strength"], 1e-3), max(evidence["look"], 1e-3)
-    detail, chance = evidence["detail_ratio"], chances.of_strength(evidence)
+    strength, mid_score = max(scores.strength, 1e-3), max(scores.mid_score, 1e-3)
+    detail, chance = scores.detail_ratio, chances.of_strength(scores)
     if math.isnan(detail):
         detail = 1.4  # usual; the view is too small to be finished one level finer
     stand_in = 0.7  # of the chance value: stands in for a rival where none was found
-    ratio = strength / max(evidence["rival"], stand_in * chance)
-    fine, fine_rival = evidence["fine"], evidence["fine_rival"]
+    ratio = strength / max(scores.rival, stand_in * chance)
+    fine, fine_rival = scores.fine, scores.fine_rival
     if math.isfinite(fine + fine_rival):
         ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, stand_in * chances.fine))
-    look_ratio = look / max(evidence["look_rival"], stand_in * chances.look)
+    mid_ratio = mid_score / max(scores.mid_rival, stand_in * chances.look)
     # Less than one standard deviation above the ground nearby does not count.
-    phase, gradients = (max(evidence[name], 1.0) for name in ("local_phase", "local_gradients"))
-    return np.log(
-        [strength / chance, ratio, look_ratio, max(detail, 1e-3), phase, phase, gradients]
-    )
+    phase, gradients = (max(each, 1.0) for each in (scores.local_phase, scores.local_gradients))
+    return np.log([strength / chance, ratio, mid_ratio, max(detail, 1e-3), phase, phase, gradients])
 
 
 DEFAULT_CONFIDENCE = RegisteredConfidence.usual(DEFAULT_CHANCES)

@@ -6,40 +6,37 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.integrity import probability_within
 from orthonav.core.localize.camera import CameraEstimate, tilt_std_deg
-from orthonav.core.localize.ground import PreparedMap
-from orthonav.core.localize.place import Finished
-from orthonav.core.localize.rectify import off_nadir_deg
-from orthonav.core.localize.search import Search
-from orthonav.core.localize.view import PreparedView
-from orthonav.core.records import RADIUS_SHARE, Fix
+from orthonav.core.localize.place import BestPlace
+from orthonav.core.localize.search import PreparedMap, Search
+from orthonav.core.localize.view import PreparedView, off_nadir_deg
+from orthonav.core.records import RADIUS_SHARE, Fix, probability_within
 
 
-def fix_of(search: Search, best: Finished) -> Fix:
+def fix_of(search: Search, best: BestPlace) -> Fix:
     """From the camera that the picture shows, else from the place alone."""
-    sheet, ground, pose = search.sheet, search.over_ground, best.fit.pose
+    map_, ground, pose = search.map, search.over_ground, best.fit.pose
     camera = search.camera(best)
     orientation, middle_en_m = ground.orientation(pose), None
     if camera is not None:
         found = _by_camera(search.view, camera)
         middle_en_m = camera.middle_en_m
     else:
-        found = _by_similarity(sheet, search.view, best)
+        found = _by_similarity(map_, search.view, best)
         if orientation is not None:
             middle_en_m = ground.middle_en_m(ground.sight_en_m(orientation), pose)
-    place = math.nan if sheet.confidence is None else sheet.confidence(best.scores)
-    radius_m = max(sheet.radius_m, RADIUS_SHARE * found.agl_m)
-    evidence = best.scores | found.stds
+    place = math.nan if map_.confidence is None else map_.confidence(best.scores)
+    radius_m = max(map_.radius_m, RADIUS_SHARE * found.agl_m)
+    evidence = _evidence(search, best) | found.stds
     if found.middle_cov_en_m2 is not None:
         widest = float(np.linalg.eigvalsh(found.middle_cov_en_m2)[-1])
         evidence["middle_std_m"] = math.sqrt(widest)
-    if orientation is not None and not sheet.ground.is_level:
+    if orientation is not None and not map_.ground.is_flat:
         evidence["terrain_gain"] = best.gain or 1.0
-    lat, lon = sheet.sheet.frame.latlon_from_en(found.place_en_m)
+    lat, lon = map_.sheet.frame.latlon_from_en(found.place_en_m)
     middle = None
     if middle_en_m is not None:
-        middle_deg = sheet.sheet.frame.latlon_from_en(np.array(middle_en_m))
+        middle_deg = map_.sheet.frame.latlon_from_en(np.array(middle_en_m))
         middle = float(middle_deg[0]), float(middle_deg[1])
     for each in (found.cov_en_m2, found.middle_cov_en_m2, found.pose_cov):
         if each is not None:
@@ -61,6 +58,22 @@ def fix_of(search: Search, best: Finished) -> Fix:
         pose_cov=found.pose_cov,
         place_probability=place,
     )
+
+
+def _evidence(search: Search, best: BestPlace) -> dict[str, float]:
+    """By the keys of `fixes.jsonl` (docs/reference/formats.md)."""
+    fit = best.fit
+    gradient, grey = fit.correlations
+    return {
+        "score": fit.weighted,
+        **best.scores.evidence(),
+        "gradient_correlation": gradient,
+        "grey_correlation": grey,
+        "blocks_t": fit.blocks_t,
+        "agreement": fit.agreement,
+        "overlap": fit.overlap,
+        "candidates": float(search.candidates),
+    }
 
 
 def _by_camera(view: PreparedView, camera: CameraEstimate) -> "_Exterior":
@@ -85,22 +98,22 @@ def _by_camera(view: PreparedView, camera: CameraEstimate) -> "_Exterior":
     )
 
 
-def _by_similarity(sheet: PreparedMap, view: PreparedView, best: Finished) -> "_Exterior":
+def _by_similarity(map_: PreparedMap, view: PreparedView, best: BestPlace) -> "_Exterior":
     """Under the reported pitch and roll."""
     pose, covariance = best.pose, best.fit.covariance
     assert covariance is not None
-    spread = sheet.camera_covariance(view, pose, covariance)
+    spread = map_.camera_covariance(view, pose, covariance)
     agl_m = view.telemetry.agl_m * math.exp(pose.log_scale)
     # A line of sight off nadir meets the ground farther out by 1 / cos^2.
     cos = math.cos(math.radians(off_nadir_deg(view.telemetry)))
     tilt_m = agl_m * math.radians(tilt_std_deg(view.telemetry)) / cos**2
-    floor_m2 = np.eye(2) * sheet.floor_m(view) ** 2
+    floor_m2 = np.eye(2) * map_.floor_m(view) ** 2
     return _Exterior(
-        sheet.camera_en_m(view, pose),
+        map_.camera_en_m(view, pose),
         (math.degrees(pose.turn_rad), view.telemetry.pitch_deg, view.telemetry.roll_deg),
         agl_m,
         spread[:2, :2] + np.eye(2) * tilt_m**2,
-        covariance[:2, :2] * sheet.grid.gsd_m**2 + floor_m2,
+        covariance[:2, :2] * map_.grid.gsd_m**2 + floor_m2,
         {
             "heading_std_deg": math.degrees(math.sqrt(spread[2, 2])),
             "log_scale_std": math.sqrt(spread[3, 3]),

@@ -2,7 +2,6 @@
 window lies, its heading, and that the camera is `agl_m * exp(log_scale)` above its mean ground."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,30 +12,32 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.geo.camera import enu_from_camera, undistort
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import sight_on_ground
-from orthonav.core.localize.confidence import RegisteredConfidence
-from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.rectify import (
-    NODE_PX,
-    Orientation,
-    node_px,
-    orthorectified,
-    rectified_level,
-)
-from orthonav.core.localize.systematic import (
+from orthonav.core.localize.resection import (
     GroundErrors,
     surface_errors,
     terrain_errors,
     unknown_ground,
 )
-from orthonav.core.localize.tiles import TileProposer
-from orthonav.core.localize.view import LIMITS, PreparedView
-from orthonav.core.mapfile.manifest import Lean, SheetInfo, TerrainInfo
-from orthonav.core.mapfile.terrain import TerrainLayer
+from orthonav.core.localize.view import (
+    LIMITS,
+    NODE_PX,
+    Orientation,
+    PreparedView,
+    node_px,
+    orthorectified,
+    rectified_flat,
+)
+from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import DEFAULT_AGL_STD
-from orthonav.core.register.pose import COMPARED, Pose, PosePrior, ScaleMap, rotation
-from orthonav.core.register.search import SearchWindows
 from orthonav.core.register.template import ViewTemplates
-from orthonav.core.register.window import GreyPyramid, Reference
+from orthonav.core.register.window import (
+    COMPARED,
+    DirectionPrior,
+    Pose,
+    Reference,
+    ScaleMap,
+    rotation,
+)
 
 UNKNOWN_LEAN = Lean(0.0, 0.0, 0.15)  # up to 0.3 between the middles of overlapping pictures
 Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ class GroundSampling:
     """Where heights are taken, and what is too little to count."""
 
     map_nodes: int = 256  # of expected scales across the map, at most
-    levelled_nodes: int = 32  # across the map, for the slopes of its terrain
+    flattened_nodes: int = 32  # across the map, for the slopes of its terrain
     window_nodes: int = 9  # across a window, for its mean height
     slope_m: float = 10.0  # half the base over which slopes are measured
     max_scale_std: float = 0.3  # of log scales searched: three are 0.41 to 2.46
@@ -56,8 +57,8 @@ class GroundSampling:
     min_rise: float = 0.05
     """and least rise of the ground below it over that in the view, of the height, at which scales
     are expected by place."""
-    min_known: float = 0.5  # windows of which less is known are registered on level ground
-    level_px: float = 0.2  # relief that displaces less (pixels of the final level) is left out
+    min_known: float = 0.5  # windows of which less is known are registered on flat ground
+    unseen_px: float = 0.2  # relief that displaces less (pixels of the final level) is left out
     surface_node_m: float = 2.0  # largest spacing of heights among houses,
     surface_nodes: int = 320  # but at most so many across a view
     smooth_m: float = 10.0  # width over which these are smoothed for the search
@@ -71,7 +72,7 @@ class Terrain(Protocol):
         """Heights (...) above sea at points (..., 2); NaN where unknown."""
 
 
-class LevelTerrain:
+class FlatTerrain:
     def at_en_m(self, points_en_m: ArrayLike) -> Array:
         return np.zeros(np.shape(points_en_m)[:-1])
 
@@ -93,12 +94,12 @@ class GroundModel:
         self.terrain, self.grid, self.info, self.land = terrain, grid, info, land
         self.surface, self._lean = surface, lean or UNKNOWN_LEAN
         self.lean_en = np.array([self._lean.east, self._lean.north])
-        self.level_errors = unknown_ground(land)
+        self.flat_errors = unknown_ground(land)
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
     @property
-    def is_level(self) -> bool:
-        return isinstance(self.terrain, LevelTerrain)
+    def is_flat(self) -> bool:
+        return isinstance(self.terrain, FlatTerrain)
 
     @property
     def leans(self) -> bool:
@@ -139,7 +140,7 @@ class GroundModel:
 
     def slopes(self, ground_m: Array) -> Array:
         """Rise (N, 2) per metre east and north at (N, 3)."""
-        if self.is_level:
+        if self.is_flat:
             return np.zeros((len(ground_m), 2))
         steps = SAMPLING.slope_m * np.concatenate([np.eye(2), -np.eye(2)])
         ahead, behind = np.split(self.terrain.at_en_m(ground_m[:, None, :2] + steps), 2, axis=1)
@@ -147,27 +148,27 @@ class GroundModel:
 
     def errors(self, ground_m: Array, slopes: Array) -> GroundErrors:
         """Of the heights under a view, by points (N, 3) and slopes (N, 2) there."""
-        if self.is_level:
-            return self.level_errors
+        if self.is_flat:
+            return self.flat_errors
         above_m = self._above_m(ground_m)
         if above_m is None:
             return terrain_errors(self.info, slopes)
         return surface_errors(self._lean.std, above_m)
 
-    def levelled(self) -> "GroundModel":
+    def flattened(self) -> "GroundModel":
         """Level ground that is known as well as this: of simulated views."""
-        if self.is_level:
+        if self.is_flat:
             return self
         sides_px = self.grid.width_px, self.grid.height_px
-        nodes_px = [np.linspace(0.0, side, SAMPLING.levelled_nodes) for side in sides_px]
-        found = GroundModel(LevelTerrain(), self.grid, self.info, self.land)
+        nodes_px = [np.linspace(0.0, side, SAMPLING.flattened_nodes) for side in sides_px]
+        found = GroundModel(FlatTerrain(), self.grid, self.info, self.land)
         ground_m = self.ground_m(np.stack(np.meshgrid(*nodes_px), -1).reshape(-1, 2))
         if (known := np.isfinite(ground_m[:, 2])).any():  # others lie off the route of the map
             ground_m = ground_m[known]
-        found.level_errors = self.errors(ground_m, self.slopes(ground_m))
+        found.flat_errors = self.errors(ground_m, self.slopes(ground_m))
         return found
 
-    def expected(self, view: PreparedView) -> PosePrior:
+    def expected(self, view: PreparedView) -> DirectionPrior:
         """The view's prior, with scales by the height above sea at each place, or else by that of
         the ground below the camera over the ground in the view."""
         telemetry, prior = view.telemetry, view.prior
@@ -225,76 +226,6 @@ class GroundModel:
         return self._means[key]
 
 
-class PreparedMap:
-    """A map and its imagery, made ready for all views; threads may share it."""
-
-    def __init__(
-        self,
-        sheet: SheetInfo,
-        layer: GreyPyramid,
-        *,
-        confidence: RegisteredConfidence | None,
-        radius_m: float,
-        floor_px: float,
-        propose: TileProposer | None = None,
-        plan: SearchPlan = DEFAULT_PLAN,
-        terrain: TerrainLayer | None = None,
-        surface: TerrainLayer | None = None,
-    ) -> None:
-        """`confidence`: None before it is learnt: no place is proven. `radius_m`: its error.
-
-        `floor_px`: standard deviation with which maps of two dates agree, pixels of level 0.
-        Without `propose` candidates come from FFT only; without `terrain` the ground is level."""
-        self.sheet, self.grid = sheet, sheet.grid
-        self.pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
-        self.reference = Reference(layer)
-        self.windows = SearchWindows(self.reference)
-        known_m2 = 0.0 if surface is None else surface.info.known_m2
-        imagery_px = 0 if sheet.grey is None else sheet.grey.valid_px
-        # Whether all views are compared one level finer than over bare ground.
-        self.is_finer = known_m2 > SAMPLING.min_known * imagery_px * self.grid.gsd_m**2
-        self.confidence, self.radius_m, self.floor_px = confidence, radius_m, floor_px
-        self.propose, self.plan = propose, plan
-        info = None if terrain is None else terrain.info
-        self.ground = GroundModel(
-            terrain or LevelTerrain(), self.grid, info, sheet.relief, surface, sheet.lean
-        )
-
-    @property
-    def pyramid(self) -> GreyPyramid:
-        return self.reference.pyramid
-
-    def px_of(self, place_en_m: Array) -> tuple[float, float]:
-        """The inverse of `GroundModel.en_m`."""
-        (east, north), grid = place_en_m, self.grid
-        return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
-
-    def floor_m(self, view: PreparedView) -> float:
-        """Agreement of maps of two dates at the view's final level."""
-        # Coarse imagery of another date is displaced by more (docs/terrain.md).
-        return self.floor_px * self.grid.gsd_m * 2.0**view.levels.final
-
-    def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
-        """Of the camera (2,)."""
-        return self.ground.en_m(pose.map_px(view.camera_px))
-
-    def camera_state(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
-        """Of the camera (4,): m east and north, heading (rad), log scale."""
-        return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
-
-    def camera_covariance(
-        self, view: PreparedView, pose: Pose, covariance: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Of `camera_state`, by the covariance of the pose."""
-        moved = pose.linear @ view.camera_px
-        camera_from_pose = np.eye(4)
-        camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
-        spread = camera_from_pose @ covariance @ camera_from_pose.T
-        spread[:2, :2] += np.eye(2) * (self.floor_m(view) / self.grid.gsd_m) ** 2
-        metres = np.diag([self.grid.gsd_m, -self.grid.gsd_m, 1.0, 1.0])
-        return np.asarray(metres @ spread @ metres)
-
-
 def _smoothed(heights: Array, side: int) -> Array:
     """Means (h, w) over squares, of what is known; NaN stays where it was."""
     side |= 1  # the middle of an even one lies between samples
@@ -343,9 +274,9 @@ class ViewOverGround:
         shape = round(rows * scale), round(cols * scale)
         picture, middle = self.view.picture_at(level), np.array([shape[1], shape[0]]) / 2
         made = None
-        if self.ground.is_level:
+        if self.ground.is_flat:
             en_from_window = self._en_from_window(pose, level, middle)
-            made = rectified_level(picture, orientation, en_from_window, shape)
+            made = rectified_flat(picture, orientation, en_from_window, shape)
         if made is None:
             smooth = smooth or level > final
             ground, shown = self._nodes_m(pose, level, shape, smooth=smooth)
@@ -403,7 +334,7 @@ class ViewOverGround:
 
     def reference_m(self, pose: Pose) -> float:
         """Mean height under the window; NaN where less than half is known."""
-        if self.ground.is_level:
+        if self.ground.is_flat:
             return 0.0
         heights = self._ground_m(pose)[:, 2]
         known = np.isfinite(heights)
@@ -423,9 +354,9 @@ class ViewOverGround:
             return self._ground_m(pose)
         return self.ground.surface_m(pose.map_px(self._reference_px))
 
-    def is_level(self, pose: Pose) -> bool:
+    def is_flat_at(self, pose: Pose) -> bool:
         """Whether relief displaces the window by less than is visible."""
-        if self.ground.is_level:
+        if self.ground.is_flat:
             return True
         ground = self._surface_m(pose)
         orientation = self.orientation(pose)
@@ -435,7 +366,7 @@ class ViewOverGround:
         rise = np.abs(ground[:, 2] - ground[:, 2].mean())
         shift_m = rise * np.hypot(offset[:, 0], offset[:, 1]) / np.maximum(-offset[:, 2], 1.0)
         pixel_m = self.ground.grid.gsd_m * 2.0**self.view.levels.final
-        return bool(shift_m.max() < SAMPLING.level_px * pixel_m)
+        return bool(shift_m.max() < SAMPLING.unseen_px * pixel_m)
 
     def moved_px(self, one: Pose, other: Pose) -> float:
         """At the rim of the window, pixels of level 0."""
@@ -472,9 +403,9 @@ class ViewOverGround:
         plane = undistort(camera, px / [camera.fx_px, camera.fy_px])
         ray = enu_from_camera(*orientation.attitude_deg.tolist()) @ [*plane.tolist(), 1.0]
         above_m = float(orientation.position_m[2])
-        if not ray[2] < -1e-6 or (self.ground.is_level and not above_m > 0):
+        if not ray[2] < -1e-6 or (self.ground.is_flat and not above_m > 0):
             return np.full(2, np.nan)
-        if self.ground.is_level:
+        if self.ground.is_flat:
             return np.asarray(orientation.position_m[:2] - ray[:2] / ray[2] * above_m)
 
         def above_sea_m(offset_en_m: Array) -> Array:

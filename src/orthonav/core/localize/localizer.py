@@ -12,9 +12,14 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.fix import fix_of
-from orthonav.core.localize.ground import PreparedMap
-from orthonav.core.localize.policy import DEFAULT_PLAN, SearchPlan
-from orthonav.core.localize.search import Found, Search, found_by
+from orthonav.core.localize.search import (
+    DEFAULT_PLAN,
+    Found,
+    PreparedMap,
+    Search,
+    SearchPlan,
+    found_by,
+)
 from orthonav.core.localize.tiles import TileLocalizer, TileProposer
 from orthonav.core.localize.view import PreparedView, check_view, prepare
 from orthonav.core.mapfile.layer import GreyLayer
@@ -48,7 +53,7 @@ class Localizer:
         Without `registration`, or a layer for it, tiles place the views, by the rule `position`.
         Without `flying`, representations too slow to fly are accepted: only for maps of one's own,
         because networks are loaded from this machine. `level_ground`: for simulated views of
-        level ground, as well known as the map's terrain."""
+        flat ground, as well known as the map's terrain."""
         has_type("map", map, MapFile, ", as of orthonav.open_map(path)")
         if len(map.manifest.sheets) != 1:
             raise MapFileError(f"this program flies maps of one sheet: {map.path}")
@@ -173,7 +178,7 @@ class RegistrationLocalizer(PreparedMap):
             surface=TerrainLayer.of(opened, layer=SURFACE),
         )
         if level_ground:
-            made.ground = made.ground.levelled()
+            made.ground = made.ground.flattened()
         return made
 
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
@@ -196,7 +201,7 @@ class RegistrationLocalizer(PreparedMap):
         prepared = self.prepared(view, heading_known)
         if isinstance(prepared, NoFix):
             return prepared
-        if not self.ground.is_level:
+        if not self.ground.is_flat:
             prepared = replace(prepared, prior=self.ground.expected(prepared))
         return Search(self, prepared, prior)
 

@@ -9,15 +9,12 @@ from numpy.typing import NDArray
 from orthonav.core.geo.camera import axis_on_ground_en_m
 from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.place import CandidateRefiner
-from orthonav.core.localize.rectify import downsampled, rectify_footprint
-from orthonav.core.localize.view import check_footprint
+from orthonav.core.localize.view import check_footprint, downsampled, rectify_footprint
 from orthonav.core.records import Telemetry, View
-from orthonav.core.register.channels import FINE, ChannelRecipe
-from orthonav.core.register.pose import Pose, PosePrior
 from orthonav.core.register.refine import Fit
 from orthonav.core.register.search import SearchWindows, bank, largest_half_px, search
-from orthonav.core.register.template import Levels, ViewTemplates
-from orthonav.core.register.window import Reference
+from orthonav.core.register.template import FINE, ChannelRecipe, Levels, ViewTemplates
+from orthonav.core.register.window import DirectionPrior, Pose, Reference
 
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
@@ -31,7 +28,7 @@ class OdometryLimits:
     levels: int = 3  # of a view that serves as the map of the next one
     turn_step_rad: float = math.radians(8.0)
     scale_step: float = 0.1
-    """Of the search from a coarse level: about that of `policy.SearchPlan`."""
+    """Of the search from a coarse level: about that of `SearchPlan`."""
     candidates: int = 8
     max_speed_mps: float = 80.0  # for which a displacement is sought
     min_score_ratio: float = 2.5
@@ -220,7 +217,7 @@ def displacement(
     reported_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
     if not math.isfinite(reported_turn):
         return None
-    prior = PosePrior(
+    prior = DirectionPrior(
         math.remainder(reported_turn, 2 * math.pi),
         max(math.sqrt(2 * telemetry_noise[0]), ODOMETRY.turn_step_rad / 3),
         max(math.sqrt(2 * telemetry_noise[1]), ODOMETRY.scale_step / 3),
@@ -263,7 +260,7 @@ class Terrain:
         cls, ground: GroundModel, place: Array, agl_m: float, ahead_en_m: Array
     ) -> "Terrain | None":
         """Below a camera at a place (2,), `agl_m` above the ground there, and where it looks; None
-        where unknown. `ahead_en_m` (2,): where it would look on level ground."""
+        where unknown. `ahead_en_m` (2,): where it would look on flat ground."""
         seen, rise = place, 0.0
         for _ in range(ODOMETRY.sight_steps):
             seen = place + (1 - rise) * ahead_en_m
@@ -296,7 +293,7 @@ def over_terrain(
     scale = float(share_en @ ground.seen) / 2
     turn = float(share_en[1] * ground.seen[0] - share_en[0] * ground.seen[1]) / 2
     parallax = np.array([[scale, -turn], [turn, scale]])
-    distance = max(1 - ground.rise, ODOMETRY.min_scaled)  # over the height, as on level ground
+    distance = max(1 - ground.rise, ODOMETRY.min_scaled)  # over the height, as on flat ground
     moved_en_m = distance * (seen.moved_en_m + parallax @ ahead_en_m)
     # What remains of the slope: all of a usual one where it is unknown.
     slope = ODOMETRY.unknown_slope * (1.0 if terrain is None else ODOMETRY.left_of_slope)
@@ -319,7 +316,7 @@ def over_terrain(
 
 
 def _registered(
-    before: OdometryView, now: OdometryView, prior: PosePrior, expected_en_m: Array | None
+    before: OdometryView, now: OdometryView, prior: DirectionPrior, expected_en_m: Array | None
 ) -> Fit | None:
     """None where no place stands out."""
     templates, reference = now.templates, _ViewAsMap(before.templates)
@@ -346,8 +343,8 @@ def _registered(
     found = [each.pose for each in search(template, window, poses, ODOMETRY.candidates)]
     if not found:
         return None
-    best = refiner.finished(refiner.judge(found, level), len(found))
-    return best.fit if best.scores["peak_ratio"] >= ODOMETRY.min_score_ratio else None
+    best = refiner.finished(refiner.judge(found, level))
+    return best.fit if best.scores.peak_ratio >= ODOMETRY.min_score_ratio else None
 
 
 def _as_expected(

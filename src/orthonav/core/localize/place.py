@@ -2,31 +2,31 @@
 
 Candidates are refined from coarse to fine, most are dropped early. The best few are finished: the
 view is orthorectified on the terrain under each pose and registered again until it stays, or on
-level ground where that is as good. Scores over those of the strongest rival say how far it stands
+flat ground where that is as good. Scores over those of the strongest rival say how far it stands
 out."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TypeVar
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, wraps
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.localize.camera import approached
+from orthonav.core.localize.confidence import Scores
 from orthonav.core.localize.ground import ViewOverGround
-from orthonav.core.localize.rectify import Orientation
-from orthonav.core.register.pose import Pose, PosePrior
-from orthonav.core.register.refine import Fit, Refiner
+from orthonav.core.localize.view import Orientation
+from orthonav.core.register.refine import Fit, Refiner, sharpness
 from orthonav.core.register.search import Peak, SearchWindows, largest_half_px, search
-from orthonav.core.register.sharpness import MAX_RATIO, sharpness
 from orthonav.core.register.template import Levels, ViewTemplates
-from orthonav.core.register.window import Reference
+from orthonav.core.register.window import DirectionPrior, Pose, Reference
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
+Step = Callable[["CandidateRefiner", Given], Made]
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Refinement:
     small_step_px: float = 0.1  # ends a refinement
     apart: float = 0.25  # least distance of a rival from the best, over the side of the view
     rival_on_terrain: float = 0.75
-    """Rivals with less than this fraction of the best score are finished on level ground: chance
+    """Rivals with less than this fraction of the best score are finished on flat ground: chance
     fits as well there, at half the cost."""
     moved_px: float = 1.0  # a window moved by more (px of the level) is orthorectified again,
     rounds: int = 3  # at most so often
@@ -66,11 +66,11 @@ REFINEMENT = Refinement()
 class Judged:
     """A place where a view may have been taken, refined at the mid level.
 
-    `level_score`: on level ground. `terrain`: the view orthorectified there, None: `fit` is on
-    level ground."""
+    `flat_score`: on flat ground. `terrain`: the view orthorectified there, None: `fit` is on flat
+    ground."""
 
     fit: Fit
-    level_score: float
+    flat_score: float
     terrain: ViewTemplates | None = None
 
     @property
@@ -82,15 +82,12 @@ class Judged:
 class Finished:
     """A place refined at the final level.
 
-    - `fit`: by `templates`, those of level ground or of the terrain; with covariance for the best.
+    - `fit`: by `templates`, those of flat ground or of the terrain.
     - `total`: scores of the mid and the final level. `score`: less the cost of the prior.
-    - `mid_score`: at the mid level after finishing on the terrain, `gain`: over that on level
-      ground; None: finished on level ground.
-    - `finer`: score one level finer, NaN: not needed. `fine`: sum of `score` and it.
-    - `camera`: under which the view fits better there, None: that of the telemetry.
-    - `scores`: of the best place, see `docs/reference/formats.md`. `rivals`: other finished places,
-      best first, near ones too.
-    - `below_camera`: the pose with the height counted from the ground below the camera."""
+    - `mid_score`: at the mid level after finishing on the terrain, `gain`: over that on flat
+      ground; None: finished on flat ground.
+    - `fine`: `score` and that one level finer, NaN: not compared there.
+    - `camera`: under which the view fits better there, None: that of the telemetry."""
 
     judged: Judged
     fit: Fit
@@ -99,16 +96,14 @@ class Finished:
     score: float
     mid_score: float | None = None
     gain: float | None = None
-    finer: float = math.nan
     fine: float = math.nan
     camera: Orientation | None = None
-    scores: dict[str, float] = field(default_factory=dict)
-    rivals: tuple["Finished", ...] = ()
     below_camera: Pose | None = None
+    """The pose with the height counted from the ground below the camera."""
 
     @property
     def pose(self) -> Pose:
-        """With the height counted from the ground below the camera."""
+        """With the height counted from the ground below the camera, once that was asked for."""
         return self.below_camera or self.fit.pose
 
     def apart_px(self, other: "Finished") -> float:
@@ -116,27 +111,50 @@ class Finished:
         return self.fit.pose.distance_px(other.fit.pose)
 
 
+@dataclass(frozen=True, eq=False)
+class BestPlace(Finished):
+    """The best of finished places; `fit` with its covariance. `rivals`: the others, best first,
+    near ones too, as strong as they are with the finer level where both were compared there."""
+
+    scores: Scores = field(kw_only=True)
+    rivals: tuple[Finished, ...] = ()
+
+
+def once(step: "Step[Given, Made]") -> "Step[Given, Made]":
+    """A step that depends on the place alone: its result is remembered for every place."""
+
+    @wraps(step)
+    def remembered(refiner: "CandidateRefiner", place: Given) -> Made:
+        key = step.__name__, place
+        if key not in refiner.remembered:
+            refiner.remembered[key] = step(refiner, place)
+        made: Made = refiner.remembered[key]
+        return made
+
+    return remembered
+
+
 class CandidateRefiner:
-    """Judges and finishes the places of one view, in one thread; each is finished once."""
+    """Judges and finishes the places of one view, in one thread.
+
+    Steps from a place to another one are marked `once`: what they find does not depend on which
+    other places there are, or on what was asked before."""
 
     def __init__(
         self,
         templates: ViewTemplates,
         levels: Levels,
-        prior: PosePrior,
+        prior: DirectionPrior,
         reference: Reference,
         *,
         pool: Executor | None = None,
         ground: ViewOverGround | None = None,
     ) -> None:
-        """`pool` shares candidates; without `ground` it is level, and no level is finer."""
+        """`pool` shares candidates; without `ground` it is flat, and no level is finer."""
         self.templates, self.levels, self.prior = templates, levels, prior
         self.reference, self._pool, self._ground = reference, pool, ground
-        self.is_level = ground is None or ground.ground.is_level
-        self._twins: dict[Judged, Judged | None] = {}
-        self._around: dict[Judged, Judged | None] = {}
-        self._finished: dict[Judged, Finished] = {}
-        self._seen: set[Judged] = set()
+        self.is_flat = ground is None or ground.ground.is_flat
+        self.remembered: dict[tuple[str, Any], Any] = {}
 
     @property
     def _over_ground(self) -> ViewOverGround:
@@ -244,7 +262,7 @@ class CandidateRefiner:
     def on_terrain(self, places: Sequence[Judged], at_most: int) -> list[Judged]:
         """The best judged places that lie apart, on the terrain where they are better there; the
         first with their surroundings, for relief displaces more than refinement follows."""
-        if self.is_level:
+        if self.is_flat:
             return list(places)
         apart_px = REFINEMENT.apart * self._over_ground.view.side_px
         moved = {
@@ -256,30 +274,30 @@ class CandidateRefiner:
         better = {a: b for a, b in moved.items() if b.fit.score > a.fit.score}
         return [better.get(each, each) for each in places]
 
+    @once
     def _twin(self, place: Judged) -> Judged | None:
-        """A place refined on the terrain; None where level ground is as good."""
-        if place not in self._twins:
-            pose, made = place.pose, None
-            if not self._over_ground.is_level(pose):
-                made = self._over_ground.templates_at(pose, self.levels.mid)
-            fit = None if made is None else self.refined(pose, self.levels.mid, made)
-            self._twins[place] = None if fit is None else Judged(fit, place.fit.score, made)
-        return self._twins[place]
+        """A place refined on the terrain; None where flat ground is as good."""
+        pose = place.pose
+        if self._over_ground.is_flat_at(pose):
+            return None
+        made = self._over_ground.templates_at(pose, self.levels.mid)
+        if made is None:
+            return None
+        return Judged(self.refined(pose, self.levels.mid, made), place.fit.score, made)
 
+    @once
     def _best_around(self, place: Judged) -> Judged | None:
         """`_twin`, or a better place by a search around it at the coarse level."""
-        if place not in self._around:
-            twin = self._twin(place)
-            found = [] if twin is None else [twin, *self._found_around(place, twin)]
-            self._around[place] = max(found, key=lambda each: each.fit.score, default=None)
-        return self._around[place]
+        twin = self._twin(place)
+        found = [] if twin is None else [twin, *self._found_around(place, twin)]
+        return max(found, key=lambda each: each.fit.score, default=None)
 
     def _found_around(self, place: Judged, twin: Judged) -> Iterator[Judged]:
         assert twin.terrain is not None
         pose, scales = place.pose, self.prior.scale_map
         starts = [(pose, twin.terrain)]
         expected = scales.at(pose.x_px, pose.y_px) if scales else pose.log_scale
-        # Level ground may fit at another scale.
+        # Flat ground may fit at another scale.
         if abs(expected - pose.log_scale) > max(REFINEMENT.scales_around):
             raised = replace(pose, log_scale=expected)
             made = self._over_ground.templates_at(raised, self.levels.mid)
@@ -309,69 +327,68 @@ class CandidateRefiner:
     def finished(
         self,
         places: Sequence[Judged],
-        candidates: int,
         direct: Sequence[Judged] = (),
         *,
         kept: int = REFINEMENT.to_finish,
         closer: bool = False,
-    ) -> Finished:
-        """The best of judged places, found by searches of `candidates` in all: the best `kept` and
-        all `direct` ones at the final level; with `closer` the best of these one level finer, where
-        there is one, and as their houses show them."""
+    ) -> BestPlace:
+        """The best of judged places: the best `kept` and all `direct` ones at the final level; with
+        `closer` the best of these as their houses show them and one level finer, where there is
+        one."""
         apart = self._best_apart(places, kept, self._exclusion_px)
         chosen = apart[: self._hopeful([each.fit for each in apart], REFINEMENT.hope, 2)]
         finalists = _best_first(self._finish_all([*chosen, *direct]))
-        if closer and not self.is_level and self._over_ground.ground.surface is not None:
-            for number, each in enumerate(finalists[: REFINEMENT.to_finest]):
-                finalists[number] = self._seen_with_houses(each)
-            finalists = _best_first(finalists)
+        few = REFINEMENT.to_finest
+        if closer and not self.is_flat and self._over_ground.ground.surface is not None:
+            seen = [self._with_houses(each) for each in finalists[:few]]
+            finalists = _best_first([*seen, *finalists[few:]])
         if closer and self.levels.final > 0:
-            finer = map(self._compared_finer, finalists[: REFINEMENT.to_finest])
-            finalists = [replace(each, fine=each.score + each.finer) for each in finer]
+            finalists = [self._compared_finer(each) for each in finalists[:few]]
             finalists.sort(key=lambda each: -each.fine)
-        best = finalists[0]
+        best, *others = finalists
         final = self._with_covariance(best.fit.pose, best.templates)
-        scores = self._scores(finalists, [*places, *direct], final)
-        return replace(
-            best,
-            fit=final,
-            scores=scores | {"candidates": float(candidates)},
-            rivals=tuple(replace(each, score=_weight(each, best)) for each in finalists[1:]),
+        values = {each.name: getattr(best, each.name) for each in fields(Finished)}
+        return BestPlace(
+            **values | {"fit": final},
+            scores=self._scores(finalists, [*places, *direct], final),
+            rivals=tuple(replace(each, score=_weight(each, best)) for each in others),
         )
 
     def _finish_all(self, places: Sequence[Judged]) -> list[Finished]:
-        """On the terrain, unless level ground is as good, too little is known, or a place is far
+        """On the terrain, unless flat ground is as good, too little is known, or a place is far
         below the best one."""
         starts = [self._start(each) for each in places]
         best = max((start.fit.score for start in starts if start is not None), default=0.0)
-        for place, start in zip(places, starts, strict=True):
-            if place in self._finished:
-                continue
-            if start is None or start.fit.score < REFINEMENT.rival_on_terrain * best:
-                self._finished[place] = self._on_level(place)
-            else:
-                self._finished[place] = self._on_terrain(place, start.pose)
-        return [self._finished[each] for each in places]
+        return [
+            self._on_flat(place)
+            if start is None or start.fit.score < REFINEMENT.rival_on_terrain * best
+            else self._on_terrain(place)
+            for place, start in zip(places, starts, strict=True)
+        ]
 
     def _start(self, place: Judged) -> Judged | None:
-        """Where a place is finished on the terrain; None: on level ground."""
-        if self.is_level:
+        """Where a place is finished on the terrain; None: on flat ground."""
+        if self.is_flat:
             return None
         return self._best_around(place) if place.terrain is None else self._twin(place)
 
-    def _on_level(self, place: Judged) -> Finished:
+    @once
+    def _on_flat(self, place: Judged) -> Finished:
         fit, total = place.fit, place.fit.score
         if self.levels.final != self.levels.mid:
             fit = self.refined(place.pose, self.levels.final)
             total = fit.score + self.refiner(self.levels.mid).place(fit.pose, 0).score
         return Finished(place, fit, self.templates, total, total - self.prior.cost(fit.pose))
 
-    def _on_terrain(self, place: Judged, pose: Pose) -> Finished:
-        final = self.levels.final
+    @once
+    def _on_terrain(self, place: Judged) -> Finished:
+        final, start = self.levels.final, self._start(place)
+        assert start is not None
+        pose = start.pose
         for _ in range(REFINEMENT.rounds):
             made = self._over_ground.templates_at(pose, final)
             if made is None:
-                return self._on_level(place)
+                return self._on_flat(place)
             fit = self.refined(pose, final, made)
             if self._over_ground.moved_px(pose, fit.pose) < REFINEMENT.moved_px * 2**final:
                 break
@@ -379,10 +396,10 @@ class CandidateRefiner:
         assert made is not None
         found = self._by_templates(place, fit, made)
         assert found.mid_score is not None
-        if found.mid_score < place.level_score:
-            level = self._on_level(place)
-            if level.total > found.total:
-                return level
+        if found.mid_score < place.flat_score:
+            flat = self._on_flat(place)
+            if flat.total > found.total:
+                return flat
         return found
 
     def _by_templates(self, place: Judged, fit: Fit, templates: ViewTemplates) -> Finished:
@@ -391,49 +408,42 @@ class CandidateRefiner:
         if self.levels.final != self.levels.mid:
             mid_score = self.refiner(self.levels.mid, templates).place(fit.pose, 0).score
             total += mid_score
-        score, gain = total - self.prior.cost(fit.pose), mid_score / max(place.level_score, 1e-6)
+        score, gain = total - self.prior.cost(fit.pose), mid_score / max(place.flat_score, 1e-6)
         return Finished(place, fit, templates, total, score, mid_score, gain)
 
-    def _seen_with_houses(self, place: Finished) -> Finished:
-        """Once, under the camera that the picture shows there, not the reported one: among houses
-        and trees that is the difference between the right place and chance."""
-        judged, pose, final = place.judged, place.fit.pose, self.levels.final
-        if judged in self._seen:
-            return place
-        self._seen.add(judged)
+    @once
+    def _with_houses(self, place: Finished) -> Finished:
+        """Under the camera that the picture shows there, not the reported one: among houses and
+        trees that is the difference between the right place and chance."""
+        pose, final = place.fit.pose, self.levels.final
         camera = approached(self._over_ground, pose)
         made = None if camera is None else self._over_ground.templates_at(pose, final, camera)
         if made is None:
             return place
-        under = self._by_templates(judged, self.refined(pose, final, made), made)
+        under = self._by_templates(place.judged, self.refined(pose, final, made), made)
         if under.total > place.total:
-            place = replace(under, finer=place.finer, camera=camera)
-        elif final > 0:
-            place = replace(place, camera=camera)  # one level finer it may fit even so
-        self._finished[judged] = place
-        return place
+            return replace(under, camera=camera)
+        return replace(place, camera=camera) if final > 0 else place  # it may fit one level finer
 
+    @once
     def _compared_finer(self, place: Finished) -> Finished:
-        """One level finer than the final one, once."""
-        if math.isnan(place.finer):
-            finer, camera = self._finer_score(place, None), None
-            if place.camera is not None:
-                score = self._finer_score(place, place.camera)
-                if score > finer:
-                    finer, camera = score, place.camera
-            place = replace(place, finer=finer, camera=camera)
-            self._finished[place.judged] = place
-        return place
+        """One level finer than the final one."""
+        finer, camera = self._finer_score(place, None), None
+        if place.camera is not None:
+            score = self._finer_score(place, place.camera)
+            if score > finer:
+                finer, camera = score, place.camera
+        return replace(place, fine=place.score + finer, camera=camera)
 
     def _finer_score(self, place: Finished, camera: Orientation | None) -> float:
         level, made = self.levels.final - 1, None
         if place.gain is not None or camera is not None:
             made = self._over_ground.templates_at(place.fit.pose, level, camera)
-        refiner = Refiner((made or self._finer_on_level).at(level), self.reference)
+        refiner = Refiner((made or self._finer_on_flat).at(level), self.reference)
         return refiner.place(place.fit.pose, REFINEMENT.finer_steps).score
 
     @cached_property
-    def _finer_on_level(self) -> ViewTemplates:
+    def _finer_on_flat(self) -> ViewTemplates:
         level = self.levels.final - 1
         made = self._over_ground.view.rectified_at(level)
         return ViewTemplates(made.grey, made.valid, level, self.templates.grey_share)
@@ -444,21 +454,23 @@ class CandidateRefiner:
         return refiner.place(pose, REFINEMENT.covariance_steps, with_covariance=True)
 
     def covariance_at(self, pose: Pose) -> NDArray[np.float64]:
-        """Of the fit (4, 4) near a pose, on level ground."""
+        """Of the fit (4, 4) near a pose, on flat ground."""
         found = self._with_covariance(pose).covariance
         assert found is not None
         return found
 
-    def below_camera(self, best: Finished) -> Finished:
+    def below_camera(self, best: BestPlace) -> BestPlace:
         """With heights, of its rivals too, counted from the ground below the camera."""
-        rivals = tuple(self.below_camera(each) for each in best.rivals)
-        below = None if best.gain is None else self._over_ground.below_camera(best.fit.pose)
-        return replace(best, rivals=rivals, below_camera=below)
+        rivals = tuple(replace(each, below_camera=self._below(each)) for each in best.rivals)
+        return replace(best, rivals=rivals, below_camera=self._below(best))
+
+    def _below(self, place: Finished) -> Pose | None:
+        return None if place.gain is None else self._over_ground.below_camera(place.fit.pose)
 
     def _scores(
         self, finalists: Sequence[Finished], judged: Sequence[Judged], final: Fit
-    ) -> dict[str, float]:
-        """The numbers behind the first finished place, `final` with its covariance."""
+    ) -> Scores:
+        """Of the first finished place, `final` with its covariance."""
         best, cost, pose = finalists[0], self.prior.cost, finalists[0].fit.pose
         far = [each for each in finalists if each.apart_px(best) > self._exclusion_px]
         others = [
@@ -472,37 +484,24 @@ class CandidateRefiner:
         if best.mid_score is None:
             # Of what was judged there: refined at the final level, it may be another candidate.
             nearest = min(judged, key=lambda each: each.pose.distance_px(pose))
-            look = self._value(nearest.fit)
+            mid_score = self._value(nearest.fit)
         else:
-            look = best.mid_score - cost(pose)
-        rival, look_rival = max((each.score for each in far), default=0.0), max(others, default=0.0)
+            mid_score = best.mid_score - cost(pose)
         is_fine = not math.isnan(best.fine)
         detail = math.nan
         if self.levels.final != self.levels.mid:
             detail = max(best.fit.score, 1e-3) / max(best.total - best.fit.score, 1e-3)
         template = best.templates.at(self.levels.final, self.levels.recipe(self.levels.final))
-        local = sharpness(template, self.reference, pose)
-        gradient, grey = final.correlations
-        return {
-            "score": final.weighted,
-            "strength": best.score,
-            "rival": rival,
-            "look": look,
-            "look_rival": look_rival,
-            "fine": best.fine,
-            "fine_rival": max((each.fine for each in far), default=0.0) if is_fine else math.nan,
-            "peak_ratio": min(MAX_RATIO, best.score / max(rival, 1e-6)),
-            "look_ratio": min(MAX_RATIO, look / max(look_rival, 1e-6)),
-            "gradient_correlation": gradient,
-            "grey_correlation": grey,
-            "detail_ratio": detail,
-            "local_ratio": local.ratio,
-            "local_gradients": local.gradients,
-            "local_phase": local.phase,
-            "blocks_t": final.blocks_t,
-            "agreement": final.agreement,
-            "overlap": final.overlap,
-        }
+        return Scores(
+            strength=best.score,
+            rival=max((each.score for each in far), default=0.0),
+            mid_score=mid_score,
+            mid_rival=max(others, default=0.0),
+            fine=best.fine,
+            fine_rival=max((each.fine for each in far), default=0.0) if is_fine else math.nan,
+            detail_ratio=detail,
+            **sharpness(template, self.reference, pose)._asdict(),
+        )
 
 
 def _best_first(places: Sequence[Finished]) -> list[Finished]:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.localize.camera import CameraEstimate
-from orthonav.core.localize.confidence import RegisteredConfidence, logit
+from orthonav.core.localize.confidence import RegisteredConfidence, Scores, logit
 from orthonav.core.localize.odometry import tilt_lever_m
-from orthonav.core.localize.place import Finished
+from orthonav.core.localize.place import BestPlace, Finished
 from orthonav.core.localize.search import Search
 from orthonav.core.records import Telemetry
 
@@ -38,26 +38,26 @@ class Sighting:
     """One place where a view may have been taken.
 
     `mean` (6,), `covariance` (6, 6): metres east and north, heading (rad), log scale, pitch, roll
-    (rad). `log_odds`: of this place, given that the aircraft is on the map. `alone`: probability by
-    the view."""
+    (rad). `log_odds`: of this place, given that the aircraft is on the map.
+    `single_view_probability`: of it by the view."""
 
     mean: Array
     covariance: Array
     log_odds: float
-    alone: float = 1.0
+    single_view_probability: float = 1.0
 
 
 def sightings(
-    search: Search, best: Finished, telemetry: Telemetry, log_scale: float, searched_share: float
+    search: Search, best: BestPlace, telemetry: Telemetry, log_scale: float, searched_share: float
 ) -> Iterator[Sighting]:
-    """Of the best place and its rivals; the sheet has a confidence.
+    """Of the best place and its rivals; the map has a confidence.
 
     `telemetry`: as searched, its height corrected by `log_scale`. `searched_share`: of the map."""
-    confidence = search.sheet.confidence
+    confidence = search.map.confidence
     assert confidence is not None
     near_px = LIMITS.apart * search.view.side_px
     places = places_of(best, confidence, near_px, searched_share)
-    for log_odds, alone, place in places:
+    for log_odds, by_view, place in places:
         likely = log_odds > places[0][0] - LIMITS.likely_nats
         camera = search.camera(place) if likely else None
         if camera is None:
@@ -66,11 +66,11 @@ def sightings(
             mean, covariance = _by_camera(camera, telemetry)
         mean[3] += log_scale
         if np.isfinite(covariance).all():
-            yield Sighting(mean, covariance, log_odds, alone)
+            yield Sighting(mean, covariance, log_odds, by_view)
 
 
 def places_of(
-    best: Finished, confidence: RegisteredConfidence, near_px: float, searched_share: float
+    best: BestPlace, confidence: RegisteredConfidence, near_px: float, searched_share: float
 ) -> list[tuple[float, float, Finished]]:
     """Log odds, probability by the view alone, and place: the best, and rivals `near_px` apart.
 
@@ -78,41 +78,39 @@ def places_of(
     within the area times `searched_share`, or, if less, those of a whole search whose rivals are
     what chance makes (docs/tracking.md)."""
     share, chances = math.log(searched_share), confidence.chances
-    chance = {
-        "rival": chances.of_strength(best.scores),
-        "look_rival": chances.look,
-        "fine_rival": chances.fine,
-    }
     out: list[tuple[float, float, Finished]] = []
     for place in (best, *best.rivals):
         if any(place.pose.distance_px(other.pose) < near_px for *_, other in out):
             continue
         scores = _as_rival(best, place) if out else best.scores
-        alone = confidence(
-            scores
-            | {k: max(scores[k], least) for k, least in chance.items() if not math.isnan(scores[k])}
+        by_chance = replace(
+            scores,
+            rival=max(scores.rival, chances.of_strength(scores)),
+            mid_rival=max(scores.mid_rival, chances.look),
+            fine_rival=max(scores.fine_rival, chances.fine),  # NaN stays
         )
+        by_view = confidence(by_chance)
         edge = LIMITS.min_probability
-        log_odds = min(logit(confidence(scores), edge) + share, logit(alone, edge))
+        log_odds = min(logit(confidence(scores), edge) + share, logit(by_view, edge))
         if out:  # the best place may have won in detail, against stronger scores elsewhere
-            log_odds, alone = min(log_odds, out[0][0]), min(alone, out[0][1])
+            log_odds, by_view = min(log_odds, out[0][0]), min(by_view, out[0][1])
         if not out or log_odds > LIMITS.min_log_odds:
-            out.append((log_odds, alone, place))
+            out.append((log_odds, by_view, place))
     return out
 
 
-def _as_rival(best: Finished, place: Finished) -> dict[str, float]:
+def _as_rival(best: BestPlace, place: Finished) -> Scores:
     """As if it were the best place, and the best one its rival."""
-    share = place.score / max(best.score, 1e-6)
-    look = best.scores["look"]
-    return best.scores | {
-        "strength": place.score,
-        "rival": best.score,
-        "look": look * share,
-        "look_rival": look,
-        "fine": math.nan,
-        "fine_rival": math.nan,
-    }
+    mid_score = best.scores.mid_score
+    return replace(
+        best.scores,
+        strength=place.score,
+        rival=best.score,
+        mid_score=mid_score * (place.score / max(best.score, 1e-6)),
+        mid_rival=mid_score,
+        fine=math.nan,
+        fine_rival=math.nan,
+    )
 
 
 def _by_camera(camera: CameraEstimate, telemetry: Telemetry) -> tuple[Array, Array]:
@@ -130,14 +128,14 @@ def _by_camera(camera: CameraEstimate, telemetry: Telemetry) -> tuple[Array, Arr
 
 def _by_similarity(search: Search, place: Finished, telemetry: Telemetry) -> tuple[Array, Array]:
     """The same of a view that does not show its tilt."""
-    sheet, pose, spread = search.sheet, place.pose, place.fit.covariance
+    map_, pose, spread = search.map, place.pose, place.fit.covariance
     if spread is None:
         spread = search.refiner.covariance_at(pose)
     tilt_rad = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-    mean = np.concatenate([sheet.camera_state(search.view, pose), tilt_rad])
+    mean = np.concatenate([map_.camera_state(search.view, pose), tilt_rad])
     lever = tilt_lever_m(replace(telemetry, yaw_deg=math.degrees(pose.turn_rad)))
     covariance = np.zeros((6, 6))
-    covariance[:4, :4] = sheet.camera_covariance(search.view, pose, spread)
+    covariance[:4, :4] = map_.camera_covariance(search.view, pose, spread)
     covariance[:2, :2] += LIMITS.unseen_tilt_rad**2 * lever @ lever.T
     covariance[:2, 4:] = -(LIMITS.unseen_tilt_rad**2) * lever
     covariance[4:, :2] = covariance[:2, 4:].T

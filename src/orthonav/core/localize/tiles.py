@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError, VariantError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize.confidence import LogisticConfidence
-from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
-from orthonav.core.localize.view import check_rectified
+from orthonav.core.localize.view import RectifiedView, check_rectified, downsampled, rectify
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import PRIOR_SIGMAS, TILE_YAW_STD_DEG, Fix, NoFix, Prior, Telemetry, View
-from orthonav.core.register.pose import Pose
 from orthonav.core.register.search import Peak
+from orthonav.core.register.window import Pose
 from orthonav.core.tiles import represent
-from orthonav.core.tiles.bank import Representation, embed_poses
+from orthonav.core.tiles.bank import Representation, embed_directions
 from orthonav.core.tiles.embed import ViewEmbedder, embedder_of
 from orthonav.core.tiles.position import (
     ExactIndex,
@@ -136,7 +135,7 @@ class TileMatcher:
 
 @dataclass(frozen=True, eq=False)
 class TileProposer:
-    """Embeds a view under many poses and finds the most similar tiles of a sheet."""
+    """Embeds a view under many directions and finds the most similar tiles of a sheet."""
 
     tiles: TileMatcher
     embedder: WhitenedEmbedder
@@ -146,7 +145,7 @@ class TileProposer:
     def of(
         cls, tiles: TileMatcher, embedder: ViewEmbedder, representation: Representation
     ) -> "TileProposer | None":
-        """None for embeddings that cannot embed a view under many poses at once."""
+        """None for embeddings that cannot embed a view under many directions at once."""
         if not isinstance(embedder, WhitenedEmbedder):
             return None
         return cls(tiles, embedder, representation)
@@ -159,7 +158,7 @@ class TileProposer:
     def candidates(
         self,
         view: RectifiedView,
-        poses: list[tuple[float, float]],
+        directions: list[tuple[float, float]],
         weights: NDArray[np.float32],
         rows: NDArray[np.intp] | None,
         count: int,
@@ -168,14 +167,14 @@ class TileProposer:
         heading-up at the map's resolution under headings (rad) and log scales with `weights` (Q,).
         """
         tiles, grid = self.tiles, self.tiles.grid
-        queries = embed_poses(
-            self.embedder, self.representation, view.grey, view.valid, poses, grid.tile_px
+        queries = embed_directions(
+            self.embedder, self.representation, view.grey, view.valid, directions, grid.tile_px
         )
         scores = tiles.index.best(queries * weights[:, None], rows)
         chosen = tiles.neighbours.maxima(scores, count, rows)
         numbers = chosen if rows is None else rows[chosen]
-        by_pose = tiles.index.scores(queries, numbers)
-        peaks = peak_poses(np.array(poses), by_pose, weights)
+        by_direction = tiles.index.scores(queries, numbers)
+        peaks = peak_directions(np.array(directions), by_direction, weights)
         found = []
         for place, tile, (turn_rad, log_scale) in zip(chosen, numbers, peaks.tolist(), strict=True):
             shift_m = tiles.neighbours.offset_en_m("peak", scores, int(tile), rows)
@@ -187,15 +186,15 @@ class TileProposer:
         return found
 
 
-def peak_poses(
-    poses: NDArray[np.float64], scores: NDArray[np.float32], weights: NDArray[np.float32]
+def peak_directions(
+    directions: NDArray[np.float64], scores: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> NDArray[np.float64]:
-    """Headings and log scales (N, 2) at the peak of scores (N, Q), by parabolas, or the best pose
+    """Headings and log scales (N, 2) at the peak of scores (N, Q), by parabolas, or the best
     beside a missing one; weights (Q,) choose it, but do not move it."""
-    off = poses - poses[:, None]
+    off = directions - directions[:, None]
     off[..., 0] = np.remainder(off[..., 0] + np.pi, 2 * np.pi) - np.pi
     best, tiles = (scores * weights).argmax(axis=1), np.arange(len(scores))
-    peaks: NDArray[np.float64] = poses[best]
+    peaks: NDArray[np.float64] = directions[best]
     for axis in (0, 1):
         other = np.isclose(off[..., 1 - axis], 0.0)
         beside = []

@@ -1,4 +1,4 @@
-/* Blocks of a view beside the map, moved a little aside: orthonav.core.register.blocks, compiled.
+/* Blocks of a view beside the map, moved a little aside: orthonav.core.register.refine, compiled.
  *
  * The map is sampled once, in planes, with a margin; then each block is multiplied with it under all
  * moves, eight pixels at a time. Rows of a block are filled up to whole vectors with zeros. `bend` is
@@ -173,7 +173,7 @@ INLINE void multiply_inline(const aside_t *with, const float *weights, float *ou
 FOR_EVERY_PROCESSOR(multiply, (const aside_t *with, const float *weights, float *out),
                     (with, weights, out))
 
-/* What orthonav.core.register.blocks says of them: grey's energy over that of gradients, and of a block
+/* What orthonav.core.register.refine says of them: grey's energy over that of gradients, and of a block
  * that counts the least share of pixels, and of energy over the median. */
 typedef struct {
     double grey, seen, energy;

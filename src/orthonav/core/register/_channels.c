@@ -1,4 +1,4 @@
-/* Channels of a picture: orthonav.core.register.channels, compiled.
+/* Channels of a picture: orthonav.core.register.template, compiled.
  *
  * Loops are such that compilers make vectors of them. At borders pictures are reflected without their
  * first pixel, as OpenCV does. */

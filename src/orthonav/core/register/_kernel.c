@@ -597,14 +597,14 @@ static PyMethodDef functions[] = {
     {"derive", py_derive, METH_VARARGS,
      "derive(view, slopes, out): see orthonav.core.register.template."},
     {"channels", py_channels, METH_VARARGS,
-     "channels(grey, valid, recipe, planes): see orthonav.core.register.channels."},
+     "channels(grey, valid, recipe, planes): see orthonav.core.register.template."},
     {"blocks", py_blocks, METH_VARARGS,
      "blocks(window, view, matrix, turn, reach, shares, correlations, pixels): see "
-     "orthonav.core.register.blocks."},
+     "orthonav.core.register.refine."},
     {"thin", py_thin, METH_VARARGS,
-     "thin(grey, factor, out): see orthonav.core.localize.rectify."},
+     "thin(grey, factor, out): see orthonav.core.localize.view."},
     {"rectify", py_rectify, METH_VARARGS,
-     "rectify(picture, nodes, grey, valid): see orthonav.core.localize.rectify."},
+     "rectify(picture, nodes, grey, valid): see orthonav.core.localize.view."},
     {"bend", py_bend, METH_VARARGS,
      "bend(surfaces, blur, places, pixels, units, limits, out): see orthonav.core.localize.resection."},
     {"search", py_search, METH_VARARGS,
@@ -614,7 +614,7 @@ static PyMethodDef functions[] = {
      "near(channels, view, weights, places, reach, out): see orthonav.core.register.search."},
     {"moved", py_moved, METH_VARARGS,
      "moved(window, view, weights, matrix, turn, moves, size, floor, out): see "
-     "orthonav.core.register.sharpness."},
+     "orthonav.core.register.refine."},
     {NULL, NULL, 0, NULL},
 };
 

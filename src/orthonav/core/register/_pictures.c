@@ -1,4 +1,4 @@
-/* Pictures made smaller, and rectified: orthonav.core.localize.rectify, compiled. */
+/* Pictures made smaller, and rectified: orthonav.core.localize.view, compiled. */
 
 #include "_kernel.h"
 
@@ -58,7 +58,7 @@ free_grey:
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
 }
 
-#define NODE_PX 4       /* pixels of a window between nodes: orthonav.core.localize.rectify.NODE_PX */
+#define NODE_PX 4       /* pixels of a window between nodes: orthonav.core.localize.view.NODE_PX */
 
 typedef struct {
     const unsigned char *grey;

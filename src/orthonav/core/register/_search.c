@@ -1,4 +1,4 @@
-/* Search of a view on the map: orthonav.core.register.search and sharpness, compiled.
+/* Search of a view on the map: orthonav.core.register.search and refine.sharpness, compiled.
  *
  * `search` lays a view on every place of a window under each of many poses, by Fourier transforms of
  * eight columns or rows at a time: those along a column, the product with the spectra of the map and

@@ -3,27 +3,45 @@
 Gauss-Newton on squared differences of channels, each kind with its own gain, so that correlation is
 maximized; derivatives are the view's (inverse compositional, Baker and Matthews, IJCV 2004). The
 covariance is the sandwich of robust statistics (Huber 1967; clustered as in Liang and Zeger 1986)
-over blocks of the view, for residuals of neighbouring pixels are not independent."""
+over blocks of the view, for residuals of neighbouring pixels are not independent.
+
+`sharpness` says how much a place stands out from the ground around it, which tells it from texture
+that repeats: rows, lattices and single roads fit nearly as well a little aside, and so do places by
+chance. Scores aside are compared with that of the place, for all channels, gradients alone, and
+phase correlation (Kuglin and Hines, 1975), all from the same spectra (docs/decisions/evidence.md).
+
+`block_scores` says how well each block of a view fits the map when it is moved a little aside.
+Under wrong tilt, relief or lens blocks fit at different displacements, which show the camera."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.channels import GROUPS
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.pose import Pose, even_scale
-from orthonav.core.register.template import BLOCKS, Template, by_steps, from_middle, gradients
+from orthonav.core.register.template import (
+    BLOCKS,
+    CHANNELS,
+    GROUPS,
+    Template,
+    block_starts,
+    by_steps,
+    from_middle,
+    gradients,
+)
 from orthonav.core.register.window import (
     FULLY_VALID,
     MapWindow,
+    Pose,
     Reference,
     Sums,
     compared,
+    even_scale,
     sampled_planes,
 )
 
@@ -318,3 +336,173 @@ class _Pixels:
         kinds = [products[group].sum(axis=0) for group in GROUPS]
         each = np.stack([*terms, *kinds, self.counts])
         return self.seen.template.block_sums(each).astype(np.float64).T
+
+
+PHASE_FLOOR = 1e-3  # fraction of the mean power below which frequencies count less
+
+
+class Sharpness(NamedTuple):
+    """Over scores a little aside: `local_ratio` of all channels over the best, up to 10; 0 without
+    correlation; `local_gradients`, `local_phase` over the mean, in standard deviations."""
+
+    local_ratio: float
+    local_gradients: float
+    local_phase: float
+
+
+def sharpness(template: Template, reference: Reference, pose: Pose) -> Sharpness:
+    """At the heading and scale of `pose`."""
+    moved = _moved_scores(template, reference, pose)
+    rows, cols = (np.arange(side, dtype=np.float64) - side // 2 for side in moved.shape[1:])
+    moved_px = np.hypot(rows[:, None], cols)
+    # The place itself is the best near by; smaller moves than those aside belong to it too.
+    near, aside = moved_px <= 3.0, moved_px > max(3.0, 0.06 * math.sqrt(template.pixels))
+    return Sharpness(
+        _ratio(moved[0] + moved[1], near, aside),
+        _deviations(moved[0], near, aside),
+        _deviations(moved[2], near, aside),
+    )
+
+
+def _ratio(scores: Array, near: NDArray[np.bool_], aside: NDArray[np.bool_]) -> float:
+    here, rival = float(scores[near].max()), float(scores[aside].max(initial=0.0))
+    return min(here / max(rival, 1e-6), 10.0) if here > 0 else 0.0
+
+
+def _deviations(scores: Array, near: NDArray[np.bool_], aside: NDArray[np.bool_]) -> float:
+    others = scores[aside]
+    if not others.size:
+        return 0.0
+    return float((scores[near].max() - others.mean()) / (others.std() + 1e-9))
+
+
+def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array:
+    """Scores (3, 2 R + 1, 2 C + 1) of gradients, grey and phase correlation, by rows and columns.
+
+    Not divided by the energy of the map under each move: that hardly changes."""
+    height, width = template.mask.shape
+    rows, cols = (max(8, int(side / 8)) for side in (height, width))
+    window = MapWindow.of(template, reference, pose, 0, (rows, cols))
+    # Moves of less than the margin never reach over the border: no padding.
+    size = tuple(cv2.getOptimalDFTSize(side) for side in window.shape)
+    if KERNEL is not None:
+        moved = np.empty((3, 2 * rows + 1, 2 * cols + 1), np.float32)
+        KERNEL.moved(
+            *(window.made, template.values, template.weights, window.matrix(pose), pose.turn_rad),
+            *((rows, cols), size, PHASE_FLOOR, moved),
+        )
+        return moved
+    planes, _ = sampled_planes(window, pose)
+    for group, weight in zip(GROUPS, template.weights, strict=True):
+        energy = float(np.square(planes[group]).sum())
+        planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
+    products = np.conj(np.fft.rfft2(template.channels, s=size, axes=(1, 2)))
+    products *= np.fft.rfft2(planes, s=size, axes=(1, 2))
+    power = np.abs(products)
+    floor = PHASE_FLOOR * power.mean(axis=(1, 2), keepdims=True) + 1e-12
+    phase = (products / (power + floor)).sum(axis=0)
+    parts = np.stack([*(products[group].sum(axis=0) for group in GROUPS), phase])
+    surface = np.fft.irfft2(parts, s=size, axes=(1, 2))
+    return np.asarray(surface[:, : 2 * rows + 1, : 2 * cols + 1], np.float32)
+
+
+BLOCK_GREY_SHARE = 0.25
+"""Grey over gradients: less than in the search, seasons mislead (docs/decisions/camera.md)."""
+MIN_SEEN = 0.4  # blocks of which less is seen on valid map do not count
+MIN_ENERGY = 0.1
+"""Nor those below this fraction of the median energy: edges brought in would count too much."""
+
+
+class BlockScores(NamedTuple):
+    """Correlation of each block of a view with the map under small displacements.
+
+    - `correlations` (B * B, 2 R + 1, 2 R + 1): by pixels down and right on the map.
+    - `pixels` (B * B,): that count, 0 where too few of a block are seen.
+    - `middles_px` (B * B, 2): x and y from the middle of the window."""
+
+    correlations: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+    middles_px: NDArray[np.float64]
+
+
+def block_scores(
+    template: Template, reference: Reference, pose: Pose, reach_px: int
+) -> BlockScores:
+    """Of a view whose window lies at `pose`, moved by up to `reach_px` pixels of the level."""
+    rows, cols = template.mask.shape
+    window = MapWindow.of(template, reference, pose, 1, (reach_px, reach_px))
+    if KERNEL is None:
+        found, pixels = _correlated(
+            *_products_of_blocks(template, window, pose, reach_px), rows * cols
+        )
+    else:
+        count, side = BLOCKS * BLOCKS, 2 * reach_px + 1
+        found, pixels = np.empty((count, side, side)), np.empty(count)
+        at = window.matrix(pose), pose.turn_rad
+        shares = BLOCK_GREY_SHARE * (template.weights[1] > 0), MIN_SEEN, MIN_ENERGY
+        KERNEL.blocks(window.made, template.planes, *at, reach_px, shares, found, pixels)
+    return BlockScores(found, pixels, _middles_px(rows, cols))
+
+
+def _correlated(
+    products: Array, sums: NDArray[np.float64], view_px: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Correlations (B * B, 2 R + 1, 2 R + 1) and pixels (B * B,) that count."""
+    used = sums[2] >= MIN_SEEN * view_px / len(products)
+    for each in sums[:2]:
+        used &= each > MIN_ENERGY * np.median(each)
+    scale = np.where(used, 1 / np.sqrt(np.where(used, sums[0] * sums[1], 1.0)), 0.0)
+    return (products * scale[:, None, None]).clip(-1.0, 1.0), np.where(used, sums[2], 0.0)
+
+
+@lru_cache(maxsize=64)
+def _middles_px(rows: int, cols: int) -> NDArray[np.float64]:
+    """Of the blocks (B * B, 2), shared: not to be written to."""
+    y, x = (
+        (np.append(each[1:], size) + each) / 2 - size / 2
+        for each, size in zip(block_starts((rows, cols)), (rows, cols), strict=True)
+    )
+    middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    middles.flags.writeable = False
+    return middles
+
+
+def _products_of_blocks(
+    template: Template, window: MapWindow, pose: Pose, reach_px: int
+) -> tuple[Array, NDArray[np.float64]]:
+    """Products (B * B, 2 R + 1, 2 R + 1) of blocks with the map, moved; of each block the energy in
+    the view and on the map, and the pixels that count (3, B * B)."""
+    rows, cols = template.mask.shape
+    seen = _sampled(window, pose)
+    here = seen[reach_px : reach_px + rows, reach_px : reach_px + cols]
+    own_weights, own = _energies(template, template.values)
+    weights, energies = _energies(template, here)
+    used = template.planes * np.sqrt(own_weights * weights)[:, None, None].astype(np.float32)
+    side = 2 * reach_px + 1
+    products = np.empty((BLOCKS * BLOCKS, side, side), np.float32)
+    for down, right in np.ndindex(side, side):
+        moved = np.moveaxis(seen[down : down + rows, right : right + cols, :3], 2, 0)
+        products[:, down, right] = template.block_sums((used[:3] * moved).sum(axis=0))
+    pixels = template.block_sums(template.mask * here[..., 3])
+    return products, np.stack([own, energies, pixels])
+
+
+def _sampled(window: MapWindow, pose: Pose) -> Array:
+    """The window (H, W, 4), edge directions turned; 0 where not valid."""
+    sampled = window.sample(pose)
+    cos, sin = math.cos(2 * pose.turn_rad), math.sin(2 * pose.turn_rad)
+    turn = np.eye(CHANNELS, dtype=np.float32)
+    turn[:2, :2] = [[cos, sin], [-sin, cos]]
+    turned = np.asarray(cv2.transform(sampled, turn), np.float32)
+    turned[sampled[..., 3] < 0.99] = 0.0
+    return turned
+
+
+def _energies(template: Template, values: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (4,) of the squares of channels (H, W, 4), and the weighted energy of each block."""
+    squares = np.moveaxis(np.square(values, dtype=np.float64), 2, 0)
+    blocks = template.block_sums(squares)
+    gradients, grey = float(blocks[:2].sum()), float(blocks[2].sum())
+    counts = grey > 0 and template.weights[1] > 0  # else the view is compared without grey
+    weights = np.array([1.0, 1.0, BLOCK_GREY_SHARE * gradients / grey if counts else 0.0, 0.0])
+    return weights, weights @ blocks

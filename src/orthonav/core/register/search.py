@@ -17,14 +17,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import counted_from_centres
-from orthonav.core.register.channels import GROUPS, ChannelRecipe
 from orthonav.core.register.kernel import KERNEL
-from orthonav.core.register.pose import Pose, ScaleMap, even_scale, rotation
-from orthonav.core.register.template import Template, energy_of, turned_planes
-from orthonav.core.register.window import MAX_SIDE_PX, Reference, cut
+from orthonav.core.register.template import (
+    GROUPS,
+    ChannelRecipe,
+    Template,
+    energy_of,
+    turned_planes,
+)
+from orthonav.core.register.window import (
+    MAX_SIDE_PX,
+    Pose,
+    Reference,
+    ScaleMap,
+    cut,
+    even_scale,
+    rotation,
+)
 
 Array = NDArray[np.float32]
-POSES_AT_ONCE = 6
+DIRECTIONS_AT_ONCE = 6
 PLACES_AT_ONCE = 50
 WIDE = 8  # columns or rows that the kernel transforms together
 
@@ -206,7 +218,7 @@ def _rounded_side(side: float) -> int:
 def search(
     template: Template,
     window: SearchWindow,
-    poses: list[tuple[float, float]],
+    directions: list[tuple[float, float]],
     count: int,
     scales: ScaleMap | None = None,
     pool: Executor | None = None,
@@ -214,11 +226,11 @@ def search(
     """The `count` best candidates, best first, at least an eighth of the view apart.
 
     `scales`: only those expected at a place are compared. Results do not depend on `pool`."""
-    share = max(1, len(poses)) if pool is None else POSES_AT_ONCE
-    parts = [range(at, min(at + share, len(poses))) for at in range(0, len(poses), share)]
+    share = max(1, len(directions)) if pool is None else DIRECTIONS_AT_ONCE
+    parts = [range(at, min(at + share, len(directions))) for at in range(0, len(directions), share)]
     window.prepare(template)
     surfaces = (pool.map if pool else map)(
-        lambda part: _best_of(template, window, poses, part, scales), parts
+        lambda part: _best_of(template, window, directions, part, scales), parts
     )
     best, which = next(surfaces)
     for scores, numbers in surfaces:
@@ -235,7 +247,7 @@ def search(
     found = []
     for row, col in peaks:
         x, y = _between(best, row, col)
-        turn, log_scale = poses[int(which[row, col])]
+        turn, log_scale = directions[int(which[row, col])]
         pose = Pose((window.col + x) * unit, (window.row + y) * unit, turn, log_scale)
         found.append(Peak(float(best[row, col]), pose))
     return found
@@ -289,20 +301,20 @@ def _best_near(
 def _best_of(
     template: Template,
     window: SearchWindow,
-    poses: list[tuple[float, float]],
+    directions: list[tuple[float, float]],
     part: range,
     scales: ScaleMap | None,
 ) -> tuple[Array, NDArray[np.int32]]:
-    """Best score (H, W) at every place, and the number of its pose."""
+    """Best score (H, W) at every place, and the number of its direction."""
     shape = window.height, window.width
     expected = None if scales is None else scales.over(window.level, window.row, window.col, shape)
     if window.by_kernel:
-        return _best_by_kernel(template, window, poses, part, scales, expected)
+        return _best_by_kernel(template, window, directions, part, scales, expected)
     best = np.full(shape, -np.inf, np.float32)
     which = np.zeros(shape, np.int32)
     numbers = np.empty(shape, np.int32)
     for number in part:
-        turn, log_scale = poses[number]
+        turn, log_scale = directions[number]
         scores = _scores(template, window, turn, log_scale)
         if scores is None:
             continue
@@ -319,7 +331,7 @@ def _best_of(
 def _best_by_kernel(
     template: Template,
     window: SearchWindow,
-    poses: list[tuple[float, float]],
+    directions: list[tuple[float, float]],
     part: range,
     scales: ScaleMap | None,
     expected: Array | None,
@@ -332,7 +344,7 @@ def _best_by_kernel(
     tried = np.array(
         [
             (turn, log_scale, *(scales.reach(log_scale) if scales else reach))
-            for turn, log_scale in (poses[number] for number in part)
+            for turn, log_scale in (directions[number] for number in part)
         ]
     )
     KERNEL.search(
@@ -380,8 +392,8 @@ def posed_half_px(template: Template, log_scale: float) -> int:
     return math.ceil(math.exp(log_scale) * math.hypot(*template.mask.shape) / 2) + 1
 
 
-def largest_half_px(template: Template, poses: Sequence[tuple[float, float]]) -> int:
-    return posed_half_px(template, max(log_scale for _, log_scale in poses))
+def largest_half_px(template: Template, directions: Sequence[tuple[float, float]]) -> int:
+    return posed_half_px(template, max(log_scale for _, log_scale in directions))
 
 
 def posed_channels(template: Template, turn: float, log_scale: float) -> Array:

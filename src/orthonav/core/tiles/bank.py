@@ -1,6 +1,6 @@
-"""A bank of poses: one view embedded under many headings and scales, without turning the picture.
+"""A bank of directions: one view embedded under many headings and scales, its picture not turned.
 
-The view is represented once and averaged to micro-cells; each pose samples `MICRO` x `MICRO` of
+The view is represented once and averaged to micro-cells; each of them samples `MICRO` x `MICRO` of
 them, adds them up to cells and turns the phases of the harmonics: 50 us instead of 1.5 ms.
 Gradients are taken at the reported resolution and micro-cells are not turned, but the bank sees
 beyond the tile, and finds it no less often. Canny's edges come out less alike."""
@@ -14,11 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.tiles.cells import MICRO
-from orthonav.core.tiles.whitened import WhitenedEmbedder, WhitenedRecipe
+from orthonav.core.tiles.whitened import MICRO, WhitenedEmbedder, WhitenedRecipe
 
 Array = NDArray[np.float32]
-Poses = NDArray[np.float64]
+Directions = NDArray[np.float64]
 
 
 class Representation(Protocol):
@@ -36,35 +35,35 @@ class Representation(Protocol):
         pass
 
 
-def embed_poses(
+def embed_directions(
     embedder: WhitenedEmbedder,
     representation: Representation,
     grey: NDArray[np.uint8],
     valid: NDArray[np.bool_],
-    poses: Sequence[tuple[float, float]],
+    directions: Sequence[tuple[float, float]],
     tile_px: int,
 ) -> Array:
-    """Unit embeddings (Q, D) of a view under `poses`; zero where a pose sees nothing.
+    """Unit embeddings (Q, D) of a view under `directions`; zero where one sees nothing.
 
-    `grey`, `valid` (H, W): heading up, at the reported resolution. A pose: true heading (rad) and
-    log of true over reported resolution. Each is close to that of the tile about the view's middle,
-    up to a third of scale. Raises `ValueError` for a bad `tile_px` or an unknown kind of
+    `grey`, `valid` (H, W): heading up, at the reported resolution. A direction: true heading (rad)
+    and log of true over reported resolution. Each is close to that of the tile about the view's
+    middle, up to a third of scale. Raises `ValueError` for a bad `tile_px` or an unknown kind of
     representation."""
     channels = representation.channels
     if tile_px % MICRO or (channels > 1 and channels % 2 == 0):
         raise ValueError(
             f"tile must be a multiple of {MICRO} px and channels odd, got {tile_px}, {channels}"
         )
-    if len(poses) == 0:
+    if len(directions) == 0:
         return np.zeros((0, embedder.dims), dtype=np.float32)
-    all_poses = np.asarray(poses, dtype=np.float64).reshape(-1, 2)
-    thinned = _thinned(representation, grey, valid, all_poses, tile_px)
+    all_directions = np.asarray(directions, dtype=np.float64).reshape(-1, 2)
+    thinned = _thinned(representation, grey, valid, all_directions, tile_px)
     side = embedder.recipe.cells
-    sums = np.empty((len(poses), side, side, channels + 1), dtype=np.float32)
-    for start in range(0, len(poses), 64):  # few enough for the processor's cache
+    sums = np.empty((len(directions), side, side, channels + 1), dtype=np.float32)
+    for start in range(0, len(directions), 64):  # few enough for the processor's cache
         part = slice(start, start + 64)
-        sums[part] = _pooled(embedder.recipe, thinned, all_poses[part], tile_px)
-    return embedder.cells(_turned(sums[..., :channels], all_poses), sums[..., channels])
+        sums[part] = _pooled(embedder.recipe, thinned, all_directions[part], tile_px)
+    return embedder.cells(_turned(sums[..., :channels], all_directions), sums[..., channels])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +82,11 @@ def _thinned(
     representation: Representation,
     grey: NDArray[np.uint8],
     valid: NDArray[np.bool_],
-    poses: Poses,
+    directions: Directions,
     tile_px: int,
 ) -> _Thinned:
-    """The part of the view that the poses reach."""
-    turns, log_scales = poses.T
+    """The part of the view that the directions reach."""
+    turns, log_scales = directions.T
     across = np.abs(np.cos(turns)) + np.abs(np.sin(turns))
     cell_px = tile_px // MICRO
     reach = float((tile_px / 2 * across * np.exp(-log_scales)).max())
@@ -121,26 +120,28 @@ def _averaged(channel: Array, cell_px: int) -> Array:
     return np.asarray(small, dtype=np.float32).reshape(size[1], size[0])
 
 
-def _pooled(recipe: WhitenedRecipe, thinned: _Thinned, poses: Poses, tile_px: int) -> Array:
+def _pooled(
+    recipe: WhitenedRecipe, thinned: _Thinned, directions: Directions, tile_px: int
+) -> Array:
     """Sums (Q, cells, cells, C + 1) of channels and valid share over a tile's cells."""
-    x, y = _samples(thinned, poses, tile_px)
-    count, cells = len(poses), recipe.cells
+    x, y = _samples(thinned, directions, tile_px)
+    count, cells = len(directions), recipe.cells
     pooled = []
     for plane in thinned.planes:
         sampled = cv2.remap(plane, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         rows = recipe.pooling @ np.asarray(sampled).reshape(count, MICRO, -1)
-        # One large product: the second sum over all poses, rows and channels at once.
+        # One large product: the second sum over all directions, rows and channels at once.
         spread = np.kron(recipe.pooling.T, np.eye(plane.shape[-1], dtype=np.float32))
         sums = rows.reshape(count * cells, -1) @ spread
         pooled.append(sums.reshape(count, cells, cells, -1))
     return np.concatenate(pooled, axis=-1)
 
 
-def _samples(thinned: _Thinned, poses: Poses, tile_px: int) -> tuple[Array, Array]:
+def _samples(thinned: _Thinned, directions: Directions, tile_px: int) -> tuple[Array, Array]:
     """Middles of micro-cells, x and y (Q, MICRO * MICRO) each."""
     along = ((np.arange(MICRO) + 0.5) / MICRO - 0.5) * (tile_px / thinned.cell_px)
     east, south = np.tile(along, MICRO), np.repeat(along, MICRO)
-    turns, log_scales = poses.T
+    turns, log_scales = directions.T
     shrink = np.exp(-log_scales)
     cos, sin = (shrink * np.cos(turns))[:, None], (shrink * np.sin(turns))[:, None]
     # OpenCV counts from the middle of the first pixel, we from its corner.
@@ -150,13 +151,13 @@ def _samples(thinned: _Thinned, poses: Poses, tile_px: int) -> tuple[Array, Arra
     return x.astype(np.float32), y.astype(np.float32)
 
 
-def _turned(cells: Array, poses: Poses) -> Array:
+def _turned(cells: Array, directions: Directions) -> Array:
     """Cells (Q, cells, cells, C) as on the map: harmonic k of the doubled direction turns by 2 k
     turns, and grey levels spread over more pixels where the view is coarser than reported."""
     channels = cells.shape[-1]
     if channels == 1:
         return np.ascontiguousarray(cells)
-    turns, log_scales = poses.T
+    turns, log_scales = directions.T
     gain = np.exp(-log_scales)[:, None]
     angles = 2 * turns[:, None] * np.arange(1, channels // 2 + 1)
     cos = (gain * np.cos(angles)).astype(np.float32)[:, None, None]

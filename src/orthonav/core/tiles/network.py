@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError, VariantError
 from orthonav.core.extras import needed
+from orthonav.core.variants import Part
 
 OPERATORS = frozenset(
     [
@@ -57,6 +58,10 @@ class AutoEncoderRecipe:
         _require("width", self.width, fits, "a multiple of 8, 8 to 1024")
         _require_training(self)
 
+    def embedder(self, part: Part, channels: int) -> "NetworkEmbedder":
+        """From a map."""
+        return NetworkEmbedder.of(self, part, channels)
+
 
 @dataclass(frozen=True)
 class TripletRecipe:
@@ -88,6 +93,10 @@ class TripletRecipe:
     @property
     def dims(self) -> int:
         return 16 * self.width
+
+    def embedder(self, part: Part, channels: int) -> "NetworkEmbedder":
+        """From a map."""
+        return NetworkEmbedder.of(self, part, channels)
 
 
 def _require_training(recipe: AutoEncoderRecipe | TripletRecipe) -> None:
@@ -123,6 +132,18 @@ class NetworkEmbedder:
         if self.onnx.dtype != np.uint8 or self.onnx.ndim != 1:
             raise MapFileError(f"encoder must be bytes, got {self.onnx.dtype} {self.onnx.shape}")
         check_graph(self.onnx)
+
+    @classmethod
+    def of(
+        cls, recipe: AutoEncoderRecipe | TripletRecipe, part: Part, channels: int
+    ) -> "NetworkEmbedder":
+        """Fails here, not at the first view, where onnxruntime is absent."""
+        made = cls(recipe, part("onnx", np.uint8, 1))
+        if made.shape[0] != channels:
+            raise MapFileError(
+                f"map's encoder takes {made.shape[0]} channels, its representation has {channels}"
+            )
+        return made
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the running session."""

@@ -10,25 +10,76 @@ Similarity is the scalar product of unit vectors."""
 import contextlib
 import math
 import mmap
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from orthonav.core.cores import in_order
-from orthonav.core.errors import VariantError
-from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
+from orthonav.core.errors import MapFileError, UsageError, VariantError
+from orthonav.core.variants import Part
 
-MAX_LEARNT_TILES = 20_000  # 44 for each of 448 features
+MICRO = 32  # along one side of a tile
+
+
+@dataclass(frozen=True)
+class CellLayout:
+    """Micro-cells of `micro_px`, every `spacing_px`."""
+
+    micro_px: int
+    spacing_px: int
+
+    @classmethod
+    def for_tiles(cls, tile_px: int, stride_px: int) -> "CellLayout":
+        """Raises `AreaError` if none serves all tiles."""
+        if tile_px % MICRO:
+            raise UsageError(f"tile_px must be a multiple of {MICRO} px, got {tile_px}")
+        micro_px = tile_px // MICRO
+        return cls(micro_px, math.gcd(micro_px, stride_px))
+
+    @property
+    def step(self) -> int:
+        return self.micro_px // self.spacing_px
+
+    def samples(self, size_px: int) -> int:
+        return max(0, (size_px - self.micro_px) // self.spacing_px + 1)
+
+
+def cell_means(
+    maps: NDArray[np.float32], valid: NDArray[np.bool_], layout: CellLayout
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Of (C, H, W), valid share (h, w); sample (i, j) begins at spacing * (i, j)."""
+    shape = (layout.samples(maps.shape[1]), layout.samples(maps.shape[2]))
+    means = np.empty((*shape, len(maps)), dtype=np.float32)
+    for channel, single in enumerate(maps):
+        means[:, :, channel] = _sampled_means(single, shape, layout)
+    if valid.all():
+        return means, np.ones(shape, dtype=np.float32)
+    return means, _sampled_means(valid.astype(np.float32), shape, layout)
+
+
+def _sampled_means(
+    single: NDArray[np.float32], shape: tuple[int, int], layout: CellLayout
+) -> NDArray[np.float32]:
+    size, spacing = layout.micro_px, layout.spacing_px
+    rows, cols = shape
+    if spacing == size:
+        whole = np.ascontiguousarray(single[: rows * size, : cols * size])
+        return np.asarray(cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA))
+    # An even box has no centre pixel: anchor 0 makes the output pixel the box's first.
+    boxes = cv2.boxFilter(
+        single, cv2.CV_32F, (size, size), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(boxes, dtype=np.float32)[::spacing, ::spacing][:rows, :cols]
+
+
 PART_NOISE = 2.0
 """Where cells are missing, over the smallest variance kept (docs/decisions/embedding.md)."""
 Made = TypeVar("Made")
-Features = NDArray[np.float32]
-Work = Callable[[Features, Features], Made]
 
 
 @dataclass(frozen=True)
@@ -46,6 +97,15 @@ class WhitenedRecipe:
             raise VariantError(f"dims must be 1 to 4096, got {self.dims}")
         if not self.floor > 0:
             raise VariantError(f"floor must be above 0, got {self.floor}")
+
+    def embedder(self, part: Part, channels: int) -> "WhitenedEmbedder":
+        """From a map."""
+        mean, basis = part("mean", np.float16, 1), part("basis", np.float16, 2)
+        if not basis.shape[0] == mean.shape[0] == self.cells**2 * channels:
+            raise MapFileError("map's embedding parts do not fit together")
+        if not (np.isfinite(mean).all() and np.isfinite(basis).all()):
+            raise MapFileError("map's embedding is not finite")
+        return WhitenedEmbedder(self, mean, basis)
 
     @cached_property
     def pooling(self) -> NDArray[np.float32]:
@@ -82,7 +142,7 @@ class CellSheet:
     def valid_share(self, tiles_px: NDArray[np.intp]) -> NDArray[np.float64]:
         """Of tiles whose first pixel (row, col) is in (N, 2)."""
         out = np.empty(len(tiles_px))
-        for part in _chunks(len(tiles_px)):
+        for part in chunks(len(tiles_px)):
             cells = self.micro_cells(self.valid[..., None], tiles_px[part])
             out[part] = cells[..., 0].mean(axis=(1, 2))
         return out
@@ -205,7 +265,7 @@ class WhitenedEmbedder:
             features, weights = pooled_features(self.recipe, sheet, tiles_px[part])
             out[part] = self.features(features, weights)
 
-        for _ in in_order(fill, _chunks(len(tiles_px)), workers):
+        for _ in in_order(fill, chunks(len(tiles_px)), workers):
             pass
         return out
 
@@ -247,7 +307,7 @@ class WhitenedEmbedder:
         out = np.empty((len(cells), self.dims), dtype=np.float32)
         along = self.recipe.pooling.sum(axis=1)
         shares = (valid / np.outer(along, along)).reshape(len(cells), -1)
-        for part in _chunks(len(cells)):
+        for part in chunks(len(cells)):
             features = _normalized(self.recipe, cells[part])
             centred = features.reshape(len(features), -1) - self._mean
             out[part] = centred @ self._basis
@@ -308,69 +368,7 @@ def _dots(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np
     return np.asarray(np.einsum("qd,qd->q", first, second)[:, None])
 
 
-def learn(
-    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp], workers: int = 1
-) -> WhitenedEmbedder:
-    """From at most `MAX_LEARNT_TILES` tiles, by any number of threads; fewer than `dims` components
-    where the tiles do not span more."""
-    taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
-
-    def over_batches(work: Work[Made]) -> Iterator[Made]:
-        def worked(part: slice) -> Made:
-            return work(*pooled_features(recipe, sheet, taken[part]))
-
-        return in_order(worked, _chunks(len(taken)), workers)
-
-    return learn_in_two_passes(recipe, over_batches)
-
-
-class OverBatches(Protocol):
-    """Runs a function on features and weights (N, F) of every batch, in order."""
-
-    def __call__(self, work: "Work[Made]") -> Iterator[Made]:
-        pass
-
-
-def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> WhitenedEmbedder:
-    """One pass for the mean, one for scatter."""
-
-    def sums(features: Features, weights: Features) -> tuple[Any, Any]:
-        total = np.einsum("nf,nf->f", features, weights, dtype=np.float64)
-        return total, weights.sum(axis=0, dtype=np.float64)
-
-    total: Any = 0.0
-    weight: Any = 1e-9
-    for some, their_weight in over_batches(sums):
-        total, weight = total + some, weight + their_weight
-    mean = (total / weight).astype(np.float16)
-
-    def products(features: Features, weights: Features) -> tuple[Any, int]:
-        centred = (features - mean.astype(np.float32)) * weights
-        return (centred.T @ centred).astype(np.float64), len(features)
-
-    scatter: Any = 0.0
-    count = 0
-    for product, size in over_batches(products):
-        scatter, count = scatter + product, count + size
-    return _whitening(recipe, mean, scatter, count)
-
-
-def _whitening(
-    recipe: WhitenedRecipe, mean: NDArray[np.float16], scatter: NDArray[np.float64], count: int
-) -> WhitenedEmbedder:
-    """Of `count` features with mean (F,) and scatter matrix (F, F)."""
-    variances, vectors = np.linalg.eigh(scatter / count)
-    variances, vectors = variances[::-1], vectors[:, ::-1]
-    kept = int(np.count_nonzero(variances[: recipe.dims] > 1e-6 * max(variances[0], 1e-12)))
-    kept = max(1, min(kept, count))
-    scale = 1 / np.sqrt(np.maximum(variances[:kept], 1e-12))
-    basis = vectors[:, :kept] * (scale / scale.max())
-    # The sign of an eigenvector is arbitrary: the largest entry is made positive.
-    largest = np.abs(basis).argmax(axis=0)
-    basis *= np.sign(basis[largest, np.arange(kept)])
-    return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
-
-
-def _chunks(count: int) -> list[slice]:
+def chunks(count: int) -> list[slice]:
+    """Of so many tiles."""
     # 512 are 0.9 MB of features, which stays in the cache.
     return [slice(start, min(count, start + 512)) for start in range(0, count, 512)]

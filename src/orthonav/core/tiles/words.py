@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import VariantError
+from orthonav.core.errors import MapFileError, VariantError
+from orthonav.core.variants import Part
 
 DIMS = {"sift": 128, "superpoint": 256}  # numbers per descriptor
 
@@ -59,6 +60,16 @@ class WordsRecipe:
             raise VariantError(f"similarity must be product or cosine, got '{self.similarity}'")
         if self.tfidf not in (0, 1):
             raise VariantError(f"tfidf must be 0 or 1, got {self.tfidf}")
+
+    def embedder(self, part: Part, _: int) -> "WordsEmbedder":
+        """From a map."""
+        if self.features != "sift":
+            # Its recipe names a file of weights; a map must not choose which files are read.
+            raise MapFileError(f"words of {self.features} do not fly")
+        try:
+            return WordsEmbedder(self, part("vocabulary", np.uint8, 2), part("idf", np.float32, 1))
+        except VariantError as error:
+            raise MapFileError(f"map's words do not fit: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)

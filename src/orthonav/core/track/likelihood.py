@@ -31,15 +31,16 @@ class Measurement:
     """A sighting as a measurement of `model.SEEN`: `mean` (6,).
 
     `noise` (6, 6): tempered. `log_odds`: over the density of what only looks alike. `independent`
-    (6, 6): not in common with views of the same ground. `seen` (6, 16): what it measures. `alone`:
-    probability by the view alone. `log_chance`: log density of chance in the area searched."""
+    (6, 6): not in common with views of the same ground. `seen` (6, 16): what it measures.
+    `single_view_probability`: of the place, by the view without the track. `log_chance`: log
+    density of chance in the area searched."""
 
     mean: Array
     noise: Array
     log_odds: float
     independent: Array
     seen: Array
-    alone: float
+    single_view_probability: float
     log_chance: float
 
 
@@ -123,7 +124,7 @@ def tempered(
         odds,
         LEAST_NEW * noise + independent,
         seen,
-        sighting.alone,
+        sighting.single_view_probability,
         -math.log(searched_m2) - poses,
     )
 
@@ -141,5 +142,5 @@ def recognition(
     spreads = covariances[:, :4, :4] + common @ common.T + seen.independent[:4, :4]
     ratios = log_densities(innovations[:, :4], spreads) - seen.log_chance
     agreement = np.exp(np.clip(ratios, 0.0, math.log(most_agreement)))
-    odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement
+    odds = seen.single_view_probability / max(1 - seen.single_view_probability, 1e-9) * agreement
     return np.asarray(odds / (1 + odds))

@@ -427,7 +427,9 @@ class Mixture:
                 share=each.share * math.exp(min(log_weights[number], 60.0)) * found,
                 mean=means[number].copy(),  # a history of views must not keep them all
                 covariance=covariances[number].copy(),
-                shown=each.shown.seen(shown[number], seen.alone, new, competed=confirms),
+                shown=each.shown.seen(
+                    shown[number], seen.single_view_probability, new, competed=confirms
+                ),
                 number=self._numbers,
             )
 
@@ -459,7 +461,9 @@ class Mixture:
             mean, covariance = updated(mean, covariance, seen)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
-            shown = Shown().seen(seen.alone, seen.alone, 1.0, competed=confirms)
+            shown = Shown().seen(
+                seen.single_view_probability, seen.single_view_probability, 1.0, competed=confirms
+            )
             yield Hypothesis(share, mean, covariance, shown, self._numbers)
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:

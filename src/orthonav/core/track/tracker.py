@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
-from orthonav.core.integrity import probability_within
 from orthonav.core.localize.localizer import Localizer
 from orthonav.core.localize.odometry import (
     CameraDisplacement,
@@ -30,8 +29,17 @@ from orthonav.core.localize.search import Found, found_by
 from orthonav.core.localize.sighting import Sighting, sightings
 from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, Fix, NoFix, Prior, Telemetry, View
-from orthonav.core.register.pose import rotation
+from orthonav.core.records import (
+    PRIOR_SIGMAS,
+    RADIUS_SHARE,
+    Fix,
+    NoFix,
+    Prior,
+    Telemetry,
+    View,
+    probability_within,
+)
+from orthonav.core.register.window import rotation
 from orthonav.core.track import (
     Estimate,
     Mixture,
@@ -285,11 +293,11 @@ class Tracker:
             more = {
                 "hypotheses": float(len(self.mixture.hypotheses)),
                 "elsewhere": self.mixture.elsewhere,
-                "recognized": estimate.shown.now,
             }
             mean, covariance = estimate.mean, estimate.covariance
             place = estimate.place_probability
-            outcome = self._fix(mean, covariance, place, telemetry, more)
+            fix = self._fix(mean, covariance, place, telemetry, more)
+            outcome = replace(fix, recognized=estimate.shown.now)
             if not self._heading_known:
                 outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
         if self._history is not None:  # once, also where an error makes `passed` begin again
@@ -427,7 +435,7 @@ class Tracker:
             return None
         white = WHITE_SHARE * math.sqrt(telemetry_noise[2])
         made = displacement(before, now, white, telemetry_noise, expected_en_m)
-        if made is None or self._registration.ground.is_level:
+        if made is None or self._registration.ground.is_flat:
             return made
         heights_m = before.view.telemetry.agl_m, now.view.telemetry.agl_m
         ahead_en_m = (before.ahead_en_m + now.ahead_en_m) / 2
@@ -485,7 +493,7 @@ class Tracker:
         """The correction includes the error of the ground assumed before."""
         relief = self._registration.ground
         height_m = float(relief.terrain.at_en_m(place_en_m))
-        if relief.is_level or not math.isfinite(height_m):
+        if relief.is_flat or not math.isfinite(height_m):
             return replace(telemetry, below=None)
         return replace(telemetry, below=Ground(height_m, 0.0, 1.0))
 
@@ -553,9 +561,6 @@ class Tracker:
             "pitch_bias_deg": float(pitch),
             "roll_bias_deg": float(roll),
             **_bias_stds(covariance),
-            "vel_east_mps": float(mean[2]),
-            "vel_north_mps": float(mean[3]),
-            "vel_std_mps": math.sqrt(float(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1])),
             **more,
         }
         return Fix(
@@ -570,6 +575,8 @@ class Tracker:
             evidence=evidence,
             pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
             roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
+            vel_en_mps=(float(mean[2]), float(mean[3])),
+            vel_std_mps=math.sqrt(float(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1])),
         )
 
 

@@ -24,7 +24,7 @@ import rasterio
 from orthonav import __version__
 from orthonav.core.errors import AreaError, AtlasError, WorkerError
 from orthonav.core.files import Progress, no_progress, with_paths
-from orthonav.core.tiles.cells import CellLayout
+from orthonav.core.tiles.whitened import CellLayout
 from orthonav.ground.atlas.catalog import CATALOG, Atlas, AtlasRecipe, CoarseRecipe, Sheet
 from orthonav.ground.atlas.cluster import TaskRunner
 from orthonav.ground.atlas.coarse import coarse_grid, write_coarse

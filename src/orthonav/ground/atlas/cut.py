@@ -35,7 +35,7 @@ from orthonav.core.mapfile.manifest import Lean, Manifest, SheetInfo, TerrainInf
 from orthonav.core.mapfile.reader import open_map, write_map
 from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, TerrainLayer
 from orthonav.core.tiles import embed, represent
-from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe
 from orthonav.core.variants import variant_from_recipe
 from orthonav.ground.atlas.catalog import Atlas, Sheet
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
@@ -47,6 +47,7 @@ from orthonav.ground.build.sheet import (
     grid_of,
     tiles_of,
 )
+from orthonav.ground.build.whitening import learn
 from orthonav.ground.imagery.mosaic import Pixels
 from orthonav.ground.planning.area import Area, Extent, outline
 from orthonav.ground.planning.route import along_polyline_en_m

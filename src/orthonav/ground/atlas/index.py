@@ -20,7 +20,7 @@ from safetensors.numpy import load_file, save
 
 from orthonav.core.errors import AtlasError
 from orthonav.core.files import Progress, no_progress
-from orthonav.core.tiles.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
+from orthonav.core.tiles.whitened import Made, WhitenedEmbedder
 from orthonav.ground.atlas.catalog import Atlas, Sheet, StoredFile, canonical, parsed, reason
 from orthonav.ground.atlas.coarse import MAX_TILES, POOLING, read_coarse, tile_count
 from orthonav.ground.atlas.store import digest_of
@@ -34,6 +34,7 @@ from orthonav.ground.atlas.vectors import (
     train,
     write_shard,
 )
+from orthonav.ground.build.whitening import Work, learn_in_two_passes
 
 FOLDER = "index"
 MANIFEST = f"{FOLDER}/index.json"

@@ -19,13 +19,20 @@ from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
-from orthonav.core.localize.policy import DEFAULT_PLAN
-from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_footprint
-from orthonav.core.localize.view import LIMITS, check_footprint, check_view, pose_prior
+from orthonav.core.localize.search import DEFAULT_PLAN
+from orthonav.core.localize.view import (
+    LIMITS,
+    RectifiedView,
+    check_footprint,
+    check_view,
+    downsampled,
+    pose_prior,
+    rectify_footprint,
+)
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.core.tiles import represent
-from orthonav.core.tiles.bank import embed_poses
+from orthonav.core.tiles.bank import embed_directions
 from orthonav.core.track import Model, State
 from orthonav.core.track.tracker import Tracker
 from orthonav.core.variants import make_variant
@@ -104,7 +111,7 @@ class SheetSearch:
         prior = pose_prior(view.telemetry, heading_known, view.camera.focal_std)
         directions = self._policy.directions(prior, self._policy.coarse_steps)
         poses = [pose for pose, nats in directions if nats <= self._policy.likely_nats]
-        embedded = embed_poses(
+        embedded = embed_directions(
             *(self._embedder, self._representation, coarse.grey, coarse.valid, poses),
             self.recipe.tile_px,
         )
@@ -204,7 +211,7 @@ class SheetTrack:
             return
         seen = self._tracker.locate(view)
         self._take(seen, view.telemetry)
-        is_seen = isinstance(seen, Fix) and seen.evidence["recognized"] >= MIN_CONFIDENCE
+        is_seen = isinstance(seen, Fix) and seen.recognized >= MIN_CONFIDENCE
         self.unseen = 0 if is_seen else self.unseen + 1
         self.has_ended = was_lost and self.state is State.LOST
 
@@ -219,11 +226,11 @@ class SheetTrack:
             return False
         fix, before_ns = self._last
         seconds = max((time_ns - before_ns) / 1e9, 0.0)
-        velocity = np.array([fix.evidence["vel_east_mps"], fix.evidence["vel_north_mps"]])
+        velocity = np.array(fix.vel_en_mps)
         # It may change by half and by 10 m/s. One less certain than that is unknown.
         fastest_mps = 120.0  # beyond the aircraft that this program is for
         speed_mps = min(float(np.hypot(*velocity)) / 2 + 10.0, fastest_mps)
-        if fix.evidence["vel_std_mps"] > 10.0:
+        if fix.vel_std_mps > 10.0:
             velocity, speed_mps = np.zeros(2), fastest_mps
         self.has_ended = SIGMAS * fix.std_m + speed_mps * seconds > MAX_REACH_M
         if not self.has_ended:
@@ -239,7 +246,7 @@ class SheetTrack:
         if isinstance(seen, NoFix):
             return
         self._last = seen, telemetry.time_ns
-        fix = _limited(seen, seen.evidence["recognized"])
+        fix = _limited(seen, seen.recognized)
         if self.state is State.TRACKING and fix.confidence >= MIN_CONFIDENCE:
             self.fix = fix
 

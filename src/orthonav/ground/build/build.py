@@ -21,14 +21,14 @@ from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import DEFAULT_TILE_CONFIDENCE
 from orthonav.core.localize.localizer import RegistrationLocalizer
-from orthonav.core.localize.policy import SearchPlan
+from orthonav.core.localize.search import SearchPlan
 from orthonav.core.localize.tiles import TileMatcher, TileProposer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 from orthonav.core.mapfile.reader import MapFile, write_map
 from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.core.tiles.network import TripletRecipe
-from orthonav.core.tiles.whitened import WhitenedRecipe, learn
+from orthonav.core.tiles.whitened import WhitenedRecipe
 from orthonav.core.variants import make_variant, variant_recipe
 from orthonav.ground.build.calibrate import (
     CALIBRATION,
@@ -49,6 +49,7 @@ from orthonav.ground.build.encoders import (
 )
 from orthonav.ground.build.layer import HeightLayers, height_layers
 from orthonav.ground.build.sheet import SheetPictures, SheetReader, grid_of, read_pictures, tiles_of
+from orthonav.ground.build.whitening import learn
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area

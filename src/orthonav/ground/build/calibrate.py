@@ -8,7 +8,7 @@ usual confidence is drawn to them.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,13 +27,14 @@ from orthonav.core.localize.confidence import (
     Chances,
     LogisticConfidence,
     RegisteredConfidence,
+    Scores,
     features_of,
     logit,
 )
 from orthonav.core.localize.localizer import RegistrationLocalizer
 from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
-from orthonav.core.register.pose import rotation
+from orthonav.core.register.window import rotation
 from orthonav.core.tiles.embed import ViewEmbedder
 
 
@@ -310,7 +311,7 @@ class RegistrationCalibration:
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
-    evidence: Mapping[str, float]
+    scores: Scores
     error_px: NDArray[np.float64]
     mirrored: bool
 
@@ -404,7 +405,7 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
 def _registration_calibration(
     outcomes: Sequence[_Outcome], radius_px: float
 ) -> RegistrationCalibration:
-    negatives = [each.evidence for each in outcomes if each.mirrored]
+    negatives = [each.scores for each in outcomes if each.mirrored]
     enough = len(negatives) >= CALIBRATION.min_negatives
     chances = _chances(negatives) if enough else DEFAULT_CHANCES
     confidence, floor_px = RegisteredConfidence.usual(chances), CALIBRATION.floor_px
@@ -418,41 +419,41 @@ def _registration_calibration(
         floor_px = min(max(spread, low_px), high_px)
         # Without a mirrored view nothing would show what a wrong place looks like.
         if negatives:
-            confidence = fit_registered([each.evidence for each in outcomes], right, chances)
+            confidence = fit_registered([each.scores for each in outcomes], right, chances)
     return RegistrationCalibration(confidence, floor_px)
 
 
-def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
+def _chances(negatives: Sequence[Scores]) -> Chances:
     """A view judged and finished at one level has the strength of one score, not of two."""
-    look = _median(negatives, "look")
-    both = [each for each in negatives if math.isfinite(each["detail_ratio"])]
+    look = _median(negatives, "mid_score")
+    both = [each for each in negatives if math.isfinite(each.detail_ratio)]
     total = look + DEFAULT_CHANCES.total - DEFAULT_CHANCES.look
     if len(both) >= CALIBRATION.min_negatives:
         total = _median(both, "strength")
     return Chances(total, look, _fine_chance(negatives, total))
 
 
-def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float:
+def _fine_chance(scores: Sequence[Scores], total: float) -> float:
     """Score of a chance match with one more level, shrunk towards the usual value."""
-    known = sum(math.isfinite(each["fine"]) for each in evidence)
+    known = sum(math.isfinite(each.fine) for each in scores)
     usual = CALIBRATION.usual_fine * total
     if not known:
         return usual
     share = known / (known + CALIBRATION.usual_fine_views)
-    return math.exp(share * math.log(_median(evidence, "fine")) + (1 - share) * math.log(usual))
+    return math.exp(share * math.log(_median(scores, "fine")) + (1 - share) * math.log(usual))
 
 
-def _median(evidence: Sequence[Mapping[str, float]], name: str) -> float:
-    values = [each[name] for each in evidence if math.isfinite(each[name])]
+def _median(scores: Sequence[Scores], name: str) -> float:
+    values = [value for each in scores if math.isfinite(value := getattr(each, name))]
     return max(float(np.median(values)), 1.0) if values else 40.0
 
 
 def fit_registered(
-    evidence: Sequence[Mapping[str, float]], right: NDArray[np.bool_], chances: Chances
+    scores: Sequence[Scores], right: NDArray[np.bool_], chances: Chances
 ) -> RegisteredConfidence:
     """The usual confidence with its first bias fitted to views (N) and drawn to the usual one."""
     usual = RegisteredConfidence.usual(chances)
-    features = [features_of(each, chances) for each in evidence]
+    features = [features_of(each, chances) for each in scores]
 
     def shifted(shift: float) -> RegisteredConfidence:
         return replace(usual, biases=(usual.biases[0] + shift, usual.biases[1]))

@@ -24,10 +24,9 @@ from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile.layer import MAX_PREVIEW_PX
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.tiles import represent
-from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
 from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.core.tiles.represent import Gray
-from orthonav.core.tiles.whitened import CellSheet
+from orthonav.core.tiles.whitened import MICRO, CellLayout, CellSheet, cell_means
 from orthonav.core.variants import variant_recipe
 from orthonav.ground.build.calibrate import Crop, CropSampler
 from orthonav.ground.build.layer import (

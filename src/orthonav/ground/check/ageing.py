@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.register.channels import FINE, channels_of
+from orthonav.core.register.template import FINE, channels_of
 
 Array = NDArray[np.float32]
 PATCH_PX = 24

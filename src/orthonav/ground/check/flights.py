@@ -4,14 +4,14 @@ The ground of a flight is easier or harder than predicted as a whole: one shift 
 of it. One draw for every half side of a view decides whether views there are localized;
 neighbouring draws are correlated (a Gauss-Markov process behind a threshold), because their views
 show much of the same ground. Between fixes the error grows with the distance, and no position is
-available. The protection level is that of a right place (core/integrity.py), as the views of a
+available. The protection level is that of a right place (core/records.py), as the views of a
 track confirm each other; wrong places count as false fixes.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.integrity import protection_level_m
+from orthonav.core.records import protection_level_m
 from orthonav.ground.check.estimate import INTERVAL, expit, logit
 from orthonav.ground.check.records import Along, Conditions, Flights, Range
 

@@ -27,9 +27,8 @@ from orthonav.core.mapfile.layer import level_shape
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import NoFix, Prior, Telemetry, View
-from orthonav.core.register.pose import rotation
 from orthonav.core.register.template import Levels
-from orthonav.core.register.window import GreyPyramid
+from orthonav.core.register.window import GreyPyramid, rotation
 from orthonav.ground.check.ageing import MARGIN_PX, another_year, displaced, reported_persistence
 from orthonav.ground.check.records import CheckRequest, Conditions
 from orthonav.ground.imagery.mosaic import Mosaic, SheetRaster

@@ -14,7 +14,7 @@ from typing import TypeGuard
 
 import numpy as np
 
-from orthonav.core import integrity
+from orthonav.core import records
 from orthonav.core.errors import FlightError
 from orthonav.core.files import StrPath
 from orthonav.core.flight import read_truth
@@ -356,7 +356,7 @@ def protection_levels_m(results: Sequence[ViewResult], risk: float | None = None
     covs = np.array([_covariance(each) for each in outcomes]).reshape(-1, 2, 2)
     for each in np.unique(risks):
         chosen = is_fix & (risks == each)
-        levels_m[chosen] = integrity.protection_levels_m(place[chosen], covs[chosen], float(each))
+        levels_m[chosen] = records.protection_levels_m(place[chosen], covs[chosen], float(each))
     return frozen(levels_m)
 
 

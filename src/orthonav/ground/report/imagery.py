@@ -18,9 +18,8 @@ from orthonav.core.geo.camera import (
     axis_on_ground_en_m,
     footprint_en_m,
 )
-from orthonav.core.localize.ground import LevelTerrain
-from orthonav.core.localize.rectify import MAX_REACH, downsampled, rectify
-from orthonav.core.localize.view import check_telemetry
+from orthonav.core.localize.ground import FlatTerrain
+from orthonav.core.localize.view import MAX_REACH, check_telemetry, downsampled, rectify
 from orthonav.core.mapfile.layer import GreyLayer, preview
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
@@ -145,7 +144,7 @@ class SheetImagery:
         self.sheet = opened.manifest.sheets[0]
         self.frame, self.grid = self.sheet.frame, self.sheet.grid
         self._layer = GreyLayer.of(opened)
-        self.terrain = TerrainLayer.of(opened) or LevelTerrain()
+        self.terrain = TerrainLayer.of(opened) or FlatTerrain()
         self.surface = TerrainLayer.of(opened, layer=SURFACE)
         self.preview = b""
         drawn = "preview_jpeg" if self._layer is None else "grey/bytes"

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.camera import Camera, camera_rays, enu_from_camera
-from orthonav.core.localize.rectify import Orientation
+from orthonav.core.localize.view import Orientation
 from orthonav.core.records import Telemetry
 from orthonav.ground.report.imagery import Grey, Mask, SheetImagery
 from orthonav.ground.simulate.render import Raster, halved_for, met

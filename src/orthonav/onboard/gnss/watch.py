@@ -205,7 +205,7 @@ class GnssWatch:
 
 def _velocity(fix: Fix) -> Array | None:
     """Velocity (2,) of the track, east and north; None where it is not known."""
-    made = np.array([fix.evidence.get(f"vel_{n}_mps", math.nan) for n in ("east", "north")])
+    made = np.array(fix.vel_en_mps or (math.nan, math.nan))
     return made if np.isfinite(made).all() else None
 
 

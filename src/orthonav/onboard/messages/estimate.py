@@ -133,15 +133,13 @@ def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
 
 
 def _velocity(fix: Fix) -> tuple[float, float] | None:
-    east = fix.evidence.get("vel_east_mps", math.nan)
-    north = fix.evidence.get("vel_north_mps", math.nan)
-    return (east, north) if math.isfinite(east) and math.isfinite(north) else None
+    known = fix.vel_en_mps is not None and np.isfinite(fix.vel_en_mps).all()
+    return fix.vel_en_mps if known else None
 
 
 def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
     """Covariance from a track, which reports the standard deviation along the worst direction."""
-    std_mps = fix.evidence.get("vel_std_mps", math.nan)
-    return np.eye(2) * std_mps**2 if math.isfinite(std_mps) else None
+    return np.eye(2) * fix.vel_std_mps**2 if math.isfinite(fix.vel_std_mps) else None
 
 
 def messages_averaged(interval_s: float, averaging_s: float = 3.0) -> float:
