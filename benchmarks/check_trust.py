@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from benchmarks.placing import views_in
 from benchmarks.record import Section, Table, resumed, rows_path, run, say
 from benchmarks.scenes import (
     WIDE,
@@ -32,6 +31,7 @@ from benchmarks.scenes import (
     map_of,
     ortho,
     place_of,
+    views_in,
 )
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map

@@ -21,7 +21,6 @@ import rasterio
 from lab.landscape import OTHER_LIGHT
 from numpy.typing import NDArray
 
-from benchmarks.placing import views_in
 from benchmarks.record import Section, Table, number, resumed, rows_path, run, say
 from benchmarks.scenes import (
     DATA,
@@ -35,6 +34,7 @@ from benchmarks.scenes import (
     gsd_of,
     map_of,
     ortho,
+    views_in,
 )
 from orthonav.core.files import replacing
 from orthonav.core.flight import open_flight, read_truth

@@ -19,9 +19,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.placing import memory_mb
 from benchmarks.posed import Picture
-from benchmarks.record import Table, number, provenance
+from benchmarks.record import Table, memory_mb, number, provenance
 from benchmarks.scenes import far_m, store
 from numpy.typing import NDArray
 

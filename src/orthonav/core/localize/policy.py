@@ -14,8 +14,8 @@ acceptable. With an unknown heading both try the likely scales first. At the mid
 scales come in stages, the most likely first. Where all is known so well that the *final level*, one
 below, is cheap too, it comes last: weak texture, as of bare ground, is only seen there.
 
-Reasons are in docs/decisions/registration.md; values without one there were chosen on the scenes of
-`python -m benchmarks.real_imagery`. `search` executes them."""
+Reasons are in docs/decisions/registration.md; values without one there were chosen on NAIP, Szada
+and recorded flights. `search` executes them."""
 
 import math
 import time
