@@ -1,10 +1,10 @@
 """This checkout against another one: accuracy, confidence, time and memory of the same views.
 
 `python -m benchmarks.against OTHER [--views N] [--rounds N] [--part growth] [--only TEXT ..]`.
-OTHER is a checkout of any commit that has `orthonav localize`. Both localize the same flights on the
-same maps, which OTHER builds, each in a process of its own, in turn; compared are the fixes that
-they write. Imagery beside the checkout that is absent is left out. `--part growth`: rows with other
-errors and sizes of views; with this checkout as OTHER, how time and memory grow with them.
+OTHER is a checkout of any commit that has `orthonav localize`. Both localize the same flights on
+the same maps, which OTHER builds, each in a process of its own, in turn; compared are the fixes
+that they write. Imagery that is absent is left out. `--part growth`: rows with other errors and
+sizes of views; with this checkout as OTHER, how time and memory grow with them.
 """
 
 import argparse

@@ -27,7 +27,7 @@ from benchmarks.closed_loop.inertial import FILTERS
 from benchmarks.closed_loop.loop import Course, Located, Scenario, fly, scenario
 from benchmarks.closed_loop.physics import VEHICLES
 from benchmarks.closed_loop.replays import Area, stated
-from benchmarks.integrity import LIMIT_M, diagram
+from benchmarks.integrity import LIMIT_M
 from benchmarks.real_ground.maps import COARSE, COARSE_STD_M, relief_file
 from benchmarks.record import Section, Table, number, percent, resumed, rows_path, run, say
 from benchmarks.scenes import (
@@ -337,9 +337,6 @@ def measure(options: argparse.Namespace) -> Section:
             f"core per flight hour, {left_h:.1f} h left"
         )
     calm = [each for each in flights if each.row["scenario"] in UNDISTURBED]
-    leveled = [(each.error_m[each.leveled], each.level_m[each.leveled]) for each in calm]
-    errors, levels = (np.concatenate(each) for each in zip(*leveled, strict=True))
-    diagram(errors, levels, options.out / "flight_hours.png")
     notes = (
         f"without GNSS, a view every {options.every:g} s; false: sent, error beyond the alert limit"
         f" of {LIMIT_M:g} m or {RADIUS_SHARE:.1%} of the height; event: views in a row",

@@ -2,11 +2,10 @@
 
 import json
 from dataclasses import asdict, replace
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from benchmarks.real_ground import gate, over_time, pairs
+from benchmarks.real_ground import gate, pairs
 from benchmarks.real_ground.maps import COARSE_STD_M, coarse_of, fractal_relief
 from benchmarks.real_ground.score import Placed, Row, Seen, compared
 from benchmarks.real_ground.views import level_telemetry
@@ -123,16 +122,6 @@ def test_a_row_without_its_counterpart_is_no_pair():
 def test_the_table_of_tracks_has_both_errors():
     made = pairs.table(pairs.paired(rows(SINGLE, farther(TRACK, 2.0))))
     assert made.rows == [["valley", "20", "1.95", "3.90", "2.80", "5.61"]]
-
-
-def test_errors_over_time_are_drawn_by_kind_of_fix(tmp_path):
-    track = [*TRACK[:-2], fix(18.0, 8.0, "coasting", False), fix(19.0, 9.0, "lost", False)]
-    found = pairs.paired(rows(SINGLE, track))
-    over_time.write(found, tmp_path)
-    assert (tmp_path / "over_time" / "valley.png").stat().st_size > 0
-    svg = ElementTree.fromstring(over_time.drawing("valley", found["valley"]).svg)
-    texts = {"".join(each.itertext()) for each in svg.iter("{http://www.w3.org/2000/svg}text")}
-    assert {"time since the first view (s)", "error (m)", *over_time.MARKS} <= texts
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.02, 0.1])
