@@ -152,7 +152,7 @@ def row_of(task: Task) -> dict[str, Any]:
 
 
 def _plain(view: Located, from_s: float) -> list[float]:
-    values = float(np.hypot(*view.error_m)), view.level_m, view.nees
+    values = view.error_m, view.level_m, view.nees
     flags = int(view.sent), int(view.state == "tracking")
     return [round(view.time_s - from_s, 2), *flags, *(float(f"{each:.5g}") for each in values)]
 

@@ -9,9 +9,8 @@ exposure) and `events.csv`.
 import argparse
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import groupby, pairwise
 from pathlib import Path
 
 import cv2
@@ -24,7 +23,6 @@ from benchmarks.looped_flight import read_rows
 from benchmarks.record import Section, Table, number, quantiles, say
 from benchmarks.scenes import DATA, PAST, PRESENT, map_of
 from orthonav.cli.demo import IMAGERY
-from orthonav.core.flight.recording import LONG_GAP_NS
 from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
@@ -33,7 +31,6 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import (
     CONFIDENT,
     Fix,
-    NoFix,
     Prior,
     Telemetry,
     View,
@@ -42,8 +39,6 @@ from orthonav.core.records import (
 )
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.simulate.render import ViewEffects
-from orthonav.onboard.cameras import GAP_S
-from orthonav.onboard.latency import MISMATCH, UNKNOWN, LatencyMonitor
 from orthonav.onboard.messages.estimate import estimate_from_result
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
@@ -114,10 +109,6 @@ LEAST_AGL_M = 100.0
 SHIFT_EN_M = (300.0, 0.0)
 """Where the camera looks while it shows a place 300 m east."""
 PRIOR_STD_M = 100.0
-LATENCY_S = 0.06
-"""From exposure to arrival, as stated to the latency monitor."""
-NO_IMAGES_S = 60.0, 62.0
-"""When no image arrives at the latency monitor, after GNSS was lost."""
 ON, OFF, SHIFTED, MIRRORED, AFTER = "GNSS on", "GNSS off", "300 m east", "mirrored", "after"
 PHASES = {
     "GNSS OFF": OFF,
@@ -174,11 +165,6 @@ class Recorded:
         rows = read_rows(self.folder / "events.csv")
         return [(float(row["time_s"]), row["event"]) for row in rows]
 
-    @cached_property
-    def alone_s(self) -> float:
-        """When GNSS was lost."""
-        return min((each.time_s for each in self.exposures if each.phase != ON), default=math.inf)
-
     def _phase(self, time_s: float) -> str:
         """What was happening at a time. Before the first disturbance it is `ON` or `OFF`."""
         phase = ON
@@ -201,10 +187,9 @@ class Recorded:
         times_s, velocities = self.truth
         return np.array([np.interp(time_s, times_s, axis) for axis in velocities.T])
 
-    def stated(self, buffer: TelemetryBuffer | None = None) -> Iterator[tuple[Exposure, Telemetry]]:
-        """The exposures, with what the autopilot stated for them, as `orthonav fly` reads it into
-        the buffer."""
-        buffer = buffer or TelemetryBuffer()
+    def stated(self) -> Iterator[tuple[Exposure, Telemetry]]:
+        """The exposures, with what the autopilot stated for them, as `orthonav fly` reads it."""
+        buffer = TelemetryBuffer()
         rows = read_rows(self.folder / "autopilot.csv")
         values = [{name: float(text) for name, text in row.items()} for row in rows]
         times_s = np.array([value["time_s"] - LATE_S for value in values])
@@ -223,11 +208,10 @@ class Recorded:
         area: Area,
         cache: Path,
         rule: Callable[[Telemetry, bool], Telemetry],
-        buffer: TelemetryBuffer | None = None,
     ) -> Iterator[tuple[Exposure, View]]:
         """Exposures and their views. `rule`: sets the deviations of the telemetry, given whether
         GNSS is on."""
-        for exposure, telemetry in self.stated(buffer):
+        for exposure, telemetry in self.stated():
             yield exposure, self.view(area, cache, exposure, rule(telemetry, exposure.phase == ON))
 
     def view(self, area: Area, cache: Path, exposure: Exposure, telemetry: Telemetry) -> View:
@@ -261,8 +245,7 @@ def _shown(area: Area, exposure: Exposure, cache: Path) -> Grey:
 
 
 RECORDED = DATA / "closed_loop"
-METHODS = ("single", "track", "fly")
-"""`fly`: a track behind the latency monitor, which gets no image for 2 s."""
+METHODS = ("single", "track")
 HEADER = (
     *("flight", "method", "views", "tilt deg", "median m", "95 % m", "NEES", "confident"),
     *("tracking", "velocity m/s", "300 m east", "mirrored"),
@@ -290,7 +273,6 @@ class Row:
     sent: bool
     velocity_off_mps: float
     tilt_off_deg: tuple[float, float]
-    reason: str | None
 
     @property
     def error_m(self) -> float:
@@ -340,53 +322,6 @@ def flights(only: Sequence[str] = ()) -> list[Path]:
     return [path for path in found if not only or path.name in only]
 
 
-@dataclass(eq=False)
-class Monitored:
-    """A track behind the latency monitor, as in `orthonav fly`; `buffer` holds the telemetry."""
-
-    track: Tracker
-    buffer: TelemetryBuffer
-    monitor: LatencyMonitor = field(default_factory=lambda: LatencyMonitor(LATENCY_S))
-    interruptions: int = 0
-    arrived_ns: int | None = None
-    tracked_ns: int | None = None
-
-    @property
-    def state_name(self) -> str | None:
-        return self.track.state_name
-
-    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
-        return self.track.passed(telemetry, reason)
-
-    def locate(self, view: View) -> Fix | NoFix:
-        """Position of a view; a `NoFix` with the monitor's reason where it is withheld."""
-        before_ns = self.arrived_ns
-        self.arrived_ns = arrived_ns = view.telemetry.time_ns + round(LATENCY_S * 1e9)
-        self.interruptions += before_ns is not None and arrived_ns - before_ns > GAP_S * 1e9
-        self.monitor.arrived(arrived_ns, self.interruptions)
-        try:
-            return self._located(view)
-        finally:
-            known = self.buffer.at, self.buffer.covered_ns
-            self.monitor.observe(arrived_ns, view.grey, view.camera, *known)
-
-    def _located(self, view: View) -> Fix | NoFix:
-        if not self.monitor.may_locate:
-            return NoFix(self.monitor.reasons()[0], self.monitor.detail())
-        telemetry, before_ns = view.telemetry, self.tracked_ns
-        self.tracked_ns = time_ns = telemetry.time_ns
-        if before_ns is not None and time_ns - before_ns > LONG_GAP_NS:
-            mean = self.buffer.mean_velocity(before_ns, time_ns)
-            view = replace(view, telemetry=replace(telemetry, vel_en_mps=mean))
-        outcome = self.track.locate(view)
-        result = ViewResult("", time_ns, outcome, 0.0, self.state_name)
-        if result.is_recognized and isinstance(outcome, Fix):
-            place = outcome.lat_deg, outcome.lon_deg
-            self.monitor.located(time_ns, place, outcome.std_m, self.buffer.mean_velocity)
-        doubt = next(iter(self.monitor.reasons()), None)
-        return outcome if doubt is None else NoFix(doubt, "")
-
-
 def replay(
     flight: Path,
     work: Path,
@@ -401,16 +336,15 @@ def replay(
     `rule` sets the deviations of the telemetry. `views`: only the first so many without GNSS.
     Without `disturbed` the flight ends before the first disturbance of the camera.
     """
-    recorded, area, buffer = Recorded(flight), Area.demo(work), TelemetryBuffer()
+    recorded, area = Recorded(flight), Area.demo(work)
     locators: dict[str, Locator] = {
         "single": SingleViews(area.localizer),
         "track": Tracker(area.localizer),
-        "fly": Monitored(Tracker(area.localizer), buffer),
     }
     gates = {name: Gate() for name in methods}
     autopilot, _, _ = flight.name.partition("_")
     rows, alone = [], 0
-    for exposure, view in recorded.views(area, work / "views", partial(rule, autopilot), buffer):
+    for exposure, view in recorded.views(area, work / "views", partial(rule, autopilot)):
         alone += exposure.phase == OFF
         too_late = not disturbed and exposure.phase not in (ON, OFF)
         if too_late or (views is not None and alone > views):
@@ -420,9 +354,6 @@ def replay(
         for name in methods:
             if name == "single" and exposure.phase == ON:
                 continue  # a track begins with GNSS; single views are judged without it
-            since_s = exposure.time_s - recorded.alone_s
-            if name == "fly" and NO_IMAGES_S[0] <= since_s < NO_IMAGES_S[1]:
-                continue
             rows.append(_row(recorded, area, name, locators[name], gates[name], exposure, view))
     return rows
 
@@ -450,10 +381,9 @@ def _row(
         velocity_off = float(np.hypot(*(own - recorded.velocity_en_mps(exposure.time_s))))
     _, pitch_deg, roll_deg = exposure.attitude_deg
     tilt_off = view.telemetry.pitch_deg - pitch_deg, view.telemetry.roll_deg - roll_deg
-    reason = outcome.reason if isinstance(outcome, NoFix) else None
     return Row(
         recorded.folder.name, method, exposure, state, error, cov, confidence,
-        admitted is not None, velocity_off, tilt_off, reason,
+        admitted is not None, velocity_off, tilt_off,
     )  # fmt: skip
 
 
@@ -507,55 +437,6 @@ def table(rows: Sequence[Row]) -> Table:
     return Table("Replays", HEADER, cells, notes)
 
 
-WITHHELD = (UNKNOWN, MISMATCH)
-WITHHELD_HEADER = (
-    *("flight", "views", *WITHHELD, "longest s"),
-    *("start s", "no images s", "300 m east s", "mirrored s"),
-)
-
-
-def withheld(rows: Sequence[Row]) -> Table:
-    """What the latency monitor withheld of the views of the method `fly`."""
-    notes = (
-        f"views {LATENCY_S * 1e3:g} ms late, as stated. Good ones: those of the undisturbed camera "
-        "after the first that passed; those withheld for each reason, and the longest time without "
-        "one that passed. Then the time to the first one: after the start, after "
-        f"{NO_IMAGES_S[1] - NO_IMAGES_S[0]:g} s without images, and after each disturbance",
-    )
-    names = dict.fromkeys(row.flight for row in rows)
-    cells = [_withheld_cells([row for row in rows if row.flight == name]) for name in names]
-    return Table("Withheld by the latency monitor", WITHHELD_HEADER, cells, notes)
-
-
-def _withheld_cells(rows: Sequence[Row]) -> list[str]:
-    """A row of that table from all views of one flight."""
-    passed_s = [row.exposure.time_s for row in rows if row.reason not in WITHHELD]
-    good = [row for row in rows if row.exposure.phase in (ON, OFF)]
-    good = [row for row in good if row.exposure.time_s >= passed_s[0]]
-    begins_s = {ON: rows[0].exposure.time_s}
-    longest_s = 0.0
-    for before, row in pairwise(rows):
-        phase, time_s = before.exposure.phase, row.exposure.time_s
-        if phase in (SHIFTED, MIRRORED) and row.exposure.phase != phase:
-            begins_s[phase] = time_s
-        elif time_s - before.exposure.time_s > 1:
-            begins_s[OFF] = time_s
-    until_s = {
-        phase: next((each - begin_s for each in passed_s if each >= begin_s), math.inf)
-        for phase, begin_s in begins_s.items()
-    }
-    for is_withheld, stretch in groupby(good, lambda row: row.reason in WITHHELD):
-        times_s = [row.exposure.time_s for row in stretch]
-        longest_s = max(longest_s, (times_s[-1] - times_s[0]) * is_withheld)
-    return [
-        rows[0].flight,
-        str(len(good)),
-        *(str(sum(row.reason == reason for row in good)) for reason in WITHHELD),
-        number(longest_s),
-        *(number(until_s.get(phase, math.nan)) for phase in (ON, OFF, SHIFTED, MIRRORED)),
-    ]
-
-
 def measure(options: argparse.Namespace) -> Section:
     """All flights, or only those named."""
     rows: list[Row] = []
@@ -570,7 +451,4 @@ def measure(options: argparse.Namespace) -> Section:
         )
         say(table(found).markdown())
         rows += found
-    tables = [table(rows)] if rows else []
-    if flown := [row for row in rows if row.method == "fly"]:
-        tables.append(withheld(flown))
-    return Section("Replays of flights with autopilots", tables)
+    return Section("Replays of flights with autopilots", [table(rows)] if rows else [])
