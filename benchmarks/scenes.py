@@ -16,16 +16,13 @@ from itertools import permutations, zip_longest
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rasterio
 from lab.landscape import DEFAULT_DATES, OTHER_LIGHT, generate_area
 
 from orthonav.core.errors import OutputError
 from orthonav.core.flight import open_flight, read_truth
-from orthonav.core.localize import Localizer
 from orthonav.core.records import View
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -217,18 +214,6 @@ def map_of(
     if not out.is_file():
         how: dict[str, Any] = {"bounds_deg": bounds_deg, "overlap": overlap}
         build_map(BuildRequest([path], out, dem=dem, relief=relief, **how))
-    return out
-
-
-def store(ortho: Path, localizer: Localizer, out: Path) -> Path:
-    """Write an orthophoto in the raster of a map, for processes that have no GDAL."""
-    grid = localizer.grid
-    with Mosaic.open([ortho]).grid_sheet(localizer.sheet.frame, grid) as raster:
-        pixels = raster.read(0, 0, grid.width_px, grid.height_px)
-    mean = round(float(pixels.grey[pixels.valid].mean()))
-    grey = np.where(pixels.valid, pixels.grey, mean).astype(np.uint8)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(out, grey=grey, valid=pixels.valid)
     return out
 
 

@@ -23,13 +23,19 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.posed import BestOfPoses, Keypoints, MutualSurface, Picture, TemplateSurface
 from benchmarks.record import provenance
-from benchmarks.scenes import store
 from numpy.typing import NDArray
 
 from experiments.paper import scenes as views
 from experiments.paper.methods import DEFAULT, STUDIED, TILE_PX, Method, Setting
+from experiments.paper.posed import (
+    Highest,
+    Keypoints,
+    MutualSurface,
+    Picture,
+    TemplateSurface,
+    store,
+)
 from experiments.paper.published import most_views
 from experiments.paper.results import ACCURACY_M, BASELINES, compact
 from experiments.paper.scenes import Scene
@@ -361,7 +367,7 @@ class Baseline:
 
 
 def _reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
-    return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
+    return lambda picture: Highest(picture, surface(picture))
 
 
 def _matched(edges: bool) -> Callable[[Picture], Any]:
@@ -406,7 +412,7 @@ def _placed_by(baseline: Baseline, picture: Picture, scene: Scene, seen: Grounds
         grey = views.view_of(ground, agl_m, gsd_m)
         start = time.perf_counter()
         grey = sobel(grey) if baseline.sobel else grey
-        found = method.locate(View(grey, camera, telemetry), True)
+        found = method.locate(View(grey, camera, telemetry))
         times_ms.append(1e3 * (time.perf_counter() - start))
         return math.inf if found is None else float(np.hypot(*(found - ground.truth_en_m)))
 

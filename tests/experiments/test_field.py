@@ -7,12 +7,12 @@ from dataclasses import asdict, replace
 import cv2
 import numpy as np
 import pytest
-from benchmarks.posed import Picture
 from experiments.paper import field, matchers, runs, scenes
 from experiments.paper.__main__ import main
 from experiments.paper.field import Placed
 from experiments.paper.matchers import FeatureMap, Features, Sift
 from experiments.paper.methods import FIELD_SCENES, FULL, REDUCED, TABLE_1, Method, flown, methods
+from experiments.paper.posed import Picture
 from experiments.paper.results import Result, compact, name_of, read
 from experiments.paper.tables import tables
 
