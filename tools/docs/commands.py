@@ -10,14 +10,15 @@ from typing import Any
 
 from docutils import nodes
 from docutils.statemachine import StringList
-from option_names import command_parser, shown_actions
 from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
-from orthonav.cli import COMMANDS
+from orthonav.cli import COMMANDS, _parser
 
 log = logging.getLogger(__name__)
 USAGE_COLUMNS = 84
+EVERYWHERE = ("--help", "--help-all", "--verbose", "--quiet")
+"""Options of every command: described once, at the top of the page."""
 
 
 def setup(app: Any) -> dict[str, bool]:
@@ -48,6 +49,20 @@ class Command(SphinxDirective):
         where = f"orthonav {self.arguments[0]}"
         self.state.nested_parse(StringList(text.splitlines(), source=where), 0, holder)
         return holder.children
+
+
+def command_parser(name: str) -> argparse.ArgumentParser:
+    """The parser of one command, with all its arguments."""
+    actions = _parser([name, "--help-all"])._actions
+    (choices,) = (a.choices for a in actions if isinstance(a, argparse._SubParsersAction))
+    parser: argparse.ArgumentParser = choices[name]
+    return parser
+
+
+def shown_actions(actions: list[argparse.Action]) -> list[argparse.Action]:
+    """Arguments that are described with their command."""
+    shown = [each for each in actions if each.help != argparse.SUPPRESS]
+    return [each for each in shown if not set(each.option_strings) & set(EVERYWHERE)]
 
 
 def _markdown(name: str, text: str, parser: argparse.ArgumentParser) -> Iterator[str]:
