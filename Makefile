@@ -56,7 +56,7 @@ docs: $(VENV)/.docs-installed
 	@echo "open site/index.html"
 
 figures: $(VENV)/.docs-installed
-	$(BIN)/python tools/docs/pictures.py
+	PYTHONPATH=. $(BIN)/python tools/docs/pictures.py
 
 golden: $(VENV)/.dev-installed
 	PYTHONPATH=. $(BIN)/python tests/golden/renew.py

@@ -8,7 +8,6 @@ import hashlib
 import json
 import logging
 import math
-import os
 import re
 import resource
 import statistics
@@ -39,6 +38,7 @@ from experiments.paper.posed import (
 from experiments.paper.published import most_views
 from experiments.paper.results import ACCURACY_M, BASELINES, compact
 from experiments.paper.scenes import Scene
+from orthonav.core.cores import usable_cores
 from orthonav.core.files import write_text
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.rectify import downsampled
@@ -144,10 +144,6 @@ def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, float
             raise
 
 
-def cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
 def _prepare(jobs: int) -> None:
     """Give a process its part of the cores; training says epoch, loss and time left."""
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
@@ -158,7 +154,7 @@ def _prepare(jobs: int) -> None:
         import torch
     except ImportError:
         return
-    torch.set_num_threads(max(1, cores() // jobs))
+    torch.set_num_threads(max(1, usable_cores() // jobs))
 
 
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
