@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -113,19 +112,16 @@ class FakeAutopilot:
         """Sleep until a time of the flight."""
         time.sleep(max(0.0, (self.mono_ns(flight_s) - time.monotonic_ns()) / 1e9))
 
-    def stop(self) -> None:
+    def __enter__(self) -> "FakeAutopilot":
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """End it; what it heard stays."""
         self._process.terminate()
         self._process.wait(10)
         self._thread.join(10)
         if self._process.stdout is not None:
             self._process.stdout.close()
-
-    def __enter__(self) -> "FakeAutopilot":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
 
 @dataclass(frozen=True)
@@ -161,14 +157,14 @@ class Fly:
                 [*script, "fly", *self.arguments], stdout=subprocess.DEVNULL, stderr=errors
             )
 
-    def watch(self, until_ns: int | None = None, every_s: float = 1.0) -> None:
+    def watch(self, until_ns: int) -> None:
         """Take a sample each second until it ends, or until a moment."""
         while self.process.poll() is None:
-            left_s = every_s if until_ns is None else (until_ns - time.monotonic_ns()) / 1e9
+            left_s = (until_ns - time.monotonic_ns()) / 1e9
             if left_s <= 0:
                 return
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(min(every_s, left_s))
+                self.process.wait(min(1.0, left_s))
             made = sample(self.process.pid)
             if made is not None:
                 self.samples.append(made)
@@ -177,15 +173,6 @@ class Fly:
         """Kill the process, as a power failure does."""
         self.process.kill()
         self.process.wait(10)
-
-    def stop(self) -> int:
-        """Stop the process as systemd does; returns the exit code."""
-        self.process.send_signal(signal.SIGTERM)
-        try:
-            return self.process.wait(40)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            raise
 
     def __enter__(self) -> "Fly":
         return self

@@ -174,19 +174,6 @@ class Recorded:
             phase = next((to for text, to in PHASES.items() if text in event), phase)
         return phase
 
-    @cached_property
-    def truth(self) -> tuple[Array, Array]:
-        """Times (N,) and true velocity (N, 2), m/s east and north."""
-        rows = read_rows(self.folder / "truth.csv")
-        times_s = np.array([float(row["time_s"]) for row in rows])
-        east_north = [[float(row["vel_east_mps"]), float(row["vel_north_mps"])] for row in rows]
-        return times_s, np.array(east_north)
-
-    def velocity_en_mps(self, time_s: float) -> Array:
-        """True velocity (2,)."""
-        times_s, velocities = self.truth
-        return np.array([np.interp(time_s, times_s, axis) for axis in velocities.T])
-
     def stated(self) -> Iterator[tuple[Exposure, Telemetry]]:
         """The exposures, with what the autopilot stated for them, as `orthonav fly` reads it."""
         buffer = TelemetryBuffer()
@@ -247,8 +234,8 @@ def _shown(area: Area, exposure: Exposure, cache: Path) -> Grey:
 RECORDED = DATA / "closed_loop"
 METHODS = ("single", "track")
 HEADER = (
-    *("flight", "method", "views", "tilt deg", "median m", "95 % m", "NEES", "confident"),
-    *("tracking", "velocity m/s", "300 m east", "mirrored"),
+    *("flight", "method", "views", "median m", "95 % m", "NEES", "confident"),
+    *("tracking", "300 m east", "mirrored"),
 )
 Rule = Callable[[str, Telemetry, bool], Telemetry]
 """From the autopilot (px4, ardupilot), telemetry, and whether GNSS aids it."""
@@ -259,8 +246,7 @@ class Row:
     """One view located by one method.
 
     `error_en_m`, `cov_en_m2`: of the fix, None without one. `confidence`: 0 without a fix.
-    `sent`: the gate admits it. `velocity_off_mps`: error of the track's velocity, NaN without one.
-    `tilt_off_deg`: stated less true pitch and roll.
+    `sent`: the gate admits it.
     """
 
     flight: str
@@ -271,8 +257,6 @@ class Row:
     cov_en_m2: Array | None
     confidence: float
     sent: bool
-    velocity_off_mps: float
-    tilt_off_deg: tuple[float, float]
 
     @property
     def error_m(self) -> float:
@@ -329,12 +313,10 @@ def replay(
     methods: Sequence[str] = METHODS,
     rule: Rule = stated,
     views: int | None = None,
-    disturbed: bool = True,
 ) -> list[Row]:
     """Locate the views of a flight folder by some of `METHODS`; `work` holds demo and pictures.
 
     `rule` sets the deviations of the telemetry. `views`: only the first so many without GNSS.
-    Without `disturbed` the flight ends before the first disturbance of the camera.
     """
     recorded, area = Recorded(flight), Area.demo(work)
     locators: dict[str, Locator] = {
@@ -346,8 +328,7 @@ def replay(
     rows, alone = [], 0
     for exposure, view in recorded.views(area, work / "views", partial(rule, autopilot)):
         alone += exposure.phase == OFF
-        too_late = not disturbed and exposure.phase not in (ON, OFF)
-        if too_late or (views is not None and alone > views):
+        if views is not None and alone > views:
             break
         if view.telemetry.missing():
             continue
@@ -372,19 +353,13 @@ def _row(
     result = ViewResult(str(exposure.number), exposure.time_ns, outcome, latency_ms, state)
     admitted, _ = gate.admit(estimate_from_result(result), exposure.time_ns)
     error = cov = None
-    confidence, velocity_off = 0.0, np.nan
+    confidence = 0.0
     if isinstance(outcome, Fix):
         place = area.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
         error = place - area.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
         cov, confidence = outcome.cov_en_m2, outcome.confidence
-        own = [outcome.evidence.get(f"vel_{axis}_mps", np.nan) for axis in ("east", "north")]
-        velocity_off = float(np.hypot(*(own - recorded.velocity_en_mps(exposure.time_s))))
-    _, pitch_deg, roll_deg = exposure.attitude_deg
-    tilt_off = view.telemetry.pitch_deg - pitch_deg, view.telemetry.roll_deg - roll_deg
-    return Row(
-        recorded.folder.name, method, exposure, state, error, cov, confidence,
-        admitted is not None, velocity_off, tilt_off,
-    )  # fmt: skip
+    name, sent = recorded.folder.name, admitted is not None
+    return Row(name, method, exposure, state, error, cov, confidence, sent)
 
 
 def judged(rows: Sequence[Row]) -> list[Row]:
@@ -413,12 +388,10 @@ def _cells(rows: Sequence[Row]) -> list[str]:
         rows[0].flight,
         rows[0].method,
         str(len(alone)),
-        number(math.sqrt(float(np.mean([np.square(row.tilt_off_deg).sum() for row in alone])))),
         *quantiles(errors, 50, 95),
         number(float(np.mean([row.nees for row in good] or [np.nan]))),
         f"{confident:.0%}",
         f"{tracking:.0%}" if rows[0].state is not None else "-",
-        *quantiles([row.velocity_off_mps for row in good], 50),
         *wrong,
     ]
 
@@ -429,8 +402,7 @@ def table(rows: Sequence[Row]) -> Table:
     cells = [_cells([row for row in rows if (row.flight, row.method) == key]) for key in keys]
     notes = (
         "errors of confident single views, and of tracked views in the state tracking, while GNSS "
-        "is off and before any disturbance; NEES: mean, 2 is right; velocity: median error; tilt: "
-        "error of the telemetry, RMS",
+        "is off and before any disturbance; NEES: mean, 2 is right",
         "300 m east, mirrored: wrong positions that the gate admits, of all views while the camera "
         f"is so disturbed; wrong: more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
@@ -447,7 +419,6 @@ def measure(options: argparse.Namespace) -> Section:
             methods=options.methods,
             rule=plain if options.plain else stated,
             views=options.views,
-            disturbed=not options.undisturbed,
         )
         say(table(found).markdown())
         rows += found
