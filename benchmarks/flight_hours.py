@@ -179,10 +179,8 @@ class Judged:
     def of(cls, row: dict[str, Any]) -> "Judged":
         """From a row of `row_of`."""
         time_s, sent, tracking, error_m, level_m, nees = np.array(row["views"], np.float64).T
-        false, leveled = (
-            (sent > 0) & (error_m > row["limit_m"]),
-            (tracking > 0) & (level_m < np.inf),
-        )
+        false = (sent > 0) & (error_m > row["limit_m"])
+        leveled = (tracking > 0) & (level_m < np.inf)
         available = leveled & (level_m <= row["limit_m"])
         return cls(row, time_s, sent > 0, false, leveled, available, error_m, level_m, nees)
 
@@ -282,22 +280,10 @@ def tasks_of(options: argparse.Namespace) -> Iterator[tuple[str, Task]]:
                 vehicle, autopilot = chance.choice(list(VEHICLES)), chance.choice(list(FILTERS))
                 if course_of(pair, options.work, options.every).agl_m > HIGHEST_QUAD_M:
                     vehicle = "plane"
-                has_terrain = number % 2 == 0
+                minutes, has_terrain = 0.25 if options.quick else options.minutes, number % 2 == 0
+                flown = str(vehicle), str(autopilot), name, 1 + number, minutes, options.every
                 about = f"{number} {name}, {pair.name}, {vehicle}, {autopilot}"
-                yield (
-                    about,
-                    Task(
-                        pair,
-                        str(vehicle),
-                        str(autopilot),
-                        name,
-                        1 + number,
-                        0.25 if options.quick else options.minutes,
-                        options.every,
-                        has_terrain,
-                        options.work,
-                    ),
-                )
+                yield about, Task(pair, *flown, has_terrain, options.work)
         number += 1
 
 
