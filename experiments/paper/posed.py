@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.localize import Localizer
-from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify
+from orthonav.core.localize import Localizer, RectifiedView, downsampled, rectify
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import View
 from orthonav.core.tiles.represent import Canny

@@ -40,8 +40,7 @@ from experiments.paper.results import ACCURACY_M, BASELINES, compact
 from experiments.paper.scenes import Scene
 from orthonav.core.cores import usable_cores
 from orthonav.core.files import write_text
-from orthonav.core.localize import Localizer
-from orthonav.core.localize.rectify import downsampled
+from orthonav.core.localize import Localizer, downsampled
 from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.mapfile import MapFile, open_map
 from orthonav.core.records import Fix, View
