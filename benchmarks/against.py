@@ -39,7 +39,6 @@ from orthonav.core.flight import read_truth
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 
-NAME = "against"
 ROOT = Path(__file__).resolve().parents[1]
 HERE, THERE = "here", "other"
 SEED = 7
@@ -257,4 +256,4 @@ def _ortho(name: str, date: str, work: Path) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

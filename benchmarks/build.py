@@ -11,8 +11,6 @@ from benchmarks.record import Section, Table, memory_mb, number, run, say
 from benchmarks.scenes import PAST, SCENES, area, is_there, ortho
 from orthonav.ground.build import BuildRequest, build_map
 
-NAME = "build"
-
 
 def measure(options: argparse.Namespace) -> Section:
     sizes = ((2000, 1.0), (4000, 1.0), (2000, 0.5))[: 1 if options.quick else 3]
@@ -47,4 +45,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
         _child(Path(sys.argv[2]), Path(sys.argv[3]))
     else:
-        sys.exit(run(NAME, __doc__, measure))
+        sys.exit(run(measure))

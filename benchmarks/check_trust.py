@@ -43,7 +43,6 @@ from orthonav.ground.check.run import check_map
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 from orthonav.onboard.run import SingleViews, locate_view
 
-NAME = "check_trust"
 WIDTHS_PX = (256, 160, 112, 80)
 PRIOR_PX, EFFORT = 60.0, 0.05
 STDS, STDS_NARROW = np.arange(4, 25, 2) / 10, np.arange(0, 15, 2) / 10
@@ -296,4 +295,4 @@ def _widths_table(found: Sequence[Outcome], by: dict[str, Recalibration]) -> Tab
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -49,7 +49,6 @@ from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.records import RADIUS_SHARE
 from orthonav.ground.evaluate.statistics import runs, upper_bound
 
-NAME = "flight_hours"
 UNDISTURBED, FAULTS = ("fixes", "start"), ("shifted", "mirrored", "frozen")
 """Scenarios of `closed_loop.loop`."""
 FAULTY_ROUNDS, ROUNDS = 3, 16
@@ -344,4 +343,4 @@ def measure(options: argparse.Namespace) -> Section:
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -37,7 +37,6 @@ from orthonav.core.localize.confidence import (
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.evaluate.statistics import calibrate, upper_bound
 
-NAME = "integrity"
 RIDGE = 1e-5
 """Weight of the ridge of the fit: only against weights without bound."""
 LIMIT_M, LIMIT_PX = 35.0, 10.0
@@ -260,4 +259,4 @@ def _tail_table(judged: Judged) -> Table:
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -14,7 +14,6 @@ from benchmarks.record import Section, Table, number, quantiles, run, say
 from benchmarks.scenes import PAST, PRESENT, area, map_of
 from orthonav.core.mapfile import open_map
 
-NAME = "onboard"
 CAMERA_HZ, RATES_HZ = 10, (5, 10)
 LEAD_S = 4.0
 """The autopilot is up before the first picture: the program has started by then."""
@@ -173,4 +172,4 @@ def _start(scene: Scene, heading: str, index: int, count: int) -> tuple[float, f
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

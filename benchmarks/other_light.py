@@ -43,7 +43,6 @@ from orthonav.core.localize.search import Search
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, View
 
-NAME = "other_light"
 SEED, WIDTH_PX = 3, 256
 FAR_SHARE = 0.05
 """A position of unreported tilt is wrong beyond this share of the height, too."""
@@ -315,4 +314,4 @@ def _ways(localizer: Localizer) -> Iterator[tuple[str, Any]]:
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

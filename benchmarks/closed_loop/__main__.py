@@ -34,4 +34,4 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run("closed_loop", __doc__, measure, add))
+    sys.exit(run(measure, add))

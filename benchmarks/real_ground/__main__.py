@@ -13,4 +13,4 @@ from benchmarks.real_ground.measure import add, measure
 from benchmarks.record import run
 
 if __name__ == "__main__":
-    sys.exit(run("real_ground", __doc__, measure, add))
+    sys.exit(run(measure, add))
