@@ -35,7 +35,7 @@ def test_links_lead_somewhere(page):
 
 
 def test_reference_pages_say_in_the_repository_what_the_site_shows():
-    """Directives, which only the site understands, are comments; names stand in the text too."""
+    """Directives, which only the site understands, are comments; every name stands in the text."""
     for page in PAGES:
         text = page.read_text("utf-8")
         seen = re.sub(r"<!-- site\n.*?\n-->", "", text, flags=re.DOTALL)

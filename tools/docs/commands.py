@@ -41,7 +41,7 @@ class Command(SphinxDirective):
         if not hasattr(self.env, "orthonav_commands"):
             self.env.orthonav_commands = set()
         self.env.orthonav_commands.add(name)
-        return self.parse("\n".join(_markdown(name, COMMANDS[name], command_parser(name))))
+        return self.parse("\n".join(_markdown(name, command_parser(name))))
 
     def parse(self, text: str) -> list[nodes.Node]:
         """Nodes of Markdown."""
@@ -51,22 +51,8 @@ class Command(SphinxDirective):
         return holder.children
 
 
-def command_parser(name: str) -> argparse.ArgumentParser:
-    """The parser of one command, with all its arguments."""
-    actions = _parser([name, "--help-all"])._actions
-    (choices,) = (a.choices for a in actions if isinstance(a, argparse._SubParsersAction))
-    parser: argparse.ArgumentParser = choices[name]
-    return parser
-
-
-def shown_actions(actions: list[argparse.Action]) -> list[argparse.Action]:
-    """Arguments that are described with their command."""
-    shown = [each for each in actions if each.help != argparse.SUPPRESS]
-    return [each for each in shown if not set(each.option_strings) & set(EVERYWHERE)]
-
-
-def _markdown(name: str, text: str, parser: argparse.ArgumentParser) -> Iterator[str]:
-    yield from (f"{text[0].upper()}{text[1:]}.", "", "```text", _usage(parser), "```", "")
+def _markdown(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
+    yield from ("```text", _usage(parser), "```", "")
     yield from (f":::{{program}} orthonav {name}", ":::", "")
     for group in parser._action_groups:
         actions = shown_actions(group._group_actions)
@@ -87,7 +73,9 @@ def _actions_of(name: str, action: argparse._SubParsersAction) -> Iterator[str]:
     for choice in action._choices_actions:
         full = f"{name} {choice.dest}"
         yield from (f"**orthonav {full}**", "")
-        yield from _markdown(full, choice.help or "", action.choices[choice.dest])
+        text = choice.help or ""
+        yield from (f"{text[0].upper()}{text[1:]}.", "")
+        yield from _markdown(full, action.choices[choice.dest])
 
 
 def _option(parser: argparse.ArgumentParser, action: argparse.Action) -> Iterator[str]:
@@ -122,3 +110,18 @@ def _all_described(_app: Any, env: Any) -> None:
     missing = sorted(set(COMMANDS) - getattr(env, "orthonav_commands", set()))
     if missing:
         log.warning("commands that no page describes: %s", ", ".join(missing))
+
+
+def command_parser(name: str) -> argparse.ArgumentParser:
+    """The parser of one command, with all its arguments."""
+    for action in _parser([name, "--help-all"])._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            parser: argparse.ArgumentParser = action.choices[name]
+            return parser
+    raise LookupError(name)
+
+
+def shown_actions(actions: list[argparse.Action]) -> list[argparse.Action]:
+    """Arguments that are described with their command."""
+    shown = [each for each in actions if each.help != argparse.SUPPRESS]
+    return [each for each in shown if not set(each.option_strings) & set(EVERYWHERE)]
