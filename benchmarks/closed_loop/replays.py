@@ -10,7 +10,7 @@ import argparse
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -190,17 +190,6 @@ class Recorded:
             telemetry = buffer.at(exposure.time_ns).telemetry(exposure.time_ns)
             yield exposure, replace(telemetry, prior=Prior(lat, lon, PRIOR_STD_M))
 
-    def views(
-        self,
-        area: Area,
-        cache: Path,
-        rule: Callable[[Telemetry, bool], Telemetry],
-    ) -> Iterator[tuple[Exposure, View]]:
-        """Exposures and their views. `rule`: sets the deviations of the telemetry, given whether
-        GNSS is on."""
-        for exposure, telemetry in self.stated():
-            yield exposure, self.view(area, cache, exposure, rule(telemetry, exposure.phase == ON))
-
     def view(self, area: Area, cache: Path, exposure: Exposure, telemetry: Telemetry) -> View:
         """The view of an exposure; its picture is kept in a folder."""
         return View(_shown(area, exposure, cache / self.folder.name), CAMERA, telemetry)
@@ -326,12 +315,14 @@ def replay(
     gates = {name: Gate() for name in methods}
     autopilot, _, _ = flight.name.partition("_")
     rows, alone = [], 0
-    for exposure, view in recorded.views(area, work / "views", partial(rule, autopilot)):
+    for exposure, reported in recorded.stated():
         alone += exposure.phase == OFF
         if views is not None and alone > views:
             break
-        if view.telemetry.missing():
+        telemetry = rule(autopilot, reported, exposure.phase == ON)
+        if telemetry.missing():
             continue
+        view = recorded.view(area, work / "views", exposure, telemetry)
         for name in methods:
             if name == "single" and exposure.phase == ON:
                 continue  # a track begins with GNSS; single views are judged without it
