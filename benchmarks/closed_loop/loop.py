@@ -34,7 +34,7 @@ from orthonav.core.records import MAP_STD_M, Fix, NoFix, Prior, Telemetry, View,
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import FrozenCheck
 from orthonav.onboard.gnss.monitor import DIFFERENTIAL
-from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
+from orthonav.onboard.gnss.watch import GnssWatch
 from orthonav.onboard.messages.estimate import (
     FilterCovariance,
     NavigationEstimate,
@@ -181,7 +181,7 @@ class Sight:
         self._area, self._scenario, self._rule, self._seed = area, scenario, rule, seed
         self._tracker, self.gate = Tracker(area.localizer), Gate()
         self._solutions: deque[GnssSample] = deque()
-        self._watch = GnssWatch(area.frame, live_solutions(self._solutions))
+        self._watch = GnssWatch(area.frame, self._solutions)
         self._frozen, self._covariance = FrozenCheck(), FilterCovariance()
         self._before: Grey | None = None
         self._displaced_m = np.random.default_rng([seed, 7]).normal(0.0, MAP_STD_M, 2)

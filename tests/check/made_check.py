@@ -1,7 +1,10 @@
 """Synthetic check results for tests of the output files."""
 
+import math
+
 import numpy as np
 
+from orthonav.ground.check.cells import CellGrid
 from orthonav.ground.check.findings import likely_outages
 from orthonav.ground.check.flights import scene_shifts, shifted, simulated
 from orthonav.ground.check.records import (
@@ -15,11 +18,13 @@ from orthonav.ground.check.records import (
     Verdict,
     Word,
 )
+from orthonav.ground.check.trials import Trial
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 
 FILES = {"index.html", "check.json", "check.tif", "check.geojson"}
-EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
+EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)>'
+EVIL += " & ünïcode \u202e\x1b[31m \udc80"
 DIGEST = "0123456789abcdef" * 4
 CONDITIONS = Conditions(
     width_m=240.0,
@@ -45,6 +50,15 @@ NO_GO = Verdict(
 )
 
 
+def right(en_m, *, error_m=2.0, expected=0.5):
+    return Trial(tuple(en_m), error_m, expected, right=True)
+
+
+def lost(en_m, *, expected=0.5):
+    """A trial without a fix."""
+    return Trial(tuple(en_m), math.nan, expected)
+
+
 def route_of(frame, points_en_m, bands_m=()):
     lat, lon = frame.latlon_from_en(np.array(points_en_m, float))
     return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
@@ -57,7 +71,7 @@ def area_of(frame, points_en_m, bands_m=(), band_m=200.0):
     return Area(frame, extent, route_of(frame, points, bands_m), 2 * half)
 
 
-def made_cells(rows, cols, side_m, seed=1, west_m=None, north_m=None):
+def made_cells(rows, cols, side_m, seed=1):
     """Cells of smooth random probabilities around the origin."""
     rng = np.random.default_rng(seed)
     noise = rng.normal(size=(rows + 12, cols + 12))
@@ -65,9 +79,7 @@ def made_cells(rows, cols, side_m, seed=1, west_m=None, north_m=None):
     probability = 1 / (1 + np.exp(-(1.6 + 2.2 * smooth[6:-6, 6:-6])))
     spread = 0.12 * np.sqrt(probability * (1 - probability)) * 2
     return Cells(
-        west_m=-cols * side_m / 2 if west_m is None else west_m,
-        north_m=rows * side_m / 2 if north_m is None else north_m,
-        side_m=side_m,
+        grid=CellGrid(-cols * side_m / 2, rows * side_m / 2, side_m, rows, cols),
         probability=probability,
         low=np.clip(probability - spread, 0, 1),
         high=np.clip(probability + spread, 0, 1),
@@ -84,8 +96,7 @@ def lost_in(cells, mask):
     names = ("probability", "low", "high", "error_m", "wrong", "persistence")
     values = {name: getattr(cells, name) * hole for name in names}
     values["trials"] = np.where(mask, 0, cells.trials).astype(np.int32)
-    corner = {"west_m": cells.west_m, "north_m": cells.north_m, "side_m": cells.side_m}
-    return Cells(**corner, **values)
+    return Cells(grid=cells.grid, **values)
 
 
 def along_of(cells, waypoints, step_m=25.0):
@@ -93,22 +104,11 @@ def along_of(cells, waypoints, step_m=25.0):
     ends = np.concatenate([[0.0], np.cumsum(legs)])
     distance = np.linspace(0, ends[-1], max(2, round(ends[-1] / step_m)))
     points = np.stack([np.interp(distance, ends, axis) for axis in waypoints.T], axis=1)
-    rows = ((cells.north_m - points[:, 1]) / cells.side_m).astype(int)
-    cols = ((points[:, 0] - cells.west_m) / cells.side_m).astype(int)
-    rows = np.clip(rows, 0, cells.probability.shape[0] - 1)
-    cols = np.clip(cols, 0, cells.probability.shape[1] - 1)
-    probability = cells.probability[rows, cols]
-    return Along(
-        distance_m=distance,
-        points_en_m=points,
-        probability=probability,
-        low=cells.low[rows, cols],
-        high=cells.high[rows, cols],
-        across_low=np.maximum(probability - 0.15, 0),
-        error_m=cells.error_m[rows, cols],
-        wrong=cells.wrong[rows, cols],
-        persistence=cells.persistence[rows, cols],
-    )
+    numbers = cells.grid.numbers(points)
+    names = ("probability", "low", "high", "error_m", "wrong", "persistence")
+    values = {name: getattr(cells, name).ravel()[numbers] for name in names}
+    lowest = np.maximum(values["probability"] - 0.15, 0)
+    return Along(distance_m=distance, points_en_m=points, across_low=lowest, **values)
 
 
 def flown(along, conditions=CONDITIONS, scenes_std=0.8, false_fixes=0):
@@ -137,7 +137,7 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
         ),
         "conditions": CONDITIONS,
         "verdict": NO_GO,
-        "area_km2": float(known.sum() * cells.side_m**2 / 1e6),
+        "area_km2": float(known.sum() * cells.grid.side_m**2 / 1e6),
         "mean": mean if flights is None else flights.probability,
         "second_date": True,
         "along": along,

@@ -7,11 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
-from made_check import route_of
-from made_trials import lost, right
+from made_check import lost, right, route_of
 
 from helpers import write_dem
-from orthonav.cli import check as check_command
 from orthonav.cli import main
 from orthonav.core.errors import AreaError, CameraError, UsageError
 from orthonav.core.geo.camera import Camera
@@ -27,8 +25,7 @@ CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 
 def halves(cells):
     """Mean probability well inside the west and the east half of the map."""
-    cols = np.arange(cells.probability.shape[1]) + 0.5
-    east_m = cells.west_m + cols * cells.side_m
+    east_m = cells.grid.centres_en_m[: cells.grid.cols, 0]
     west, east = (east_m < -80) & (east_m > -400), (east_m > 80) & (east_m < 400)
     inner = cells.probability[2:-2]
     return float(np.nanmean(inner[:, west])), float(np.nanmean(inner[:, east]))
@@ -110,8 +107,8 @@ def test_a_route_over_both_halves(checked, frame):
     assert along.distance_m[-1] - 100 < result.outages[-1].end_m <= along.distance_m[-1]
     assert result.outages[-1].start_m > 250 and result.flights.availability.low < 0.6
     assert result.verdict.word is not Word.GO and result.band_m == 200.0
-    cells, west = result.cells, result.cells.west_m
-    assert west == pytest.approx(-450, abs=1) and cells.north_m == pytest.approx(100, abs=1)
+    cells, (west, _, _, north) = result.cells, result.cells.grid.extent_en_m
+    assert (west, north) == pytest.approx((-450, 100), abs=1)
     corners = cells.probability[[0, 0, -1, -1], [0, -1, 0, -1]]
     assert np.isnan(corners).all()  # of the box, outside the round ends of the band
 
@@ -171,18 +168,6 @@ def test_progress_counts_all_that_will_be_tried(untried, half_blank, monkeypatch
     request = CheckRequest(half_blank.map, camera=CAMERA, agl_m=130.0, effort=0.05)
     check_map(request, lambda _, share: shares.append(share))
     assert shares[0] == 0.5 and shares[-1] == 1.0 and shares.count(0.99) <= 1
-
-
-def test_without_a_terminal_lines_say_how_long_it_will_take(monkeypatch, capsys):
-    lines, now_s = check_command._Lines(), [0.0]
-    monkeypatch.setattr(check_command.time, "monotonic", lambda: now_s[0])
-    for now_s[0], share in ((100, 0.1), (102, 0.2), (105, 0.3), (106, 0.4), (116, 0.9), (130, 1)):
-        lines("trials", share)
-    first, second = capsys.readouterr().err.splitlines()
-    assert (first, second) == (
-        "trials: 30 %, about 18 s left",
-        "trials: 90 %, about 2 s left",
-    )
 
 
 @pytest.mark.parametrize(

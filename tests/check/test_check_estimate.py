@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_trials import lost, misplaced, right
+from made_check import lost, right
 
 from orthonav.ground.check.estimate import LEARNT, Predictor
 
@@ -50,7 +50,7 @@ def test_all_is_in_order_whatever_the_trials(count, kinds, expected, view_side_m
     make = {
         "right": lambda en: right(en, expected=expected),
         "lost": lost,
-        "wrong": lambda en: misplaced(en, en + 200.0),
+        "wrong": lambda en: replace(lost(en), error_m=280.0, wrong=True),
     }
     trials = [make[kind](en) for kind, en in zip(kinds, places(count), strict=False)]
     # Near, between, and far from all.

@@ -15,6 +15,7 @@ from made_check import EVIL, FILES, small_route
 from html_page import Page
 from orthonav.ground.check.layers import check_to_plain
 from orthonav.ground.check.records import CELL_VALUES
+from orthonav.ground.check.wording import text
 from orthonav.ground.check.write import write_check
 
 KINDS = {"tiny", "small_route", "nearly_empty", "evil"}
@@ -27,8 +28,11 @@ def folder(opened, frame, tmp_path_factory):
     for kind in ("tiny", "small_route", "nearly_empty"):
         path = write_check(getattr(made_check, kind)(frame), opened, root / kind)
         assert path == root / kind / "index.html"
-    about = replace(made_check.tiny(frame).about, map_name=EVIL, route_name=EVIL)
-    write_check(small_route(frame, about=about), opened, root / "evil")
+    names = dict.fromkeys(("map_name", "imagery", "route_name", "command"), EVIL)
+    about = replace(made_check.tiny(frame).about, **names, terms=(EVIL,))
+    evil = small_route(frame, about=about)
+    write_check(evil, opened, root / "evil")
+    assert "\x1b" not in text(evil)
     return root
 
 
@@ -41,7 +45,10 @@ def test_every_kind_of_check_is_written(folder):
     assert {path.name for path in folder.iterdir()} == KINDS
     for each in folder.iterdir():
         assert {path.name for path in each.iterdir()} == FILES
-        assert (each / "index.html").stat().st_size < 4_000_000
+        page = (each / "index.html").read_text(encoding="utf-8")
+        assert len(page) < 4_000_000 and "<script>alert" not in page and "<img src=x" not in page
+        for name in ("check.json", "check.geojson"):
+            json.loads((each / name).read_text(encoding="utf-8"), parse_constant=pytest.fail)
 
 
 def test_nothing_is_asked_for(page):
@@ -54,9 +61,9 @@ def test_nothing_is_asked_for(page):
                 name,
             )
         assert "style" not in attributes and not [n for n in attributes if n.startswith("on")]
-    for text in page.texts["style"]:
-        assert "@import" not in text
-        assert all(each.startswith("data:") for each in re.findall(r"url\(([^)]*)\)", text))
+    for style in page.texts["style"]:
+        assert "@import" not in style
+        assert all(each.startswith("data:") for each in re.findall(r"url\(([^)]*)\)", style))
     assert "sourceMappingURL" not in "".join(page.texts["script"])
 
 

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import made_trials
 import numpy as np
 import pytest
+from made_check import CONDITIONS as GIVEN
 from made_check import area_of
 
 from orthonav.core.geo.frames import LocalFrame
@@ -18,7 +18,7 @@ from orthonav.ground.check.records import Along
 
 FRAME = LocalFrame(46.0, 3.0)
 SIDE_M = 100.0
-CONDITIONS = replace(made_trials.CONDITIONS, width_m=SIDE_M, height_m=SIDE_M)
+CONDITIONS = replace(GIVEN, width_m=SIDE_M, height_m=SIDE_M, drift=0.03)
 
 
 def predicted(probability, error_m):

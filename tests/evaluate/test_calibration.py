@@ -1,8 +1,6 @@
 """Calibration of confidence and consistency of covariance against cases worked out by hand."""
 
-import json
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +15,6 @@ from orthonav.ground.evaluate.statistics import (
     calibrate,
     check_covariance,
     is_covariance,
-    normalized_squared,
 )
 
 RADIUS_M = 20.0
@@ -82,15 +79,6 @@ def test_drawn_as_stated_is_calibrated_and_wilson_covers() -> None:
     assert sum(inside) >= 8
 
 
-def test_nees_against_an_inverse() -> None:
-    random = np.random.default_rng(2)
-    roots = random.normal(0.0, 5.0, (50, 2, 2))
-    cov = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(2)
-    errors = random.normal(0.0, 5.0, (50, 2))
-    expected = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(cov), errors)
-    np.testing.assert_allclose(normalized_squared(errors, cov), expected, rtol=1e-9)
-
-
 def test_right_covariance_is_consistent_and_a_halved_one_is_not() -> None:
     random = np.random.default_rng(4)
     cov = np.array([[25.0, 12.0], [12.0, 16.0]])
@@ -136,33 +124,7 @@ def test_an_invalid_covariance_is_counted_and_left_out(rows: list[list[float]]) 
     assert found.nees.tolist() == [2.0]
 
 
-def test_no_covariance_leaves_nothing_defined() -> None:
-    cov = np.full((3, 2, 2), math.nan)
-    found = check_covariance(np.ones((3, 2)), cov, np.full(3, RADIUS_M), 15.0)
-    assert (found.n, found.n_without, found.n_unusable, found.nees.size) == (3, 3, 0, 0)
-    figures = (found.nees_mean, found.nees_median, *found.within.values())
-    assert all(map(math.isnan, figures))
-    nothing = check_covariance(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0), 15.0)
-    assert nothing.n == 0 and math.isnan(nothing.nees_mean)
-
-
 CENTRE = LocalFrame(48.0, -4.5)
-
-
-def test_the_command_compares_several_runs(tmp_path, run) -> None:
-    lat, lon = CENTRE.latlon_from_en(np.array([3.0, 4.0]))
-    fix = Fix(float(lat), float(lon), 25 * np.eye(2), 0.95, RADIUS_M, 0.0, 100.0)
-    unknown = replace(fix, confidence=math.nan, cov_en_m2=np.full((2, 2), math.nan))
-    truth = tmp_path / "truth.csv"
-    truth.write_text("frame,lat_deg,lon_deg\na.jpg,48.0,-4.5\n")
-    paths = [tmp_path / "one.jsonl", tmp_path / "two.jsonl"]
-    for path, known in zip(paths, (fix, unknown), strict=True):
-        path.write_text(result_to_json(ViewResult("a.jpg", 0, known, 10.0)) + "\n")
-    done = run("evaluate", *paths, "--truth", truth)
-    assert done.code == 0 and "nan" not in done.out.lower()
-    runs = json.loads(run("evaluate", *paths, "--truth", truth, "--json").out)["runs"]
-    assert runs["two"]["calibration"]["ece"] is None
-    assert runs["one"]["covariance"]["nees_mean"] == pytest.approx(1.0, rel=1e-3)
 
 
 def test_a_truth_by_which_most_confident_fixes_are_wrong_is_doubted(tmp_path, run) -> None:

@@ -17,6 +17,7 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.ground.evaluate.metrics import Comparison, compare, measure
 from orthonav.ground.evaluate.report import write_report
+from orthonav.ground.evaluate.statistics import consistency
 from orthonav.ground.evaluate.tables import (
     FlightReport,
     metrics_to_json,
@@ -26,7 +27,6 @@ from orthonav.ground.evaluate.tables import (
 )
 from orthonav.ground.evaluate.track import (
     TrackMetrics,
-    check_consistency,
     course_en,
     effective_number,
     measure_track,
@@ -93,12 +93,13 @@ def drawn(n=200, seed=0, alike=0.0):
 @pytest.mark.parametrize("alike", [0.0, 0.9])
 def test_of_twenty_consistent_tracks_about_one_is_called_otherwise(alike: float) -> None:
     found = [
-        check_consistency(drawn(300, seed, alike), np.tile(COV, (300, 1, 1))) for seed in range(60)
+        consistency(drawn(300, seed, alike), np.tile(COV, (300, 1, 1)), effective_number)
+        for seed in range(60)
     ]
     assert sum(each.verdict == "consistent" for each in found) >= 53
     mean = np.mean([each.nees_mean for each in found])
     assert mean == pytest.approx(2.0, abs=0.15)
-    small = check_consistency(drawn(300, 1, alike), np.tile(COV / 4, (300, 1, 1)))
+    small = consistency(drawn(300, 1, alike), np.tile(COV / 4, (300, 1, 1)), effective_number)
     assert small.verdict == "over-confident"
 
 

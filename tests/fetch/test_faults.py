@@ -191,7 +191,7 @@ def test_a_broken_entry_of_the_cache_is_fetched_again(take, tmp_path):
 
 def command_for(server, bounds, out):
     area = [f"--bounds={bounds}", "--gsd-m", "1"]
-    command = [sys.executable, "-m", "orthonav", "fetch", "--no-terrain"]
+    command = [sys.executable, "-m", "orthonav", "fetch", "--heights", "none"]
     return [*command, *area, "--source", source(server), "--out", out]
 
 

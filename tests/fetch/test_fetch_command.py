@@ -36,7 +36,7 @@ def command(capsys):
     """Function that runs the command and gives exit code, stdout and stderr."""
 
     def run(*arguments, terrain=False):
-        more = [] if terrain else ["--no-terrain"]
+        more = [] if terrain else ["--heights", "none"]
         code = main(["fetch", *map(str, arguments), *more])
         return code, *capsys.readouterr()
 
@@ -162,18 +162,15 @@ def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, capl
     ):
         url.append(heights.url)
         offered(heights.url, [("town", f"{server.url}/{{z}}/{{x}}/{{y}}.png")])
-        fetch = (area, "--source", "town", "--gsd-m", 1, "--out", out, "--with-surface")
+        fetch = (area, "--source", "town", "--gsd-m", 1, "--out", out, "--heights", "surface")
         dry = json.loads(command(*fetch, "--dry-run", "--json", terrain=True)[1])
         assert dry["surface"] == "swisssurface3d" and dry["terrain"] is None
         assert "terrain from copernicus-dem where" in command(*fetch, "--dry-run", terrain=True)[1]
-        assert "copernicus" not in command(*fetch, "--dry-run")[1]
         code, stdout, _ = command(*fetch, "--json", terrain=True)
         plain = json.loads(stdout)
         assert code == 0 and (plain["terrain"] is None) == (plain["surface"] is not None)
         code, stdout, _ = command(*fetch, terrain=True)
         assert code == 0 and dem_path.exists() == broken
-        dem_path.unlink(missing_ok=True)
-        assert command(*fetch)[0] == 0 and not dem_path.exists()  # --no-terrain
     line = f"orthonav build --ortho {out} "
     if broken:
         assert "no surface was fetched" in caplog.text and "--source swisssurf" in caplog.text
@@ -258,7 +255,7 @@ def test_services_known_by_name_are_listed(command):
     assert (
         code == 0 and "ign: IGN" in stdout and "1950-1965" in stdout and "DATAFORSYNINGEN" in stdout
     )
-    assert "--with-surface fetches swisssurface3d" in stdout
+    assert "--heights surface fetches swisssurface3d" in stdout
     code, stdout, _ = command("--list", "--json")
     assert code == 0 and json.loads(stdout)[0]["licence"]
     assert json.loads(stdout)[0]["surface"] == "ign-surface"
@@ -271,7 +268,7 @@ def test_services_known_by_name_are_listed(command):
         (["--source", "ign:2021"], "give a --source .* and an --out"),
         (["--source", "ign:2021", "--out", "o.tif"], "give one area"),
         (["--source", "file:///etc/passwd", "--out", "o.tif"], "write the protocol"),
-        (["--bounds=3,46,3.1,46.1", "--source", "nrw", "--out", "o.tif", "--with-surface"],
+        (["--bounds=3,46,3.1,46.1", "--source", "nrw", "--out", "o.tif", "--heights", "surface"],
          "no surface model is known for 'nrw'; sources with one: .*ign.*swissimage"),
         (["--bounds=3,46,3.1,46.1", "--source", "xyz:http://a/{z}/{x}/{y}", "--out", "o.jpg"],
          "must be a .tif"),
@@ -281,7 +278,7 @@ def test_services_known_by_name_are_listed(command):
 )  # fmt: skip
 def test_wrong_usage_is_reported_on_one_line(command, arguments, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, stdout, stderr = command(*arguments)
+    code, stdout, stderr = command(*arguments, terrain=True)
     wanted = 1 if words.startswith(("table", "no surface")) else 2
     assert code == wanted and not stdout and stderr.count("\n") == 1
     assert len(re.findall(words, stderr)) == 1

@@ -34,7 +34,7 @@ def test_a_service_and_its_layers_are_complete(name, monkeypatch):
         assert (layer.options.max_zoom or 22) <= 22, id_
         assert (layer.date is None) == (id_ == CURRENT) or layer.date.partition("/")[0] in id_
         source = name if id_ == CURRENT else f"{name}:{id_}"
-        spec = parse_source(source, ImageryOptions(), date=layer.date)
+        spec = parse_source(source, ImageryOptions())
         assert spec.provenance.licence and spec.provenance.attribution, id_
         assert spec.options.layer == layer.options.layer, id_
         assert "express" not in id_ or "no other date" in spec.provenance.note
@@ -75,9 +75,8 @@ def test_unknown_names_list_the_known_ones():
 
 def test_options_of_the_user_take_precedence():
     asked = ImageryOptions(style="other", crs="EPSG:2154", gsd_m=1.0)
-    spec = parse_source("ign:2021", asked, date="2021-07")
+    spec = parse_source("ign:2021", asked)
     assert (spec.options.style, spec.options.crs, spec.options.gsd_m) == ("other", "EPSG:2154", 1)
-    assert spec.provenance.date == "2021-07"
 
 
 def test_rows_of_an_own_table_replace_those_of_the_same_name(tmp_path):
@@ -143,9 +142,11 @@ def test_keys_come_from_the_environment_only(monkeypatch):
 
 
 @pytest.mark.parametrize("date", ["21", "2021-13", "2021-02-40", "June", "2021/2022/2023", ""])
-def test_dates_are_checked(date):
-    with pytest.raises(UsageError, match="date must be"):
-        parse_source("ign", ImageryOptions(), date=date)
+def test_dates_are_checked(date, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(f'[a]\nprotocol = "wms"\nurl = "u"\n[[a.layers]]\nid = "x"\ndate = "{date}"')
+    with pytest.raises(FetchError, match="date must be"):
+        parse_source("a:x", ImageryOptions(), own=path)
 
 
 @pytest.mark.parametrize(

@@ -142,6 +142,11 @@ def test_fields_of_view():
     assert across.fx_px == pytest.approx(math.hypot(1280, 960) / 2 / math.tan(math.radians(42)))
     with pytest.raises(CameraError, match=r"64\.7 if these are radians"):
         Camera.from_fov(1.13, 1280, 960)
+    square = Camera.from_fov(90.0, 1280, 960)
+    assert square.fx_px == pytest.approx(640) and square.cx_px == 640 and square.focal_std > 0
+    for wrong in (0.0, 180.0, math.nan):
+        with pytest.raises(CameraError, match="field of view"):
+            Camera.from_fov(wrong, 1280, 960)
     whole = Camera.from_fov(65, 1280.0, 960.0)
     assert type(whole.width_px) is int and whole == Camera.from_fov(65, 1280, 960)
 
@@ -149,6 +154,8 @@ def test_fields_of_view():
 def test_matrices_that_are_not_those_of_opencv():
     matrix = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
     assert Camera.from_matrix(matrix, None, (640, 480)).cx_px == 320.0
+    with pytest.raises(CameraError, match=r"\(3, 3\)"):
+        Camera.from_matrix(np.eye(2), [], (640, 480))
     with pytest.raises(CameraError, match=r"transposed \(its last row is 319.5, 239.5, 1\)"):
         Camera.from_matrix(matrix.T, None, (640, 480))
     for row, col in ((0, 1), (1, 0), (2, 0)):

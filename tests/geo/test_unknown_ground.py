@@ -1,14 +1,11 @@
 """What ground of unknown slope costs."""
 
 import math
-import re
-from pathlib import Path
 
 import pytest
 
 from orthonav.cli.common import OPTIONS
 from orthonav.core.geo.ground import RELIEF_SLOPES, unknown_slope_share
-from orthonav.core.records import DEFAULT_TILT_STD_DEG
 
 
 def test_slope_and_tilt_are_told_apart_by_what_is_known_of_each():
@@ -18,20 +15,6 @@ def test_slope_and_tilt_are_told_apart_by_what_is_known_of_each():
         tilt = math.radians(1)
         exact = 1 / math.sqrt(1 / tilt**2 + 2 / slope**2)
         assert unknown_slope_share(1, relief) == pytest.approx(exact)
-
-
-def test_the_default_costs_three_percent_without_tilt_and_half_of_it_with():
-    assert unknown_slope_share(3) == pytest.approx(0.03, abs=0.001)
-    assert unknown_slope_share(1) == pytest.approx(0.0157, abs=0.0005)
-
-
-def test_the_documentation_states_what_is_computed():
-    page = (Path(__file__).parents[2] / "docs" / "terrain.md").read_text(encoding="utf-8")
-    found = dict(re.findall(r"^\| `(level|rolling|hills)` \| (.*) \|$", page, re.MULTILINE))
-    tilts_deg = (0.5, 1.0, 2.0, DEFAULT_TILT_STD_DEG)
-    for relief in RELIEF_SLOPES:
-        row = [f"{100 * unknown_slope_share(tilt_deg, relief):.1f} %" for tilt_deg in tilts_deg]
-        assert found[relief] == " | ".join(row)
 
 
 def test_the_command_line_offers_all_reliefs():

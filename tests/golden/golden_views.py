@@ -19,6 +19,7 @@ import rasterio
 from lab.clouds import Clouds
 from rasterio.transform import Affine
 from rasterio.windows import Window
+from threadpoolctl import threadpool_info
 
 from orthonav.cli.demo import IMAGERY
 from orthonav.cli.source import map_heights
@@ -56,7 +57,7 @@ TOLERANCES = {
     "confidence": 0.01,
     "std_m": 0.01,  # a share
 }
-"""On processors with the vector instructions of the one that made the file."""
+"""With the instructions and kernels that made the file."""
 ELSEWHERE = {
     "east_m": 0.5,
     "north_m": 0.5,
@@ -235,10 +236,13 @@ class Difference:
 
 
 def instructions() -> str:
-    """The widest vector instructions of this processor, by which results are rounded."""
+    """By which results are rounded: the widest vector instructions of this processor, and the
+    kernels that NumPy's OpenBLAS takes for it (those of Haswell for a processor newer than it)."""
+    wide = "avx2" if cv2.checkHardwareSupport(CPU_AVX2) else "others"
     if cv2.checkHardwareSupport(CPU_AVX512_SKX):
-        return "avx512"
-    return "avx2" if cv2.checkHardwareSupport(CPU_AVX2) else "others"
+        wide = "avx512"
+    found = [each for each in threadpool_info() if "numpy" in each["filepath"]]
+    return " ".join((wide, *(each["architecture"] for each in found if "architecture" in each)))
 
 
 def report(stored: Mapping[str, Any], found: Mapping[str, list[Row]]) -> str:

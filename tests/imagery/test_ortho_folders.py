@@ -319,7 +319,7 @@ def test_build_from_a_folder(run, tmp_path, monkeypatch):
     found = []
     for ortho, said in ((tmp_path / "ortho_2019", "4 files"), (whole, "whole.tif")):
         out = tmp_path / f"{ortho.stem}.onav"
-        more = ("--tile-px", 64, "--overlap", 0.5, "--calibration-views", 2, "--workers", 2)
+        more = ("--tile-px", 64, "--overlap", 0.5, "--workers", 2)
         assert said in run("build", "--ortho", ortho, *more, "--out", out).out
         found.append(open_map(out))
     (entry,) = found[0].manifest.imagery

@@ -137,6 +137,6 @@ def test_a_conversion_that_fails_is_an_error_and_no_hole(tmp_path, monkeypatch):
 def test_build_says_one_thing_about_a_system(run, tmp_path, monkeypatch, crs, lat, lon, said):
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
     path = made(tmp_path / "a.tif", crs, lat, lon)
-    more = ("--tile-px", 64, "--overlap", 0.5, "--calibration-views", 2, "--workers", 2)
+    more = ("--tile-px", 64, "--overlap", 0.5, "--workers", 2)
     out = run("build", "--ortho", path, *more, "--out", tmp_path / "a.onav").out
     assert said in out and out.count("WGS 84") == 1

@@ -103,22 +103,6 @@ def masked(mask, tmp_path):
     return written(tmp_path / "a.onav", {MASKS: data, MASK_OFFSETS: offsets})
 
 
-BITS = 256 * 256 // 8
-MASK_CASES = {
-    "not compressed": bytes(100),
-    "one byte": b"\x78",
-    "wrong checksum": zlib.compress(bytes(BITS))[:-1] + b"\0",
-    "too short": zlib.compress(bytes(BITS - 1)),
-    "too long": zlib.compress(bytes(BITS + 1)),
-    "a bomb of 100 MB": zlib.compress(bytes(100_000_000), 1),
-    "bytes after the end": zlib.compress(bytes(BITS)) + b"more",
-    "a preset dictionary": (lambda c: c.compress(bytes(BITS)) + c.flush())(
-        zlib.compressobj(zdict=b"words")
-    ),
-    "raw deflate": zlib.compress(bytes(BITS))[2:-4],
-}
-
-
 COMMANDS = """
 import json, sys
 from orthonav.cli import main
@@ -133,7 +117,7 @@ def test_crafted_maps_print_no_traceback(tmp_path, flight_path):
     def limit():
         resource.setrlimit(resource.RLIMIT_AS, (3 * 2**29,) * 2)
 
-    path = masked(MASK_CASES["a bomb of 100 MB"], tmp_path)
+    path = masked(zlib.compress(bytes(100_000_000), 1), tmp_path)
     commands = (
         ("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl", "-q"),
         ("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl", "-q", "--track"),

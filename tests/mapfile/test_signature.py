@@ -275,7 +275,7 @@ def test_the_commands(tmp_path, run):
     write_map(path, manifest(), arrays())
     public = tmp_path / "key" / "public.pem"
     assert run("sign", path, "--new-key", tmp_path / "key").code == 0
-    assert "signature and contents are valid" in run("verify", path, "--public-key", public).out
+    assert "signature and contents are valid" in run("verify", path, "--key", public).out
     signature_path(path).unlink()
     done = run("localize", path, tmp_path, "--out", tmp_path / "out", "--require-signed", public)
     assert done.code == 1 and "not signed" in done.err and done.err.count("\n") == 1
@@ -286,9 +286,9 @@ def test_the_commands(tmp_path, run):
     done = run("localize", path, tmp_path, "--out", tmp_path / "out", "--require-signed", public)
     assert "expected a flight folder" in done.err  # the next thing that is wrong
     assert "map cannot be flown" in run(*fly).err  # likewise
-    signed = run("verify", path, "--public-key", public).out
+    signed = run("verify", path, "--key", public).out
     assert "serial " in signed and "signed " in signed
-    for command in (("verify", path, "--public-key", public), (*fly, "--state", tmp_path / "s")):
+    for command in (("verify", path, "--key", public), (*fly, "--state", tmp_path / "s")):
         done = run(*command, "--not-before", "2100-01-01")
         assert done.code == 1 and "too old" in done.err and done.err.count("\n") == 1
     localize = ("localize", path, tmp_path, "--out", tmp_path / "out", "--not-before", "9" * 15)
@@ -316,7 +316,7 @@ def test_a_map_that_replaces_the_checked_one_is_not_used(command, path, keys, ru
     monkeypatch.setattr(localize, "_take_flown", lambda *asked: None)
     done = run(
         *{
-            "verify": ("verify", path, "--public-key", public),
+            "verify": ("verify", path, "--key", public),
             "localize": ("localize", path, path, "--out", path, "--require-signed", public),
             "fly": ("fly", path, path, "--recorded-telemetry", "--require-signed", public),
         }[command]

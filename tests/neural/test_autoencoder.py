@@ -8,15 +8,6 @@ from orthonav.research.autoencoder import AutoEncoder, reconstructions
 from orthonav.research.tiles import SheetTiles
 
 
-@pytest.mark.parametrize("tile_px", [32, 48, 128])
-@pytest.mark.parametrize("channels", [1, 2])
-def test_a_reconstruction_has_the_size_of_its_tile(tile_px, channels):
-    model = AutoEncoder(tile_px=tile_px, channels=channels, width=8, dims=12)
-    tiles = torch.rand(3, channels, tile_px, tile_px)
-    assert model.encoder(tiles).shape == (3, 12)
-    assert model(tiles).shape == tiles.shape
-
-
 @pytest.mark.long
 def test_only_binary_inputs_end_in_a_sigmoid():
     pictures = []

@@ -3,9 +3,6 @@
 import dataclasses
 import functools
 import json
-import signal
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -101,26 +98,6 @@ def test_the_auto_encoder_learns_to_reconstruct_the_area(tmp_path):
     assert "float32" in messages[-1][0]
 
 
-@pytest.mark.slow  # an experiment
-def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
-    recipe = TripletRecipe(width=4, epochs=30, batch=32, learning_rate=2e-3, apart=0.5)
-    recipe = dataclasses.replace(recipe, similarity="cosine", margin=0.2)
-    tiles = sheet()
-    before = learn(dataclasses.replace(recipe, epochs=1, learning_rate=1e-9), tiles=tiles)
-    after = learn(recipe, tmp_path, tiles=tiles, means=RARELY_SAVED)
-    history = losses(tmp_path)
-    assert history[-1] < 0.1 * history[0]
-    rng = np.random.default_rng(9)
-    seen = np.stack([noisy(rng, tiles.grey_tile(row)) for row in range(len(tiles))])
-    seen = seen[:, None].astype(np.float32) / 255
-    found = []
-    for embedder in (before, after):
-        scores = embedder.views(seen) @ embedder.views(tiles.batch(np.arange(len(tiles)))).T
-        found.append(np.mean(scores.argmax(axis=1) == np.arange(len(tiles))))
-    assert found[0] < 0.5
-    assert found[1] > 0.75  # rounding differs between machines and numbers of threads
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     "recipe",
@@ -151,50 +128,13 @@ def test_a_training_killed_within_an_epoch_resumes_within_it(recipe, at, tmp_pat
     monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
     with pytest.raises(Killed):
         learn(recipe, tmp_path / "killed", report=kill_at(at))
+    half = tmp_path / "killed" / ".checkpoint.pt.x.tmp.pt"
+    half.write_bytes(b"of a write that was killed")
     messages = []
     resumed = learn(recipe, tmp_path / "killed", report=lambda text, share: messages.append(text))
-    assert messages[0].startswith(at)
+    assert messages[0].startswith(at) and not half.exists()
     np.testing.assert_array_equal(resumed.onnx, whole.onnx)
     assert losses(tmp_path / "killed") == whole.losses
-
-
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-import torch
-torch.set_num_threads(1)
-sys.path.insert(0, sys.argv[1])
-import test_training as here
-
-written = []
-save = torch.save
-
-def save_and_die(content, path):
-    save(content, path)
-    written.append(path)
-    if len(written) == 6:
-        with open(path, "r+b") as stream:
-            stream.truncate(1000)
-        os.kill(os.getpid(), signal.SIGKILL)
-
-torch.save = save_and_die
-here.learn(here.AUTO, Path(sys.argv[2]))
-"""
-
-
-@pytest.mark.slow  # starts PyTorch again
-def test_a_kill_during_a_write_leaves_the_previous_checkpoint(tmp_path, monkeypatch):
-    command = [sys.executable, "-c", KILLED, str(Path(__file__).parent), str(tmp_path)]
-    assert subprocess.run(command, timeout=60).returncode == -signal.SIGKILL
-    assert len(list(tmp_path.glob(".checkpoint*"))) == 1
-    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
-    messages = []
-    learn(AUTO, tmp_path, report=lambda text, share: messages.append(text))
-    assert messages[0].startswith("epoch 2 of 3, batch 2 of 4")  # five were written
-    assert not list(tmp_path.glob(".*"))
-    alone = tmp_path / "alone"
-    learn(AUTO, alone)
-    np.testing.assert_allclose(losses(tmp_path), losses(alone), rtol=1e-4)
 
 
 def test_epochs_can_be_added_to_a_finished_training_and_not_taken_away(tmp_path):

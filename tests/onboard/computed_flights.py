@@ -26,11 +26,7 @@ class ComputedOdometry:
     """Takes the place of `PictureOdometry`: the true motion with noise."""
 
     def __init__(self, flight):
-        self.flight = flight
-        self.reset()
-
-    def reset(self):
-        self.before = None
+        self.flight, self.before = flight, None
 
     def motion(self, grey, camera, arrived_ns):
         flight, start = self.flight, self.before
@@ -101,6 +97,10 @@ class ComputedFlight:
             if arrives(at_s):
                 self.images.append((at_s, *self._image(at_s)))
         return self.images[before:]
+
+    def sends_all(self, until_s):
+        """Fly on; whether every image of this time had a position."""
+        return all(reason is None for _, reason, _ in self.fly(until_s))
 
     def _image(self, at_s):
         arrived_ns = round((BEGIN_S + at_s + abs(self.rng.normal(0, 0.01))) * S)

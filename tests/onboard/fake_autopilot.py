@@ -1,11 +1,9 @@
 """Fake surroundings of a flight, beyond those of `benchmarks.fakes`: an autopilot over UDP, a
 flight folder, a locator."""
 
-import json
 import socket
 import threading
 import time
-from dataclasses import asdict
 from types import MappingProxyType
 
 import cv2
@@ -13,11 +11,30 @@ import numpy as np
 from benchmarks.fakes import UTC_NS, Port, S, Time
 from examples.simulated_autopilot import Encoder as Autopilot
 
+from orthonav.core.flight import FlightWriter
 from orthonav.core.records import Fix
+from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.telemetry import TelemetryBuffer
 from wire import TABLES, decode
 
 __all__ = ["UTC_NS", "Port", "Time"]  # tests import them from here
 MS = 10**6
+AHEAD_NS = -90 * S  # the autopilot was switched on at 90 s of our clock
+
+
+class Linked:
+    """A link between a port and clocks of the test."""
+
+    def __init__(self, **options):
+        self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
+        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), self.time.clocks, **options)
+
+    def boot_ns(self):
+        return self.time.now_ns + AHEAD_NS
+
+    def hear(self, *frames):
+        self.port.coming.extend(frames)
+        return self.link.poll()
 
 
 class LiveAutopilot(threading.Thread):
@@ -85,15 +102,12 @@ def fix(lat_deg=48.0, lon_deg=2.0, confidence=0.97, std_m=2.0, heading_deg=0.0, 
 
 def write_flight(folder, camera, views):
     """A flight folder of grey pictures and their telemetry."""
-    (folder / "frames").mkdir(parents=True)
-    (folder / "flight.json").write_text(json.dumps({"camera": asdict(camera)}))
-    lines = ["frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m"]
+    folder.mkdir(exist_ok=True)
+    writer = FlightWriter(folder, camera, "")
     for number, (grey, telemetry) in enumerate(views):
-        cv2.imwrite(str(folder / "frames" / f"{number:03d}.png"), grey)
-        time_s = f"{telemetry.time_ns // S}.{telemetry.time_ns % S:09d}"
-        numbers = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
-        lines.append(",".join([f"{number:03d}.png", time_s, *map(repr, numbers)]))
-    (folder / "telemetry.csv").write_text("\n".join(lines) + "\n")
+        frame = f"{number:03d}.png"
+        writer.add_encoded(frame, cv2.imencode(".png", grey)[1].tobytes(), telemetry, None)
+    writer.close()
 
 
 class FakeLocator:

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_autopilot import MS, FakeLocator, S, fix
+from fake_autopilot import AHEAD_NS, MS, FakeLocator, S, fix
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from test_fly import AHEAD_NS, Flight
+from test_fly import Flight, beginning
 
 from orthonav.cli.flying import _interrupted
 from orthonav.core.flight.gnss import FAULTS, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import ViewResult
 from orthonav.onboard.gnss.biases import unknown
-from orthonav.onboard.gnss.watch import GnssWatch, live_solutions
+from orthonav.onboard.gnss.watch import GnssWatch
 from orthonav.onboard.state import SavedState, learnt_biases, reference_biases, save
 from orthonav.onboard.telemetry import Clocks
 
@@ -31,7 +31,7 @@ class Watched(Flight):
         known = options.pop("known", {})
         self.off_m, self.fix_type, self.receiver, self.north_m = np.zeros(2), 3, receiver, 0.0
         solved = deque()
-        self.watch = GnssWatch(FRAME, live_solutions(solved), digest="d", known=known)
+        self.watch = GnssWatch(FRAME, solved, digest="d", known=known)
         locator = FakeLocator(lambda view: self.seen())
         super().__init__(tmp_path, locator, gnss=self.watch, **options)
         self.link.gnss = solved
@@ -78,16 +78,7 @@ class Watched(Flight):
 
 @pytest.fixture
 def begin(tmp_path):
-    """Function that starts a watched flight, which ends after the test."""
-    made = []
-
-    def flight(**options):
-        made.append(Watched(tmp_path, **options))
-        return made[-1]
-
-    yield flight
-    for each in made:
-        each.runner._publisher.close()
+    yield from beginning(Watched, tmp_path)
 
 
 @pytest.mark.long
@@ -174,7 +165,7 @@ def test_the_reference_survives_a_restart_in_flight(tmp_path, age_s, east_m):
         solutions = deque()
         watch = GnssWatch(
             FRAME,
-            live_solutions(solutions),
+            solutions,
             digest="d",
             known=learnt_biases(path),
             reference=_interrupted(Namespace(state=path), "d", clocks),
@@ -234,7 +225,7 @@ def corrections(differences_m, std_m=3.6, fix_type=3, known=None):
 
     `differences_m`: GNSS less map (2,)."""
     solutions, en_m = deque(), np.zeros(2)
-    watch = GnssWatch(FRAME, live_solutions(solutions), digest="d", known=known or {})
+    watch = GnssWatch(FRAME, solutions, digest="d", known=known or {})
     made = []
     for second, difference_m in enumerate([*differences_m, *[None] * 6]):
         time_ns = (100 + second) * S
@@ -298,6 +289,6 @@ def test_the_displacement_of_an_earlier_flight_corrects_a_flight_without_gnss():
 
 
 def test_a_watch_without_solutions_reports_nothing():
-    watch = GnssWatch(FRAME, live_solutions(deque()))
+    watch = GnssWatch(FRAME, deque())
     assert watch.tick(10**12) == [] and watch.reasons() == () and watch.plain() == []
     assert watch.maps() == {} and math.isnan(watch.difference_m)

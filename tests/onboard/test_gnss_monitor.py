@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from benchmarks.gnss_watch import FRAME, MAPS, delay, false_alarms, fed, lawnmower, map_positions
 
-from orthonav.core.flight.gnss import GnssSample
+from orthonav.core.flight.gnss import Fault, GnssSample
 from orthonav.ground.simulate.receiver import receiver_of, solutions
 from orthonav.onboard.gnss.biases import (
     Biases,
     Difference,
     DifferenceWindow,
-    Fault,
     _Filter,
     unknown,
 )
@@ -253,6 +252,7 @@ def test_a_hovering_receiver_may_repeat_its_position():
 def test_a_wrong_velocity_is_named():
     air = Air()
     air.fly(100)
+    air.fly(1, vel_en_mps=None)  # one that is missing delays it only
     for _ in range(30):
         status = air.fly(1, vel_en_mps=(3.0, 20.0))
     assert status.fault is Fault.VELOCITY
@@ -262,6 +262,9 @@ def test_a_receiver_without_velocity_is_watched():
     air = Air()
     assert air.fly(200, vel_en_mps=None).state is GnssState.GOOD
     assert air.fly(6, vel_en_mps=None, gnss_m=(50.0, 0.0)).state is GnssState.ALARM
+    air = Air()  # without the map
+    assert air.fly(60, vel_en_mps=None, map_m=None).fault is None
+    assert air.fly(1, vel_en_mps=None, map_m=None, gnss_m=(50.0, 0.0)).fault is Fault.JUMP
 
 
 def test_a_receiver_that_was_never_heard_has_no_fault():

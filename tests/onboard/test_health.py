@@ -4,20 +4,20 @@ import math
 import os
 import socket
 from collections import Counter
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
-from fake_autopilot import S, fix
+from fake_autopilot import S
 
-from orthonav.core.records import Telemetry
 from orthonav.onboard.health import Health, HealthReporter, Level, judge, notify
 from orthonav.onboard.monitors import (
-    CameraMonitor,
     EventCounter,
-    LinkMonitor,
-    OutputMonitor,
-    ProgramMonitor,
     TrackMonitor,
+    camera_reasons,
+    link_reasons,
+    output_reasons,
+    program_reasons,
 )
 
 
@@ -41,21 +41,18 @@ class Judged:
         gate = SimpleNamespace(is_unavailable=seen.pop("unavailable", False))
         publisher = SimpleNamespace(gate=gate, messenger=SimpleNamespace(needs_origin=True))
         state, change = seen.pop("state", "tracking"), seen.pop("map_change", None)
-        camera = CameraMonitor(self.events)
-        camera.taken_ns = self._before(seen.pop("image_age_s", 0.0))
+        for name, age in (("taken", "image_age_s"), ("confident", "low_confidence_s")):
+            age_s = seen.pop(age, 0.0)
+            self.events.last_ns[name] = 0 if math.isinf(age_s) else self.now_ns - round(age_s * S)
         self.track = TrackMonitor(self.events, publisher, lambda: state)
-        self.track.confident_ns = self._before(seen.pop("low_confidence_s", 0.0))
         self.monitors = [
-            camera,
-            LinkMonitor(self.events, link, recorded=False),
-            ProgramMonitor(self.events, lambda: change),
-            OutputMonitor(self.events, publisher, link),
-            self.track,
+            partial(camera_reasons, self.events),
+            partial(link_reasons, self.events, link, False),
+            partial(program_reasons, self.events, lambda: change),
+            partial(output_reasons, self.events, publisher, link),
+            self.track.reasons,
         ]
         assert not seen
-
-    def _before(self, age_s):
-        return None if math.isinf(age_s) else self.now_ns - round(age_s * S)
 
     def health(self):
         return judge(self.monitors, self.now_ns)
@@ -110,17 +107,6 @@ def test_without_faults_health_is_ok():
 )
 def test_every_fault_has_a_reason(level, reason, seen):
     assert Judged(**seen).health() == Health(level, (reason,))
-
-
-@pytest.mark.parametrize(
-    ("heading_deg", "agl_m", "reason"),
-    [(190.0, 100.0, "heading_mismatch"), (0.0, 50.0, "height_mismatch")],
-)
-def test_a_fix_may_contradict_heading_and_height(heading_deg, agl_m, reason):
-    seen = Judged()
-    telemetry = Telemetry(0, 0.0, 0.0, 0.0, 100.0)
-    seen.track.found(fix(heading_deg=heading_deg, agl_m=agl_m), telemetry, seen.now_ns)
-    assert seen.health() == Health(Level.DEGRADED, (reason,))
 
 
 def test_reasons_of_failed_come_first():

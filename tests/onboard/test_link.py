@@ -6,7 +6,7 @@ import pty
 import socket
 
 import pytest
-from fake_autopilot import MS, UTC_NS, Autopilot, Port, S, Time
+from fake_autopilot import AHEAD_NS, MS, UTC_NS, Autopilot, Linked, S, Time
 
 from helpers import wait_for
 from orthonav.core.errors import VariantError
@@ -18,25 +18,21 @@ from orthonav.onboard.telemetry import TelemetryBuffer
 from wire import decode
 
 KEY = bytes(range(32))
-AHEAD_NS = -90 * S  # the autopilot was switched on at 90 s of our clock
 
 
-class Flying:
-    """A link between a port and clocks of the test."""
-
-    def __init__(self, **options):
-        self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
-        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), self.time.clocks, **options)
-
-    def boot_ns(self):
-        return self.time.now_ns + AHEAD_NS
-
-    def hear(self, *frames):
-        self.port.coming.extend(frames)
-        return self.link.poll()
+class Flying(Linked):
+    @property
+    def state(self):
+        return self.link.state_at(self.time.now_ns)
 
     def telemetry(self, **options):
-        return self.link.state_at(self.time.now_ns).telemetry(0, **options)
+        return self.state.telemetry(0, **options)
+
+    def position(self, amsl_m, home_m):
+        """GLOBAL_POSITION_INT with these heights."""
+        mm = round(amsl_m * 1000), round(home_m * 1000)
+        ms = self.boot_ns() // MS
+        self.hear(self.autopilot.say("global_position_int", ms, 0, 0, *mm, 0, 0, 0, 0))
 
 
 @pytest.fixture
@@ -88,41 +84,35 @@ def test_telemetry_at_an_exposure(flying):
 
 
 def test_heights_above_sea_level(flying):
-    now = flying.boot_ns()
-    say = flying.autopilot.say
-    flying.hear(flying.autopilot.attitude(now))
-    flying.hear(say("global_position_int", now // MS, 0, 0, 0, 60_000, 0, 0, 0, 0))
-    state = flying.link.state_at(flying.time.now_ns)
+    flying.hear(flying.autopilot.attitude(flying.boot_ns()))
+    flying.position(0.0, 60.0)
+    state = flying.state
     assert state.home_m == state.height_m == 60.0 and math.isnan(state.amsl_m)  # 0 is "unknown"
-    flying.hear(say("altitude", now // 1000, 0, 640.0, 0, 55.0, -1001.0, 0))
-    assert flying.link.state_at(flying.time.now_ns).amsl_m == 640.0
+    us = flying.boot_ns() // 1000
+    flying.hear(flying.autopilot.say("altitude", us, 0, 640.0, 0, 55.0, -1001.0, 0))
+    assert flying.state.amsl_m == 640.0
     flying.time.go(0.02)
-    now = flying.boot_ns()
-    flying.hear(say("global_position_int", now // MS, 0, 0, 655_000, 60_000, 0, 0, 0, 0))
-    assert flying.link.state_at(flying.time.now_ns).amsl_m == 655.0
+    flying.position(655.0, 60.0)
+    assert flying.state.amsl_m == 655.0
 
 
-def heights_of(kind, alt_m, relative_m):
-    """Heights above home and sea level by an autopilot of a kind."""
+PX4, ARDUPILOT = 12, 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "amsl_m", "home_m", "known"),
+    [
+        *((kind, 160.0, 120.0, (120.0, 160.0)) for kind in (PX4, ARDUPILOT)),
+        (PX4, 39.971, 39.971, (math.nan, 39.971)),  # no home position: both are above the sea
+        (ARDUPILOT, -0.14, -0.14, (-0.14, math.nan)),  # no altitude by GNSS: above the start
+        (ARDUPILOT, 120.0, 119.99, (119.99, math.nan)),
+    ],
+)
+def test_one_height_that_is_sent_twice_is_not_taken_for_two(kind, amsl_m, home_m, known):
     flying = Flying()
-    flying.hear(flying.autopilot.heartbeat(kind))
-    now, mm = flying.boot_ns(), (round(alt_m * 1000), round(relative_m * 1000))
-    flying.hear(flying.autopilot.attitude(now))
-    flying.hear(flying.autopilot.say("global_position_int", now // MS, 0, 0, *mm, 0, 0, 0, 0))
-    state = flying.link.state_at(flying.time.now_ns)
-    known = (state.home_m, state.amsl_m)
-    return tuple(None if math.isnan(each) else round(each, 3) for each in known)
-
-
-def test_one_height_that_is_sent_twice_is_not_taken_for_two():
-    px4, ardupilot = 12, 3
-    for kind in (px4, ardupilot):
-        assert heights_of(kind, 160.0, 120.0) == (120.0, 160.0)
-    # PX4 without a home position: both are heights above the sea.
-    assert heights_of(px4, 39.971, 39.971) == (None, 39.971)
-    # ArduPilot without an altitude by GNSS: both are heights above the start.
-    assert heights_of(ardupilot, -0.14, -0.14) == (-0.14, None)
-    assert heights_of(ardupilot, 120.0, 119.99) == (119.99, None)
+    flying.hear(flying.autopilot.heartbeat(kind), flying.autopilot.attitude(flying.boot_ns()))
+    flying.position(amsl_m, home_m)
+    assert (flying.state.home_m, flying.state.amsl_m) == pytest.approx(known, nan_ok=True)
 
 
 def test_heights_of_every_message(flying):
@@ -131,7 +121,7 @@ def test_heights_of_every_message(flying):
 
     def height(*frames):
         flying.hear(*frames)
-        return round(flying.link.state_at(flying.time.now_ns).height_m, 2)
+        return round(flying.state.height_m, 2)
 
     unknown = -1001.0
     say = flying.autopilot.say
@@ -163,7 +153,7 @@ def test_a_barometer_and_the_terrain_of_px4_are_no_heights(flying):
     now = flying.boot_ns()
     flying.hear(flying.autopilot.attitude(now))
     flying.hear(flying.autopilot.say("altitude", now // 1000, 489.8, 489.8, 0, 55.0, 150.0, 80.0))
-    state = flying.link.state_at(flying.time.now_ns)
+    state = flying.state
     assert math.isnan(state.amsl_m) and state.height_m == 80.0
 
 
@@ -279,7 +269,7 @@ def test_the_origin_of_the_autopilot_is_stored_until_it_restarts(flying):
 
 
 def stds(flying):
-    telemetry = flying.link.state_at(flying.time.now_ns).telemetry(0)
+    telemetry = flying.state.telemetry(0)
     total_deg, mount_deg = telemetry.tilt_std_deg, telemetry.mount_std_deg
     assert total_deg == math.hypot(telemetry.horizon_std_deg, mount_deg) and mount_deg == 2.5
     return telemetry.vel_std_mps, pytest.approx(telemetry.horizon_std_deg)

@@ -56,24 +56,13 @@ def begun(folder, **how):
     return log
 
 
-def read(path):
-    """Topic to messages, by the library's own reader."""
-    found = {}
-    with path.open("rb") as stream:
-        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(
-            log_time_order=False
-        ):
-            found.setdefault(channel.topic, []).append(message)
-    return found
-
-
-def read_chunks(path):
-    """The same of a file whose ending may not have had space."""
-    found = {}
-    with path.open("rb") as stream, contextlib.suppress(EndOfFile):
-        for _, channel, message in NonSeekingReader(stream, validate_crcs=True).iter_messages(
-            log_time_order=False
-        ):
+def read(path, reader=make_reader):
+    """Topic to messages, by the library's own reader; `NonSeekingReader`: of a file whose ending
+    may not have had space."""
+    found, allowed = {}, [EndOfFile] if reader is NonSeekingReader else []
+    with path.open("rb") as stream, contextlib.suppress(*allowed):
+        whole = reader(stream, validate_crcs=True)
+        for _, channel, message in whole.iter_messages(log_time_order=False):
             found.setdefault(channel.topic, []).append(message)
     return found
 
@@ -248,7 +237,7 @@ def test_a_full_disk_drops_images_first(tmp_path, monkeypatch):
     log.close()
     logged = {}
     for name in files_in(tmp_path):
-        for topic, messages in read_chunks(tmp_path / name).items():
+        for topic, messages in read(tmp_path / name, NonSeekingReader).items():
             logged.setdefault(topic, []).extend(messages)
     assert log.lost["views"] == 30 - len(logged["/orthonav/view"]) > 10
     assert len(logged["/orthonav/result"]) > len(logged["/orthonav/view"]) >= 4

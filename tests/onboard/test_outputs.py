@@ -182,6 +182,16 @@ def test_the_gate_judges_the_accuracy_of_the_fix():
     assert sending.frames[-1]["eph"] > 4.0
 
 
+def test_messages_are_confident_by_the_rules_of_the_gate():
+    """Where an alert limit decides, they have no least confidence of their own."""
+    sending = Sending("global-position", "gps-input", rules=GateRules(min_confidence=0.0))
+    low = replace(ESTIMATE, confidence=0.5, time_ns=sending.time.now_ns)
+    assert sending.publish(low)[1] == "not_made:GLOBAL_POSITION_SENSOR"
+    admitted = sending.gate.admit(low, sending.time.now_ns).estimate
+    assert sending.publish(admitted) == (("GLOBAL_POSITION_SENSOR", "GPS_INPUT"), None)
+    assert sending.frames[-1]["fix_type"] == 3
+
+
 @pytest.mark.parametrize(
     "kind, interval_s, too_slow",
     [(Autopilot.PX4, 0.2, 4), (Autopilot.PX4, 0.125, 0), (Autopilot.ARDUPILOT, 0.5, 0)],
@@ -203,9 +213,9 @@ def test_nmea_over_udp():
         heard.bind(("127.0.0.1", 0))
         heard.settimeout(60)
         out = NmeaOut(open_sink(f"udp:127.0.0.1:{heard.getsockname()[1]}"))
-        out.write(ESTIMATE, UTC_NS, 0.9)
+        out.write(ESTIMATE, UTC_NS)
         gga, rmc, gst = sentences(heard.recv(500))
-        out.write(None, UTC_NS, 0.9)
+        out.write(None, UTC_NS)
         none, *_ = sentences(heard.recv(500))
         out.close()
     assert (gga.msgID, rmc.msgID, gst.msgID) == ("GGA", "RMC", "GST")
@@ -218,13 +228,13 @@ def test_nmea_over_a_serial_port_that_is_unplugged():
     ours, theirs = pty.openpty()
     name = os.ttyname(theirs)
     out = NmeaOut(open_sink(f"serial:{name}:115200"))
-    out.write(ESTIMATE, UTC_NS, 0.9)
+    out.write(ESTIMATE, UTC_NS)
     assert sentences(os.read(ours, 500))[0].quality == 6
     os.close(theirs)
     os.close(ours)
     for _ in range(2):
         with pytest.raises(OSError):
-            out.write(ESTIMATE, UTC_NS, 0.9)
+            out.write(ESTIMATE, UTC_NS)
     out.close()
 
 

@@ -74,7 +74,7 @@ def test_an_invalid_covariance_has_no_standard_deviation(cov: list[list[float]])
     estimate = replace(PLAIN, cov_en_m2=np.array(cov))
     assert all(map(math.isnan, error_ellipse(estimate.cov_en_m2)))
     assert math.isnan(estimate.horizontal_std_m())
-    assert not estimate.is_confident()
+    assert not estimate.is_confident
 
 
 def test_the_standard_deviation_is_that_of_the_worst_direction() -> None:
@@ -97,7 +97,7 @@ def test_the_standard_deviation_is_that_of_the_worst_direction() -> None:
 def test_a_confident_estimate_is_of_high_confidence_and_tracking(
     confidence: float, state: str | None, confident: bool
 ) -> None:
-    assert replace(PLAIN, confidence=confidence, state=state).is_confident() is confident
+    assert replace(PLAIN, confidence=confidence, state=state).is_confident is confident
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lab.clouds import Clouds
 from scipy.spatial.transform import Rotation
-from test_flight import PLAIN, SMALL, plane_of, route_of
+from test_flight import SMALL, plane_of, route_of
 
-from helpers import textured
-from orthonav.core.errors import UsageError
-from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.flight import open_flight
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
@@ -21,27 +19,6 @@ from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_p
 SEEN = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
 CORNERS = np.array([[-300.0, -200.0], [-300.0, 100.0], [200.0, 100.0]])
 ALL = Errors(5.0, 0.05, 1.0, 2.0, 40.0)
-
-
-@pytest.fixture(scope="module")
-def ortho(make_ortho, tmp_path_factory):
-    return make_ortho(tmp_path_factory.mktemp("blots") / "blots.tif", textured((700, 800)))
-
-
-@pytest.fixture(scope="module")
-def frame(ortho):
-    return plane_of(ortho).frame
-
-
-@pytest.fixture
-def fly(ortho, frame, tmp_path):
-    def flown(name="f", corners=CORNERS, **request):
-        route = route_of(frame, *corners)
-        kinds = {"route": route, "agl_m": 100.0, "camera": SMALL, "effects": PLAIN, **request}
-        simulate_flight(SimulateRequest([ortho], tmp_path / name, **kinds))
-        return open_flight(tmp_path / name), read_truth(tmp_path / name / "truth.csv")
-
-    return flown
 
 
 def reported(flight, *fields):
@@ -70,10 +47,11 @@ def test_a_seed_gives_the_numbers_of_earlier_versions(area, tmp_path):
     assert lines[4] == "0004.jpg,6,353.495,2.995,0.282,106.121,5,5,48.86032265,2.34959257,40,1"
 
 
-def test_biases_are_constant(fly):
-    exact, truth = fly("exact", errors=ALL, spacing_m=100.0, seed=3)
+def test_biases_are_constant(fly, frame):
+    along = {"route": route_of(frame, *CORNERS), "spacing_m": 100.0, "seed": 3}
+    exact, truth, _ = fly(errors=ALL, **along)
     bias = Errors(*[5.0, 0.05, 1.0, 2.0, 40.0], yaw_bias_deg=-4.0, agl_bias=0.08)
-    erring, same = fly("erring", errors=bias, spacing_m=100.0, seed=3)
+    erring, same, _ = fly(errors=bias, **along)
     assert truth == same
     off = reported(erring, "yaw_deg", "agl_m") - reported(exact, "yaw_deg", "agl_m")
     assert (off[:, 0] + 180) % 360 - 180 == pytest.approx(-4)
@@ -84,19 +62,10 @@ def test_biases_are_constant(fly):
         assert (a == b).all()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.77, 1.0])
-@pytest.mark.parametrize("count", [1, 7, 500])
-def test_the_share_of_views_with_clouds(count, share):
-    clouds = Clouds(share, count, 0)
-    degree = np.array([clouds.degree(number) for number in range(count)])
-    assert (degree > 0).sum() == round(share * count)
-    assert degree.min() >= 0 and degree.max() <= 1
-
-
-def test_clouds_hide_some_views_and_leave_the_others(fly):
-    kinds = {"camera": SEEN, "spacing_m": 25.0, "seed": 3}
-    clear, truth = fly("clear", **kinds)
-    hidden, same = fly("hidden", **kinds, clouds=partial(Clouds, 0.4))
+def test_clouds_hide_some_views_and_leave_the_others(fly, frame):
+    along = {"route": route_of(frame, *CORNERS), "spacing_m": 25.0, "seed": 3, "camera": SEEN}
+    clear, truth, _ = fly(**along)
+    hidden, same, _ = fly(**along, clouds=partial(Clouds, 0.4))
     assert truth == same
     fields = ("yaw_deg", "time_ns", "agl_m")
     assert (reported(clear, *fields) == reported(hidden, *fields)).all()
@@ -107,19 +76,6 @@ def test_clouds_hide_some_views_and_leave_the_others(fly):
     spread = np.array([b.std() for _, b in pairs])
     assert (degree == 1).sum() >= 3 and spread[degree == 1].max() < 6
     assert spread[(degree > 0.3) & (degree < 0.7)].min() > 15
-
-
-@pytest.mark.parametrize(
-    "request_",
-    [
-        {"turn_radius_m": 10.0},
-        {"errors": Errors(velocity_drift=0.0)},
-    ],
-    ids=["turn_radius_m", "velocity_drift"],
-)
-def test_random_positions_refuse_route_options(fly, request, request_):
-    with pytest.raises(UsageError, match=f"{request.node.callspec.id}: only along a route"):
-        fly(route=None, random=3, **request_)
 
 
 def test_the_command(run, ortho, frame, tmp_path):

@@ -193,6 +193,9 @@ REFUSED = {
     "none": ({"random": 0}, UsageError, "random must be 1 to"),
     "neither": ({"random": None}, UsageError, "either a route or"),
     "turn": ({"turn_radius_m": -1.0}, UsageError, "turn_radius_m"),
+    "corners": ({"turn_radius_m": 10.0}, UsageError, "turn_radius_m: only along a route"),
+    "odometry": ({"errors": Errors(velocity_drift=0.0)}, UsageError, "drift: only along a route"),
+    "ahead": ({"camera_pitch_deg": 70.0}, UsageError, "camera_pitch_deg must be 0 to 65"),
 }
 
 

@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_flight import PLAIN, SMALL, plane_of, route_of
+from test_flight import route_of
 
 from helpers import write_dem
 from orthonav.core.errors import AreaError, FlightError, ImageryError
-from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.flight import open_flight
 from orthonav.ground.imagery.terrain import open_dem
-from orthonav.ground.simulate import flight as flight_module
-from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
 
 HOUSE_M, ROOF_M, AGL_M = 30.0, 8.0, 60.0
 
@@ -32,11 +30,6 @@ def ortho(make_ortho, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def frame(ortho):
-    return plane_of(ortho).frame
-
-
-@pytest.fixture(scope="module")
 def models(frame, tmp_path_factory):
     folder = tmp_path_factory.mktemp("heights")
     kinds = {"dsm": (town, 1.0), "dem": (slope, 10.0)}
@@ -48,24 +41,14 @@ def models(frame, tmp_path_factory):
 
 
 @pytest.fixture
-def fly(ortho, tmp_path, monkeypatch):
+def over(fly):
     """Telemetry, true places and the rendered heights of a flight without its pictures."""
 
-    def of(**asked):
-        seen = []
+    def flown(**asked):
+        flight, truth, made = fly(pictures=False, **{"agl_m": AGL_M, **asked})
+        return [v.telemetry for v in flight.views], [*truth.values()], made[0][2]
 
-        def picture(request, ground, surface, *_):
-            seen.append(surface)
-            return np.full((48, 64), 99, np.uint8)
-
-        monkeypatch.setattr(flight_module, "_picture", picture)
-        request = {"camera": SMALL, "effects": PLAIN, "agl_m": AGL_M, **asked}
-        folder = tmp_path / f"f{len(list(tmp_path.glob('f*')))}"
-        simulate_flight(SimulateRequest([ortho], folder, **request))
-        truth, views = read_truth(folder / "truth.csv"), open_flight(folder).views
-        return [each.telemetry for each in views], [truth[each.frame] for each in views], seen[0]
-
-    return of
+    return flown
 
 
 def near_middle(raster, heights):
@@ -76,10 +59,10 @@ def near_middle(raster, heights):
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["with a terrain", "lower envelope"])
-def test_heights_count_from_the_ground_also_over_a_house(fly, models, frame, known):
+def test_heights_count_from_the_ground_also_over_a_house(over, models, frame, known):
     terrain = models["dem"] if known else None
     flown = {"random": 12, "seed": 4, "surface": [models["dsm"]], "terrain": terrain}
-    telemetry, places, seen = fly(**flown)
+    telemetry, places, seen = over(**flown)
     there = np.array([frame.en_from_latlon(*place) for place in places])
     assert (town(*there.T) > slope(*there.T) + 1).any()
     amsl_m = np.array([each.amsl_m for each in telemetry])
@@ -87,20 +70,20 @@ def test_heights_count_from_the_ground_also_over_a_house(fly, models, frame, kno
     assert np.isnan([each.agl_m for each in telemetry]).all()
     assert np.abs(near_middle(seen, town)).max() < 0.5
     if known:
-        telemetry, _, seen = fly(random=12, seed=4, terrain=terrain)
+        telemetry, _, seen = over(random=12, seed=4, terrain=terrain)
         assert [each.amsl_m for each in telemetry] == amsl_m.tolist()
         assert near_middle(seen, town).min() < -ROOF_M + 0.5
 
 
-def test_the_altitude_of_a_route_counts_from_the_ground(fly, models, frame):
+def test_the_altitude_of_a_route_counts_from_the_ground(over, models, frame):
     """It begins over a house."""
     route = route_of(frame, (10.0, 10.0), (130.0, 10.0))
-    telemetry, _, _ = fly(route=route, surface=[models["dsm"]])
+    telemetry, _, _ = over(route=route, surface=[models["dsm"]])
     amsl_m = [each.amsl_m for each in telemetry]
     np.testing.assert_allclose(amsl_m, slope(10.0, 10.0) + AGL_M, atol=0.5)
 
 
-def test_earlier_models_come_first_and_the_terrain_fills_holes(fly, models, frame, tmp_path):
+def test_earlier_models_come_first_and_the_terrain_fills_holes(over, models, frame, tmp_path):
     def western(heights):
         heights[:, heights.shape[1] // 2 :] = -9999
         return heights
@@ -108,29 +91,29 @@ def test_earlier_models_come_first_and_the_terrain_fills_holes(fly, models, fram
     west = open_dem(write_dem(tmp_path / "w.tif", frame, town, 800.0, 1.0, western), "msl")
     raised = replace(models["dem"], gsd_m=1.0)
     for rest, heights in ((raised, slope), (models["dsm"], town)):
-        seen = fly(random=1, surface=[west, rest])[2]
+        seen = over(random=1, surface=[west, rest])[2]
         assert np.abs(near_middle(seen, heights)[:, 31:]).max() < 0.5
         assert np.abs(near_middle(seen, town)[:, :29]).max() < 0.5
-    seen = fly(random=1, surface=[west], terrain=models["dem"])[2]
+    seen = over(random=1, surface=[west], terrain=models["dem"])[2]
     assert np.abs(near_middle(seen, slope)[:, 31:]).max() < 0.5
 
 
-def test_flights_that_cannot_be(fly, models, frame, tmp_path):
+def test_flights_that_cannot_be(over, models, frame, tmp_path):
     surface = [models["dsm"]]
     route = route_of(frame, (0.0, 10.0), (40.0, 10.0))
     with pytest.raises(FlightError, match=r"view 1 is 5 m above ground, in a house or tree"):
-        fly(route=route, agl_m=5.0, surface=surface)
+        over(route=route, agl_m=5.0, surface=surface)
     with pytest.raises(ImageryError, match=r"every 10 m, which shows no houses"):
-        fly(random=1, surface=[models["dem"]])
+        over(random=1, surface=[models["dem"]])
     lower = write_dem(tmp_path / "deep.tif", frame, lambda *at: slope(*at) - 45.0, 800.0, 10.0)
     with pytest.raises(ImageryError, match="lies 45 m above the terrain"):
-        fly(random=1, surface=surface, terrain=open_dem(lower, "msl"))
+        over(random=1, surface=surface, terrain=open_dem(lower, "msl"))
     far = type(frame)(frame.lat_deg + 1.0, frame.lon_deg)
     away = open_dem(write_dem(tmp_path / "away.tif", far, town, 200.0, 1.0), "msl")
     with pytest.raises(AreaError, match="the surface does not reach to the imagery"):
-        fly(random=1, surface=[away], terrain=models["dem"])
+        over(random=1, surface=[away], terrain=models["dem"])
     with pytest.raises(AreaError, match="no height below a view"):
-        fly(random=1, surface=[away])
+        over(random=1, surface=[away])
 
 
 def test_the_command(run, ortho, models, tmp_path):

@@ -4,44 +4,23 @@ import math
 
 import numpy as np
 import pytest
-from test_flight import SMALL, plane_of, route_of
+from test_flight import route_of
 
-from helpers import textured
 from orthonav.core.flight import open_flight
-from orthonav.ground.simulate import flight as flight_module
-from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.flight import Errors
 from orthonav.ground.simulate.motion import HORIZON_TIME_S
 
 
-@pytest.fixture(scope="module")
-def ortho(make_ortho, tmp_path_factory):
-    return make_ortho(tmp_path_factory.mktemp("blots") / "blots.tif", textured((1200, 1200)))
-
-
 @pytest.fixture
-def tilts(ortho, tmp_path, monkeypatch):
+def tilts(fly):
     """Flies, and gives true pitch and roll of the camera (N, 2) and the telemetry."""
 
-    def flown(name, **request):
-        true = []
-
-        def picture(*arguments):
-            true.append(arguments[5].attitude[1:3])
-            return np.full((48, 64), 99, np.uint8)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(flight_module, "_picture", picture)
-            request = {"agl_m": 100.0, "camera": SMALL, **request}
-            simulate_flight(SimulateRequest([ortho], tmp_path / name, **request))
-        return np.array(true), [v.telemetry for v in open_flight(tmp_path / name).views]
+    def flown(**request):
+        flight, _, asked = fly(pictures=False, **request)
+        true = [arguments[5].attitude[1:3] for arguments in asked]
+        return np.array(true), [view.telemetry for view in flight.views]
 
     return flown
-
-
-@pytest.fixture(scope="module")
-def route(ortho):
-    corners = [((-1) ** (n // 2) * 400.0, -400.0 + 80.0 * ((n + 1) // 2)) for n in range(18)]
-    return route_of(plane_of(ortho).frame, *corners)
 
 
 def test_the_mount_is_constant_and_of_the_stated_size(tilts):
@@ -49,7 +28,7 @@ def test_the_mount_is_constant_and_of_the_stated_size(tilts):
     biased = Errors(mount_std_deg=2.0, pitch_bias_deg=3.0, roll_bias_deg=-4.0)
     assert biased.mount_deg(1) - errors.mount_deg(1) == pytest.approx([3.0, -4.0])
     for seed in range(3):
-        true, reported = tilts(f"f{seed}", random=2, seed=seed, errors=errors)
+        true, reported = tilts(random=2, seed=seed, errors=errors)
         assert true == pytest.approx(np.tile(errors.mount_deg(seed), (2, 1)), abs=1e-9)
         assert all((t.pitch_deg, t.roll_deg, t.tilt_std_deg) == (0, 0, None) for t in reported)
     mounts = np.array([errors.mount_deg(seed) for seed in range(400)])
@@ -57,8 +36,10 @@ def test_the_mount_is_constant_and_of_the_stated_size(tilts):
     assert np.abs(mounts.mean(axis=0)).max() < 4 * 2.0 / math.sqrt(400)
 
 
-def test_the_horizon_wanders_along_a_route(tilts, route):
-    true, reported = tilts("f", route=route, spacing_m=40.0, errors=Errors(horizon_std_deg=1.5))
+def test_the_horizon_wanders_along_a_route(tilts, frame):
+    corners = [((-1) ** (n // 2) * 400.0, -400.0 + 80.0 * ((n + 1) // 2)) for n in range(18)]
+    route = route_of(frame, *corners)
+    true, reported = tilts(route=route, spacing_m=40.0, errors=Errors(horizon_std_deg=1.5))
     assert len(true) > 150
     assert 0.7 < true.std() < 2.3
     step_s = (reported[1].time_ns - reported[0].time_ns) / 1e9
@@ -74,8 +55,8 @@ def test_what_the_telemetry_states(tilts):
         None: Errors(mount_std_deg=1.0, horizon_std_deg=1.0),
         0.5: Errors(tilt_std_deg=0.5, mount_std_deg=1.0, horizon_std_deg=1.0),
     }
-    for number, (std, errors) in enumerate(stated.items()):
-        _, reported = tilts(f"f{number}", random=2, errors=errors)
+    for std, errors in stated.items():
+        _, reported = tilts(random=2, errors=errors)
         assert {t.tilt_std_deg for t in reported} == {std}
     assert Errors(pitch_bias_deg=1.0).reported_tilt_std_deg is None
     assert Errors(attitude_std_deg=3.0).reported_tilt_std_deg == 0

@@ -23,7 +23,7 @@ CAMERA = {
 }
 XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-<rdf:Description rdf:about="" xmlns:{prefix}="{uri}" {attributes}>{elements}</rdf:Description>
+<rdf:Description rdf:about="" xmlns:{prefix}="{uri}" {attributes}></rdf:Description>
 </rdf:RDF></x:xmpmeta><?xpacket end="w"?>"""
 SENSEFLY = "sensefly", "http://ns.sensefly.com/1.0/"
 DJI = "drone-dji", "http://www.dji.com/drone-dji/1.0/"
@@ -46,23 +46,18 @@ def camera_file(path, **changes):
 # Photographs.
 
 
-def packet(maker=DJI, as_elements=False, **values):
+def packet(maker=DJI, **values):
     prefix, uri = maker
-    if as_elements:
-        telemetry = "".join(
-            f"<{prefix}:{name}>{value}</{prefix}:{name}>" for name, value in values.items()
-        )
-        return XMP.format(prefix=prefix, uri=uri, attributes="", elements=telemetry)
     telemetry = "\n".join(f'{prefix}:{name}="{value}"' for name, value in values.items())
-    return XMP.format(prefix=prefix, uri=uri, attributes=telemetry, elements="")
+    return XMP.format(prefix=prefix, uri=uri, attributes=telemetry)
 
 
-def dji(yaw=30.0, pitch=-90.0, roll=0.0, height=120.5):
+def dji(yaw=30.0, pitch=-90.0, roll=0.0, height=120.5, body=77.7):
     return packet(
         GimbalYawDegree=f"{yaw:+.2f}",
         GimbalPitchDegree=f"{pitch:+.2f}",
         GimbalRollDegree=f"{roll:+.2f}",
-        FlightYawDegree="+77.70",
+        FlightYawDegree=f"{body:+.2f}",
         FlightXSpeed="+3.50",
         FlightYSpeed="-1.25",
         RelativeAltitude=f"{height:+.2f}",
@@ -204,9 +199,9 @@ def clock(seconds):
     return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d},{thousandths:03d}"
 
 
-def subtitles(path, texts, spacing_s=0.1, encoding="utf-8"):
+def subtitles(path, texts, encoding="utf-8"):
     parts = [
-        f"{i + 1}\n{clock(i * spacing_s)} --> {clock((i + 1) * spacing_s)}\n{text}\n"
+        f"{i + 1}\n{clock(i / 10)} --> {clock((i + 1) / 10)}\n{text}\n"
         for i, text in enumerate(texts)
     ]
     path.write_text("\n".join(parts), encoding=encoding)

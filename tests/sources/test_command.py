@@ -10,7 +10,7 @@ import pytest
 from bags import Messages, record
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from recorders import START_S, camera_file, packet, photo, place, tlog, video
+from recorders import START_S, camera_file, packet, photo, place, tlog
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import FlightWriter, open_flight, read_image
@@ -186,7 +186,6 @@ BROKEN = {
     "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "flight log:"),
     "text": (lambda folder: cut(folder / "a.mp4", data=b"words " * 99), "expected photographs"),
     "a log": (lambda folder: tlog(folder / "a.tlog"), "belongs to --telemetry"),
-    "video cut": (lambda folder: cut(video(folder / "a.mkv")), "a.mkv"),
     "mcap cut": (lambda folder: cut(bag(folder / "b", "file")), "recording was cut short"),
     "bag cut": (lambda folder: cut(bag(folder / "b", "bag")), "rosbag reindex"),
     "no flight": (lambda folder: folder_of(folder / "f") / "frames", "no time in EXIF"),

@@ -39,6 +39,7 @@ from orthonav.core.records import Prior, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings import SourceOptions, open_source, source_kind
 from orthonav.ground.recordings import flightlog as flightlog_module
+from orthonav.ground.recordings.flightlog import open_flight_log
 from orthonav.onboard.log import FlightLog, Segment
 from orthonav.onboard.run import MountCorrected, locate_view, model_of
 
@@ -304,7 +305,7 @@ def test_whatever_is_done_to_a_log_only_our_errors_come_out(tmp_path_factory, co
     middle = data.draw(st.binary(max_size=40))
     path.write_bytes(whole[:first] + middle + whole[last:])
     try:
-        for view in open_source(path, SourceOptions(kind="log")).views:
+        for view in open_flight_log(path, SourceOptions()).views:
             assert np.array_equal(view.grey(), picture(int(view.frame[:6])))
     except OrthonavError:
         pass

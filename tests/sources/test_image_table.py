@@ -219,10 +219,13 @@ def test_rows_with_folders_are_of_these_folders(images):
 
 
 def test_the_table_comes_before_metadata(tmp_path):
-    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5), xmp=dji(yaw=30, pitch=-80))
-    found = views_of(tmp_path / "p", "file,yaw,agl,lat,lon\na.jpg,77,99,47,3\n", SourceOptions())
+    gps = place(46.5, 2.5) | {29: "2023:11:14", 7: (20, 1, 2)}
+    photo(tmp_path / "p/a.jpg", gps=gps, xmp=dji(yaw=30, pitch=-80))
+    table = "file,yaw,agl,lat,lon,time\na.jpg,77,99,47,3,7\n"
+    found = views_of(tmp_path / "p", table, SourceOptions())
     assert angles(found.by["a.jpg"]) == pytest.approx((77, 10, 0, 99), abs=1e-6)
     assert found.by["a.jpg"].truth_latlon_deg == (47, 3)
+    assert found.by["a.jpg"].telemetry.time_ns == 7 * 10**9
 
 
 def test_a_gimbal_that_is_0_in_all_rows_was_not_recorded(images):

@@ -2,6 +2,7 @@
 
 import math
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from recorders import (
     video,
 )
 
-from orthonav.core.errors import FlightError
+from orthonav.core.errors import FlightError, MissingExtraError
 from orthonav.core.flight.telemetry_track import angles_at
 from orthonav.core.tilt import MOUNT_STD_DEG
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
@@ -99,6 +100,7 @@ def test_logs_without_gps_count_from_boot(tmp_path):
     del (estimated := px4_topics())["vehicle_gps_position"]
     track = read_log(ulog(tmp_path / "b.ulg", estimated), DOWN)
     assert track.latlon_deg(6 * 10**9) == (46.5, 2.5)  # the estimator's own, which aids nothing
+    assert track.warnings == ("positions are an estimate: the log has no receiver",)
     assert track.telemetry(6 * 10**9).horizon_std_deg == pytest.approx(3.0)
     ardupilot = read_log(dataflash(tmp_path / "a.bin", gps=False), DOWN)
     assert ardupilot.origin_ns == 3 * 10**9
@@ -303,12 +305,6 @@ def test_instances_of_a_ulog(tmp_path):
         read_log(path, DOWN, {"height": "distance_sensor[1]"})
 
 
-def test_positions_of_px4_without_a_receiver_are_called_an_estimate(tmp_path):
-    del (topics := px4_topics())["vehicle_gps_position"]
-    track = read_log(ulog(tmp_path / "a.ulg", topics), DOWN)
-    assert track.warnings == ("positions are an estimate: the log has no receiver",)
-
-
 def test_a_log_behind_a_ulog_is_not_read(tmp_path):
     path = ulog(tmp_path / "a.ulg", px4_topics(seconds=5))
     first = path.read_bytes()
@@ -380,4 +376,12 @@ def test_what_is_broken_is_one_error(tmp_path, how, capfd):
     with pytest.raises(FlightError, match=words) as caught:
         read_log(path, DOWN)
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
-    assert capfd.readouterr() == ("", "")
+    print("heard")
+    assert capfd.readouterr() == ("heard\n", "")
+
+
+def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
+    path = ulog(tmp_path / "a.ulg", px4_topics())
+    monkeypatch.setitem(sys.modules, "pyulog.core", None)
+    with pytest.raises(MissingExtraError, match=r"PX4 logs needs pyulog: pip install 'orthonav\[f"):
+        read_log(path, DOWN)

@@ -97,6 +97,8 @@ def test_angles_as_pix4d_names_them(tmp_path, make, roll):
     xmp = packet(PIX4D, Yaw="200.0", Pitch="6.0", Roll="4.0")
     telemetry = read_photo(photo(tmp_path / "a.jpg", xmp=xmp, make=make))
     assert attitude(telemetry) == pytest.approx((200, 6, roll))
+    zeros = photo(tmp_path / "b.jpg", xmp=packet(PIX4D, Yaw="0", Pitch="0.0", Roll="0"), make=make)
+    assert read_photo(zeros).rotation is None
 
 
 @pytest.mark.parametrize(
@@ -186,38 +188,16 @@ def test_a_photograph_that_programs_turn_is_used_as_stored(tmp_path):
     assert np.abs(stored.astype(int) - picture(1)).mean() < 6
 
 
-PARROT = "drone-parrot", "http://www.parrot.com/drone-parrot/1.0/"
-SKYDIO = "drone-skydio", "http://www.skydio.com/drone-skydio/1.0/"
-
-
-@pytest.mark.parametrize("nested", [True, False])
-def test_parrot_and_skydio(tmp_path, nested):
-    """Their cameras look ahead at 0, 0, 0, as DJI's do."""
-    xmp = packet(PARROT, CameraYawDegree="30.5", CameraPitchDegree="-80", CameraRollDegree="0")
-    assert attitude(read_photo(photo(tmp_path / "a.jpg", xmp=xmp))) == pytest.approx((30.5, 10, 0))
-    names = {"Roll": "0", "Pitch": "-80.0", "Yaw": "30.5"}
-    attributes = " ".join(f'drone-skydio:{name}="{value}"' for name, value in names.items())
-    camera = f"<drone-skydio:CameraOrientationNED {attributes}/>"
-    if nested:
-        inner = "".join(f"<drone-skydio:{n}>{v}</drone-skydio:{n}>" for n, v in names.items())
-        camera = 'CameraOrientationNED rdf:parseType="Resource"'
-        camera = f"<drone-skydio:{camera}>{inner}</drone-skydio:CameraOrientationNED>"
-    body = camera.replace("Camera", "Vehicle").replace("30.5", "99").replace("-80.0", "1")
-    xmp = packet(SKYDIO, RelativeAltitude="55.5")
-    xmp = xmp.replace("</rdf:Description>", f"{camera}{body}</rdf:Description>")
-    read = read_photo(photo(tmp_path / "b.jpg", xmp=xmp))
-    assert attitude(read) == pytest.approx((30.5, 10, 0)) and read.home_m == 55.5
-
-
 @pytest.mark.parametrize(
     "maker, gps, named",
     [
         (("Maker", "http://maker.com/"), {}, "Maker:MountYaw"),
+        (("drone-parrot", "http://www.parrot.com/drone-parrot/1.0/"), {}, "drone-parrot:MountYaw"),
         (DJI, {16: "M", 17: 30.0}, "GPSImgDirection"),
     ],
 )
 def test_angles_that_are_not_read_are_named(tmp_path, maker, gps, named):
-    xmp = packet(maker, **({"MountYaw": "30.5"} if maker[0] == "Maker" else {}))
+    xmp = packet(maker, **({} if maker == DJI else {"MountYaw": "30.5"}))
     photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5) | gps, xmp=xmp)
     recording = open_source(tmp_path / "p")
     said = f"such as angles of {named}, which are not read"
@@ -239,12 +219,10 @@ def test_missing_metadata_stays_missing(tmp_path):
 def test_values_that_cannot_be_used_are_counted_with_an_example(tmp_path):
     """The heading of the aircraft does not stand in for one of the gimbal that cannot be read."""
     xmp = dji().replace('GimbalYawDegree="+30.00"', 'GimbalYawDegree="30 deg"')
-    photo(tmp_path / "p/a.jpg", xmp=xmp)
-    photo(tmp_path / "p/b.jpg", "2023:11:14 22:13:21", xmp=dji())
-    recording = open_source(tmp_path / "p")
+    recording = open_source(series(tmp_path / "p", {"xmp": xmp}, {}))
     assert (
         "values of 1 of 2 photographs cannot be used, such as unreadable value "
-        "drone-dji:GimbalYawDegree='30 deg': a.jpg" in recording.warnings
+        "drone-dji:GimbalYawDegree='30 deg': 0.jpg" in recording.warnings
     )
     first, second = (view.telemetry.yaw_deg for view in recording.views)
     assert math.isnan(first) and second == pytest.approx(30)
@@ -312,36 +290,21 @@ def views_of(folder, **options):
     return list(open_source(folder, SourceOptions(**options)).views)
 
 
-def gimbal(yaw, pitch, roll, body):
-    return packet(
-        GimbalYawDegree=f"{yaw:+.2f}",
-        GimbalPitchDegree=f"{pitch:+.2f}",
-        GimbalRollDegree=f"{roll:+.2f}",
-        FlightYawDegree=f"{body:+.2f}",
-        RelativeAltitude="+119.30",
-    )
-
-
-# A gimbal that was not recorded.
-
-
-def test_a_gimbal_that_reports_zero_was_not_recorded(tmp_path):
-    zeros = [{"xmp": gimbal(0, 0, 0, body)} for body in (152.0, -154.2, 0.0)]
-    recording = open_source(series(tmp_path / "p", *zeros))
-    assert "gimbal angles of 3 photographs are all 0" in recording.warnings[0]
-    reported = [view.telemetry for view in recording.views]
-    assert [each.yaw_deg for each in reported] == pytest.approx([152.0, 205.8, 0.0])
+@pytest.mark.parametrize(
+    "headings, expected", [((152.0, -154.2, 0.0), (152.0, 205.8, 0.0)), ((0.0, 0.0), None)]
+)
+def test_a_gimbal_that_reports_zero_was_not_recorded(tmp_path, headings, expected):
+    """Nor was a heading of the aircraft that is 0 throughout."""
+    series(tmp_path / "p", *({"xmp": dji(0, 0, 0, body=body)} for body in headings))
+    said = f"gimbal angles of {len(headings)} photographs are all 0"
+    assert said in open_source(tmp_path / "p").warnings[0]
+    reported = [view.telemetry for view in views_of(tmp_path / "p")]
+    if expected is None:
+        assert reported[0].missing() == ["yaw_deg"]
+    else:
+        assert [each.yaw_deg for each in reported] == pytest.approx(expected)
     assert all(each.pitch_deg == each.roll_deg == 0 for each in reported)
     assert {(each.tilt_std_deg, each.mount_std_deg) for each in reported} == {(6.0, None)}
-
-
-def test_angles_that_are_all_zero_were_not_recorded(tmp_path):
-    series(tmp_path / "p", {}, {}, xmp=gimbal(0, 0, 0, 0))
-    series(tmp_path / "q", {}, {}, xmp=packet(PIX4D, Yaw="0", Pitch="0.0", Roll="0"))
-    assert "gimbal angles of 2 photographs are all 0" in open_source(tmp_path / "p").warnings[0]
-    for view in views_of(tmp_path / "p"):
-        assert view.telemetry.missing() == ["yaw_deg"]
-    assert "yaw_deg" in views_of(tmp_path / "q")[0].telemetry.missing()
 
 
 # Focal lengths.
@@ -526,10 +489,8 @@ def test_whole_values_of_xmp_are_read_and_others_named(text, value):
     ],
 )
 def test_an_editor_may_have_turned_a_photograph(tmp_path, programs, edited):
-    for number, program in enumerate(programs):
-        first, time = {SOFTWARE: program} if program else {}, f"2023:11:14 22:13:2{number}"
-        photo(tmp_path / f"p/{number}.jpg", time, xmp=dji(), first=first)
-    recording = open_source(tmp_path / "p")
+    software = ({"first": {SOFTWARE: each} if each else {}} for each in programs)
+    recording = open_source(series(tmp_path / "p", *software))
     stds = {number: view.telemetry.yaw_std_deg for number, view in enumerate(recording.views)}
     assert [number for number in stds if stds[number] == 180.0] == edited
     assert ("1 of 3 photographs were written by an editor" in recording.warnings[0]) == bool(edited)
@@ -562,6 +523,8 @@ def test_photographs_of_another_focal_length_are_left_out(tmp_path, other):
     )
     assert [view.frame for view in recording.views] == ["0.jpg", "1.jpg", "none.jpg"]
     assert recording.camera.fx_px == pytest.approx(math.hypot(64, 48) * 24 / math.hypot(36, 24))
+    given = SourceOptions(camera=camera_file(tmp_path / "camera.json"))
+    assert open_source(tmp_path / "p", given).expected == 3
 
 
 def test_as_many_photographs_of_several_cameras_are_not_guessed(tmp_path):
@@ -579,20 +542,6 @@ def test_as_many_photographs_of_several_cameras_are_not_guessed(tmp_path):
             open_source(tmp_path / folder)
         found = open_source(sorted((tmp_path / folder).glob("*_W.jpg")))
         assert found.expected == 2
-
-
-def test_a_table_comes_before_the_clock(tmp_path):
-    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5) | {29: "2023:11:14", 7: (20, 1, 2)})
-    (tmp_path / "p/t.csv").write_text("file,yaw,time\na.jpg,1,7\n")
-    assert next(open_source(tmp_path / "p").views).telemetry.time_ns == 7 * 10**9
-
-
-def test_photographs_of_another_focal_length_are_left_out_with_a_camera_file_too(tmp_path):
-    series(tmp_path / "p", {}, {"more": {0xA405: 48, 0x920A: 17.6}}, {})
-    camera = camera_file(tmp_path / "camera.json")
-    recording = open_source(tmp_path / "p", SourceOptions(camera=camera))
-    assert [view.frame for view in recording.views] == ["0.jpg", "2.jpg"]
-    assert "1 of 3 photographs left out, of another focal length" in recording.warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,6 @@ def test_a_message_states_its_horizon_or_a_placeholder(variances, expected):
         ({"rate_hz": 0.0}, "rate_hz"),
         ({"prior_std_m": -1.0}, "prior_std_m"),
         ({"time_offset_s": math.inf}, "finite"),
-        ({"kind": "film"}, "photos, video"),
         ({"topics": {"depth": "/d"}}, "image, camera_info"),
     ],
 )

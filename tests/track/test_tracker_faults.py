@@ -53,7 +53,7 @@ def seen():
 @pytest.fixture(scope="module")
 def confirmed(localizer, seen):
     """A tracker before the first broken view, and its last position; not to be changed."""
-    tracker = Tracker(localizer, smooth=True, lag=2)
+    tracker = Tracker(localizer, smooth=True)
     rows = results(tracker, seen[:FIRST])
     assert all(result.is_recognized for result, _ in rows[-2:])
     return tracker, rows[-1][0]
@@ -66,7 +66,7 @@ def tracker(localizer, confirmed):
 
 def copied(localizer, confirmed):
     tracker, _ = confirmed
-    shared = (localizer, localizer.registration, tracker._before)
+    shared = (localizer, localizer.registration, tracker._past)
     return copy.deepcopy(tracker, {id(each): each for each in shared})
 
 
@@ -118,9 +118,9 @@ def expected_m(seen, number):
 
 
 PARTS_OF_A_VIEW = [
-    *[(Tracker, name) for name in ("locate", "_predict", "_update", "_outcome", "_fix")],
+    *[(Tracker, name) for name in ("locate", "_predict", "_step", "_update", "_outcome", "_fix")],
     *[(Mixture, name) for name in ("predict", "update", "estimate", "_merge")],
-    *[(History, name) for name in ("record", "smoothed")],
+    (History, "record"),
 ]
 
 
@@ -171,7 +171,7 @@ class Flown:
         self.time, self.left, self.published, self.said = Time(), [*seen], [], []
         publisher = Publisher(Gate(), self.time.clocks, lines=[self], graph=self)
         options = FlyOptions(recorded=True)
-        parts = self, seen[0].camera, lambda: tracker, publisher, options, self.time.clocks
+        parts = self, seen[0].camera, lambda: tracker, publisher, options
         self.runner = Runner(*parts, sink=MagicMock(lost={}))
 
     def take(self, _):
@@ -232,7 +232,7 @@ def test_an_error_in_any_call_of_the_flight_loop_costs_one_view(
 
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(Mixture, "predict"), (Mixture, "_predictions"), (Tracker, "_reported_velocity")],
+    [(Mixture, "predict"), (Mixture, "_predictions"), (tracker_module, "_reported_velocity")],
 )
 def test_without_dead_reckoning_there_is_no_position_until_the_next_view(
     localizer, confirmed, tracker, seen, faults, owner, name

@@ -273,7 +273,7 @@ def _photograph(folder: Path) -> None:
     if report.is_file():
         _shoot(browser, report.as_uri(), FIGURES / "check.png", (1180, 900))
     command = [Path(sys.executable).with_name("orthonav"), "view", "tracked.jsonl"]
-    command += ["--map", "area.onav", "--flight", "flight", "--no-browser"]
+    command += ["--map", "area.onav", "--flight", "flight"]
     server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, encoding="utf-8")
     try:
         address = (server.stdout.readline() if server.stdout else "").split()

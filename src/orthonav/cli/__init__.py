@@ -113,9 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _require_outputs(options: argparse.Namespace) -> None:
     """Raise `OutputError` where a result could not be written, before the work for it."""
     out_is_folder = options.command in ("check", "demo", "import", "run", "simulate")
-    is_folder = {"out": out_is_folder, "footprint": False, "preview": False}
-    is_folder |= {"report": True, "work": True}
-    for name, folder in is_folder.items():
+    for name, folder in {"out": out_is_folder, "report": True, "work": True}.items():
         path = getattr(options, name, None)
         if isinstance(path, Path) and not is_stdout(path):
             require_writable(path, folder=folder)

@@ -52,7 +52,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "name of a sheet, such as r001526c001392"
     retire.add_argument("sheets", nargs="+", metavar="SHEET", help=text)
     index = action("index", "build or update the index that is searched without a prior")
-    index.add_argument("--rebuild", action="store_true", help="rebuild the whole index")
+    index.add_argument("--replace", action="store_true", help="build the whole index again")
     cut = action("cut", "cut the map of a route or of bounds out of an atlas")
     add_area(cut, required=True)
     text = "map file to write"
@@ -73,9 +73,6 @@ def _add_build(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("coarse tiles, for views without a prior").add_argument
     text = "ground resolution of coarse tiles, metres per pixel (default 8)"
     add("--coarse-gsd-m", type=float, help=text)
-    add("--coarse-tile-px", type=int, help="width of a coarse tile (default 128)")
-    text = "do not update the search index at the end"
-    add("--no-index", dest="index", action="store_false", help=text)
     group = parser.add_argument_group("workers")
     text = "sheets that are built at a time (default: 1; with --cluster one per core)"
     add_options(group, "--workers", help=text)
@@ -101,9 +98,8 @@ def _build(options: argparse.Namespace) -> int:
     from orthonav.ground.atlas.catalog import AtlasRecipe
 
     recipe = given(options, AtlasRecipe)
-    coarse = {name: getattr(options, f"coarse_{name}") for name in ("gsd_m", "tile_px")}
-    if set_ := {name: value for name, value in coarse.items() if value is not None}:
-        recipe["coarse"] = set_
+    if options.coarse_gsd_m is not None:
+        recipe["coarse"] = {"gsd_m": options.coarse_gsd_m}
     fields = asked(options, AtlasRequest) | {"url": options.atlas, "recipe": recipe}
     request = AtlasRequest(**fields)
     try:
@@ -222,7 +218,7 @@ def _index(options: argparse.Namespace, atlas: "Atlas") -> None:
     from orthonav.ground.atlas.index import make_index
 
     with progress(options) as shown:
-        made = make_index(atlas, progress=shown, rebuild=options.rebuild)
+        made = make_index(atlas, progress=shown, rebuild=options.replace)
     if made is None:
         print(f"no sheet has coarse tiles, nothing to index: {atlas.store}")
         return

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import add_area, add_options, given, print_json, progress
+from orthonav.cli.info import summary, summary_text
 
 if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
@@ -49,15 +50,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     text += "which an interrupted build resumes (default: MAP.onav.work for large areas, removed "
     group.add_argument("--work", type=Path, metavar="DIR", help=f"{text}when the map is written)")
     add_options(group, "--workers")
-    text = "device on which a network is trained (default auto: a GPU if there is one)"
-    group.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"), help=text)
 
 
 def add_recipe(group: argparse._ActionsContainer) -> None:
     add_options(group, "--gsd-m", "--tile-px", "--overlap", "--seed")
     add = group.add_argument
-    text = "mirrored views that measure the level of chance on this map (default 24)"
-    add("--calibration-views", type=int, help=text)
     text = "embedding: gradient (default), autoencoder, caevl, triplet or bovw"
     add("--method", metavar="NAME[:FIELD=VALUE,..]", help=text)
     text = "image representation: gradient, gray, canny (canny:low=100,high=200), segments, "
@@ -77,7 +74,6 @@ def asked(options: argparse.Namespace, request: type) -> dict[str, Any]:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.cli.info import summary, summary_text
     from orthonav.ground.build import BuildRequest, build_map
 
     start = time.perf_counter()

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import orthonav
-from orthonav.cli.common import add_options, beside, counted, print_json, progress, watched
+from orthonav.cli.common import add_options, beside, counted, print_result, progress, watched
 from orthonav.cli.source import (
     add_source,
     dem_of,
@@ -17,6 +17,7 @@ from orthonav.cli.source import (
 from orthonav.core.errors import UsageError
 
 if TYPE_CHECKING:
+    from orthonav.core.flight import RecordedView
     from orthonav.ground.recordings import Recording
     from orthonav.ground.recordings.calibrate import MountCalibration
 
@@ -52,11 +53,7 @@ def run(options: argparse.Namespace) -> None:
     found = _calibrated(options)
     write_mount(options.out, found.mount)
     with beside(options.out):
-        if options.json:
-            more = {"first": found.first, "last": found.last, "moved": found.moved}
-            print_json(asdict(found.mount) | more)
-            return
-        print(f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}")
+        lines = [f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}"]
         for name, bias, unit in (
             ("heading, deg", found.mount.heading_deg, 1.0),
             ("height (or focal), %", found.mount.log_scale, 100.0),
@@ -64,11 +61,13 @@ def run(options: argparse.Namespace) -> None:
             ("roll, deg", found.mount.roll_deg, 1.0),
         ):
             value, std, scatter = (unit * each for each in (bias.value, bias.std, bias.scatter))
-            print(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
-        print(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
+            lines.append(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
+        lines.append(f"from {counted(found.mount.views, 'view')}, {found.first} to {found.last}")
         if found.moved:
-            print("the camera moved in its mount before these views; earlier views are not used")
-        print(f"written to {options.out}")
+            moved = "the camera moved in its mount before these views; earlier views are not used"
+            lines.append(moved)
+        more = {"first": found.first, "last": found.last, "moved": found.moved}
+        print_result(options, asdict(found.mount) | more, *lines, f"written to {options.out}")
 
 
 def _calibrated(options: argparse.Namespace) -> "MountCalibration":
@@ -79,39 +78,44 @@ def _calibrated(options: argparse.Namespace) -> "MountCalibration":
     dem, opened = dem_of(options), orthonav.open_map(options.map)
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
     flight = open_source(options.flight, options, over_terrain=over_terrain)
-    priors = _measured(options, flight, opened) if options.prior_std_m is not None else {}
+    measured = options.prior_std_m is not None
+    if measured:
+        _check_positions(options, flight, opened)
     tracker = orthonav.Tracker(
         orthonav.Localizer(opened),
         heading_known=options.heading == "known",
-        use_prior=bool(priors),
-        every_prior=bool(priors),
+        use_prior=measured,
+        every_prior=measured,
         smooth=True,
     )
-    views = (
-        replace(view, telemetry=replace(view.telemetry, prior=priors.get(view.frame)))
-        for view in flight.views
-    )
+    views = (_with_prior(view, options.prior_std_m) for view in flight.views)
     heights = flight_heights(options, opened, flight, dem)
     with progress(options) as shown:
         results = located(options, tracker, flight, views, shown, heights=heights)
     return calibrate_mount(smoothed_track(tracker, results, None))
 
 
-def _measured(
+def _check_positions(
     options: argparse.Namespace, flight: "Recording", opened: orthonav.MapFile
-) -> dict[str, orthonav.Prior]:
-    """Priors by frame, of recorded positions only: other priors are no measurements."""
+) -> None:
+    """By the first recorded one. Raises `UsageError` where there is none."""
     from orthonav.ground.evaluate.metrics import check_truth
 
-    recorded = {view.frame: view.truth_latlon_deg for view in flight.views}
-    places = {frame: place for frame, place in recorded.items() if place is not None}
-    if not places:
+    places = (view.truth_latlon_deg for view in flight.views)
+    first = next((place for place in places if place is not None), None)
+    if first is None:
         raise UsageError(
             f"--prior-std-m needs recorded positions, and no view has one: {options.flight}"
         )
     centre = opened.manifest.sheets[0].frame
-    check_truth(places, (), (centre.lat_deg, centre.lon_deg), options.flight)
-    return {frame: orthonav.Prior(*place, options.prior_std_m) for frame, place in places.items()}
+    check_truth({"": first}, (), (centre.lat_deg, centre.lon_deg), options.flight)
+
+
+def _with_prior(view: "RecordedView", std_m: float | None) -> "RecordedView":
+    """With the recorded position as its prior: other priors are no measurements."""
+    place = None if std_m is None else view.truth_latlon_deg
+    prior = None if place is None or std_m is None else orthonav.Prior(*place, std_m)
+    return replace(view, telemetry=replace(view.telemetry, prior=prior))
 
 
 def _run_latency(options: argparse.Namespace) -> None:
@@ -124,8 +128,9 @@ def _run_latency(options: argparse.Namespace) -> None:
         found = calibrate_latency(flight.camera, views, heading_known=options.heading == "known")
     write_latency(options.out, found)
     with beside(options.out):
-        if options.json:
-            print_json(asdict(found))
-            return
-        print(f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms")
-        print(f"from {found.pairs} pairs of images; written to {options.out}")
+        print_result(
+            options,
+            asdict(found),
+            f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms",
+            f"from {found.pairs} pairs of images; written to {options.out}",
+        )

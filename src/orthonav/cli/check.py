@@ -3,13 +3,16 @@
 import argparse
 import shlex
 import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_options, given, print_json, progress
+from orthonav import __version__
+from orthonav.cli.common import add_options, camera_of, given, print_result, progress
+from orthonav.cli.info import imagery_text, recipe_text, texts
+from orthonav.cli.source import dem_of, is_above_sea
+from orthonav.core.errors import CheckError, RouteError, UsageError
 from orthonav.core.limits import CAMERA_KINDS
 from orthonav.core.tilt import UNSTATED
 
@@ -86,52 +89,24 @@ def run(options: argparse.Namespace) -> int:
     require_free(options.out)
     request = _request(options)
     with progress(options) as shown:
-        is_shown = options.quiet or sys.stderr.isatty()
-        result, opened = check_map(request, shown if is_shown else _Lines())
+        result, opened = check_map(request, shown)
     page = write_check(result, opened, options.out)
-    if options.json:
-        print_json(check_to_plain(result))
-    else:
-        print(text(result))
-        print(f"\nreport: {page}")
+    print_result(options, check_to_plain(result), text(result), f"\nreport: {page}")
     return result.verdict.word.exit_code
 
 
-class _Lines:
-    """Prints on stderr how long the check will take, and every 10 s how far it is."""
-
-    def __init__(self) -> None:
-        self._first: tuple[float, float] | None = None
-        self._next_s = 0.0
-
-    def __call__(self, stage: str, share: float) -> None:
-        now_s = time.monotonic()
-        if self._first is None:  # without the start of the workers
-            self._first, self._next_s = (now_s, share), now_s + 4
-        done = share - self._first[1]
-        if now_s < self._next_s or done < 0.03 or share >= 1:
-            return
-        left_s = (now_s - self._first[0]) * (1 - share) / done
-        print(f"{stage}: {100 * share:.0f} %, about {left_s:.0f} s left", file=sys.stderr)
-        self._next_s = now_s + 10
-
-
 def _request(options: argparse.Namespace) -> "CheckRequest":
-    from orthonav.core.errors import UsageError
-    from orthonav.core.geo.camera_files import read_camera_file
     from orthonav.ground.check.records import CheckRequest
     from orthonav.ground.planning.route import read_route
-    from orthonav.ground.planning.spacing import DEFAULT_CAMERA
 
     if options.band_m is not None and options.route is None:
         raise UsageError("--band-m is the width of a band around a route; give --route too")
     route = read_route(options.route) if options.route else None
     agl_m, origin = _agl_m(options, route)
-    camera = DEFAULT_CAMERA if options.camera is None else read_camera_file(options.camera)
     more = {
         "map_path": options.map,
         "route": route,
-        "camera": camera,
+        "camera": camera_of(options),
         "agl_m": agl_m,
         "yaw_std_deg": None if options.heading == "unknown" else options.yaw_std_deg,
         "prior_std_m": None if options.prior == "none" else options.prior_std_m,
@@ -145,8 +120,6 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
 
     Raises `CheckError` where the heights of the route are not above ground and no terrain is known.
     """
-    from orthonav.cli.source import dem_of, is_above_sea
-    from orthonav.core.errors import CheckError, RouteError
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.terrain import TerrainLayer
     from orthonav.ground.planning.spacing import flown_agl_m
@@ -183,8 +156,6 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
 
 
 def _checked_inputs(options: argparse.Namespace, route: "Route | None") -> "CheckedInputs":
-    from orthonav import __version__
-    from orthonav.cli.info import imagery_text, recipe_text, texts
     from orthonav.core.mapfile import open_map
     from orthonav.ground.check.records import CheckedInputs
 

@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, redirect_stdout
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -20,6 +20,7 @@ from orthonav.core.limits import ALERT_LIMITS_M, DEFAULT_RISK, RISKS
 from orthonav.ground import planning
 
 if TYPE_CHECKING:
+    from orthonav.core.geo.camera import Camera
     from orthonav.core.localize.confidence import Acceptance
     from orthonav.core.localize.policy import SearchPlan
     from orthonav.core.mapfile.signature import Signature
@@ -314,14 +315,9 @@ def watched(items: Iterable[T], expected: int | None, stage: str, shown: Progres
             shown(stage, min(1.0, number / expected))
 
 
-@contextmanager
-def progress(options: argparse.Namespace) -> Iterator[Progress]:
+def progress(options: argparse.Namespace) -> AbstractContextManager[Progress]:
     """Progress bars of a command, closed on success and on errors."""
-    shown = Progress(options.quiet)
-    try:
-        yield shown
-    finally:
-        shown.close()
+    return closing(Progress(options.quiet))
 
 
 def reporter(options: argparse.Namespace) -> Callable[[str], None]:
@@ -366,5 +362,21 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
+def camera_of(options: argparse.Namespace) -> "Camera":
+    """The camera of `--camera`, else the usual one."""
+    from orthonav.core.geo.camera import Camera
+
+    own = options.camera
+    return planning.DEFAULT_CAMERA if own is None else Camera.from_file(own)
+
+
 def print_json(plain: Any) -> None:
     print(json.dumps(plain, indent=1, allow_nan=False))
+
+
+def print_result(options: argparse.Namespace, plain: Any, *lines: str) -> None:
+    """Print plain values with `--json`, else lines for people."""
+    if options.json:
+        print_json(plain)
+    else:
+        print(*lines, sep="\n")

@@ -11,7 +11,8 @@ from typing import Any
 
 import orthonav
 from orthonav.cli.common import add_options, print_json, run_command, say
-from orthonav.core.files import replacing_folder
+from orthonav.core.files import replacing_folder, write_text
+from orthonav.ground import planning
 
 EXAMPLE = ""
 IMAGERY = Path(__file__).parents[1] / "ground" / "demo_data"
@@ -80,7 +81,9 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
         say(options, f"1/4 building the map from {past}")
         built = run_command(options, "build", "--ortho", past, "--dem", dem, "--out", "area.onav")
         frame = orthonav.open_map("area.onav").manifest.sheets[0].frame
-        _write_route(Path("route.geojson"), frame.latlon_from_en(WAYPOINTS_EN_M))
+        places = zip(*frame.latlon_from_en(WAYPOINTS_EN_M), strict=True)
+        route = planning.Route(tuple((float(lat), float(lon)) for lat, lon in places), name="demo")
+        write_text(Path("route.geojson"), planning.to_geojson([route]))
         # Views then cover 346 x 259 m, a whole tile of 256 m.
         flown = ("--route", "route.geojson", "--agl-m", 270)
         say(options, f"2/4 checking from {past} alone where along the route fixes are expected")
@@ -103,10 +106,3 @@ def _demo(folder: Path, options: argparse.Namespace) -> tuple[dict[str, Any], st
         measured = run_command(options, *scored, *reported)
     verdict = checked.partition("\n")[0]
     return plain, f"{built}\ncheck      {verdict}\n\n{measured.rpartition('report: ')[0]}"
-
-
-def _write_route(path: Path, latlon_deg: Any) -> None:
-    line = [[float(lon), float(lat)] for lat, lon in zip(*latlon_deg, strict=True)]
-    geometry = {"type": "LineString", "coordinates": line}
-    feature = {"type": "Feature", "properties": {"name": "demo"}, "geometry": geometry}
-    path.write_text(json.dumps(feature) + "\n", encoding="utf-8")

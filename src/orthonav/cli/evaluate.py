@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import orthonav
-from orthonav.cli.common import add_options, print_json
+from orthonav.cli.common import add_options, print_result
+from orthonav.cli.info import imagery_text, recipe_text
 from orthonav.cli.source import add_source, open_source
 from orthonav.cli.version import require_extras
 from orthonav.core.errors import FlightError, OrthonavError, UsageError
@@ -62,12 +63,8 @@ def run(options: argparse.Namespace) -> None:
     flights = _measured(options, opened)
     if options.report:
         _write_report(options.report, flights, opened)
-    if options.json:
-        print_json(runs_to_json(flights))
-        return
-    print(text(flights))
-    if options.report:
-        print(f"report: {options.report / 'index.html'}")
+    lines = [f"report: {options.report / 'index.html'}"] if options.report else []
+    print_result(options, runs_to_json(flights), text(flights), *lines)
 
 
 def _one_each(given: list[Path], fixes: list[Path], option: str) -> list[Path]:
@@ -150,7 +147,6 @@ def _digest_of(folder: Path) -> str | None:
 def _write_report(
     out: Path, flights: "list[FlightReport]", opened: "orthonav.MapFile | None"
 ) -> None:
-    from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.ground.evaluate.report import write_report
 
     manifest = opened.manifest if opened else None

@@ -17,7 +17,7 @@ from orthonav.cli.common import (
     say,
 )
 from orthonav.cli.version import require_extras
-from orthonav.core.errors import FetchError, UsageError
+from orthonav.core.errors import AreaError, FetchError, OutputError, UsageError
 
 if TYPE_CHECKING:
     from orthonav.ground.fetch.run import CostEstimate, FetchRequest, FetchResult
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 EXAMPLE = "--route route.kml --source ign --out ortho.tif"
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--source", "--list", "--out", "--dry-run", "--gsd-m"),
-    *("--layer", "--time", "--date", "--no-terrain", "--with-surface", "--json"),
+    *("--layer", "--time", "--heights", "--json"),
 )
 
 
@@ -37,10 +37,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--services", type=Path, metavar="FILE.toml", help=text)
     parser.add_argument("--list", action="store_true", help="list the services known by name")
     parser.add_argument("--out", type=Path, metavar="ORTHO.tif", help="GeoTIFF to write")
-    text = "omit the terrain model that is written beside the imagery, as ORTHO_dem.tif"
-    parser.add_argument("--no-terrain", dest="terrain", action="store_false", help=text)
-    text = "also write a surface model of houses and trees, as ORTHO_dsm.tif, where one is known"
-    parser.add_argument("--with-surface", dest="surface", action="store_true", help=text)
+    text = "written beside the imagery: the terrain, as ORTHO_dem.tif (default); with surface also "
+    text += "houses and trees, as ORTHO_dsm.tif, where a model of them is known"
+    heights = ("none", "terrain", "surface")
+    parser.add_argument("--heights", choices=heights, default="terrain", help=text)
     text = "print the estimated cost and fetch nothing"
     parser.add_argument("--dry-run", action="store_true", help=text)
     add_options(parser, "--json")
@@ -55,7 +55,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     add = group.add_argument
     add("--layer", help="layer of the service, coverage of a WCS, or collection of a STAC")
     add("--time", help="ISO 8601 time, or interval A/B of a STAC")
-    add("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
     add("--key-env", metavar="VARIABLE", help="environment variable with the key for {key}")
     text = "compression of the GeoTIFF (default jpeg)"
     add("--compress", choices=("jpeg", "deflate"), default="jpeg", help=text)
@@ -86,7 +85,7 @@ def run(options: argparse.Namespace) -> None:
     for kind, name in names.items():
         if name is not None and imagery:
             found |= _heights(options, request, kind, name)
-    if _falls_back(options, names) and imagery and not found:
+    if _falls_back(names) and imagery and not found:
         found = _heights(options, request, "terrain", DEFAULT_TERRAIN)
     if options.json:
         more: dict[str, object] = dict.fromkeys(names)
@@ -105,16 +104,16 @@ def _heights_presets(options: argparse.Namespace) -> dict[str, str | None]:
     from orthonav.ground.fetch.presets import DEFAULT_TERRAIN, surface_preset, terrain_preset
 
     asked = options.source, options.services
-    surface = surface_preset(*asked) if options.surface else None
-    terrain = terrain_preset(*asked) if options.terrain else None
+    surface = surface_preset(*asked) if options.heights == "surface" else None
+    terrain = terrain_preset(*asked) if options.heights != "none" else None
     if surface is not None and terrain == DEFAULT_TERRAIN:
         terrain = None  # it includes trees and houses: the lower envelope of the surface is better
     return {"terrain": terrain, "surface": surface}
 
 
-def _falls_back(options: argparse.Namespace, names: dict[str, str | None]) -> bool:
+def _falls_back(names: dict[str, str | None]) -> bool:
     """Whether the default terrain is fetched where the surface cannot be had."""
-    return bool(options.terrain and names["surface"] and names["terrain"] is None)
+    return names["surface"] is not None and names["terrain"] is None
 
 
 def _print_estimate(
@@ -126,7 +125,7 @@ def _print_estimate(
         print_json(vars(estimate) | {"provenance": vars(estimate.provenance), **names})
     else:
         more = "".join(f", and {kind} from {name}" for kind, name in names.items() if name)
-        if _falls_back(options, names):
+        if _falls_back(names):
             more += f" (terrain from {DEFAULT_TERRAIN} where that cannot be had)"
         print(f"would fetch {estimate.text()}{more}")
 
@@ -135,7 +134,6 @@ def _heights(
     options: argparse.Namespace, imagery: "FetchRequest", kind: str, name: str
 ) -> "dict[str, tuple[Path, FetchResult]]":
     """Nothing, with a warning, where they cannot be had: the imagery is kept."""
-    from orthonav.core.errors import AreaError, OutputError
     from orthonav.ground.fetch.presets import DEFAULT_TERRAIN, ImageryOptions, parse_source
     from orthonav.ground.fetch.run import fetch_heights, heights_request
 
@@ -173,7 +171,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise UsageError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
-    named = {"date": options.date, "key_env": options.key_env, "own": options.services}
+    named = {"key_env": options.key_env, "own": options.services}
     asked = ImageryOptions(**given(options, ImageryOptions))
     more = {
         "spec": parse_source(options.source, asked, **named),
@@ -211,6 +209,6 @@ def _print_presets(options: argparse.Namespace) -> None:
         print(f"  {', '.join(preset.layers)}")
         print(f"  {preset.licence}; {preset.attribution}")
         if preset.surface:
-            print(f"  --with-surface fetches {preset.surface}")
+            print(f"  --heights surface fetches {preset.surface}")
         if preset.key_env:
             print(f"  needs a key in {preset.key_env}")

@@ -1,11 +1,15 @@
 """`orthonav fly`: position messages to an autopilot, from a live camera or a recording."""
 
 import argparse
+import gc
 import logging
+import signal
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 
 from orthonav.cli.common import add_acceptance, add_options, numbers
+from orthonav.core.errors import StoppedError, VariantError
 
 EXAMPLE = "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550"
 EVERYDAY = (
@@ -62,11 +66,22 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARGS", help=text)
 
 
+def _message(text: str) -> str:
+    name, colon, gps_id = text.partition(":")
+    has_id = name == "gps-input" and gps_id.isdecimal() and int(gps_id) < 256
+    if name not in SEND or (colon and not has_id):
+        raise argparse.ArgumentTypeError(
+            f"expected {', '.join(SEND)} or gps-input:0 to gps-input:255, got '{text}'"
+        )
+    return text
+
+
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("outputs")
     add = group.add_argument
-    text = "message to send to the autopilot (default global-position); can be repeated"
-    add("--send", action="append", choices=SEND, help=text)
+    text = f"message to send to the autopilot: {', '.join(SEND)} (default the first; can be "
+    text += "repeated); gps-input:1 states the gps_id 1 (default 0)"
+    add("--send", action="append", type=_message, metavar="MESSAGE", help=text)
     text = "NMEA to udp:HOST:PORT or serial:DEVICE:BAUD; can be repeated. RMC has status V, which "
     text += "most displays ignore: see --nmea-as-gps"
     add("--nmea", action="append", default=[], metavar="URL", help=text)
@@ -84,7 +99,6 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     text += "where the autopilot has none; with --ros2: of the map frame"
     triple = "LAT,LON,ALT_M"
     add("--origin", type=numbers(3, triple), metavar=triple, help=text)
-    add("--gps-id", type=int, default=0, metavar="N", help="gps_id of GPS_INPUT (default 0)")
     text = "NMEA quality 1 and RMC status A (GPS fix) instead of 6 and V (estimated)"
     add("--nmea-as-gps", action="store_true", help=text)
 
@@ -114,12 +128,6 @@ def _add_flight(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fly until SIGTERM, SIGINT or the end of a recording."""
-    import gc
-    import signal
-    import threading
-
-    from orthonav.core.errors import StoppedError
-
     _check(options)
     stopping = threading.Event()
     before = {}
@@ -145,8 +153,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import VariantError
-
     if options.ros2 and (options.source or options.autopilot):
         raise VariantError("--ros2 replaces SOURCE and --autopilot: give one or the other")
     if options.ros_args and not options.ros2:

@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -37,7 +38,7 @@ from orthonav.onboard.cameras import NewestImage, read_in_thread
 from orthonav.onboard.console import Console, Narrator
 from orthonav.onboard.fly import FlyOptions, Runner
 from orthonav.onboard.gnss.biases import Biases
-from orthonav.onboard.gnss.watch import GnssWatch, live_solutions, recorded_solutions
+from orthonav.onboard.gnss.watch import GnssWatch
 from orthonav.onboard.latency import MIN_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.messages.gate import Gate, GateRules
@@ -76,7 +77,6 @@ class _Setup:
         self.opened = _opened(options)
         self.digest = self.opened.manifest.sha256
         self.localizer = Localizer(self.opened, plan=search_plan(options))
-        self.start = start_of(options, self.clocks, self.localizer)
         self.link = _link(options, self.clocks)
         self.fly = self._fly_options()
 
@@ -105,10 +105,8 @@ class _Setup:
             self._locator,
             publisher,
             replace(self.fly, min_agl_m=self._min_agl_m(camera)),
-            self.clocks,
             link=self.link,
             sink=sink,
-            start=self.start,
             gnss=gnss,
             latency=_latency(options, heading_known=self.fly.heading_known),
         )
@@ -132,6 +130,7 @@ class _Setup:
             recorded=options.ros2 or options.recorded_telemetry,
             accept=acceptance(options),
             map_change=self.opened.change,
+            start=start_of(options, self.clocks, self.localizer),
             state_path=options.state,
             logged_options=_logged_options(options, mount),
         )
@@ -201,7 +200,6 @@ class _Setup:
             reader.now_ns,
             origin_alt_m=origin[2] if origin else math.nan,
             min_std_m=options.min_std_m,
-            min_confidence=self._min_sent,
             silent=options.dry_run,
         )
         reader.report_wait = lambda why: publisher.health(
@@ -220,9 +218,8 @@ class _Setup:
             messenger = outputs.Messenger(
                 *(gate, link, clocks),
                 kinds=_kinds(options),
-                gps_id=options.gps_id,
+                gps_id=_gps_id(options),
                 min_std_m=options.min_std_m,
-                min_confidence=self._min_sent,
                 origin=Origin(*options.origin) if options.origin else None,
             )
         # ROS 2 names what it waits for itself.
@@ -239,7 +236,6 @@ class _Setup:
             nmea=nmea,
             lines=[*lines, narrator],
             graph=graph,
-            min_confidence=self._min_sent,
             min_std_m=options.min_std_m,
         )
 
@@ -249,12 +245,11 @@ class _Setup:
         options, clocks = self.options, self.clocks
         recorded = options.recorded_telemetry and not options.ros2
         if recorded:
-            solutions = recorded_solutions(read_gnss(Path(options.source) / FILE))
+            recording = read_gnss(Path(options.source) / FILE)
+            solutions = deque(sorted(recording, key=lambda each: each.arrived_ns))
         else:
-            heard: Any = source if options.ros2 else self.link
-            if heard is None:
-                raise UsageError("--gnss needs --autopilot, --ros2 or --recorded-telemetry")
-            solutions = live_solutions(heard.gnss)
+            heard: Any = source if options.ros2 else self.link  # one of them: see `fly._check`
+            solutions = heard.gnss
         used = camera, options.mount_deg, self.fly.mount, _stated(options.camera_latency_ms)
         return GnssWatch(
             self.localizer.sheet.frame,
@@ -334,7 +329,7 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         system_id=options.system_id,
         signing=_signing(options, clocks),
         silent=options.dry_run,
-        own_receiver=options.gps_id if "gps-input" in _kinds(options) else None,
+        own_receiver=_gps_id(options) if "gps-input" in _kinds(options) else None,
     )
 
 
@@ -356,7 +351,12 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
 
 
 def _kinds(options: argparse.Namespace) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(options.send or ["global-position"]))
+    asked = options.send or ["global-position"]
+    return tuple(dict.fromkeys(each.partition(":")[0] for each in asked))
+
+
+def _gps_id(options: argparse.Namespace) -> int:
+    return max((int(each.partition(":")[2] or 0) for each in options.send or ()), default=0)
 
 
 def _opened_outputs(

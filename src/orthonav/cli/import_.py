@@ -5,7 +5,7 @@ import logging
 from dataclasses import asdict
 from pathlib import Path
 
-from orthonav.cli.common import add_options, counted, print_json, progress
+from orthonav.cli.common import add_options, counted, print_result, progress
 from orthonav.cli.source import add_source, open_source
 from orthonav.core.errors import UsageError
 from orthonav.core.geo.headings import RADIANS
@@ -40,15 +40,14 @@ def run(options: argparse.Namespace) -> None:
         log.warning("%d views left out, the first: %s", done.broken, done.first_broken)
     if done.radians:
         log.warning("%s", RADIANS)
-    if options.json:
-        plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
-        print_json(plain | {"choices": recording.choices} | asdict(done))
-    else:
-        tilt = "not stated, 3 deg are assumed"
-        if done.tilt_std_deg is not None:
-            tilt = " to ".join(dict.fromkeys(f"{each:.1f}" for each in done.tilt_std_deg)) + " deg"
-        print(
-            f"{counted(done.views, 'view')}, {done.complete} with heading, pitch, roll and "
-            f"height, {done.with_truth} with a position\n"
-            f"standard deviation of pitch and roll: {tilt}\nwritten to {options.out}"
-        )
+    tilt = "not stated, 3 deg are assumed"
+    if done.tilt_std_deg is not None:
+        tilt = " to ".join(dict.fromkeys(f"{each:.1f}" for each in done.tilt_std_deg)) + " deg"
+    plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
+    print_result(
+        options,
+        plain | {"choices": recording.choices} | asdict(done),
+        f"{counted(done.views, 'view')}, {done.complete} with heading, pitch, roll and height, "
+        f"{done.with_truth} with a position",
+        f"standard deviation of pitch and roll: {tilt}\nwritten to {options.out}",
+    )

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_options, beside, print_json
+from orthonav.cli.common import add_options, print_result
 
 if TYPE_CHECKING:
     from orthonav.core.mapfile.manifest import Manifest, SheetInfo
@@ -17,28 +17,14 @@ EXAMPLE = "area.onav"
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to describe")
     add_options(parser, "--json")
-    text = "write the outline of the area with imagery as GeoJSON; -: stdout"
-    parser.add_argument("--footprint", type=Path, metavar="FILE.geojson", help=text)
-    text = "write the imagery as a grey .png or .tif for QGIS, georeferenced by FILE.aux.xml"
-    parser.add_argument("--preview", type=Path, metavar="FILE.png", help=text)
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.files import write_text
     from orthonav.core.mapfile import open_map
-    from orthonav.core.mapfile.shown import footprint_geojson, write_preview
 
     opened = open_map(options.map)
-    if options.footprint is not None:
-        write_text(options.footprint, footprint_geojson(opened))
-    if options.preview is not None:
-        write_preview(opened, options.preview)
     plain = summary(opened.manifest, opened.size_bytes, options.map)
-    with beside(options.footprint):
-        if options.json:
-            print_json(plain)
-        else:
-            print(summary_text(plain))
+    print_result(options, plain, summary_text(plain))
 
 
 def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]:

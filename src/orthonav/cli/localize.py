@@ -4,7 +4,7 @@ import argparse
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -156,7 +156,7 @@ def _on_map(options: argparse.Namespace) -> None:
     advisor = SetupAdvice(options, flight, localizer, corrected)
     digest = FlightDigest()
     with progress(options) as shown:
-        views = digest.watching(advisor.watching())
+        views = digest.watching(flight.views)
         how_shown = (accept, heights, advisor.take)
         results = located(options, locator, flight, views, shown, *how_shown)
         if tracker is not None and options.smooth:
@@ -289,19 +289,17 @@ class SetupAdvice:
     ) -> None:
         from orthonav.ground.recordings.setups import LowConfidenceViews
 
-        self._options, self._flight, self._localizer = options, flight, localizer
+        self._options, self._localizer = options, localizer
         self._low = LowConfidenceViews(flight.camera, corrected)
-        self.take = self._low.take
         self._nearest: tuple[float, str] | None = None
         self._yaw_deg: list[float] = []
 
-    def watching(self) -> "Iterator[RecordedView]":
-        for view in self._low.watching(self._flight.views):
-            found = far_from_map(view, self._localizer)
-            if found is not None and (self._nearest is None or found < self._nearest):
-                self._nearest = found
-            self._yaw_deg.append(view.telemetry.yaw_deg)
-            yield view
+    def take(self, view: "RecordedView", result: "orthonav.ViewResult") -> None:
+        found = far_from_map(view, self._localizer)
+        if found is not None and (self._nearest is None or found < self._nearest):
+            self._nearest = found
+        self._yaw_deg.append(view.telemetry.yaw_deg)
+        self._low.take(view, result)
 
     def advice(
         self, results: "Sequence[orthonav.ViewResult]", accept: "Acceptance"

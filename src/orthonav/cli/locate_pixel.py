@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import orthonav
-from orthonav.cli.common import add_options, print_json
+from orthonav.cli.common import add_options, print_result
 from orthonav.core.errors import FlightError, MissingFileError, OrthonavError
 
 if TYPE_CHECKING:
@@ -78,18 +78,19 @@ def run(options: argparse.Namespace) -> None:
         "confident": result.is_confident,
         "shown_turned": turned,
     }
-    if options.json:
-        print_json(plain)
-        return
     above = "" if math.isnan(height_m) else f", {height_m:.1f} m above sea"
-    print(f"{found.lat_deg:.8f}, {found.lon_deg:.8f}{above}")
     axes = "unknown"
     if ellipse is not None:
         axes = f"{ellipse['major_m']:.1f} x {ellipse['minor_m']:.1f} m, major axis at "
         axes += f"{ellipse['direction_deg']:.0f} deg"
-    print(f"95 % ellipse {axes}; {found.range_m:.0f} m from the camera")
-    if not result.is_confident:
-        print("! the position of this view is a best guess")
+    guess = [] if result.is_confident else ["! the position of this view is a best guess"]
+    print_result(
+        options,
+        plain,
+        f"{found.lat_deg:.8f}, {found.lon_deg:.8f}{above}",
+        f"95 % ellipse {axes}; {found.range_m:.0f} m from the camera",
+        *guess,
+    )
 
 
 def _is_turned(path: Path) -> bool:

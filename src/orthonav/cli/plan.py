@@ -4,8 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import orthonav
-from orthonav.cli.common import add_area, add_options, beside, counted, print_json
+from orthonav.cli.common import add_area, add_options, beside, camera_of, counted, print_result
 from orthonav.cli.source import dem_of
 from orthonav.core.errors import AreaError, UsageError
 from orthonav.core.files import write_text
@@ -64,10 +63,7 @@ def run(options: argparse.Namespace) -> None:
         write_text(options.out, planning.to_geojson(sheets))
         plain["out"] = str(options.out)
     with beside(options.out):
-        if options.json:
-            print_json(plain)
-        else:
-            print(plan_text(plain))
+        print_result(options, plain, plan_text(plain))
 
 
 def _view(
@@ -83,8 +79,7 @@ def _view(
             "--camera needs a height above ground: give --agl-m, or a route with heights (above "
             "ground; with --dem also above the sea or above home)"
         )
-    own = None if options.camera is None else orthonav.Camera.from_file(options.camera)
-    return planning.ViewPlan.of(own or planning.DEFAULT_CAMERA, agl_m)
+    return planning.ViewPlan.of(camera_of(options), agl_m)
 
 
 def _map_of(options: argparse.Namespace, view: "planning.ViewPlan | None") -> tuple[float, int]:

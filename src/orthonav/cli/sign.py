@@ -3,13 +3,15 @@
 import argparse
 from pathlib import Path
 
+from orthonav.core.errors import UsageError
+
 EXAMPLE = "area.onav --key keys/private.pem"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", nargs="?", help="map to sign")
     how = parser.add_mutually_exclusive_group(required=True)
-    how.add_argument("--key", type=Path, metavar="private.pem", help="Ed25519 private key (PEM)")
+    how.add_argument("--key", type=Path, metavar="KEY.pem", help="Ed25519 private key (PEM)")
     text = "create private.pem and public.pem in this folder, and sign the map if one is given"
     how.add_argument("--new-key", type=Path, metavar="DIR", help=text)
     text = "serial number in the signature (default: seconds since 1970, which increase)"
@@ -17,7 +19,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from orthonav.core.errors import UsageError
     from orthonav.core.mapfile.signature import PRIVATE_NAME, PUBLIC_NAME, new_key, sign_map
 
     key = options.key

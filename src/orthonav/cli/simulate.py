@@ -5,7 +5,15 @@ from functools import partial
 from pathlib import Path
 
 import orthonav
-from orthonav.cli.common import add_options, counted, given, print_json, progress, within
+from orthonav.cli.common import (
+    add_options,
+    camera_of,
+    counted,
+    given,
+    print_result,
+    progress,
+    within,
+)
 from orthonav.cli.source import dem_of
 from orthonav.ground import planning
 
@@ -65,12 +73,11 @@ def run(options: argparse.Namespace) -> None:
     for each in (*surface, *([] if dem is None else [dem])):
         each.require_datum("heights of simulated flights are above the sea")
     tilt_deg = options.unreported_tilt_deg
-    own = None if options.camera is None else orthonav.Camera.from_file(options.camera)
     more = {
         "orthos": options.ortho,
         "route": planning.read_route(options.route) if options.route else None,
         "airspeed_mps": options.speed_mps,
-        "camera": own or planning.DEFAULT_CAMERA,
+        "camera": camera_of(options),
         "errors": Errors(
             **given(options, Errors), mount_std_deg=tilt_deg, horizon_std_deg=tilt_deg
         ),
@@ -82,7 +89,5 @@ def run(options: argparse.Namespace) -> None:
     request = orthonav.SimulateRequest(**given(options, orthonav.SimulateRequest) | more)
     with progress(options) as shown:
         views = orthonav.simulate_flight(request, lambda share: shown("simulate", share))
-    if options.json:
-        print_json({"flight": str(options.out), "views": views})
-    else:
-        print(f"{counted(views, 'view')} written to {options.out}")
+    done = f"{counted(views, 'view')} written to {options.out}"
+    print_result(options, {"flight": str(options.out), "views": views}, done)

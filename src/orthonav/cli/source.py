@@ -13,7 +13,7 @@ from orthonav.core.geo.swapped import swapped_hint
 from orthonav.ground import planning
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Iterator
 
     from orthonav.cli.common import Progress
     from orthonav.core.flight.heights import Array, FlownHeights, Undulation
@@ -115,16 +115,11 @@ def source_options(options: argparse.Namespace, **more: Any) -> "SourceOptions":
 def open_source(
     path: Path | list[Path], options: argparse.Namespace, *, over_terrain: bool = False
 ) -> "Recording":
-    """The open recording of the command line; its warnings are logged. `over_terrain`: whether a
-    terrain turns its heights into heights above ground."""
-    return open_recording(path, source_options(options, over_terrain=over_terrain))
+    """The open recording; its choices and warnings are logged. `over_terrain`: whether a terrain
+    turns its heights into heights above ground."""
+    from orthonav.ground import recordings
 
-
-def open_recording(path: Path | list[Path], how: "SourceOptions") -> "Recording":
-    """The open recording; its choices and warnings are logged."""
-    from orthonav.ground.recordings import open_source
-
-    recording = open_source(path, how)
+    recording = recordings.open_source(path, source_options(options, over_terrain=over_terrain))
     for said in (*recording.choices, *recording.warnings):
         log.warning("%s", said)
     return recording
@@ -279,18 +274,24 @@ def located(
     shown: "Progress",
     accept: "Acceptance | None" = None,
     heights: "FlownHeights | None" = None,
-    take: "Callable[[orthonav.ViewResult], None]" = lambda result: None,
+    take: "Callable[[RecordedView, orthonav.ViewResult], None]" = lambda view, result: None,
 ) -> "list[orthonav.ViewResult]":
-    """Results of the views of a recording; `take` gets each."""
+    """Results of the views of a recording; `take` gets each view with its own."""
     from orthonav.ground.recordings.localize import localize_flight
 
     how: dict[str, Any] = {
         "skip_bad_images": getattr(options, "skip_bad_images", True),
         "accept": accept,
     }
-    results = []
-    found = localize_flight(locator, flight, views=views, heights=heights, **how)
+    results, newest = [], list["RecordedView"]()
+
+    def read() -> "Iterator[RecordedView]":
+        for view in views:
+            newest[:] = [view]
+            yield view
+
+    found = localize_flight(locator, flight, views=read(), heights=heights, **how)
     for result in watched(found, flight.expected, options.command, shown):
         results.append(result)
-        take(result)
+        take(newest[0], result)
     return results

@@ -5,13 +5,13 @@ from pathlib import Path
 
 from orthonav.cli.common import add_options
 
-EXAMPLE = "area.onav --public-key keys/public.pem"
+EXAMPLE = "area.onav --key keys/public.pem"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to check")
     text = "Ed25519 public key (PEM) of the expected signer"
-    parser.add_argument("--public-key", type=Path, required=True, metavar="public.pem", help=text)
+    parser.add_argument("--key", type=Path, required=True, metavar="KEY.pem", help=text)
     add_options(parser, "--not-before")
 
 
@@ -19,7 +19,7 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.core.mapfile import open_map
     from orthonav.core.mapfile.signature import require_signature
 
-    found = require_signature(options.map, options.public_key, options.not_before)
+    found = require_signature(options.map, options.key, options.not_before)
     open_map(options.map, found.manifest_sha256)
     print(f"signature and contents are valid: {options.map}\nmanifest  {found.manifest_sha256}")
     print(f"serial    {found.serial}\nsigned    {found.signed_utc}")

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import add_options, given
+from orthonav.cli.common import add_options, given, within
 from orthonav.cli.source import add_source, source_options
 
 if TYPE_CHECKING:
@@ -28,9 +28,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "ground truth: the true positions (default: those that --flight has, if any)"
     add("--truth", type=Path, metavar="truth.csv", help=text)
     add_options(parser, "--mount", "--radius-m")
-    add("--port", type=_port, default=0, help="port of the server (default: any free port)")
-    text = "print the address without opening a browser"
-    add("--no-browser", action="store_true", help=text)
+    port, text = within(0, 65535, int), "port of the server (default: any free port)"
+    add("--port", type=port, default=0, metavar="N", help=text)
     add_source(parser, dem=False)
 
 
@@ -43,28 +42,21 @@ def run(options: argparse.Namespace) -> None:
     pages = Pages(Run(request), load_assets())
     server = Server(pages, options.port)
     with server:
-        _announce(server, options)
+        _announce(server)
         try:
             server.serve_forever(poll_interval=0.2)
         except KeyboardInterrupt:
             print("ended", flush=True)
 
 
-def _announce(server: "Server", options: argparse.Namespace) -> None:
+def _announce(server: "Server") -> None:
     address = server.url()
     print(f"{address}  (Ctrl-C ends)", flush=True)
     # Without a screen a text browser would cover the output.
     screen = not sys.platform.startswith("linux") or {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}
-    if not options.no_browser and sys.stdout.isatty() and screen:
+    if sys.stdout.isatty() and screen:
         import threading
         import webbrowser
 
         # Some browsers return only when closed.
         threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
-
-
-def _port(text: str) -> int:
-    port = int(text)
-    if not 0 <= port <= 65535:
-        raise argparse.ArgumentTypeError(f"a port must be 0 to 65535, got {text}")
-    return port

@@ -32,29 +32,16 @@ def replacing(path: Path) -> Iterator[Path]:
     `OutputError`."""
     path = Path(path).resolve()
     require_writable(path)
-    made: list[Path] = []
-    try:
-        made = _made_folders(path.parent)
-        handle, name = tempfile.mkstemp(
-            prefix=f".{path.name}.", suffix=f".tmp{path.suffix}", dir=path.parent
-        )
-    except OSError as error:
-        _remove_empty(made)
-        raise _output_error(error, path) from error
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        _sync(temporary)
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-    except OSError as error:
-        if isinstance(error, MissingFileError | OutputError) or error.errno is None:
-            raise
-        raise _output_error(error, path) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-        _remove_empty(made)
+    with _beside(path, f".tmp{path.suffix}") as temporary:
+        try:
+            yield temporary
+            _sync(temporary)
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(path)
+        except OSError as error:
+            if isinstance(error, MissingFileError | OutputError) or error.errno is None:
+                raise
+            raise _output_error(error, path) from error
 
 
 @contextmanager
@@ -66,31 +53,22 @@ def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) 
         raise OutputError(
             f"output folder exists and is not empty; remove it or name another: {path}"
         )
-    made: list[Path] = []
-    try:
-        made = _made_folders(path.parent)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
-    except OSError as error:
-        _remove_empty(made)
-        raise _output_error(error, path) from error
-    try:
-        yield temporary
-        temporary.chmod(0o777 & ~_umask())
-        if is_ours is not None and path.exists() and is_ours(path):
-            _remove_folder(path)
-        elif path.exists():
-            path.rmdir()  # refuses what appeared in it meanwhile
-        temporary.replace(path)
-    except OSError as error:
-        cause = error.__cause__ if isinstance(error, OutputError) else error  # of a file in it
-        if isinstance(error, MissingFileError) or not isinstance(cause, OSError):
-            raise
-        if cause.errno is None:
-            raise
-        raise _output_error(cause, path) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        _remove_empty(made)
+    with _beside(path, ".tmp", folder=True) as temporary:
+        try:
+            yield temporary
+            temporary.chmod(0o777 & ~_umask())
+            if is_ours is not None and path.exists() and is_ours(path):
+                _remove_folder(path)
+            elif path.exists():
+                path.rmdir()  # refuses what appeared in it meanwhile
+            temporary.replace(path)
+        except OSError as error:
+            cause = error.__cause__ if isinstance(error, OutputError) else error  # of a file in it
+            if isinstance(error, MissingFileError) or not isinstance(cause, OSError):
+                raise
+            if cause.errno is None:
+                raise
+            raise _output_error(cause, path) from error
 
 
 def require_writable(path: Path, *, folder: bool = False) -> None:
@@ -108,16 +86,36 @@ def require_writable(path: Path, *, folder: bool = False) -> None:
         raise OutputError(f"disk full; nothing was written: {path}")
 
 
-def _made_folders(folder: Path) -> list[Path]:
-    missing = [each for each in (folder, *folder.parents) if not each.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    return missing
+@contextmanager
+def _beside(path: Path, suffix: str, *, folder: bool = False) -> Iterator[Path]:
+    """A temporary file or folder beside `path`, removed in the end, as are folders that were made
+    for it and stay empty."""
+    missing: list[Path] = []
+    make = tempfile.mkdtemp if folder else _made_file
+    try:
+        try:
+            missing = [each for each in (path.parent, *path.parent.parents) if not each.exists()]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = Path(make(prefix=f".{path.name}.", suffix=suffix, dir=path.parent))
+        except OSError as error:
+            raise _output_error(error, path) from error
+        try:
+            yield temporary
+        finally:
+            if folder:
+                shutil.rmtree(temporary, ignore_errors=True)
+            else:
+                temporary.unlink(missing_ok=True)
+    finally:
+        with suppress(OSError):
+            for each in missing:
+                each.rmdir()
 
 
-def _remove_empty(folders: list[Path]) -> None:
-    with suppress(OSError):
-        for each in folders:
-            each.rmdir()
+def _made_file(prefix: str, suffix: str, dir: Path) -> str:
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=dir)
+    os.close(handle)
+    return name
 
 
 def not_written(reason: object, path: Path) -> OutputError:

@@ -34,24 +34,21 @@ Grey = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class CameraImage:
-    """One image with its time of exposure.
-
-    `exposed_ns`: by our monotonic clock; of a live camera the arrival, from which the flight loop
-    subtracts the latency. `time_ns`: written to results: UTC of a live camera, else that of the
-    recording. `grey`: (H, W), None where the image could not be decoded. `telemetry`, `vehicle`:
-    that came with it, from a recording or ROS. `interruptions`: of a live camera: how often images
-    stopped for a while, or it was opened again; the latency may have changed.
-    """
+    """One image with its time of exposure."""
 
     number: int
     frame: str
     exposed_ns: int
-    time_ns: int
-    grey: Grey | None
+    """By our monotonic clock; of a live camera the arrival, from which the flight loop subtracts
+    the latency."""
+    time_ns: int  # written to results: UTC of a live camera, else that of the recording
+    grey: Grey | None  # (H, W), None where the image could not be decoded
     problem: NoFix | None = None
-    telemetry: Telemetry | None = None
-    vehicle: VehicleState | None = None
+    telemetry: Telemetry | None = None  # that came with it, from a recording or ROS
+    vehicle: VehicleState | None = None  # the same
     interruptions: int | None = None
+    """Of a live camera: how often images stopped for a while, or it was opened again; the latency
+    may have changed."""
 
 
 class CameraGoneError(CameraError):

@@ -2,7 +2,6 @@
 few seconds, a summary. It is an output of `Publisher`, like the lines of JSON."""
 
 import contextlib
-import io
 import logging
 import math
 import os
@@ -10,7 +9,7 @@ import queue
 import sys
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TextIO
 
 import numpy as np
@@ -80,6 +79,10 @@ class Console:
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(f"{seconds:8.1f} s  {text}\n")
 
+    def write(self, text: str) -> None:
+        """As a stream of log records, which end with their line."""
+        self.put(text.rstrip("\n"))
+
     def close(self) -> None:
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(None)
@@ -92,7 +95,7 @@ class Console:
         level = root.level
         for handler in root.handlers if self.is_open else ():
             if isinstance(handler, logging.StreamHandler) and handler.stream is sys.stderr:
-                handler.setStream(_Lines(self.put))
+                handler.setStream(self)
                 streams.append(handler)
         if self.is_open:
             root.setLevel(min(level, logging.WARNING))
@@ -110,17 +113,6 @@ class Console:
             with contextlib.suppress(OSError):  # nobody reads any more, or a full disk
                 while descriptor is not None and data:
                     data = data[os.write(descriptor, data) :]
-
-
-class _Lines(io.TextIOBase):
-    """A stream that passes what is written on without its line end."""
-
-    def __init__(self, put: Callable[[str], None]) -> None:
-        self._put = put
-
-    def write(self, text: str) -> int:
-        self._put(text.rstrip("\n"))
-        return len(text)
 
 
 class Narrator:

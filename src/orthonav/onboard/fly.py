@@ -8,6 +8,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -37,17 +38,17 @@ from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.gate import unavailable_text
 from orthonav.onboard.messages.mavlink import dialect, status_texts
 from orthonav.onboard.monitors import (
-    CameraMonitor,
     EventCounter,
-    LinkMonitor,
-    OutputMonitor,
-    ProgramMonitor,
     TrackMonitor,
+    camera_reasons,
+    link_reasons,
+    output_reasons,
+    program_reasons,
 )
 from orthonav.onboard.motion import PAIR_INTERVAL, Grey
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
-from orthonav.onboard.telemetry import Clocks, VehicleState
+from orthonav.onboard.telemetry import VehicleState
 
 if TYPE_CHECKING:
     from orthonav.onboard.log import FlightLog
@@ -78,24 +79,20 @@ LOOP = LoopParameters()
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """Options of the flight loop.
+    """Options of the flight loop."""
 
-    `mount_deg`: yaw, pitch, roll of the camera in the body. `mount`: calibrated one, for the health
-    only: the locator applies it. `heights`: None where the map has no terrain. `min_agl_m`: lower
-    views are not located. `recorded`: telemetry comes with the image, from a recording or ROS.
-    `accept`: of fixes that are accepted; `map_change`: how the open map file was changed in place.
-    `logged_options`: for a replay of the log.
-    """
-
-    mount_deg: Angles = LOOKS_DOWN
-    mount: Mount | None = None
-    heights: FlownHeights | None = None
+    mount_deg: Angles = LOOKS_DOWN  # yaw, pitch, roll of the camera in the body
+    mount: Mount | None = None  # calibrated, for the health only: the locator applies it
+    heights: FlownHeights | None = None  # None where the map has no terrain
     heading_known: bool = True
-    min_agl_m: float = 0.0
-    recorded: bool = False
+    min_agl_m: float = 0.0  # lower views are not located
+    recorded: bool = False  # telemetry comes with the image, from a recording or ROS
     accept: Acceptance = field(default_factory=lambda: Acceptance("confidence", CONFIDENT))
     map_change: Callable[[], str | None] = lambda: None
+    """How the open map file was changed in place."""
+    start: Callable[[], Prior | None] = lambda: None  # the prior of the first view
     state_path: Path | None = None
+    # For a replay of the log.
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
@@ -118,38 +115,34 @@ class Runner:
         locator: Callable[[], Locator],
         publisher: Publisher,
         options: FlyOptions,
-        clocks: Clocks,
         *,
         link: AutopilotLink | None = None,
         sink: "FlightLog | None" = None,
-        start: Callable[[], Prior | None] = lambda: None,
         gnss: GnssWatch | None = None,
         latency: LatencyMonitor | None = None,
     ) -> None:
-        """`locator` makes one, again where the time of a recording goes back; `start` gives the
-        prior of the first view. `latency`: of a live camera; None where images carry the time of
-        their exposure."""
+        """`locator` makes one, again where the time of a recording goes back. `latency`: of a live
+        camera; None where images carry the time of their exposure."""
         self._newest, self._camera = newest, camera
-        self._new_locator, self._locator = locator, locator()
-        self._publisher, self.options, self._clocks = publisher, options, clocks
+        self._new_locator, self._locator, self._start = locator, locator(), True
+        self._publisher, self.options, self._clocks = publisher, options, publisher.clocks
         self._link, self._sink, self._gnss, self._latency = link, sink, gnss, latency
-        self._begin, self._start = start, True
-        self.counter, self._reporter = EventCounter(clocks.mono_ns()), HealthReporter()
-        self._camera_monitor = CameraMonitor(self.counter)
+        counter = self.counter = EventCounter(self._clocks.mono_ns())
+        self._reporter = HealthReporter()
         self._track = TrackMonitor(
-            self.counter,
+            counter,
             publisher,
             lambda: self._locator.state_name,
             heading_known=options.heading_known,
         )
         self._monitors: list[Monitor] = [
-            *([] if latency is None else [latency]),
-            self._camera_monitor,
-            LinkMonitor(self.counter, link, recorded=options.recorded),
-            ProgramMonitor(self.counter, options.map_change),
-            OutputMonitor(self.counter, publisher, link),
-            *([] if gnss is None else [gnss]),
-            self._track,
+            *([] if latency is None else [latency.reasons]),
+            partial(camera_reasons, counter),
+            partial(link_reasons, counter, link, options.recorded),
+            partial(program_reasons, counter, options.map_change),
+            partial(output_reasons, counter, publisher, link),
+            *([] if gnss is None else [gnss.reasons]),
+            self._track.reasons,
         ]
         self.health: Health | None = None
         self._frozen, self._heights_said, self._texts = FrozenCheck(), False, 0
@@ -157,7 +150,7 @@ class Runner:
         self._tracked_ns: int | None = None
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
-        self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
+        self._utc_ahead_ns = self._clocks.utc_ns() - self._clocks.mono_ns()
         self._boot_id = states.boot_id()
 
     def run(self, stopping: threading.Event) -> None:
@@ -188,7 +181,7 @@ class Runner:
         return result
 
     def _process(self, image: CameraImage) -> ViewResult | None:
-        now_ns = self._camera_monitor.taken_ns = self._clocks.mono_ns()
+        now_ns = self._clocks.mono_ns()
         self._count("taken")
         if self._latency is not None and image.interruptions is not None:
             self._latency.arrived(image.exposed_ns, image.interruptions)
@@ -300,7 +293,7 @@ class Runner:
     def _from_start(self, view: View) -> View:
         telemetry = view.telemetry
         if self._start:
-            prior, self._start = self._begin(), False
+            prior, self._start = self.options.start(), False
             view = replace(view, telemetry=replace(telemetry, prior=prior or telemetry.prior))
             self._track.started(prior, telemetry.time_ns)
         self._track.moved(telemetry)
@@ -350,7 +343,6 @@ class Runner:
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
         now_ns, fix, mount = self._clocks.mono_ns(), result.outcome, self.options.mount
         if result.is_recognized:
-            self._track.confident_ns = now_ns
             self._count("confident")
         is_tracking = result.state in (None, "tracking")
         if not isinstance(fix, Fix) or not is_tracking:

@@ -2,10 +2,9 @@
 
 import os
 import socket
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Protocol
 
 STATUSTEXT_INTERVAL_NS = 5 * 10**9
 FAILURES = (
@@ -27,9 +26,8 @@ class Level(Enum):
         return {Level.OK: 6, Level.DEGRADED: 4, Level.FAILED: 3}[self]
 
 
-class Monitor(Protocol):
-    def reasons(self, now_ns: int) -> Iterable[str]:
-        """Reasons of health at a time of our clock."""
+Monitor = Callable[[int], Iterable[str]]
+"""Gives reasons of health at a time of our clock."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Health:
 
 def judge(monitors: Sequence[Monitor], now_ns: int, detail: str = "") -> Health:
     """Health by the reasons of the monitors, in their order, failures first."""
-    found = [reason for monitor in monitors for reason in monitor.reasons(now_ns)]
+    found = [reason for monitor in monitors for reason in monitor(now_ns)]
     worst = [each for each in found if each in FAILURES]
     others = [each for each in found if each not in FAILURES]
     level = Level.FAILED if worst else Level.DEGRADED if others else Level.OK

@@ -15,7 +15,6 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -29,6 +28,7 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.core.errors import CameraError, OutputError, described
 from orthonav.core.flight.fixes import result_to_json
+from orthonav.core.flight.folder import encoded
 from orthonav.core.flight.logged import (
     FORMAT,
     MAX_JSON_BYTES,
@@ -158,28 +158,30 @@ class FlightLog:
     ) -> None:
         """Log a view before it is located: `grey` (H, W), which is copied, None for an unusable
         image; `telemetry` uncorrected by the mount. The first image sets the size of the camera."""
-        time_ns = self._time_ns = telemetry.time_ns
+        self._time_ns = telemetry.time_ns
         if grey is not None and not self._sized:
             self._fit(grey.shape)
         index, self._index = self._index, self._index + 1
         self._indices[frame] = index
         while len(self._indices) > RESULTS_LATE:
             self._indices.pop(next(iter(self._indices)))
-        picture = "none" if grey is not None else "bad"
+        picture, kept = self._kept(grey)
         seen = LoggedView(index, number, frame, telemetry, picture, latency_ms, withheld)
-        if grey is None or self._views == "none":
-            self._add(lambda: [_telemetry(seen, time_ns)], 1000)
-            return
-        if self._views == "full" and self._has_room(grey.nbytes):
-            kept = np.array(grey, dtype=np.uint8, order="C")
-            self._add(lambda: _full(seen, kept), kept.nbytes, has_view=True)
-        elif self._views == "full":
+        size = 1000 if kept is None else kept.nbytes
+        self._add(lambda: _view(seen, kept), size, has_view=picture == "full")
+
+    def _kept(self, grey: Grey | None) -> tuple[str, Grey | None]:
+        """One of `PICTURES`, and what is logged of an image."""
+        if grey is None:
+            return "bad", None
+        if self._views == "none":
+            return "none", None
+        if self._views == "thumbnails":
+            return "thumbnail", _thumbnail(grey)
+        if not self._has_room(grey.nbytes):
             self._lose("views", "the writer falls behind, or an image is too large")
-            seen = replace(seen, picture="dropped")
-            self._add(lambda: [_telemetry(seen, time_ns)], 1000)
-        else:
-            small = _thumbnail(grey)
-            self._add(lambda: _with_thumbnail(seen, small), small.nbytes)
+            return "dropped", None
+        return "full", np.array(grey, dtype=np.uint8, order="C")
 
     def result(self, result: ViewResult) -> None:
         index = self._indices.get(result.frame, 0)
@@ -330,32 +332,24 @@ def _message(topic: Any, time_ns: int, data: bytes, index: int = 0) -> Message:
     return Message(topic, time_ns, data, index)
 
 
-def _telemetry(seen: LoggedView, time_ns: int) -> Message:
-    return _message(TOPICS.telemetry, time_ns, telemetry_message(seen), seen.index)
-
-
-def _full(seen: LoggedView, grey: Grey) -> list[Message]:
+def _view(seen: LoggedView, kept: Grey | None) -> list[Message]:
     time_ns = seen.telemetry.time_ns
-    data = picture_message(lossless_png(grey), "png", time_ns)
-    picture = _message(TOPICS.view, time_ns, data, seen.index)
-    return [_telemetry(replace(seen, picture="full"), time_ns), picture]
+    messages = [_message(TOPICS.telemetry, time_ns, telemetry_message(seen), seen.index)]
+    if kept is not None:
+        if seen.picture == "full":
+            topic, kind, data = TOPICS.view, "png", lossless_png(kept)
+        else:
+            data = encoded(kept, "thumbnail.jpg", THUMBNAIL_QUALITY)
+            topic, kind = TOPICS.thumbnail, "jpeg"
+        picture = picture_message(data, kind, time_ns)
+        messages.append(_message(topic, time_ns, picture, seen.index))
+    return messages
 
 
 def _thumbnail(grey: Grey) -> Grey:
     share = min(1.0, THUMBNAIL_PX / max(grey.shape))
     size = tuple(max(1, round(share * side)) for side in grey.shape[::-1])
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _with_thumbnail(seen: LoggedView, small: Grey) -> list[Message]:
-    time_ns = seen.telemetry.time_ns
-    options = [int(cv2.IMWRITE_JPEG_QUALITY), THUMBNAIL_QUALITY]
-    done, jpeg = cv2.imencode(".jpg", small, options)
-    telemetry = _telemetry(replace(seen, picture="thumbnail" if done else "none"), time_ns)
-    if not done:
-        return [telemetry]
-    data = picture_message(jpeg.tobytes(), "jpeg", time_ns)
-    return [telemetry, _message(TOPICS.thumbnail, time_ns, data, seen.index)]
 
 
 def _result(result: ViewResult, index: int) -> list[Message]:

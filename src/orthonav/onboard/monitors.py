@@ -49,10 +49,12 @@ class EventCounter:
         self._events: deque[tuple[int, str]] = deque()
         self._latencies: deque[tuple[int, float]] = deque()
         self._followed: Mapping[str, int] = {}
+        self.last_ns: dict[str, int] = {}
         self.total: Counter[str] = Counter()
 
     def add(self, now_ns: int, name: str) -> None:
         self._events.append((now_ns, name))
+        self.last_ns[name] = now_ns
         self.total[name] += 1
 
     def add_latency(self, now_ns: int, seconds: float) -> None:
@@ -86,51 +88,78 @@ class EventCounter:
     def is_settled(self, now_ns: int) -> bool:
         return now_ns - self._begun_ns > LIMITS.settled_s * 1e9
 
-    def age_s(self, now_ns: int, then_ns: int | None) -> float:
-        """Time since `then_ns`, None: since the start."""
-        return (now_ns - (self._begun_ns if then_ns is None else then_ns)) / 1e9
+    def age_s(self, now_ns: int, name: str) -> float:
+        """Time since the last such event, else since the start."""
+        return (now_ns - self.last_ns.get(name, self._begun_ns)) / 1e9
 
 
-class CameraMonitor:
-    def __init__(self, events: EventCounter) -> None:
-        self._events = events
-        self.taken_ns: int | None = None
-
-    def reasons(self, now_ns: int) -> Iterator[str]:
-        counts, many = self._events.counts(now_ns), self._events.many(now_ns)
-        age_s = self._events.age_s(now_ns, self.taken_ns)
-        if self._events.is_settled(now_ns) and age_s > LIMITS.image_age_s:
-            yield "no_camera"
-        elif counts["camera_lost"]:
-            yield "camera_lost"
-        if counts["wrong_camera"]:
-            yield "wrong_camera"
-        if "frozen" in many:
-            yield "frozen_image"
-        if "bad_image" in many:
-            yield "bad_images"
+def camera_reasons(events: EventCounter, now_ns: int) -> Iterator[str]:
+    counts, many = events.counts(now_ns), events.many(now_ns)
+    if events.is_settled(now_ns) and events.age_s(now_ns, "taken") > LIMITS.image_age_s:
+        yield "no_camera"
+    elif counts["camera_lost"]:
+        yield "camera_lost"
+    if counts["wrong_camera"]:
+        yield "wrong_camera"
+    if "frozen" in many:
+        yield "frozen_image"
+    if "bad_image" in many:
+        yield "bad_images"
 
 
-class LinkMonitor:
+def link_reasons(
+    events: EventCounter, link: AutopilotLink | None, recorded: bool, now_ns: int
+) -> Iterator[str]:
     """Of the autopilot and its telemetry. `recorded`: that comes with the images."""
+    settled = events.is_settled(now_ns)
+    is_down = settled and link is not None and link.heard_age_s > LIMITS.link_age_s
+    if is_down:
+        yield "link_down"
+    attitude_age_s = 0.0 if link is None or recorded else link.attitude_age_s
+    if settled and attitude_age_s > LIMITS.telemetry_age_s:
+        yield "no_telemetry"
+    elif "no_telemetry" in events.many(now_ns):
+        yield "telemetry_gaps"
+    if events.counts(now_ns)["clock_jump"]:
+        yield "clock_jumped"
+    if settled and link is not None and not is_down and not link.sync.is_exact:
+        yield "not_synchronized"
 
-    def __init__(self, events: EventCounter, link: AutopilotLink | None, *, recorded: bool) -> None:
-        self._events, self._link, self._recorded = events, link, recorded
 
-    def reasons(self, now_ns: int) -> Iterator[str]:
-        link, settled = self._link, self._events.is_settled(now_ns)
-        is_down = settled and link is not None and link.heard_age_s > LIMITS.link_age_s
-        if is_down:
-            yield "link_down"
-        attitude_age_s = 0.0 if link is None or self._recorded else link.attitude_age_s
-        if settled and attitude_age_s > LIMITS.telemetry_age_s:
-            yield "no_telemetry"
-        elif "no_telemetry" in self._events.many(now_ns):
-            yield "telemetry_gaps"
-        if self._events.counts(now_ns)["clock_jump"]:
-            yield "clock_jumped"
-        if settled and link is not None and not is_down and not link.sync.is_exact:
-            yield "not_synchronized"
+def program_reasons(
+    events: EventCounter, map_change: Callable[[], str | None], now_ns: int
+) -> Iterator[str]:
+    """`map_change`: how the open map file was changed in place."""
+    counts = events.counts(now_ns)
+    if map_change() is not None:
+        yield "map_file_changed"
+    if counts["internal_error"] > LIMITS.error_share * max(counts["processed"], 1):
+        yield "internal_errors"
+    elif counts["internal_error"]:
+        yield "internal_error"
+
+
+def output_reasons(
+    events: EventCounter, publisher: Publisher, link: AutopilotLink | None, now_ns: int
+) -> Iterator[str]:
+    counts, messenger = events.counts(now_ns), publisher.messenger
+    needs_origin = messenger is not None and link is not None and messenger.needs_origin
+    has_origin = not needs_origin or (link is not None and link.origin is not None)
+    if events.latency_s(0.95) > LIMITS.latency_s or "late" in events.many(now_ns):
+        yield "slow"
+    if counts["slow_vision"] > LIMITS.share * LIMITS.window_s:
+        yield "slow_vision"
+    if not has_origin and events.is_settled(now_ns):
+        yield "no_origin"
+    if has_origin and counts["incomplete"] > LIMITS.share * LIMITS.window_s:
+        yield "incomplete_message"
+    for event, reason in (
+        ("output_failed", "output_failed"),
+        ("log_failed", "log_failed"),
+        ("state_failed", "state_not_saved"),
+    ):
+        if counts[event]:
+            yield reason
 
 
 class TrackMonitor:
@@ -146,7 +175,6 @@ class TrackMonitor:
     ) -> None:
         self._events, self._publisher, self._state = events, publisher, state
         self._heading_known = heading_known
-        self.confident_ns: int | None = None
         self._off_deg = self._off_log_scale = 0.0
         self._start: StartCheck | None = None
 
@@ -177,7 +205,7 @@ class TrackMonitor:
             yield "height_mismatch"
         if self.start_off_m(now_ns):
             yield "start_mismatch"
-        state, low_s = self._state(), self._events.age_s(now_ns, self.confident_ns)
+        state, low_s = self._state(), self._events.age_s(now_ns, "confident")
         unavailable = self._publisher.gate.is_unavailable
         if state in ("lost", "searching") or (state == "coasting" and low_s > LIMITS.coasting_s):
             yield state
@@ -185,50 +213,6 @@ class TrackMonitor:
             yield "low_confidence"
         if unavailable:
             yield "unavailable"
-
-
-class ProgramMonitor:
-    """`map_change`: how the open map file was changed in place."""
-
-    def __init__(self, events: EventCounter, map_change: Callable[[], str | None]) -> None:
-        self._events, self._map_change = events, map_change
-
-    def reasons(self, now_ns: int) -> Iterator[str]:
-        counts = self._events.counts(now_ns)
-        if self._map_change() is not None:
-            yield "map_file_changed"
-        if counts["internal_error"] > LIMITS.error_share * max(counts["processed"], 1):
-            yield "internal_errors"
-        elif counts["internal_error"]:
-            yield "internal_error"
-
-
-class OutputMonitor:
-    def __init__(
-        self, events: EventCounter, publisher: Publisher, link: AutopilotLink | None
-    ) -> None:
-        self._events, self._publisher, self._link = events, publisher, link
-
-    def reasons(self, now_ns: int) -> Iterator[str]:
-        events, counts = self._events, self._events.counts(now_ns)
-        messenger, link = self._publisher.messenger, self._link
-        needs_origin = messenger is not None and link is not None and messenger.needs_origin
-        has_origin = not needs_origin or (link is not None and link.origin is not None)
-        if events.latency_s(0.95) > LIMITS.latency_s or "late" in events.many(now_ns):
-            yield "slow"
-        if counts["slow_vision"] > LIMITS.share * LIMITS.window_s:
-            yield "slow_vision"
-        if not has_origin and events.is_settled(now_ns):
-            yield "no_origin"
-        if has_origin and counts["incomplete"] > LIMITS.share * LIMITS.window_s:
-            yield "incomplete_message"
-        for event, reason in (
-            ("output_failed", "output_failed"),
-            ("log_failed", "log_failed"),
-            ("state_failed", "state_not_saved"),
-        ):
-            if counts[event]:
-                yield reason
 
 
 class StartCheck:

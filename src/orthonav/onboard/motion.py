@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 from orthonav.core.geo.camera import Camera, undistort
@@ -35,7 +35,6 @@ MIN_EXPLAINED = 0.6
 SUMMED, SIGMAS = 4, 3.0
 """Successive pairs that are summed; their motion counts from so many least standard deviations."""
 Array = NDArray[np.float64]
-Times = NDArray[np.int64]
 Grey = NDArray[np.uint8]
 Corners = NDArray[np.float32]
 
@@ -188,55 +187,6 @@ def reported_motion(
         turn_of_both, shift = centre_motion(both)
     turn = np.where(np.isfinite(turn_of_both), turn_of_both, turn)
     return turn, tilt_shift, shift - tilt_shift
-
-
-class StateHistory:
-    def __init__(self, gap_s: float) -> None:
-        """`gap_s`: longest interval between states that is interpolated."""
-        self._gap_ns = round(gap_s * 1e9)
-        self._times: Times = np.zeros(0, np.int64)
-        self._rows: Array = np.zeros((0, 13))
-
-    @property
-    def newest_ns(self) -> int:
-        return int(self._times[-1]) if len(self._times) else -(2**62)
-
-    def add(
-        self,
-        time_ns: int,
-        enu_from_camera: ArrayLike | None,
-        velocity_enu_mps: ArrayLike | None,
-        height_m: float,
-    ) -> None:
-        """Add a state; None and NaN: not known. A time that is not newer is ignored."""
-        if time_ns <= self.newest_ns:
-            return
-        row = np.full(13, math.nan)
-        if enu_from_camera is not None:
-            row[:9] = np.ravel(enu_from_camera)
-        if velocity_enu_mps is not None:
-            row[9:12] = velocity_enu_mps
-        row[12] = height_m if height_m > 0 else math.nan
-        first = int(np.searchsorted(self._times, time_ns - 60 * 10**9))
-        self._times = np.append(self._times[first:], time_ns)
-        self._rows = np.concatenate([self._rows[first:], row[None]])
-
-    def motion(self, start_ns: Times, end_ns: Times) -> ReportedMotion:
-        start, end = self._at(start_ns), self._at(end_ns)
-        seconds = float(end_ns[0] - start_ns[0]) / 1e9
-        velocity, height = (start[:, 9:12] + end[:, 9:12]) / 2, start[:, 12]
-        before, after = (each[:, :9].reshape(-1, 3, 3) for each in (start, end))
-        return reported_motion(before, after, velocity, height, seconds)
-
-    def _at(self, times_ns: Times) -> Array:
-        if len(self._times) < 2:
-            return np.full((len(times_ns), 13), math.nan)
-        after = np.clip(np.searchsorted(self._times, times_ns), 1, len(self._times) - 1)
-        begin, until = self._times[after - 1], self._times[after]
-        weight = ((times_ns - begin) / (until - begin))[:, None]
-        values = (1 - weight) * self._rows[after - 1] + weight * self._rows[after]
-        known = (times_ns >= begin) & (times_ns <= until) & (until - begin <= self._gap_ns)
-        return np.asarray(np.where(known[:, None], values, math.nan))
 
 
 def varying(values: Array, seconds: Array) -> Array:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from orthonav.core.errors import VariantError
 from orthonav.core.flight.fixes import UNKNOWN, Identity, result_to_json
-from orthonav.core.records import CONFIDENT, ViewResult
+from orthonav.core.records import ViewResult
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.messages.estimate import (
     EstimateError,
@@ -72,14 +72,12 @@ class Messenger:
         kinds: Sequence[str] = ("global-position",),
         gps_id: int = 0,
         min_std_m: float = 0.0,
-        min_confidence: float = CONFIDENT,
         origin: Origin | None = None,
     ) -> None:
         """`kinds`: keys of `KINDS`. `gps_id`: of GPS_INPUT. `origin`: of the local frame, set on
         the ground where the autopilot has none."""
         self._gate, self._link, self._clocks = gate, link, clocks
         self._kinds, self._gps_id, self._own_origin = kinds, gps_id, origin
-        self._min_confidence = min_confidence
         self._covariance = FilterCovariance(min_std_m)
         self.incomplete = self.too_slow = 0
         self._said: set[str] = set()
@@ -147,18 +145,18 @@ class Messenger:
         self._requests += link.send(request_message(49, link.target))  # GPS_GLOBAL_ORIGIN
 
     def _make(self, name: str, estimate: NavigationEstimate, vehicle: VehicleState) -> Message:
-        least, target = self._min_confidence, self._link.target or AUTOPILOT
+        target = self._link.target or AUTOPILOT
         if name == "global-position":
-            return global_position_sensor(estimate, target=target, min_confidence=least)
+            return global_position_sensor(estimate, target=target)
         if name == "gps-input":
             if math.isfinite(vehicle.amsl_m) and math.isnan(estimate.alt_amsl_m):
                 estimate = replace(estimate, alt_amsl_m=vehicle.amsl_m, alt_std_m=DOWN_STD_M)
-            return gps_input(estimate, gps_id=self._gps_id, min_confidence=least)
+            return gps_input(estimate, gps_id=self._gps_id)
         if name == "external-position":
-            return external_position_estimate(estimate, target=target, min_confidence=least)
+            return external_position_estimate(estimate, target=target)
         make = odometry if name == "odometry" else vision_position_estimate
         pose = _pose(vehicle, self._link.origin)
-        return make(estimate, pose, self._link.kind or Autopilot.PX4, min_confidence=least)
+        return make(estimate, pose, self._link.kind or Autopilot.PX4)
 
 
 def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
@@ -217,10 +215,8 @@ class NmeaOut:
     def __init__(self, sink: Sink, *, quality: Quality = Quality.ESTIMATED) -> None:
         self._sink, self._quality = sink, quality
 
-    def write(
-        self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
-    ) -> None:
-        given = estimate, utc_ns, min_confidence
+    def write(self, estimate: NavigationEstimate | None, utc_ns: int) -> None:
+        given = estimate, utc_ns
         sentences = gga(*given, self._quality), rmc(*given, self._quality), gst(*given)
         self._sink.write(b"".join(sentences))
 
@@ -231,13 +227,11 @@ class NmeaOut:
 class JsonOut:
     """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld`; the health."""
 
-    def __init__(
-        self, path: Path | None, stream: TextIO | None = None, identity: Identity = UNKNOWN
-    ) -> None:
-        """Append to a file, or write to `stream` (stdout) where `path` is None; the first view
-        states `identity`."""
+    def __init__(self, path: Path | None, identity: Identity = UNKNOWN) -> None:
+        """Append to a file, or write to stdout where `path` is None; the first view states
+        `identity`."""
         self._path, self._identity = path, identity
-        self._stream: TextIO | None = stream or sys.stdout
+        self._stream: TextIO | None = sys.stdout
         if path is not None:
             self._stream = path.open("a", encoding="ascii")
 
@@ -283,13 +277,11 @@ class Publisher:
         nmea: Sequence[NmeaOut] = (),
         lines: "Sequence[JsonOut | Narrator]" = (),
         graph: "Ros2Publisher | None" = None,
-        min_confidence: float = CONFIDENT,
         min_std_m: float = 0.0,
     ) -> None:
         """`min_std_m`: lower bound of the standard deviation of a fix that `graph` publishes."""
-        self.gate, self._clocks = gate, clocks
-        self.messenger = messenger
-        self._nmea, self._lines, self._least = nmea, lines, min_confidence
+        self.gate, self.clocks, self.messenger = gate, clocks, messenger
+        self._nmea, self._lines = nmea, lines
         self._graph = [] if graph is None else [graph]
         self._covariance = FilterCovariance(min_std_m)
         self._nmea_ns = 0
@@ -307,8 +299,8 @@ class Publisher:
         """Send a position that the gate admits; the names of the messages. Only a view that was
         processed (`judged`) gives one: the prediction of a track is not a measurement."""
         sent: tuple[str, ...] = ()
-        now_ns = self._clocks.mono_ns()
-        ahead_ns = self._clocks.utc_ns() - now_ns
+        now_ns = self.clocks.mono_ns()
+        ahead_ns = self.clocks.utc_ns() - now_ns
         decision = Decision(None)
         if withheld is not None:
             decision = self.gate.withhold(withheld)
@@ -323,7 +315,7 @@ class Publisher:
             sent_here, rate = self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
             sent, withheld = sent + sent_here, withheld or rate
         self._write_nmea(estimate, exposed_ns + ahead_ns)
-        age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
+        age_ms = (self.clocks.mono_ns() - exposed_ns) / 1e6
         why = None if sent else withheld
         self._each(self._lines, lambda out: out.view(result, age_ms, sent, why))
         return sent
@@ -341,7 +333,7 @@ class Publisher:
         sent: list[str] = []
         if not self._graph:
             return (), None
-        if not self.gate.due("ROS2", self._clocks.mono_ns()):
+        if not self.gate.due("ROS2", self.clocks.mono_ns()):
             return (), "rate:ROS2"
         stated = self._covariance.prepare("ROS2", estimate, exposed_ns)
         self._each(
@@ -357,10 +349,10 @@ class Publisher:
     def _write_nmea(self, estimate: NavigationEstimate | None, utc_ns: int) -> None:
         # Farther behind, the clock was set back.
         goes_back = 0 < self._nmea_ns - utc_ns <= MAX_AGE_S * 1e9
-        if self._nmea and not goes_back and self.gate.due("NMEA", self._clocks.mono_ns()):
+        if self._nmea and not goes_back and self.gate.due("NMEA", self.clocks.mono_ns()):
             self._nmea_ns = utc_ns
             failed = self.failed
-            self._each(self._nmea, lambda out: out.write(estimate, utc_ns, self._least))
+            self._each(self._nmea, lambda out: out.write(estimate, utc_ns))
             self.gate.sent["NMEA"] += self.failed == failed
 
     def _each(self, outs: Sequence[Any], call: Callable[[Any], None]) -> None:

@@ -34,20 +34,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SavedState:
-    """A position with its standard deviation, and when it was taken and saved, by two clocks.
-
-    `std_m`: along the worst axis. `utc_ns`, `mono_ns`: time of exposure; the second is valid while
-    `boot_id`, that of the operating system, is the same. `signing_timestamp_10us`: see
-    `orthonav.onboard.messages.mavlink.Signing`.
-    """
+    """A position with its standard deviation, and when it was taken, by two clocks."""
 
     lat_deg: float = math.nan
     lon_deg: float = math.nan
-    std_m: float = math.nan
-    utc_ns: int = 0
-    mono_ns: int = 0
-    boot_id: str = ""
-    signing_timestamp_10us: int = 0
+    std_m: float = math.nan  # along the worst axis
+    utc_ns: int = 0  # time of exposure
+    mono_ns: int = 0  # the same; valid while `boot_id` is the same
+    boot_id: str = ""  # that of the operating system
+    signing_timestamp_10us: int = 0  # see `orthonav.onboard.messages.mavlink.Signing`
 
     def age_s(self, utc_ns: int, mono_ns: int, boot_id: str) -> float:
         """Age of the position in seconds; negative where the clock was set back."""

@@ -95,31 +95,25 @@ def export_encoder(
     expected = _torch_embeddings(encoder, held_out)
     _require_same(_raw(plain, random), _torch_embeddings(encoder, random), "random numbers")
     _require_same(_raw(plain, held_out), expected, "tiles")
-    cosine = {"float32": least_cosine_between(_raw(plain, held_out), expected)}
-    sizes = {"float32": plain.onnx.nbytes / 1e6}
+    tried = {"float32": plain}
+    if recipe.precision != "float32":
+        smaller = int8(model, calibration) if recipe.precision == "int8" else float16(model)
+        tried[recipe.precision] = _embedder(recipe, smaller)
+    cosine = {
+        name: least_cosine_between(_raw(each, held_out), expected) for name, each in tried.items()
+    }
+    sizes = {name: each.onnx.nbytes / 1e6 for name, each in tried.items()}
     enough = LEAST_COSINE[recipe.precision] if least_cosine is None else least_cosine
-    if recipe.precision == "float32":
-        return Exported(plain, "float32", cosine, enough, sizes)
-    smaller = int8 if recipe.precision == "int8" else float16
-    small = _embedder(recipe, smaller(model, calibration))
-    cosine[recipe.precision] = least_cosine_between(_raw(small, held_out), expected)
-    sizes[recipe.precision] = small.onnx.nbytes / 1e6
-    if cosine[recipe.precision] >= enough:
-        return Exported(small, recipe.precision, cosine, enough, sizes)
-    return Exported(plain, "float32", cosine, enough, sizes)
-
-
-def cosines(first: Array, second: Array) -> Array:
-    """Cosines (N,) between embeddings (N, D) of the same tiles; 1 for two zero vectors."""
-    norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
-    products = np.einsum("nd,nd->n", first, second)
-    both_zero = np.maximum(np.abs(first).max(axis=1), np.abs(second).max(axis=1)) == 0
-    return np.asarray(np.where(both_zero, 1, products / np.maximum(norms, 1e-30)), np.float32)
+    chosen = recipe.precision if cosine[recipe.precision] >= enough else "float32"
+    return Exported(tried[chosen], chosen, cosine, enough, sizes)
 
 
 def least_cosine_between(first: Array, second: Array) -> float:
-    """Smallest cosine between embeddings (N, D) of the same tiles."""
-    return float(cosines(first, second).min())
+    """Smallest cosine between embeddings (N, D) of the same tiles; 1 for two zero vectors."""
+    norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    products = np.einsum("nd,nd->n", first, second)
+    both_zero = np.maximum(np.abs(first).max(axis=1), np.abs(second).max(axis=1)) == 0
+    return float(np.where(both_zero, 1, products / np.maximum(norms, 1e-30)).min())
 
 
 def encoder_graph(encoder: nn.Module, shape: tuple[int, ...]) -> Any:
@@ -178,7 +172,7 @@ def int8(model: Any, calibration: Array) -> bytes:
         return target.read_bytes()
 
 
-def float16(model: Any, _: Array | None = None) -> bytes:
+def float16(model: Any) -> bytes:
     """The model with weights in 16 bits, converted to 32 when it is loaded."""
     import onnx
 

@@ -111,14 +111,13 @@ class SamBoundaries:
     def __post_init__(self) -> None:
         if not self.path:
             raise VariantError(f"sam needs weights=PATH, or {WEIGHTS_VARIABLE}: {WHERE}")
-        for name, least, most in (("grid", 1, 256), ("prompts", 1, 4096)):
+        ranges = {"grid": (1, 256), "prompts": (1, 4096)}
+        ranges |= dict.fromkeys(("iou", "stability", "overlap"), (0, 1))
+        for name, (least, most) in ranges.items():
             if not least <= getattr(self, name) <= most:
                 raise VariantError(
                     f"sam {name} must be {least} to {most}, got {getattr(self, name)}"
                 )
-        for name in ("iou", "stability", "overlap"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise VariantError(f"sam {name} must be 0 to 1, got {getattr(self, name)}")
         if not self.offset > 0:
             raise VariantError(f"sam offset must be above 0, got {self.offset}")
         if self.window and not 16 <= self.window <= 4096:

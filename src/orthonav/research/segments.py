@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 from orthonav.core.extras import needed
+from orthonav.core.tiles.words import filled
 
 MARGIN_PX = 32
 """Most changes by cropping end there, see `Segments`."""
@@ -67,8 +68,9 @@ class Segments:
         """
         if not valid.any():
             return np.zeros((1, *grey.shape), dtype=np.float32)
-        labels = _felzenszwalb()(
-            _filled(grey, valid), scale=self.scale, sigma=self.sigma, min_size=self.min_size
+        library = needed("skimage.segmentation", "segments", "graph-based segmentation")
+        labels = library.felzenszwalb(
+            filled(grey, valid), scale=self.scale, sigma=self.sigma, min_size=self.min_size
         )
         edges = boundaries(labels)
         if not valid.all():
@@ -90,14 +92,3 @@ def boundaries(labels: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
     edges[:, 1:] |= right
     edges[:, :-1] |= right
     return edges
-
-
-def _filled(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The image, with its mean at pixels that are not valid."""
-    if valid.all():
-        return np.ascontiguousarray(grey)
-    return np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
-
-
-def _felzenszwalb() -> Any:
-    return needed("skimage.segmentation", "segments", "graph-based segmentation").felzenszwalb

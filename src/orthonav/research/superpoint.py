@@ -23,12 +23,13 @@ try:
 except ImportError as error:
     raise missing_extra("a neural network", "train", "torch", error) from error
 
-CELL_PX = 8
-DIMS = 256
+CELL_PX = 8  # of the network; a feature sees its own cell and the neighbouring ones
 WHERE = (
     "the folder of magic-leap-community/superpoint (config.json and model.safetensors) from the "
     "Hugging Face hub; mind its licence, which forbids commercial use"
 )
+
+Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,9 @@ class SuperPoint:
             raise VariantError(f"superpoint max_points must be 0 or more, got {self.max_points}")
         require_device(self.device)
 
-    def describe(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Points (N, 2) and unit descriptors (N, 256) of a picture (H, W), strongest first.
+    def __call__(self, grey: NDArray[np.uint8]) -> tuple[Array, Array, Array]:
+        """Points (N, 2), radii (N,) and unit descriptors (N, 256) of a picture (H, W), strongest
+        first.
 
         A point is (x, y) in pixels from the outer corner of the first pixel, whose centre is
         (0.5, 0.5). A picture without keypoints gives N = 0. Raises `MissingFileError` or
@@ -77,7 +79,8 @@ class SuperPoint:
         scores = found.scores[0].cpu().numpy()[order]
         order = order[np.argsort(-scores, kind="stable")][: self.max_points or None]
         descriptors = found.descriptors[0].cpu().numpy()[order]
-        return (points[order] + 0.5).astype(np.float32), descriptors.astype(np.float32)
+        radii = np.full(len(order), CELL_PX, np.float32)
+        return (points[order] + 0.5).astype(np.float32), radii, descriptors.astype(np.float32)
 
 
 def _padding(size: int) -> int:

@@ -168,23 +168,18 @@ class TrainingState:
         if self.plateau is not None:
             self.plateau.step(loss)
 
+    def _with_states(self) -> dict[str, Any]:
+        names = "model", "optimizer", "plateau", "scaler"
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
     def parts(self) -> dict[str, Any]:
-        return {
-            "model": self.model.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "plateau": self.plateau.state_dict() if self.plateau else None,
-            "scaler": self.scaler.state_dict(),
-            "history": self.history,
-            "losses": self.losses,
-        }
+        states = {name: each.state_dict() for name, each in self._with_states().items()}
+        return {"plateau": None, **states, "history": self.history, "losses": self.losses}
 
     def take(self, parts: dict[str, Any]) -> None:
-        self.model.load_state_dict(parts["model"])
-        self.optimizer.load_state_dict(parts["optimizer"])
-        if self.plateau is not None:
-            self.plateau.load_state_dict(parts["plateau"])
-        if parts.get("scaler"):
-            self.scaler.load_state_dict(parts["scaler"])
+        for name, each in self._with_states().items():
+            if name != "scaler" or parts.get(name):
+                each.load_state_dict(parts[name])
         self.history = list(parts["history"])
         self.losses = list(parts.get("losses", []))  # absent in older checkpoints
 

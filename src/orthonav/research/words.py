@@ -37,31 +37,6 @@ BLOCK_PX, AROUND_PX = 1024, 256
 """Side of the blocks in which features of a sheet are found, and what is seen around them."""
 ITERATIONS = 20
 """Iterations of k-means; faiss's own default is 25."""
-SUPERPOINT_RADIUS_PX = 8.0
-"""A SuperPoint feature covers its own cell of 8 px and the neighbouring cells."""
-
-
-@dataclass(frozen=True)
-class SuperPointDetector:
-    """SuperPoint features: `weights` is the path of the network, `most` the number of features."""
-
-    weights: str
-    most: int
-
-    def __call__(self, grey: Grey) -> tuple[Array, Array, Array]:
-        """Points (N, 2) from the outer corner, radii (N,) and unit descriptors (N, 256)."""
-        from orthonav.research.superpoint import SuperPoint  # only here is PyTorch needed
-
-        points, descriptors = SuperPoint(self.weights, max_points=self.most).describe(grey)
-        radii = np.full(len(points), SUPERPOINT_RADIUS_PX, dtype=np.float32)
-        return points, radii, descriptors
-
-
-def detector_of(recipe: WordsRecipe) -> Detector | None:
-    """Feature detector of a recipe; None for SIFT, which is built in."""
-    if recipe.features == "sift":
-        return None
-    return SuperPointDetector(recipe.weights, recipe.max_features)
 
 
 class _Sample:
@@ -108,7 +83,12 @@ def learn_words(
     k-means done. Raises `VariantError` if there are fewer descriptors than words,
     `MissingExtraError` without faiss.
     """
-    faiss, detector = _faiss(), detector_of(recipe)
+    faiss = _faiss()
+    detector: Detector | None = None  # SIFT is built in
+    if recipe.features != "sift":
+        from orthonav.research.superpoint import SuperPoint  # only here is PyTorch needed
+
+        detector = SuperPoint(recipe.weights, max_points=recipe.max_features)
     sample = _Sample(max(MIN_SAMPLES, SAMPLES_PER_WORD * recipe.words), seed)
     owners = _Sample(sample.size, seed)  # draws the same tickets: the picture of each row
     stored = np.uint8 if recipe.features == "sift" else np.float16

@@ -4,6 +4,7 @@ import csv
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 from orthonav.core.errors import FlightError
@@ -13,10 +14,23 @@ from orthonav.core.records import Evidence
 
 FILE = "gnss.csv"
 FIX_3D = 3  # GPS_FIX_TYPE of MAVLink from which a position is three-dimensional
-FAULTS = (
-    *("gnss_lost", "gnss_frozen", "gnss_jump", "gnss_step", "gnss_drift"),
-    *("gnss_velocity", "gnss_offset", "gnss_disagrees", "gnss_returning"),
-)
+
+
+class Fault(Enum):
+    """A fault of GNSS, by its reason in health, logs and pages; in order of priority."""
+
+    LOST = "gnss_lost"  # no messages, no 3D fix, or a useless stated accuracy
+    FROZEN = "gnss_frozen"  # position or timestamp stands still while the aircraft moves
+    JUMP = "gnss_jump"  # the position jumps against the receiver's own velocity
+    STEP = "gnss_step"  # the difference from the map changed within seconds
+    DRIFT = "gnss_drift"  # the difference from the map grows
+    VELOCITY = "gnss_velocity"  # the velocity contradicts the positions of the receiver
+    OFFSET = "gnss_offset"  # the difference is too large, and did not begin within the window
+    DISAGREES = "gnss_disagrees"  # it changed, but the map jumped too: which is wrong is unknown
+
+
+RETURNING = "gnss_returning"  # GNSS agrees again, but not yet for long enough
+FAULTS = (*(each.value for each in Fault), RETURNING)
 """Reasons by the code, from 1, that evidence has as `gnss_fault`; 0 is none (docs/gnss.md)."""
 BIASES = (
     ("gnss_map_east_m", "gnss_map_east_std_m"),
@@ -35,29 +49,20 @@ OPTIONAL_COLUMNS = (
 
 @dataclass(frozen=True)
 class GnssSample:
-    """Solution of a GNSS receiver, for comparison with positions by the map.
+    """Solution of a GNSS receiver, for comparison with positions by the map."""
 
-    `time_ns`: time of the solution, by the clock of the exposures.
-    `arrived_ns`: time of arrival by the same clock.
-    `lat_deg`, `lon_deg`: WGS84.
-    `fix_type`: as GPS_FIX_TYPE of MAVLink: `FIX_3D` or more is a 3D fix.
-    `std_m`: stated horizontal standard deviation; NaN where not known.
-    `vel_en_mps`: velocity over ground (Doppler), true east and north; None where not known.
-    `satellites`: number used; -1 where not known.
-    `stamp_ns`: the receiver's own timestamp, whatever its epoch; None where it has none.
-    `receiver`: 0 for the first, 1 for the second.
-    """
-
-    time_ns: int
-    arrived_ns: int
-    lat_deg: float
+    time_ns: int  # of the solution, by the clock of the exposures
+    arrived_ns: int  # by the same clock
+    lat_deg: float  # WGS84
     lon_deg: float
-    fix_type: int
-    std_m: float = math.nan
+    fix_type: int  # as GPS_FIX_TYPE of MAVLink: `FIX_3D` or more is a 3D fix
+    std_m: float = math.nan  # stated horizontal standard deviation; NaN where not known
     vel_en_mps: tuple[float, float] | None = None
-    satellites: int = -1
+    """Velocity over ground (Doppler), true east and north; None where not known."""
+    satellites: int = -1  # number used; -1 where not known
     stamp_ns: int | None = None
-    receiver: int = 0
+    """The receiver's own timestamp, whatever its epoch; None where it has none."""
+    receiver: int = 0  # 0 for the first, 1 for the second
 
     @property
     def has_fix(self) -> bool:

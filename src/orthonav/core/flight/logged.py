@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core import extras
 from orthonav.core.errors import CameraError, FlightError, MissingExtraError, described
 from orthonav.core.flight.fixes import INTEGRITY_KEYS
 from orthonav.core.flight.folder import BROKEN, camera_from_plain
 from orthonav.core.flight.gnss import GnssSample
+from orthonav.core.flight.ros_messages import Definitions
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
 from orthonav.core.records import Fix, Prior, Telemetry
@@ -35,17 +35,13 @@ FRAME_ID = "camera"
 PICTURES = ("full", "thumbnail", "none", "dropped", "bad")
 """State of a view's image: logged, logged small, not requested, dropped for lack of time or space,
 or unusable as the camera delivered it."""
-NO_ALTITUDE_M2 = 1e8
-"""Vertical variance of a position: a fix has no altitude, which is written as NaN."""
 _REPORTED = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
 _OPTIONAL = tuple(each.name for each in fields(Telemetry) if each.type == float | None)
 
 
 @cache
-def _ros() -> Any:
-    """Definitions and serialization of the messages of ROS 2."""
-    typesys = extras.needed("rosbags.typesys", "autopilot", "a flight log")
-    return typesys.get_typestore(typesys.Stores.LATEST)
+def _ros() -> Definitions:
+    return Definitions("autopilot", "a flight log")
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ class Topic:
     def definition(self) -> str:
         """Its schema: the definition of the ROS message, or a JSON schema."""
         if self.is_ros:
-            return str(_ros().generate_msgdef(self.schema, ros_version=2)[0])
+            return _ros().text(self.schema)
         properties = {name: _JSON_TYPES[kind] for kind, text in self.names for name in text.split()}
         return json.dumps({"title": self.schema, "type": "object", "properties": properties})
 
@@ -165,8 +161,24 @@ class LoggedView:
 
 def to_json(plain: Any) -> bytes:
     """Strict JSON of plain values and numbers. Raises `ValueError` or `TypeError` for others."""
-    strict = json.loads(json.dumps(plain, default=float), parse_constant=str)
-    return json.dumps(strict, separators=(",", ":")).encode("ascii")
+    text = json.dumps(_strict(plain), default=_number_of, allow_nan=False, separators=(",", ":"))
+    return text.encode("ascii")
+
+
+def _strict(plain: Any) -> Any:
+    """With texts in place of numbers that JSON cannot express."""
+    if isinstance(plain, dict):
+        return {key: _strict(value) for key, value in plain.items()}
+    if isinstance(plain, list | tuple):
+        return [_strict(value) for value in plain]
+    if isinstance(plain, float) and not math.isfinite(plain):
+        return "NaN" if math.isnan(plain) else "Infinity" if plain > 0 else "-Infinity"
+    return plain
+
+
+def _number_of(value: Any) -> Any:
+    """Of NumPy. Raises `ValueError` or `TypeError` for other values."""
+    return _strict(float(value))
 
 
 def from_json(data: bytes) -> dict[str, Any]:
@@ -295,28 +307,8 @@ def _navsat(
 ) -> bytes:
     if not (np.isfinite(place).all() and np.isfinite(cov_en_m2).all()):
         raise ValueError("position is not finite")
-    covariance = np.diag([0.0, 0.0, NO_ALTITUDE_M2])
-    covariance[:2, :2] = cov_en_m2
-    status = _ros().types["sensor_msgs/msg/NavSatStatus"](status=0 if valid else -1, service=0)
-    return _cdr(
-        TOPICS.navsat.schema,
-        time_ns,
-        status=status,
-        latitude=float(place[0]),
-        longitude=float(place[1]),
-        altitude=math.nan,
-        position_covariance=covariance.ravel(),
-        position_covariance_type=3,  # known
-    )
-
-
-def _cdr(kind: str, time_ns: int, **values: Any) -> bytes:
-    """A message of ROS 2 with a header, little endian."""
-    types, (sec, nanosec) = _ros().types, divmod(max(0, int(time_ns)), 10**9)
-    time = types["builtin_interfaces/msg/Time"](sec=min(sec, 2**31 - 1), nanosec=nanosec)
-    header = types["std_msgs/msg/Header"](stamp=time, frame_id=FRAME_ID)
-    message = types[kind](header=header, **values)
-    return bytes(_ros().serialize_cdr(message, kind, little_endian=True))
+    header = _ros().header(time_ns, FRAME_ID)
+    return _ros().encoded(_ros().navsatfix(header, place, cov_en_m2, valid=valid))
 
 
 def stamp(time_ns: int) -> dict[str, int]:
@@ -327,14 +319,14 @@ def stamp(time_ns: int) -> dict[str, int]:
 
 def picture_message(data: bytes, kind: str, time_ns: int) -> bytes:
     """The message of `Topics.view` and `Topics.thumbnail`: `data` encoded as `kind`."""
-    pixels = np.frombuffer(data, dtype=np.uint8)
-    return _cdr(TOPICS.view.schema, time_ns, format=kind, data=pixels)
+    header, pixels = _ros().header(time_ns, FRAME_ID), np.frombuffer(data, dtype=np.uint8)
+    return _ros().encoded(_ros().new(TOPICS.view.schema, header=header, format=kind, data=pixels))
 
 
 def picture_of(message: bytes) -> tuple[bytes, str]:
     """The encoded image in a message of `Topics.view` and its format. Raises `FlightError`."""
     try:
-        found = _ros().deserialize_cdr(message, TOPICS.view.schema)
+        found = _ros().decoded(TOPICS.view.schema, message)
     except MissingExtraError:
         raise
     except Exception as error:  # of the library, about damaged data

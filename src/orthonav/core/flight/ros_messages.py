@@ -1,6 +1,9 @@
-"""Images, cameras, attitudes and heights of ROS messages; axes: REP 103 and REP 105."""
+"""Messages of ROS 2 by the definitions of `rosbags`; images, cameras, attitudes and heights of ROS
+messages. Axes: REP 103 and REP 105."""
 
+import math
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -8,14 +11,87 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
+from orthonav.core.extras import needed
 from orthonav.core.flight import decode_image
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import camera_from_numbers
 from orthonav.core.records import grey_levels
 from orthonav.core.tilt import stated_deg
 
+TIME_NS = 10**9
+NO_ALTITUDE_M2 = 1e8
+"""Vertical variance of a position: a fix has no altitude of its own."""
+_GEOGRAPHIC = {
+    "geographic_msgs/msg/GeoPoint": "float64 latitude\nfloat64 longitude\nfloat64 altitude\n",
+    "geographic_msgs/msg/GeoPointStamped": (
+        "std_msgs/Header header\ngeographic_msgs/GeoPoint position\n"
+    ),
+}
+Grey = NDArray[np.uint8]
 _NOT_BODY = ("camera", "optical", "gimbal", "lidar", "laser", "ned", "frd")
 _NOT_DOWN = ("front", "forward", "rear", "back", "backward", "left", "right", "up", "upward")
+
+
+class Definitions:
+    def __init__(self, extra: str, what: str, distro: str = "") -> None:
+        """`extra`, `what`: of the error where `rosbags` is missing. `distro` as in ROS_DISTRO
+        ("humble"); one that is not known stands for the newest. Raises `MissingExtraError`."""
+        typesys = needed("rosbags.typesys", extra, what)
+        stores = {store.value: store for store in typesys.Stores}
+        self._store = typesys.get_typestore(stores.get(f"ros2_{distro}", typesys.Stores.LATEST))
+        for name, text in _GEOGRAPHIC.items():
+            self._store.register(typesys.get_types_from_msg(text, name))
+
+    def text(self, name: str) -> str:
+        """The definition of a message, of those that it consists of too."""
+        return str(self._store.generate_msgdef(name, ros_version=2)[0])
+
+    def new(self, name: str, /, **values: Any) -> Any:
+        """A message of the type `name` ("sensor_msgs/msg/NavSatFix")."""
+        return self._store.types[name](**values)
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        return self.new("std_msgs/msg/Header", stamp=self.time(stamp_ns), frame_id=frame)
+
+    def time(self, stamp_ns: int) -> Any:
+        """Within its range: 1970 to 2038."""
+        sec, nanosec = divmod(max(0, int(stamp_ns)), TIME_NS)
+        return self.new("builtin_interfaces/msg/Time", sec=min(sec, 2**31 - 1), nanosec=nanosec)
+
+    def vector(self, kind: str, names: str, values: Sequence[float]) -> Any:
+        """A message of `geometry_msgs` of plain numbers, such as Point and Quaternion."""
+        numbers = map(float, values)
+        return self.new(f"geometry_msgs/msg/{kind}", **dict(zip(names, numbers, strict=True)))
+
+    def navsatfix(
+        self,
+        header: Any,
+        latlon_deg: tuple[float, float],
+        cov_en_m2: NDArray[np.float64],
+        altitude_m: float = math.nan,
+        *,
+        valid: bool = True,
+    ) -> Any:
+        """A position, status "no fix" unless `valid`; its altitude, NaN for unknown, is not
+        measured, and the satellite service is 0."""
+        covariance = np.diag([0.0, 0.0, NO_ALTITUDE_M2])
+        covariance[:2, :2] = cov_en_m2
+        return self.new(
+            "sensor_msgs/msg/NavSatFix",
+            header=header,
+            status=self.new("sensor_msgs/msg/NavSatStatus", status=int(valid) - 1, service=0),
+            latitude=float(latlon_deg[0]),
+            longitude=float(latlon_deg[1]),
+            altitude=altitude_m,
+            position_covariance=covariance.ravel(),
+            position_covariance_type=3,  # known
+        )
+
+    def decoded(self, name: str, cdr: bytes) -> Any:
+        return self._store.deserialize_cdr(cdr, name)
+
+    def encoded(self, message: Any) -> bytes:
+        return bytes(self._store.serialize_cdr(message, message.__msgtype__, little_endian=True))
 
 
 def stamp_ns(message: Any, recorded_ns: int) -> int:
@@ -72,7 +148,6 @@ def height_of_message(message: Any) -> float | None:
     return float(message.data)
 
 
-Grey = NDArray[np.uint8]
 # encoding: bytes per channel, channels, conversion to grey.
 _TO_GREY: dict[str, tuple[int, int, int | None]] = {
     "mono8": (1, 1, None),

@@ -46,17 +46,6 @@ class LocalFrame:
             "+datum=WGS84 +units=m +no_defs"
         )
 
-    @property
-    def wkt(self) -> str:
-        return (
-            'PROJCS["sheet of an orthonav map",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",'
-            f"{WGS84_A_M:.0f},{1 / WGS84_F:.9f}]],PRIMEM["
-            '"Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Azimuthal_Equidistant"],'
-            f'PARAMETER["latitude_of_center",{float(self.lat_deg)!r}],'
-            f'PARAMETER["longitude_of_center",{float(self.lon_deg)!r}],'
-            'PARAMETER["false_easting",0],PARAMETER["false_northing",0],UNIT["metre",1]]'
-        )
-
     def en_from_latlon(self, lat_deg: ArrayLike, lon_deg: ArrayLike) -> Array:
         """Local `(..., 2)`; beyond `MAX_SHEET_M` errors grow with the cube (0.2 m at 300 km)."""
         lat = np.radians(np.asarray(lat_deg, dtype=np.float64))

@@ -6,12 +6,10 @@ header only. Serial number and time are signed too, so that older maps can be re
 import base64
 import binascii
 import contextlib
-import functools
 import hashlib
 import json
 import os
 import re
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,14 +23,11 @@ from orthonav.core.errors import (
     described,
 )
 from orthonav.core.extras import missing_extra
-from orthonav.core.files import replacing, require_file, write_text
+from orthonav.core.files import require_file, write_text
 from orthonav.core.mapfile.reader import map_digest, open_map
 
 if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import (
-        Ed25519PrivateKey,
-        Ed25519PublicKey,
-    )
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 KIND = {"format": "orthonav-signature", "schema": 2, "algorithm": "ed25519"}
 MAX_BYTES = 4096  # of a signature, and of a key
@@ -108,14 +103,13 @@ def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
     serial = int(now.timestamp()) if serial is None else serial
     if not 0 <= serial <= MAX_SERIAL:
         raise VariantError(f"serial number must be 0 to {MAX_SERIAL}, got {serial}")
-    private = _private_key(key)
+    private = _key("private", key)
     digest = open_map(path).manifest.sha256
     made = Signature(key_id(private.public_key()), digest, serial, now.strftime(_TIME))
     encoded = base64.b64encode(private.sign(made.message)).decode()
     plain = {**KIND, **asdict(made), "signature": encoded}
     out = signature_path(path)
-    with replacing(out) as temporary:
-        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="ascii")
+    write_text(out, json.dumps(plain, indent=1) + "\n")
     return out
 
 
@@ -127,7 +121,7 @@ def require_signature(path: Path, public_key: Path, not_before: str | None = Non
     old, `MissingFileError`, `VariantError` (`not_before`) and `MissingExtraError`."""
     invalid, _, _ = _crypto()
     least = None if not_before is None else _least(not_before)
-    public = _public_key(public_key)
+    public = _key("public", public_key)
     digest = map_digest(path)
     found, encoded = _signature(path)
     known = key_id(public)
@@ -158,14 +152,12 @@ def _least(text: str) -> int | datetime:
 
 def _require_not_older(found: Signature, least: int | datetime, text: str, path: Path) -> None:
     if isinstance(least, int):
-        if found.serial < least:
-            raise MapFileError(
-                f"map is too old: serial number {found.serial}, --not-before {text}: {path}"
-            )
-    elif datetime.strptime(found.signed_utc, _TIME).replace(tzinfo=UTC) < least:
-        raise MapFileError(
-            f"map is too old: signed {found.signed_utc}, --not-before {text}: {path}"
-        )
+        is_older, said = found.serial < least, f"serial number {found.serial}"
+    else:
+        signed = datetime.strptime(found.signed_utc, _TIME).replace(tzinfo=UTC)
+        is_older, said = signed < least, f"signed {found.signed_utc}"
+    if is_older:
+        raise MapFileError(f"map is too old: {said}, --not-before {text}: {path}")
 
 
 def _signature(path: Path) -> tuple[Signature, str]:
@@ -202,24 +194,23 @@ def _signature(path: Path) -> tuple[Signature, str]:
     return Signature(texts[0], texts[1], serial, signed_utc), texts[2]
 
 
-def _private_key(path: Path) -> "Ed25519PrivateKey":
+def _key(name: str, path: Path) -> Any:
+    """The "public" or "private" key in a file."""
     _, serialization, ed25519 = _crypto()
-    load = functools.partial(serialization.load_pem_private_key, password=None)
-    found: Ed25519PrivateKey = _key(load, ed25519.Ed25519PrivateKey, "private", path)
-    return found
-
-
-def _public_key(path: Path) -> "Ed25519PublicKey":
-    _, serialization, ed25519 = _crypto()
-    load = serialization.load_pem_public_key
-    found: Ed25519PublicKey = _key(load, ed25519.Ed25519PublicKey, "public", path)
-    return found
-
-
-def _key(load: Callable[[bytes], Any], kind: type, name: str, path: Path) -> Any:
-    data = _key_bytes(path, f"{name} key")
+    private = name == "private"
+    kind = ed25519.Ed25519PrivateKey if private else ed25519.Ed25519PublicKey
     try:
-        key = load(data)
+        with require_file(path, f"{name} key").open("rb") as stream:
+            data = stream.read(MAX_BYTES)
+    except MissingFileError:
+        raise
+    except OSError as error:
+        raise MissingFileError(f"{name} key cannot be read ({error.strerror}): {path}") from error
+    try:
+        if private:
+            key = serialization.load_pem_private_key(data, password=None)
+        else:
+            key = serialization.load_pem_public_key(data)
     except TypeError as error:  # raised for a key with a passphrase
         raise MapFileError(f"{name} key has a passphrase; give one without: {path}") from error
     except Exception as error:
@@ -227,16 +218,6 @@ def _key(load: Callable[[bytes], Any], kind: type, name: str, path: Path) -> Any
     if not isinstance(key, kind):
         raise MapFileError(f"expected an Ed25519 {name} key, got another kind: {path}")
     return key
-
-
-def _key_bytes(path: Path, what: str) -> bytes:
-    try:
-        with require_file(path, what).open("rb") as stream:
-            return stream.read(MAX_BYTES)
-    except OSError as error:
-        if isinstance(error, MissingFileError):
-            raise
-        raise MissingFileError(f"{what} cannot be read ({error.strerror}): {path}") from error
 
 
 def _crypto() -> tuple[Any, Any, Any]:

@@ -176,7 +176,7 @@ class ExactIndex:
 
     @property
     def _block_rows(self) -> int:
-        return max(1, min(BLOCK_ROWS, BLOCK_NUMBERS // max(1, self._stored.shape[1])))
+        return max(1, min(BLOCK_ROWS, BLOCK_NUMBERS // max(1, int(self._stored.shape[1]))))
 
     def _count(self, rows: NDArray[np.intp] | None) -> int:
         return len(self._stored) if rows is None else len(rows)

@@ -2,18 +2,13 @@
 a track was born again, smoothing begins again."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from orthonav.core.track.hypothesis import Hypothesis
 from orthonav.core.track.mixture import Mixture
-from orthonav.core.track.model import STATE, Array
+from orthonav.core.track.model import Array
 from orthonav.core.track.motion import Expected
-
-SIZES = [STATE, STATE**2] * 3 + [STATE**2]
-"""Of a state, its prediction, the state before, and their covariance."""
-STARTS = np.cumsum(SIZES)[:-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,48 +20,19 @@ class Smoothed:
     belief: float
 
 
-class _Kept(NamedTuple):
-    """`numbers`: state, prediction, state before and their covariance, in one array: many small
-    ones would hold on to more memory."""
-
-    parent: int
-    share: float
-    numbers: Array
-    is_predicted: bool
-
-    def state(self) -> tuple[Array, Array]:
-        mean, covariance = np.split(self.numbers, STARTS[:2])[:2]
-        return mean, covariance.reshape(STATE, STATE)
-
-    def expected(self) -> Expected:
-        parts = np.split(self.numbers, STARTS)[2:]
-        return Expected(
-            *(each if each.size == STATE else each.reshape(STATE, STATE) for each in parts)
-        )
-
-
 class History:
     """The hypotheses after each view, as far as the smoother still needs them. Mutable."""
 
     def __init__(self) -> None:
-        self._views: list[dict[int, _Kept]] = []
+        self._views: list[dict[int, Hypothesis]] = []
         self._most: list[float] = []  # largest belief that each view allows
 
     def record(self, mixture: Mixture, number: int) -> None:
         """The view with this number, from 0, in place of what an error left of it."""
         del self._views[number:], self._most[number:]
-        self._views.append({each.number: self._kept(each) for each in mixture.hypotheses})
+        self._views.append({each.number: each for each in mixture.hypotheses})
         self._most.append(mixture.trust.most)
         self._forget()
-
-    @staticmethod
-    def _kept(each: Hypothesis) -> _Kept:
-        parts, expected = [each.mean, each.covariance], each.expected
-        if expected is not None:
-            parts += [expected.mean, expected.covariance]
-            parts += [expected.mean_before, expected.covariance_before, expected.cross]
-        numbers = np.concatenate([part.ravel() for part in parts])
-        return _Kept(each.parent, each.share, numbers, expected is not None)
 
     def _forget(self) -> None:
         """Without successors, except the most likely one of each view."""
@@ -80,28 +46,27 @@ class History:
             for number in left:
                 del view[number]
 
-    def smoothed(self, last: int | None = None) -> list[Smoothed | None]:
-        """Of all views, or the `last` ones; None where none exists even then."""
+    def smoothed(self) -> list[Smoothed | None]:
+        """Of all views; None where none exists even then."""
         out: list[Smoothed | None] = []
-        after: _Kept | None = None
+        after: Hypothesis | None = None
         later: Smoothed | None = None
-        first = 0 if last is None else -last
-        views = zip(self._views[first:], self._most[first:], strict=True)
-        for view, most in reversed(list(views)):
+        for view, most in reversed(list(zip(self._views, self._most, strict=True))):
             before = None if after is None else view.get(after.parent)
-            if after is None or before is None or not after.is_predicted or later is None:
+            if after is None or before is None or after.expected is None or later is None:
                 after = view[_likeliest(view)] if view else None
-                share = 0.0 if after is None else min(after.share, most)
-                later = None if after is None else Smoothed(*after.state(), share)
+                later = None
+                if after is not None:
+                    later = Smoothed(after.mean, after.covariance, min(after.share, most))
             else:
                 belief = max(later.belief, min(before.share, most))
-                later = replace(_one_back(after.expected(), later), belief=belief)
+                later = replace(_one_back(after.expected, later), belief=belief)
                 after = before
             out.append(later)
         return out[::-1]
 
 
-def _likeliest(view: dict[int, _Kept]) -> int:
+def _likeliest(view: dict[int, Hypothesis]) -> int:
     return max(view, key=lambda number: view[number].share)
 
 

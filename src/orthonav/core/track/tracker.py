@@ -86,6 +86,27 @@ class SearchArea(NamedTuple):
 WHOLE_MAP = SearchArea(None, True)
 
 
+class _Past(NamedTuple):
+    """What a prediction needs of the view before. `velocity` (2,): as reported, and the variance of
+    its error, learnt over `learnt_s`."""
+
+    time_ns: int
+    view: OdometryView | None
+    velocity: Array | None = None
+    velocity_variance: float = 0.0
+    learnt_s: float = 0.0
+
+
+class _Step(NamedTuple):
+    """From the view before to this one. `moves`: arguments of `Mixture.predict`, None at the first
+    view. `overlap` of both; `ground`: share that the one before cannot have shown, 0..1."""
+
+    here: _Past
+    moves: tuple[Any, ...] | None = None
+    overlap: float = 0.0
+    ground: float = 1.0
+
+
 class Tracker:
     """Follows one flight over one map. Mutable; not to be shared between threads."""
 
@@ -98,37 +119,33 @@ class Tracker:
         use_prior: bool = True,
         every_prior: bool = False,
         smooth: bool = False,
-        lag: int | None = None,
         area_m2: float = 0.0,
     ) -> None:
         """`localizer`: or an opened map. `model`: None: the usual one, with a mount as good as the
         height asks for. `area_m2`: where the aircraft may be, if that is more than the map.
 
         With `use_prior` the track starts at the first view's prior; with `every_prior` all priors
-        are position measurements, such as GNSS. `smooth` records the history for `smoothed_track`;
-        with `lag` each view is smoothed over those before it and so many after it.
+        are position measurements, such as GNSS. `smooth` records the history for `smoothed_track`.
 
         Raises `MapFileError` where the map has no registration layer or no confidence."""
         if not isinstance(localizer, Localizer):
             localizer = Localizer(localizer)
         self._heading_known = heading_known
-        self.model, self._usual_model = model or Model(), model is None
-        self._usual_scale = self._usual_model
+        self._usual_model = self._usual_scale = model is None
+        self.mixture = Mixture(model or Model(), self._use(localizer), area_m2)
         self._usual_horizon_rad = self.model.horizon_rad
-        self.mixture = Mixture(self.model, self._use(localizer), area_m2)
-        self._time_ns: int | None = None
+        self._past: _Past | None = None
         self._predicted_ns: int | None = None  # a view predicted, but without an outcome so far
-        self._before: OdometryView | None = None
-        self._velocity: Array | None = None
-        self._velocity_variance, self._learnt_s = 0.0, 0.0
         self._seen: list[Sighting] = []
         self._whole_map = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if smooth else None
-        self._lag = lag
         self._outcomes: list[tuple[Fix | NoFix, Telemetry]] = []
-        self._lagged: list[Fix | NoFix] = []
         self.state = State.SEARCHING
+
+    @property
+    def model(self) -> Model:
+        return self.mixture.model
 
     def _use(self, localizer: Localizer) -> tuple[float, float, float, float]:
         """Extent (west, south, east, north) in metres."""
@@ -155,11 +172,11 @@ class Tracker:
         if self._usual_scale:
             self._usual_scale = False
             scale = math.hypot(Model.log_scale, view.camera.focal_std)
-            self.model = self.mixture.model = replace(self.model, log_scale=scale)
-        overlap, ground = self._predict(None if refused else view, view.telemetry)
+            self.mixture.model = replace(self.model, log_scale=scale)
+        step = self._predict(None if refused else view, view.telemetry)
         self._seen = []
         if refused is None:
-            refused = self._update(view, overlap, ground)
+            refused = self._update(view, step)
         outcome = self._outcome(view.telemetry, refused)
         self._predicted_ns = None
         return outcome
@@ -201,8 +218,8 @@ class Tracker:
             tilt_std_deg=tilt_std_deg,
             vel_en_mps=vel_en_mps,
         )
-        if self._time_ns is not None:
-            step_s = (view.telemetry.time_ns - self._time_ns) / 1e9
+        if self._past is not None:
+            step_s = (view.telemetry.time_ns - self._past.time_ns) / 1e9
             if not 0 < step_s <= LONGEST_GAP_S:
                 log.warning(
                     "time_s changed by %+g s since the image before: it is in seconds, not ms or "
@@ -233,12 +250,13 @@ class Tracker:
         """Positions at all views so far, each estimated from the views after it too."""
         if self._history is None:
             raise ValueError("smoothing needs a tracker made with smooth=True")
-        left = len(self._outcomes) - len(self._lagged)
-        smoothed = self._history.smoothed(left) if left else []
-        return self._lagged + [
-            self._smoothed_fix(*pair)
-            for pair in zip(smoothed, self._outcomes[len(self._lagged) :], strict=True)
-        ]
+        smoothed = self._history.smoothed()
+        return [self._smoothed_fix(*pair) for pair in zip(smoothed, self._outcomes, strict=True)]
+
+    @property
+    def recorded_ns(self) -> list[int]:
+        """Times of the views of `smoothed_track`: those at which no error was raised."""
+        return [telemetry.time_ns for _, telemetry in self._outcomes]
 
     def _smoothed_fix(
         self, smoothed: Smoothed | None, filtered: tuple[Fix | NoFix, Telemetry]
@@ -274,18 +292,10 @@ class Tracker:
             outcome = self._fix(mean, covariance, place, telemetry, more)
             if not self._heading_known:
                 outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
-        if self._history is not None:
-            self._record(self._history, outcome, telemetry)
+        if self._history is not None:  # once, also where an error makes `passed` begin again
+            self._history.record(self.mixture, len(self._outcomes))
+            self._outcomes.append((outcome, telemetry))
         return outcome
-
-    def _record(self, history: History, outcome: Fix | NoFix, telemetry: Telemetry) -> None:
-        """For the smoother; once, also where an error in here makes `passed` begin again."""
-        seen, lag = len(self._outcomes), self._lag
-        if lag is not None and len(self._lagged) < seen - lag:
-            smoothed = history.smoothed(lag + 1)[0]
-            self._lagged.append(self._smoothed_fix(smoothed, self._outcomes[-lag - 1]))
-        history.record(self.mixture, seen)
-        self._outcomes.append((outcome, telemetry))
 
     def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
         """NaN where the view was not registered at the fix."""
@@ -295,51 +305,57 @@ class Tracker:
         )
         return math.degrees(turn_rad) % 360 if off_m <= fix.radius_m else math.nan
 
-    def _predict(self, view: View | None, telemetry: Telemetry) -> tuple[float, float]:
-        """Overlap with the view before, and the share that this cannot have shown, 0..1.
+    def _predict(self, view: View | None, telemetry: Telemetry) -> _Step:
+        """Time and picture change with the mixture: an error before leaves all as they were."""
+        if self._usual_model and math.isfinite(telemetry.agl_m):
+            self._usual_model = view is None  # as on the ground
+            self.mixture.model = self.model.at_height(telemetry.agl_m)
+        tilt = telemetry.horizon_std_deg
+        horizon = self._usual_horizon_rad if tilt is None else math.radians(tilt)
+        self.mixture.model = replace(self.model, horizon_rad=horizon)
+        step, prior = self._step(view, telemetry), telemetry.prior
+        if step.moves is not None:
+            self.mixture.predict(*step.moves)
+        elif prior is not None and (self._use_prior or self._every_prior):
+            self.mixture.start(*self._position_of(prior))
+        # No call comes between: it could raise an error.
+        self._past, self._predicted_ns = step.here, telemetry.time_ns
+        if step.moves is not None and prior is not None and self._every_prior:
+            self.mixture.measure_position(*self._position_of(prior))
+        return step
 
-        Time, velocity and view change with the mixture: an error before leaves all as they were."""
-        before, now = self._before, None
+    def _step(self, view: View | None, telemetry: Telemetry) -> _Step:
+        """Changes nothing. `view`: None where its picture is not used."""
+        past, now = self._past, None
+        before = None if past is None else past.view
         if view is not None and self._heading_known:
             bias, _ = self.mixture.bias()
             before = None if before is None else before.corrected(bias)
             now = self._odometry_view(view, before, bias)
-        prior = telemetry.prior if self._use_prior or self._every_prior else None
-        if self._usual_model and math.isfinite(telemetry.agl_m):
-            self._usual_model = view is None  # as on the ground
-            self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
-        tilt = telemetry.horizon_std_deg
-        horizon = self._usual_horizon_rad if tilt is None else math.radians(tilt)
-        self.model = self.mixture.model = replace(self.model, horizon_rad=horizon)
-        if self._time_ns is None:
-            if prior is not None:
-                self.mixture.start(*self._position_of(prior))
-            self._time_ns = self._predicted_ns = telemetry.time_ns
-            self._velocity, self._before = None, now
-            return 0.0, 1.0
-        seconds = (telemetry.time_ns - self._time_ns) / 1e9
+        if past is None:
+            return _Step(_Past(telemetry.time_ns, now))
+        seconds = (telemetry.time_ns - past.time_ns) / 1e9
         if not 0 < seconds < LONGEST_GAP_S:
             seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
         noise = self._telemetry_noise(telemetry)
-        velocity = self._reported_velocity(telemetry)
+        velocity = _reported_velocity(past, telemetry)
         expected = self._expected_displacement(seconds, velocity)
         moved = self._displacement(before, now, noise, expected)
         camera = None if moved is None else moved.displacement
-        if camera is not None:
-            self._learn_velocity(velocity, camera, seconds)
+        here = past._replace(time_ns=telemetry.time_ns, view=now, velocity=None)
+        if velocity is not None:
+            here = here._replace(velocity=velocity.now_en_mps)
+            if camera is not None and seconds <= LEARNT_S:
+                here = self._with_learnt(here, velocity, camera, seconds)
         # Clouds do not fit each other, but show no new ground either.
         if moved is not None:
             ground = 1 - moved.overlap
         else:
             ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
         # An image that is not used makes no error independent.
-        self.mixture.predict(seconds, velocity, camera, noise, 1.0 if view is None else 1 - ground)
-        # No call comes between: it could raise an error.
-        self._time_ns = self._predicted_ns = telemetry.time_ns
-        self._velocity, self._before = (None if velocity is None else velocity.now_en_mps), now
-        if self._every_prior and prior is not None:
-            self.mixture.measure_position(*self._position_of(prior))
-        return 0.0 if moved is None else moved.overlap, ground
+        overlap = 1.0 if view is None else 1 - ground
+        moves = seconds, velocity, camera, noise, overlap
+        return _Step(here, moves, 0.0 if moved is None else moved.overlap, ground)
 
     def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
         """By the expected displacement or the largest usual speed."""
@@ -372,24 +388,10 @@ class Tracker:
                 return made
         return OdometryView.of(view, None, bias)
 
-    def _reported_velocity(self, telemetry: Telemetry) -> ReportedVelocity | None:
-        """None where none is given."""
-        before, reported = self._velocity, telemetry.vel_en_mps
-        if reported is None or not np.isfinite(reported).all():
-            return None
-        now = np.array(reported)
-        std = telemetry.vel_std_mps
-        if std is None or not std > 0:
-            std = usual_velocity_std_mps(float(np.hypot(*now)))
-        std = max(std, math.sqrt(max(self._velocity_variance, 0.0)))
-        return ReportedVelocity(now, before, std, UNAIDED_S if std >= UNAIDED_STD_MPS else None)
-
-    def _learn_velocity(
-        self, velocity: ReportedVelocity | None, moved: CameraDisplacement, seconds: float
-    ) -> None:
-        """Its variance, less that of odometry itself: a horizon that changes looks like motion."""
-        if velocity is None or seconds > LEARNT_S:
-            return
+    def _with_learnt(
+        self, here: _Past, velocity: ReportedVelocity, moved: CameraDisplacement, seconds: float
+    ) -> _Past:
+        """The variance less that of odometry itself: a horizon that changes looks like motion."""
         bias, _ = self.mixture.bias()
         off = (
             rotation(-bias[0], math.exp(bias[1])) @ moved.moved_en_m - velocity.now_en_mps * seconds
@@ -398,9 +400,9 @@ class Tracker:
         changed = 2 * model.horizon_rad**2 * (1 - math.exp(-seconds / model.horizon_s))
         own = float(np.trace(moved.covariance)) + changed * float(np.sum(moved.levers_m[0] ** 2))
         shown = (float(off @ off) - own) / (2 * seconds**2)
-        self._learnt_s += seconds
-        share = max(1 - math.exp(-seconds / LEARNT_S), seconds / self._learnt_s)
-        self._velocity_variance += share * (shown - self._velocity_variance)
+        learnt_s, before = here.learnt_s + seconds, here.velocity_variance
+        share = max(1 - math.exp(-seconds / LEARNT_S), seconds / learnt_s)
+        return here._replace(velocity_variance=before + share * (shown - before), learnt_s=learnt_s)
 
     def _expected_displacement(
         self, seconds: float, velocity: ReportedVelocity | None
@@ -444,7 +446,7 @@ class Tracker:
         relief = self._registration.ground
         return Terrain.ahead(relief, best.mean[POSITION], agl_m * scale, ahead_m)
 
-    def _update(self, view: View, overlap: float, ground: float) -> NoFix | None:
+    def _update(self, view: View, step: _Step) -> NoFix | None:
         """`NoFix` where the view shows too little."""
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
@@ -464,7 +466,7 @@ class Tracker:
         search = self._registration.search(corrected, prior, self._heading_known)
         if isinstance(search, NoFix):
             return search
-        newness = max(1 - overlap, LEAST_NEW)
+        newness = max(1 - step.overlap, LEAST_NEW)
         found = found_by(search)
         if isinstance(found, Found):
             share = min(searched.area_m2, self.mixture.map_m2) / self.mixture.area_m2
@@ -475,7 +477,7 @@ class Tracker:
             math.radians(telemetry.roll_deg),
         )
         self.mixture.update(
-            attitude, self._seen, newness, searched.circle, ground, confirms=searched.confirms
+            attitude, self._seen, newness, searched.circle, step.ground, confirms=searched.confirms
         )
         return None
 
@@ -569,6 +571,19 @@ class Tracker:
             pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
             roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
         )
+
+
+def _reported_velocity(past: _Past, telemetry: Telemetry) -> ReportedVelocity | None:
+    """None where none is given."""
+    reported, std = telemetry.vel_en_mps, telemetry.vel_std_mps
+    if reported is None or not np.isfinite(reported).all():
+        return None
+    now = np.array(reported)
+    if std is None or not std > 0:
+        std = usual_velocity_std_mps(float(np.hypot(*now)))
+    std = max(std, math.sqrt(max(past.velocity_variance, 0.0)))
+    unaided_s = UNAIDED_S if std >= UNAIDED_STD_MPS else None
+    return ReportedVelocity(now, past.velocity, std, unaided_s)
 
 
 def _bias_stds(covariance: Array) -> dict[str, float]:

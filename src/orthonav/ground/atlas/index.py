@@ -128,7 +128,7 @@ def make_index(
     if sum(counts) < 2**CODE_BITS:  # the codes of a quantizer
         raise AtlasError(
             f"the atlas has {sum(counts)} coarse tiles with imagery, too few for an index; build "
-            "it with smaller ones (--coarse-gsd-m, --coarse-tile-px)"
+            "it with smaller ones (--coarse-gsd-m)"
         )
     with tempfile.TemporaryDirectory(prefix="orthonav-index-") as name:
         folder = Path(name)

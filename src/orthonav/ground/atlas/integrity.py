@@ -95,7 +95,7 @@ def _leftover(store: Store, name: str, kind: str, detail: str, min_age_s: float 
 
 
 def _index_problems(atlas: Atlas, sizes: Mapping[str, int], deep: bool) -> Iterator[Problem]:
-    remedy = "rebuild the index: orthonav atlas index --rebuild"
+    remedy = "rebuild the index: orthonav atlas index --replace"
     try:
         manifest = read_manifest(atlas)
     except AtlasError as error:

@@ -68,7 +68,7 @@ def check_device(name: str) -> None:
     if name not in ("auto", "cpu", "cuda"):
         raise VariantError(f"device must be auto, cpu or cuda, got '{name}'")
     if name == "cuda" and not needed("torch", "train", "a GPU").cuda.is_available():
-        raise VariantError("PyTorch sees no GPU; use --device auto or cpu")
+        raise VariantError("PyTorch sees no GPU; use device auto or cpu")
 
 
 def stored_representation(representation: Any) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def _require_as_in_flight(
     if away > 4e-3 * max(float(np.abs(flown).max()), 1e-6):
         raise VariantError(
             f"the device embeds tiles otherwise than the encoder in flight, by {away:.2g}; "
-            "learn with --device cpu"
+            "hide the GPU (CUDA_VISIBLE_DEVICES=)"
         )
 
 

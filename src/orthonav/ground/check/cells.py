@@ -29,10 +29,15 @@ class CellGrid:
     cols: int
 
     @classmethod
-    def over(cls, extent: tuple[float, float, float, float], side_m: float) -> "CellGrid":
+    def over(cls, extent: Extent, side_m: float) -> "CellGrid":
         west, south, east, north = extent
         rows, cols = (max(1, math.ceil(d / side_m - 1e-9)) for d in (north - south, east - west))
         return cls(west, north, side_m, rows, cols)
+
+    @property
+    def extent_en_m(self) -> Extent:
+        east_m, south_m = self.cols * self.side_m, -self.rows * self.side_m
+        return self.west_m, self.north_m + south_m, self.west_m + east_m, self.north_m
 
     @property
     def centres_en_m(self) -> Array:

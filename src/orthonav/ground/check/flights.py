@@ -8,8 +8,6 @@ available. The protection level is that of a right place (core/integrity.py), as
 track confirm each other; wrong places count as false fixes.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,9 +62,9 @@ def simulated(
     distance_m, rounding = along.distance_m, 1e-9
     step_m = conditions.side_m / 2  # views that overlap by more are hardly independent
     stops_m = np.arange(int(distance_m[-1] / step_m + rounding) + 1) * step_m
-    known = np.isfinite(along.error_m)
-    usual_m = float(along.error_m[known].mean()) if known.any() else np.inf
-    error_m = np.interp(stops_m, distance_m, np.where(known, along.error_m, usual_m))
+    stated = np.isfinite(along.error_m)
+    usual_m = float(along.error_m[stated].mean()) if stated.any() else np.inf
+    error_m = np.interp(stops_m, distance_m, np.where(stated, along.error_m, usual_m))
     chances = shifted(np.interp(stops_m, distance_m, along.probability), shifts)
     fixed = _gauss_markov(rng, chances.shape) < ndtri(chances)
     fixed[:, 0] = True
@@ -84,29 +82,19 @@ def simulated(
     shape = false_fixes + 0.5
     wrong = np.interp(stops_m, distance_m, along.wrong).clip(0, 1)
     rates = wrong * rng.gamma(shape, 1 / shape, (len(shifts), 1))
-    flights = Flights(
+    known = 1.0 if conditions.states_level else np.nan  # times what follows from the levels
+    median_m, high_m = np.quantile(levels_m, (0.5, INTERVAL[1]), axis=0, method="nearest")
+    return Flights(
         count=len(shifts),
         probability=Range.of(chances.mean(axis=1)),
-        availability=Range.of(available @ lengths_m / lengths_m.sum()),
-        outage_m=Range.of(outage_m),
-        outage_s=Range.of(outage_m / conditions.speed_mps),
+        availability=Range.of(known * (available @ lengths_m) / lengths_m.sum()),
+        outage_m=Range.of(known * outage_m),
+        outage_s=Range.of(known * outage_m / conditions.speed_mps),
         error_95_m=Range.of(level_m(errors_m.max(axis=1), 0.05)),
         false_fix=Range.of(1 - np.exp(-rates.sum(axis=1))),
-        available=available.mean(axis=0),
-        protection_m=np.quantile(levels_m, 0.5, axis=0, method="nearest"),
-        protection_high_m=np.quantile(levels_m, INTERVAL[1], axis=0, method="nearest"),
-    )
-    if conditions.states_level:
-        return flights
-    unknown, nowhere = Range(np.nan, np.nan, np.nan), np.full(len(distance_m), np.nan)
-    return replace(
-        flights,
-        availability=unknown,
-        outage_m=unknown,
-        outage_s=unknown,
-        available=nowhere,
-        protection_m=nowhere,
-        protection_high_m=nowhere,
+        available=known * available.mean(axis=0),
+        protection_m=known * median_m,
+        protection_high_m=known * high_m,
     )
 
 

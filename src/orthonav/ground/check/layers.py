@@ -67,12 +67,10 @@ def _stretches(result: CheckResult) -> list[Plain]:
 
 
 def _cells_to_plain(frame: LocalFrame, cells: Cells) -> Plain:
-    grid = cells.grid
-    west, north = grid.west_m, grid.north_m
-    east, south = west + grid.cols * grid.side_m, north - grid.rows * grid.side_m
+    west, south, east, north = cells.grid.extent_en_m
     corners = np.array([(west, north), (east, north), (east, south), (west, south)])
     return {
-        **to_plain(grid, 4),
+        **to_plain(cells.grid, 4),
         "corners_latlon_deg": _latlon_deg(frame, corners),
         **to_plain({name: getattr(cells, name) for name in CELL_VALUES}, BY_UNIT),
     }
@@ -169,17 +167,16 @@ def tif_bytes(result: CheckResult) -> bytes:
     from rasterio import Affine
     from rasterio.io import MemoryFile
 
-    cells = result.cells
-    rows, cols = cells.probability.shape
+    cells, grid = result.cells, result.cells.grid
     profile: dict[str, Any] = {
         "driver": "GTiff",
-        "width": cols,
-        "height": rows,
+        "width": grid.cols,
+        "height": grid.rows,
         "count": len(CELL_VALUES),
         "dtype": "float32",
         "nodata": math.nan,
         "crs": result.frame.proj4,
-        "transform": Affine(cells.side_m, 0.0, cells.west_m, 0.0, -cells.side_m, cells.north_m),
+        "transform": Affine(grid.side_m, 0.0, grid.west_m, 0.0, -grid.side_m, grid.north_m),
         "compress": "deflate",
         "predictor": 3,
         "interleave": "band",

@@ -209,20 +209,11 @@ class Conditions(Assumptions):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cells(Prediction):
-    """Predictions for square cells; arrays are (rows, cols), row 0 in the north, as `CELL_VALUES`
-    says.
+    """Predictions for the cells of a grid in the plane of the map's sheet; arrays are (rows, cols),
+    row 0 in the north, as `CELL_VALUES` says."""
 
-    `west_m`, `north_m`: north-west corner in the plane of the map's sheet.
-    """
-
-    west_m: float
-    north_m: float
-    side_m: float
+    grid: CellGrid
     trials: NDArray[np.int32]
-
-    @property
-    def grid(self) -> CellGrid:
-        return CellGrid(self.west_m, self.north_m, self.side_m, *self.probability.shape)
 
 
 CELL_VALUES = {

@@ -244,7 +244,7 @@ class _Check:
             frame=frame,
             cells=cells,
             verdict=verdict_of(findings),
-            area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
+            area_km2=float(known.sum()) * cells.grid.side_m**2 / 1e6,
             mean=findings.mean,
             second_date=bool(other),
             along=along,
@@ -304,9 +304,7 @@ class _Check:
         for name, values in vars(found).items():
             columns[name].ravel()[here] = values
         trials = grid.counts(np.array([each.en_m for each in own]))
-        return Cells(
-            west_m=grid.west_m, north_m=grid.north_m, side_m=side_m, trials=trials, **columns
-        )
+        return Cells(grid=grid, trials=trials, **columns)
 
     def _objects(self, places: Array) -> tuple[float, float]:
         """Fractions of places (N, 2) whose view shows many houses and trees (over a tenth of it,

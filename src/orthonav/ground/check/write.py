@@ -172,14 +172,9 @@ def _page_data(result: CheckResult) -> str:
 
 def visible_box(cells: Cells) -> Box:
     """West, south, east, north in metres of the cells, with a margin."""
-    rows, cols = cells.probability.shape
-    margin_m = 0.04 * max(rows, cols) * cells.side_m
-    return (
-        cells.west_m - margin_m,
-        cells.north_m - rows * cells.side_m - margin_m,
-        cells.west_m + cols * cells.side_m + margin_m,
-        cells.north_m + margin_m,
-    )
+    west, south, east, north = cells.grid.extent_en_m
+    margin_m = 0.04 * max(cells.grid.rows, cells.grid.cols) * cells.grid.side_m
+    return west - margin_m, south - margin_m, east + margin_m, north + margin_m
 
 
 def map_image(opened: MapFile, box: Box) -> tuple[Grey, Mask]:

@@ -535,10 +535,8 @@ def _criterion(outcome: Fix | NoFix, name: str) -> float:
 
 def places_en_m(local: LocalFrame, places: Sequence[LatLon | None]) -> FloatArray:
     """(N, 2) metres in the plane of `local`; NaN where a place is None or not finite."""
-    lat_lon_deg = np.full((len(places), 2), np.nan)
-    for i, place in enumerate(places):
-        if place is not None:
-            lat_lon_deg[i] = place
+    nowhere = math.nan, math.nan
+    lat_lon_deg = np.array([place or nowhere for place in places], np.float64).reshape(-1, 2)
     en_m = np.full(lat_lon_deg.shape, np.nan)
     known = np.isfinite(lat_lon_deg).all(axis=1)
     if known.any():

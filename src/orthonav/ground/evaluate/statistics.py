@@ -319,19 +319,20 @@ def check_covariance(
 def consistency(
     errors_en_m: FloatArray,
     cov_en_m2: FloatArray,
-    effective: Callable[[FloatArray, FloatArray], float] = lambda errors, cov: len(errors),
+    effective: Callable[[FloatArray], float] = len,
 ) -> Consistency:
     """Consistency of errors (N, 2) with their covariances (N, 2, 2).
 
     If C is the covariance of e, the mean of e^T C^-1 e is 2; if they are Gaussian too, it follows
     chi-square with 2 degrees of freedom (Bar-Shalom et al., "Estimation with applications to
-    tracking and navigation", 2001, section 5.4). `effective`: number of independent errors, of
-    errors and usable covariances.
+    tracking and navigation", 2001, section 5.4). `effective`: number of independent errors among
+    those (N, 2) in units of their covariance.
     """
     without = np.isnan(cov_en_m2).any(axis=(1, 2)) | np.isnan(errors_en_m).any(axis=1)
     usable = is_covariance(cov_en_m2) & ~without
-    used = errors_en_m[usable], cov_en_m2[usable]
-    nees, n_effective = np.sort(normalized_squared(*used)), float(effective(*used))
+    units = whitened(errors_en_m[usable], cov_en_m2[usable])
+    with np.errstate(over="ignore"):  # infinite where a covariance is next to nothing
+        nees, n_effective = np.sort((units**2).sum(axis=1)), float(effective(units))
     low, high = nees_mean_bounds(n_effective)
     return Consistency(
         n=len(errors_en_m),
@@ -353,7 +354,7 @@ def is_covariance(cov_en_m2: FloatArray) -> BoolArray:
     with np.errstate(all="ignore"):
         largest = np.maximum(east, north)
         symmetric = np.abs(cov_en_m2[:, 0, 1] - cov_en_m2[:, 1, 0]) <= 1e-6 * largest
-        independence = 1.0 - _correlation(cov_en_m2) ** 2
+        independence = 1.0 - (cov_en_m2[:, 1, 0] / np.sqrt(east) / np.sqrt(north)) ** 2
         usable: BoolArray = (
             np.isfinite(cov_en_m2).all(axis=(1, 2))
             & ((east > 0.0) & (north > 0.0))
@@ -362,15 +363,11 @@ def is_covariance(cov_en_m2: FloatArray) -> BoolArray:
     return usable
 
 
-def normalized_squared(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatArray:
-    """(N,) e^T C^-1 e of (N, 2) errors and (N, 2, 2) positive definite covariances, no unit."""
-    rho = _correlation(cov_en_m2)
-    with np.errstate(over="ignore"):  # infinite where the covariance is next to nothing
-        east = errors_en_m[:, 0] / np.sqrt(cov_en_m2[:, 0, 0])
-        north = errors_en_m[:, 1] / np.sqrt(cov_en_m2[:, 1, 1])
-        # as a sum of squares: never negative, whatever the rounding
-        squared: FloatArray = north**2 + (east - rho * north) ** 2 / (1.0 - rho**2)
-    return squared
+def whitened(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatArray:
+    """(N, 2) errors in units of their positive definite covariance (N, 2, 2): the solution z of
+    L z = e where C = L L^T."""
+    lower = np.linalg.cholesky(cov_en_m2)
+    return np.asarray(np.linalg.solve(lower, errors_en_m[..., None])[..., 0])
 
 
 def nees_bound(level: float) -> float:
@@ -387,12 +384,6 @@ def nees_mean_bounds(n: float) -> tuple[float, float]:
         return math.nan, math.nan
     low, high = _stats().chi2.ppf([0.025, 0.975], 2 * n) / n
     return float(low), float(high)
-
-
-def _correlation(cov_en_m2: FloatArray) -> FloatArray:
-    scale = np.sqrt(cov_en_m2[:, 0, 0]) * np.sqrt(cov_en_m2[:, 1, 1])
-    rho: FloatArray = 0.5 * (cov_en_m2[:, 0, 1] + cov_en_m2[:, 1, 0]) / scale
-    return rho
 
 
 def _is_radius(own_radius_m: FloatArray) -> BoolArray:

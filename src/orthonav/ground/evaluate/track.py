@@ -155,9 +155,10 @@ def measure_track(
         false_lock_longest_s=longest_stretch(wrong, seconds_s[rows]),
         along=error_statistics(series.along_m[tracking[rows]]),
         across=error_statistics(series.across_m[tracking[rows]]),
-        consistency=check_consistency(
+        consistency=consistency(  # of consecutive views, which are correlated
             (comparison.fix_en_m - comparison.truth_en_m)[tracking[rows]],
             comparison.cov_en_m2[tracking[rows]],
+            effective_number,
         ),
         series=series,
     )
@@ -182,13 +183,6 @@ def course_en(truth_en_m: FloatArray) -> FloatArray:
     course = np.full(path_m.shape, math.nan)
     course[moves] = path_m[moves] / length_m[moves, None]
     return course
-
-
-def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> Consistency:
-    """Consistency of errors (N, 2) of consecutive views, which are correlated."""
-    return consistency(
-        errors_en_m, cov_en_m2, lambda errors, cov: effective_number(_whitened(errors, cov))
-    )
 
 
 def effective_number(whitened: FloatArray) -> float:
@@ -231,14 +225,6 @@ def _shares(states: NDArray[np.str_], weights: FloatArray) -> Mapping[str, float
     found = {name: float(weights[states == name].sum()) for name in STATES}
     known = whole > 0.0  # not NaN
     return {name: part / whole if known else math.nan for name, part in found.items()}
-
-
-def _whitened(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatArray:
-    """(N, 2) errors in units of their covariance: the solution z of L z = e where C = L L^T."""
-    if not len(errors_en_m):
-        return errors_en_m
-    lower = np.linalg.cholesky(cov_en_m2)
-    return np.asarray(np.linalg.solve(lower, errors_en_m[..., None])[..., 0])
 
 
 def _series(

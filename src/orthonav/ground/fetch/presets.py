@@ -278,7 +278,6 @@ def parse_source(
     text: str,
     options: ImageryOptions,
     *,
-    date: str | None = None,
     key_env: str | None = None,
     own: Path | None = None,
 ) -> SourceSpec:
@@ -286,11 +285,9 @@ def parse_source(
 
     Raises `FetchError` for unknown names, addresses that are not http or https, and missing keys.
     """
-    if date is not None:
-        _check_date(date)
     head, _, rest = text.partition(":")
     if head in PROTOCOLS and rest:
-        provenance = Provenance(shown(rest), options.layer or "", date)
+        provenance = Provenance(shown(rest), options.layer or "")
         return SourceSpec(head, rest, options, provenance, _secrets(head, rest, key_env))
     if head.lower() in ("http", "https", "file"):
         raise UsageError(
@@ -302,7 +299,7 @@ def parse_source(
     terms = f"{preset.licence} ({preset.licence_url})" if preset.licence_url else preset.licence
     notes = "; ".join(note for note in (layer.note, preset.note) if note) or None
     provenance = Provenance(
-        *(shown(preset.url), options.layer or "", date or layer.date),
+        *(shown(preset.url), options.layer or "", layer.date),
         *(terms, preset.attribution, notes, preset.datum),
     )
     secrets = _secrets(preset.protocol, preset.url, key_env or preset.key_env)

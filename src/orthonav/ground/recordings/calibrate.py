@@ -16,13 +16,13 @@ with J the rotation by 90 deg. These five linear parameters have Gaussian priors
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.mount import Bias, CameraLatency, Mount
@@ -36,8 +36,9 @@ from orthonav.onboard.motion import (
     TURN_STD_RAD,
     ImageMotion,
     PictureOdometry,
-    StateHistory,
+    ReportedMotion,
     explained_part,
+    reported_motion,
     varying,
 )
 
@@ -52,6 +53,7 @@ _BIASES = {
 }
 """Keys of the estimated biases in evidence, and lower bounds of their standard deviations."""
 Array = NDArray[np.float64]
+Times = NDArray[np.int64]
 Prior = tuple[Array, Array]
 """Mean (5,) and precision (5, 5) of the linear parameters."""
 
@@ -171,8 +173,10 @@ def calibrate_latency(
     shows too little motion, or estimates disagree.
     """
     history = StateHistory(1.0)  # longest interval (s) over which telemetry is interpolated
-    odometry, estimator = PictureOdometry(), LatencyEstimator(heading_known=heading_known)
-    estimates: list[LatencyEstimate | None] = []
+    odometry, estimates = PictureOdometry(), list[LatencyEstimate | None]()
+    waiting: deque[ImageMotion] = deque(maxlen=SEARCH.most_pairs)
+    pairs: deque[tuple[ImageMotion, Array]] = deque(maxlen=SEARCH.most_pairs)
+    candidates_ns = np.round(SEARCH.candidates_s * 1e9).astype(np.int64)
     due_ns: float = -math.inf
     intervals = []
     before_ns = None
@@ -195,12 +199,70 @@ def calibrate_latency(
             grey = view.grey()
         except FlightError:
             continue
-        estimator.add(odometry.motion(grey, camera, arrived_ns), history)
+        motion = odometry.motion(grey, camera, arrived_ns)
+        waiting.extend([] if motion is None else [motion])
+        # A pair counts once the history reaches beyond all candidates.
+        while waiting and waiting[0].end_ns - candidates_ns[0] <= history.newest_ns:
+            one = waiting.popleft()
+            shown = history.motion(one.start_ns - candidates_ns, one.end_ns - candidates_ns)
+            if np.isfinite(shown[0]).mean() >= SEARCH.pair_share:
+                pairs.append((one, np.column_stack(shown)))
+        while pairs and pairs[0][0].start_ns < pairs[-1][0].end_ns - SEARCH.window_s * 1e9:
+            pairs.popleft()
         if arrived_ns >= due_ns:
             due_ns = arrived_ns + 10.0 * 1e9
-            estimates.append(estimator.estimate())
-    estimates.append(estimator.estimate())
+            estimates.append(_estimate(pairs, heading_known=heading_known))
+    estimates.append(_estimate(pairs, heading_known=heading_known))
     return _agreed(estimates, intervals)
+
+
+class StateHistory:
+    def __init__(self, gap_s: float) -> None:
+        """`gap_s`: longest interval between states that is interpolated."""
+        self._gap_ns = round(gap_s * 1e9)
+        self._times: Times = np.zeros(0, np.int64)
+        self._rows: Array = np.zeros((0, 13))
+
+    @property
+    def newest_ns(self) -> int:
+        return int(self._times[-1]) if len(self._times) else -(2**62)
+
+    def add(
+        self,
+        time_ns: int,
+        enu_from_camera: ArrayLike | None,
+        velocity_enu_mps: ArrayLike | None,
+        height_m: float,
+    ) -> None:
+        """Add a state; None and NaN: not known. A time that is not newer is ignored."""
+        if time_ns <= self.newest_ns:
+            return
+        row = np.full(13, math.nan)
+        if enu_from_camera is not None:
+            row[:9] = np.ravel(enu_from_camera)
+        if velocity_enu_mps is not None:
+            row[9:12] = velocity_enu_mps
+        row[12] = height_m if height_m > 0 else math.nan
+        first = int(np.searchsorted(self._times, time_ns - 60 * 10**9))
+        self._times = np.append(self._times[first:], time_ns)
+        self._rows = np.concatenate([self._rows[first:], row[None]])
+
+    def motion(self, start_ns: Times, end_ns: Times) -> ReportedMotion:
+        start, end = self._at(start_ns), self._at(end_ns)
+        seconds = float(end_ns[0] - start_ns[0]) / 1e9
+        velocity, height = (start[:, 9:12] + end[:, 9:12]) / 2, start[:, 12]
+        before, after = (each[:, :9].reshape(-1, 3, 3) for each in (start, end))
+        return reported_motion(before, after, velocity, height, seconds)
+
+    def _at(self, times_ns: Times) -> Array:
+        if len(self._times) < 2:
+            return np.full((len(times_ns), 13), math.nan)
+        after = np.clip(np.searchsorted(self._times, times_ns), 1, len(self._times) - 1)
+        begin, until = self._times[after - 1], self._times[after]
+        weight = ((times_ns - begin) / (until - begin))[:, None]
+        values = (1 - weight) * self._rows[after - 1] + weight * self._rows[after]
+        known = (times_ns >= begin) & (times_ns <= until) & (until - begin <= self._gap_ns)
+        return np.asarray(np.where(known[:, None], values, math.nan))
 
 
 class LatencyEstimate(NamedTuple):
@@ -209,43 +271,6 @@ class LatencyEstimate(NamedTuple):
     delay_s: float
     std_s: float
     pairs: int
-
-
-class LatencyEstimator:
-    """Estimates the latency over a sliding window. Mutable; the same values give the same."""
-
-    def __init__(self, *, heading_known: bool = True) -> None:
-        self._heading_known = heading_known
-        self._waiting: deque[ImageMotion] = deque(maxlen=SEARCH.most_pairs)
-        self._pairs: deque[tuple[ImageMotion, Array]] = deque(maxlen=SEARCH.most_pairs)
-
-    def add(self, motion: ImageMotion | None, history: StateHistory) -> None:
-        """Add the motion of a pair. It counts once the history reaches beyond all candidates."""
-        if motion is not None:
-            self._waiting.append(motion)
-        reach_ns = round(-SEARCH.least_s * 1e9)
-        candidates_ns = np.round(SEARCH.candidates_s * 1e9).astype(np.int64)
-        while self._waiting and self._waiting[0].end_ns + reach_ns <= history.newest_ns:
-            one = self._waiting.popleft()
-            shown = history.motion(one.start_ns - candidates_ns, one.end_ns - candidates_ns)
-            if np.isfinite(shown[0]).mean() < SEARCH.pair_share:
-                continue
-            self._pairs.append((one, np.column_stack(shown)))
-            while self._pairs[0][0].start_ns < one.end_ns - SEARCH.window_s * 1e9:
-                self._pairs.popleft()
-
-    def estimate(self) -> LatencyEstimate | None:
-        """The latency in the window, None where it is not observable."""
-        if len(self._pairs) < SEARCH.least_pairs:
-            return None
-        motions, reported = zip(*self._pairs, strict=True)
-        pairs = _Pairs(
-            np.array([each.seconds for each in motions]),
-            np.array([each.turn_rad for each in motions]),
-            np.array([each.shift for each in motions]),
-            np.array(reported),
-        )
-        return _estimate(pairs, heading_known=self._heading_known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,6 +285,13 @@ class _Pairs:
     turn: Array
     shift: Array
     reported: Array
+
+    @classmethod
+    def of(cls, pairs: Iterable[tuple[ImageMotion, Array]]) -> "_Pairs":
+        seen, reported = zip(*pairs, strict=True)
+        turns = [(each.seconds, each.turn_rad, *each.shift) for each in seen]
+        seconds, turn, *shift = np.array(turns, np.float64).T
+        return cls(seconds, turn, np.stack(shift, axis=1), np.array(reported))
 
     def least_noise(self) -> Array:
         """Least standard deviations (2,) of turn and shift."""
@@ -294,7 +326,13 @@ class _Fit:
         return MAD_TO_STD * np.array(middle)
 
 
-def _estimate(pairs: _Pairs, *, heading_known: bool) -> LatencyEstimate | None:
+def _estimate(
+    compared: Collection[tuple[ImageMotion, Array]], *, heading_known: bool
+) -> LatencyEstimate | None:
+    """The latency in a window, None where it is not observable."""
+    if len(compared) < SEARCH.least_pairs:
+        return None
+    pairs = _Pairs.of(compared)
     if (np.isfinite(pairs.reported[..., :3]).all(axis=-1).mean(axis=0) < SEARCH.known_share).any():
         return None  # a latency that cannot be excluded
     prior = _prior(pairs.reported, heading_known=heading_known)

@@ -8,7 +8,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from xml.sax.saxutils import escape
@@ -40,8 +40,8 @@ class CameraPosition:
     fix: Fix
     height_m: float
     std_m: float
-    above_sea: bool = False
-    en_m: tuple[float, float] = (0.0, 0.0)
+    above_sea: bool
+    en_m: tuple[float, float]
 
     @property
     def up_m(self) -> float:
@@ -56,30 +56,22 @@ def camera_positions(
     results: Sequence[ViewResult], terrain: TerrainHeights | None
 ) -> list[CameraPosition]:
     """The confident positions of a flight; heights above sea by the ground of `terrain`."""
-    found: list[CameraPosition] = []
-    for view in results:
-        fix = view.outcome
-        if not isinstance(fix, Fix) or not view.is_confident:
-            continue
-        ground_m = math.nan
-        if terrain is not None:
-            ground_m = float(terrain(np.array([fix.lat_deg]), np.array([fix.lon_deg]))[0])
+    placed = [(v, v.outcome) for v in results if isinstance(v.outcome, Fix) and v.is_confident]
+    if not placed:
+        return []
+    numbers = np.array([(fix.lat_deg, fix.lon_deg, fix.agl_m) for _, fix in placed])
+    lat, lon, agl_m = numbers.T
+    heights_m = agl_m + (math.nan if terrain is None else terrain(lat, lon))
+    above_sea = bool(np.isfinite(heights_m).all())
+    places_m = LocalFrame(*numbers[0, :2].tolist()).en_from_latlon(lat, lon)
+    found = []
+    for (view, fix), height_m, en_m in zip(placed, heights_m.tolist(), places_m, strict=True):
         worst = max(float(np.linalg.eigvalsh(fix.cov_en_m2)[-1]), 0.0)
         if view.state is None:  # that of a track has it already
             worst += MAP_STD_M**2
-        found.append(CameraPosition(view, fix, ground_m + fix.agl_m, math.sqrt(worst)))
-    if not found:
-        return found
-    above_sea = all(math.isfinite(each.height_m) for each in found)
-    plane = LocalFrame(found[0].fix.lat_deg, found[0].fix.lon_deg)
-    return [
-        replace(
-            each,
-            above_sea=above_sea,
-            en_m=tuple(plane.en_from_latlon(each.fix.lat_deg, each.fix.lon_deg).tolist()),
-        )
-        for each in found
-    ]
+        place = float(en_m[0]), float(en_m[1])
+        found.append(CameraPosition(view, fix, height_m, math.sqrt(worst), above_sea, place))
+    return found
 
 
 def export_of(text: str) -> tuple[str, Path]:

@@ -103,7 +103,7 @@ class LogContent:
     def read(
         self, file: McapFile, take: Callable[[str, bytes], None] = lambda topic, data: None
     ) -> None:
-        """Read what is new in a file; `take` gets topic and data of every message but images.
+        """Read a file; `take` gets topic and data of every message but images.
 
         Messages that are damaged, or for which `take` raises, are skipped. Raises `BrokenLogError`.
         """

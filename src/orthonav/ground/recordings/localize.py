@@ -10,7 +10,7 @@ from orthonav.core.flight.recording import Flight, RecordedView
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.records import Fix, NoFix, View, ViewResult
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard.run import Locator, finite, locate_view, passed_view
+from orthonav.onboard.run import MAP_CHANGED, Locator, finite, locate_view, passed_view
 
 
 def localize_flight(
@@ -26,9 +26,9 @@ def localize_flight(
 
     `heights`: turns reported heights into heights above ground; None: they are used as reported.
     With `accept` each result says whether its fix meets it, and states the protection level at its
-    risk. Raises `FlightError` or
-    `MissingFileError` at an image that cannot be decoded or is missing, unless `skip_bad_images`
-    makes it a `NoFix`; raises `CameraError` where an image has not the camera's aspect ratio.
+    risk. Raises `FlightError` or `MissingFileError` at an image that cannot be decoded or is
+    missing, unless `skip_bad_images` makes it a `NoFix`; raises `CameraError` where an image has
+    not the camera's aspect ratio.
     """
     for view in flight.views if views is None else views:
         outcome: Fix | NoFix
@@ -57,8 +57,13 @@ def localize_flight(
 def smoothed_track(
     tracker: Tracker, results: Sequence[ViewResult], accept: Acceptance | None
 ) -> list[ViewResult]:
-    placed = [finite(outcome) for outcome in tracker.smoothed_track()]
-    smoothed = [
-        replace(result, outcome=outcome) for result, outcome in zip(results, placed, strict=True)
-    ]
+    """The results with smoothed positions; those of views that the tracker did not record, because
+    of an error such as a map that changed, as they are."""
+    placed = zip(tracker.recorded_ns, tracker.smoothed_track(), strict=True)
+    ahead, smoothed = next(placed, None), []
+    for result in results:
+        changed = isinstance(result.outcome, NoFix) and result.outcome.reason == MAP_CHANGED
+        if ahead is not None and ahead[0] == result.time_ns and not changed:
+            result, ahead = replace(result, outcome=finite(ahead[1])), next(placed, None)
+        smoothed.append(result)
     return smoothed if accept is None else [accept.judged(each) for each in smoothed]

@@ -10,7 +10,6 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from enum import IntEnum
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,14 +22,7 @@ WHAT = "flight logs"
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
 
 
-class Opcode(IntEnum):
-    """Kinds of records."""
-
-    FOOTER = 2
-    CHANNEL = 4
-    MESSAGE = 5
-    CHUNK = 6
-    DATA_END = 15
+_FOOTER, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 2, 4, 5, 6, 15  # kinds of records
 
 
 @dataclass(frozen=True)
@@ -44,11 +36,10 @@ class LoggedMessage:
 
 @dataclass
 class McapFile:
-    """A file, how far it was read, and its damage."""
+    """A file, how far it can be read, and its damage."""
 
     path: Path
-    next_offset: int = len(MAGIC)
-    """Offset of the first record that was not read yet; reading a growing file continues there."""
+    end: int = len(MAGIC)  # of the last complete record of data
     lost_bytes: int = 0  # bytes after the last complete record
     damaged: int = 0  # damaged chunks
     ended: bool = False  # whether the file has a proper end
@@ -67,10 +58,10 @@ def profile_of(path: Path) -> str | None:
 
 
 def chunks(file: McapFile) -> Iterator[tuple[int, bytes]]:
-    """Offset and content of each complete chunk that was not read yet; updates `file`."""
+    """Offset and content of each complete chunk; updates `file`."""
     with file.path.open("rb") as stream:
         for opcode, at, length in _records(stream, file):
-            if opcode == Opcode.CHUNK:
+            if opcode == _CHUNK:
                 plain = _content(stream, length)
                 if plain is None:
                     file.damaged += 1
@@ -83,7 +74,7 @@ def chunk_at(path: Path, offset: int) -> bytes:
     with path.open("rb") as stream:
         stream.seek(offset)
         opcode, length = _HEAD.unpack(stream.read(_HEAD.size).ljust(_HEAD.size, b"\0"))
-        return (_content(stream, length) if opcode == Opcode.CHUNK else None) or b""
+        return (_content(stream, length) if opcode == _CHUNK else None) or b""
 
 
 def messages(chunk: bytes, channels: dict[int, str]) -> Iterator[LoggedMessage]:
@@ -97,10 +88,10 @@ def messages(chunk: bytes, channels: dict[int, str]) -> Iterator[LoggedMessage]:
             return
         record = _stream_of(chunk[at - length : at])
         try:
-            if opcode == Opcode.CHANNEL:
+            if opcode == _CHANNEL:
                 channel = records.Channel.read(record)
                 channels[channel.id] = channel.topic[:1000]  # many long ones would fill the memory
-            elif opcode == Opcode.MESSAGE:
+            elif opcode == _MESSAGE:
                 found = records.Message.read(record, length)
                 topic = channels.get(found.channel_id, "")
                 yield LoggedMessage(topic, found.sequence, found.data)
@@ -114,24 +105,23 @@ def complete_bytes(path: Path) -> int:
     with path.open("rb") as stream:
         for _ in _records(stream, file):
             pass
-        return min(file.next_offset, stream.seek(0, io.SEEK_END))
+        return min(file.end, stream.seek(0, io.SEEK_END))
 
 
 def _records(stream: BinaryIO, file: McapFile) -> Iterator[tuple[int, int, int]]:
     """Opcode, offset and length of each complete record of data; `stream` is at its content."""
-    size = stream.seek(0, io.SEEK_END)
-    at = file.next_offset
+    size, at = stream.seek(0, io.SEEK_END), len(MAGIC)
     while at + _HEAD.size <= size:
         stream.seek(at)
         opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
-        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+        if opcode in (_DATA_END, _FOOTER):
             file.ended = True
             return
         if opcode == 0 or length > size - at - _HEAD.size:
             break
-        file.next_offset = at + _HEAD.size + length
+        file.end = at + _HEAD.size + length
         yield opcode, at, length
-        at = file.next_offset
+        at = file.end
     file.lost_bytes = max(0, size - at)
 
 

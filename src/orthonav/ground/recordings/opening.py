@@ -47,10 +47,7 @@ def _opened(paths: list[Path], options: SourceOptions) -> Recording:
             raise MissingFileError(f"source does not exist: {each}")
     if len(paths) > 1:
         return open_photos(paths, options)
-    kind = options.kind or source_kind(path)
-    wanted = {"flight": "folder", "video": "file"}.get(kind)
-    if wanted and path.is_dir() != (wanted == "folder"):
-        raise FlightError(f"expected a {wanted} for kind {kind}: {path}")
+    kind = source_kind(path)
     if kind == "flight":
         return _flight(open_flight(path, images_needed=not options.skip_bad_images), options)
     if kind == "photos":
@@ -160,15 +157,13 @@ class Imported:
 def import_flight(
     recording: Recording,
     out: Path,
-    jpeg_quality: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Imported:
     """Write the views of `recording` as a flight folder `out`, whole or not at all.
 
-    Encoded images are copied unchanged; others are written grey, as PNG or, with `jpeg_quality`,
-    as JPEG. Views whose image cannot be decoded, or has another size than the camera, are left out
-    and counted. Raises `FlightError` where none is left, `OutputError` where `out` cannot be
-    written.
+    Encoded images are copied unchanged; others are written as grey PNG. Views whose image cannot be
+    decoded, or has another size than the camera, are left out and counted. Raises `FlightError`
+    where none is left, `OutputError` where `out` cannot be written.
     """
     views = truths = complete = broken = 0
     first_broken, yaw_deg, tilt_std_deg = "", [], []
@@ -176,7 +171,7 @@ def import_flight(
         writer = FlightWriter(folder, recording.camera, recording.note, recording.choices)
         for view in recording.views:
             try:
-                frame, data = _encoded_image(view, recording, jpeg_quality)
+                frame, data = _encoded_image(view, recording)
             except FlightError as error:
                 broken, first_broken = broken + 1, first_broken or str(error)
                 continue
@@ -196,9 +191,7 @@ def import_flight(
     return Imported(views, truths, complete, broken, first_broken, seem_radians(yaw_deg), tilt)
 
 
-def _encoded_image(
-    view: RecordedView, recording: Recording, jpeg_quality: int | None
-) -> tuple[str, bytes]:
+def _encoded_image(view: RecordedView, recording: Recording) -> tuple[str, bytes]:
     grey, camera = view.grey(), recording.camera
     if grey.shape != (camera.height_px, camera.width_px):
         raise FlightError(
@@ -207,6 +200,5 @@ def _encoded_image(
         )
     if view.data is not None and view.frame.lower().endswith(SUFFIXES):
         return view.frame, view.data()
-    suffix = ".png" if jpeg_quality is None else ".jpg"
-    frame = str(PurePosixPath(view.frame).with_suffix(suffix))
-    return frame, encoded(grey, frame, jpeg_quality or 0)
+    frame = str(PurePosixPath(view.frame).with_suffix(".png"))
+    return frame, encoded(grey, frame)

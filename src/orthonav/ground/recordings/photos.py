@@ -130,12 +130,13 @@ def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
     return found[0] if found else None
 
 
-def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
+def posed(photos: Sequence[Photo], edited: Sequence[int] = ()) -> tuple[list[Photo], list[str]]:
     """The photographs of a flight with their attitude, and warnings for people.
 
     Photographs of one camera are judged together: a gimbal that is level and points north in all of
     them, whatever the heading of the aircraft, was not recorded. The camera then looks straight
     down, with the heading of the aircraft. Where a table states the attitude, that one counts.
+    `edited`: numbers of those that an editor has written.
     """
     turned = [photo for photo in photos if photo.gimbal_deg is None or any(photo.gimbal_deg)]
     recorded = {photo.optics.model for photo in turned}
@@ -150,7 +151,7 @@ def posed(photos: Sequence[Photo]) -> tuple[list[Photo], list[str]]:
             f"gimbal angles of {sum(lost)} photographs are all 0, so they were not recorded: "
             "heading of the aircraft and a camera that looks straight down assumed"
         )
-    if edited := _edited(photos):
+    if edited:
         warnings.append(
             f"{len(edited)} of {len(photos)} photographs were written by an editor "
             f"({photos[edited[0]].software}); one that was turned there has kept its angles, so "
@@ -204,14 +205,15 @@ def open_photos(sources: Sequence[Path], options: SourceOptions) -> Recording:
     focal_px = [_focal_px(photo, options) for photo in photos]
     photos, zoomed = _alike(photos, focal_px, "of another focal length than most", ROUNDED)
     warnings += zoomed
-    camera, note = _camera(photos, options)
+    edited = _edited(photos)
+    camera, note = _camera(photos, edited, options)
     track = None
     if options.telemetry is not None:
         track = read_log(options.telemetry, options.mount_deg, options.topics)
         check_overlap(track, _time_ns(photos[0]), _time_ns(photos[-1]), options.telemetry)
         warnings += warnings_of(track, options)
     else:
-        photos, doubts = posed(photos)
+        photos, doubts = posed(photos, edited)
         warnings += doubts
         level = sum(math.isnan(photo.pose["pitch_deg"]) for photo in photos)
         if chosen.singly and level:
@@ -413,7 +415,9 @@ def _focal_px(photo: Photo, options: SourceOptions) -> float | None:
     return None if found is None else found.px
 
 
-def _camera(photos: Sequence[Photo], options: SourceOptions) -> tuple[Camera, str]:
+def _camera(
+    photos: Sequence[Photo], edited: Sequence[int], options: SourceOptions
+) -> tuple[Camera, str]:
     photo = photos[0]
     width, height, path = photo.width_px, photo.height_px, photo.path
     given = given_camera(options, width, height, str(path))
@@ -427,7 +431,7 @@ def _camera(photos: Sequence[Photo], options: SourceOptions) -> tuple[Camera, st
         raise CameraError(
             f"photograph has no focal length; give --camera FILE or --fov-deg: {path}"
         )
-    if lens := _factory_camera(photos, focal):
+    if not edited and (lens := _factory_camera(photos, focal)):
         return lens, f"focal length {lens.fx_px:.0f} px and distortion: DewarpData of DJI"
     camera = Camera(width, height, focal.px, focal.px, width / 2, height / 2, focal_std=focal.std)
     share = f"good to {100 * focal.std:.0f} %"
@@ -435,10 +439,10 @@ def _camera(photos: Sequence[Photo], options: SourceOptions) -> tuple[Camera, st
 
 
 def _factory_camera(photos: Sequence[Photo], focal: FocalLength) -> Camera | None:
-    """The camera as DJI calibrated it; None where not all photographs state the same one, where an
-    editor may have turned or dewarped them, and where it is of another size by EXIF."""
+    """The camera as DJI calibrated it, of photographs that no editor may have turned or dewarped;
+    None where not all of them state the same one, and where it is of another size by EXIF."""
     lens, size = photos[0].lens, (photos[0].width_px, photos[0].height_px)
-    if lens is None or any(each.lens != lens for each in photos) or _edited(photos):
+    if lens is None or any(each.lens != lens for each in photos):
         return None
     # A larger difference from the focal length of EXIF means another size of the picture.
     if size[0] < size[1] or abs(lens[0] / focal.px - 1) > 3.0 * focal.std:

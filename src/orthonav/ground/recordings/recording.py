@@ -19,7 +19,6 @@ from orthonav.core.geo.camera_files import read_camera_file
 from orthonav.core.records import Prior, Telemetry
 from orthonav.core.tilt import ASSUMED
 
-KINDS = ("flight", "photos", "video", "ros", "log")
 ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
 MAX_FOV_DEG = 150.0
 Grey = NDArray[np.uint8]
@@ -29,7 +28,6 @@ Grey = NDArray[np.uint8]
 class SourceOptions:
     """How a recording is read. Raises `UsageError` for invalid values."""
 
-    kind: str | None = None  # one of `KINDS`; None: detected by content
     camera: Path | None = None  # camera file; None: the recording's own camera
     rate_hz: float = 1.0  # views per second of a video
     telemetry: Path | None = None  # log to join by time; None: the recording's own telemetry
@@ -70,8 +68,6 @@ class SourceOptions:
         numbers = (self.time_offset_s, *self.mount_deg, self.ground_alt_m or 0.0)
         if not all(math.isfinite(number) for number in numbers):
             raise UsageError("give finite numbers as time offset, mount and ground altitude")
-        if self.kind is not None and self.kind not in KINDS:
-            raise UsageError(f"kind must be one of {', '.join(KINDS)}, got '{self.kind}'")
         unknown = [role for role in self.topics if role not in ROLES]
         if unknown:
             raise UsageError(f"give topics of {', '.join(ROLES)}, got '{unknown[0]}'")

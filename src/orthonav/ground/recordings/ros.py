@@ -303,27 +303,21 @@ def bound_inflation() -> None:
     """
     lz4 = needed("lz4.frame", WHAT).LZ4FrameDecompressor
 
-    def unpacked_zstd(data: bytes, size: int) -> bytes:
+    def of_mcap(kind: str, data: bytes, size: int) -> bytes:
         _require(size)
-        return inflated("zstd", data, size + 1)
+        return inflated(kind, data, size + 1)  # which is then compared with the stated size
 
-    def unpacked(decompressor: Any, data: bytes, size: int) -> bytes:
-        _require(size)
-        # One byte more than allowed, so that the end after exactly `size` bytes is seen.
-        plain: bytes = decompressor.decompress(data, max_length=size + 1)
-        if len(plain) > size or not decompressor.eof:
-            raise ValueError(f"a chunk is cut, or takes more than the {size} bytes it may")
+    def of_bag(decompressor: Callable[[], Any], data: bytes) -> bytes:
+        unpacking = decompressor()
+        plain: bytes = unpacking.decompress(data, max_length=MAX_CHUNK_BYTES + 1)
+        if len(plain) > MAX_CHUNK_BYTES or not unpacking.eof:
+            raise ValueError(f"a chunk is cut, or takes more than the {MAX_CHUNK_BYTES} it may")
         return plain
 
     mcap = needed("rosbags.rosbag2.storage_mcap", WHAT)
-    mcap.DECOMPRESSORS.update(
-        zstd=unpacked_zstd, lz4=lambda data, size: unpacked(lz4(), data, size)
-    )
+    mcap.DECOMPRESSORS.update({kind: partial(of_mcap, kind) for kind in ("zstd", "lz4")})
     bag = needed("rosbags.rosbag1.reader", WHAT)
-    bag.decompressors.update(
-        lz4=lambda data: unpacked(lz4(), data, MAX_CHUNK_BYTES),
-        bz2=lambda data: unpacked(bz2.BZ2Decompressor(), data, MAX_CHUNK_BYTES),
-    )
+    bag.decompressors.update(lz4=partial(of_bag, lz4), bz2=partial(of_bag, bz2.BZ2Decompressor))
 
 
 def check_held(readers: Iterable[Any]) -> None:

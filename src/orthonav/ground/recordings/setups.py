@@ -7,7 +7,7 @@ time. The change that makes them confident names the value to check.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -80,30 +80,22 @@ class LowConfidenceViews:
     def __init__(self, camera: Camera, corrected: Callable[[Telemetry], Telemetry]) -> None:
         """`corrected`: what is known to be wrong with the telemetry is corrected by it."""
         self._camera, self._corrected = camera, corrected
-        self._current: RecordedView | None = None
         self._count, self._every = 0, 1
         self.views: list[View] = []
 
-    def watching(self, views: Iterable[RecordedView]) -> Iterator[RecordedView]:
-        """The same views; the newest one is the one whose result `take` receives next."""
-        for view in views:
-            self._current = view
-            yield view
-
-    def take(self, result: ViewResult) -> None:
-        """Keep the view of this result if its confidence is low, and its turn."""
+    def take(self, view: RecordedView, result: ViewResult) -> None:
+        """Keep a view if the confidence of its result is low, and its turn."""
         outcome = result.outcome
         placeable = ("too_small", "too_coarse", "no_match", "outside_map", "low_confidence")
-        retried = isinstance(outcome, Fix) or outcome.reason in placeable
-        if self._current is None or result.is_confident or not retried:
+        if result.is_confident or (isinstance(outcome, NoFix) and outcome.reason not in placeable):
             return
         self._count += 1
         if (self._count - 1) % self._every:
             return
-        telemetry = self._corrected(self._current.telemetry)
+        telemetry = self._corrected(view.telemetry)
         if math.isfinite(telemetry.agl_m):
             with suppress(FlightError):  # a track has a position without the image
-                self.views.append(View(self._current.grey(), self._camera, telemetry))
+                self.views.append(View(view.grey(), self._camera, telemetry))
         if len(self.views) > SAMPLE:
             self.views = self.views[::2]
             self._every *= 2

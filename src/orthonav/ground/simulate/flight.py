@@ -45,10 +45,15 @@ from orthonav.ground.simulate.motion import (
     steady_path,
 )
 from orthonav.ground.simulate.receiver import Good, samples_of, solutions
-from orthonav.ground.simulate.render import Clouds, Raster, ViewEffects, degraded, render_view
+from orthonav.ground.simulate.render import Raster, ViewEffects, degraded, projected
 
 MAX_VIEWS = 1_000_000  # sanity limit
 Array = NDArray[np.float64]
+Clouds = Callable[
+    [int, Camera, tuple[float, float, float, float], Array, NDArray[np.uint8]], NDArray[np.uint8]
+]
+"""A picture with its clouds, such as `lab.clouds` makes: by the number of the view, its camera,
+heading, pitch, roll (deg) and height (m), position (2,), and the picture without them."""
 
 
 @dataclass(frozen=True)
@@ -409,17 +414,17 @@ def _picture(
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
     camera, attitude = request.camera, pose.attitude
-    cover = None
-    if clouds is not None:
-        cover = clouds.before(number, camera, attitude, pose.position_en_m)
     if surface is not None:
         above_m = pose.agl_m if pose.amsl_m is None else pose.amsl_m
         position = np.array([*pose.position_en_m, above_m])
         picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m)
-        return degraded(picture, request.effects, rng, cover)
-    rgb, corner_en_m = ground.window(_corners_en_m(camera, pose))
-    corner = corner_en_m - pose.position_en_m
-    return render_view(camera, attitude, rgb, corner, ground.gsd_m, request.effects, rng, cover)
+    else:
+        rgb, corner_en_m = ground.window(_corners_en_m(camera, pose))
+        corner = corner_en_m - pose.position_en_m
+        picture = projected(camera, attitude, rgb, corner, ground.gsd_m)
+    if clouds is not None:
+        picture = clouds(number, camera, attitude, pose.position_en_m, picture)
+    return degraded(picture, request.effects, rng)
 
 
 def _telemetry(

@@ -7,7 +7,7 @@ scipy, the ground by marching along them.
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,22 +24,6 @@ from orthonav.core.geo.camera import (
 
 MAX_STEPS = 4000  # along a ray, each about a pixel of the heights
 Array = NDArray[np.float64]
-
-
-class CloudLayer(Protocol):
-    """Clouds in front of one view."""
-
-    def over(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
-
-
-class Clouds(Protocol):
-    """Clouds of a flight, such as `lab.clouds` makes."""
-
-    def before(
-        self, number: int, camera: Camera, attitude: tuple[float, float, float, float], en_m: Array
-    ) -> CloudLayer | None:
-        """Clouds between a view and the ground, None if it is clear. `attitude`: heading, pitch,
-        roll (deg) and height (m). `en_m`: position (2,)."""
 
 
 @dataclass(frozen=True)
@@ -66,23 +50,17 @@ def render_view(
     gsd_m: float,
     effects: ViewEffects,
     rng: np.random.Generator,
-    clouds: CloudLayer | None = None,
 ) -> NDArray[np.uint8]:
     """Image (H, W, 3) of flat ground. `ground_rgb` (h, w, 3) is an orthophoto with `gsd_m` metres
     per pixel; `ground_corner_en_m` is its north-west corner, metres from the nadir of the camera.
     `attitude`: yaw, pitch, roll (deg) and height (m)."""
-    picture = _projected(camera, attitude, ground_rgb, ground_corner_en_m, gsd_m)
-    return degraded(picture, effects, rng, clouds)
+    picture = projected(camera, attitude, ground_rgb, ground_corner_en_m, gsd_m)
+    return degraded(picture, effects, rng)
 
 
 def degraded(
-    picture: NDArray[np.uint8],
-    effects: ViewEffects,
-    rng: np.random.Generator,
-    clouds: CloudLayer | None = None,
+    picture: NDArray[np.uint8], effects: ViewEffects, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    if clouds is not None:
-        picture = clouds.over(picture)
     if effects.blur_px > 0:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), effects.blur_px), dtype=np.uint8)
     gain = float(np.exp(rng.normal(0, 1) * effects.exposure_std))
@@ -91,7 +69,7 @@ def degraded(
     return np.asarray(np.clip(exposed, 0, 255), dtype=np.uint8)
 
 
-def _projected(
+def projected(
     camera: Camera,
     attitude: tuple[float, float, float, float],
     ground_rgb: NDArray[np.uint8],

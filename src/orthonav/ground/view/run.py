@@ -331,7 +331,7 @@ def _images(request: ViewRequest, recorded: Recorded) -> Images | None:
         return LoggedRun(path)
     if not path.exists():
         raise MissingFileError(f"flight does not exist: {path}")
-    if (request.source.kind or source_kind(path)) in ("video", "ros"):
+    if source_kind(path) in ("video", "ros"):
         raise FlightError(
             "images of a video or of ROS messages are decoded one after the other only; convert "
             f"it with `orthonav import` and give that flight folder: {path}"

@@ -1,21 +1,13 @@
 """The difference GNSS minus map: its constant biases, the tests of a change, and learning.
 
-The difference is linear in the biases: a displacement of the map is constant, an error of the mount
-turns with the heading and grows with the height, a latency acts along the velocity over ground. An
-error of the mount's yaw turns the view and does not displace it, so it is none of them.
+It is linear in the biases: a displacement of the map is constant, an error of the mount turns with
+the heading and grows with the height, a latency acts along the velocity over ground.
 
-Tests: the differences of a window are a Gaussian vector of the biases as far as they are known, and
-slowly varying errors of GNSS and map. A fault adds a step or a ramp. For each onset the change is
-estimated by generalized least squares and compared with its standard deviation: the generalized
-likelihood ratio test of Willsky and Jones (1976, doi:10.1109/TAC.1976.1101146), over a window
-instead of a recursion.
-
-Learning: a Kalman filter whose state is the biases and the slowly varying errors. With these in the
-state the differences are correlated, and the covariance of the biases is honest. A combination of
-biases that a flight does not show stays as uncertain as before. A spoofed receiver must not move
-the map: only values in agreement count, each waits in quarantine, an alarm discards those that
-wait, an offset discards all that was learnt since the reference, outliers are left out, and the
-biases are bounded.
+The tests are generalized likelihood ratios (Willsky and Jones 1976, doi:10.1109/TAC.1976.1101146)
+over a window instead of a recursion. Learning is a Kalman filter whose state has the slowly varying
+errors too: with these the covariance of the biases is honest. A spoofed receiver must not move the
+map: values wait in quarantine, an offset discards all since the reference, outliers are left out,
+and the biases are bounded (docs/gnss.md).
 """
 
 import copy
@@ -23,37 +15,16 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthonav.core.flight.gnss import Fault
 from orthonav.core.records import MAP_STD_M
 
 Array = NDArray[np.float64]
-
-
-class Fault(Enum):
-    """A fault of GNSS; the value is the reason in health, logs and pages. In order of priority."""
-
-    LOST = "gnss_lost"
-    """No messages, no 3D fix, or a useless stated accuracy."""
-    FROZEN = "gnss_frozen"
-    """The position or the timestamp stands still while the aircraft moves."""
-    JUMP = "gnss_jump"
-    """The position jumps against the receiver's own velocity."""
-    STEP = "gnss_step"
-    """The difference from the map changed within seconds."""
-    DRIFT = "gnss_drift"
-    """The difference from the map grows."""
-    VELOCITY = "gnss_velocity"
-    """The velocity contradicts the positions of the receiver."""
-    OFFSET = "gnss_offset"
-    """The difference from the map is too large, and did not begin within the window."""
-    DISAGREES = "gnss_disagrees"
-    """The difference changed, but the map jumped too: which of the two is wrong is not known."""
 
 
 NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
@@ -74,17 +45,13 @@ class Biases:
     """Estimated biases of GNSS minus map.
 
     `mean` (5,), `cov` (5, 5): in the order of `NAMES`. East and north are where the map should be,
-    from where it is. Pitch and roll are errors of the reported tilt, as `Mount` has them: pitch
-    positive ahead, roll positive to the left. The latency is that of the images less that of GNSS,
-    positive where the images are older than assumed.
-    `agreed_s`: time of agreement that they were learnt from.
-    `setup`: identifies camera, mount and stated latency, for which pitch, roll and latency hold.
-    """
+    from where it is. Pitch and roll are errors of the reported tilt, as `Mount` has them. The
+    latency is that of the images less that of GNSS."""
 
     mean: Array
     cov: Array
-    agreed_s: float = 0.0
-    setup: str = ""
+    agreed_s: float = 0.0  # time of agreement that they were learnt from
+    setup: str = ""  # identifies camera, mount and stated latency, for which the last three hold
 
     @property
     def en_m(self) -> Array:
@@ -229,25 +196,16 @@ MULTIPATH_M, FAULT_SIGMAS = 8.0, 5.0
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """One value of the window.
-
-    `time_s`: time. `en_m` (2,): GNSS minus map. `gnss_std_m`, `map_std_m`: stated deviations.
-    `heading_rad`: heading. `vel_en_mps` (2,): velocity. `agl_m`: height above ground; 0 where not
-    known, which gives it no error of the mount. `rolling_std_m`: standard deviation of an error of
-    this value alone, while the aircraft rolls.
-    """
+    """One value of the window."""
 
     time_s: float
-    en_m: Array
-    gnss_std_m: float
+    en_m: Array  # (2,): GNSS minus map
+    gnss_std_m: float  # stated
     map_std_m: float
     heading_rad: float
-    vel_en_mps: Array
-    agl_m: float = 0.0
-    rolling_std_m: float = 0.0
-
-    def rolling(self, std_m: float) -> "Difference":
-        return replace(self, rolling_std_m=max(self.rolling_std_m, std_m))
+    vel_en_mps: Array  # (2,)
+    agl_m: float = 0.0  # 0 where not known, which gives it no error of the mount
+    rolling_std_m: float = 0.0  # of an error of this value alone, while the aircraft rolls
 
     @cached_property
     def design(self) -> Array:
@@ -255,6 +213,12 @@ class Difference:
 
     def residual(self, known: Biases) -> Array:
         return self.en_m - self.design @ known.mean
+
+
+def widen_last(values: deque[Difference], rolling_std_m: float) -> None:
+    if values:
+        std_m = max(values[-1].rolling_std_m, rolling_std_m)
+        values[-1] = replace(values[-1], rolling_std_m=std_m)
 
 
 class Finding(NamedTuple):
@@ -276,10 +240,6 @@ class DifferenceWindow:
         self.values.append(value)
         while self.values[0].time_s < value.time_s - WINDOW_S:
             self.values.popleft()
-
-    def widen(self, rolling_std_m: float) -> None:
-        if self.values:
-            self.values[-1] = self.values[-1].rolling(rolling_std_m)
 
     def recent(self, seconds: float) -> list[Difference]:
         begin = self.values[-1].time_s - seconds if self.values else 0.0
@@ -398,45 +358,34 @@ class BiasLearner:
 
     def __init__(self, start: Biases, reference: Biases | None = None) -> None:
         """`reference`: of a flight that was interrupted; else it is the `start`."""
-        self._filter, self._reference = _Filter(start), reference or start
-        self._waiting: deque[Difference] = deque()
+        self._filter = _Filter(start)
+        self.reference = reference or start
+        """What a slow drag-off of this flight has not moved: the biases before the flight, or,
+        where they were not known, after the first `SETTLED_S` of agreement."""
+        self.waiting: deque[Difference] = deque()  # in quarantine; an alarm clears it
 
     @property
     def learnt(self) -> Biases:
         """Estimate from all values whose quarantine has ended."""
         return self._filter.biases
 
-    @property
-    def reference(self) -> Biases:
-        """What a slow drag-off of this flight has not moved: the biases before the flight, or,
-        where they were not known, after the first `SETTLED_S` of agreement."""
-        return self._reference
-
     def add(self, value: Difference) -> None:
-        self._waiting.append(value)
-        while self._waiting and self._waiting[0].time_s <= value.time_s - QUARANTINE_S:
-            self._filter.update(self._waiting.popleft())
-        if self._reference.agreed_s < SETTLED_S <= self.learnt.agreed_s:
-            self._reference = self.learnt
-
-    def widen(self, rolling_std_m: float) -> None:
-        if self._waiting:
-            self._waiting[-1] = self._waiting[-1].rolling(rolling_std_m)
-
-    def discard(self) -> None:
-        """Drop everything in quarantine, as at an alarm."""
-        self._waiting.clear()
+        self.waiting.append(value)
+        while self.waiting and self.waiting[0].time_s <= value.time_s - QUARANTINE_S:
+            self._filter.update(self.waiting.popleft())
+        if self.reference.agreed_s < SETTLED_S <= self.learnt.agreed_s:
+            self.reference = self.learnt
 
     def restore(self) -> None:
         """Go back to the reference, if there is one: a drag-off may have been learnt since."""
-        self.discard()
-        if self._reference.agreed_s >= SETTLED_S:
-            self._filter = _Filter(self._reference)
+        self.waiting.clear()
+        if self.reference.agreed_s >= SETTLED_S:
+            self._filter = _Filter(self.reference)
 
     def until(self, time_s: float) -> Biases:
         """Estimate with the values before a time as well, though they are in quarantine."""
         ahead = copy.copy(self._filter)
-        for value in self._waiting:
+        for value in self.waiting:
             if value.time_s < time_s:
                 ahead.update(value)
         return ahead.biases

@@ -9,10 +9,11 @@ from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
-from orthonav.core.flight.gnss import FAULTS, GnssSample
+from orthonav.core.flight.gnss import FAULTS, RETURNING, Fault, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import (
     FAULT_SIGMAS,
@@ -25,65 +26,46 @@ from orthonav.onboard.gnss.biases import (
     BiasLearner,
     Difference,
     DifferenceWindow,
-    Fault,
     Finding,
     rolling_std_m,
     unknown,
+    widen_last,
 )
 
 DIFFERENTIAL = 4
 """GPS_FIX_TYPE from which on corrections are used."""
-RETURNING = FAULTS[-1]
-"""Reason in health while GNSS agrees again, but not yet for long enough."""
 
 
 class GnssState(Enum):
-    WAITING = "waiting"
-    """Since the start: no fault, but no agreement with the map yet."""
-    GOOD = "good"
-    """GNSS and map agree; the biases of their difference are learnt."""
-    ALARM = "alarm"
-    """A fault."""
-    RETURNING = "returning"
-    """No fault is seen any more; not yet in agreement for long enough."""
+    WAITING = "waiting"  # since the start: no fault, but no agreement with the map yet
+    GOOD = "good"  # GNSS and map agree; the biases of their difference are learnt
+    ALARM = "alarm"  # a fault
+    RETURNING = "returning"  # no fault is seen any more; not yet in agreement for long enough
 
 
 @dataclass(frozen=True, eq=False)
 class MapPosition:
-    """A confident position by the map.
+    """A confident position by the map."""
 
-    `time_ns`: exposure, by the clock of the samples.
-    `en_m` (2,): position in the plane of the map, uncorrected.
-    `std_m`: standard deviation along the worst axis.
-    `vel_en_mps` (2,): velocity of the track; None where not known.
-    `heading_deg`: heading of the top of the image; errors of a tilted mount turn with it.
-    `agl_m`: height above ground; errors of a tilted mount grow with it. 0 where not known.
-    """
-
-    time_ns: int
-    en_m: Array
-    std_m: float
-    vel_en_mps: Array | None = None
-    heading_deg: float = 0.0
-    agl_m: float = 0.0
+    time_ns: int  # exposure, by the clock of the samples
+    en_m: Array  # (2,): in the plane of the map, uncorrected
+    std_m: float  # along the worst axis
+    vel_en_mps: Array | None = None  # (2,): of the track; None where not known
+    heading_deg: float = 0.0  # of the top of the image; errors of a tilted mount turn with it
+    agl_m: float = 0.0  # above ground, and these errors grow with it; 0 where not known
 
 
 @dataclass(frozen=True)
 class GnssStatus:
-    """Status of one receiver.
-
-    `state`, `fault`: the fault is that of the alarm, also while returning; None without one.
-    `since_ns`: time at which the state began.
-    `difference_en_m`: recent GNSS minus map, east and north; NaN where not known. A switch from the
-    map to GNSS would make this jump.
-    `fault_en_m`: estimated change of the difference by the fault; NaN where it has none.
-    """
+    """Status of one receiver."""
 
     state: GnssState = GnssState.WAITING
-    fault: Fault | None = None
-    since_ns: int = 0
+    fault: Fault | None = None  # of the alarm, also while returning
+    since_ns: int = 0  # time at which the state began
     difference_en_m: tuple[float, float] = (math.nan, math.nan)
+    """Recent GNSS minus map, by which a switch from the map to GNSS would jump."""
     fault_en_m: tuple[float, float] = (math.nan, math.nan)
+    """Estimated change of the difference by the fault."""
 
     @property
     def reason(self) -> str | None:
@@ -123,20 +105,12 @@ class ReceiverLimits:
 RECEIVER = ReceiverLimits()
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """A good sample.
-
-    `en_m` (2,): position. `integral_m` (2,): integral of the velocity since the first sample; NaN
-    where a velocity is missing. `residual_m` (2,): position less that integral, or less what
-    the positions before predict.
-    """
+class _Point(NamedTuple):
+    """A good sample: position (2,) and velocity (2,), NaN where not known."""
 
     time_s: float
     en_m: Array
-    integral_m: Array
-    residual_m: Array
-    vel_en_mps: Array | None
+    vel_en_mps: Array
 
 
 class Receiver:
@@ -165,7 +139,8 @@ class Receiver:
         if not self._usable or (points and not 0 < time_s - points[-1].time_s <= RECEIVER.gap_s):
             points.clear()
         if self._usable:
-            points.append(self._point(time_s, en_m, sample.vel_en_mps))
+            velocity = np.array(sample.vel_en_mps or (math.nan, math.nan))
+            points.append(_Point(time_s, en_m, velocity))
             span_s = RECEIVER.velocity_s
             if points[0].time_s < time_s - 2 * span_s:  # rarely: deleting moves the list
                 del points[: bisect_left(points, time_s - span_s - RECEIVER.gap_s, key=_time_s)]
@@ -182,52 +157,39 @@ class Receiver:
             return Fault.LOST
         if (self._heard_ns - self._stamped_ns) / 1e9 >= RECEIVER.still_s:
             return Fault.FROZEN
-        own = self._points[-1].vel_en_mps if self._points else None
-        speed_mps = np.fmax(speed_mps, math.nan if own is None else float(np.hypot(*own)))
+        own_mps = float(np.hypot(*self._points[-1].vel_en_mps)) if self._points else math.nan
+        speed_mps = np.fmax(speed_mps, own_mps)
         still_s = (self._heard_ns - self._moved_ns) / 1e9
         if still_s >= RECEIVER.still_s and speed_mps > RECEIVER.moving_mps:
             return Fault.FROZEN
         return Fault.JUMP if self._has_jumped() else None
 
-    def residual_over(self, span_s: float) -> float:
-        """Distance by which positions left the integrated velocity within `span_s`; NaN unknown."""
-        points = self._points
-        if not points or points[0].time_s > points[-1].time_s - span_s:
-            return math.nan
-        last = points[-1]
-        first = points[bisect_left(points, last.time_s - span_s, key=_time_s)]
-        return float(np.hypot(*(last.en_m - first.en_m - last.integral_m + first.integral_m)))
+    def left_m(self, span_s: float) -> float:
+        """Distance by which positions left the integrated velocity within `span_s`, at the most;
+        NaN where a velocity is missing."""
+        begin_s = self._points[-1].time_s - span_s
+        points = self._points[bisect_left(self._points, begin_s, key=_time_s) :]
+        times_s, places_m, velocities = map(np.array, zip(*points, strict=True))
+        steps_m = (velocities[1:] + velocities[:-1]) / 2 * np.diff(times_s)[:, None]
+        return float(np.hypot(*(places_m[-1] - places_m[0] - steps_m.sum(axis=0))))
 
-    def _point(self, time_s: float, en_m: Array, velocity: tuple[float, float] | None) -> _Point:
-        vel = None if velocity is None else np.array(velocity)
-        if not self._points:
-            return _Point(time_s, en_m, np.zeros(2), np.zeros(2), vel)
-        before = self._points[-1]
-        seconds = time_s - before.time_s
-        moved = np.full(2, math.nan)
-        if vel is not None and before.vel_en_mps is not None:
-            moved = (vel + before.vel_en_mps) / 2 * seconds
-        expected = moved
-        if not np.isfinite(moved).all():  # that of the positions before
-            expected = en_m - before.en_m
-            if len(self._points) > 1:
-                earlier = self._points[-2]
-                speed = (before.en_m - earlier.en_m) / (before.time_s - earlier.time_s)
-                expected = speed * seconds
-        off = en_m - before.en_m - expected
-        return _Point(time_s, en_m, before.integral_m + moved, before.residual_m + off, vel)
+    def is_known_for(self, span_s: float) -> bool:
+        points = self._points
+        return bool(points) and points[0].time_s <= points[-1].time_s - span_s
 
     def _has_jumped(self) -> bool:
-        points = self._points
-        if len(points) < 2:
+        if len(self._points) < 2:
             return False
-        last = points[-1]
-        if last.vel_en_mps is None:
-            seconds = last.time_s - points[-2].time_s
-            off_m = float(np.hypot(*(last.residual_m - points[-2].residual_m)))
-            return off_m > RECEIVER.jump_m + RECEIVER.acceleration_mps2 * seconds**2
-        first = points[bisect_left(points, last.time_s - RECEIVER.jump_s, key=_time_s)]
-        return float(np.hypot(*(last.residual_m - first.residual_m))) > RECEIVER.jump_m
+        off_m, allowed_m = self.left_m(RECEIVER.jump_s), RECEIVER.jump_m
+        if math.isnan(off_m):  # by the speed of the positions before
+            if len(self._points) < 3:
+                return False
+            earlier, before, last = self._points[-3:]
+            speed = (before.en_m - earlier.en_m) / (before.time_s - earlier.time_s)
+            seconds = last.time_s - before.time_s
+            off_m = float(np.hypot(*(last.en_m - before.en_m - speed * seconds)))
+            allowed_m += RECEIVER.acceleration_mps2 * seconds**2
+        return off_m > allowed_m
 
 
 def _time_s(point: _Point) -> float:
@@ -359,17 +321,9 @@ class GnssMonitor:
         # Corrections by SBAS or a reference station (GPS_FIX_TYPE) make 1 m.
         least_m = GNSS_STD_M if sample.fix_type < DIFFERENTIAL else 1.0
         std_m = max(sample.std_m, least_m) if math.isfinite(sample.std_m) else GNSS_STD_M
-        heading = math.radians(position.heading_deg)
         time_s = position.time_ns / 1e9
-        made = Difference(
-            time_s,
-            off_en_m,
-            std_m,
-            position.std_m,
-            heading,
-            velocity,
-            position.agl_m,
-        )
+        flown = math.radians(position.heading_deg), velocity, position.agl_m
+        made = Difference(time_s, off_en_m, std_m, position.std_m, *flown)
         if self._bin and math.floor(self._bin[0].time_s) != math.floor(time_s):
             value, self._bin = _median(self._bin), []
             self._judge(value, now_ns)
@@ -378,14 +332,14 @@ class GnssMonitor:
     def _judge(self, value: Difference, now_ns: int) -> None:
         if value.time_s <= self._newest_s:
             self._window.values.clear()  # the clock went back
-            self._learner.discard()
+            self._learner.waiting.clear()
         self._newest_s = value.time_s
         self._judged.append(value)
         rolling_m = rolling_std_m(self._judged, self._learner.learnt)
         if rolling_m:  # headings show it a second later than the bank
-            value = value.rolling(rolling_m)
-            self._window.widen(rolling_m)
-            self._learner.widen(rolling_m)
+            value = replace(value, rolling_std_m=rolling_m)
+            widen_last(self._window.values, rolling_m)
+            widen_last(self._learner.waiting, rolling_m)
         self._window.add(value)
         recent = self._window.recent(AGREEMENT.recent_s)
         east, north = np.mean([each.en_m for each in recent], axis=0).tolist()
@@ -413,7 +367,7 @@ class GnssMonitor:
         if float(np.hypot(*_residual(recent, anchor))) > limit_m:
             self._agreed_s = 0.0
             if self.status.state is GnssState.WAITING:
-                self._learner.discard()
+                self._learner.waiting.clear()
             if self.status.state in (GnssState.ALARM, GnssState.RETURNING):
                 fault = self.status.fault
                 named = fault if fault is None else _LEFT.get(fault, fault)
@@ -440,7 +394,7 @@ class GnssMonitor:
             self.status.fault is fault or (fault is Fault.JUMP and self.status.fault is Fault.STEP)
         ):
             return
-        self._learner.discard()
+        self._learner.waiting.clear()
         self._forget()
         size = (math.nan, math.nan) if found is None else found.en_m
         self.status = replace(self.status, fault=fault, fault_en_m=size)
@@ -489,7 +443,9 @@ class GnssMonitor:
     def _velocity_fault(self) -> Fault | None:
         gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-RECEIVER.velocity_s / GNSS_TAU_S))
         drift_m2 = (RECEIVER.velocity_std_mps * RECEIVER.velocity_s) ** 2
-        own_m = self._receiver.residual_over(RECEIVER.velocity_s)
+        if not self._receiver.is_known_for(RECEIVER.velocity_s):
+            return None
+        own_m = self._receiver.left_m(RECEIVER.velocity_s)
         if own_m > MULTIPATH_M + FAULT_SIGMAS * math.sqrt(gnss_m2 + drift_m2):
             return Fault.VELOCITY
         return None

@@ -9,6 +9,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -25,26 +26,6 @@ log = logging.getLogger(__name__)
 DISPLACED = "map_displaced"
 """Reason in health: the learnt displacement is larger than that of a map as accurate as fixes
 state, or GNSS was spoofed since the first flight over it."""
-Solutions = Callable[[int], list[GnssSample]]
-"""Gives the solutions that arrived until a time, each once, in order."""
-
-
-def live_solutions(queue: deque[GnssSample]) -> Solutions:
-    return lambda until_ns: [queue.popleft() for _ in range(len(queue))]
-
-
-def recorded_solutions(samples: list[GnssSample]) -> Solutions:
-    waiting = deque(sorted(samples, key=lambda each: each.arrived_ns))
-
-    def take(until_ns: int) -> list[GnssSample]:
-        taken = []
-        while waiting and waiting[0].arrived_ns <= until_ns:
-            taken.append(waiting.popleft())
-        return taken
-
-    return take
-
-
 GnssText = tuple[int, str]
 """MAV_SEVERITY and at most 50 characters, for the operator."""
 
@@ -55,7 +36,7 @@ class GnssWatch:
     def __init__(
         self,
         frame: LocalFrame,
-        solutions: Solutions,
+        solutions: deque[GnssSample],
         *,
         digest: str = "",
         known: Mapping[str, Biases] = MappingProxyType({}),
@@ -65,22 +46,22 @@ class GnssWatch:
         min_confidence: float = CONFIDENT,
         utc_ahead_ns: Callable[[], int] = lambda: 0,
     ) -> None:
-        """`frame`: plane of the map. `digest`: of the map; `known`: biases by digest, the latest
-        last. `reference`: of this flight, where it was interrupted. `setup`: identifies camera,
-        mount and stated latency.
-
-        `recorded`: times are
-        those of the recording. `utc_ahead_ns`: what is added to times of solutions in the log.
-        `log` gets every solution, as the message of a flight log.
+        """`frame`: plane of the map. `solutions`: those that arrived, or all of a recording, in
+        order of their arrival. `digest`: of the map; `known`: biases by digest, the latest last.
+        `reference`: of this flight, where it was interrupted. `setup`: identifies camera, mount and
+        stated latency. `recorded`: times are those of the recording. `utc_ahead_ns`: what is added
+        to times of solutions in the log. `log` gets every solution, as the message of a flight log.
         """
         self._frame, self._solutions, self._utc_ahead_ns = frame, solutions, utc_ahead_ns
         self.log: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self._digest, self._known = digest, dict(known)
-        self._start = self._reference = at_start(known, digest, setup)
+        start = before = at_start(known, digest, setup)
         if reference is not None:
-            self._reference = at_start({**known, digest: reference}, digest, setup)
+            before = at_start({**known, digest: reference}, digest, setup)
+        self._made = partial(GnssMonitor, frame, start, before)
         self._recorded, self._least = recorded, min_confidence
-        self._monitors: dict[int, GnssMonitor] = {}
+        self._first = self._made()
+        self._monitors: dict[int, GnssMonitor] = {}  # of the receivers that were heard
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
         self._now_ns, self._has_failed = 0, False
@@ -110,8 +91,7 @@ class GnssWatch:
         """By the displacement of the map, as far as it is known, where the fix includes one."""
         if not float(np.linalg.eigvalsh(fix.cov_en_m2)[0]) >= MAP_STD_M**2:
             return fix
-        first = self._monitors.get(0)
-        en_m, cov = (self._start if first is None else first.undisturbed).displacement
+        en_m, cov = self._first.undisturbed.displacement
         place_m = np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)) + en_m
         lat, lon = self._frame.latlon_from_en(place_m)
         moved = fix.with_covariance(fix.cov_en_m2 + cov - np.eye(2) * MAP_STD_M**2)
@@ -147,14 +127,9 @@ class GnssWatch:
     def reasons(self, now_ns: int = 0) -> tuple[str, ...]:
         """Reasons of health by the last judgements."""
         found = [monitor.status.reason for monitor in self._monitors.values()]
-        if not self._learnt.is_plausible:
+        if not self._first.learnt.is_plausible:
             found.append(DISPLACED)
         return tuple(dict.fromkeys(each for each in found if each))
-
-    @property
-    def _learnt(self) -> Biases:
-        first = self._monitors.get(0)
-        return self._start if first is None else first.learnt
 
     @property
     def code(self) -> int:
@@ -163,16 +138,14 @@ class GnssWatch:
     @property
     def difference_m(self) -> float:
         """Recent distance from the map to the first receiver; NaN where not known."""
-        first = self._monitors.get(0)
-        return math.nan if first is None else math.hypot(*first.status.difference_en_m)
+        return math.hypot(*self._first.status.difference_en_m)
 
     def maps(self) -> dict[str, Any]:
         """Biases for the state file: those of this map, learnt further, after the others."""
         made = {name: each.to_plain() for name, each in self._known.items() if name != self._digest}
-        if self._digest and self._learnt.agreed_s > 0:
-            first = self._monitors.get(0)
-            reference = self._reference if first is None else first.reference
-            made[self._digest] = {**self._learnt.to_plain(), "reference": reference.to_plain()}
+        learnt, reference = self._first.learnt, self._first.reference
+        if self._digest and learnt.agreed_s > 0:
+            made[self._digest] = {**learnt.to_plain(), "reference": reference.to_plain()}
         return made
 
     def plain(self) -> list[dict[str, Any]]:
@@ -183,19 +156,17 @@ class GnssWatch:
 
     def _take(self, now_ns: int) -> None:
         self._now_ns = max(self._now_ns, now_ns) if not self._recorded else now_ns
-        for sample in self._solutions(now_ns):
+        waiting = self._solutions
+        while waiting and (not self._recorded or waiting[0].arrived_ns <= now_ns):
+            sample = waiting.popleft()
             if sample.receiver not in self._monitors:
-                made = GnssMonitor(self._frame, self._start, self._reference)
-                self._monitors[sample.receiver] = made
+                self._monitors[sample.receiver] = self._made() if sample.receiver else self._first
             self._monitors[sample.receiver].sample(sample)
             if sample.receiver == 0:
                 self._last = sample
-            self._write(sample)
-
-    def _write(self, sample: GnssSample) -> None:
-        time_ns = sample.time_ns + self._utc_ahead_ns()
-        with contextlib.suppress(ValueError):  # a position that is not finite
-            self.log(time_ns, gnss_message(sample, time_ns))
+            time_ns = sample.time_ns + self._utc_ahead_ns()
+            with contextlib.suppress(ValueError):  # a position that is not finite
+                self.log(time_ns, gnss_message(sample, time_ns))
 
     def _is_confident(self, fix: Fix, state: str | None) -> bool:
         known = math.isfinite(fix.std_m + fix.heading_deg)
@@ -214,8 +185,8 @@ class GnssWatch:
     def _evidence(self, now_ns: int) -> dict[str, float]:
         """Position of the first receiver at an exposure, by its velocity, and the fault's code."""
         made = {"gnss_fault": float(self.code)}
-        if self._learnt.agreed_s > 0:
-            made |= _bias_evidence(self._learnt)
+        if self._first.learnt.agreed_s > 0:
+            made |= _bias_evidence(self._first.learnt)
         last = self._last
         if last is None or not last.is_valid:
             return made
@@ -239,15 +210,11 @@ def _velocity(fix: Fix) -> Array | None:
 
 
 def _change(name: str, before: GnssStatus, now: GnssStatus) -> GnssText | None:
-    if now.state is GnssState.ALARM and (
-        before.state is not GnssState.ALARM or before.fault != now.fault
-    ):
+    changed = (before.state, before.fault) != (now.state, now.fault)
+    if now.state is GnssState.ALARM and changed:
         kind = now.fault.value.removeprefix("gnss_") if now.fault else "fault"
         return 2, f"orthonav {name} {kind}{_size(now.fault_en_m)}"
-    if now.state is GnssState.GOOD and before.state in (
-        GnssState.ALARM,
-        GnssState.RETURNING,
-    ):
+    if now.state is GnssState.GOOD and before.state in (GnssState.ALARM, GnssState.RETURNING):
         return 5, f"orthonav {name} agrees, jump{_size(now.difference_en_m)}"
     return None
 

@@ -17,35 +17,26 @@ class EstimateError(OrthonavError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class NavigationEstimate:
-    """Position of the aircraft at one exposure.
-
-    `cov_en_m2`: covariance (2, 2) of east and north, given that the fix is correct.
-    `confidence`: 0 to 1; NaN: not known.
-    `protection_level_m`: the error exceeds it with the risk of the result; infinite: not known.
-    `accepted`: whether it met a criterion beside the rules of the gate.
-    `time_ns`: time of exposure by a steady clock; `utc_ns`: UTC, None: not known.
-    `processing_s`: from exposure until the message is sent.
-    `alt_amsl_m`, `alt_std_m`: above mean sea level; NaN where not known.
-    `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
-    `state`: state of the track; None for views that are located one by one.
-    `reset_counter`: 0 to 255; changes when the position jumped.
-    """
+    """Position of the aircraft at one exposure."""
 
     lat_deg: float
     lon_deg: float
-    cov_en_m2: NDArray[np.float64]
-    confidence: float
-    time_ns: int
-    utc_ns: int | None = None
-    processing_s: float = 0.0
-    alt_amsl_m: float = math.nan
+    cov_en_m2: NDArray[np.float64]  # (2, 2) of east and north, given that the fix is correct
+    confidence: float  # 0 to 1; NaN: not known
+    time_ns: int  # of exposure, by a steady clock
+    utc_ns: int | None = None  # of exposure; None: not known
+    processing_s: float = 0.0  # from exposure until the message is sent
+    alt_amsl_m: float = math.nan  # above mean sea level; NaN: not known
     alt_std_m: float = math.nan
-    vel_en_mps: tuple[float, float] | None = None
-    vel_cov_en: NDArray[np.float64] | None = None
-    state: str | None = None
-    reset_counter: int = 0
+    vel_en_mps: tuple[float, float] | None = None  # over ground, true east and north
+    vel_cov_en: NDArray[np.float64] | None = None  # (2, 2)
+    state: str | None = None  # of the track; None for views that are located one by one
+    reset_counter: int = 0  # 0 to 255; changes when the position jumped
     protection_level_m: float = math.inf
-    accepted: bool = True
+    """The error exceeds it with the risk of the result; infinite: not known."""
+    accepted: bool = True  # whether it met a criterion beside the rules of the gate
+    min_confidence: float = CONFIDENT
+    """From which on it is confident, by the rules of the gate that admitted it."""
 
     def __post_init__(self) -> None:
         if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # NaN too
@@ -86,13 +77,23 @@ class NavigationEstimate:
         """
         return error_ellipse(self.cov_en_m2)[0]
 
-    def is_confident(self, min_confidence: float = CONFIDENT) -> bool:
+    @property
+    def is_confident(self) -> bool:
         """Whether it is confident, with a valid covariance, and of no track or one that tracks."""
         return (
-            self.confidence >= min_confidence  # False for NaN
+            self.confidence >= self.min_confidence  # False for NaN
             and self.state in (None, "tracking")
             and not math.isnan(self.horizontal_std_m())
         )
+
+    def require_confident(self, message: str) -> None:
+        """Raise `EstimateError` unless it is confident, as `message` cannot mark it."""
+        if not self.is_confident:
+            raise EstimateError(
+                f"{message} cannot mark a position of low confidence (confidence "
+                f"{self.confidence:.3g}, state {self.state}, standard deviation "
+                f"{self.horizontal_std_m():.3g} m): do not send it"
+            )
 
 
 def estimate_from_result(

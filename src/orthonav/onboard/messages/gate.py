@@ -26,27 +26,21 @@ Array = NDArray[np.float64]
 class GateRules:
     """Limits of the gate.
 
-    `min_confidence`: 0 to 1. `max_std_m`: along the worst direction. `min_interval_s`: shortest
-    time between two messages, by name. `alert_limit_m`: of the protection level, above 0;
-    infinite: none. `max_ahead_s`: of an exposure before our clock. `jitter`: fraction of an
-    interval by which a message may be early.
+    A position is a jump where it differs from the prediction by more than the deviations and the
+    possible manoeuvre explain. It is withheld until `jump_views` in a row agree."""
 
-    A position is a jump where it differs from the prediction by more than `jump_sigmas` beyond the
-    possible manoeuvre: `max_accel_mps2` where the velocity is known, with `velocity_std_mps` where
-    it has no covariance, else `max_speed_mps`. It is withheld until `jump_views` in a row agree.
-    """
-
-    min_confidence: float = CONFIDENT
-    max_std_m: float = 50.0
+    min_confidence: float = CONFIDENT  # 0 to 1
+    max_std_m: float = 50.0  # along the worst direction
     min_interval_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    alert_limit_m: float = math.inf
-    max_ahead_s: float = 0.1
-    jitter: float = 0.1
+    """Shortest time between two messages, by name."""
+    alert_limit_m: float = math.inf  # of the protection level, above 0; infinite: none
+    max_ahead_s: float = 0.1  # of an exposure before our clock
+    jitter: float = 0.1  # fraction of an interval by which a message may be early
     jump_sigmas: float = 5.0
     jump_views: int = 3
-    max_accel_mps2: float = 10.0
-    max_speed_mps: float = 60.0
-    velocity_std_mps: float = 1.0
+    max_accel_mps2: float = 10.0  # where the velocity is known,
+    max_speed_mps: float = 60.0  # and where it is not
+    velocity_std_mps: float = 1.0  # where the velocity has no covariance
 
     def __post_init__(self) -> None:
         limits = {
@@ -106,7 +100,8 @@ class Gate:
         if jumped or (self._last is not None and self._interrupted):
             self.resets += 1
         self._interrupted = False
-        self._last = replace(estimate, reset_counter=self.resets % 256)
+        least, resets = self.rules.min_confidence, self.resets % 256
+        self._last = replace(estimate, reset_counter=resets, min_confidence=least)
         return Decision(self._last)
 
     def withhold(self, reason: str) -> Decision:

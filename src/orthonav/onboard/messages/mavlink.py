@@ -20,7 +20,7 @@ from orthonav.core.errors import MissingExtraError
 from orthonav.core.extras import needed
 from orthonav.core.geo.attitude import matrices_of_wxyz, wxyz_of_angles
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.core.records import CONFIDENT, error_ellipse
+from orthonav.core.records import error_ellipse
 from orthonav.onboard.messages.estimate import EstimateError, NavigationEstimate
 
 Message = Any
@@ -104,18 +104,13 @@ class Packer:
         return frame
 
 
-def global_position_sensor(
-    estimate: NavigationEstimate,
-    *,
-    target: Target = AUTOPILOT,
-    min_confidence: float = CONFIDENT,
-) -> Message:
+def global_position_sensor(estimate: NavigationEstimate, *, target: Target = AUTOPILOT) -> Message:
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, stamped at sending.
 
     Raises `EstimateError` for an estimate of low confidence or without accuracy: PX4 reads no
     flag, takes coordinates that mean "unknown" for a place, and an unknown accuracy for a good one.
     """
-    require_confident(estimate, min_confidence, "GLOBAL_POSITION_SENSOR")
+    estimate.require_confident("GLOBAL_POSITION_SENSOR")
     eph_m = estimate.horizontal_std_m()
     if math.isnan(eph_m):
         raise EstimateError("GLOBAL_POSITION_SENSOR needs the accuracy of the position")
@@ -136,19 +131,14 @@ def global_position_sensor(
     )
 
 
-def gps_input(
-    estimate: NavigationEstimate,
-    *,
-    gps_id: int = 0,
-    min_confidence: float = CONFIDENT,
-) -> Message:
+def gps_input(estimate: NavigationEstimate, *, gps_id: int = 0) -> Message:
     """GPS_INPUT (message 232): the position as that of a GPS receiver, stamped at exposure.
 
     Unknown values are marked in `ignore_flags` and sent as 0: the vertical velocity and dilutions
     of precision always, altitude and speed accuracy unless the estimate has them. `fix_type` is 3
     for a confident estimate, else 1 with all fields ignored. There are 0 satellites.
     """
-    confident = estimate.is_confident(min_confidence)
+    confident = estimate.is_confident
     eph_m = estimate.horizontal_std_m()
     vel_cov = estimate.vel_cov_en
     speed_std_mps = math.nan if vel_cov is None else error_ellipse(vel_cov)[0]
@@ -183,14 +173,11 @@ def gps_input(
 
 
 def external_position_estimate(
-    estimate: NavigationEstimate,
-    *,
-    target: Target = AUTOPILOT,
-    min_confidence: float = CONFIDENT,
+    estimate: NavigationEstimate, *, target: Target = AUTOPILOT
 ) -> Message:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) as COMMAND_INT: a single fix while dead reckoning.
     Raises `EstimateError` for an estimate of low confidence, which it cannot mark."""
-    require_confident(estimate, min_confidence, "MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
+    estimate.require_confident("MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
     wrapped_ns = estimate.sent_ns % (250 * 10**9)  # by the definition of the field
     return dialect().MAVLink_command_int_message(
         target_system=target.system_id,
@@ -233,16 +220,6 @@ def status_texts(severity: int, text: str, number: int) -> list[Message]:
     starts = range(0, len(data) + 1, MAX_TEXT)
     identity = number % (2**16 - 1) + 1  # 0 marks a single chunk
     return [make(severity, data[at : at + MAX_TEXT], identity, at // MAX_TEXT) for at in starts]
-
-
-def require_confident(estimate: NavigationEstimate, min_confidence: float, message: str) -> None:
-    """Raise `EstimateError` unless the estimate is confident, as `message` cannot mark it."""
-    if not estimate.is_confident(min_confidence):
-        raise EstimateError(
-            f"{message} cannot mark a position of low confidence (confidence "
-            f"{estimate.confidence:.3g}, state {estimate.state}, standard deviation "
-            f"{estimate.horizontal_std_m():.3g} m): do not send it"
-        )
 
 
 def dialect() -> Any:
@@ -352,28 +329,18 @@ class Origin:
 
 @dataclass(frozen=True)
 class LocalPose:
-    """State that the autopilot reported for the exposure, in its local frame. NaN: not known.
-
-    `down_m`, `down_std_m`: below the origin; needed where the estimate has no altitude.
-    `attitude_rad`, `attitude_std_rad`: roll, pitch, yaw of the body from NED (rotations ZYX).
-    """
+    """State that the autopilot reported for the exposure, in its local frame. NaN: not known."""
 
     origin: Origin
-    down_m: float = math.nan
+    down_m: float = math.nan  # below the origin; needed where the estimate has no altitude
     down_std_m: float = math.nan
-    attitude_rad: Triple = _NAN3
+    attitude_rad: Triple = _NAN3  # roll, pitch, yaw of the body from NED (rotations ZYX)
     attitude_std_rad: Triple = _NAN3
     vel_down_mps: float = math.nan
     vel_down_std_mps: float = math.nan
 
 
-def odometry(
-    estimate: NavigationEstimate,
-    pose: LocalPose,
-    autopilot: Autopilot,
-    *,
-    min_confidence: float = CONFIDENT,
-) -> Message:
+def odometry(estimate: NavigationEstimate, pose: LocalPose, autopilot: Autopilot) -> Message:
     """ODOMETRY (message 331) as `autopilot` reads it, stamped at exposure.
 
     PX4: pose and velocity in MAV_FRAME_LOCAL_NED; attitude and velocity are NaN where not known.
@@ -381,7 +348,7 @@ def odometry(
     only pair that it accepts; it always reads attitude and velocity, so they must be known.
     `quality` is the confidence in per cent. Raises `EstimateError`.
     """
-    require_confident(estimate, min_confidence, "ODOMETRY")
+    estimate.require_confident("ODOMETRY")
     position, variance = _position(estimate, pose, autopilot, "ODOMETRY")
     velocity_ned = _velocity_ned(estimate, pose)
     frames = 1, 1  # MAV_FRAME_LOCAL_NED
@@ -420,17 +387,13 @@ def odometry(
 
 
 def vision_position_estimate(
-    estimate: NavigationEstimate,
-    pose: LocalPose,
-    autopilot: Autopilot,
-    *,
-    min_confidence: float = CONFIDENT,
+    estimate: NavigationEstimate, pose: LocalPose, autopilot: Autopilot
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
 
     Raises `EstimateError` where height or attitude is not known, or for a low confidence.
     """
-    require_confident(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
+    estimate.require_confident("VISION_POSITION_ESTIMATE")
     (x, y, z), variance = _position(estimate, pose, autopilot, "this message")
     if not all(map(math.isfinite, pose.attitude_rad)):
         raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude of the autopilot")

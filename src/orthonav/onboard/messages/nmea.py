@@ -9,7 +9,7 @@ import math
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 
-from orthonav.core.records import CONFIDENT, error_ellipse
+from orthonav.core.records import error_ellipse
 from orthonav.onboard.messages.estimate import NavigationEstimate
 
 MPS_PER_KNOT = 1852 / 3600
@@ -30,14 +30,13 @@ class Quality(Enum):
 def gga(
     estimate: NavigationEstimate | None,
     utc_ns: int | None = None,
-    min_confidence: float = CONFIDENT,
     quality: Quality = Quality.ESTIMATED,
 ) -> bytes:
     """GGA: time, position, quality, altitude above mean sea level where known; 00 satellites.
 
     `utc_ns`: time of a sentence without an estimate.
     """
-    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    time_ns, confident = _when_and_whether(estimate, utc_ns)
     if estimate is None or not confident:
         return _sentence(["GGA", _time(time_ns), *_NO_PLACE, "0", "00", *[""] * 7])
     altitude, place = _altitude(estimate.alt_amsl_m), _place(estimate)
@@ -48,11 +47,10 @@ def gga(
 def rmc(
     estimate: NavigationEstimate | None,
     utc_ns: int | None = None,
-    min_confidence: float = CONFIDENT,
     quality: Quality = Quality.ESTIMATED,
 ) -> bytes:
     """RMC: time and date, status, position, speed in knots and course where velocity is known."""
-    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    time_ns, confident = _when_and_whether(estimate, utc_ns)
     if estimate is None or not confident:
         fields = ["V", *_NO_PLACE, "", "", _date(time_ns), "", "", "N"]
     else:
@@ -62,14 +60,10 @@ def rmc(
     return _sentence(["RMC", _time(time_ns), *fields])
 
 
-def gst(
-    estimate: NavigationEstimate | None,
-    utc_ns: int | None = None,
-    min_confidence: float = CONFIDENT,
-) -> bytes:
+def gst(estimate: NavigationEstimate | None, utc_ns: int | None = None) -> bytes:
     """GST: one-sigma error ellipse (m, direction of the major axis from true north) and standard
     deviations of latitude, longitude and altitude (m). The RMS of ranges is empty."""
-    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    time_ns, confident = _when_and_whether(estimate, utc_ns)
     if estimate is None or not confident:
         return _sentence(["GST", _time(time_ns), *[""] * 7])
     major, minor, direction_deg = error_ellipse(estimate.cov_en_m2)
@@ -97,11 +91,11 @@ def _sentence(fields: list[str]) -> bytes:
 
 
 def _when_and_whether(
-    estimate: NavigationEstimate | None, utc_ns: int | None, min_confidence: float
+    estimate: NavigationEstimate | None, utc_ns: int | None
 ) -> tuple[int | None, bool]:
     if estimate is None:
         return utc_ns, False
-    return estimate.utc_ns, estimate.is_confident(min_confidence)
+    return estimate.utc_ns, estimate.is_confident
 
 
 def _place(estimate: NavigationEstimate) -> list[str]:

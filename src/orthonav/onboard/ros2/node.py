@@ -12,18 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from orthonav.core.errors import MissingExtraError, OutputError, UsageError, described
-from orthonav.core.extras import needed
+from orthonav.core.flight.ros_messages import Definitions
 from orthonav.onboard.ros2.parameters import Parameters, declared
 
 log = logging.getLogger(__name__)
-TIME_NS = 10**9
 _LOG = "rcl_interfaces/msg/Log"
-_GEOGRAPHIC = {
-    "geographic_msgs/msg/GeoPoint": "float64 latitude\nfloat64 longitude\nfloat64 altitude\n",
-    "geographic_msgs/msg/GeoPointStamped": (
-        "std_msgs/Header header\ngeographic_msgs/GeoPoint position\n"
-    ),
-}
 Handler = Callable[[Any, bytes], None]
 Writer = Callable[[Any], None]
 """Sends one message. Raises `OSError` where the middleware does not take it."""
@@ -41,41 +34,6 @@ def _ros_module(name: str) -> Any:
         ) from error
 
 
-class Definitions:
-    def __init__(self, distro: str = "") -> None:
-        """`distro` as in ROS_DISTRO ("humble"); one that is not known stands for the newest.
-
-        Raises `MissingExtraError`.
-        """
-        typesys = needed("rosbags.typesys", "flights", "--ros2")
-        stores = {store.value: store for store in typesys.Stores}
-        self._store = typesys.get_typestore(stores.get(f"ros2_{distro}", typesys.Stores.LATEST))
-        for name, text in _GEOGRAPHIC.items():
-            self._store.register(typesys.get_types_from_msg(text, name))
-
-    def new(self, name: str, /, **values: Any) -> Any:
-        """A message of the type `name` ("sensor_msgs/msg/NavSatFix")."""
-        return self._store.types[name](**values)
-
-    def header(self, stamp_ns: int, frame: str) -> Any:
-        return self.new("std_msgs/msg/Header", stamp=self.time(stamp_ns), frame_id=frame)
-
-    def time(self, stamp_ns: int) -> Any:
-        sec, nanosec = divmod(stamp_ns, TIME_NS)
-        return self.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-
-    def vector(self, kind: str, names: str, values: Sequence[float]) -> Any:
-        """A message of `geometry_msgs` of plain numbers, such as Point and Quaternion."""
-        numbers = map(float, values)
-        return self.new(f"geometry_msgs/msg/{kind}", **dict(zip(names, numbers, strict=True)))
-
-    def decoded(self, name: str, cdr: bytes) -> Any:
-        return self._store.deserialize_cdr(cdr, name)
-
-    def encoded(self, message: Any) -> bytes:
-        return bytes(self._store.serialize_cdr(message, message.__msgtype__))
-
-
 class Node:
     """Reads and writes topics. `spin` is for one thread, writers are for any.
 
@@ -89,7 +47,7 @@ class Node:
         Raises `MissingExtraError`, `UsageError` for words that are none of ROS, `VariantError` for
         an invalid parameter, or `OutputError` where the middleware cannot join.
         """
-        self.definitions = Definitions(distro)
+        self.definitions = Definitions("flights", "--ros2", distro)
         self.problems: dict[str, str] = {}
         self.undecodable: Counter[str] = Counter()
         self.kinds: dict[str, str] = {}

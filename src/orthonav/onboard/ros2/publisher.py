@@ -11,18 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.flight.logged import NO_ALTITUDE_M2
+from orthonav.core.flight.ros_messages import NO_ALTITUDE_M2
 from orthonav.core.geo.attitude import ros_xyzw_from_ned
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import CONFIDENT
 from orthonav.onboard.messages.estimate import NavigationEstimate, floored
-from orthonav.onboard.messages.mavlink import require_confident
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import VehicleState
 
 NOT_MEASURED_RAD2 = math.pi**2
 """Variance of an angle that is not measured: (180 deg)^2."""
-_STATUS_FIX, _COVARIANCE_KNOWN = 0, 3
 _LEVELS = {"OK": 0, "DEGRADED": 1, "FAILED": 2}
 Array = NDArray[np.float64]
 
@@ -38,14 +35,13 @@ class Ros2Publisher:
         *,
         origin_alt_m: float = math.nan,
         min_std_m: float = 0.0,
-        min_confidence: float = CONFIDENT,
         silent: bool = False,
     ) -> None:
         """`origin`: origin of the map frame, `origin_alt_m` its altitude. `now_ns`: reads ROS time.
         `min_std_m`: lower bound of the standard deviation in any direction. `silent`: send no
         positions."""
         self._node, self._frame, self._now_ns = node, origin, now_ns
-        self._floor_m, self._least, self._silent = min_std_m, min_confidence, silent
+        self._floor_m, self._silent = min_std_m, silent
         self._origin_alt_m = origin_alt_m
         resolved = node.resolved
         self._parameters = node.parameters
@@ -64,12 +60,14 @@ class Ros2Publisher:
         self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
     ) -> tuple[str, ...]:
         """The names of the topics. Raises `EstimateError`, also for a low confidence."""
-        require_confident(estimate, self._least, "NavSatFix")
+        estimate.require_confident("NavSatFix")
         if self._silent:
             return ()
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
-        self._fix(self._navsatfix(estimate, cov, self._altitude_m(vehicle), stamp_ns))
-        east, north = self._frame.en_from_latlon(estimate.lat_deg, estimate.lon_deg).tolist()
+        definitions, place = self._node.definitions, (estimate.lat_deg, estimate.lon_deg)
+        header = definitions.header(stamp_ns, self._parameters.base_frame)
+        self._fix(definitions.navsatfix(header, place, cov, self._altitude_m(vehicle)))
+        east, north = self._frame.en_from_latlon(*place).tolist()
         turn = np.array([0.0, 0.0, 0.0, 1.0])  # where the attitude is not known
         if vehicle.ned_from_body is not None:
             turn = ros_xyzw_from_ned(vehicle.ned_from_body)
@@ -116,24 +114,6 @@ class Ros2Publisher:
         if chosen == "home":
             return self._origin_alt_m + vehicle.home_m
         return math.nan if chosen == "none" else float(chosen)
-
-    def _navsatfix(
-        self, estimate: NavigationEstimate, cov: Array, altitude_m: float, stamp_ns: int
-    ) -> Any:
-        """Latitude and longitude; the altitude is not measured, and the satellite service is 0."""
-        definitions = self._node.definitions
-        full = np.zeros((3, 3))
-        full[:2, :2], full[2, 2] = cov, NO_ALTITUDE_M2
-        return definitions.new(
-            "sensor_msgs/msg/NavSatFix",
-            header=definitions.header(stamp_ns, self._parameters.base_frame),
-            status=definitions.new("sensor_msgs/msg/NavSatStatus", status=_STATUS_FIX, service=0),
-            latitude=float(estimate.lat_deg),
-            longitude=float(estimate.lon_deg),
-            altitude=altitude_m,
-            position_covariance=full.ravel(),
-            position_covariance_type=_COVARIANCE_KNOWN,
-        )
 
     def _posed(
         self, position_en_m: tuple[float, float], cov: Array, turn: Array, stamp_ns: int

@@ -17,6 +17,7 @@ from typing import Any
 from orthonav.core.errors import CameraError, FlightError, StoppedError
 from orthonav.core.flight.gnss import FIX_3D, GnssSample
 from orthonav.core.flight.ros_messages import (
+    TIME_NS,
     attitude_of_message,
     camera_of_info,
     grey_of_message,
@@ -30,7 +31,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.records import NoFix
 from orthonav.core.tilt import AUTOPILOT
 from orthonav.onboard.cameras import CameraImage
-from orthonav.onboard.ros2.node import TIME_NS, Node
+from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import FIX_NS, Clocks, TelemetryBuffer
 
 log = logging.getLogger(__name__)
@@ -38,6 +39,8 @@ JUMP_NS = TIME_NS
 """Stamps that go back by more show a restart: a simulation was reset, or a bag played again."""
 FAR_NS = 2 * TIME_NS
 """Images whose stamps differ from now by more are stamped by another clock."""
+WAIT_NS = 150_000_000
+"""Longest wait of an image for the attitude that follows its exposure."""
 REMIND_S = 10.0
 """Seconds between two log lines about a missing input."""
 MOST_LINES = 100
@@ -89,11 +92,9 @@ class Ros2Reader:
         stopped: Callable[[], bool],
         *,
         mount_deg: Angles = LOOKS_DOWN,
-        wait_s: float = 0.15,
     ) -> None:
-        """`wait_s`: how long an image waits for the attitude that follows its exposure."""
         self._node, self._buffer, self._clocks, self._stopped = node, buffer, clocks, stopped
-        self._mount_deg, self._wait_ns = mount_deg, round(wait_s * 1e9)
+        self._mount_deg = mount_deg
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
         self.log_gnss: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self.report_wait: Callable[[str], None] = lambda why: None  # once a second
@@ -275,7 +276,7 @@ class Ros2Reader:
         covered_ns = self._buffer.covered_ns
         if covered_ns is not None and covered_ns >= image.stamp_ns:
             return True
-        return self._clocks.mono_ns() - image.arrived_ns >= self._wait_ns
+        return self._clocks.mono_ns() - image.arrived_ns >= WAIT_NS
 
     def _camera_image(self, image: _WaitingImage) -> CameraImage:
         self._number += 1
