@@ -4,6 +4,7 @@ import contextlib
 import functools
 import time
 import tracemalloc
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -69,6 +70,24 @@ def write_dem(path, frame, height_of, half_m=1500.0, px_m=25.0, change=lambda he
     ) as data:  # fmt: skip
         data.write(heights[None])
     return path
+
+
+def waypoints(frame, points_en_m):
+    """Latitude and longitude of points (N, 2) of a plane, as pairs."""
+    places = frame.latlon_from_en(np.asarray(points_en_m, float))
+    return tuple(zip(*(each.tolist() for each in places), strict=True))
+
+
+def box_deg(frame, west_m, south_m, east_m, north_m):
+    """West, south, east, north in degrees of a box in a plane."""
+    (south, west), (north, east) = waypoints(frame, [[west_m, south_m], [east_m, north_m]])
+    return west, south, east, north
+
+
+def content(folder):
+    """The bytes of all files below a folder, by name."""
+    paths = sorted(path for path in Path(folder).rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 LONGEST_S = 240.0

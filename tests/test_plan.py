@@ -3,19 +3,13 @@
 import json
 
 import pytest
-from pyproj import Transformer
 
-from helpers import write_dem
+from helpers import waypoints, write_dem
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.mapfile import open_map
 from orthonav.ground.planning.route import Height, read_route
 
 FRAME = LocalFrame(46.5, 2.5)
 CORNERS_EN_M = [(-1500.0, -1500.0), (-1500.0, 1500.0), (1500.0, 1500.0)]
-
-
-def places_of(points_en_m, frame=FRAME):
-    return tuple(zip(*(each.tolist() for each in frame.latlon_from_en(points_en_m)), strict=True))
 
 
 @pytest.fixture
@@ -44,7 +38,7 @@ def dem(tmp_path):
 def table(tmp_path):
     """An L of 3 + 3 km, flown 700 m above the sea, the first leg with a band of its own."""
     path = tmp_path / "route.csv"
-    rows = [f"{lat},{lon},700" for lat, lon in places_of(CORNERS_EN_M)]
+    rows = [f"{lat},{lon},700" for lat, lon in waypoints(FRAME, CORNERS_EN_M)]
     lines = [f"{row},{band}" for row, band in zip(rows, (300, "", ""), strict=True)]
     path.write_text("\n".join(["lat,lon,amsl_m,band_m", *lines]))
     return path
@@ -132,31 +126,3 @@ def test_impossible_plans_are_refused(run, table, camera, dem, tmp_path, argumen
     files = {"TABLE": table, "CAMERA": camera, "DEM": dem, "FAR": far}
     done = run("plan", *(files.get(argument, argument) for argument in arguments))
     assert done.code == code and message in done.err and done.out == ""
-
-
-@pytest.mark.long
-def test_the_bands_of_a_route_are_built_and_it_is_flown(run, make_ortho, tmp_path):
-    ortho = make_ortho(tmp_path / "past.tif", gsd_m=2.0)  # 800 m across
-    lon, lat = Transformer.from_crs(2154, 4326, always_xy=True).transform(700_400, 6_599_600)
-    frame = LocalFrame(lat, lon)
-    places = places_of([(-150.0, -150.0), (-150.0, 150.0), (150.0, 150.0)], frame)
-    path = tmp_path / "route.gpx"
-    points = "".join(f'<rtept lat="{lat}" lon="{lon}"/>' for lat, lon in places)
-    path.write_text(f"<gpx><rte>{points}</rte></gpx>")
-    table = tmp_path / "route.csv"
-    rows = [f"{lat};{lon};{band}" for (lat, lon), band in zip(places, (40, 120, ""), strict=True)]
-    table.write_text("\n".join(["lat;lon;band_m", *rows]))
-    sizes = ["--gsd-m", 2, "--tile-px", 64, "--overlap", 0.75]
-    planned = run("plan", "--route", table, *sizes, "--json")
-    made = run(
-        "build", "--ortho", ortho, "--route", table, *sizes, "--no-registration",
-        "--out", tmp_path / "a.onav",
-    )  # fmt: skip
-    assert (made.code, made.err) == (0, "")
-    sheet = open_map(tmp_path / "a.onav").manifest.sheets[0]
-    assert sheet.tiles == json.loads(planned.out)["map"]["tiles"]
-    flown = run(
-        "simulate", "--ortho", ortho, "--route", path, "--agl-m", 60, "--spacing-m", 100,
-        "--out", tmp_path / "flight", "--json",
-    )  # fmt: skip
-    assert json.loads(flown.out)["views"] == 7

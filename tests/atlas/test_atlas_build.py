@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers import content
 from orthonav.core.errors import (
     AreaError,
     AtlasError,
@@ -57,11 +58,6 @@ def made(place, *orthos, **request):
     request = {"recipe": SMALL, "index": False, **request}
     with SerialRunner() as runner:
         return build_atlas(AtlasRequest(str(place), orthos, **request), runner)
-
-
-def content(place):
-    paths = sorted(path for path in Path(place).rglob("*") if path.is_file())
-    return {str(path.relative_to(place)): path.read_bytes() for path in paths}
 
 
 def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
@@ -257,17 +253,6 @@ def test_a_disk_that_stays_full_ends_the_build(ortho, tmp_path, monkeypatch):
     monkeypatch.setattr(building, "GIVE_UP_AFTER", 2)
     result = made(tmp_path / "atlas", ortho)
     assert len(result.failed) == 2 and result.untried == COUNT - 2 and not result.is_complete
-
-
-def test_sheets_stay_where_the_snapshot_cannot_be_written(built, ortho, tmp_path, monkeypatch):
-    def full(atlas):
-        raise StorageError("disk full")
-
-    place = shutil.copytree(built[0], tmp_path / "atlas")
-    monkeypatch.setattr(Atlas, "snapshot", full)
-    with pytest.raises(StorageError, match="disk full"):
-        made(place, ortho)
-    assert len(Atlas.open(place).sheets()) == COUNT
 
 
 def test_only_sheets_of_the_area_are_planned(ortho, built):

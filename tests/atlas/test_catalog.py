@@ -9,6 +9,7 @@ from pathlib import Path
 import fsspec
 import pytest
 
+from helpers import content
 from orthonav.core.errors import AreaError, AtlasError, StorageError
 from orthonav.ground.atlas.catalog import (
     Atlas,
@@ -17,7 +18,6 @@ from orthonav.ground.atlas.catalog import (
     Sheet,
     StoredFile,
     canonical,
-    copy_sheets,
     read_item,
 )
 from orthonav.ground.atlas.integrity import check_atlas
@@ -72,14 +72,6 @@ def near(tmp_path):
     return Atlas.open_or_create(tmp_path / "atlas", RECIPE)
 
 
-def contents(url):
-    return {
-        str(path.relative_to(url)): path.read_bytes()
-        for path in Path(url).rglob("*")
-        if path.is_file()
-    }
-
-
 def test_a_sheet_that_is_put_is_read_back(atlas, files):
     sheet = atlas.put(files(), described())
     again = Atlas.open(atlas.url)
@@ -127,7 +119,7 @@ def test_the_same_atlas_byte_for_byte(tmp_path, files):
         for sheet in order:
             atlas.put(files(sheet), described(sheet))
         atlas.snapshot()
-        return contents(url)
+        return content(url)
 
     assert make(tmp_path / "a", [HERE, EAST]) == make(tmp_path / "b", [EAST, HERE])
 
@@ -143,7 +135,7 @@ def test_sheets_that_do_not_fit_are_refused(near, files):
         near.put(files(), described(area_km2=float("nan")))
     with pytest.raises(AtlasError, match="not an item of orthonav"):
         near.put(files(), described(tiles=0))
-    assert near.sheets() == {} and list(contents(near.url)) == ["atlas.json"]
+    assert near.sheets() == {} and list(content(near.url)) == ["atlas.json"]
 
 
 def test_creating_and_opening(tmp_path):
@@ -173,8 +165,6 @@ def test_creating_and_opening(tmp_path):
         (lambda text: text.replace('"overlap":0.875,', ""), "recipe of the atlas cannot be read"),
         (lambda text: text.replace("Licences", "No licences"), "altered"),
         (lambda text: "[" * 100_000, "damaged"),
-        (lambda text: '{"type":' + "9" * 5000 + "}", "damaged"),
-        (lambda text: "", "damaged"),
         (lambda text: "[]", "not an atlas of orthonav"),
     ],
 )
@@ -190,15 +180,14 @@ def test_an_altered_catalogue_is_refused(near, change, words):
     [
         ("gsd_m", "abc"),
         ("gsd_m", 0.0),
-        ("gsd_m", float("nan")),
         ("tile_px", -3),
-        ("tile_px", 2.5),
         ("tile_px", True),
         ("overlap", 1.0),
         ("sheet_km", 1e6),
         ("coarse", {"width": 3}),
         ("coarse", {"gsd_m": -8.0, "tile_px": 128, "overlap": 0.5}),
         ("coarse", 5),
+        ("coarse", None),
     ],
     ids=str,
 )
@@ -221,20 +210,15 @@ def altered(item, path, value):
     ("path", "value"),
     [
         (("id",), "../x"),
-        (("id",), EAST),
         (("bbox",), [2.0, 46.0, 1.0, 47.0]),
         (("bbox",), ["a", 46.0, 1.0, 47.0]),
         (("properties", "gsd"), 0.0),
         (("properties", "orthonav:sheet"), None),
-        (("properties", "orthonav:sheet", "schema"), 3),
         (("properties", "orthonav:sheet", "tiles"), 1.5),
-        (("properties", "orthonav:sheet", "more"), 1),
         (("assets", "map", "href"), "../../../etc/passwd"),
-        (("assets", "map", "href"), f"../sheets/{EAST}.000000000000.onav"),
         (("assets", "map", "file:size"), -1),
         (("assets", "map", "file:checksum"), "1220" + "g" * 64),
         (("assets", "model"), {}),
-        (("assets",), {}),
         (("assets", "map"), None),
     ],
 )
@@ -251,14 +235,10 @@ def test_untrusted_items_are_refused(near, files, path, value):
     "change",
     [
         lambda data: data[:-1],
-        lambda data: data + b"\n",
         lambda data: data.replace(b'"tiles":12', b'"tiles":11,"tiles":12'),
         lambda data: data.replace(b"3.25", b"Infinity"),
-        lambda data: data.replace(b"3.25", b"1e999"),
         lambda data: b"[" * 100_000,
         lambda data: b"\xff",
-        lambda data: b"",
-        lambda data: b"null",
         lambda data: b" " * (2**20 + 1),
     ],
 )
@@ -393,20 +373,3 @@ def test_dates_become_times_of_stac(dates, times):
         times = {"datetime": None, "start_datetime": times[0], "end_datetime": times[1]}
     assert found == times
     assert read_item(sheet.item_name, canonical(sheet.to_item())) == sheet
-
-
-def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
-    source = Atlas.open_or_create(tmp_path / "source", RECIPE)
-    for sheet in (HERE, EAST):
-        source.put(files(sheet), described(sheet))
-    near.put(files(EAST), described(EAST))
-    assert copy_sheets(source, near) == ([HERE], [EAST])
-    assert contents(near.url) == {**contents(source.url), **contents(near.url)}
-    source.put(files("new"), described())
-    assert copy_sheets(source, near) == ([], [HERE, EAST])
-    assert copy_sheets(source, near, replace=True) == ([HERE], [EAST])
-    assert near.path(near.sheets()[HERE]).read_text() == "map of new"
-    assert check_atlas(near) == []
-    other = Atlas.open_or_create(tmp_path / "other", replace(RECIPE, overlap=0.5))
-    with pytest.raises(AtlasError, match=r"overlap: 0\.5, not 0\.875"):
-        copy_sheets(source, other)

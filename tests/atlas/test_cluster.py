@@ -11,8 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from test_atlas_build import RECIPE, SMALL, content, made
+from test_atlas_build import RECIPE, SMALL, made
 
+from helpers import content
 from orthonav.core.errors import MissingExtraError, UsageError
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from helpers import textured, write_dem
+from helpers import box_deg, textured, waypoints, write_dem
 from orthonav.core.errors import (
     AreaError,
     AtlasError,
@@ -24,30 +24,27 @@ from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, Telemetry, View
-from orthonav.core.tiles.cells import CellLayout
-from orthonav.core.tiles.whitened import CellSheet
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
-from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe
+from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, CoarseRecipe
 from orthonav.ground.atlas.cluster import SerialRunner
 from orthonav.ground.atlas.cut import (
     Warp,
-    check_shown,
     cut_heights,
     cut_map,
     least_roughness_m,
     opened_sheets,
     steepest,
 )
-from orthonav.ground.build.sheet import Block, grid_of
+from orthonav.ground.build.sheet import Block
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Route
 
+COARSE = CoarseRecipe(gsd_m=4.0, tile_px=32, overlap=0.5)
 RECIPE = AtlasRecipe(
-    gsd_m=1.0, tile_px=64, overlap=0.75, calibration_views=2, sheet_km=0.3, coarse=None
+    gsd_m=1.0, tile_px=64, overlap=0.75, calibration_views=2, sheet_km=0.3, coarse=COARSE
 )
 SIDE_PX = 1100
-LAYOUT = CellLayout(2, 2)
 
 
 @pytest.fixture(scope="module")
@@ -74,12 +71,12 @@ def names(middle):
 @pytest.fixture(scope="module")
 def folder(ortho, names, middle, tmp_path_factory):
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
-    recipe = {name: value for name, value in asdict(RECIPE).items() if name != "coarse"}
     request = AtlasRequest(
         str(folder),
         [ortho],
-        recipe | {"coarse": None},
+        asdict(RECIPE),
         bounds_around(middle, 190),
+        index=False,
         dem=write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0),
         surface=[write_dem(folder.parent / "trees.tif", middle, wooded, half_m=900.0, px_m=2.0)],
         dem_datum="msl",
@@ -112,8 +109,7 @@ def atlas(folder, tmp_path):
 
 
 def bounds_around(frame, half_m):
-    lat, lon = frame.latlon_from_en([[-half_m, -half_m], [half_m, half_m]])
-    return float(lon[0]), float(lat[0]), float(lon[1]), float(lat[1])
+    return box_deg(frame, -half_m, -half_m, half_m, half_m)
 
 
 def area_around(frame, half_m):
@@ -121,7 +117,7 @@ def area_around(frame, half_m):
 
 
 def line(frame, *points_en_m):
-    return Route(tuple(zip(*(c.tolist() for c in frame.latlon_from_en(points_en_m)), strict=True)))
+    return Route(waypoints(frame, points_en_m))
 
 
 @pytest.fixture(scope="module")
@@ -268,19 +264,6 @@ def test_missing_sheets_are_named_where_the_others_show_nothing(
 def centre_of(name):
     west, south, east, north = RECIPE.sheets.bounds_deg(name)
     return (south + north) / 2, (west + east) / 2
-
-
-def test_imagery_that_is_missing_under_the_route_is_an_error(atlas, middle, caplog):
-    area = Area.from_route(line(middle, [-150, 0], [150, 0]), 200)
-    grid = grid_of(area, 1.0, 1.0, RECIPE.tile_px, RECIPE.overlap)
-    cells = CellSheet(LAYOUT, grid.height_px, grid.width_px, 7)
-    cells.valid[:, : cells.valid.shape[1] // 2] = 1
-    with pytest.raises(AtlasError, match="of the route has no imagery"):
-        check_shown(area, grid, cells, atlas, allow_holes=False)
-    check_shown(area, grid, cells, atlas, allow_holes=True)
-    assert "of the area has no imagery" in caplog.text
-    cells.valid[:] = 1
-    check_shown(area, grid, cells, atlas, allow_holes=False)
 
 
 def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):

@@ -1,6 +1,5 @@
 """Fetching in tests: without pauses, from servers on the loopback, and a real WMTS and WMS."""
 
-import io
 import warnings
 from socketserver import ThreadingMixIn
 from threading import Thread
@@ -106,14 +105,4 @@ def cog_bytes(tmp_path_factory):
     path = terrain.write_tif(
         tmp_path_factory.mktemp("cog") / "terrain.tif", "EPSG:32631", size=500, driver="COG"
     )
-    return io.BytesIO(path.read_bytes()).getvalue()
-
-
-@pytest.fixture
-def names_below():
-    """Function that lists everything below a folder, hidden temporaries included."""
-
-    def names(folder):
-        return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
-
-    return names
+    return path.read_bytes()

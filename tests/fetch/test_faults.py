@@ -66,14 +66,10 @@ REASONS = {
     "403": "HTTP 403",
     "nothing": "empty answer",
 }
-SLOW = {"half a picture", "cut short", "500", "reset"}
-"""Faults that a test of temporary faults has in every run."""
+TEMPORARY = ["a page", "half a picture", "cut short", "500", "429", "reset"]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in FAULTS],
-)
+@pytest.mark.parametrize("name", ["a page", *sorted(FAULTS.keys() - TEMPORARY)])
 def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name):
     with servers.serving(tiles_but(FAULTS[name])) as server:
         with pytest.raises(FetchError, match=r"\d of \d+ tiles failed .*--allow-holes") as raised:
@@ -91,7 +87,7 @@ def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name)
     assert not (tmp_path / "ortho.tif.tiles").exists()
 
 
-@pytest.mark.parametrize("name", ["a page", "half a picture", "cut short", "500", "429", "reset"])
+@pytest.mark.parametrize("name", TEMPORARY)
 def test_a_temporary_fault_is_overcome(take, name):
     with servers.serving(tiles_but(FAULTS[name], lasting=False)) as server:
         result, path = take(source(server))
@@ -164,13 +160,13 @@ def test_an_error_of_a_service_that_quotes_the_key_does_not_show_it(take, protoc
         ({"out": "folder.tif"}, "folder or a device"),
     ],
 )
-def test_limits_end_a_fetch_before_it_starts(take, tmp_path, names_below, options, words):
+def test_limits_end_a_fetch_before_it_starts(take, tmp_path, names_in, options, words):
     (tmp_path / "folder.tif").mkdir()
     with servers.serving(servers.tiles) as server:
         with pytest.raises((FetchError, OutputError, UsageError), match=words):
             take(source(server), **options)
         assert not server.log
-    assert names_below(tmp_path) == ["folder.tif"]
+    assert names_in(tmp_path) == ["folder.tif"]
 
 
 def test_a_broken_entry_of_the_cache_is_fetched_again(take, tmp_path):
@@ -196,7 +192,7 @@ def command_for(server, bounds, out):
 
 
 @pytest.mark.long
-def test_a_killed_fetch_resumes(take, tmp_path, names_below):
+def test_a_killed_fetch_resumes(take, tmp_path, names_in):
     """SIGKILL after some tiles; the same fetch then asks only for the rest."""
     out = tmp_path / "ortho.tif"
 
@@ -219,7 +215,7 @@ def test_a_killed_fetch_resumes(take, tmp_path, names_below):
     assert 0 < asked <= result.estimate.tiles - 4
     shift, worst, valid = terrain.offset_px(out)
     assert np.abs(shift).max() < 0.05 and worst <= 1 and valid == 1.0
-    assert names_below(tmp_path) == ["ortho.tif"]
+    assert names_in(tmp_path) == ["ortho.tif"]
 
 
 def test_an_interrupt_leaves_no_half_file(tmp_path):

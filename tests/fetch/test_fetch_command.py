@@ -84,14 +84,14 @@ def test_a_route_and_its_band(command, tmp_path):
     assert code == 2 and "--band-m" in stderr
 
 
-def test_a_dry_run_fetches_no_tile(command, area, tmp_path, names_below):
+def test_a_dry_run_fetches_no_tile(command, area, tmp_path, names_in):
     with servers.serving(servers.tiles) as server:
         source = f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png"
         code, stdout, _ = command(area, "--source", source, "--dry-run")
         assert code == 0 and "would fetch" in stdout and "tiles" in stdout and "MB" in stdout
         code, stdout, _ = command(area, "--source", source, "--dry-run", "--json")
         assert json.loads(stdout)["tiles"] > 0 and not server.log
-    assert names_below(tmp_path) == []
+    assert names_in(tmp_path) == []
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def offered(monkeypatch):
 
 
 def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
-    found, step, west, _ = terrain.height_files(tmp_path)
+    found, step, west, north = terrain.height_files(tmp_path)
     url, asked_for = [], []
     out = tmp_path / "ortho.tif"
     with (
@@ -138,9 +138,12 @@ def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
     assert area in words and words[-1] == str(tmp_path / "ortho.onav")
     box = asked_for[0]["bbox"]  # beyond the imagery by what oblique views see
     assert (box[3] - terrain.LAT_DEG) * terrain.NORTH_M > 1200
-    dem = open_dem(dem_path)
-    lat, lon = np.array([terrain.LAT_DEG]), np.array([west - 3 * step])
+    dem = open_dem(dem_path)  # its datum is not asked for
+    assert dem.datum.name == "EGM2008 height" and not dem.datum.above_ellipsoid
+    lat = terrain.LAT_DEG + np.linspace(-5, 5, 11) * step
+    lon = west - np.linspace(0.5, 8, 11) * step
     np.testing.assert_allclose(dem(lat, lon), terrain.heights(lat, lon), atol=0.05)
+    assert np.isnan(dem(np.array([north - 19 * step]), np.array([west + 6.5 * step])))
 
 
 @pytest.mark.parametrize("broken", [False, True])

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers import waypoints
 from orthonav.core.errors import CameraError, RouteError
 from orthonav.core.geo.camera import Camera, footprint_en_m
 from orthonav.core.geo.frames import LocalFrame
@@ -82,7 +83,7 @@ def test_what_speaks_against_a_map(agl_m, gsd_m, tile_px, expected):
 
 FRAME = LocalFrame(46.5, 2.5)
 ENDS = np.array([[0.0, 0.0], [0.0, 4000.0], [2000.0, 4000.0]])
-PLACES = tuple(zip(*(each.tolist() for each in FRAME.latlon_from_en(ENDS)), strict=True))
+PLACES = waypoints(FRAME, ENDS)
 
 
 def slope(lat, lon):

@@ -135,13 +135,10 @@ def test_a_landing_pattern_is_flown_to_its_end(read, kind, approach):
     "document, message",
     [
         ("", "is empty"),
-        ("{", "cannot be read as JSON"),
         ("[]", "must be a JSON object"),
         ({"fileType": "Parameters"}, "fileType 'Plan', got 'Parameters'"),
         ({"fileType": "Plan"}, "cannot be read .mission is missing"),
-        ({"fileType": "Plan", "mission": {"items": 3}}, "cannot be read"),
         (plan(), "no waypoint with a position"),
-        (plan(simple(206)), "no waypoint with a position"),
         (plan(3), "cannot be read"),
         (plan({"type": "Other"}), "item 1 of the plan is a 'Other'"),
         (plan(simple(16, A) | {"params": [1, 2]}), "cannot be read .coordinate is missing"),
@@ -156,10 +153,7 @@ def test_a_landing_pattern_is_flown_to_its_end(read, kind, approach):
             "item 2 of the plan is a 'StructureScan': only surveys, .*remove it from the plan",
         ),
         (plan(transects("survey", ())), "item 1 of the plan .survey. has no Visual"),
-        (plan({"type": "ComplexItem", "complexItemType": "survey"}), "no VisualTransectPoints"),
-        (plan(transects("survey", ((1,),))), "cannot be read"),
         (plan(transects("CorridorScan", (A, B), CorridorWidth=-5)), "band of a leg must be wider"),
-        (plan({"type": "ComplexItem", "complexItemType": "fwLandingPattern"}), "cannot be read"),
     ],
 )
 def test_invalid_plans_are_refused(read, document, message):
@@ -207,10 +201,7 @@ def test_older_waypoint_files_have_no_home(read):
         ("QGC WPL 100\n1", "must begin with 'QGC WPL 110', got 'QGC WPL 100'"),
         ("QGC WPL 110\n1\t2\n", "line 2 of the waypoint file has 2 values, expected 12"),
         (WPL.replace("47.40", "north"), "line 5, column 9 must be a number"),
-        (WPL.replace("47.40", "nan"), "line 5, column 9 must be a number"),
-        (WPL.replace("47.40", "470"), "a latitude within 90"),
         (WPL.replace("\t82\t", "\t82.5\t"), "line 7: number, frame and command must be whole"),
-        (WPL.replace("4\t0\t10", "4\t0\t1"), "MAV_FRAME 1"),
     ],
 )
 def test_invalid_waypoint_files_are_refused(read, text, message):

@@ -38,17 +38,13 @@ def marks_off_px(grey, gsd_m):
 @pytest.mark.parametrize(
     "crs, frame, source_gsd_m, turn_deg, gsd_m",
     [
-        pytest.param(LAMBERT, FRAME, 1.0, 0, 1.0, marks=pytest.mark.slow),
         (LAMBERT, BREST, 1.0, 0, 1.0),
         (LAMBERT, BREST, 0.2, 0, 1.0),
-        pytest.param(LAMBERT, BREST, 0.4, 0, 1.0, marks=pytest.mark.slow),
         (LAMBERT, FRAME, 1.0, 30, 1.0),
         (LAMBERT, BREST, 0.5, -100, 1.0),
         ("EPSG:3857", FRAME, 1.0, 0, 1.0),
         ("EPSG:3857", VOSGES, 0.25, 0, 1.0),
-        pytest.param("EPSG:4326", FRAME, 1.0, 0, 1.0, marks=pytest.mark.slow),
         ("EPSG:4326", BREST, 0.3, 0, 1.0),
-        pytest.param("EPSG:32632", VOSGES, 0.6, 0, 1.0, marks=pytest.mark.slow),
         ("EPSG:32632", VOSGES, 0.6, 0, 0.5),
         ("EPSG:4258", FRAME, 0.8, 0, 2.0),
         ("ESRI:102014", FRAME, 1.0, 0, 1.0),
@@ -83,9 +79,7 @@ def rich_scene(size, source_gsd_m, seed=0):
     [
         (LAMBERT, FRAME, 1.0),
         (LAMBERT, BREST, 1.0),
-        pytest.param(LAMBERT, BREST, 0.2, marks=pytest.mark.slow),
         (LAMBERT, FRAME, 0.4),
-        pytest.param(LAMBERT, FRAME, 0.7, marks=pytest.mark.slow),
         ("EPSG:3857", VOSGES, 0.3),
         ("EPSG:4326", FRAME, 1.0),
     ],

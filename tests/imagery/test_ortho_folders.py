@@ -86,6 +86,11 @@ def test_a_package_of_bd_ortho(tmp_path, whole, caplog):
         (["m_4710060_ne_14_060_20200715"], "2020-07-15", None),
         (["tile_7", "ortho_2019"], "2019", None),
         (["ortho_2019_00"], "2019", None),
+        (["dop_2048x2048", "tile_2000x2000", "1024X1999_b", "tile_2000px"], None, None),
+        (["tile_2040_1899", "1234567"], None, None),
+        (["tile_2000_px_2018"], "2018", None),
+        (["bordeaux2018"], "2018", None),
+        (["2000x2000_2019-05"], "2019-05", None),
     ],
 )
 def test_what_names_tell(names, date, system):

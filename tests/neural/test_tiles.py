@@ -1,11 +1,9 @@
 """Tiles equal their part of the sheet."""
 
-import time
-
 import numpy as np
 import pytest
 
-from orthonav.research.tiles import SheetTiles, epoch_batches, made_ahead
+from orthonav.research.tiles import SheetTiles, epoch_batches
 
 TILE_PX = 32
 
@@ -49,22 +47,3 @@ def test_batches_hold_every_tile_once_in_random_order(count, batch):
     together = np.concatenate(plan)
     np.testing.assert_array_equal(np.sort(together), np.arange(count))
     assert count == 1 or not np.array_equal(together, np.arange(count))
-
-
-def test_batches_come_in_order_whichever_thread_is_first():
-    plan = [np.array([number]) for number in range(12)]
-
-    def make(indices):
-        time.sleep(0.002 * (5 - int(indices[0]) % 6))
-        return (indices * 10,)
-
-    made = [int(array[0]) for (array,) in made_ahead(make, plan, workers=3)]
-    assert made == [10 * number for number in range(12)]
-
-
-def test_an_error_in_a_thread_is_raised():
-    def make(indices):
-        raise ValueError("broken tile")
-
-    with pytest.raises(ValueError, match="broken tile"):
-        list(made_ahead(make, [np.array([0])], workers=2))

@@ -2,13 +2,16 @@
 
 import errno
 import os
+import threading
+import time
 
 import cv2
 import numpy as np
 import pytest
 
-from helpers import textured
-from orthonav.core.errors import AreaError, OutputError, UsageError
+from helpers import box_deg, textured, waypoints
+from orthonav.core.cores import in_order
+from orthonav.core.errors import AreaError, ImageryError, OutputError, UsageError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.localize.confidence import LogisticConfidence, RegisteredConfidence
@@ -60,15 +63,6 @@ def built(ortho, folder, name="map.onav", **request):
     orthos = ortho if isinstance(ortho, list) else [ortho]
     build_map(BuildRequest(orthos, folder / name, **request))
     return open_map(folder / name)
-
-
-def bounds_deg(frame, west_m, south_m, east_m, north_m):
-    lat, lon = frame.latlon_from_en([[west_m, south_m], [east_m, north_m]])
-    return float(lon[0]), float(lat[0]), float(lon[1]), float(lat[1])
-
-
-def route_of(frame, *points_en_m):
-    return Route(tuple(zip(*(c.tolist() for c in frame.latlon_from_en(points_en_m)), strict=True)))
 
 
 def centres_en_m(opened):
@@ -124,7 +118,7 @@ def test_the_whole_imagery_is_covered(ortho, tmp_path, frame):
 def test_bounds_are_covered(ortho, tmp_path, frame, tile_px, overlap):
     box = (-120.0, -60.0, 77.3, 131.9)
     opened = built(
-        ortho, tmp_path, bounds_deg=bounds_deg(frame, *box), overlap=overlap, tile_px=tile_px
+        ortho, tmp_path, bounds_deg=box_deg(frame, *box), overlap=overlap, tile_px=tile_px
     )
     sheet = opened.manifest.sheets[0]
     # To whole micro-cells, of which 32 make a tile.
@@ -139,7 +133,9 @@ def test_bounds_are_covered(ortho, tmp_path, frame, tile_px, overlap):
 
 def test_a_band_around_a_route_is_covered(ortho, tmp_path, frame):
     a, b = np.array([-110.0, -90.0]), np.array([100.0, 60.0])
-    opened = built(ortho, tmp_path, route=route_of(frame, a, b), band_m=80.0, overlap=0.875)
+    opened = built(
+        ortho, tmp_path, route=Route(waypoints(frame, [a, b])), band_m=80.0, overlap=0.875
+    )
     points = random_points(-160, -140, 150, 110)
     near = inside_band(points, a, b, 40.0)
     stride_m = opened.manifest.sheets[0].grid.stride_m
@@ -161,6 +157,34 @@ def test_blocks_do_not_matter(small_ortho, tmp_path, monkeypatch):
     )
     assert scores.min() > 0.995
     np.testing.assert_array_equal(centres_en_m(whole), centres_en_m(blocks))
+
+
+@pytest.mark.parametrize("tile_px", [64, 96], ids=["chunks in one block", "chunks over blocks"])
+def test_any_number_of_workers_gives_the_same_bytes(make_ortho, tmp_path, monkeypatch, tile_px):
+    grey = textured((300, 300))
+    grey[75:172, 98:142] = 0
+    ortho = make_ortho(tmp_path / "2019.tif", grey, nodata=0)
+    monkeypatch.setattr("orthonav.ground.build.sheet.BLOCK_PX", 128)
+    for workers in (1, 3):
+        built(ortho, tmp_path, f"{workers}.onav", tile_px=tile_px, workers=workers, **WITH_LAYER)
+    assert (tmp_path / "1.onav").read_bytes() == (tmp_path / "3.onav").read_bytes()
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_first_error_is_raised_and_no_thread_stays(workers):
+    before = threading.active_count()
+
+    def failing(item):
+        time.sleep(0.002 * (5 - item % 6))  # later ones are first
+        if item in (7, 8):
+            raise ImageryError(f"item {item}")
+        return item
+
+    found = []
+    with pytest.raises(ImageryError, match="item 7"):
+        for item in in_order(failing, range(20), workers):
+            found.append(item)
+    assert found == list(range(7)) and threading.active_count() == before
 
 
 def test_the_manifest(small_ortho, tmp_path):
@@ -204,7 +228,7 @@ REFUSED = [
 def test_what_cannot_be_built(ortho, tmp_path, frame, names_in, request_, message):
     box = request_.get("bounds_deg", (0,))
     if max(box) > 180:
-        request_ = {"bounds_deg": bounds_deg(frame, *box)}
+        request_ = {"bounds_deg": box_deg(frame, *box)}
     with pytest.raises((UsageError, AreaError), match=message):
         built(ortho, tmp_path, **request_)
     assert names_in(tmp_path) == []

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from helpers import textured
+from helpers import textured, waypoints
 from orthonav.core.mapfile import GreyLayer, open_map
 from orthonav.core.mapfile.layer import part_names
 from orthonav.ground.build import BuildRequest, build_map
@@ -163,8 +163,7 @@ def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
     wide = make_ortho(tmp_path / "wide.tif", grey)
     outline = Mosaic.open([wide]).outline_latlon_deg
     frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
-    ends = frame.latlon_from_en(np.array([[-400.0, -400.0], [400.0, 400.0]]))
-    route = Route(tuple(zip(*(each.tolist() for each in ends), strict=True)))
+    route = Route(waypoints(frame, [[-400.0, -400.0], [400.0, 400.0]]))
     opened = built(wide, tmp_path, route=route, band_m=100.0)
     layer = GreyLayer.of(opened)
     rows, cols = layer.shape(0)

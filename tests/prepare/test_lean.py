@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from helpers import box_deg
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.mapfile.manifest import Lean
@@ -75,9 +76,7 @@ def found(make_ortho, tmp_path):
     middle = 700_000 + SIDE_M / 2, 6_600_000 - SIDE_M / 2  # of what `make_ortho` writes
     lon, lat = pyproj.Transformer.from_crs(2154, 4326, always_xy=True).transform(*middle)
     half_m = SIDE_M / 2 - 10
-    ends = LocalFrame(lat, lon).latlon_from_en(np.array([[-half_m] * 2, [half_m] * 2]))
-    (south, north), (west, east) = ends
-    area = Area.from_bounds((float(west), float(south), float(east), float(north)))
+    area = Area.from_bounds(box_deg(LocalFrame(lat, lon), -half_m, -half_m, half_m, half_m))
 
     def in_picture(grey, high):
         path = make_ortho(tmp_path / "ortho.tif", grey, gsd_m=PX_M)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from helpers import write_dem
+from helpers import box_deg, write_dem
 from orthonav.core.errors import AreaError, ImageryError, MapFileError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
@@ -39,8 +39,7 @@ def town(east_m, north_m):
 
 @pytest.fixture(scope="module")
 def area():
-    (south, north), (west, east) = LOCAL.latlon_from_en(np.array([[-200.0] * 2, [200.0] * 2]))
-    return Area.from_bounds((float(west), float(south), float(east), float(north)))
+    return Area.from_bounds(box_deg(LOCAL, -200.0, -200.0, 200.0, 200.0))
 
 
 @pytest.fixture(scope="module")

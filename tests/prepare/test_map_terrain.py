@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from helpers import write_dem
+from helpers import waypoints, write_dem
 from orthonav.cli.source import map_heights
 from orthonav.core.errors import AreaError
 from orthonav.core.flight import open_flight, read_truth
@@ -92,8 +92,7 @@ def test_terrain_of_a_corridor_is_small_and_holes_are_named(tmp_path, caplog):
         return heights
 
     path = write_dem(tmp_path / "dem.tif", FRAME, hill, half_m=4000, px_m=10, change=holed)
-    ends = FRAME.latlon_from_en(np.array([[-3500.0, -3500.0], [3500.0, 3500.0]]))
-    route = Route(tuple(zip(*(each.tolist() for each in ends), strict=True)))
+    route = Route(waypoints(FRAME, [[-3500.0, -3500.0], [3500.0, 3500.0]]))
     sizes = {}
     for name, area in (("all", Area.from_bounds((2.46, 46.47, 2.54, 46.53))),
                        ("band", Area.from_route(route, 300))):  # fmt: skip
@@ -181,11 +180,10 @@ def flown(area, frame, dem, tmp_path_factory):
     """A flight at a constant altitude over the hill."""
     from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
 
-    corners = np.array([[-350.0, -250.0], [350.0, -250.0], [350.0, 250.0]])
-    lat, lon = frame.latlon_from_en(corners)
+    corners = [[-350.0, -250.0], [350.0, -250.0], [350.0, 250.0]]
     out = tmp_path_factory.mktemp("flown") / "flight"
     request = SimulateRequest(
-        [area.present], out, route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
+        [area.present], out, route=Route(waypoints(frame, corners)),
         agl_m=250.0, spacing_m=70.0, camera=area.camera, errors=Errors(yaw_std_deg=3.0),
         terrain=open_dem(dem, "msl"), seed=1,
     )  # fmt: skip

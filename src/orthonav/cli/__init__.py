@@ -129,7 +129,7 @@ def _exported(options: argparse.Namespace) -> list[Path]:
 def _written(options: argparse.Namespace, since_s: float) -> str:
     """Which of the paths among the options were written since a time; outputs appear when whole."""
     paths = [value for value in vars(options).values() if isinstance(value, Path)]
-    paths += [Path(f"{path}{kept}") for path in paths for kept in (".work", ".tiles")]
+    paths += [Path(f"{path}.tiles") for path in paths]
     paths += _exported(options)
     since_s -= 0.01  # times of files lag behind the clock
     new = [path for path in paths if path.exists() and path.stat().st_mtime > since_s]

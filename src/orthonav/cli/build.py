@@ -46,9 +46,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_area(parser.add_argument_group("area (default: all imagery)"))
     add_recipe(parser.add_argument_group("map"))
     group = parser.add_argument_group("work")
-    text = "folder of finished blocks, and of checkpoints and images of a network's training, from "
-    text += "which an interrupted build resumes (default: MAP.onav.work for large areas, removed "
-    group.add_argument("--work", type=Path, metavar="DIR", help=f"{text}when the map is written)")
+    text = "folder of checkpoints and images of a network's training, from which an interrupted "
+    group.add_argument("--work", type=Path, metavar="DIR", help=f"{text}training resumes")
     add_options(group, "--workers")
 
 

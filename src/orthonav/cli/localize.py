@@ -192,8 +192,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     require_extras("localize ATLAS")
     from orthonav.core.flight.fixes import FlightDigest, Identity
     from orthonav.ground.atlas.catalog import Atlas
-    from orthonav.ground.atlas.locate import AtlasLocator
-    from orthonav.ground.atlas.search import SheetSearch
+    from orthonav.ground.atlas.locate import AtlasLocator, SheetSearch
     from orthonav.ground.recordings.export import export_all, export_of
 
     of_maps = (

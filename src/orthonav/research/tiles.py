@@ -6,19 +6,11 @@ the sheet before tiles are cut out of it, unless tiles are given as `singles`.
 """
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-BATCHES_AHEAD = 2
-"""Batches made ahead at least; with more threads, one each."""
-
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,17 +83,3 @@ def epoch_batches(count: int, batch: int, seed: int, epoch: int) -> list[NDArray
     order = np.random.default_rng([seed, epoch]).permutation(count)
     parts = np.array_split(order, math.ceil(count / batch))
     return [np.resize(part, max(len(part), min(2, batch))) for part in parts]
-
-
-def made_ahead(
-    make: Callable[[NDArray[np.intp]], Made], plan: Sequence[NDArray[np.intp]], workers: int
-) -> Iterator[Made]:
-    """Results of `make` for each batch of the plan, in order, computed by threads a few ahead."""
-    with ThreadPoolExecutor(max(1, workers)) as pool:
-        waiting: deque[Future[Made]] = deque()
-        for indices in plan:
-            waiting.append(pool.submit(make, indices))
-            if len(waiting) > max(BATCHES_AHEAD, workers):
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()

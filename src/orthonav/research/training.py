@@ -39,13 +39,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from orthonav.core.cores import usable_cores
+from orthonav.core.cores import in_order, usable_cores
 from orthonav.core.errors import OrthonavError, OutputError
 from orthonav.core.files import Progress, replacing, write_text
 from orthonav.core.tiles.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
 from orthonav.research.autoencoder import AutoEncoder, Reconstruction, reconstructions
 from orthonav.research.export import export_encoder
-from orthonav.research.tiles import SheetTiles, epoch_batches, made_ahead
+from orthonav.research.tiles import SheetTiles, epoch_batches
 from orthonav.research.triplet import Positive, Triplets
 
 log = logging.getLogger(__name__)
@@ -517,7 +517,7 @@ class _Feed:
         """Tensors of each batch, from number `first` up to `end`, exclusive."""
         plan = epoch_batches(self.count, self.batch, self.seed, epoch)
         workers = workers_of(self.means, self.device)
-        for tensors in made_ahead(partial(self._made, epoch), plan[first:end], workers):
+        for tensors in in_order(partial(self._made, epoch), plan[first:end], workers):
             yield [each.to(self.device, non_blocking=True) for each in tensors]
 
     def _made(self, epoch: int, indices: NDArray[np.intp]) -> list[Tensor]:

@@ -11,7 +11,6 @@ import contextlib
 import math
 import mmap
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol, TypeVar
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from orthonav.core.cores import in_order
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
 
@@ -205,7 +205,7 @@ class WhitenedEmbedder:
             features, weights = pooled_features(self.recipe, sheet, tiles_px[part])
             out[part] = self.features(features, weights)
 
-        for _ in _worked(fill, len(tiles_px), workers):
+        for _ in in_order(fill, _chunks(len(tiles_px)), workers):
             pass
         return out
 
@@ -316,9 +316,10 @@ def learn(
     taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
 
     def over_batches(work: Work[Made]) -> Iterator[Made]:
-        return _worked(
-            lambda part: work(*pooled_features(recipe, sheet, taken[part])), len(taken), workers
-        )
+        def worked(part: slice) -> Made:
+            return work(*pooled_features(recipe, sheet, taken[part]))
+
+        return in_order(worked, _chunks(len(taken)), workers)
 
     return learn_in_two_passes(recipe, over_batches)
 
@@ -370,15 +371,6 @@ def _whitening(
     return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
 
 
-def _worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator[Made]:
-    """In order."""
-    if workers <= 1:
-        yield from map(work, _chunks(count))
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(work, _chunks(count))
-
-
-def _chunks(count: int) -> Iterator[slice]:
-    for start in range(0, count, 512):  # 0.9 MB of features, which stays in the cache
-        yield slice(start, min(count, start + 512))
+def _chunks(count: int) -> list[slice]:
+    # 512 are 0.9 MB of features, which stays in the cache.
+    return [slice(start, min(count, start + 512)) for start in range(0, count, 512)]

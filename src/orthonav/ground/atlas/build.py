@@ -4,6 +4,8 @@ A sheet is finished when its item is written, so an interrupted build keeps its 
 the same command resumes it. The same imagery, recipe and versions give the same atlas byte for
 byte, with any number of workers, on processors that round alike."""
 
+import hashlib
+import json
 import logging
 import math
 import platform
@@ -30,7 +32,7 @@ from orthonav.ground.atlas.cut import box_around, box_deg, turned
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.build.build import BuildRequest, build_map, require_relief, require_surface
 from orthonav.ground.build.layer import rounded_gsd_m
-from orthonav.ground.build.sheet import digest, grid_of
+from orthonav.ground.build.sheet import grid_of
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area, Extent, require_one_area
@@ -140,13 +142,13 @@ def request_digest(
         depends.append(["surface", len(request.surface), request.true_ortho])
     if request.relief is not None:
         depends.append(request.relief)
-    return digest(depends)
+    text = json.dumps(depends, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def margin_m(recipe: AtlasRecipe) -> float:
     """A tile, and 64 pixels beyond it for gradients and resampling."""
-    coarse = recipe.coarse or recipe
-    return max((recipe.tile_px + 64) * recipe.gsd_m, (coarse.tile_px + 64) * coarse.gsd_m)
+    return max((each.tile_px + 64) * each.gsd_m for each in (recipe, recipe.coarse))
 
 
 class Imagery:
@@ -221,9 +223,8 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
         area, min(imagery_gsd_m, recipe.gsd_m), recipe.gsd_m, recipe.tile_px, recipe.overlap
     )
     CellLayout.for_tiles(grid.tile_px, grid.stride_px)
-    if recipe.coarse is not None:
-        coarse = coarse_grid(area, recipe.coarse)
-        CellLayout.for_tiles(coarse.tile_px, coarse.stride_px)
+    coarse = coarse_grid(area, recipe.coarse)
+    CellLayout.for_tiles(coarse.tile_px, coarse.stride_px)
 
 
 def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
@@ -324,7 +325,7 @@ def build_atlas(
     log.info("%d of %d sheets to build", len(missing), len(tasks))
     _build_sheets(missing, runner, result, progress)
     atlas.snapshot()
-    if request.index and recipe.coarse is not None and not result.failed:
+    if request.index and not result.failed:
         from orthonav.ground.atlas.index import make_index  # with FAISS
 
         make_index(atlas, progress=progress)
@@ -340,15 +341,15 @@ def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
             atlas.require_recipe(wanted)
             return wanted
         gsd_m = rounded_gsd_m(mosaic.gsd_m)
-        return AtlasRecipe(**{"gsd_m": gsd_m, **_requested(request, None)})
+        return AtlasRecipe(**{"gsd_m": gsd_m, **_requested(request, CoarseRecipe())})
     except (TypeError, AtlasError) as error:
         raise AtlasError(f"recipe of the atlas is impossible: {error}") from error
 
 
-def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, Any]:
+def _requested(request: AtlasRequest, coarse: CoarseRecipe) -> dict[str, Any]:
     fields = dict(request.recipe)
     if isinstance(fields.get("coarse"), Mapping):
-        fields["coarse"] = replace(coarse or CoarseRecipe(), **fields["coarse"])
+        fields["coarse"] = replace(coarse, **fields["coarse"])
     return fields
 
 
@@ -372,28 +373,17 @@ def build_sheet(task: SheetTask) -> Sheet | None:
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> Sheet | None:
     sheet, made, common = task.sheet, task.request, asdict(task.recipe)
     del common["sheet_km"], common["coarse"]
-    files = {"map": folder / f"{sheet.id}.onav"}
-    request = BuildRequest(
-        orthos=made.orthos,
-        out=files["map"],
-        bounds_deg=sheet.bounds_deg,
-        workers=1,
-        dem=made.dem,
-        surface=made.surface,
-        true_ortho=made.true_ortho,
-        dem_datum=made.dem_datum,
-        dem_needed=False,
-        relief=made.relief,
-        **common,
-    )
+    files = {"map": folder / f"{sheet.id}.onav", "coarse": folder / f"{sheet.id}.safetensors"}
+    shared = ("orthos", "dem", "surface", "true_ortho", "dem_datum", "relief")
+    common |= {name: getattr(made, name) for name in shared}
+    place: dict[str, Any] = {"out": files["map"], "bounds_deg": sheet.bounds_deg}
+    request = BuildRequest(**place, **common, workers=1, dem_needed=False)
     try:
         info = build_map(request).manifest.sheets[0]
     except AreaError as error:  # the recipe was tried when the task was made: no imagery
         log.info("%s is empty: %s", sheet.id, error)
         return None
-    if task.recipe.coarse is not None:
-        files["coarse"] = folder / f"{sheet.id}.safetensors"
-        write_coarse(mosaic, sheet.bounds_deg, task.recipe.coarse, files["coarse"])
+    write_coarse(mosaic, sheet.bounds_deg, task.recipe.coarse, files["coarse"])
     described = replace(sheet, tiles=info.tiles, area_km2=info.area_km2)
     return Atlas.open(made.url).put(files, described)
 

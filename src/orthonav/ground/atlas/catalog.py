@@ -18,7 +18,6 @@ from typing import Any, cast
 import numpy as np
 
 from orthonav.core.errors import AtlasError, described
-from orthonav.core.files import Progress, no_progress
 from orthonav.ground.atlas.store import Store, digest_of
 from orthonav.ground.planning.area import Extent
 from orthonav.ground.planning.sheets import WorldSheets
@@ -293,15 +292,14 @@ class CoarseRecipe:
 @dataclass(frozen=True)
 class AtlasRecipe:
     """How every sheet is made; fields are those of `BuildRequest`, whose defaults hold for all
-    others. `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior.
-    """
+    others. `coarse`: recipe of the coarse tiles."""
 
     gsd_m: float  # metres per pixel
     tile_px: int = 256
     overlap: float = 0.875
     calibration_views: int = 24
     sheet_km: float = 10.0  # greatest width of a sheet
-    coarse: CoarseRecipe | None = CoarseRecipe()
+    coarse: CoarseRecipe = CoarseRecipe()
 
     def __post_init__(self) -> None:
         _require_possible(self)
@@ -318,8 +316,7 @@ class AtlasRecipe:
     def from_plain(cls, plain: Any) -> "AtlasRecipe":
         try:
             values = {each.name: plain[each.name] for each in fields(cls)}
-            coarse = values.pop("coarse")
-            return cls(**values, coarse=None if coarse is None else CoarseRecipe(**coarse))
+            return cls(**values | {"coarse": CoarseRecipe(**values["coarse"])})
         except (KeyError, TypeError, ValueError) as error:
             raise AtlasError(f"recipe of the atlas cannot be read ({reason(error)})") from error
 
@@ -458,24 +455,6 @@ class Atlas:
         for file in before.files.values():
             if file.name not in left:
                 self.store.remove(file.name)
-
-
-def copy_sheets(
-    source: Atlas, atlas: Atlas, replace: bool = False, progress: Progress = no_progress
-) -> tuple[list[str], list[str]]:
-    """Copy the sheets of one atlas into another of the same recipe: names of copied sheets, and of
-    those that were there and left unchanged. With `replace` sheets that differ are replaced."""
-    atlas.require_recipe(source.recipe)
-    found, there = source.sheets(), atlas.sheets(refresh=True)
-    copied: list[str] = []
-    for number, (sheet_id, new) in enumerate(found.items()):
-        progress("copy", number / len(found))
-        old = there.get(sheet_id)
-        if old is None or (replace and old != new):
-            atlas.put({key: source.path(new, key) for key in new.files}, new)
-            copied.append(sheet_id)
-    atlas.snapshot()
-    return copied, [each for each in found if each not in copied]
 
 
 def _is_free(store: Store) -> bool:

@@ -21,7 +21,6 @@ from orthonav.core.tiles import represent
 from orthonav.core.tiles.whitened import WhitenedRecipe, pooled_features
 from orthonav.core.variants import make_variant
 from orthonav.ground.atlas.catalog import CoarseRecipe, canonical, reason
-from orthonav.ground.build.calibrate import CropSampler
 from orthonav.ground.build.sheet import MIN_TILE_VALID_SHARE, SheetReader
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.planning.area import Area, Extent
@@ -49,16 +48,6 @@ class CoarseTiles:
         return self.features[tiles].astype(np.float32), np.repeat(share, repeats, axis=1)
 
 
-class NoCrops(CropSampler):
-    """Takes no views out of the imagery, for sheets that are not calibrated."""
-
-    def __init__(self, tile_px: int) -> None:
-        super().__init__(tile_px, 0)
-
-    def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
-        return np.zeros((0, 2), np.intp)
-
-
 def coarse_grid(area: Area, recipe: CoarseRecipe) -> TileGrid:
     return TileGrid.covering(
         area.extent_en_m, gsd_m=recipe.gsd_m, tile_px=recipe.tile_px, overlap=recipe.overlap
@@ -78,12 +67,11 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
     area = Area.from_bounds(bounds_deg)
     grid = coarse_grid(area, recipe)
     representation = make_variant(represent.TABLE, EDGES)
-    reader = SheetReader(
-        mosaic, area, grid, representation, NoCrops(recipe.tile_px), registration=False
-    )
+    reader = SheetReader(area, grid, representation, registration=False)
     first_px = tiles_in(bounds_deg, area, grid) * grid.stride_px
     try:
-        reader.read(no_progress, workers=1)
+        with mosaic.grid_sheet(area.frame, grid, threads=1) as raster:
+            reader.read(raster, no_progress, workers=1)
     except AreaError:  # no pixel of imagery
         first_px = first_px[:0]
     first_px = first_px[reader.cells.valid_share(first_px) >= MIN_TILE_VALID_SHARE]

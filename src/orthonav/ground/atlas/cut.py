@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,7 +38,6 @@ from orthonav.core.tiles import embed, represent
 from orthonav.core.tiles.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.core.variants import variant_from_recipe
 from orthonav.ground.atlas.catalog import Atlas, Sheet
-from orthonav.ground.atlas.coarse import NoCrops
 from orthonav.ground.build.build import MAX_WORKERS, BuildResult
 from orthonav.ground.build.layer import HeightLayers, TerrainParts, terrain_parts
 from orthonav.ground.build.sheet import (
@@ -48,7 +47,7 @@ from orthonav.ground.build.sheet import (
     grid_of,
     tiles_of,
 )
-from orthonav.ground.imagery.mosaic import Mosaic, Pixels
+from orthonav.ground.imagery.mosaic import Pixels
 from orthonav.ground.planning.area import Area, Extent, outline
 from orthonav.ground.planning.route import along_polyline_en_m
 from orthonav.ground.planning.sheets import in_box
@@ -173,20 +172,10 @@ def _corners(block: Block) -> Array:
 
 
 class SheetMosaic:
-    """Sheets read as one picture, as `SheetReader` reads a `Mosaic` of orthophotos. Threads may
-    share it."""
+    """Sheets read as one picture, a `GreyRaster` of `SheetReader`."""
 
     def __init__(self, members: Sequence[SheetSource], frame: LocalFrame, grid: TileGrid) -> None:
         self._warps = [Warp(each, frame, grid) for each in members]
-
-    def grid_sheet(self, *_: Any, **__: Any) -> "SheetMosaic":
-        return self
-
-    def __enter__(self) -> "SheetMosaic":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
 
     def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
         block = Block(row, col, height_px, width_px)
@@ -455,12 +444,9 @@ def cut_map(
         )
     members = opened_sheets(atlas, sheets, grid)
     recipe, representation = recipes(members[0].manifest)
-    mosaic = cast(Mosaic, SheetMosaic(members, area.frame, grid))
-    reader = SheetReader(
-        mosaic, area, grid, representation, NoCrops(grid.tile_px), registration=True
-    )
+    reader = SheetReader(area, grid, representation, registration=True)
     with suppress(AreaError):  # no imagery at all: `check_shown` names the sheets that are missing
-        reader.read(progress, workers)
+        reader.read(SheetMosaic(members, area.frame, grid), progress, workers)
     check_shown(area, grid, reader.cells, atlas, allow_holes)
     progress("learn", 0.0)
     written = write_map(out, *_learnt(reader, recipe, members, workers))
@@ -470,24 +456,11 @@ def cut_map(
 def _learnt(
     reader: SheetReader, recipe: WhitenedRecipe, members: Sequence[SheetSource], workers: int
 ) -> tuple[Manifest, dict[str, NDArray[Any]]]:
-    area, grid, layer = reader.area, reader.grid, reader.layer
-    assert layer is not None
+    area, grid = reader.area, reader.grid
     tiles_rc = tiles_of(area, grid, reader.cells)
     tiles_px = tiles_rc * grid.stride_px
     embedder = learn(recipe, reader.cells, tiles_px, workers)
-    grey, grey_parts = layer.finish()
-    area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
+    embeddings = embedder.tiles(reader.cells, tiles_px, workers)
     heights = cut_heights(members, area, grid)
-    terrain, surface = heights.infos
-    sheet = SheetInfo(
-        *(area.frame, grid, len(tiles_rc), area_km2, grey, terrain, steepest(members), surface),
-        lean=heights.lean,
-    )
-    return pooled_manifest(members, sheet), {
-        "sheet0/centres_en_m": grid.centres_en_m(tiles_rc).astype(np.float32),
-        "sheet0/embeddings": embedder.tiles(reader.cells, tiles_px, workers),
-        "sheet0/preview_jpeg": reader.preview.jpeg(),
-        **{f"embed/{name}": array for name, array in embedder.parts().items()},
-        **grey_parts,
-        **heights.arrays,
-    }
+    sheet, arrays = reader.finish(tiles_rc, embedder, embeddings, heights, steepest(members))
+    return pooled_manifest(members, sheet), arrays

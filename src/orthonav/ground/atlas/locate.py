@@ -11,7 +11,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -19,12 +19,27 @@ from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
+from orthonav.core.localize.policy import DEFAULT_PLAN
+from orthonav.core.localize.rectify import RectifiedView, downsampled, rectify_footprint
+from orthonav.core.localize.view import LIMITS, check_footprint, check_view, pose_prior
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
+from orthonav.core.tiles import represent
+from orthonav.core.tiles.bank import embed_poses
 from orthonav.core.track import Model, State
 from orthonav.core.track.tracker import Tracker
+from orthonav.core.variants import make_variant
 from orthonav.ground.atlas.catalog import Atlas
-from orthonav.ground.atlas.search import SheetSearch
+from orthonav.ground.atlas.coarse import EDGES
+from orthonav.ground.atlas.index import (
+    LEARNT,
+    half_whitened,
+    index_file,
+    load_learnt,
+    read_manifest,
+    stale_sheets,
+)
+from orthonav.ground.atlas.vectors import NONE, ShardedIndex
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +53,81 @@ MIN_CONFIDENCE = 0.5  # of a fix, by the view alone too
 MAX_UNSEEN = 2  # views in a row without which a place still rules out a fix at another one
 MAX_TRACKS = 3  # the least likely are dropped
 MAX_NEW_TRACKS = 2  # at a view: opening and searching a sheet takes a second
+
+
+EFFORTS = (
+    (10**6, 0.4, 300),
+    (3 * 10**7, 0.25, 800),
+    (math.inf, 0.085, 1500),
+)
+"""Greatest number of tiles, fraction of the lists scanned, tiles compared by their stored vectors:
+finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
+(`benchmarks.atlas_search` at d63ac91)."""
+
+
+class SheetSearch:
+    """The index of an atlas with its shards mapped. Not to be shared between threads."""
+
+    def __init__(self, atlas: Atlas) -> None:
+        """Warns of sheets that are not in the index. Raises `AtlasError` without an index."""
+        manifest = read_manifest(atlas)
+        if manifest is None:
+            raise AtlasError(
+                f"the atlas has no index: make it with 'orthonav atlas index': {atlas.url}"
+            )
+        self.atlas = atlas
+        self.recipe = atlas.recipe.coarse
+        if new := stale_sheets(atlas, manifest)[0]:
+            log.warning(
+                "%d sheets are missing from the index and are not searched; update it with "
+                "'orthonav atlas index'",
+                len(new),
+            )
+        file = partial(index_file, atlas, manifest)
+        self._policy = DEFAULT_PLAN
+        self._embedder, quantizers = load_learnt(file(LEARNT), manifest.recipe)
+        self._representation = make_variant(represent.TABLE, EDGES)
+        self._index = ShardedIndex(file, manifest.shards, quantizers)
+        share, rerank = next(effort for most, *effort in EFFORTS if len(self._index) <= most)
+        self._probes = max(1, round(share * manifest.recipe.lists))
+        self._rerank = int(rerank)
+
+    def sheets(self, view: View, heading_known: bool) -> list[str] | NoFix:
+        """Names of the sheets with the tiles most similar to a view, best first, or why it cannot
+        be searched."""
+        refused = check_view(view, self.recipe.gsd_m, heading_known)
+        if refused is not None:
+            return refused
+        coarse = self._rectified(view)
+        if isinstance(coarse, NoFix):
+            return coarse
+        prior = pose_prior(view.telemetry, heading_known, view.camera.focal_std)
+        directions = self._policy.directions(prior, self._policy.coarse_steps)
+        poses = [pose for pose, nats in directions if nats <= self._policy.likely_nats]
+        embedded = embed_poses(
+            *(self._embedder, self._representation, coarse.grey, coarse.valid, poses),
+            self.recipe.tile_px,
+        )
+        queries = half_whitened(self._embedder, embedded)
+        scores, ids = self._index.search(queries, 20, self._probes, self._rerank)
+        best_first = ids.ravel()[np.argsort(-scores, axis=None, kind="stable")]
+        found = self._index.sheets_of(best_first[best_first != NONE])
+        there = self.atlas.sheets()
+        return [name for name in dict.fromkeys(found) if name in there]
+
+    def _rectified(self, view: View) -> RectifiedView | NoFix:
+        """At the resolution of the coarse tiles; `NoFix` unless about as wide as one."""
+        gsd_m, tile_m = self.recipe.gsd_m, self.recipe.tile_m
+        coarse = rectify_footprint(downsampled(view, gsd_m), gsd_m=gsd_m, multiple_px=1)
+        side_m = math.sqrt(float(coarse.valid.sum())) * gsd_m
+        least, most = (share * tile_m for share in self._policy.view_tiles)
+        if least <= side_m <= most:
+            return check_footprint(coarse, 1.0, LIMITS.min_view_px) or coarse
+        return NoFix(
+            "wrong_scale",
+            f"view is {side_m:.0f} m wide; the coarse tiles of this atlas are for views of "
+            f"{least:.0f} to {most:.0f} m",
+        )
 
 
 class SheetMaps:
@@ -138,13 +228,11 @@ class SheetTrack:
         self.has_ended = SIGMAS * fix.std_m + speed_mps * seconds > MAX_REACH_M
         if not self.has_ended:
             lat, lon = LocalFrame(fix.lat_deg, fix.lon_deg).latlon_from_en(velocity * seconds)
-            self._change_sheet(self._maps.name_at(float(lat), float(lon)))
+            name = self._maps.name_at(float(lat), float(lon))
+            if name != self.sheet and (localizer := self._maps.open(name)) is not None:
+                self._tracker.continue_on(localizer)
+                self.sheet = name
         return self.has_ended
-
-    def _change_sheet(self, name: str) -> None:
-        if name != self.sheet and (localizer := self._maps.open(name)) is not None:
-            self._tracker.continue_on(localizer)
-            self.sheet = name
 
     def _take(self, seen: Fix | NoFix, telemetry: Telemetry) -> None:
         self.fix = None
@@ -173,7 +261,7 @@ class AtlasLocator:
     def locate(self, view: View) -> Fix | NoFix:
         self._tracks = _followed(self._tracks, lambda track: track.locate(view))
         best, reason = self._best(), None
-        if best is None or best is not self._believed:
+        if best is None or best[0] is not self._believed:
             reason = self._begin(view)
         return self._outcome(reason)
 
@@ -197,32 +285,27 @@ class AtlasLocator:
         self._tracks = _likeliest([*self._tracks, *begun])
         return None
 
-    def _best(self) -> SheetTrack | None:
-        """The likeliest track with a fix; None where another recognized a view elsewhere lately."""
-        fixed = [each for each in self._tracks if each.fix is not None]
-        best = max(fixed, key=lambda each: each.odds, default=None)
-        if best is None or any(each.unseen < MAX_UNSEEN for each in self._rivals(best)):
+    def _best(self) -> tuple[SheetTrack, Fix, float] | None:
+        """The likeliest track with a fix, that fix, and the probability of its place among all
+        tracks; None where another recognized a view elsewhere lately."""
+        fixed = [(each.odds, each, each.fix) for each in self._tracks if each.fix is not None]
+        if not fixed:
             return None
-        return best
-
-    def _rivals(self, best: SheetTrack) -> list[SheetTrack]:
-        fix = best.fix
-        return [each for each in self._tracks if fix is not None and each.is_elsewhere(fix)]
+        odds, best, fix = max(fixed, key=lambda each: each[0])
+        rivals = [each for each in self._tracks if each.is_elsewhere(fix)]
+        if any(each.unseen < MAX_UNSEEN for each in rivals):
+            return None
+        most = odds / (1 + odds + sum(each.odds for each in rivals))
+        return best, _limited(fix, most), most
 
     def _published(self) -> Fix | None:
-        """The fix of the best track, as probable as it is among all tracks. Once it is confident
-        the others end."""
-        best = self._best()
-        if best is None or best.fix is None:
+        """The fix of the best track. Once it is confident the others end."""
+        found = self._best()
+        if found is None or found[1].confidence < MIN_CONFIDENCE:
             return None
-        others = sum(each.odds for each in self._rivals(best))
-        most = best.odds / (1 + best.odds + others)
-        fix = _limited(best.fix, most)
-        if fix.confidence < MIN_CONFIDENCE:
-            return None
-        self._believed = best
+        self._believed, fix, most = found
         if most >= CONFIDENT:
-            self._tracks = [best]
+            self._tracks = [self._believed]
         return fix
 
     def _outcome(self, reason: NoFix | None = None) -> Fix | NoFix:

@@ -300,6 +300,7 @@ class OpenShard:
         self._index.referenced_objects.append(mapped)
 
     def scan(self, rotated: Array, lists: Ids, scores: Array, count: int) -> tuple[Array, Ids]:
+        """Scores by code and ids (Q, count) of the best vectors in these lists."""
         module, index = faiss(), self._index
         found = np.empty((len(rotated), count), dtype=np.float32)
         rows = np.empty((len(rotated), count), dtype=np.int64)
@@ -318,7 +319,7 @@ class OpenShard:
         )
         if rows.max(initial=NONE) >= self.info.rows or rows.min(initial=NONE) < NONE:
             raise AtlasError(f"codes of shard {self.info.name} are damaged; rebuild the index")
-        return found, rows
+        return found, np.where(rows == NONE, NONE, rows + self.info.base)
 
     def vectors(self, rows: Ids) -> Array:
         size, offset, file = 2 * self._dims, self._offset, self._file
@@ -359,17 +360,12 @@ class ShardedIndex:
         rotated = self.quantizers.rotated(queries)
         lists, centre_scores = self.quantizers.nearest_lists(rotated, probes)
         rerank = max(k, rerank)
-        scores = np.full((len(queries), 0), -np.inf, dtype=np.float32)
-        ids: Ids = np.empty((len(queries), 0), dtype=np.int64)
         with one_thread():
-            for shard in self._shards:
-                found, rows = shard.scan(rotated, lists, centre_scores, rerank)
-                some = np.where(rows == NONE, NONE, rows + shard.info.base)
-                scores, ids = _highest(
-                    np.concatenate([scores, found], axis=1),
-                    np.concatenate([ids, some], axis=1),
-                    rerank,
-                )
+            found = [shard.scan(rotated, lists, centre_scores, rerank) for shard in self._shards]
+        scores, ids = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
+        if ids.shape[1] > rerank:
+            best = np.argpartition(scores, -rerank, axis=1)[:, -rerank:]
+            ids = np.take_along_axis(ids, best, axis=1)
         return self._compared(queries, ids, k)
 
     def vectors(self, ids: Ids) -> Array:
@@ -398,10 +394,3 @@ class ShardedIndex:
             out_scores[query, : len(order)] = scores[order]
             out_ids[query, : len(order)] = real[order]
         return out_scores, out_ids
-
-
-def _highest(scores: Array, ids: Ids, count: int) -> tuple[Array, Ids]:
-    if scores.shape[1] <= count:
-        return scores, ids
-    chosen = np.argpartition(scores, -count, axis=1)[:, -count:]
-    return np.take_along_axis(scores, chosen, axis=1), np.take_along_axis(ids, chosen, axis=1)

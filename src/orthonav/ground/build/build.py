@@ -81,8 +81,7 @@ class BuildRequest:
     calibration_views: int = 24
     """Mirrored views, and views of other dates, that are located, 1 to 384."""
     work: GivenPath | None = None
-    """Folder of blocks and checkpoints of networks, from which an interrupted build resumes; None:
-    blocks of a large map in `OUT.work` until it is written."""
+    """Folder of checkpoints of a network, from which an interrupted training resumes."""
     workers: int | None = None  # threads, 1 to 64; None: one per core
     dem: GivenPath | None = None  # terrain model; None: the map has no terrain layer
     surface: Sequence[GivenPath] = ()
@@ -116,6 +115,7 @@ class BuildResult:
 @dataclass(frozen=True, eq=False)
 class _Inputs:
     request: BuildRequest
+    mosaic: Mosaic
     other_dates: tuple[Mosaic, ...]
     recipe: WhitenedRecipe | EncoderRecipe
     sheet: SheetReader
@@ -146,7 +146,6 @@ class _Inputs:
         # Networks and visual words learn from images of the tiles, not from cell means.
         needs_pictures = not isinstance(recipe, WhitenedRecipe)
         sheet = SheetReader(
-            mosaic,
             area,
             grid,
             representation,
@@ -154,7 +153,7 @@ class _Inputs:
             registration=request.registration,
             pictures=SheetPictures(grid, representation) if needs_pictures else None,
         )
-        return cls(request, other_dates, recipe, sheet, heights)
+        return cls(request, mosaic, other_dates, recipe, sheet, heights)
 
 
 def _check_numbers(request: BuildRequest) -> None:
@@ -239,15 +238,15 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     progress = progress or no_progress
     inputs = _Inputs.open(request)
     sheet, grid = inputs.sheet, inputs.sheet.grid
-    cache = sheet.block_cache(request.out, request.work)
-    sheet.read(progress, request.workers, cache)
+    with inputs.mosaic.grid_sheet(sheet.area.frame, grid, threads=1) as raster:
+        sheet.read(raster, progress, request.workers)
     tiles_rc = tiles_of(sheet.area, grid, sheet.cells)
     embedder, embeddings = _learned(inputs, tiles_rc * grid.stride_px, progress)
     tiles = TileMatcher(grid, grid.centres_en_m(tiles_rc).astype(np.float32), embeddings)
     name = stored_representation(sheet.representation)["name"]
     is_usual = isinstance(embedder.recipe, WhitenedRecipe) and name == "gradient"
     calibration = calibrate(
-        sheet.sampler,
+        sheet.crops,
         tiles,
         sheet.representation,
         embedder,
@@ -255,31 +254,12 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         usual=DEFAULT_TILE_CONFIDENCE if is_usual else None,
         slow=not represent.TABLE[name].flies,
     )
-    arrays: dict[str, NDArray[Any]] = {
-        "sheet0/centres_en_m": tiles.centres_en_m,
-        "sheet0/embeddings": embeddings,
-        "sheet0/preview_jpeg": sheet.preview.jpeg(),
-        **{f"embed/{name}": array for name, array in embedder.parts().items()},
-    }
-    grey = None
-    if sheet.layer is not None:
-        grey, parts = sheet.layer.finish()
-        arrays |= parts
-    arrays |= inputs.heights.arrays
-    terrain, surface = inputs.heights.infos
-    area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
-    info = SheetInfo(
-        *(sheet.area.frame, grid, len(tiles_rc), area_km2),
-        *(grey, terrain, request.relief, surface),
-        lean=inputs.heights.lean,
-    )
+    info, arrays = sheet.finish(tiles_rc, embedder, embeddings, inputs.heights, request.relief)
     manifest = _manifest(inputs, info, embedder, calibration)
     if request.registration:
         found = _registration(inputs, tiles, embedder, manifest, arrays, progress)
         manifest = replace(manifest, registration=found)
     written = write_map(request.out, manifest, arrays)
-    if cache is not None:
-        cache.discard()
     return BuildResult(written, request.out.stat().st_size)
 
 
@@ -322,7 +302,7 @@ def _manifest(
             "seed": request.seed,
         },
         sheets=(info,),
-        imagery=sheet.mosaic.describe(),
+        imagery=inputs.mosaic.describe(),
         view={
             "heading_step_deg": CALIBRATION.heading_step_deg,
             "min_valid_share": MIN_VIEW_VALID_SHARE,
@@ -352,7 +332,7 @@ def _registration(
         SearchPlan(last_ms=SEARCH_MS),
     )
     assert localizer is not None
-    crops = sheet.sampler.crops
+    crops = sheet.crops
     later = [crop for date in inputs.other_dates for crop in _crops_of(date, sheet, crops)]
     if inputs.other_dates and not later:
         log.warning("the other dates do not cover the area: nothing can be learned from them")

@@ -173,31 +173,26 @@ class CropSampler:
         ]
         return np.array(drawn, np.intp).reshape(-1, 2)
 
-    def cut(
-        self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], places: NDArray[np.intp]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """Crops (N, S, S) at places with contrast; these places and whether all is valid (N, 3)."""
+    def take(
+        self,
+        grey: NDArray[np.uint8],
+        valid: NDArray[np.bool_],
+        places: NDArray[np.intp],
+        row_px: int,
+        col_px: int,
+    ) -> None:
+        """Add the crops with contrast at `places` (N, 2) of a block whose first pixel is (row_px,
+        col_px) of the sheet."""
         size = self._crop_px(*grey.shape)
-        crops = np.zeros((len(places), size, size), np.uint8)
-        found: list[tuple[int, int, bool]] = []
-        for row, col in places:
+        for row, col in places.tolist():
             part = np.s_[row : row + size, col : col + size]
             crop, inside = grey[part], valid[part]
             share = inside.mean()
-            if share >= CALIBRATION.min_valid and crop[inside].std() > 1:
-                crops[len(found)] = np.where(inside, crop, crop[inside].mean().round())
-                found.append((row, col, share == 1))
-        return crops[: len(found)], np.array(found, np.intp).reshape(-1, 3)
-
-    def take(
-        self, crops: NDArray[np.uint8], places: NDArray[np.intp], row_px: int, col_px: int
-    ) -> None:
-        """Add what `cut` gave for a block whose first pixel is (row_px, col_px) of the sheet."""
-        for grey, (row, col, whole) in zip(crops, places.tolist(), strict=True):
-            known = self._whole if whole else self._partial
-            if len(known) < 2 * CROPS:
-                half = grey.shape[0] / 2
-                known.append(Crop(grey.copy(), row_px + row + half, col_px + col + half))
+            known = self._whole if share == 1 else self._partial
+            if len(known) >= 2 * CROPS or share < CALIBRATION.min_valid or crop[inside].std() <= 1:
+                continue
+            filled = np.where(inside, crop, crop[inside].mean().round()).astype(np.uint8)
+            known.append(Crop(filled, row_px + row + size / 2, col_px + col + size / 2))
 
     @property
     def crops(self) -> list[Crop]:
@@ -209,7 +204,7 @@ class CropSampler:
 
 
 def calibrate(
-    sampler: CropSampler,
+    sampled: Sequence[Crop],
     tiles: TileMatcher,
     representation: Any,
     embedder: ViewEmbedder,
@@ -220,7 +215,7 @@ def calibrate(
 ) -> TileCalibration:
     """Search changed and mirrored crops on the new map. `usual`: confidence on other maps, if
     known."""
-    grid, sampled = tiles.grid, sampler.crops
+    grid = tiles.grid
     rng = np.random.default_rng([len(sampled), 2])
     most = min(CROPS, CALIBRATION.slow_crops) if slow else CROPS
     crops = [sampled[i] for i in rng.permutation(len(sampled))[:most]]

@@ -198,7 +198,12 @@ def terrain_of_dem(
     made = terrain_parts(area, grid, posting_m, dem.path.name, dem.datum.name, heights)
     if made is None and needed:
         raise _no_height("terrain", area, dem)
-    return None if made is None else made._replace(info=_with_source(made.info, dem, area))
+    if made is None:
+        return None
+    source_m = clamped(TerrainInfo, "source_posting_m", rounded_gsd_m(dem.gsd_m))
+    roughness_m = _roughness_m(made.info, dem, area)
+    info = replace(made.info, source_posting_m=source_m, roughness_m=roughness_m)
+    return made._replace(info=info)
 
 
 def _no_height(what: str, area: Area, dem: Dem) -> AreaError:
@@ -377,11 +382,6 @@ def _above(
     corner = info.west_m + left * info.posting_m, info.north_m - top * info.posting_m
     below = ground(*corner, info.posting_m, *size)
     return heights - bilinear_of(below, col - left, row - top)
-
-
-def _with_source(info: TerrainInfo, dem: Dem, area: Area) -> TerrainInfo:
-    source_m = clamped(TerrainInfo, "source_posting_m", rounded_gsd_m(dem.gsd_m))
-    return replace(info, source_posting_m=source_m, roughness_m=_roughness_m(info, dem, area))
 
 
 def _roughness_m(info: TerrainInfo, dem: Dem, area: Area) -> float | None:

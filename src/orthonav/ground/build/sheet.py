@@ -1,78 +1,46 @@
 """Reading a sheet: from blocks of imagery to cell means, crops and the registration layer.
 
-Several threads read blocks; results are collected in the order of the
-blocks, so the map is the same for any number of threads. The result of a block is a dictionary of
-arrays, one file in a cache from which an interrupted build resumes.
+Several threads read blocks; results are collected in the order of the blocks, so the map is the
+same for any number of threads.
 """
 
 import contextlib
 import functools
-import hashlib
-import json
 import logging
 import math
-import re
-import shutil
-import zipfile
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 
-from orthonav import __version__
-from orthonav.core.cores import usable_cores
+from orthonav.core.cores import in_order, usable_cores
 from orthonav.core.errors import AreaError, VariantError
-from orthonav.core.files import Progress, no_progress, replacing
+from orthonav.core.files import Progress, no_progress
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.mapfile.layer import MAX_PREVIEW_PX
+from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.cells import MICRO, CellLayout, cell_means
+from orthonav.core.tiles.embed import ViewEmbedder
 from orthonav.core.tiles.represent import Gray
 from orthonav.core.tiles.whitened import CellSheet
 from orthonav.core.variants import variant_recipe
-from orthonav.ground.build.calibrate import CropSampler
-from orthonav.ground.build.layer import CHUNK_PX, GreyLayerWriter, Parts, rounded_gsd_m
-from orthonav.ground.imagery.mosaic import Mosaic, Pixels, SheetRaster
+from orthonav.ground.build.calibrate import Crop, CropSampler
+from orthonav.ground.build.layer import (
+    CHUNK_PX,
+    GreyLayerWriter,
+    HeightLayers,
+    Parts,
+    rounded_gsd_m,
+)
+from orthonav.ground.imagery.mosaic import Mosaic, Pixels
 from orthonav.ground.imagery.source import quiet
 from orthonav.ground.planning.area import Area
 from orthonav.research.tiles import SheetTiles
-
-Item = TypeVar("Item")
-Made = TypeVar("Made")
-AHEAD = 2
-"""Finished results that may wait for a slower one."""
-
-
-def in_order(
-    work: Callable[[Item], Made], items: Sequence[Item], workers: int
-) -> Generator[Made, None, None]:
-    """Results of `work` in the order of the items, at most `workers + AHEAD` ahead.
-
-    The first error, in that order, is raised. No thread runs once this is closed."""
-    workers = min(workers, len(items))
-    if workers <= 1:
-        yield from map(work, items)
-        return
-    waiting: deque[Future[Made]] = deque()
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) >= workers + AHEAD:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for result in waiting:
-                result.cancel()
 
 
 @dataclass(frozen=True)
@@ -131,24 +99,15 @@ class Preview:
         height, width = grid.height_px * self._scale, grid.width_px * self._scale
         self._grey = np.zeros((max(1, round(height)), max(1, round(width))), np.uint8)
 
-    def small(self, block: Block, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The overview (h, w) of a block in any resolution; empty if it is smaller than a pixel."""
-        y0, y1, x0, x1 = self._edges(block)
-        if y1 <= y0 or x1 <= x0:
-            return np.zeros((0, 0), np.uint8)
-        small = cv2.resize(grey, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
-        return np.asarray(small, dtype=np.uint8)
-
-    def put(self, block: Block, small: NDArray[np.uint8]) -> None:
-        if small.size:
-            y0, y1, x0, x1 = self._edges(block)
-            self._grey[y0:y1, x0:x1] = small
-
-    def _edges(self, block: Block) -> tuple[int, int, int, int]:
+    def put(self, block: Block, grey: NDArray[np.uint8]) -> None:
+        """A block in any resolution; nothing of it is shown if it is smaller than a pixel."""
         rows, cols = self._grey.shape
         y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
         x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
-        return y0, min(y1, rows), x0, min(x1, cols)
+        y1, x1 = min(y1, rows), min(x1, cols)
+        if y1 > y0 and x1 > x0:
+            size = x1 - x0, y1 - y0
+            self._grey[y0:y1, x0:x1] = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
 
     def jpeg(self) -> NDArray[np.uint8]:
         encoded = cv2.imencode(".jpg", self._grey, [int(cv2.IMWRITE_JPEG_QUALITY), 70])[1]
@@ -235,24 +194,15 @@ class SheetPictures:
         self._valid = np.zeros(shape, np.bool_)
         self._grey = None if self.is_grey else np.zeros(shape, np.uint8)
 
-    def parts(
-        self, pixels: Pixels, maps: NDArray[np.float32], part: tuple[slice, slice]
-    ) -> dict[str, NDArray[Any]]:
-        """`pixels` and their representation `maps` (1, H, W) of a block that is a part of them."""
-        parts: dict[str, NDArray[Any]] = {
-            "pixels": np.rint(maps[0][part] * self._scale).astype(np.uint8),
-            "pixels_valid": pixels.valid[part],
-        }
-        if self._grey is not None:
-            parts["pixels_grey"] = pixels.grey[part]
-        return parts
-
-    def put(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
+    def put(
+        self, block: Block, pixels: Pixels, maps: NDArray[np.float32], part: tuple[slice, slice]
+    ) -> None:
+        """`pixels` and their representation `maps` (1, H, W), of which the block is a part."""
         where = np.s_[block.row : block.row + block.height, block.col : block.col + block.width]
-        self._pixels[0][where] = parts["pixels"]
-        self._valid[where] = parts["pixels_valid"]
+        self._pixels[0][where] = np.rint(maps[0][part] * self._scale).astype(np.uint8)
+        self._valid[where] = pixels.valid[part]
         if self._grey is not None:
-            self._grey[where] = parts["pixels_grey"]
+            self._grey[where] = pixels.grey[part]
 
     def tiles(self, tiles_px: NDArray[np.intp], progress: Progress = no_progress) -> SheetTiles:
         """Tiles whose first pixels (row, col) are given (N, 2)."""
@@ -288,85 +238,47 @@ def read_pictures(
             pixels = raster.read_grey(*outer.window)
             if pixels.valid.any():
                 maps = sheet_maps(representation, pixels.grey, pixels.valid)
-                pictures.put(block, pictures.parts(pixels, maps, block.within(outer)))
+                pictures.put(block, pixels, maps, block.within(outer))
             progress("other date", (done + 1) / len(blocks))
     return pictures
 
 
 BLOCK_PX = 1024
 """Least width: a few MB of memory per thread."""
-MIN_CACHED_BLOCKS = 16
-"""Smaller builds do not cache blocks by default: they are quickly rebuilt."""
 
 
-def digest(values: Any) -> str:
-    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+class GreyRaster(Protocol):
+    """Imagery in the pixels of a sheet. Threads may share it."""
+
+    def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> Pixels: ...
 
 
-class BlockCache:
-    """Finished blocks of one request, as files in a folder of their own.
+@dataclass(frozen=True, eq=False)
+class BlockContent:
+    """What a thread makes of a block: pixels and representation with its margin, cell means."""
 
-    May be shared between threads.
-    """
-
-    def __init__(self, folder: Path, request: str) -> None:
-        """`request`: 24 hexadecimal digits of the digest of everything that determines the blocks;
-        removes other blocks."""
-        self._folder, self._blocks = folder, folder / f"blocks-{request}"
-        for other in folder.glob("blocks-*"):
-            is_cache = re.fullmatch(r"blocks-[0-9a-f]{24}", other.name) and other.is_dir()
-            if is_cache and other != self._blocks:
-                shutil.rmtree(other)
-        if found := len(list(self._blocks.glob("*.npz"))):
-            log.warning("resuming: %d blocks are cached in %s", found, folder)
-
-    def load(self, block: "Block") -> Parts | None:
-        """None if it is not cached or damaged."""
-        path = self._path(block)
-        try:
-            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-                return dict(stored)
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            log.warning("cached block is damaged (%s) and is recomputed: %s", error, path)
-            return None
-
-    def store(self, block: "Block", parts: Parts) -> None:
-        with replacing(self._path(block)) as temporary:
-            np.savez(temporary, **parts)  # type: ignore[arg-type]  # none is `allow_pickle`
-
-    def discard(self) -> None:
-        """Remove all blocks, and the folder unless it holds something else."""
-        shutil.rmtree(self._blocks, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            self._folder.rmdir()
-
-    def _path(self, block: "Block") -> Path:
-        return self._blocks / f"r{block.row}-c{block.col}.npz"
-
-
-Job = tuple[Block, NDArray[np.intp]]
-"""A block to be read, and the positions (N, 2) of crops in it."""
+    pixels: Pixels
+    maps: NDArray[np.float32] | None  # where pictures are made of them
+    means: NDArray[np.float32]
+    share: NDArray[np.float32]
 
 
 class SheetReader:
-    """Collects the input of all later steps; `pictures` is for methods that learn from them."""
+    """Collects the input of all later steps. `sampler`: takes crops for calibration; `pictures`:
+    for methods that learn from them."""
 
     def __init__(
         self,
-        mosaic: Mosaic,
         area: Area,
         grid: TileGrid,
         representation: Any,
-        sampler: CropSampler,
+        sampler: CropSampler | None = None,
         *,
         registration: bool,
         pictures: SheetPictures | None = None,
     ) -> None:
-        self.mosaic, self.area, self.grid = mosaic, area, grid
-        self.representation, self.sampler = representation, sampler
+        self.area, self.grid = area, grid
+        self.representation, self._sampler = representation, sampler
         height, width = grid.height_px, grid.width_px
         self._layout = layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
         self.cells = CellSheet(layout, height, width, representation.channels)
@@ -376,106 +288,102 @@ class SheetReader:
         # Cells that begin in a block may end beyond it, within the margin.
         self._beyond_px = layout.micro_px - layout.spacing_px
         self._margin_px = layout.micro_px + representation.margin_px
-        self._jobs = self._drawn_jobs()
 
-    def read(
-        self, progress: Progress, workers: int | None = None, cache: BlockCache | None = None
-    ) -> None:
-        """Read all blocks that are not in `cache`, with `workers` threads (None: one per core)."""
+    @property
+    def crops(self) -> list[Crop]:
+        return [] if self._sampler is None else self._sampler.crops
+
+    def read(self, raster: GreyRaster, progress: Progress, workers: int | None = None) -> None:
+        """Read all blocks with `workers` threads (None: one per core)."""
         workers = usable_cores() if workers is None else workers
-        if not represent.TABLE[self._recipe["name"]].flies:
+        recipe = variant_recipe(represent.TABLE, self.representation)
+        if not represent.TABLE[recipe["name"]].flies:
             workers = 1  # one network in memory, which uses threads itself
-        raster = self.mosaic.grid_sheet(self.area.frame, self.grid, threads=1)
-        work = functools.partial(self._read_block, raster, cache)
+        blocks = blocks_of_area(self.area, self.grid, self._layout)
+        places = self._places_of_crops(blocks)
+        work = functools.partial(self._read_block, raster)
         with (
             one_opencv_thread(),
             quiet(),
-            raster,
-            contextlib.closing(in_order(work, self._jobs, workers)) as made,
+            contextlib.closing(in_order(work, blocks, workers)) as made,
         ):
-            for done, parts in enumerate(made):
-                if parts:
-                    self._take(self._jobs[done][0], parts)
-                progress("imagery", (done + 1) / len(self._jobs))
+            for done, content in enumerate(made):
+                if content is not None:
+                    self._take(blocks[done], content, places[done])
+                progress("imagery", (done + 1) / len(blocks))
         if not self.cells.valid.any():
             raise AreaError(
                 "the area has no imagery: it lies outside the orthophotos or is all nodata"
             )
 
-    def block_cache(self, out: Path, work: Path | None) -> BlockCache | None:
-        """Cache in `work`, or, if there are many blocks, beside the map; else None."""
-        if work is None and len(self._jobs) < MIN_CACHED_BLOCKS:
-            return None
-        folder = work / f"blocks-{out.name}" if work else out.with_name(f"{out.name}.work")
-        return BlockCache(folder, self._request())
-
-    @property
-    def _recipe(self) -> dict[str, Any]:
-        return variant_recipe(represent.TABLE, self.representation)
+    def finish(
+        self,
+        tiles_rc: NDArray[np.intp],
+        embedder: ViewEmbedder,
+        embeddings: NDArray[np.float16],
+        heights: HeightLayers,
+        relief: str | None,
+    ) -> tuple[SheetInfo, Parts]:
+        """The record and the arrays of the sheet in a map, with these tiles."""
+        grid, (terrain, surface) = self.grid, heights.infos
+        arrays: Parts = {
+            "sheet0/centres_en_m": grid.centres_en_m(tiles_rc).astype(np.float32),
+            "sheet0/embeddings": embeddings,
+            "sheet0/preview_jpeg": self.preview.jpeg(),
+            **{f"embed/{name}": array for name, array in embedder.parts().items()},
+        }
+        grey = None
+        if self.layer is not None:
+            grey, parts = self.layer.finish()
+            arrays |= parts
+        area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
+        info = SheetInfo(
+            *(self.area.frame, grid, len(tiles_rc), area_km2),
+            *(grey, terrain, relief, surface),
+            lean=heights.lean,
+        )
+        return info, arrays | heights.arrays
 
     def _outer(self, block: Block) -> Block:
         return block.with_margin(self.grid, self._margin_px)
 
-    def _drawn_jobs(self) -> list[Job]:
-        blocks = blocks_of_area(self.area, self.grid, self._layout)
+    def _places_of_crops(self, blocks: Sequence[Block]) -> list[NDArray[np.intp]]:
+        """First pixels of the crops of each block with its margin."""
         total_px = sum(block.height * block.width for block in blocks)
-        jobs = []
+        found = []
         for block in blocks:
             outer, share = self._outer(block), block.height * block.width / total_px
-            jobs.append((block, self.sampler.places(outer.height, outer.width, share)))
-        return jobs
+            drawn = np.zeros((0, 2), np.intp)
+            if self._sampler is not None:
+                drawn = self._sampler.places(outer.height, outer.width, share)
+            found.append(drawn)
+        return found
 
-    def _read_block(self, raster: SheetRaster, cache: BlockCache | None, job: Job) -> Parts:
-        block, places = job
-        cached = None if cache is None else cache.load(block)
-        if cached is not None:
-            return cached
+    def _read_block(self, raster: GreyRaster, block: Block) -> BlockContent | None:
+        """None where it has no imagery."""
         outer = self._outer(block)
-        pixels, part = raster.read_grey(*outer.window), block.within(outer)
-        grey, valid = pixels.grey, pixels.valid
-        parts: Parts = {}
-        if valid.any():
-            maps = sheet_maps(self.representation, grey, valid)
-            more = block.within(outer, self._beyond_px)
-            means, share = cell_means(maps[:, more[0], more[1]], valid[more], self._layout)
-            parts = {
-                "means": means,
-                "share": share,
-                "preview": self.preview.small(block, grey[part]),
-            }
-            parts["crops"], parts["crop_places"] = self.sampler.cut(grey, valid, places)
-            if self.pictures is not None:
-                parts |= self.pictures.parts(pixels, maps, part)
-            if self.layer is not None:
-                parts |= layer_parts(self.area, self.grid, block, grey[part], valid[part])
-        if cache is not None:
-            cache.store(block, parts)
-        return parts
+        pixels = raster.read_grey(*outer.window)
+        if not pixels.valid.any():
+            return None
+        maps = sheet_maps(self.representation, pixels.grey, pixels.valid)
+        more = block.within(outer, self._beyond_px)
+        means, share = cell_means(maps[:, more[0], more[1]], pixels.valid[more], self._layout)
+        return BlockContent(pixels, maps if self.pictures else None, means, share)
 
-    def _take(self, block: Block, parts: Parts) -> None:
-        self.cells.put(block.row, block.col, parts["means"], parts["share"])
-        self.preview.put(block, parts["preview"])
-        if self.pictures is not None:
-            self.pictures.put(block, parts)
-        outer = self._outer(block)
-        self.sampler.take(parts["crops"], parts["crop_places"], outer.row, outer.col)
+    def _take(self, block: Block, content: BlockContent, places: NDArray[np.intp]) -> None:
+        outer, pixels = self._outer(block), content.pixels
+        part = block.within(outer)
+        self.cells.put(block.row, block.col, content.means, content.share)
+        self.preview.put(block, pixels.grey[part])
+        if self._sampler is not None:
+            self._sampler.take(pixels.grey, pixels.valid, places, outer.row, outer.col)
+        if self.pictures is not None and content.maps is not None:
+            self.pictures.put(block, pixels, content.maps, part)
         if self.layer is not None:
-            self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
-
-    def _request(self) -> str:
-        everything = {
-            "versions": [__version__, np.__version__, cv2.__version__, rasterio.__version__],
-            "gdal": rasterio.__gdal_version__,
-            "represent": self._recipe,
-            "area": repr(self.area),
-            "grid": vars(self.grid),
-            "layout": [vars(self._layout), self._margin_px, MAX_PREVIEW_PX, CHUNK_PX],
-            "jobs": [[*block.window, places.tolist()] for block, places in self._jobs],
-            "crop_px": self.sampler.size_px,
-            "parts": [self.layer is not None, self.pictures is not None],
-            "imagery": [source.stamp for source in self.mosaic.sources],
-        }
-        return digest(everything)[:24]
+            grey, valid = near_route(
+                self.area, self.grid, block, pixels.grey[part], pixels.valid[part]
+            )
+            self.layer.add(block.row, block.col, grey, valid)
 
 
 @contextmanager
@@ -498,13 +406,13 @@ def blocks_of_area(area: Area, grid: TileGrid, layout: CellLayout) -> list[Block
     return blocks_of(area, grid, -(-least // step) * step)
 
 
-def layer_parts(
+def near_route(
     area: Area, grid: TileGrid, block: Block, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
-) -> Parts:
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Copies of a block (H, W) without the chunks that are too far from the route."""
     grey, valid = grey.copy(), valid.copy()
     for chunk in block.cut(CHUNK_PX):
         if not chunk.may_matter(area, grid):
             where = chunk.within(block)
             grey[where], valid[where] = 0, False
-    return {"grey": grey, "valid": valid}
+    return grey, valid

@@ -124,31 +124,25 @@ def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
     share, across_px = view.tile_share(tile_m), view.across_px(gsd_m)
     across = f"a view is {across_px:.0f} map pixels across"
     covers = f"a view covers {share:.0%} of a tile"
-    found = []
-    if view.short_m < LIMITS.low_view_m:
-        text = (
-            f"a view is only {view.short_m:.0f} m across: over forest or one large field it shows "
-            "no lasting structure, and relief displacement of trees and houses is large; fly higher"
-        )
-        found.append(Caution("low", text))
-    if coarser > LIMITS.max_coarser:
-        text = (
-            f"a pixel of the view covers {coarser:.1f} pixels of the map: refused (too_coarse); "
-            "build coarser, or fly lower"
-        )
-        found.append(Caution("too_coarse", text))
-    if across_px < LIMITS.min_view_px:
-        text = f"{across}: refused below {LIMITS.min_view_px:.0f}; build finer, or fly higher"
-        found.append(Caution("too_small", text))
-    elif across_px < LIMITS.good_view_px * 0.999:
-        text = f"{across}, fewer than {LIMITS.good_view_px:.0f}; build finer, or fly higher"
-        found.append(Caution("few_pixels", text))
-    if share < LIMITS.min_tile_share:
-        text = f"{covers}: tile search refuses below {LIMITS.min_tile_share:.0%}; use smaller tiles"
-        found.append(Caution("tile_too_large", text))
-    elif share < 0.999:
-        found.append(Caution("part_of_tile", f"{covers} of {tile_m:.0f} m; best is a whole tile"))
-    return found
+    low, tiny = view.short_m < LIMITS.low_view_m, across_px < LIMITS.min_view_px
+    few = not tiny and across_px < LIMITS.good_view_px * 0.999
+    small = share < LIMITS.min_tile_share
+    rows = [
+        (low, "low", f"a view is only {view.short_m:.0f} m across: over forest or one large field "
+         "it shows no lasting structure, and relief displacement of trees and houses is large; "
+         "fly higher"),
+        (coarser > LIMITS.max_coarser, "too_coarse", f"a pixel of the view covers {coarser:.1f} "
+         "pixels of the map: refused (too_coarse); build coarser, or fly lower"),
+        (tiny, "too_small",
+         f"{across}: refused below {LIMITS.min_view_px:.0f}; build finer, or fly higher"),
+        (few, "few_pixels",
+         f"{across}, fewer than {LIMITS.good_view_px:.0f}; build finer, or fly higher"),
+        (small, "tile_too_large",
+         f"{covers}: tile search refuses below {LIMITS.min_tile_share:.0%}; use smaller tiles"),
+        (not small and share < 0.999, "part_of_tile",
+         f"{covers} of {tile_m:.0f} m; best is a whole tile"),
+    ]  # fmt: skip
+    return [Caution(code, text) for holds, code, text in rows if holds]
 
 
 @dataclass(frozen=True)
