@@ -2,7 +2,7 @@
 # make test    install and run the tests; `make test EXTRAS=test` without PyTorch and Ray, whose tests
 #              are then skipped by name
 # make lint    style, types, import layers
-# make bench   measure speed, memory and accuracy, and compare with other methods
+# make bench   measure building, and latency, load and accuracy of `orthonav fly`
 # make paper   the tables of the paper in the reduced setting, about two hours on two cores
 # make docs    the documentation as a site in site/, to be opened without a server
 # make figures  renew the figures of the documentation by running a tutorial, minutes
@@ -45,7 +45,8 @@ format: $(VENV)/.dev-installed
 	$(BIN)/ruff format .
 
 bench: $(VENV)/.dev-installed
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks.build
+	$(BIN)/python -m benchmarks.onboard
 
 paper: $(VENV)/.dev-installed
 	$(BIN)/python -m experiments.paper
@@ -55,7 +56,7 @@ docs: $(VENV)/.docs-installed
 	@echo "open site/index.html"
 
 figures: $(VENV)/.docs-installed
-	$(BIN)/python tools/docs/pictures.py
+	PYTHONPATH=. $(BIN)/python tools/docs/pictures.py
 
 golden: $(VENV)/.dev-installed
 	PYTHONPATH=. $(BIN)/python tests/golden/renew.py

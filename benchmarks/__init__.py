@@ -1,4 +1,4 @@
-"""Benchmarks of the checkout: `python -m benchmarks`, `python -m benchmarks.NAME`."""
+"""Benchmarks of the checkout: `python -m benchmarks.NAME`."""
 
 import os
 

@@ -1,9 +1,10 @@
 """This checkout against another one: accuracy, confidence, time and memory of the same views.
 
-`python -m benchmarks.against OTHER [--views N] [--rounds N] [--only TEXT ..] [--work DIR]`. OTHER
-is a checkout of any commit that has `orthonav localize`. Both localize the same flights on the same
-maps, which OTHER builds, each in a process of its own, in turn; compared are the fixes that
-they write. Imagery beside the checkout that is absent is left out.
+`python -m benchmarks.against OTHER [--views N] [--rounds N] [--part growth] [--only TEXT ..]`.
+OTHER is a checkout of any commit that has `orthonav localize`. Both localize the same flights on
+the same maps, which OTHER builds, each in a process of its own, in turn; compared are the fixes
+that they write. Imagery that is absent is left out. `--part growth`: rows with other errors and
+sizes of views; with this checkout as OTHER, how time and memory grow with them.
 """
 
 import argparse
@@ -38,7 +39,6 @@ from orthonav.core.flight import read_truth
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 
-NAME = "against"
 ROOT = Path(__file__).resolve().parents[1]
 HERE, THERE = "here", "other"
 SEED = 7
@@ -59,19 +59,33 @@ HEADER = (
 @dataclass(frozen=True)
 class Case:
     """Views over a map: `map` and `views` are names of orthophotos, or sides of generated squares
-    in metres; `prior_px`: standard deviation of a prior, pixels of the map."""
+    in metres; `prior_px`: standard deviation of a prior, pixels of the map; `yaw_std_deg` and
+    `agl_std`: of heading and height (fraction), as reported."""
 
     map: str
     views: str
     width_px: int = 256
     heading_known: bool = True
     prior_px: float | None = None
+    yaw_std_deg: float = 10.0
+    agl_std: float = 0.1
 
     @property
     def name(self) -> str:
-        heading = "heading to 10 deg" if self.heading_known else "heading unknown"
+        heading = f"to {self.yaw_std_deg:g} deg" if self.heading_known else "unknown"
+        height = "" if self.agl_std == 0.1 else f", height to {self.agl_std:.0%}"
         prior = "" if self.prior_px is None else f", prior to {self.prior_px:g} px"
-        return f"{self.map}: {self.width_px} px, {heading}{prior}"
+        return f"{self.map}: {self.width_px} px, heading {heading}{height}{prior}"
+
+
+def growth() -> Iterator[Case]:
+    """Other errors and sizes over 16 km2, and a prior on 100 km2."""
+    yield Case("4000", "2000", yaw_std_deg=40.0)
+    for std in (0.02, 0.3):
+        yield Case("4000", "2000", agl_std=std)
+    for width_px in (96, 128, 512):
+        yield Case("4000", "2000", width_px)
+    yield Case("10000", "2000", prior_px=50.0)
 
 
 def cases() -> Iterator[Case]:
@@ -91,6 +105,9 @@ def cases() -> Iterator[Case]:
     for side_m in ("4000", "10000"):
         yield Case(side_m, "2000")
         yield Case(side_m, "2000", heading_known=False)
+
+
+PARTS = {"usual": cases, "growth": growth}
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,12 +177,13 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("other", type=Path, help="checkout of another commit")
     parser.add_argument("--views", type=int, default=100, help="views per row")
     parser.add_argument("--rounds", type=int, default=2, help="times that both localize them")
+    parser.add_argument("--part", choices=PARTS, default="usual")
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="rows that contain one of these")
 
 
 def measure(options: argparse.Namespace) -> Section:
     rows = []
-    for case in cases():
+    for case in PARTS[options.part]():
         if options.only and not any(text in case.name for text in options.only):
             continue
         if case.map.endswith(".tif") and not is_there(case.map, case.views):
@@ -176,7 +194,7 @@ def measure(options: argparse.Namespace) -> Section:
     notes = (
         f"other: commit {commit}; CPU ms: processor time of a view, less that of a blank one, "
         f"least of {options.rounds} rounds in turn; ms, p99: on the clock, by the "
-        "fixes; peak: of the process; height known to 10 %",
+        "fixes; peak: of the process; height known to 10 % unless stated",
         f"correct: within 35 m or 10 px; accepted: of these, confidence of {CONFIDENT:g} or more",
     )
     title = "Against another commit"
@@ -223,7 +241,8 @@ def _inputs(case: Case, other: Tree, options: argparse.Namespace) -> tuple[Path,
     flown = _ortho(case.views, PRESENT, work)
     gsd_m = gsd_of(past)
     prior_m = None if case.prior_px is None else case.prior_px * gsd_m
-    errors, agl_m = replace(WIDE, prior_std_m=prior_m), agl_of(case.width_px, gsd_m)
+    stds = {"yaw_std_deg": case.yaw_std_deg, "agl_std": case.agl_std}
+    errors, agl_m = replace(WIDE, prior_std_m=prior_m, **stds), agl_of(case.width_px, gsd_m)
     views = 6 if options.quick else options.views
     folder = flight(flown, work, views=views, errors=errors, seed=SEED, agl_m=agl_m)
     built = work / f"{past.parent.name}-{past.stem}.onav"
@@ -237,4 +256,4 @@ def _ortho(name: str, date: str, work: Path) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

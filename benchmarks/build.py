@@ -2,16 +2,14 @@
 
 import argparse
 import json
+import subprocess
 import sys
 import time
 from pathlib import Path
 
-from benchmarks.placing import child, memory_mb
-from benchmarks.record import Section, Table, number, run, say
+from benchmarks.record import Section, Table, memory_mb, number, run, say
 from benchmarks.scenes import PAST, SCENES, area, is_there, ortho
 from orthonav.ground.build import BuildRequest, build_map
-
-NAME = "build"
 
 
 def measure(options: argparse.Namespace) -> Section:
@@ -24,7 +22,8 @@ def measure(options: argparse.Namespace) -> Section:
     for path in paths:
         start, out = time.perf_counter(), options.work / "built.onav"
         out.unlink(missing_ok=True)
-        found = child("build", "--child", str(path), str(out))
+        command = [sys.executable, "-m", "benchmarks.build", "--child", str(path), str(out)]
+        found = json.loads(subprocess.check_output(command).splitlines()[-1])
         wall_s = time.perf_counter() - start
         figures = found["km2"], found["tiles"], wall_s, found["peak_mb"], found["map_mb"]
         name = f"{path.parent.name}, {path.stem}"
@@ -46,4 +45,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
         _child(Path(sys.argv[2]), Path(sys.argv[3]))
     else:
-        sys.exit(run(NAME, __doc__, measure))
+        sys.exit(run(measure))

@@ -10,9 +10,8 @@ recalibrated by the others. `--fit` prints the recalibration by all scenes. Reru
 import argparse
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from benchmarks.placing import views_in
 from benchmarks.record import Section, Table, resumed, rows_path, run, say
 from benchmarks.scenes import (
     WIDE,
@@ -32,6 +30,7 @@ from benchmarks.scenes import (
     map_of,
     ortho,
     place_of,
+    views_in,
 )
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
@@ -44,10 +43,8 @@ from orthonav.ground.check.run import check_map
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA
 from orthonav.onboard.run import SingleViews, locate_view
 
-NAME = "check_trust"
 WIDTHS_PX = (256, 160, 112, 80)
 PRIOR_PX, EFFORT = 60.0, 0.05
-BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
 STDS, STDS_NARROW = np.arange(4, 25, 2) / 10, np.arange(0, 15, 2) / 10
 """Standard deviations between scenes, and what a halving of the width adds, that are compared."""
 RIDGE = Recalibration(0.1, 2.0, 0.5, 0.5, 0.0)
@@ -238,7 +235,7 @@ def _between_scenes(found: Sequence[Outcome], by: Recalibration) -> tuple[float,
 
 
 def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]:
-    """Predicted and measured: by condition, and by fifths of what was predicted."""
+    """Predicted and measured: by condition, and by the width of views."""
     scenes = sorted({each.scene for each in found})
     by = {s: fitted([each for each in found if each.scene != s]) for s in scenes}
     rows = [_row(each, by[each.scene]) for each in found if each.right]
@@ -259,8 +256,6 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
     return [
         Table("Checks and what came out", header, rows, notes),
         _widths_table(above, by),
-        _bins_table(found, lambda each: each.predicted(by[each.scene]), "by the other scenes"),
-        _bins_table(found, lambda each: each.predicted(PLAIN), "without recalibration"),
     ]
 
 
@@ -299,23 +294,5 @@ def _widths_table(found: Sequence[Outcome], by: dict[str, Recalibration]) -> Tab
     return Table("By the width of views", header, rows)
 
 
-def _bins_table(
-    found: Sequence[Outcome], predicted_of: Callable[[Outcome], Array], name: str
-) -> Table:
-    predicted = np.concatenate([predicted_of(each) for each in found])
-    right = np.concatenate([np.array(each.right, np.bool_) for each in found])
-    rows, error = [], 0.0
-    for low, high in pairwise(BINS):
-        inside = (predicted >= low) & (predicted < high)
-        if inside.any():
-            means = float(predicted[inside].mean()), float(right[inside].mean())
-            error += abs(means[0] - means[1]) * float(inside.mean())
-            count = str(int(inside.sum()))
-            rows.append([f"{low:.1f} to {min(high, 1):.1f}", count, *(f"{m:.2f}" for m in means)])
-    notes = (f"calibration error {error:.3f} over fifths, {len(right)} views",)
-    header = ("predicted", "views", "mean predicted", "measured")
-    return Table(f"Predicted and measured, {name}", header, rows, notes)
-
-
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

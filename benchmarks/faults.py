@@ -46,7 +46,6 @@ from orthonav.core.mapfile import open_map
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.simulate.render import ViewEffects, render_view
 
-NAME = "faults"
 SIDE_M, MAP_M = 1600, 1200
 """Sides of the generated area, and of the map in its middle."""
 REACH_M, AGL_M, SPEED_MPS = 380.0, 150.0, 18.0
@@ -231,4 +230,4 @@ def measure(options: argparse.Namespace) -> Section:
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -27,7 +27,7 @@ from benchmarks.closed_loop.inertial import FILTERS
 from benchmarks.closed_loop.loop import Course, Located, Scenario, fly, scenario
 from benchmarks.closed_loop.physics import VEHICLES
 from benchmarks.closed_loop.replays import Area, stated
-from benchmarks.integrity import LIMIT_M, diagram
+from benchmarks.integrity import LIMIT_M
 from benchmarks.real_ground.maps import COARSE, COARSE_STD_M, relief_file
 from benchmarks.record import Section, Table, number, percent, resumed, rows_path, run, say
 from benchmarks.scenes import (
@@ -49,7 +49,6 @@ from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.records import RADIUS_SHARE
 from orthonav.ground.evaluate.statistics import runs, upper_bound
 
-NAME = "flight_hours"
 UNDISTURBED, FAULTS = ("fixes", "start"), ("shifted", "mirrored", "frozen")
 """Scenarios of `closed_loop.loop`."""
 FAULTY_ROUNDS, ROUNDS = 3, 16
@@ -152,7 +151,7 @@ def row_of(task: Task) -> dict[str, Any]:
 
 
 def _plain(view: Located, from_s: float) -> list[float]:
-    values = float(np.hypot(*view.error_m)), view.level_m, view.nees
+    values = view.error_m, view.level_m, view.nees
     flags = int(view.sent), int(view.state == "tracking")
     return [round(view.time_s - from_s, 2), *flags, *(float(f"{each:.5g}") for each in values)]
 
@@ -179,10 +178,8 @@ class Judged:
     def of(cls, row: dict[str, Any]) -> "Judged":
         """From a row of `row_of`."""
         time_s, sent, tracking, error_m, level_m, nees = np.array(row["views"], np.float64).T
-        false, leveled = (
-            (sent > 0) & (error_m > row["limit_m"]),
-            (tracking > 0) & (level_m < np.inf),
-        )
+        false = (sent > 0) & (error_m > row["limit_m"])
+        leveled = (tracking > 0) & (level_m < np.inf)
         available = leveled & (level_m <= row["limit_m"])
         return cls(row, time_s, sent > 0, false, leveled, available, error_m, level_m, nees)
 
@@ -282,22 +279,10 @@ def tasks_of(options: argparse.Namespace) -> Iterator[tuple[str, Task]]:
                 vehicle, autopilot = chance.choice(list(VEHICLES)), chance.choice(list(FILTERS))
                 if course_of(pair, options.work, options.every).agl_m > HIGHEST_QUAD_M:
                     vehicle = "plane"
-                has_terrain = number % 2 == 0
+                minutes, has_terrain = 0.25 if options.quick else options.minutes, number % 2 == 0
+                flown = str(vehicle), str(autopilot), name, 1 + number, minutes, options.every
                 about = f"{number} {name}, {pair.name}, {vehicle}, {autopilot}"
-                yield (
-                    about,
-                    Task(
-                        pair,
-                        str(vehicle),
-                        str(autopilot),
-                        name,
-                        1 + number,
-                        0.25 if options.quick else options.minutes,
-                        options.every,
-                        has_terrain,
-                        options.work,
-                    ),
-                )
+                yield about, Task(pair, *flown, has_terrain, options.work)
         number += 1
 
 
@@ -337,9 +322,6 @@ def measure(options: argparse.Namespace) -> Section:
             f"core per flight hour, {left_h:.1f} h left"
         )
     calm = [each for each in flights if each.row["scenario"] in UNDISTURBED]
-    leveled = [(each.error_m[each.leveled], each.level_m[each.leveled]) for each in calm]
-    errors, levels = (np.concatenate(each) for each in zip(*leveled, strict=True))
-    diagram(errors, levels, options.out / "flight_hours.png")
     notes = (
         f"without GNSS, a view every {options.every:g} s; false: sent, error beyond the alert limit"
         f" of {LIMIT_M:g} m or {RADIUS_SHARE:.1%} of the height; event: views in a row",
@@ -361,4 +343,4 @@ def measure(options: argparse.Namespace) -> Section:
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -30,7 +30,6 @@ from orthonav.ground.simulate.receiver import (
 from orthonav.onboard.gnss.biases import Biases, design
 from orthonav.onboard.gnss.monitor import GnssMonitor, GnssState, GnssStatus, MapPosition
 
-NAME = "gnss_watch"
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS, LEG_M, TURN_RADIUS_M = 20.0, 2000.0, 100.0
 ROLL_S = 3
@@ -380,4 +379,4 @@ def measure(options: argparse.Namespace) -> Section:
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -9,18 +9,14 @@ rows are kept in DIR, rerun to resume. `--fit` prints weights fitted to all view
 import argparse
 import math
 import os
-import re
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
@@ -41,17 +37,12 @@ from orthonav.core.localize.confidence import (
 from orthonav.core.records import CONFIDENT, protection_levels_m
 from orthonav.ground.evaluate.statistics import calibrate, upper_bound
 
-NAME = "integrity"
 RIDGE = 1e-5
 """Weight of the ridge of the fit: only against weights without bound."""
 LIMIT_M, LIMIT_PX = 35.0, 10.0
 """Alert limit of the tables: the larger one, coarse imagery cannot do better."""
 TAIL = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 0.0)
 """Bounds of the stated probability of a wrong place."""
-GAPS = ((0, 3), (3, 7), (7, 15), (15, 60))
-"""Years between map and views, from and below."""
-LARGEST_M = 500.0
-"""Errors and protection levels of the diagram are at most this."""
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -178,11 +169,9 @@ def measure(options: argparse.Namespace) -> Section:
         judge = fit_judge(judged.features, judged.right)
         print("biases =", tuple(round(each, 2) for each in judge.biases))
         print("weights =", tuple(round(each, 2) for each in judge.weights))
-    diagram(judged.error_m, judged.level_m, options.out / "integrity.png")
     tables = [
         _groups_table(judged, "By scene, left out", _scenes(judged)),
         _groups_table(judged, "By kind of view", _kinds(judged)),
-        _groups_table(judged, "By years between map and views", _gaps(judged)),
         _tail_table(judged),
     ]
     return Section(f"Integrity of {len(rows)} single views", tables)
@@ -213,20 +202,6 @@ def _name(width_px: int, known: bool, prior_px: float | None, tracked: bool) -> 
     words += [] if prior_px is None else [f"prior {prior_px:g} px"]
     words += ["tracked"] if tracked else []
     return ", ".join(words)
-
-
-def _gaps(judged: Judged) -> list[tuple[str, Mask]]:
-    apart = np.array([_years_apart(each["pair"]) for each in judged.rows])
-    return [
-        (f"{least} to {most - 1}", (apart >= least) & (apart < most) & judged.found)
-        for least, most in GAPS
-    ]
-
-
-def _years_apart(pair: str) -> int:
-    """By the last two years in the name of a pair; -1 where it states none."""
-    years = [int(year) for year in re.findall(r"(?:19|20)\d\d", pair)]
-    return abs(years[-1] - years[-2]) if len(years) > 1 else -1
 
 
 def _groups_table(judged: Judged, name: str, groups: Sequence[tuple[str, Mask]]) -> Table:
@@ -285,25 +260,5 @@ def _tail_table(judged: Judged) -> Table:
     return Table("Tail of the place probability, scenes left out", header, rows)
 
 
-def diagram(error_m: Array, level_m: Array, out: Path) -> None:
-    """A Stanford diagram: errors (N,) against protection levels, one pixel for so many fixes."""
-    shown = np.isfinite(level_m)
-    levels, errors = (np.clip(each[shown], 0.1, LARGEST_M) for each in (level_m, error_m))
-    figure = Figure(figsize=(6.5, 5.5), layout="constrained")
-    axes = figure.add_subplot()
-    edges = np.geomspace(0.1, LARGEST_M, 121)
-    counts = axes.hist2d(errors, levels, [edges, edges], norm=mpl.colors.LogNorm())[3]
-    axes.plot([0.1, LARGEST_M], [0.1, LARGEST_M], color="tab:red", linewidth=1)
-    axes.axhline(LIMIT_M, color="grey", linewidth=1, linestyle="--")
-    axes.axvline(LIMIT_M, color="grey", linewidth=1, linestyle="--")
-    axes.set(xscale="log", yscale="log", xlabel="error, m", ylabel="protection level, m")
-    axes.set_title(
-        f"{int(shown.sum())} fixes with a protection level at a risk of {DEFAULT_RISK:g}"
-    )
-    figure.colorbar(counts, label="fixes")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=120)
-
-
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -15,8 +15,17 @@ import numpy as np
 import rasterio
 from rasterio.warp import transform_bounds
 
-from benchmarks.placing import views_in
-from benchmarks.scenes import USUAL, Pair, agl_of, flight, gsd_of, map_of, ortho, place_of
+from benchmarks.scenes import (
+    USUAL,
+    Pair,
+    agl_of,
+    flight,
+    gsd_of,
+    map_of,
+    ortho,
+    place_of,
+    views_in,
+)
 from benchmarks.scenes import far_m as far_m_of
 from orthonav.core.errors import AreaError
 from orthonav.core.localize import Localizer

@@ -1,18 +1,15 @@
 """Looped flights played in real time: one lap is rendered, cached and repeated."""
 
 import csv
-import hashlib
 import math
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.files import replacing
 from orthonav.core.flight import read_truth
 from orthonav.core.geo import camera
 from orthonav.core.geo.camera import Camera
@@ -25,7 +22,6 @@ CAMERA = Camera(
     1280, 960, 1000.0, 1000.0, 646.0, 474.0, distortion=(-0.12, 0.05, 0.0005, -0.0003, 0.0)
 )
 """A wide board camera: 65 x 51 deg, and a lens that bends the rim by 17 px."""
-SMALL_CAMERA = Camera(640, 480, 500.0, 500.0, 323.0, 237.0)
 AGL_M, SPEED_MPS = 250.0, 25.0
 HALF_M, TURN_RADIUS_M = 300.0, 120.0
 LINE_EN_M = ((0, 1), (1, 1), (1, -1), (-1, -1), (-1, 1), (0, 1))
@@ -44,41 +40,21 @@ ERRORS = Errors(
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class LoopedFlight:
-    """How a lap is flown: by which camera, at how many views a second. Short: a side and a half."""
-
-    camera: Camera
-    rate_hz: float
-    short: bool = False
-
-    @property
-    def corners_en_m(self) -> Array:
-        """Corners (N, 2) of its route."""
-        line = LINE_EN_M[-3:] if self.short else LINE_EN_M
-        return np.array(line, np.float64) * HALF_M
-
-
-def route_of(frame: LocalFrame, corners_en_m: Array) -> Route:
-    """A route along corners (N, 2)."""
-    lat, lon = frame.latlon_from_en(corners_en_m)
-    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
-
-
-def rendered(work: Path, ortho: Path, frame: LocalFrame, lap: LoopedFlight) -> Path:
-    """Flight folder of a lap, rendered once."""
-    settings = repr((lap, lap.corners_en_m.tolist(), AGL_M, SPEED_MPS, TURN_RADIUS_M, ERRORS))
-    digest = hashlib.sha256(settings.encode() + ortho.parent.name.encode()).hexdigest()
-    folder = work / f"lap-{lap.camera.width_px}-{digest[:8]}"
+def rendered(
+    work: Path, ortho: Path, frame: LocalFrame, rate_hz: float, short: bool = False
+) -> Path:
+    """Flight folder of a lap at so many views a second, rendered once; short: a side and a half."""
+    folder = work / f"lap-{rate_hz:g}-hz{'-short' * short}"
     if not folder.is_dir():
+        lat, lon = frame.latlon_from_en(np.array(LINE_EN_M[-3:] if short else LINE_EN_M) * HALF_M)
         request = SimulateRequest(
             [ortho],
             folder,
-            route=route_of(frame, lap.corners_en_m),
+            route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
             agl_m=AGL_M,
-            spacing_m=SPEED_MPS / lap.rate_hz,
+            spacing_m=SPEED_MPS / rate_hz,
             airspeed_mps=SPEED_MPS,
-            camera=lap.camera,
+            camera=CAMERA,
             errors=ERRORS,
             seed=SEED,
             turn_radius_m=TURN_RADIUS_M,
@@ -149,15 +125,10 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 def write_rows(path: Path, rows: Sequence[dict[str, str]]) -> None:
     """Write what `read_rows` reads."""
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+    with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-
-
-def views_of(folder: Path) -> int:
-    """How many views a flight folder has."""
-    return len(read_rows(folder / "telemetry.csv"))
 
 
 def _closing_m(lap: Path) -> float:

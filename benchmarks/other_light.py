@@ -1,8 +1,7 @@
 """Views in other light than the map's: infrared, night, snow, flood, thermal, other seasons.
 
 `python -m benchmarks.other_light [--views 30] [--workers 2]` places real pairs where the optional
-imagery is there, and rendered ones of generated landscapes, on whole maps without a prior, and
-writes a picture of the best and of the worst case of each row.
+imagery is there, and rendered ones of generated landscapes, on whole maps without a prior.
 """
 
 import argparse
@@ -21,7 +20,6 @@ import rasterio
 from lab.landscape import OTHER_LIGHT
 from numpy.typing import NDArray
 
-from benchmarks.placing import views_in
 from benchmarks.record import Section, Table, number, resumed, rows_path, run, say
 from benchmarks.scenes import (
     DATA,
@@ -35,6 +33,7 @@ from benchmarks.scenes import (
     gsd_of,
     map_of,
     ortho,
+    views_in,
 )
 from orthonav.core.files import replacing
 from orthonav.core.flight import open_flight, read_truth
@@ -44,7 +43,6 @@ from orthonav.core.localize.search import Search
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, View
 
-NAME = "other_light"
 SEED, WIDTH_PX = 3, 256
 FAR_SHARE = 0.05
 """A position of unreported tilt is wrong beyond this share of the height, too."""
@@ -269,7 +267,6 @@ def measured(task: tuple[str, int, Path]) -> dict[str, Any]:
     localizer = _localizer(row.map, work)
     found: dict[str, Any] = {"views": 0, "ms": dict.fromkeys(WAYS, 0.0)}
     found |= {key: dict.fromkeys(WAYS, 0) for key in ("right", "accepted", "wrong")}
-    cases: list[tuple[float, View, Fix | NoFix]] = []
     for view, truth, of_ground in row.cases(work, count):
         found["views"] += 1
         for way, locate in _ways(localizer):
@@ -282,12 +279,7 @@ def measured(task: tuple[str, int, Path]) -> dict[str, Any]:
             found["right"][way] += right
             found["accepted"][way] += fix.is_confident
             found["wrong"][way] += fix.is_confident and not right
-        rank = fix.confidence if isinstance(fix, Fix) else 0.0
-        cases.append((rank, view, fix))
     found["ms"] = {way: each / max(found["views"], 1) for way, each in found["ms"].items()}
-    if cases and not row.elsewhere:
-        cases.sort(key=lambda each: each[0])
-        _draw(work / "pictures" / f"{row.name}.png", localizer, [cases[-1], cases[0]])
     return found
 
 
@@ -321,38 +313,5 @@ def _ways(localizer: Localizer) -> Iterator[tuple[str, Any]]:
     yield DEFAULT, localizer.locate
 
 
-def _draw(path: Path, localizer: Localizer, cases: list[tuple[float, View, Fix | NoFix]]) -> None:
-    """Views, left, beside the map where they were placed, best above worst."""
-    lines = []
-    for confidence, view, fix in cases:
-        side = 256
-        picture = cv2.resize(view.grey, (side * 4 // 3, side))
-        beside = np.zeros_like(picture)
-        if isinstance(fix, Fix) and fix.ground_latlon_deg is not None:
-            beside = _map_at(localizer, fix, view, beside.shape)
-        pair = np.hstack([picture, beside])
-        cv2.putText(pair, f"{confidence:.2f}", (6, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.7, 255, 2)
-        lines.append(pair)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.vstack(lines))
-
-
-def _map_at(
-    localizer: Localizer, fix: Fix, view: View, shape: tuple[int, ...]
-) -> NDArray[np.uint8]:
-    """The map (H, W) around the ground in the middle of a view, turned as the view."""
-    assert localizer.registration is not None and fix.ground_latlon_deg is not None
-    pyramid, grid = localizer.registration.pyramid, localizer.grid
-    x, y = localizer.registration.px_of(
-        localizer.sheet.frame.en_from_latlon(*fix.ground_latlon_deg)
-    )
-    width_m = fix.agl_m * view.camera.width_px / view.camera.fx_px
-    scale = shape[1] * grid.gsd_m / width_m
-    turn = np.asarray(cv2.getRotationMatrix2D((x, y), fix.heading_deg, scale), np.float64)
-    turn[:, 2] += np.array([shape[1], shape[0]]) / 2 - [x, y]
-    whole, _ = pyramid.read(0, 0, 0, *pyramid.shape(0))
-    return np.asarray(cv2.warpAffine(whole, turn, (shape[1], shape[0])), np.uint8)
-
-
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

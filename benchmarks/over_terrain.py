@@ -30,7 +30,6 @@ from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.simulate.render import Raster
 
-NAME = "over_terrain"
 PARTS = ("slopes", "wrong", "oblique")
 WRONG = ("", "displaced by 200 m", "50 m too high", "with holes")
 POSTING_M, FINER = 10.0, 4
@@ -284,4 +283,4 @@ def _placed(
 
 
 if __name__ == "__main__":
-    sys.exit(run(NAME, __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -3,13 +3,11 @@
 import contextlib
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,18 +68,16 @@ def utc_ahead_ns() -> int:
 class FakeAutopilot:
     """The process of the fake autopilot, and its received messages."""
 
-    def __init__(self, flight: Path, port: int, core: int, pace: float = 1.0) -> None:
+    def __init__(self, flight: Path, port: int, core: int) -> None:
         """Returns when its clock has begun."""
-        self.flight, self.pace = flight, pace
+        self.flight = flight
         self.heard: list[dict[str, Any]] = []
         program = Path(__file__).parents[1] / "examples" / "simulated_autopilot.py"
         # 49 attitudes a second: exposures fall anywhere between two.
         options = ("--url", f"127.0.0.1:{port}", "--rate-hz", "49", "--messages", "--tail-s", "5")
         command = [sys.executable, str(program), str(flight), *options]
         with on_core(core):
-            self._process = subprocess.Popen(
-                [*command, "--pace", str(pace)], stdout=subprocess.PIPE, text=True
-            )
+            self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         out = self._process.stdout
         assert out is not None
         begun = json.loads(out.readline())
@@ -110,25 +106,22 @@ class FakeAutopilot:
 
     def mono_ns(self, flight_s: float) -> int:
         """When a time of the flight is, by the monotonic clock."""
-        return self.begin_ns + round(flight_s / self.pace * 1e9)
+        return self.begin_ns + round(flight_s * 1e9)
 
     def wait_until(self, flight_s: float) -> None:
         """Sleep until a time of the flight."""
         time.sleep(max(0.0, (self.mono_ns(flight_s) - time.monotonic_ns()) / 1e9))
 
-    def stop(self) -> None:
+    def __enter__(self) -> "FakeAutopilot":
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """End it; what it heard stays."""
         self._process.terminate()
         self._process.wait(10)
         self._thread.join(10)
         if self._process.stdout is not None:
             self._process.stdout.close()
-
-    def __enter__(self) -> "FakeAutopilot":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
 
 @dataclass(frozen=True)
@@ -138,16 +131,12 @@ class Sample:
     - `at_ns`: time on the monotonic clock, ns.
     - `rss_mb`, `peak_mb`: resident memory, current and peak.
     - `cpu_s`: processor time of the process.
-    - `waited_s`: time that its first thread was ready to run but had to wait.
-    - `core_s`: processor time of the core for all processes.
     """
 
     at_ns: int
     rss_mb: float
     peak_mb: float
     cpu_s: float
-    waited_s: float
-    core_s: float
 
 
 @dataclass
@@ -168,15 +157,15 @@ class Fly:
                 [*script, "fly", *self.arguments], stdout=subprocess.DEVNULL, stderr=errors
             )
 
-    def watch(self, until_ns: int | None = None, every_s: float = 1.0) -> None:
+    def watch(self, until_ns: int) -> None:
         """Take a sample each second until it ends, or until a moment."""
         while self.process.poll() is None:
-            left_s = every_s if until_ns is None else (until_ns - time.monotonic_ns()) / 1e9
+            left_s = (until_ns - time.monotonic_ns()) / 1e9
             if left_s <= 0:
                 return
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(min(every_s, left_s))
-            made = sample(self.process.pid, self.core)
+                self.process.wait(min(1.0, left_s))
+            made = sample(self.process.pid)
             if made is not None:
                 self.samples.append(made)
 
@@ -184,15 +173,6 @@ class Fly:
         """Kill the process, as a power failure does."""
         self.process.kill()
         self.process.wait(10)
-
-    def stop(self) -> int:
-        """Stop the process as systemd does; returns the exit code."""
-        self.process.send_signal(signal.SIGTERM)
-        try:
-            return self.process.wait(40)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            raise
 
     def __enter__(self) -> "Fly":
         return self
@@ -202,13 +182,12 @@ class Fly:
             self.kill()
 
 
-def sample(pid: int, core: int) -> Sample | None:
+def sample(pid: int) -> Sample | None:
     """A process now; None where it has ended."""
     at_ns = time.monotonic_ns()
     try:
         status = Path(f"/proc/{pid}/status").read_text().splitlines()
         stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        waited = int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
     except (OSError, IndexError):
         return None
     kb = {line.split(":")[0]: int(line.split()[1]) for line in status if line.startswith("Vm")}
@@ -216,17 +195,7 @@ def sample(pid: int, core: int) -> Sample | None:
         return None
     cpu_s = (int(stat[11]) + int(stat[12])) / TICKS_PER_S
     rss_mb, peak_mb = (kb[name] * 1024 / 1e6 for name in ("VmRSS", "VmHWM"))
-    return Sample(at_ns, rss_mb, peak_mb, cpu_s, waited / 1e9, _core_s(core))
-
-
-def _core_s(core: int) -> float:
-    """What a core has worked so far: all but idle and waiting for disks."""
-    for line in Path("/proc/stat").read_text().splitlines():
-        name, *values = line.split()
-        if name == f"cpu{core}":
-            ticks = [int(value) for value in values[:8]]
-            return (sum(ticks) - ticks[3] - ticks[4]) / TICKS_PER_S
-    raise RuntimeError(f"this system does not report the load of core {core}")
+    return Sample(at_ns, rss_mb, peak_mb, cpu_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,13 +205,11 @@ class Arrivals:
     - `view`: index of the view.
     - `latency_ms`: from exposure to arrival, ms.
     - `error_m`: distance from the truth, m.
-    - `clock_ms`: error of the exposure time in the message, ms.
     """
 
     view: NDArray[np.intp]
     latency_ms: Array
     error_m: Array
-    clock_ms: Array
 
     @classmethod
     def of(cls, fake_autopilot: FakeAutopilot) -> "Arrivals":
@@ -255,44 +222,20 @@ class Arrivals:
         for message in fake_autopilot.heard:
             if message["name"] != POSITION:
                 continue
-            sent_us = message["time_usec"]  # of this message; exposure is before it by its age
-            reported_ns = (
-                sent_us - message["processing_time"]
-            ) * 1000 - fake_autopilot.utc_ahead_ns
-            progress_s = (reported_ns - fake_autopilot.begin_ns) / 1e9 * fake_autopilot.pace
-            view = int(np.abs(times_s - progress_s).argmin())
+            # The message states its own time; the exposure is before it by its age.
+            exposed_us = message["time_usec"] - message["processing_time"]
+            since_ns = exposed_us * 1000 - fake_autopilot.utc_ahead_ns - fake_autopilot.begin_ns
+            view = int(np.abs(times_s - since_ns / 1e9).argmin())
             exposed_ns = fake_autopilot.mono_ns(float(times_s[view]))
             off = LocalFrame(*places[view]).en_from_latlon(
                 message["lat"] * 1e-7, message["lon"] * 1e-7
             )
-            latency_ms, clock_ms = (
-                (message["at_ns"] - exposed_ns) / 1e6,
-                (reported_ns - exposed_ns) / 1e6,
-            )
-            rows.append((view, latency_ms, float(np.hypot(*off)), clock_ms))
-        columns = np.array(rows, np.float64).reshape(-1, 4)
+            rows.append((view, (message["at_ns"] - exposed_ns) / 1e6, float(np.hypot(*off))))
+        columns = np.array(rows, np.float64).reshape(-1, 3)
         return cls(columns[:, 0].astype(np.intp), *columns[:, 1:].T)
 
 
-@dataclass(frozen=True, eq=False)
-class Lines:
-    """What the program itself wrote: ages (ms) of all views, its last line of health, and for how
-    many lines each reason of health was there."""
-
-    ages_ms: Array
-    health: dict[str, Any]
-    reasons: Counter[str]
-
-    @classmethod
-    def read(cls, path: Path) -> "Lines":
-        """The file of `--jsonl`; a line that was cut off by a kill is left out."""
-        ages, health, reasons = [], {}, Counter[str]()
-        for text in path.read_text("ascii").splitlines() if path.is_file() else ():
-            with contextlib.suppress(ValueError):
-                line = json.loads(text)
-                if "health" in line:
-                    health = line
-                    reasons.update(line["reasons"])
-                else:
-                    ages.append(line["age_ms"])
-        return cls(np.array(ages, np.float64), health, reasons)
+def views_in(lines: Path) -> int:
+    """How many views the program wrote into its `--jsonl`."""
+    text = lines.read_text("ascii") if lines.is_file() else ""
+    return sum('"age_ms"' in line for line in text.splitlines())

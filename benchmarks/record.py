@@ -10,7 +10,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -86,12 +86,13 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def options_of(
-    name: str, about: str | None, add: Adds | None, arguments: Sequence[str]
-) -> argparse.Namespace:
-    """Options of a question: those of all, and what `add` adds."""
+def run(measure: Callable[[argparse.Namespace], Section], add: Adds | None = None) -> int:
+    """Run the question of the module that was started, with the options of all and those that `add`
+    adds, print its tables and write them; returns the exit code."""
+    module = sys.modules["__main__"]
+    name = str(module.__spec__ and module.__spec__.name.split(".")[1])
     parser = argparse.ArgumentParser(
-        prog=f"python -m benchmarks.{name}", description=str(about).splitlines()[0]
+        prog=f"python -m benchmarks.{name}", description=str(module.__doc__).splitlines()[0]
     )
     parser.add_argument("--quick", action="store_true", help="smaller areas, fewer views")
     parser.add_argument(
@@ -100,27 +101,25 @@ def options_of(
     parser.add_argument("--out", type=Path, default=Path("bench_results"), metavar="DIR")
     if add is not None:
         add(parser)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     options.work = options.work or options.out / "work" / name
     options.work.mkdir(parents=True, exist_ok=True)
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
-    return options
-
-
-def run(
-    name: str,
-    about: str | None,
-    measure: Callable[[argparse.Namespace], Section],
-    add: Adds | None = None,
-) -> int:
-    """Run a question by the command line, print its tables, write them; returns the exit code."""
-    options = options_of(name, about, add, sys.argv[1:])
     start, started = time.perf_counter(), provenance(name)
     section = measure(options)
     print(section.markdown(), flush=True)
-    save(options.out, [section], started, time.perf_counter() - start)
+    _save(options.out, section, started, time.perf_counter() - start)
     return int(section.failed)
+
+
+def memory_mb() -> float:
+    """Largest resident memory of this process in MB.
+
+    Linux's own count: `ru_maxrss` of a started process also remembers its parent's memory.
+    """
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) * 1024 / 1e6
 
 
 def side_by_side(
@@ -163,18 +162,16 @@ def resumed(
             yield found[key]
 
 
-def save(out: Path, done: Iterable[Section], started: dict[str, Any], wall_s: float) -> None:
+def _save(out: Path, section: Section, started: dict[str, Any], wall_s: float) -> None:
     """Write JSON and Markdown named by date and commit. `started`: the `provenance` of before."""
     load = " ".join(f"{value:.2f}" for value in os.getloadavg())
     about = {**started, "wall_s": round(wall_s), "load_1_5_15_min": load}
     stem = f"{about['date'][:19].replace(':', '')}-{about['commit'][:10]}-{about['run']}"
     head = "\n".join(f"- {key}: {value}" for key, value in about.items())
-    sections = list(done)
-    plain = {**about, "sections": [asdict(section) for section in sections]}
     out.mkdir(parents=True, exist_ok=True)
-    text = "\n".join([head, "", *(section.markdown() for section in sections)])
-    (out / f"{stem}.md").write_text(text, encoding="utf-8")
-    (out / f"{stem}.json").write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    (out / f"{stem}.md").write_text(f"{head}\n\n{section.markdown()}", encoding="utf-8")
+    plain = json.dumps({**about, "section": asdict(section)}, indent=1)
+    (out / f"{stem}.json").write_text(plain + "\n", encoding="utf-8")
     say(f"{wall_s:5.0f} s  written to {out / stem}.md and .json")
 
 

@@ -16,16 +16,13 @@ from itertools import permutations, zip_longest
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rasterio
 from lab.landscape import DEFAULT_DATES, OTHER_LIGHT, generate_area
 
-from benchmarks.placing import FlownView, views_in
 from orthonav.core.errors import OutputError
-from orthonav.core.localize import Localizer
-from orthonav.core.mapfile import open_map
+from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.records import View
 from orthonav.ground.build import BuildRequest, build_map
-from orthonav.ground.imagery.mosaic import Mosaic
 from orthonav.ground.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -220,23 +217,6 @@ def map_of(
     return out
 
 
-def localizer_of(name: str, work: Path) -> Localizer:
-    """On the map of an orthophoto's name."""
-    return Localizer(open_map(map_of(ortho(name, work), work)))
-
-
-def store(ortho: Path, localizer: Localizer, out: Path) -> Path:
-    """Write an orthophoto in the raster of a map, for processes that have no GDAL."""
-    grid = localizer.grid
-    with Mosaic.open([ortho]).grid_sheet(localizer.sheet.frame, grid) as raster:
-        pixels = raster.read(0, 0, grid.width_px, grid.height_px)
-    mean = round(float(pixels.grey[pixels.valid].mean()))
-    grey = np.where(pixels.valid, pixels.grey, mean).astype(np.uint8)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(out, grey=grey, valid=pixels.valid)
-    return out
-
-
 def agl_of(width_px: float, gsd_m: float) -> float:
     """Height from which the shorter side of a view covers so many pixels of the map."""
     return width_px * gsd_m / min(DEFAULT_CAMERA.extent)
@@ -259,15 +239,22 @@ def flight(path: Path, work: Path, *, views: int, errors: Errors, seed: int, agl
     return folder
 
 
-def simulated_views(
-    pair: Pair, work: Path, *, views: int, seed: int, width_px: float = 256, errors: Errors = USUAL
-) -> Iterator[FlownView]:
-    """Views of the later date of a pair at random places, with errors of heading and height, which
-    are reported, and of tilt, which are not."""
-    path = ortho(pair.views, work)
-    agl_m = agl_of(width_px, gsd_of(path))
-    folder = flight(path, work, views=views, errors=errors, seed=seed, agl_m=agl_m)
-    yield from views_in(folder)
+@dataclass(frozen=True, eq=False)
+class FlownView:
+    """A view, the name of its image, and where it was taken."""
+
+    frame: str
+    view: View
+    truth_latlon_deg: tuple[float, float]
+
+
+def views_in(folder: Path) -> Iterator[FlownView]:
+    """Views of a flight folder, each read on demand."""
+    recorded, truth = open_flight(folder), read_truth(folder / "truth.csv")
+    for each in recorded.views:
+        if each.frame in truth:
+            view = View(each.grey(), recorded.camera, each.telemetry)
+            yield FlownView(each.frame, view, truth[each.frame])
 
 
 def chosen(pairs: Sequence[Pair], only: Sequence[str] | None) -> list[Pair]:

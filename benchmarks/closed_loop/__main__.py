@@ -25,7 +25,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     again = parser.add_argument_group("replays: recorded flights located again")
     again.add_argument("--methods", nargs="+", default=replays.METHODS, choices=replays.METHODS)
     again.add_argument("--views", type=int, help="only the first so many views without GNSS")
-    again.add_argument("--undisturbed", action="store_true", help="end before any disturbance")
     flown = parser.add_argument_group("fly: simulated flights on what is sent")
     flown.add_argument("--vehicle", choices=VEHICLES, default="plane")
     flown.add_argument("--filter", choices=FILTERS, default="px4", help="instruments and tuning")
@@ -35,4 +34,4 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run("closed_loop", __doc__, measure, add))
+    sys.exit(run(measure, add))

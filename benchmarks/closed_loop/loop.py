@@ -120,16 +120,14 @@ class Sample:
 class Located:
     """A view: what orthonav made of it.
 
-    `tilt_off_m` (2,): displacement, ahead and right, that the error of the stated tilt makes of a
-    fix that trusts it. `error_m` (2,): of the fix, ahead and right, NaN without one. `nees`: by its
-    covariance. `level_m`: its protection level, infinite without a fix. `is_wrong`: see `replays`.
-    `sent_std_m`: as stated in the message, NaN where none was sent.
+    `error_m`: of the fix, NaN without one. `nees`: by its covariance. `level_m`: its protection
+    level, infinite without a fix. `is_wrong`: see `replays`. `sent_std_m`: as stated in the
+    message, NaN where none was sent.
     """
 
     time_s: float
     state: str
-    error_m: Array
-    tilt_off_m: Array
+    error_m: float
     nees: float
     level_m: float
     is_wrong: bool
@@ -221,7 +219,7 @@ class Sight:
             made = estimate_from_result(result, processing_s=LATENCY_S)
         admitted, _ = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
         stated = None if admitted is None else self.stated(admitted, telemetry.time_ns)
-        return self._judged(time_s, truth, estimate, outcome, stated), admitted
+        return self._judged(time_s, truth, outcome, stated), admitted
 
     def stated(self, admitted: NavigationEstimate, exposed_ns: int) -> NavigationEstimate:
         """As its message states it."""
@@ -272,46 +270,26 @@ class Sight:
         self,
         time_s: float,
         truth: Motion,
-        estimate: Motion,
         outcome: Fix | NoFix,
         stated: NavigationEstimate | None,
     ) -> Located:
-        error, nees, level_m, wrong = np.full(2, np.nan), math.nan, math.inf, False
-        yaw, _, _ = euler_rad(truth.rotation)
-        ahead_right = about(2, yaw)[:2, :2].T
+        error_m, nees, level_m, wrong = math.nan, math.nan, math.inf, False
         if isinstance(outcome, Fix):
             place = self.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
             off = place - truth.position[[1, 0]]
             nees = float(off @ np.linalg.solve(outcome.cov_en_m2, off))
-            error = ahead_right @ off[::-1]
+            error_m = float(np.hypot(*off))
             level_m = outcome.protection_level_m()
-            wrong = is_wrong(float(np.hypot(*off)), outcome.cov_en_m2)
+            wrong = is_wrong(error_m, outcome.cov_en_m2)
         return Located(
             time_s,
             self._tracker.state_name,
-            error,
-            ahead_right @ _tilt_off_m(truth, estimate),
+            error_m,
             nees,
             level_m,
             wrong,
             math.nan if stated is None else stated.horizontal_std_m(),
         )
-
-
-def tilt_off_rad(truth: Motion, estimate: Motion) -> Array:
-    """The error (2,) of an estimated attitude about north and east, its heading left out."""
-    yaw = euler_rad(truth.rotation)[0] - euler_rad(estimate.rotation)[0]
-    wrong = (about(2, yaw) @ estimate.rotation) @ truth.rotation.T
-    return np.array([wrong[2, 1] - wrong[1, 2], wrong[0, 2] - wrong[2, 0]]) / 2
-
-
-def _tilt_off_m(truth: Motion, estimate: Motion) -> Array:
-    """The displacement (2,) north and east of a fix that trusts the estimated tilt."""
-    about_north, about_east = tilt_off_rad(truth, estimate).tolist()
-    # The axis seems to look farther north by a turn about east and farther west by one about
-    # north, so what it sees seems to be seen from the opposite side.
-    height_m = -float(truth.position[2])
-    return height_m * np.array([-math.tan(about_east), math.tan(about_north)])
 
 
 def fly(
@@ -466,8 +444,8 @@ GNSS_S, BEFORE_S, AFTER_S = 60.0, 60.0, 60.0
 SCENARIOS = ("gnss", "nothing", "fixes", "start", "shifted", "mirrored", "frozen")
 LASTS_S = {"shifted": 40.0, "mirrored": 40.0, "frozen": 10.0}
 HEADER = (
-    *("scenario", "position median m", "95 %", "max", "position NEES", "velocity m/s", "95 %"),
-    *("tilt deg", "fixes median m", "95 %", "NEES", "slope", "sent", "false"),
+    *("scenario", "position median m", "95 %", "max", "position NEES"),
+    *("fixes median m", "95 %", "NEES", "sent", "false"),
 )
 
 
@@ -488,35 +466,20 @@ def scenario(name: str, minutes: float, send: str) -> Scenario:
     return Scenario(name, begin_s + lasts_s + AFTER_S, GNSS_S, send, name, begin_s, lasts_s)
 
 
-def slope_by_tilt(views: Sequence[Located]) -> str:
-    """Slopes, ahead and right, of the errors of fixes over those that the stated tilt makes."""
-    if len(views) < 10:
-        return "-"
-    errors = np.array([view.error_m for view in views]).T
-    tilts = np.array([view.tilt_off_m for view in views]).T
-    spreads = [np.cov(tilt, error) for tilt, error in zip(tilts, errors, strict=True)]
-    return ", ".join(f"{each[0, 1] / each[0, 0]:.2f}" for each in spreads)
-
-
 def cells(flown: Flown) -> list[str]:
     samples, views = spans(flown)
     off = np.array([each.estimate.position - each.truth.position for each in samples])
     far_m = np.hypot(*off[:, :2].T)
     claimed = np.array([each.claimed_m for each in samples])
-    mps = [np.hypot(*(each.estimate.velocity - each.truth.velocity)[:2]) for each in samples]
-    tilts = np.degrees([tilt_off_rad(each.truth, each.estimate) for each in samples])
     sent = [view for view in views if view.sent]
-    errors = np.array([np.hypot(*view.error_m) for view in sent])
+    errors = np.array([view.error_m for view in sent])
     return [
         flown.scenario.name,
         *quantiles(far_m, 50, 95),
         number(float(far_m.max())),
         number(float(np.mean((far_m / claimed) ** 2))),
-        *quantiles(mps, 50, 95),
-        number(math.sqrt(float((tilts**2).sum(1).mean()))),
         *quantiles(errors, 50, 95),
         number(float(np.mean([view.nees for view in sent]))) if sent else "-",
-        slope_by_tilt(sent),
         f"{len(sent) / len(views):.0%}" if views else "-",
         str(sum(view.is_wrong for view in sent)) if views else "-",
     ]
@@ -541,9 +504,7 @@ def measure(options: argparse.Namespace) -> Section:
             say(f"{' | '.join(rows[-1])} {flown.withheld}")
     notes = (
         f"{options.minutes:g} minutes without GNSS, {GNSS_S:g} s with it; the map is displaced by "
-        f"{MAP_STD_M:g} m per axis; position, velocity, tilt: errors of the autopilot; slope: of "
-        "errors of fixes with height times the tangent of the autopilot's error of tilt, ahead and "
-        "right; false: sent, and "
+        f"{MAP_STD_M:g} m per axis; position: errors of the autopilot; false: sent, and "
         f"more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
     title = f"{options.vehicle}, filter like {options.filter}'s, sent: {options.send}"

@@ -9,9 +9,8 @@ exposure) and `events.csv`.
 import argparse
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from itertools import groupby, pairwise
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -24,7 +23,6 @@ from benchmarks.looped_flight import read_rows
 from benchmarks.record import Section, Table, number, quantiles, say
 from benchmarks.scenes import DATA, PAST, PRESENT, map_of
 from orthonav.cli.demo import IMAGERY
-from orthonav.core.flight.recording import LONG_GAP_NS
 from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
@@ -33,7 +31,6 @@ from orthonav.core.mapfile import open_map
 from orthonav.core.records import (
     CONFIDENT,
     Fix,
-    NoFix,
     Prior,
     Telemetry,
     View,
@@ -42,8 +39,6 @@ from orthonav.core.records import (
 )
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.simulate.render import ViewEffects
-from orthonav.onboard.cameras import GAP_S
-from orthonav.onboard.latency import MISMATCH, UNKNOWN, LatencyMonitor
 from orthonav.onboard.messages.estimate import estimate_from_result
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.run import Locator, SingleViews, locate_view
@@ -114,10 +109,6 @@ LEAST_AGL_M = 100.0
 SHIFT_EN_M = (300.0, 0.0)
 """Where the camera looks while it shows a place 300 m east."""
 PRIOR_STD_M = 100.0
-LATENCY_S = 0.06
-"""From exposure to arrival, as stated to the latency monitor."""
-NO_IMAGES_S = 60.0, 62.0
-"""When no image arrives at the latency monitor, after GNSS was lost."""
 ON, OFF, SHIFTED, MIRRORED, AFTER = "GNSS on", "GNSS off", "300 m east", "mirrored", "after"
 PHASES = {
     "GNSS OFF": OFF,
@@ -174,11 +165,6 @@ class Recorded:
         rows = read_rows(self.folder / "events.csv")
         return [(float(row["time_s"]), row["event"]) for row in rows]
 
-    @cached_property
-    def alone_s(self) -> float:
-        """When GNSS was lost."""
-        return min((each.time_s for each in self.exposures if each.phase != ON), default=math.inf)
-
     def _phase(self, time_s: float) -> str:
         """What was happening at a time. Before the first disturbance it is `ON` or `OFF`."""
         phase = ON
@@ -188,23 +174,9 @@ class Recorded:
             phase = next((to for text, to in PHASES.items() if text in event), phase)
         return phase
 
-    @cached_property
-    def truth(self) -> tuple[Array, Array]:
-        """Times (N,) and true velocity (N, 2), m/s east and north."""
-        rows = read_rows(self.folder / "truth.csv")
-        times_s = np.array([float(row["time_s"]) for row in rows])
-        east_north = [[float(row["vel_east_mps"]), float(row["vel_north_mps"])] for row in rows]
-        return times_s, np.array(east_north)
-
-    def velocity_en_mps(self, time_s: float) -> Array:
-        """True velocity (2,)."""
-        times_s, velocities = self.truth
-        return np.array([np.interp(time_s, times_s, axis) for axis in velocities.T])
-
-    def stated(self, buffer: TelemetryBuffer | None = None) -> Iterator[tuple[Exposure, Telemetry]]:
-        """The exposures, with what the autopilot stated for them, as `orthonav fly` reads it into
-        the buffer."""
-        buffer = buffer or TelemetryBuffer()
+    def stated(self) -> Iterator[tuple[Exposure, Telemetry]]:
+        """The exposures, with what the autopilot stated for them, as `orthonav fly` reads it."""
+        buffer = TelemetryBuffer()
         rows = read_rows(self.folder / "autopilot.csv")
         values = [{name: float(text) for name, text in row.items()} for row in rows]
         times_s = np.array([value["time_s"] - LATE_S for value in values])
@@ -217,18 +189,6 @@ class Recorded:
             lat, lon = (float(np.interp(exposure.time_s, times_s, axis)) for axis in places.T)
             telemetry = buffer.at(exposure.time_ns).telemetry(exposure.time_ns)
             yield exposure, replace(telemetry, prior=Prior(lat, lon, PRIOR_STD_M))
-
-    def views(
-        self,
-        area: Area,
-        cache: Path,
-        rule: Callable[[Telemetry, bool], Telemetry],
-        buffer: TelemetryBuffer | None = None,
-    ) -> Iterator[tuple[Exposure, View]]:
-        """Exposures and their views. `rule`: sets the deviations of the telemetry, given whether
-        GNSS is on."""
-        for exposure, telemetry in self.stated(buffer):
-            yield exposure, self.view(area, cache, exposure, rule(telemetry, exposure.phase == ON))
 
     def view(self, area: Area, cache: Path, exposure: Exposure, telemetry: Telemetry) -> View:
         """The view of an exposure; its picture is kept in a folder."""
@@ -261,11 +221,10 @@ def _shown(area: Area, exposure: Exposure, cache: Path) -> Grey:
 
 
 RECORDED = DATA / "closed_loop"
-METHODS = ("single", "track", "fly")
-"""`fly`: a track behind the latency monitor, which gets no image for 2 s."""
+METHODS = ("single", "track")
 HEADER = (
-    *("flight", "method", "views", "tilt deg", "median m", "95 % m", "NEES", "confident"),
-    *("tracking", "velocity m/s", "300 m east", "mirrored"),
+    *("flight", "method", "views", "median m", "95 % m", "NEES", "confident"),
+    *("tracking", "300 m east", "mirrored"),
 )
 Rule = Callable[[str, Telemetry, bool], Telemetry]
 """From the autopilot (px4, ardupilot), telemetry, and whether GNSS aids it."""
@@ -276,8 +235,7 @@ class Row:
     """One view located by one method.
 
     `error_en_m`, `cov_en_m2`: of the fix, None without one. `confidence`: 0 without a fix.
-    `sent`: the gate admits it. `velocity_off_mps`: error of the track's velocity, NaN without one.
-    `tilt_off_deg`: stated less true pitch and roll.
+    `sent`: the gate admits it.
     """
 
     flight: str
@@ -288,9 +246,6 @@ class Row:
     cov_en_m2: Array | None
     confidence: float
     sent: bool
-    velocity_off_mps: float
-    tilt_off_deg: tuple[float, float]
-    reason: str | None
 
     @property
     def error_m(self) -> float:
@@ -340,53 +295,6 @@ def flights(only: Sequence[str] = ()) -> list[Path]:
     return [path for path in found if not only or path.name in only]
 
 
-@dataclass(eq=False)
-class Monitored:
-    """A track behind the latency monitor, as in `orthonav fly`; `buffer` holds the telemetry."""
-
-    track: Tracker
-    buffer: TelemetryBuffer
-    monitor: LatencyMonitor = field(default_factory=lambda: LatencyMonitor(LATENCY_S))
-    interruptions: int = 0
-    arrived_ns: int | None = None
-    tracked_ns: int | None = None
-
-    @property
-    def state_name(self) -> str | None:
-        return self.track.state_name
-
-    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
-        return self.track.passed(telemetry, reason)
-
-    def locate(self, view: View) -> Fix | NoFix:
-        """Position of a view; a `NoFix` with the monitor's reason where it is withheld."""
-        before_ns = self.arrived_ns
-        self.arrived_ns = arrived_ns = view.telemetry.time_ns + round(LATENCY_S * 1e9)
-        self.interruptions += before_ns is not None and arrived_ns - before_ns > GAP_S * 1e9
-        self.monitor.arrived(arrived_ns, self.interruptions)
-        try:
-            return self._located(view)
-        finally:
-            known = self.buffer.at, self.buffer.covered_ns
-            self.monitor.observe(arrived_ns, view.grey, view.camera, *known)
-
-    def _located(self, view: View) -> Fix | NoFix:
-        if not self.monitor.may_locate:
-            return NoFix(self.monitor.reasons()[0], self.monitor.detail())
-        telemetry, before_ns = view.telemetry, self.tracked_ns
-        self.tracked_ns = time_ns = telemetry.time_ns
-        if before_ns is not None and time_ns - before_ns > LONG_GAP_NS:
-            mean = self.buffer.mean_velocity(before_ns, time_ns)
-            view = replace(view, telemetry=replace(telemetry, vel_en_mps=mean))
-        outcome = self.track.locate(view)
-        result = ViewResult("", time_ns, outcome, 0.0, self.state_name)
-        if result.is_recognized and isinstance(outcome, Fix):
-            place = outcome.lat_deg, outcome.lon_deg
-            self.monitor.located(time_ns, place, outcome.std_m, self.buffer.mean_velocity)
-        doubt = next(iter(self.monitor.reasons()), None)
-        return outcome if doubt is None else NoFix(doubt, "")
-
-
 def replay(
     flight: Path,
     work: Path,
@@ -394,35 +302,30 @@ def replay(
     methods: Sequence[str] = METHODS,
     rule: Rule = stated,
     views: int | None = None,
-    disturbed: bool = True,
 ) -> list[Row]:
     """Locate the views of a flight folder by some of `METHODS`; `work` holds demo and pictures.
 
     `rule` sets the deviations of the telemetry. `views`: only the first so many without GNSS.
-    Without `disturbed` the flight ends before the first disturbance of the camera.
     """
-    recorded, area, buffer = Recorded(flight), Area.demo(work), TelemetryBuffer()
+    recorded, area = Recorded(flight), Area.demo(work)
     locators: dict[str, Locator] = {
         "single": SingleViews(area.localizer),
         "track": Tracker(area.localizer),
-        "fly": Monitored(Tracker(area.localizer), buffer),
     }
     gates = {name: Gate() for name in methods}
     autopilot, _, _ = flight.name.partition("_")
     rows, alone = [], 0
-    for exposure, view in recorded.views(area, work / "views", partial(rule, autopilot), buffer):
+    for exposure, reported in recorded.stated():
         alone += exposure.phase == OFF
-        too_late = not disturbed and exposure.phase not in (ON, OFF)
-        if too_late or (views is not None and alone > views):
+        if views is not None and alone > views:
             break
-        if view.telemetry.missing():
+        telemetry = rule(autopilot, reported, exposure.phase == ON)
+        if telemetry.missing():
             continue
+        view = recorded.view(area, work / "views", exposure, telemetry)
         for name in methods:
             if name == "single" and exposure.phase == ON:
                 continue  # a track begins with GNSS; single views are judged without it
-            since_s = exposure.time_s - recorded.alone_s
-            if name == "fly" and NO_IMAGES_S[0] <= since_s < NO_IMAGES_S[1]:
-                continue
             rows.append(_row(recorded, area, name, locators[name], gates[name], exposure, view))
     return rows
 
@@ -441,20 +344,13 @@ def _row(
     result = ViewResult(str(exposure.number), exposure.time_ns, outcome, latency_ms, state)
     admitted, _ = gate.admit(estimate_from_result(result), exposure.time_ns)
     error = cov = None
-    confidence, velocity_off = 0.0, np.nan
+    confidence = 0.0
     if isinstance(outcome, Fix):
         place = area.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
         error = place - area.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
         cov, confidence = outcome.cov_en_m2, outcome.confidence
-        own = np.array(outcome.vel_en_mps or (np.nan, np.nan))
-        velocity_off = float(np.hypot(*(own - recorded.velocity_en_mps(exposure.time_s))))
-    _, pitch_deg, roll_deg = exposure.attitude_deg
-    tilt_off = view.telemetry.pitch_deg - pitch_deg, view.telemetry.roll_deg - roll_deg
-    reason = outcome.reason if isinstance(outcome, NoFix) else None
-    return Row(
-        recorded.folder.name, method, exposure, state, error, cov, confidence,
-        admitted is not None, velocity_off, tilt_off, reason,
-    )  # fmt: skip
+    name, sent = recorded.folder.name, admitted is not None
+    return Row(name, method, exposure, state, error, cov, confidence, sent)
 
 
 def judged(rows: Sequence[Row]) -> list[Row]:
@@ -483,12 +379,10 @@ def _cells(rows: Sequence[Row]) -> list[str]:
         rows[0].flight,
         rows[0].method,
         str(len(alone)),
-        number(math.sqrt(float(np.mean([np.square(row.tilt_off_deg).sum() for row in alone])))),
         *quantiles(errors, 50, 95),
         number(float(np.mean([row.nees for row in good] or [np.nan]))),
         f"{confident:.0%}",
         f"{tracking:.0%}" if rows[0].state is not None else "-",
-        *quantiles([row.velocity_off_mps for row in good], 50),
         *wrong,
     ]
 
@@ -499,61 +393,11 @@ def table(rows: Sequence[Row]) -> Table:
     cells = [_cells([row for row in rows if (row.flight, row.method) == key]) for key in keys]
     notes = (
         "errors of confident single views, and of tracked views in the state tracking, while GNSS "
-        "is off and before any disturbance; NEES: mean, 2 is right; velocity: median error; tilt: "
-        "error of the telemetry, RMS",
+        "is off and before any disturbance; NEES: mean, 2 is right",
         "300 m east, mirrored: wrong positions that the gate admits, of all views while the camera "
         f"is so disturbed; wrong: more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
     return Table("Replays", HEADER, cells, notes)
-
-
-WITHHELD = (UNKNOWN, MISMATCH)
-WITHHELD_HEADER = (
-    *("flight", "views", *WITHHELD, "longest s"),
-    *("start s", "no images s", "300 m east s", "mirrored s"),
-)
-
-
-def withheld(rows: Sequence[Row]) -> Table:
-    """What the latency monitor withheld of the views of the method `fly`."""
-    notes = (
-        f"views {LATENCY_S * 1e3:g} ms late, as stated. Good ones: those of the undisturbed camera "
-        "after the first that passed; those withheld for each reason, and the longest time without "
-        "one that passed. Then the time to the first one: after the start, after "
-        f"{NO_IMAGES_S[1] - NO_IMAGES_S[0]:g} s without images, and after each disturbance",
-    )
-    names = dict.fromkeys(row.flight for row in rows)
-    cells = [_withheld_cells([row for row in rows if row.flight == name]) for name in names]
-    return Table("Withheld by the latency monitor", WITHHELD_HEADER, cells, notes)
-
-
-def _withheld_cells(rows: Sequence[Row]) -> list[str]:
-    """A row of that table from all views of one flight."""
-    passed_s = [row.exposure.time_s for row in rows if row.reason not in WITHHELD]
-    good = [row for row in rows if row.exposure.phase in (ON, OFF)]
-    good = [row for row in good if row.exposure.time_s >= passed_s[0]]
-    begins_s = {ON: rows[0].exposure.time_s}
-    longest_s = 0.0
-    for before, row in pairwise(rows):
-        phase, time_s = before.exposure.phase, row.exposure.time_s
-        if phase in (SHIFTED, MIRRORED) and row.exposure.phase != phase:
-            begins_s[phase] = time_s
-        elif time_s - before.exposure.time_s > 1:
-            begins_s[OFF] = time_s
-    until_s = {
-        phase: next((each - begin_s for each in passed_s if each >= begin_s), math.inf)
-        for phase, begin_s in begins_s.items()
-    }
-    for is_withheld, stretch in groupby(good, lambda row: row.reason in WITHHELD):
-        times_s = [row.exposure.time_s for row in stretch]
-        longest_s = max(longest_s, (times_s[-1] - times_s[0]) * is_withheld)
-    return [
-        rows[0].flight,
-        str(len(good)),
-        *(str(sum(row.reason == reason for row in good)) for reason in WITHHELD),
-        number(longest_s),
-        *(number(until_s.get(phase, math.nan)) for phase in (ON, OFF, SHIFTED, MIRRORED)),
-    ]
 
 
 def measure(options: argparse.Namespace) -> Section:
@@ -566,11 +410,7 @@ def measure(options: argparse.Namespace) -> Section:
             methods=options.methods,
             rule=plain if options.plain else stated,
             views=options.views,
-            disturbed=not options.undisturbed,
         )
         say(table(found).markdown())
         rows += found
-    tables = [table(rows)] if rows else []
-    if flown := [row for row in rows if row.method == "fly"]:
-        tables.append(withheld(flown))
-    return Section("Replays of flights with autopilots", tables)
+    return Section("Replays of flights with autopilots", [table(rows)] if rows else [])

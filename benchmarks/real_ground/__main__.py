@@ -1,8 +1,8 @@
 """Single and tracked views of real ground: relief, houses and trees, lenses, recorded flights.
 
 `python -m benchmarks.real_ground --work DIR [--part flights relief ..] [--only TEXT ..]
-[--views 40] [--workers 1]` prints a row for each map and kind of view, compares tracks with
-single views of the same flight and draws their errors over time; rerun to resume.
+[--views 40] [--workers 1]` prints a row for each map and kind of view, and compares tracks with
+single views of the same flight; rerun to resume.
 `--gate` runs a compact part against the figures of `gate.json` and fails where one is worse;
 `--gate --renew` writes them.
 """
@@ -13,4 +13,4 @@ from benchmarks.real_ground.measure import add, measure
 from benchmarks.record import run
 
 if __name__ == "__main__":
-    sys.exit(run("real_ground", __doc__, measure, add))
+    sys.exit(run(measure, add))

@@ -7,7 +7,7 @@ from typing import Any
 
 import cv2
 
-from benchmarks.real_ground import gate, over_time, pairs
+from benchmarks.real_ground import gate, pairs
 from benchmarks.real_ground.maps import Map, code
 from benchmarks.real_ground.rows import PARTS, AnySource, Question, questions
 from benchmarks.real_ground.score import HEADER, RISK, cells
@@ -50,7 +50,6 @@ def measure(options: argparse.Namespace) -> Section:
     if found := pairs.paired(values):
         tables.append(pairs.table(found))
     if not options.gate:
-        over_time.write(found, options.work)
         return gate.verdict("Real ground", pairs.failures(found), tables)
     if options.only or set(options.part) < set(PARTS):
         figures = {name: each for name, each in figures.items() if name in values}

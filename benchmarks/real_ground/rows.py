@@ -1,7 +1,7 @@
 """The rows: which views on which map, single or tracked."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -36,8 +36,7 @@ SLOPES = (2.0, 5.0, 10.0)
 LAND = {2.0: "level", 5.0: "rolling", 10.0: "hills"}
 TILTS = (0.0, None), (0.0, 0.5), (1.0, None), (3.0, None)
 """Standard deviations of the true pitch and roll, and as stated, degrees."""
-ROOFS_GSD_M, ROOFS_SEEDS = 0.2, (1, 11, 25)  # of generated towns
-TOWN_SEEDS, TOWN_SIDE_M, TOWN_WITHIN_M = (253, 286, 288), 1000, 250.0
+TOWN_GSD_M, TOWN_SEEDS, TOWN_SIDE_M, TOWN_WITHIN_M = 0.2, (253, 286, 288), 1000, 250.0
 """Of seeds 1 to 300 those whose first square kilometre has a town, and nearest to its middle; its
 side, and how far from the middle of it the views look."""
 TOWN_LOOKS = *product((120.0, 80.0, 50.0), (0.0, 30.0, 45.0)), (250.0, 0.0), (250.0, 30.0)
@@ -165,10 +164,9 @@ def _rendered(
     pairs: list[Pair],
     slope: float,
     nominal: bool = False,
-    tilts: Iterable[tuple[float, float | None]] = TILTS,
 ) -> Iterator[Question]:
     """Rows over one relief: true and stated tilt, and what the map knows of the ground."""
-    for tilt, stated in tilts:
+    for tilt, stated in TILTS:
         told = "" if stated is None else f" stated {stated:g}"
         maps = [dict(_grounds(pair.map, slope)) for pair in pairs]
         for ground in maps[0]:
@@ -186,20 +184,14 @@ def _relief() -> Iterator[Question]:
     yield from _rendered("naip", "relief", [SCENES["naip"].pair("20090818", "20180716")], 5.0)
     lab = SCENES["generated_31"].pair(PAST, PRESENT)
     yield from _rendered("houses and trees", "houses", [lab], 5.0)
-    dates = PAST, PRESENT
-    roofs = [
-        Scene(f"roofs_{seed}", f"generated:{seed}:{ROOFS_GSD_M}", ROOFS_GSD_M, dates).pair(*dates)
-        for seed in ROOFS_SEEDS
-    ]
-    yield from _rendered("roofs at 0.2 m", "houses", roofs, 2.0, tilts=[(0.0, 0.0), (0.0, None)])
     yield from _towns()
 
 
 def _towns() -> Iterator[Question]:
-    folder = f"generated:{{}}:{ROOFS_GSD_M}:{TOWN_SIDE_M}"
+    folder = f"generated:{{}}:{TOWN_GSD_M}:{TOWN_SIDE_M}"
     dates = PAST, PRESENT
     towns = [
-        Scene(f"town_{seed}", folder.format(seed), ROOFS_GSD_M, dates).pair(*dates)
+        Scene(f"town_{seed}", folder.format(seed), TOWN_GSD_M, dates).pair(*dates)
         for seed in TOWN_SEEDS
     ]
     maps = [dict(_grounds(pair.map, 2.0)) for pair in towns]

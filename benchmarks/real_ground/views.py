@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from benchmarks.closed_loop.replays import OFF, ON, Area, Recorded, plain, stated
 from benchmarks.judged_views import is_covered
-from benchmarks.placing import views_in
 from benchmarks.real_ground.maps import BARE, SURFACE, found, landscape_heights, relief_file
 from benchmarks.real_ground.score import Seen
-from benchmarks.scenes import DATA, Pair, flight, root_agl_of
+from benchmarks.scenes import DATA, Pair, flight, root_agl_of, views_in
 from orthonav.core.files import replacing
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import FOV_STD, Camera, axis_on_ground_en_m

@@ -31,6 +31,7 @@ from experiments.paper.methods import (
 )
 from experiments.paper.results import BASELINES, FIELD, PROGRAM, keep, stored
 from experiments.paper.scenes import Scene
+from orthonav.core.cores import usable_cores
 from orthonav.core.errors import MissingExtraError, OrthonavError
 from orthonav.core.extras import require
 from orthonav.core.tiles.learned import VARIABLE
@@ -85,7 +86,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if FIELD in wanted and not _has_matchers(options):
         wanted.discard(FIELD)
     tasks = _tasks(options, place, wanted)
-    jobs = 1 if goes_on else options.jobs or (runs.cores() if setting.name == "reduced" else 1)
+    jobs = 1 if goes_on else options.jobs or (usable_cores() if setting.name == "reduced" else 1)
     if jobs > 1:  # those that learn longest first, so that no core is idle at the end
         tasks.sort(key=lambda task: ORDER.index(task[2].family))
     flown_over = {task[1].name: task[1] for task in tasks}.values()

@@ -19,15 +19,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.placing import memory_mb
-from benchmarks.posed import Picture
-from benchmarks.record import Table, number, provenance
-from benchmarks.scenes import far_m, store
+from benchmarks.record import Table, memory_mb, number, provenance
+from benchmarks.scenes import far_m
 from numpy.typing import NDArray
 
 from experiments.paper import matchers
 from experiments.paper import scenes as views
 from experiments.paper.methods import Method, flown, methods
+from experiments.paper.posed import Picture, store
 from experiments.paper.results import ACCURACY_M, FIELD, Result, numbers, percent
 from experiments.paper.runs import MB, Workplace, head, save
 from experiments.paper.scenes import Scene

@@ -16,9 +16,9 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
-from benchmarks.posed import BORDER_PX, MIN_INLIERS, RANSAC_PX, Picture, posed
 from numpy.typing import NDArray
 
+from experiments.paper.posed import BORDER_PX, MIN_INLIERS, RANSAC_PX, Picture, posed
 from orthonav.core.extras import needed
 from orthonav.core.records import PRIOR_SIGMAS, View
 
@@ -190,7 +190,7 @@ class FeatureMap:
     ) -> Found | None:
         """Position of the camera; None with too few inliers or against the reported pose."""
         gsd_m, reported = self._picture.gsd_m, view.telemetry
-        seen = next(posed(view, gsd_m, [(0.0, 1.0)]))
+        seen = posed(view, gsd_m)
         most = round(view.grey.size * KEYPOINTS_PER_PX)
         found = _valid(self._local.features(_filled(seen.grey, seen.valid), most), seen.valid)
         grid = self._picture.grid

@@ -8,7 +8,6 @@ import hashlib
 import json
 import logging
 import math
-import os
 import re
 import resource
 import statistics
@@ -23,16 +22,23 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.posed import BestOfPoses, Keypoints, MutualSurface, Picture, TemplateSurface
 from benchmarks.record import provenance
-from benchmarks.scenes import store
 from numpy.typing import NDArray
 
 from experiments.paper import scenes as views
 from experiments.paper.methods import DEFAULT, STUDIED, TILE_PX, Method, Setting
+from experiments.paper.posed import (
+    Highest,
+    Keypoints,
+    MutualSurface,
+    Picture,
+    TemplateSurface,
+    store,
+)
 from experiments.paper.published import most_views
 from experiments.paper.results import ACCURACY_M, BASELINES, compact
 from experiments.paper.scenes import Scene
+from orthonav.core.cores import usable_cores
 from orthonav.core.files import write_text
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.tiles import TileMatcher
@@ -138,10 +144,6 @@ def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, float
             raise
 
 
-def cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
 def _prepare(jobs: int) -> None:
     """Give a process its part of the cores; training says epoch, loss and time left."""
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
@@ -152,7 +154,7 @@ def _prepare(jobs: int) -> None:
         import torch
     except ImportError:
         return
-    torch.set_num_threads(max(1, cores() // jobs))
+    torch.set_num_threads(max(1, usable_cores() // jobs))
 
 
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
@@ -361,7 +363,7 @@ class Baseline:
 
 
 def _reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
-    return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
+    return lambda picture: Highest(picture, surface(picture))
 
 
 def _matched(edges: bool) -> Callable[[Picture], Any]:
@@ -406,7 +408,7 @@ def _placed_by(baseline: Baseline, picture: Picture, scene: Scene, seen: Grounds
         grey = views.view_of(ground, agl_m, gsd_m)
         start = time.perf_counter()
         grey = sobel(grey) if baseline.sobel else grey
-        found = method.locate(View(grey, camera, telemetry), True)
+        found = method.locate(View(grey, camera, telemetry))
         times_ms.append(1e3 * (time.perf_counter() - start))
         return math.inf if found is None else float(np.hypot(*(found - ground.truth_en_m)))
 

@@ -3,11 +3,9 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 
 from lab.landscape import DEFAULT_DATES, OTHER_LIGHT, generate_area, generate_heights
-from orthonav.cli.common import Progress
 from orthonav.core.errors import OrthonavError
 
 
@@ -17,23 +15,12 @@ def main(arguments: Sequence[str]) -> None:
     area = {"size_m": tuple(options.size_m), "gsd_m": options.gsd_m, "seed": options.seed}
     files: list[Path] = []
     try:
-        with closing(Progress(quiet=False)) as shown:
-            if options.hills is not None:  # first, so that an impossible slope is refused at once
-                files = generate_heights(
-                    options.out,
-                    slope=options.hills,
-                    progress=lambda share: shown("heights", share),
-                    **area,
-                )
-            dates = generate_area(
-                options.out,
-                dates=DEFAULT_DATES + OTHER_LIGHT * options.other_light,
-                progress=lambda share: shown("landscape", share),
-                **area,
-            )
+        if options.hills is not None:  # first, so that an impossible slope is refused at once
+            files = generate_heights(options.out, slope=options.hills, **area)
+        dates = DEFAULT_DATES + OTHER_LIGHT * options.other_light
+        print(*generate_area(options.out, dates=dates, **area), *files, sep="\n")
     except OrthonavError as error:
         sys.exit(f"error: {error}")
-    print(*dates, *files, sep="\n")
 
 
 def _parser() -> argparse.ArgumentParser:

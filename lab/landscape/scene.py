@@ -1,6 +1,7 @@
 """The landscape: renders any window at any date and resolution."""
 
 from collections import OrderedDict
+from collections.abc import Iterator
 from math import ceil
 
 import numpy as np
@@ -61,15 +62,10 @@ class Landscape:
         gsd_m: metres on the ground per pixel, 0.2..10. Windows on the same pixel grid agree where
         they overlap. Raises `AreaError` on impossible sizes.
         """
-        whole = _window(west_m, north_m, width_px, height_px, gsd_m)
         out = np.empty((height_px, width_px, 3), np.uint8)
-        factor = ceil(gsd_m / 1.25)
-        for col, row, width, height in chunks(width_px, height_px, _CHUNK_PX // factor):
-            part = whole.part(col, row, width, height)
+        for part, inside, factor in _parts(west_m, north_m, width_px, height_px, gsd_m):
             picture, _ = self._picture(part.finer(factor), date)
-            if factor > 1:
-                picture = _averaged(picture, factor)
-            out[row : row + height, col : col + width] = develop(picture, part, self.seed, date)
+            out[inside] = develop(_averaged(picture, factor), part, self.seed, date)
         return out
 
     def object_heights(
@@ -82,14 +78,10 @@ class Landscape:
         gsd_m: float,
     ) -> Float32:
         """Return heights (H, W) of buildings, trees and woods above the ground, as `render`."""
-        whole = _window(west_m, north_m, width_px, height_px, gsd_m)
         out = np.empty((height_px, width_px), np.float32)
-        factor = ceil(gsd_m / 1.25)
-        for col, row, width, height in chunks(width_px, height_px, _CHUNK_PX // factor):
-            _, heights = self._picture(whole.part(col, row, width, height).finer(factor), date)
-            out[row : row + height, col : col + width] = _averaged(heights[..., None], factor)[
-                ..., 0
-            ]
+        for part, inside, factor in _parts(west_m, north_m, width_px, height_px, gsd_m):
+            _, heights = self._picture(part.finer(factor), date)
+            out[inside] = _averaged(heights[..., None], factor)[..., 0]
         return out
 
     def _picture(self, window: PixelWindow, date: Epoch) -> tuple[Float32, Float32]:
@@ -140,16 +132,22 @@ class Landscape:
         return self._plans[cell]
 
 
-def _window(
+def _parts(
     west_m: float, north_m: float, width_px: int, height_px: int, gsd_m: float
-) -> PixelWindow:
-    """Return a window by its corner in EPSG:2154; raise `AreaError` for impossible sizes."""
+) -> Iterator[tuple[PixelWindow, tuple[slice, slice], int]]:
+    """Yield the pieces of a window by its corner in EPSG:2154: each as a window, where it lies in
+    the picture, and how much finer it is drawn. Raises `AreaError` for impossible sizes."""
     if width_px < 1 or height_px < 1:
         raise AreaError(f"an image needs at least one pixel, got {width_px} x {height_px}")
     check_gsd(gsd_m)
     if not (np.isfinite(west_m) and np.isfinite(north_m)):
         raise AreaError(f"the corner of an image must be finite, got {west_m}, {north_m}")
-    return PixelWindow.at(west_m - ORIGIN_M[0], north_m - ORIGIN_M[1], width_px, height_px, gsd_m)
+    corner_m = west_m - ORIGIN_M[0], north_m - ORIGIN_M[1]
+    whole = PixelWindow.at(*corner_m, width_px, height_px, gsd_m)
+    factor = ceil(gsd_m / 1.25)
+    for col, row, width, height in chunks(width_px, height_px, _CHUNK_PX // factor):
+        part = whole.part(col, row, width, height)
+        yield part, (slice(row, row + height), slice(col, col + width)), factor
 
 
 def _averaged(picture: Float32, factor: int) -> Float32:

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from benchmarks.closed_loop.loop import Scenario, fly, tilt_off_rad
+from benchmarks.closed_loop.loop import Scenario, fly
 from benchmarks.closed_loop.physics import (
     STEP_S,
     VEHICLES,
     Grade,
-    Motion,
     Wind,
     increments,
     integrated,
@@ -45,14 +44,5 @@ def test_filter_with_exact_instruments_follows(kind, gnss_s):
     scenario = Scenario("", 12.0, gnss_s=gnss_s, send=None)
     flown = fly(scenario, None, vehicle=kind, autopilot="px4", seed=2, rule=plain, grade=PERFECT)
     off = [each.estimate.position - each.truth.position for each in flown.samples]
-    tilt = [tilt_off_rad(each.truth, each.estimate) for each in flown.samples]
     late = slice(-10, None)
     assert np.abs(off[late]).max() < (1.0 if gnss_s == 12.0 else 8.0)
-    assert np.abs(tilt[late]).max() < 0.04  # a bias of the accelerometer looks like a tilt
-
-
-def test_tilt_error_has_its_sign():
-    level = Motion(np.zeros(3), np.zeros(3), np.eye(3))
-    cos, sin = np.cos(0.02), np.sin(0.02)
-    nose_up = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-    assert tilt_off_rad(level, Motion(np.zeros(3), np.zeros(3), nose_up))[1] == pytest.approx(sin)

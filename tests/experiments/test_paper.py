@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from experiments.paper import dates, published, runs, scenes, words
 from experiments.paper.__main__ import main
-from experiments.paper.methods import FULL, GPU, REDUCED, TABLE_1, Method, dry, methods
-from experiments.paper.results import accepted_at, ceiling, confident, read
+from experiments.paper.methods import FULL, REDUCED, TABLE_1, Method, methods
+from experiments.paper.results import accepted_at, confident
 from experiments.paper.tables import report
 
-from orthonav.core.errors import MissingFileError
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
@@ -36,27 +35,6 @@ def test_tiles_of_the_full_trajectories_are_those_of_the_grid(name):
     )
     assert grid.rows * grid.cols == flown.tiles
     assert grid.stride_m == pytest.approx(flown.stride_m)
-
-
-def test_rows_have_different_keys():
-    keys = [each.key for each in methods(REDUCED, "B", 900, sam_weights="weights.pth")]
-    assert len(set(keys)) == len(keys)
-    assert "autoencoder-sam" in keys and "triplet-canny" in keys
-
-
-def test_the_full_setting_leaves_no_row_out():
-    rows = {each.key for each in methods(FULL, "D", 900)}
-    for scene in (*TABLE_1, "szada-1"):
-        assert {each.key for each in methods(FULL, scene, 900)} == rows
-        fewer = {each.key for each in methods(REDUCED, scene, 900)}
-        assert {"gradient-gradient", "autoencoder-canny"} <= fewer
-    assert {"autoencoder-segments", "triplet-segments", "triplet-gray"} <= rows
-
-
-def test_every_real_scene_gets_the_auto_encoder_on_edges_and_grey_levels():
-    for scene in (*scenes.REDUCED_REAL, *scenes.UNTUNED):
-        rows = {each.key for each in methods(REDUCED, scene, 900)}
-        assert {f"autoencoder-{edges}" for edges in ("canny", "gray", "onnx")} <= rows
 
 
 def test_a_picture_is_like_itself_and_not_like_another():
@@ -107,14 +85,6 @@ def made(place, scene):
         return runs.run(place, scene, Method("gradient", "gradient", "gradient"))
 
 
-@pytest.mark.slow  # an experiment
-def test_map_covers_the_search_band(place, scene, made):
-    localizer = Localizer(open_map(place.work(scene, "gradient-gradient") / "map.onav"))
-    extent = np.ptp(localizer.tiles.centres_en_m, axis=0) + localizer.grid.stride_m
-    assert extent == pytest.approx([SMALL.length_m, SMALL.band_m], abs=33)
-    assert localizer.grid.gsd_m == 1.0
-
-
 def test_band_narrower_than_a_tile_is_one_around_the_route(scene):
     narrow = replace(scene, trajectory=replace(SMALL, band_m=100.0)).area()
     made = Area.from_route(narrow["route"], narrow["band_m"])
@@ -162,15 +132,6 @@ def test_a_run_says_what_it_was_and_is_not_run_twice(place, scene, made, monkeyp
     assert runs.run(place, scene, Method("gradient", "gradient", "gradient")) == written
 
 
-@pytest.mark.slow
-def test_runs_side_by_side_say_what_went_wrong(place, scene, made, tmp_path):
-    method = Method("gradient", "gradient", "gradient")
-    missing = replace(scene, name="none", past=tmp_path / "none.tif")
-    tasks = [(place, scene, method), (place, missing, method)]
-    ended = {task[1].name: outcome for task, outcome in runs.side_by_side(tasks, 2)}
-    assert ended["B"] == made["minutes"] and isinstance(ended["none"], MissingFileError)
-
-
 @pytest.mark.slow  # an experiment
 def test_tables_are_made_of_the_files_alone(tmp_path, made):
     folder = tmp_path / "reduced"
@@ -202,29 +163,6 @@ def test_ratios_are_compared_at_equal_accuracy():
     assert nothing[1] == 0
 
 
-def test_ceiling_is_the_part_of_the_square_in_the_circle():
-    assert ceiling(10) == 1
-    assert ceiling(64) == pytest.approx(np.pi * 15**2 / 64**2, rel=0.01)
-
-
-def test_published_figures_are_found():
-    assert published.published_accuracy("autoencoder", "segments", "B") == "90.4"
-    assert published.published_accuracy("gradient", "gradient", "B") == "-"
-    assert published.published_criterion("autoencoder", "canny", "A") == "96/12.1"
-
-
-def test_imagery_too_small_is_refused(area):
-    made = scenes.over("own", area.past, area.present)
-    assert made.trajectory.length_m > 0
-    with pytest.raises(ValueError, match="too small"):
-        scenes.over("own", area.past, area.present, gsd_m=4.0)
-
-
-def test_no_results_are_no_tables(tmp_path):
-    assert read(tmp_path) == []
-    assert report(tmp_path, "reduced") is None
-
-
 def test_rows_tuned_on_their_scene_are_marked():
     def marked(scene, setting=REDUCED):
         return {each.key for each in methods(setting, scene, 900) if each.tuned_on(scene)}
@@ -240,17 +178,6 @@ def test_rows_tuned_on_their_scene_are_marked():
     assert full == {"autoencoder-onnx"}
 
 
-def test_a_triplet_learns_from_the_third_date_of_a_generated_area(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(scenes, "generate_area", lambda *_, dates, **__: asked.append(dates))
-    made = scenes.generated(REDUCED, "B", tmp_path)
-    assert asked == []
-    scenes.render(made)
-    assert [path.stem for path in made.others] == [asked[0][2].name]
-    assert scenes.generated(REDUCED, "D", tmp_path).others == ()
-    assert len(scenes.generated(FULL, "D", tmp_path).others) == 1
-
-
 def test_one_view_per_tile_step_as_many_as_the_paper():
     """B and D are flown in the tile steps of their pixels; C in every third or fourth one."""
     for name in ("B", "D"):
@@ -262,49 +189,9 @@ def test_one_view_per_tile_step_as_many_as_the_paper():
     assert np.array_equal(scenes.along_route(CENTRES, 4)[:, 0], [0, 96, 192, 288])
 
 
-def test_another_ground_resolution_is_a_scene_of_its_own(tmp_path):
-    made = scenes.generated(REDUCED, "B", tmp_path, gsd_m=0.75)
-    assert (made.name, made.trajectory.gsd_m, made.trajectory.stride_m) == ("B-0.75m", 0.75, 24)
-    rows = {each.key for each in methods(REDUCED, made.name, 900)}
-    assert rows == {each.key for each in methods(REDUCED, "B", 900)}
-    assert scenes.generated(REDUCED, "B", tmp_path, gsd_m=1.0).name == "B"
-
-
-@pytest.mark.slow  # an experiment
-def test_more_epochs_are_another_run_of_the_same_row(place, scene, made, monkeypatch):
-    rows = {each.key: each.recipe for each in methods(REDUCED, "B", 900, more_epochs=77)}
-    assert "epochs=77" in rows["autoencoder-canny"] and "epochs=77" in rows["triplet-gray"]
-    monkeypatch.setattr(runs, "build_map", lambda *_: pytest.fail("built"))
-    with pytest.raises(pytest.fail.Exception, match="built"):
-        runs.run(place, scene, Method("gradient", "gradient:dims=8", "gradient"))
-
-
-@pytest.mark.slow  # an experiment
-def test_a_dry_run_goes_through_every_step(scene, tmp_path, monkeypatch):
-    """A small network, from imagery to the tables; no checkpoint is left."""
-    monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 8)
-    setting = dry(replace(REDUCED, encoder_width=8))
-    there = runs.Workplace(tmp_path, setting, "test", device="cpu", workers=1)
-    flown = scene.of(setting)
-    (method,) = [each for each in methods(setting, "B", 2) if each.key == "autoencoder-canny"]
-    made = runs.run(there, flown, method)
-    assert made["tiles"] <= 4 and "epochs=1" in made["method"]["recipe"]
-    assert set(made["views"]) == set(scenes.PLACEMENTS)
-    assert "Auto-Encoder" in report(tmp_path, setting.folder).read_text()
-    assert not list(tmp_path.rglob("checkpoint.pt"))
-
-
 @pytest.mark.slow
 def test_a_dry_run_of_all_rows_ends_without_a_failure(tmp_path):
     arguments = ["--dry-run", "--only", *"ABCD", "baselines", "--jobs", "2", "--device", "cpu"]
     assert main([*arguments, "--out", str(tmp_path)]) == 0
     rows = {path.stem for path in (tmp_path / "dry-reduced").glob("*.json")}
     assert rows >= {f"{name}-autoencoder-canny" for name in "ABCD"} | {"B-triplet-gray"}
-
-
-def test_the_gpu_setting_learns_on_b_and_d():
-    assert {each.key for each in methods(GPU, "B", 21_000)} == {
-        *("gradient-gradient", "autoencoder-canny", "autoencoder-gray"),
-        "gradient-gradient-registration",
-    }
-    assert [scene for scene in "ABCD" if len(methods(GPU, scene, 900)) > 2] == ["B", "D"]

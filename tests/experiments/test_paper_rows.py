@@ -3,10 +3,9 @@
 import json
 from dataclasses import asdict
 
-import cv2
-from experiments.paper import curves, dates, page, results
+from experiments.paper import dates, page, results
 from experiments.paper.__main__ import main
-from experiments.paper.methods import CURVE, EPOCHS, REDUCED, TABLE_1, methods
+from experiments.paper.methods import REDUCED, TABLE_1, methods
 from experiments.paper.results import Result, compact, stored
 from experiments.paper.tables import above_default
 
@@ -62,12 +61,6 @@ def test_results_are_kept_and_the_page_follows(tmp_path, monkeypatch):
     assert "B-autoencoder-canny" in shown.read_text()
 
 
-def test_a_row_is_small():
-    made = row().plain
-    made["views"] = {"grid": [[123.456789, 0.123456, 1.234567, 2.345678, 0.98765]] * 625}
-    assert len(compact(made)) < 32_000
-
-
 def test_rows_above_the_default_are_named():
     ours, canny = row("gradient-gradient-registration"), row()
     for placement in ("grid", "anywhere"):
@@ -80,23 +73,6 @@ def test_rows_above_the_default_are_named():
     ours.plain["views"]["route"] = [*[[1.0] * 5] * 49, [99.0] * 5]
     assert above_default([canny, ours])[0].rows[0][-1] == "within the noise"
     assert above_default([canny]) == []
-
-
-def test_networks_are_shown_as_they_learn(tmp_path):
-    chosen = [each for each in methods(EPOCHS, "B", TILES) if each.training.endswith("canny-512")]
-    assert len({each.key for each in chosen}) == len(CURVE["autoencoder"]) == len(chosen)
-    plain = row().plain | {"peak_mb": 900, "setting": asdict(EPOCHS)}
-    learnt = [
-        Result(plain | {"method": asdict(each), "loss": [0.2] * each.number("epochs")})
-        for each in chosen[:2]
-    ]
-    (shown,) = curves.table(learnt)
-    assert shown.header[1:3] == ("1", "2")
-    assert shown.rows == [
-        ["Auto-Encoder, Canny, width 512", "50", "50", "0.2 to 0.2", "900"],
-    ]
-    curves.figure(learnt, tmp_path / "epochs.png")
-    assert cv2.imread(str(tmp_path / "epochs.png")) is not None
 
 
 def placed(key, scene, errors_m):

@@ -1,6 +1,6 @@
 """Renews the figures of the documentation, docs/figures, by running the tutorial of the operator.
 
-    python tools/docs/pictures.py
+    PYTHONPATH=. python tools/docs/pictures.py
 
 They are part of the repository, so that its pages can be read there. Pages of the program are
 photographed with chromium; where there is none, their figures stay as they are.

@@ -51,7 +51,7 @@ BLOCK_SUMS = 7
 
 @dataclass(frozen=True)
 class Descent:
-    """How a refinement goes; values without a source are by `python -m benchmarks.real_imagery`."""
+    """How a refinement goes; values without a source are by NAIP, Szada and recorded flights."""
 
     steps: int = 6  # at most
     small_step_px: float = 0.03  # ends the refinement

@@ -4,7 +4,7 @@
 et al. 2024, section Methodology, Considered methods). *weighted*: mean of all centres, weighted by
 scores above zero (Bianchi and Barfoot, RA-L 2021). *neighbours*: the best tile and those around it,
 weighted by scores above the lowest (after Couturier and Akhloufi, 2021). *peak*: a parabola through
-the best tile and its neighbours: a third of the error (`python -m benchmarks --only compare`)."""
+the best tile and its neighbours: a third of the error."""
 
 from collections.abc import Iterator
 from typing import Literal, get_args
