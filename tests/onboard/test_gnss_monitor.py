@@ -267,6 +267,20 @@ def test_a_receiver_without_velocity_is_watched():
     assert air.fly(1, vel_en_mps=None, map_m=None, gnss_m=(50.0, 0.0)).fault is Fault.JUMP
 
 
+def test_a_slide_past_missing_velocities_is_a_jump():
+    """A cross-track slide of 10 m/s at 5 Hz; every tenth velocity is missing."""
+    receiver, faults = Receiver(), []
+    for count in range(75):
+        ns = count * S // 5
+        en_m = np.array([10.0 * max(0.0, ns / S - 10), 20.0 * ns / S])
+        lat, lon = (float(each) for each in FRAME.latlon_from_en(en_m))
+        velocity = None if count % 10 == 0 else (0.0, 20.0)
+        assert receiver.add(GnssSample(ns, ns, lat, lon, 3, 1.5, velocity), en_m)
+        faults.append(receiver.fault(ns, 20.0))
+    assert set(faults[:51]) == {None}  # before the slide
+    assert Fault.JUMP in faults[51:66] and Fault.JUMP in faults[66:]
+
+
 def test_a_receiver_that_was_never_heard_has_no_fault():
     assert Receiver().fault(10**12, 20.0) is None
     assert Air().fly(100, silent=True).state is GnssState.WAITING

@@ -106,11 +106,16 @@ RECEIVER = ReceiverLimits()
 
 
 class _Point(NamedTuple):
-    """A good sample: position (2,) and velocity (2,), NaN where not known."""
+    """A good sample: position (2,) and velocity (2,), NaN where not known.
+
+    `residual_m` (2,): sum of the distances by which positions left what the velocity predicts, or
+    where one is missing, the positions before.
+    """
 
     time_s: float
     en_m: Array
     vel_en_mps: Array
+    residual_m: Array
 
 
 class Receiver:
@@ -140,7 +145,7 @@ class Receiver:
             points.clear()
         if self._usable:
             velocity = np.array(sample.vel_en_mps or (math.nan, math.nan))
-            points.append(_Point(time_s, en_m, velocity))
+            points.append(self._point(time_s, en_m, velocity))
             span_s = RECEIVER.velocity_s
             if points[0].time_s < time_s - 2 * span_s:  # rarely: deleting moves the list
                 del points[: bisect_left(points, time_s - span_s - RECEIVER.gap_s, key=_time_s)]
@@ -169,7 +174,7 @@ class Receiver:
         NaN where a velocity is missing."""
         begin_s = self._points[-1].time_s - span_s
         points = self._points[bisect_left(self._points, begin_s, key=_time_s) :]
-        times_s, places_m, velocities = map(np.array, zip(*points, strict=True))
+        times_s, places_m, velocities, _ = map(np.array, zip(*points, strict=True))
         steps_m = (velocities[1:] + velocities[:-1]) / 2 * np.diff(times_s)[:, None]
         return float(np.hypot(*(places_m[-1] - places_m[0] - steps_m.sum(axis=0))))
 
@@ -177,19 +182,31 @@ class Receiver:
         points = self._points
         return bool(points) and points[0].time_s <= points[-1].time_s - span_s
 
+    def _point(self, time_s: float, en_m: Array, velocity: Array) -> _Point:
+        if not self._points:
+            return _Point(time_s, en_m, velocity, np.zeros(2))
+        before = self._points[-1]
+        seconds, moved_m = time_s - before.time_s, en_m - before.en_m
+        expected_m = (velocity + before.vel_en_mps) / 2 * seconds
+        if not np.isfinite(expected_m).all():  # that of the positions before
+            expected_m = moved_m
+            if len(self._points) > 1:
+                earlier = self._points[-2]
+                speed = (before.en_m - earlier.en_m) / (before.time_s - earlier.time_s)
+                expected_m = speed * seconds
+        return _Point(time_s, en_m, velocity, before.residual_m + moved_m - expected_m)
+
     def _has_jumped(self) -> bool:
-        if len(self._points) < 2:
+        points = self._points
+        if len(points) < 2:
             return False
-        off_m, allowed_m = self.left_m(RECEIVER.jump_s), RECEIVER.jump_m
-        if math.isnan(off_m):  # by the speed of the positions before
-            if len(self._points) < 3:
-                return False
-            earlier, before, last = self._points[-3:]
-            speed = (before.en_m - earlier.en_m) / (before.time_s - earlier.time_s)
-            seconds = last.time_s - before.time_s
-            off_m = float(np.hypot(*(last.en_m - before.en_m - speed * seconds)))
-            allowed_m += RECEIVER.acceleration_mps2 * seconds**2
-        return off_m > allowed_m
+        last = points[-1]
+        first, allowed_m = points[-2], RECEIVER.jump_m
+        if np.isfinite(last.vel_en_mps).all():
+            first = points[bisect_left(points, last.time_s - RECEIVER.jump_s, key=_time_s)]
+        else:
+            allowed_m += RECEIVER.acceleration_mps2 * (last.time_s - first.time_s) ** 2
+        return float(np.hypot(*(last.residual_m - first.residual_m))) > allowed_m
 
 
 def _time_s(point: _Point) -> float:
