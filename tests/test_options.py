@@ -77,6 +77,13 @@ def test_only_the_gps_message_has_an_id(sent, capsys):
     assert ended.value.code == 2 and "gps-input:0 to gps-input:255" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("first", ["gps-input:1", "gps-input:0"])
+def test_messages_have_one_gps_id(first, run):
+    asked = ["--send", first, "--send", "gps-input:2"]
+    done = run("fly", "a.onav", "video.mp4", "--autopilot", "udpin:14550", *asked)
+    assert done.code == 2 and f"several receivers: {first} and gps-input:2" in done.err
+
+
 @pytest.mark.parametrize("gnss", [[], ["--gnss", "watch"]])
 def test_a_flight_needs_telemetry(gnss, run):
     done = run("fly", "a.onav", "video.mp4", *gnss)

@@ -153,6 +153,10 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
+    ids = {int(gps_id) for each in options.send or () if (gps_id := each.partition(":")[2])}
+    if len(ids) > 1:
+        stated = " and ".join(f"gps-input:{each}" for each in sorted(ids))
+        raise VariantError(f"--send states several receivers: {stated}; give one of them")
     if options.ros2 and (options.source or options.autopilot):
         raise VariantError("--ros2 replaces SOURCE and --autopilot: give one or the other")
     if options.ros_args and not options.ros2:
