@@ -316,8 +316,20 @@ def test_messages_that_cannot_be_encoded_are_counted(tmp_path):
     log_views(log, range(3, 5))
     found = read(tmp_path / "flight_0001.mcap")
     assert len(found["/orthonav/view"]) == 2
+    pictures = [each["picture"] for each in plain(found["/orthonav/telemetry"])]
+    assert pictures == ["none", "full", "full"]  # the telemetry is not lost
     assert log.lost == {"views": 3, "messages": 6}
     assert plain(found["/orthonav/session"])[0]["options"]["heading"] == "known"
+
+
+def test_a_thumbnail_that_cannot_be_encoded_leaves_the_telemetry(tmp_path, monkeypatch):
+    monkeypatch.setattr(log_module.cv2, "imencode", lambda *_: (False, None))
+    log = begun(tmp_path, views="thumbnails")
+    log.view(0, "0.png", picture(0), telemetry(0))
+    log.close()
+    found = read(tmp_path / "flight_0001.mcap")
+    assert [each["picture"] for each in plain(found["/orthonav/telemetry"])] == ["none"]
+    assert "/orthonav/thumbnail" not in found and log.lost == {"views": 1, "messages": 0}
 
 
 def test_the_camera_has_the_size_of_the_images(tmp_path):

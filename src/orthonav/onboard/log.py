@@ -15,6 +15,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -168,7 +169,7 @@ class FlightLog:
         picture, kept = self._kept(grey)
         seen = LoggedView(index, number, frame, telemetry, picture, latency_ms, withheld)
         size = 1000 if kept is None else kept.nbytes
-        self._add(lambda: _view(seen, kept), size, has_view=picture == "full")
+        self._add(lambda: self._view(seen, kept), size, has_view=picture == "full")
 
     def _kept(self, grey: Grey | None) -> tuple[str, Grey | None]:
         """One of `PICTURES`, and what is logged of an image."""
@@ -275,6 +276,16 @@ class FlightLog:
             self._lose("views" if waiting.has_view else "messages", described(error))
             return []
 
+    def _view(self, seen: LoggedView, kept: Grey | None) -> list[Message]:
+        time_ns, images = seen.telemetry.time_ns, []
+        if kept is not None:
+            try:
+                images = [_image(seen, kept)]
+            except Exception as error:  # must not lose the telemetry
+                self._lose("views", described(error))
+                seen = replace(seen, picture="none")
+        return [_message(TOPICS.telemetry, time_ns, telemetry_message(seen), seen.index), *images]
+
     def _write(self, messages: list[Message]) -> None:
         """Write a chunk; without its images where that fails."""
         views = sum(message.is_view for message in messages)
@@ -332,18 +343,14 @@ def _message(topic: Any, time_ns: int, data: bytes, index: int = 0) -> Message:
     return Message(topic, time_ns, data, index)
 
 
-def _view(seen: LoggedView, kept: Grey | None) -> list[Message]:
+def _image(seen: LoggedView, kept: Grey) -> Message:
     time_ns = seen.telemetry.time_ns
-    messages = [_message(TOPICS.telemetry, time_ns, telemetry_message(seen), seen.index)]
-    if kept is not None:
-        if seen.picture == "full":
-            topic, kind, data = TOPICS.view, "png", lossless_png(kept)
-        else:
-            data = encoded(kept, "thumbnail.jpg", THUMBNAIL_QUALITY)
-            topic, kind = TOPICS.thumbnail, "jpeg"
-        picture = picture_message(data, kind, time_ns)
-        messages.append(_message(topic, time_ns, picture, seen.index))
-    return messages
+    if seen.picture == "full":
+        topic, kind, data = TOPICS.view, "png", lossless_png(kept)
+    else:
+        data = encoded(kept, "thumbnail.jpg", THUMBNAIL_QUALITY)
+        topic, kind = TOPICS.thumbnail, "jpeg"
+    return _message(topic, time_ns, picture_message(data, kind, time_ns), seen.index)
 
 
 def _thumbnail(grey: Grey) -> Grey:

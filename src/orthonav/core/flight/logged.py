@@ -33,8 +33,8 @@ MAX_PICTURE_BYTES = MAX_CHUNK_BYTES // 2
 MAX_JSON_BYTES = 2**20
 FRAME_ID = "camera"
 PICTURES = ("full", "thumbnail", "none", "dropped", "bad")
-"""State of a view's image: logged, logged small, not requested, dropped for lack of time or space,
-or unusable as the camera delivered it."""
+"""State of a view's image: logged, logged small, not requested or not encodable, dropped for lack
+of time or space, or unusable as the camera delivered it."""
 _REPORTED = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
 _OPTIONAL = tuple(each.name for each in fields(Telemetry) if each.type == float | None)
 
