@@ -130,3 +130,12 @@ def test_pictures_that_show_nothing_of_the_map_give_no_wrong_message(world):
     assert sent >= 0.95 * views >= 15  # it was tracking before
     assert max(each.error_m for each in report.sent if each not in report.during()) < 12.0
     assert report.wrong() == [] and len(report.during()) <= 3
+
+
+@pytest.mark.long
+def test_the_suite_notices_a_wrong_message(world):
+    """A map that is displaced by 60 m cannot be noticed: its messages count as wrong."""
+    fault = Fault("shifted", "map", 8.0, from_start=True, ground_en_m=(60.0, 0.0))
+    report = FaultFlight(world, fault, seed=3, lead_s=9.0, recovery_s=0.0).fly()
+    assert len(report.wrong()) > 5 and report.worst_m() == pytest.approx(60.0, abs=8.0)
+    assert np.isinf(report.recovery_s())

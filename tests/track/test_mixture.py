@@ -503,6 +503,12 @@ def test_an_error_is_small_no_more_probably_than_its_place_is_right(displacement
         assert found.confidence <= found.place_probability <= 1.0
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_confidence_of_a_flight_is_below_its_place_probability(seed):
+    for *_, found, _ in known(seed)[1]:
+        assert found.confidence <= found.place_probability
+
+
 LOST, TRACKING = State.LOST, State.TRACKING
 
 
