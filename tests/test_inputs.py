@@ -84,6 +84,10 @@ def test_swapped_true_positions_end_every_command(run, fixes, few, map_path, tmp
     swapped.write_text("frame,lat_deg,lon_deg\n" + swapped.read_text() + "\n")
     turned = shutil.copytree(few, tmp_path / "turned")
     shutil.copy(swapped, turned / "truth.csv")
+    first, *others = swapped.read_text().splitlines()[1:]
+    lost = shutil.copytree(few, tmp_path / "lost")  # a receiver without a fix at first
+    lines = ["frame,lat_deg,lon_deg", f"{first.split(',')[0]},0,0", *others]
+    (lost / "truth.csv").write_text("\n".join(lines) + "\n")
     none = tmp_path / "none.jsonl"
     none.write_text(fixes.read_text().replace('"status": "fix"', '"status": "no_fix"'))
     none.write_text(none.read_text().replace('"reason": null', '"reason": "blank"'))
@@ -92,6 +96,7 @@ def test_swapped_true_positions_end_every_command(run, fixes, few, map_path, tmp
         ["evaluate", none, "--truth", swapped, "--map", map_path],
         ["view", fixes, "--map", map_path, "--truth", swapped],
         ["calibrate", map_path, turned, "--out", tmp_path / "m", "--prior-std-m", 5],
+        ["calibrate", map_path, lost, "--out", tmp_path / "m", "--prior-std-m", 5],
     ):
         done = run(*command)
         assert (done.code, done.out) == (1, ""), command

@@ -15,6 +15,7 @@ from orthonav.ground.evaluate.statistics import (
     calibrate,
     check_covariance,
     is_covariance,
+    whitened,
 )
 
 RADIUS_M = 20.0
@@ -77,6 +78,17 @@ def test_drawn_as_stated_is_calibrated_and_wilson_covers() -> None:
     assert found.brier == pytest.approx(1 / 6, abs=0.005)  # the integral of c (1 - c)
     inside = [b.right_low <= b.mean_confidence <= b.right_high for b in found.bins]
     assert sum(inside) >= 8
+
+
+def test_nees_against_an_inverse() -> None:
+    random = np.random.default_rng(2)
+    roots = random.normal(0.0, 5.0, (50, 2, 2))
+    cov = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(2)
+    errors = random.normal(0.0, 5.0, (50, 2))
+    expected = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(cov), errors)
+    np.testing.assert_allclose((whitened(errors, cov) ** 2).sum(axis=1), expected, rtol=1e-9)
+    found = check_covariance(errors, cov, np.full(50, 1000.0), 15.0)
+    np.testing.assert_allclose(found.nees, np.sort(expected), rtol=1e-9)
 
 
 def test_right_covariance_is_consistent_and_a_halved_one_is_not() -> None:

@@ -2,6 +2,9 @@
 
 import errno
 import os
+import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -280,6 +283,37 @@ def test_an_interrupt_leaves_nothing(small_ortho, tmp_path, names_in, stage):
     with pytest.raises(KeyboardInterrupt):
         build_map(request, progress)
     assert names_in(tmp_path) == []
+
+
+KILLED = """
+import os, signal, sys
+from orthonav.ground.build import BuildRequest, build_map
+
+def kill(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def progress(stage, share):
+    if stage == sys.argv[3]:
+        kill()
+
+if sys.argv[3] == "write":
+    os.fsync = kill
+small = {"tile_px": 64, "overlap": 0.75, "registration": False}
+build_map(BuildRequest([sys.argv[1]], sys.argv[2], **small), progress)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("stage, left", [("imagery", 0), ("write", 1)])
+def test_a_killed_build_keeps_the_old_map(small_ortho, tmp_path, names_in, stage, left):
+    out = tmp_path / "map.onav"
+    out.write_bytes(b"an older map")
+    command = [sys.executable, "-c", KILLED, small_ortho, out, stage]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    assert out.read_bytes() == b"an older map"
+    temporaries = [name for name in names_in(tmp_path) if name != out.name]
+    assert [name.startswith(".map.onav.") for name in temporaries] == [True] * left
+    assert built(small_ortho, tmp_path).manifest.sheets[0].tiles > 0
 
 
 def own_views(localizer, path, mirrored=False, count=14):

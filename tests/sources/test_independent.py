@@ -118,7 +118,7 @@ def compare(path):
 
 def compare_pose(ours, tags):
     """Heading and tilt: of the gimbal, of the body where a camera has none."""
-    (photo,), _ = posed([ours])
+    (photo,), _ = posed([ours], [])
     pose = photo.pose
     heading = first(tags, "XMP-drone-dji:GimbalYawDegree", "DJI:CameraYaw", "XMP-sensefly:Heading")
     pitch = first(tags, "XMP-drone-dji:GimbalPitchDegree", "DJI:CameraPitch")

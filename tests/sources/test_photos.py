@@ -45,7 +45,7 @@ def series(folder, *each, first=20, **common):
 
 def attitude(photo):
     """Heading, pitch and roll of a photograph by itself."""
-    (photo,), _ = posed([photo])
+    (photo,), _ = posed([photo], [])
     pose = photo.pose
     return pose["yaw_deg"], pose["pitch_deg"], pose["roll_deg"]
 
@@ -188,11 +188,34 @@ def test_a_photograph_that_programs_turn_is_used_as_stored(tmp_path):
     assert np.abs(stored.astype(int) - picture(1)).mean() < 6
 
 
+PARROT = "drone-parrot", "http://www.parrot.com/drone-parrot/1.0/"
+SKYDIO = "drone-skydio", "http://www.skydio.com/drone-skydio/1.0/"
+
+
+@pytest.mark.parametrize("nested", [True, False])
+def test_parrot_and_skydio(tmp_path, nested):
+    """Their cameras look ahead at 0, 0, 0, as DJI's do."""
+    xmp = packet(PARROT, CameraYawDegree="30.5", CameraPitchDegree="-80", CameraRollDegree="0")
+    assert attitude(read_photo(photo(tmp_path / "a.jpg", xmp=xmp))) == pytest.approx((30.5, 10, 0))
+    names = {"Roll": "0", "Pitch": "-80.0", "Yaw": "30.5"}
+    attributes = " ".join(f'drone-skydio:{name}="{value}"' for name, value in names.items())
+    camera = f"<drone-skydio:CameraOrientationNED {attributes}/>"
+    if nested:
+        inner = "".join(f"<drone-skydio:{n}>{v}</drone-skydio:{n}>" for n, v in names.items())
+        camera = 'CameraOrientationNED rdf:parseType="Resource"'
+        camera = f"<drone-skydio:{camera}>{inner}</drone-skydio:CameraOrientationNED>"
+    body = camera.replace("Camera", "Vehicle").replace("30.5", "99").replace("-80.0", "1")
+    xmp = packet(SKYDIO, RelativeAltitude="55.5")
+    xmp = xmp.replace("</rdf:Description>", f"{camera}{body}</rdf:Description>")
+    read = read_photo(photo(tmp_path / "b.jpg", xmp=xmp))
+    assert attitude(read) == pytest.approx((30.5, 10, 0)) and read.home_m == 55.5
+
+
 @pytest.mark.parametrize(
     "maker, gps, named",
     [
         (("Maker", "http://maker.com/"), {}, "Maker:MountYaw"),
-        (("drone-parrot", "http://www.parrot.com/drone-parrot/1.0/"), {}, "drone-parrot:MountYaw"),
+        (PARROT, {}, "drone-parrot:MountYaw"),
         (DJI, {16: "M", 17: 30.0}, "GPSImgDirection"),
     ],
 )

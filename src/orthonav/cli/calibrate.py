@@ -98,17 +98,20 @@ def _calibrated(options: argparse.Namespace) -> "MountCalibration":
 def _check_positions(
     options: argparse.Namespace, flight: "Recording", opened: orthonav.MapFile
 ) -> None:
-    """By the first recorded one. Raises `UsageError` where there is none."""
+    """By all recorded ones: a first one may be of before the first GNSS fix.
+
+    Raises `UsageError` where there is none, `FlightError` where they seem to be swapped.
+    """
     from orthonav.ground.evaluate.metrics import check_truth
 
-    places = (view.truth_latlon_deg for view in flight.views)
-    first = next((place for place in places if place is not None), None)
-    if first is None:
+    recorded = {view.frame: view.truth_latlon_deg for view in flight.views}
+    places = {frame: place for frame, place in recorded.items() if place is not None}
+    if not places:
         raise UsageError(
             f"--prior-std-m needs recorded positions, and no view has one: {options.flight}"
         )
     centre = opened.manifest.sheets[0].frame
-    check_truth({"": first}, (), (centre.lat_deg, centre.lon_deg), options.flight)
+    check_truth(places, (), (centre.lat_deg, centre.lon_deg), options.flight)
 
 
 def _with_prior(view: "RecordedView", std_m: float | None) -> "RecordedView":

@@ -182,10 +182,11 @@ _VALUE = re.compile(
 _NUMBER = re.compile(r"([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d{1,2})?)(?:\s*/\s*(\d+(?:[.,]\d+)?))?")
 """A number with a decimal point or comma, or a fraction."""
 _ANGLE_OR_PLACE = re.compile(
-    r"(?:drone(?:-dji)?|Camera|sensefly):(?:Gimbal|Flight(?:Yaw|Pitch|Roll)|Yaw|Pitch|Roll|Heading|"
-    r"Altitude|Height|Lat|Lon)"
+    r"(?:drone(?:-dji)?|Camera|sensefly|skydio|drone-parrot):(?:Gimbal|Flight(?:Yaw|Pitch|Roll)|"
+    r"(?:Camera)?(?:Yaw|Pitch|Roll)|Heading|Altitude|Height|Lat|Lon)"
 )
 """Values that a view is worse off without."""
+_SKYDIO = re.compile(r"(?s)(drone-skydio:CameraOrientationNED\b)(?:[^<>]{0,600}/>|.{0,600}?</\1)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +271,10 @@ def read_photo(path: Path) -> Photo:
         rotation=rotation,
         body_yaw_deg=body_yaw,
         home_m=measured(
-            xmp.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
+            xmp.first(
+                *("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height"),
+                *("drone-skydio:RelativeAltitude", "drone-parrot:RelativeAltitude"),
+            )
         ),
         amsl_m=xmp.first("sensefly:AltitudeAMSL"),
         hae_m=xmp.first("drone-dji:AbsoluteAltitude" if rtk else "sensefly:AltitudeWGS84"),
@@ -403,7 +407,9 @@ class Xmp:
     @classmethod
     def of(cls, packet: str | bytes) -> "Xmp":
         text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
-        texts = dict(_VALUE.findall(text))
+        camera = _SKYDIO.search(text)  # its names are those of the aircraft's angles too
+        skydio = camera[0].replace("drone-skydio:", "skydio:") if camera else ""
+        texts = dict(_VALUE.findall(skydio + text))
         found = {name: _stated(value) for name, value in texts.items()}
         values = {name: value for name, value in found.items() if math.isfinite(value)}
         unread = tuple(
@@ -434,7 +440,8 @@ class Xmp:
 
     def gimbal_deg(self) -> tuple[float, float, float] | None:
         """Yaw, pitch and roll of the gimbal, of a camera that looks ahead at 0, 0, 0."""
-        return self._angles("drone-dji:Gimbal{}Degree") or self._angles("drone:Gimbal{}Degree")
+        forms = "drone-dji:Gimbal{}Degree", "drone:Gimbal{}Degree", "drone-parrot:Camera{}Degree"
+        return next(filter(None, map(self._angles, (*forms, "skydio:{}"))), None)
 
     def body_yaw_deg(self) -> float:
         """Heading of the aircraft; NaN where a gimbal has another one that cannot be read."""

@@ -130,7 +130,7 @@ def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
     return found[0] if found else None
 
 
-def posed(photos: Sequence[Photo], edited: Sequence[int] = ()) -> tuple[list[Photo], list[str]]:
+def posed(photos: Sequence[Photo], edited: Sequence[int]) -> tuple[list[Photo], list[str]]:
     """The photographs of a flight with their attitude, and warnings for people.
 
     Photographs of one camera are judged together: a gimbal that is level and points north in all of
