@@ -105,6 +105,13 @@ def test_build(run, ortho, out, names_in):
     assert names_in(out) == ["a.onav", "b.onav"]
 
 
+@pytest.mark.parametrize("method", [(), ("--method", "bovw:words=64")])
+def test_checkpoints_are_those_of_a_network(run, ortho, out, names_in, method):
+    done = run("build", "--ortho", ortho, *method, "--work", out / "w", "--out", out / "a.onav")
+    assert done.code == 2 and "training of a network: give --method autoencoder" in done.err
+    assert names_in(out) == []
+
+
 @pytest.mark.parametrize(
     "options",
     [

@@ -18,6 +18,7 @@ from orthonav.ground.atlas.catalog import (
     Sheet,
     StoredFile,
     canonical,
+    copy_sheets,
     read_item,
 )
 from orthonav.ground.atlas.integrity import check_atlas
@@ -187,13 +188,21 @@ def test_an_altered_catalogue_is_refused(near, change, words):
         ("coarse", {"width": 3}),
         ("coarse", {"gsd_m": -8.0, "tile_px": 128, "overlap": 0.5}),
         ("coarse", 5),
-        ("coarse", None),
     ],
     ids=str,
 )
 def test_impossible_recipes_are_refused(name, value):
     with pytest.raises(AtlasError, match="recipe"):
         AtlasRecipe.from_plain({**RECIPE.to_plain(), name: value})
+
+
+def test_an_atlas_without_coarse_tiles_is_to_be_built_again(near):
+    path = Path(near.url) / "atlas.json"
+    plain = json.loads(path.read_text())
+    plain["orthonav:atlas"]["recipe"]["coarse"] = None
+    path.write_bytes(canonical(plain))
+    with pytest.raises(AtlasError, match=r"^the atlas has no coarse tiles.*build it again"):
+        Atlas.open(near.url)
 
 
 def altered(item, path, value):
@@ -373,3 +382,29 @@ def test_dates_become_times_of_stac(dates, times):
         times = {"datetime": None, "start_datetime": times[0], "end_datetime": times[1]}
     assert found == times
     assert read_item(sheet.item_name, canonical(sheet.to_item())) == sheet
+
+
+def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
+    source = Atlas.open_or_create(tmp_path / "source", RECIPE)
+    for sheet in (HERE, EAST):
+        source.put(files(sheet), described(sheet))
+    near.put(files(EAST), described(EAST))
+    assert copy_sheets(source, near) == ([HERE], [EAST])
+    assert content(near.url) == {**content(source.url), **content(near.url)}
+    source.put(files("new"), described())
+    assert copy_sheets(source, near) == ([], [HERE, EAST])
+    assert copy_sheets(source, near, replace=True) == ([HERE], [EAST])
+    assert near.path(near.sheets()[HERE]).read_text() == "map of new"
+    assert check_atlas(near) == []
+    other = Atlas.open_or_create(tmp_path / "other", replace(RECIPE, overlap=0.5))
+    with pytest.raises(AtlasError, match=r"overlap: 0\.5, not 0\.875"):
+        copy_sheets(source, other)
+
+
+def test_a_damaged_sheet_is_not_copied(tmp_path, files, near):
+    source = Atlas.open_or_create(tmp_path / "source", RECIPE)
+    sheet = source.put(files(), described())
+    source.path(sheet).write_text("map of two")  # of the same size
+    with pytest.raises(StorageError):
+        copy_sheets(Atlas.open(source.url), near)
+    assert near.sheets(refresh=True) == {} and near.store.names("sheets") == {}

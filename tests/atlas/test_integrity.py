@@ -151,6 +151,14 @@ def test_a_sheet_finished_meanwhile_is_no_orphan(near, tmp_path, monkeypatch):
     assert found(near, clean=True, min_age_s=-5) == []
 
 
+def test_a_full_disk_is_reported(near, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("orthonav.ground.atlas.store.shutil.copyfile", full)
+    assert main(["atlas", "add", near.url + "2", near.url, "-q"]) == 1
+
+
 def run(capfd, *arguments):
     code = main(["atlas", *map(str, arguments), "-q"])
     return code, capfd.readouterr()
@@ -193,14 +201,28 @@ def test_check(near, capfd):
     assert {each["kind"] for each in plain["problems"]} == {"missing file"}
 
 
-def test_copied_sheets_are_checked_and_retired(near, tmp_path, capfd):
-    """A folder holds all of a sheet, so it is copied with the tools of the system."""
+def test_add_and_retire(near, tmp_path, capfd):
     copy = tmp_path / "copy"
-    Atlas.open_or_create(copy, RECIPE)
-    for name in ("items", "sheets"):
-        shutil.copytree(Path(near.url, name), copy / name)
-    assert found(Atlas.open(copy), deep=True) == []
+    code, done = run(capfd, "add", copy, near.url)
+    assert (code, done.out) == (0, f"2 sheets added, 0 unchanged: {copy}\n")
+    code, done = run(capfd, "add", copy, near.url, "--replace")
+    assert done.out.startswith("0 sheets added, 2 unchanged")
+    assert list(Atlas.open(copy).sheets()) == [HERE, EAST] and found(Atlas.open(copy)) == []
     code, done = run(capfd, "retire", copy, HERE, EAST)
     assert code == 0 and Atlas.open(copy).sheets() == {} and found(Atlas.open(copy)) == []
     code, done = run(capfd, "retire", copy, HERE)
     assert code == 1 and "has no sheet" in done.err
+    shutil.rmtree(copy)
+    Atlas.open_or_create(copy, replace(RECIPE, overlap=0.5))
+    code, done = run(capfd, "add", copy, near.url)
+    assert code == 1 and "overlap: 0.5, not 0.875" in done.err
+
+
+def test_sheets_are_listed_even_if_no_index_can_be_made(near, tmp_path, capfd):
+    files = {"map": tmp_path / "map", "coarse": tmp_path / "coarse"}
+    for path in files.values():
+        path.write_text("no tiles")
+    near.put(files, described(HERE))
+    code, done = run(capfd, "index", near.url)
+    assert code == 1 and "coarse" in done.err
+    assert len(json.loads(near.store.read("items.geojson"))["features"]) == 2

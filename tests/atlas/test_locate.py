@@ -274,6 +274,7 @@ def test_the_index_follows_the_sheets(copied, tmp_path, caplog):
         (lambda plain: _asset(plain).update(name="../../../etc/passwd"), "altered"),
         (lambda plain: _asset(plain).update(size_bytes="x"), "size"),
         (lambda plain: plain.update(shards=7), "another kind"),
+        (lambda plain: plain.update(shards=[]), "altered"),
     ],
 )
 def test_an_untrusted_index_is_checked(atlas, change, words):

@@ -211,6 +211,7 @@ OUTSIDE = '<!DOCTYPE kml SYSTEM "file:///etc/passwd"><kml/>'
         ("a.kml", '<?xml version="1.0" encoding="klingon"?><kml/>', "KML file"),
         ("a.kml", BOMB, "has a DOCTYPE"),
         ("a.kml", OUTSIDE, "has a DOCTYPE"),
+        ("a.gpx", OUTSIDE.replace("<kml/>", "<gpx/>"), "has a DOCTYPE"),
         ("a.kml", "<kml>" + "<a>" * 100, "more than .* 100 levels"),
         ("a.kml", "<gpx/>", "must begin with <kml>, got <gpx>"),
         ("a.kml", kml_of(("a", line(coordinates=""))), "no LineString"),

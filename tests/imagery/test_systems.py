@@ -101,7 +101,9 @@ def test_an_epoch_moves_the_imagery(tmp_path):
     outlines = moved.outline_latlon_deg - as_it_is.outline_latlon_deg
     assert outlines == pytest.approx(np.broadcast_to(expected, outlines.shape), abs=1e-12)
     assert moved.describe()[0]["epoch"] == "2026.9"
-    assert moved.sources[0].stamp != as_it_is.sources[0].stamp, "cached blocks are of one epoch"
+    assert moved.sources[0].stamp != as_it_is.sources[0].stamp, (
+        "sheets of an atlas are of one epoch"
+    )
     east_m, north_m = FRAME.en_from_latlon(FRAME.lat_deg + expected[0], FRAME.lon_deg + expected[1])
     shift = moved.sources[0].transform.c - as_it_is.sources[0].transform.c
     assert shift == pytest.approx(east_m, abs=0.01) and 0.5 < north_m < 0.7

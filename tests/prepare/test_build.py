@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from helpers import box_deg, textured, waypoints
-from orthonav.core.cores import in_order
+from orthonav.core.cores import AHEAD, in_order
 from orthonav.core.errors import AreaError, ImageryError, OutputError, UsageError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import HINT
@@ -188,6 +188,15 @@ def test_the_first_error_is_raised_and_no_thread_stays(workers):
         for item in in_order(failing, range(20), workers):
             found.append(item)
     assert found == list(range(7)) and threading.active_count() == before
+
+
+def test_few_results_wait_for_a_reader():
+    started = []
+    results = in_order(started.append, range(100), 3)
+    next(results)
+    time.sleep(0.05)
+    assert len(started) <= 3 + AHEAD
+    results.close()
 
 
 def test_the_manifest(small_ortho, tmp_path):

@@ -116,6 +116,7 @@ def test_the_detail_says_all(ask):
         "/nothing",
         "/static/",
         "/static/../server.py",
+        "/static/%2e%2e/server.py",
         "/static/..%2fserver.py",
         "/static//etc/passwd",
         "/leaflet/leaflet.js",

@@ -44,6 +44,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "remove leftovers of interrupted builds that are older than 24 hours"
     check.add_argument("--clean", action="store_true", help=text)
     add_options(check, "--json")
+    copied = action("add", "copy sheets of another atlas of the same recipe into this one")
+    copied.add_argument("source", metavar="FROM", help="folder or URL of the other atlas")
+    text = "replace sheets that differ from those of FROM"
+    copied.add_argument("--replace", action="store_true", help=text)
     retire = action("retire", "take sheets out of an atlas")
     text = "name of a sheet, such as r001526c001392"
     retire.add_argument("sheets", nargs="+", metavar="SHEET", help=text)
@@ -82,6 +86,9 @@ def run(options: argparse.Namespace) -> int | None:
 
     if options.action == "build":
         return _build(options)
+    if options.action == "add":
+        _add(options)
+        return None
     actions = {"info": _info, "check": _check, "retire": _retire, "index": _index, "cut": _cut}
     return actions[options.action](options, Atlas.open(options.atlas))
 
@@ -190,6 +197,16 @@ def _check(options: argparse.Namespace, atlas: "Atlas") -> int:
     return NOT_WHOLE if left else 0
 
 
+def _add(options: argparse.Namespace) -> None:
+    from orthonav.ground.atlas.catalog import Atlas, copy_sheets
+
+    source = Atlas.open(options.source)
+    atlas = Atlas.open_or_create(options.atlas, source.recipe)
+    with progress(options) as shown:
+        copied, unchanged = copy_sheets(source, atlas, options.replace, shown)
+    print(f"{len(copied)} sheets added, {len(unchanged)} unchanged: {atlas.store}")
+
+
 def _retire(options: argparse.Namespace, atlas: "Atlas") -> None:
     for sheet in dict.fromkeys(options.sheets):
         atlas.retire(sheet)
@@ -200,9 +217,9 @@ def _retire(options: argparse.Namespace, atlas: "Atlas") -> None:
 def _index(options: argparse.Namespace, atlas: "Atlas") -> None:
     from orthonav.ground.atlas.index import make_index
 
+    atlas.snapshot()
     with progress(options) as shown:
         made = make_index(atlas, progress=shown, rebuild=options.replace)
-    atlas.snapshot()
     if made is None:
         print(f"no sheet has coarse tiles, nothing to index: {atlas.store}")
         return

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import add_area, add_options, given, print_json, progress
 from orthonav.cli.info import summary, summary_text
+from orthonav.core.errors import UsageError
 
 if TYPE_CHECKING:
     from orthonav.core.mapfile import Manifest
@@ -16,6 +17,7 @@ WITHOUT_TERRAIN = (
     "the imagery)"
 )
 LEVEL_LAND = "; --relief level does where the land is level"
+NETWORKS = ("autoencoder", "caevl", "triplet")
 LEAST_SHIFT_M = 0.3
 """A pixel of the finest orthophotos of countries."""
 
@@ -75,6 +77,11 @@ def asked(options: argparse.Namespace, request: type) -> dict[str, Any]:
 def run(options: argparse.Namespace) -> None:
     from orthonav.ground.build import BuildRequest, build_map
 
+    if options.work is not None and (options.method or "").partition(":")[0] not in NETWORKS:
+        raise UsageError(
+            f"--work keeps the training of a network: give --method {NETWORKS[0]}, {NETWORKS[1]} "
+            f"or {NETWORKS[2]}"
+        )
     start = time.perf_counter()
     request = BuildRequest(**asked(options, BuildRequest), other_dates=options.other_date)
     with progress(options) as shown:

@@ -18,6 +18,7 @@ from typing import Any, cast
 import numpy as np
 
 from orthonav.core.errors import AtlasError, described
+from orthonav.core.files import Progress, no_progress
 from orthonav.ground.atlas.store import Store, digest_of
 from orthonav.ground.planning.area import Extent
 from orthonav.ground.planning.sheets import WorldSheets
@@ -314,6 +315,10 @@ class AtlasRecipe:
 
     @classmethod
     def from_plain(cls, plain: Any) -> "AtlasRecipe":
+        if isinstance(plain, dict) and "coarse" in plain and plain["coarse"] is None:
+            raise AtlasError(
+                "the atlas has no coarse tiles, which this version needs; build it again"
+            )
         try:
             values = {each.name: plain[each.name] for each in fields(cls)}
             return cls(**values | {"coarse": CoarseRecipe(**values["coarse"])})
@@ -455,6 +460,24 @@ class Atlas:
         for file in before.files.values():
             if file.name not in left:
                 self.store.remove(file.name)
+
+
+def copy_sheets(
+    source: Atlas, atlas: Atlas, replace: bool = False, progress: Progress = no_progress
+) -> tuple[list[str], list[str]]:
+    """Copy the sheets of one atlas into another of the same recipe: names of copied sheets, and of
+    those that were there and left unchanged. With `replace` sheets that differ are replaced."""
+    atlas.require_recipe(source.recipe)
+    found, there = source.sheets(), atlas.sheets(refresh=True)
+    copied: list[str] = []
+    for number, (sheet_id, new) in enumerate(found.items()):
+        progress("copy", number / len(found))
+        old = there.get(sheet_id)
+        if old is None or (replace and old != new):
+            atlas.put({key: source.path(new, key) for key in new.files}, new)
+            copied.append(sheet_id)
+    atlas.snapshot()
+    return copied, [each for each in found if each not in copied]
 
 
 def _is_free(store: Store) -> bool:

@@ -66,7 +66,8 @@ class IndexManifest:
             parts = [part for shard in shards for part in shard.parts]
             made = cls(VectorRecipe(**plain["recipe"]), shards, files)
             possible = (
-                all(map(_NAME.fullmatch, [*files, *(shard.name for shard in shards)]))
+                len(shards) > 0
+                and all(map(_NAME.fullmatch, [*files, *(shard.name for shard in shards)]))
                 and all(file.name == f"{FOLDER}/{name}" for name, file in files.items())
                 and all(0 <= part.rows <= MAX_TILES for part in parts)
                 and list(accumulate((shard.rows for shard in shards), initial=0))[:-1]
