@@ -244,3 +244,9 @@ def test_velocity_and_recognition_of_a_track_stand_in_its_evidence() -> None:
     assert isinstance(fix := read.outcome, Fix) and dict(fix.evidence) == FIX_LINE["evidence"]
     assert (fix.vel_en_mps, fix.vel_std_mps, fix.recognized) == ((3.0, -4.0), 0.5, 0.9)
     assert json.loads(result_to_json(read))["evidence"] == plain["evidence"]
+
+
+@pytest.mark.parametrize("wrong", [{"recognized": 7.0}, {"vel_std_mps": -3.0}])
+def test_impossible_motion_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(FlightError, match="recognized of 0 to 1"):
+        result_from_json(json.dumps({**FIX_LINE, "evidence": wrong}))

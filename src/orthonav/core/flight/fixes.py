@@ -70,6 +70,7 @@ MOTION_KEYS = (  # in the evidence of a track
     "vel_std_mps",
     "recognized",
 )
+NO_VELOCITY = (math.nan, math.nan)
 STATES = ("searching", "tracking", "coasting", "lost")
 MAX_LINE_BYTES = 2**20  # limit of a line; the evidence of a view takes about 1000 bytes
 MAX_RESULTS = 1_000_000  # limit of lines: as many as a flight folder may have views
@@ -170,7 +171,10 @@ def to_plain(record: Any, risk: float = DEFAULT_RISK) -> dict[str, Any]:
             values |= zip(TRACK_KEYS, (True, record.state), strict=True)
     else:
         values = _outcome_values(record)
-        numbers = {**record.evidence, **(_motion(record) if isinstance(record, Fix) else {})}
+        numbers = {
+            **record.evidence,
+            **(motion_evidence(record) if isinstance(record, Fix) else {}),
+        }
         values["evidence"] = {str(k): _or_none(v) for k, v in numbers.items()}
         if isinstance(record, Fix):
             stated = record.place_probability, record.protection_level_m(risk), risk
@@ -327,10 +331,13 @@ def _pose_values(fix: Fix) -> dict[str, Any]:
     return dict(zip(POSE_KEYS, (*angles, upper), strict=True))
 
 
-def _motion(fix: Fix) -> dict[str, float]:
-    velocity = fix.vel_en_mps or (math.nan, math.nan)
+def motion_evidence(fix: Fix) -> dict[str, float]:
+    """Velocity of a track, and whether the view shows the map, as `fixes.jsonl` has them: those
+    that are known."""
+    known = fix.vel_en_mps is not None and np.isfinite(fix.vel_en_mps).all()
+    velocity = map(float, fix.vel_en_mps) if fix.vel_en_mps is not None and known else NO_VELOCITY
     stated = dict(zip(MOTION_KEYS, (*velocity, fix.vel_std_mps, fix.recognized), strict=True))
-    return {key: value for key, value in stated.items() if not math.isnan(value)}
+    return {key: value for key, value in stated.items() if math.isfinite(value)}
 
 
 def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
@@ -351,6 +358,11 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
     cov_en_m2 = _numbers(values, "cov_en_m2", (2, 2))
     *velocity, vel_std_mps, recognized = (evidence.pop(key, math.nan) for key in MOTION_KEYS)
     east_mps, north_mps = velocity
+    if vel_std_mps < 0 or not (math.isnan(recognized) or 0 <= recognized <= 1):
+        raise FlightError(
+            "evidence: expected vel_std_mps of 0 or more and recognized of 0 to 1, got "
+            f"{vel_std_mps:g} and {recognized:g}"
+        )
     # Absent in earlier files.
     values = {**dict.fromkeys((*INTEGRITY_KEYS, *GROUND_KEYS, *POSE_KEYS)), **values}
     return Fix(

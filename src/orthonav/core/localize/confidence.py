@@ -71,11 +71,11 @@ class Scores:
 
     @property
     def peak_ratio(self) -> float:
-        return min(MAX_RATIO, self.strength / max(self.rival, 1e-6))
+        return min(self.strength / max(self.rival, 1e-6), MAX_RATIO)  # in this order NaN stays
 
     @property
     def mid_ratio(self) -> float:
-        return min(MAX_RATIO, self.mid_score / max(self.mid_rival, 1e-6))
+        return min(self.mid_score / max(self.mid_rival, 1e-6), MAX_RATIO)
 
     def evidence(self) -> dict[str, float]:
         """By the keys of `fixes.jsonl` (docs/reference/formats.md)."""
