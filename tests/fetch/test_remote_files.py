@@ -32,9 +32,14 @@ def placed():
     return check
 
 
-def test_a_window_of_a_file_as_it_is(take, placed, cog_bytes):
+def test_a_window_of_a_file_as_it_is(take, placed, cog_bytes, tmp_path):
     with servers.serving(servers.files({"/a.tif": cog_bytes})) as server:
-        result, path = take(f"cog:{server.url}/a.tif", gsd_m=None, terms={"date": "2021-07-04"})
+        table = tmp_path / "own.toml"
+        table.write_text(
+            f'[mine]\nprotocol = "cog"\nurl = "{server.url}/a.tif"\n'
+            '[[mine.layers]]\nid = "a"\ndate = "2021-07-04"\n'
+        )
+        result, path = take("mine:a", gsd_m=None, terms={"own": table})
         assert all("bytes=" in asked.headers["Range"] for asked in server.log[1:])
         before, outside = len(server.log), Area.from_bounds((3.5, 46.5, 3.501, 46.501))
         with pytest.raises(FetchError, match="no imagery of this area"):
