@@ -378,6 +378,12 @@ class Fix(Outcome):
         known = math.isfinite(self.place_probability)
         return self.place_probability if known else self.confidence
 
+    @property
+    def known_velocity_en_mps(self) -> tuple[float, float] | None:
+        """`vel_en_mps` where both are finite."""
+        velocity = self.vel_en_mps
+        return velocity if velocity is not None and np.isfinite(velocity).all() else None
+
     def __repr__(self) -> str:
         return (
             f"Fix({self.lat_deg:.6f}, {self.lon_deg:.6f}, std {self.std_m:.1f} m, confidence "

@@ -334,9 +334,10 @@ def _pose_values(fix: Fix) -> dict[str, Any]:
 def motion_evidence(fix: Fix) -> dict[str, float]:
     """Velocity of a track, and whether the view shows the map, as `fixes.jsonl` has them: those
     that are known."""
-    known = fix.vel_en_mps is not None and np.isfinite(fix.vel_en_mps).all()
-    velocity = map(float, fix.vel_en_mps) if fix.vel_en_mps is not None and known else NO_VELOCITY
-    stated = dict(zip(MOTION_KEYS, (*velocity, fix.vel_std_mps, fix.recognized), strict=True))
+    velocity = fix.known_velocity_en_mps
+    east_mps, north_mps = NO_VELOCITY if velocity is None else map(float, velocity)
+    values = east_mps, north_mps, fix.vel_std_mps, fix.recognized
+    stated = dict(zip(MOTION_KEYS, values, strict=True))
     return {key: value for key, value in stated.items() if math.isfinite(value)}
 
 

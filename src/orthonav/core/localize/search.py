@@ -16,7 +16,7 @@ below, is cheap too, it comes last: weak texture, as of bare ground, is only see
 
 A search ends as soon as the best place stands out or is proven by its confidence. `place` judges
 candidates. Reasons are in docs/decisions/registration.md; values without one there were chosen on
-the scenes of `python -m benchmarks.real_imagery`."""
+the real scenes of `benchmarks.scenes`."""
 
 import math
 import time

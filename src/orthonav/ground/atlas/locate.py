@@ -226,11 +226,12 @@ class SheetTrack:
             return False
         fix, before_ns = self._last
         seconds = max((time_ns - before_ns) / 1e9, 0.0)
-        velocity = np.array(fix.vel_en_mps or (math.nan, math.nan))
+        known = fix.known_velocity_en_mps
+        velocity = np.array(known or (0.0, 0.0))
         # It may change by half and by 10 m/s. One less certain than that is unknown.
         fastest_mps = 120.0  # beyond the aircraft that this program is for
         speed_mps = min(float(np.hypot(*velocity)) / 2 + 10.0, fastest_mps)
-        if not (fix.vel_std_mps <= 10.0 and np.isfinite(velocity).all()):
+        if known is None or not fix.vel_std_mps <= 10.0:
             velocity, speed_mps = np.zeros(2), fastest_mps
         self.has_ended = SIGMAS * fix.std_m + speed_mps * seconds > MAX_REACH_M
         if not self.has_ended:

@@ -118,7 +118,7 @@ def estimate_from_result(
         time_ns=result.time_ns,
         utc_ns=result.time_ns + utc_ahead_ns,
         processing_s=processing_s,
-        vel_en_mps=_velocity(fix) if result.state is not None else None,
+        vel_en_mps=fix.known_velocity_en_mps if result.state is not None else None,
         vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,
         state=result.state,
         protection_level_m=fix.protection_level_m(result.risk),
@@ -130,11 +130,6 @@ def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
     """Symmetric covariance (N, N) with a standard deviation of at least `min_std` everywhere."""
     values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
     return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
-
-
-def _velocity(fix: Fix) -> tuple[float, float] | None:
-    known = fix.vel_en_mps is not None and np.isfinite(fix.vel_en_mps).all()
-    return fix.vel_en_mps if known else None
 
 
 def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
