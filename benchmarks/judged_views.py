@@ -30,7 +30,8 @@ from benchmarks.scenes import far_m as far_m_of
 from orthonav.core.errors import AreaError
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.fix import fix_of
-from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.prepared import PreparedMap
+from orthonav.core.localize.search import Search
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import PRIOR_SIGMAS, RADIUS_SHARE, NoFix, Telemetry, View
 
@@ -186,16 +187,17 @@ def _flown_for(
 
 
 def _placed(
-    localizer: RegistrationLocalizer, case: Case, view: View, truth: tuple[float, float]
+    localizer: PreparedMap, case: Case, view: View, truth: tuple[float, float]
 ) -> dict[str, Any]:
     """Evidence, error and verdict of a view; `evidence` None where it was refused."""
     prior = None if case.prior_px is None else view.telemetry.prior
-    found = localizer.found(view, prior, case.heading_known)
+    search = Search.of(localizer, view, prior, case.heading_known)
+    found = search if isinstance(search, NoFix) else search.run()
     if isinstance(found, NoFix):
         return {"evidence": None, "right": False}
     gsd_m = localizer.grid.gsd_m
     assert localizer.confidence is not None
-    fix, frame = fix_of(*found), localizer.sheet.frame
+    fix, frame = fix_of(found), localizer.sheet.frame
     off_m = frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - frame.en_from_latlon(*truth)
     error_m = float(np.hypot(*off_m))
     far_m = far_m_of(gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
@@ -213,9 +215,7 @@ def _placed(
     }
 
 
-def is_covered(
-    localizer: RegistrationLocalizer, truth: tuple[float, float], width_px: float
-) -> bool:
+def is_covered(localizer: PreparedMap, truth: tuple[float, float], width_px: float) -> bool:
     """Whether the map has imagery at the middle of a view and half way to its corners."""
     grid = localizer.grid
     east, north = localizer.sheet.frame.en_from_latlon(*truth)
@@ -255,7 +255,7 @@ def _scaled(telemetry: Telemetry, scale: float) -> Telemetry:
     )
 
 
-def _registration(map_path: Path) -> RegistrationLocalizer:
+def _registration(map_path: Path) -> PreparedMap:
     found = Localizer(open_map(map_path)).registration
     assert found is not None
     return found

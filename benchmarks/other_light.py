@@ -39,7 +39,7 @@ from orthonav.core.files import replacing
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.fix import fix_of
-from orthonav.core.localize.search import Search
+from orthonav.core.localize.search import Found, Search
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, View
 
@@ -300,13 +300,13 @@ def _ways(localizer: Localizer) -> Iterator[tuple[str, Any]]:
     registration = localizer.registration
 
     def alone(view: View, gradients: bool) -> Fix | NoFix:
-        search = registration.search(view)
+        search = Search.of(registration, view)
         if isinstance(search, Search) and gradients:
             search = Search(search.map, search.view.by_gradients(), None)
-        best = search if isinstance(search, NoFix) else search.run()
-        if isinstance(search, NoFix) or isinstance(best, NoFix):
+        best = search.best() if isinstance(search, Search) else None
+        if isinstance(search, NoFix) or best is None:
             return NoFix("no_match", "not placed")
-        return fix_of(search, best)
+        return fix_of(Found(search, best))
 
     yield BOTH, partial(alone, gradients=False)
     yield GRADIENTS, partial(alone, gradients=True)

@@ -18,7 +18,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import Chances, RegisteredConfidence
-from orthonav.core.localize.search import DEFAULT_PLAN
+from orthonav.core.localize.plan import DEFAULT_PLAN
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import TerrainInfo
 from orthonav.core.records import Fix, Prior

@@ -8,7 +8,7 @@ import pytest
 from blots import AGL_M, CAMERA, GROUND, Ground, error_m, planned, rendered
 
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.search import Found, found_by
+from orthonav.core.localize.search import Found, Search, prepared_view
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.refine import block_scores
@@ -43,8 +43,8 @@ def test_ground_whose_contrast_turns_over_is_found_by_its_edges(localizer, place
     assert isinstance(fix, Fix) and fix.is_confident
     assert error_m(localizer, fix, place) < 0.5
     assert fix.evidence["grey_correlation"] == 0 < fix.evidence["gradient_correlation"]
-    both = localizer.registration.search(seen)
-    assert both.likelihood(both.run()) < 0.5
+    both = Search.of(localizer.registration, seen)
+    assert both.likelihood(both.best()) < 0.5
 
 
 def test_by_day_grey_levels_count(localizer):
@@ -59,9 +59,9 @@ def test_other_ground_in_other_light_is_not_recognized(localizer):
 
 
 def test_the_same_candidates_are_compared_again(localizer):
-    search = localizer.registration.search(view(infrared, PLACES[1]))
-    search.best()
-    again = search.by_gradients()
+    search = Search.of(localizer.registration, view(infrared, PLACES[1]))
+    again = search.run().search
+    assert again is not search
     assert again.found[: len(search.found)] == search.found and again.budget is search.budget
     assert again.candidates > search.candidates > 0
     assert again.view.templates.grey_share == again.sought.grey_share == 0
@@ -71,7 +71,7 @@ def test_the_same_candidates_are_compared_again(localizer):
 def test_near_a_prior_candidates_are_sought_as_they_are_compared(localizer):
     lat, lon = localizer.sheet.frame.latlon_from_en(np.array(PLACES[1]))
     seen = view(infrared, PLACES[1])
-    search = localizer.registration.search(seen, Prior(lat, lon, 20.0))
+    search = Search.of(localizer.registration, seen, Prior(lat, lon, 20.0))
     assert search.sought.grey_share == search.view.templates.grey_share > 0
     fix = localizer.locate(seen, prior=Prior(lat, lon, 20.0))
     assert fix.is_confident and fix.evidence["grey_correlation"] == 0
@@ -79,15 +79,14 @@ def test_near_a_prior_candidates_are_sought_as_they_are_compared(localizer):
 
 def test_a_prior_beside_the_map_finds_nothing(localizer):
     lat, lon = localizer.sheet.frame.latlon_from_en(np.array([9000.0, 0.0]))
-    search = localizer.registration.search(view(GROUND, PLACES[0]), Prior(lat, lon, 10.0))
-    found = found_by(search)
+    found = Search.of(localizer.registration, view(GROUND, PLACES[0]), Prior(lat, lon, 10.0)).run()
     assert not isinstance(found, Found) and found.reason == "outside_map"
 
 
 def test_a_search_that_was_cut_short_is_not_followed_by_another(map_path):
     hasty = Localizer(open_map(map_path), plan=planned(budget_ms=1e-6))
-    search = hasty.registration.search(view(infrared, PLACES[1]))
-    found = found_by(search)
+    search = Search.of(hasty.registration, view(infrared, PLACES[1]))
+    found = search.run()
     assert isinstance(found, Found) and found.search is search and search.budget.cut_short
 
 
@@ -106,8 +105,8 @@ def test_a_track_follows_ground_whose_contrast_turns_over(localizer):
 @pytest.mark.parametrize("share", [0.6, 0.0])
 def test_blocks_of_the_same_ground_fit(localizer, share):
     registration = localizer.registration
-    prepared = registration.prepared(view(GROUND, PLACES[3]), True)
-    fit = registration.search(view(GROUND, PLACES[3])).run().fit
+    prepared = prepared_view(registration, view(GROUND, PLACES[3]), True)
+    fit = Search.of(registration, view(GROUND, PLACES[3])).run().best.place.fit
     templates = prepared.templates.weighing_grey(share)
     scores = block_scores(templates.at(prepared.levels.final), registration.reference, fit.pose, 3)
     assert np.median(scores.correlations.max(axis=(1, 2))) > 0.85

@@ -20,7 +20,7 @@ from orthonav.core.localize.confidence import (
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.build.calibrate import fit_registered
 
-CHANCE = Chances(total=25.0, look=15.0, fine=40.0)
+CHANCE = Chances(total=25.0, mid=15.0, fine=40.0)
 MODEL = RegisteredConfidence((-8.0, -3.0), (0.5, 11.0, 1.5, 2.0, 1.0, 2.0, 3.0), CHANCE)
 
 strengths = st.floats(1.0, 300.0)
@@ -74,7 +74,7 @@ def changed(value, *path):
 
 
 NUMBERS = [("biases",), *(("weights", name) for name in FEATURES)]
-NUMBERS += [("chances", name) for name in CHANCES]
+NUMBERS += [("chances", key) for key in CHANCES.values()]
 
 
 @pytest.mark.parametrize("path", NUMBERS, ids=".".join)

@@ -24,7 +24,7 @@ from blots import (
 
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.place import CandidateRefiner
-from orthonav.core.localize.search import ClearMargin
+from orthonav.core.localize.plan import ClearMargin
 from orthonav.core.mapfile import GreyLayer, open_map
 from orthonav.core.mapfile.layer import part_names
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
@@ -176,18 +176,18 @@ def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, mo
 
 @pytest.fixture
 def from_tiles_only(localizer, monkeypatch):
-    """The localizer's plan allows no search by FFT; the candidates that it judged."""
+    """The localizer's plan allows no search by FFT; the candidates that it refined."""
     registration = localizer.registration
     plan = planned(max_search_px=100, tile_candidates=(40, 80))
     monkeypatch.setattr(registration, "plan", plan)
-    judge, seen = CandidateRefiner.judge, []
+    refine, candidates = CandidateRefiner.to_mid_level, []
 
     def noted(refiner, poses, *more):
-        seen.extend(poses)
-        return judge(refiner, poses, *more)
+        candidates.extend(poses)
+        return refine(refiner, poses, *more)
 
-    monkeypatch.setattr(CandidateRefiner, "judge", noted)
-    return seen
+    monkeypatch.setattr(CandidateRefiner, "to_mid_level", noted)
+    return candidates
 
 
 def test_a_view_is_found_by_tiles_alone(localizer, plain, from_tiles_only):

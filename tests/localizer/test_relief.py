@@ -26,6 +26,7 @@ from orthonav.core.localize.camera import FITTING
 from orthonav.core.localize.confidence import MAX_RATIO
 from orthonav.core.localize.ground import GroundModel, ViewOverGround
 from orthonav.core.localize.resection import ERRORS
+from orthonav.core.localize.search import prepared_view
 from orthonav.core.localize.view import Orientation
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
@@ -208,7 +209,7 @@ def test_level_ground_is_as_without_a_terrain(opened):
 def test_formulas_for_level_ground_agree_with_those_for_any(opened, attitude):
     registration = Localizer(opened).registration
     picture = rendered(GROUND, PLACE, ATTITUDE)
-    prepared = registration.prepared(View(picture, CAMERA, telemetry(ATTITUDE)), True)
+    prepared = prepared_view(registration, View(picture, CAMERA, telemetry(ATTITUDE)), True)
     flat = GroundModel(
         Heights(Raster(np.zeros((70, 70), np.float32), -7e4, 7e4, 2e3)), registration.grid
     )

@@ -13,6 +13,7 @@ from orthonav.core.localize import Localizer, resection
 from orthonav.core.localize.camera import camera_of
 from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.resection import _Marginal
+from orthonav.core.localize.search import Search
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Prior, Telemetry, View
 
@@ -182,10 +183,9 @@ def test_a_place_that_stands_out_is_known_better(localizer, monkeypatch):
         CAMERA,
         Telemetry(0, *attitude, AGL_M),
     )
-    search = localizer.registration.search(view, None, True)
-    place = search.run()
+    search, best = Search.of(localizer.registration, view).run()
     alike, alone = (
-        camera_of(search.over_ground, place.fit.pose, ratio, 0.0) for ratio in (1.0, 10.0)
+        camera_of(search.over_ground, best.place.window_pose, ratio, 0.0) for ratio in (1.0, 10.0)
     )
     assert (alone.orientation.position_m == alike.orientation.position_m).all()
     stds = [np.sqrt(np.trace(each.covariance[:2, :2])) for each in (alone, alike)]

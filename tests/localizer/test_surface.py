@@ -17,8 +17,9 @@ from orthonav.core.localize.ground import (
     ViewOverGround,
     _smoothed,
 )
+from orthonav.core.localize.prepared import PreparedMap
 from orthonav.core.localize.resection import ERRORS
-from orthonav.core.localize.search import PreparedMap
+from orthonav.core.localize.search import prepared_view
 from orthonav.core.localize.view import hidden
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import Lean, TerrainInfo
@@ -33,8 +34,8 @@ PLACE = np.array([30.0, -90.0])
 
 
 def pose_of(registration, view, camera_state):
-    """The inverse of `camera_state`."""
-    x, y = registration.px_of(camera_state[:2])
+    """Of a camera (4,): m east and north, heading (rad), log scale."""
+    x, y = registration.ground.map_px(camera_state[:2])
     turn, log_scale = camera_state[2:].tolist()
     moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
     return Pose(x - float(moved[0]), y - float(moved[1]), turn, log_scale)
@@ -107,7 +108,7 @@ def test_the_camera_is_approached_from_metres_and_degrees(opened, town, view):
     """Where only the finer level shows it."""
     _, ground, above = town
     registration = on(opened, ground, Heights(above)).registration
-    prepared = registration.prepared(view, True)
+    prepared = prepared_view(registration, view, True)
     seen = ViewOverGround(registration.ground, prepared, registration.reference)
     below = float(ground.at(PLACE[:1], PLACE[1:])[0])
     off = np.array([PLACE[0] + 2.0, PLACE[1] - 1.5, np.radians(ATTITUDE[0] + 1.0), np.log(0.98)])
@@ -128,7 +129,7 @@ def test_a_camera_that_the_picture_does_not_show_among_houses_is_not_found(opene
     for surface, shown in ((Heights(above), False), (None, True)):  # over bare ground not asked
         registration = on(opened, ground, surface).registration
         for picture, found in ((view.grey, True), (other, shown)):
-            prepared = registration.prepared(replace(view, grey=picture), True)
+            prepared = prepared_view(registration, replace(view, grey=picture), True)
             seen = ViewOverGround(registration.ground, prepared, registration.reference)
             pose = pose_of(registration, prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
             camera = camera_of(seen, pose, 1.0, 0.0)
@@ -140,7 +141,7 @@ def test_houses_that_lean_on_the_map_are_seen_where_they_stand(opened, town, vie
     _, ground, above = town
     lean = Lean(east, north, 0.0)
     registration = on(opened, ground, Heights(shown(above, lean)), lean).registration
-    prepared = registration.prepared(view, True)
+    prepared = prepared_view(registration, view, True)
     seen = ViewOverGround(registration.ground, prepared, registration.reference)
     pose = pose_of(registration, prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
     nodes, on_map = seen._nodes_m(pose, 0, (120, 160), smooth=False)
@@ -173,7 +174,7 @@ def test_an_unknown_height_at_the_rim_hides_nothing_less(opened, town, view):
     for surface in (above, holed):
         registration = on(opened, ground, Heights(surface)).registration
         seen = ViewOverGround(
-            registration.ground, registration.prepared(view, True), registration.reference
+            registration.ground, prepared_view(registration, view, True), registration.reference
         )
         pose = pose_of(registration, seen.view, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
         nodes, _ = seen._nodes_m(pose, 0, (200, 260), smooth=False)
@@ -243,7 +244,7 @@ def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
     def expected(heading_deg, ahead_deg):
         telemetry = Telemetry(0, heading_deg, ahead_deg, 0.0, agl_m)
         picture = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
-        prepared = registration.prepared(View(picture, CAMERA, telemetry), True)
+        prepared = prepared_view(registration, View(picture, CAMERA, telemetry), True)
         return registration.ground.expected(prepared), prepared
 
     nadir, prepared = expected(90.0, 0.0)

@@ -44,12 +44,12 @@ def pixel_centres(shape):
 def seen(ground, pose, shape):
     """Values (H, W) of the ground under a window at a pose, one pixel of level 0 to a pixel.
 
-    Written out independently: the top of the window points to `turn_rad`, clockwise from north.
+    Written out independently: the top of the window points to `heading_rad`, clockwise from north.
     """
     x, y = pixel_centres(shape)
     scale = math.exp(pose.log_scale)
     right, down = (x - shape[1] / 2) * scale, (y - shape[0] / 2) * scale
-    cos, sin = math.cos(pose.turn_rad), math.sin(pose.turn_rad)
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     return ground(pose.x_px + cos * right - sin * down, pose.y_px + sin * right + cos * down)
 
 
@@ -117,4 +117,4 @@ def apart_px(one, other):
 
 def turned_rad(one, other):
     """How much further one pose is turned than another, -pi to pi."""
-    return math.remainder(one.turn_rad - other.turn_rad, 2 * math.pi)
+    return math.remainder(one.heading_rad - other.heading_rad, 2 * math.pi)

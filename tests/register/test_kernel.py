@@ -46,7 +46,10 @@ def views(count, seed, level, view_valid=None):
     """Templates of views all over the map and beyond its border, each with a pose nearby."""
     for pose in random_poses(count, SHAPE, 10, seed=seed, log_scale=0.15):
         made = templates_of(GROUND, pose, (96, 128), view_valid).at(level)
-        yield made, Pose(pose.x_px + 2, pose.y_px - 1, pose.turn_rad + 0.03, pose.log_scale - 0.02)
+        yield (
+            made,
+            Pose(pose.x_px + 2, pose.y_px - 1, pose.heading_rad + 0.03, pose.log_scale - 0.02),
+        )
 
 
 def valid_but_a_corner(whole):
@@ -151,7 +154,7 @@ SIZES = [(256, 320), (97, 320), (256, 61), (17, 19), (130, 134)]
 @pytest.mark.parametrize("size", SIZES, ids=str)
 def test_a_search_finds_the_same_scores_and_poses(reference, monkeypatch, size, with_scales):
     made, _ = next(views(1, 7, 1))
-    poses = bank(None, 0.1, turn_step_rad=0.6, scale_step=0.13, sigmas=2)
+    poses = bank(None, 0.1, heading_step_rad=0.6, scale_step=0.13, sigmas=2)
     np.random.default_rng(3).shuffle(poses)  # smaller ones after larger ones
     values = np.random.default_rng(2).uniform(-0.3, 0.3, (9, 11)).astype(np.float32)
     scales = ScaleMap(values, 40.0, 0.05) if with_scales else None
@@ -241,7 +244,7 @@ def test_scores_of_blocks_where_nothing_is_interpolated_are_exactly_those(
         sums = refine._products_of_blocks(view, window, pose, reach_px)
         plain, plain_pixels = refine._correlated(*sums, math.prod(shape))
         found, pixels = np.full_like(plain, math.nan), np.full_like(plain_pixels, math.nan)
-        at = window.matrix(pose), pose.turn_rad, reach_px, SHARES
+        at = window.matrix(pose), pose.heading_rad, reach_px, SHARES
         KERNEL.blocks(window.made, view.planes, *at, found, pixels)
         assert pixels.any()
         np.testing.assert_allclose(pixels, plain_pixels, rtol=1e-3, atol=1e-3)

@@ -27,23 +27,23 @@ def reference():
 
 
 def prior_of(pose, std_deg=8.0):
-    return DirectionPrior(pose.turn_rad, math.radians(std_deg), 0.08)
+    return DirectionPrior(pose.heading_rad, math.radians(std_deg), 0.08)
 
 
 def searched(reference, templates, prior, level, count=24):
     """Candidates anywhere on the sheet."""
     recipe = LEVELS.recipe(level)
     window = SearchWindows(reference).whole(level, recipe, templates.side_px)
-    std_rad = None if prior.turn_rad is None else prior.turn_std_rad
-    steps = {"turn_step_rad": math.radians(8), "scale_step": 0.13, "sigmas": 2}
+    std_rad = None if prior.heading_rad is None else prior.heading_std_rad
+    steps = {"heading_step_rad": math.radians(8), "scale_step": 0.13, "sigmas": 2}
     poses = bank(std_rad, prior.log_scale_std, **steps)
-    around = [((prior.turn_rad or 0.0) + turn, scale) for turn, scale in poses]
+    around = [((prior.heading_rad or 0.0) + turn, scale) for turn, scale in poses]
     return [each.pose for each in search(templates.at(level, recipe), window, around, count)]
 
 
 def verified(refiner, candidates, level, **more):
     """From candidates to the best place."""
-    return refiner.finished(refiner.judge(candidates, level), **more)
+    return refiner.best(refiner.to_mid_level(candidates, level), **more)
 
 
 def registered(reference, templates, prior, level=LEVELS.mid):
@@ -79,29 +79,29 @@ SAME_AGAIN = Pose(336.0, 192.0, 0.3, 0.0)
 def test_a_view_is_found_and_stands_out(reference, level):
     for pose in random_poses(4, SHAPE, 90, seed=1, log_scale=0.08):
         found = registered(reference, templates_of(GROUND, pose), prior_of(pose), level)
-        assert apart_px(found.pose, pose) < 0.1
-        assert abs(turned_rad(found.pose, pose)) < math.radians(0.2)
-        assert abs(found.pose.log_scale - pose.log_scale) < 0.004
-        assert found.fit.level == LEVELS.final
+        assert apart_px(found.place.window_pose, pose) < 0.1
+        assert abs(turned_rad(found.place.window_pose, pose)) < math.radians(0.2)
+        assert abs(found.place.window_pose.log_scale - pose.log_scale) < 0.004
+        assert found.place.fit.level == LEVELS.final
         assert found.scores.peak_ratio > 1.8 and found.scores.mid_ratio > 1.8
-        assert np.linalg.eigvalsh(found.fit.covariance).min() > 0
-        assert found.fit.agreement > 0.9
+        assert np.linalg.eigvalsh(found.place.fit.covariance).min() > 0
+        assert found.place.fit.agreement > 0.9
 
 
 def test_a_place_that_is_there_twice_is_not_sure():
     reference = reference_of(Twin(), SHAPE)
     found = registered(reference, templates_of(GROUND, ONE), prior_of(ONE))
-    assert min(apart_px(found.pose, each) for each in (ONE, SAME_AGAIN)) < 0.1
+    assert min(apart_px(found.place.window_pose, each) for each in (ONE, SAME_AGAIN)) < 0.1
     assert found.scores.peak_ratio == pytest.approx(1, abs=0.05)
     assert found.scores.mid_ratio == pytest.approx(1, abs=0.05)
-    assert found.fit.weighted > 0.9  # however well it fits
+    assert found.place.fit.weighted > 0.9  # however well it fits
 
 
 @pytest.mark.parametrize("turn_deg", [25.0, -25.0])
 def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
     """The twin is turned: the reported heading decides between them."""
     reference = reference_of(Twin(turn_rad=math.radians(turn_deg)), SHAPE)
-    twin = Pose(336.0, 192.0, ONE.turn_rad + math.radians(turn_deg), 0.0)
+    twin = Pose(336.0, 192.0, ONE.heading_rad + math.radians(turn_deg), 0.0)
     templates = templates_of(GROUND, ONE)
     candidates = [near(ONE, 3, -2), near(twin, -2, 3), near(twin, 0, 90), near(ONE, 0, -80)]
 
@@ -115,7 +115,7 @@ def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
         found = found_with(prior_of(pose, std_deg))
         # A weak heading leaves a tie of both places, which OpenCV 4 and 5 round apart.
         right = (ONE, twin) if std_deg > 10.0 else (pose,)
-        assert min(apart_px(found.pose, each) for each in right) < 0.1
+        assert min(apart_px(found.place.window_pose, each) for each in right) < 0.1
         ratios.append(found.scores.peak_ratio)
     assert min(ratios[:2]) > ratios[2] >= 0.99
     assert found_with(NO_PRIOR).scores.peak_ratio == pytest.approx(1, abs=0.05)
@@ -125,9 +125,9 @@ def test_a_view_of_elsewhere_stands_out_nowhere(reference):
     right = registered(reference, templates_of(GROUND, HERE), prior_of(HERE))
     for seed in (5, 6, 7):
         wrong = registered(reference, templates_of(Ground(seed=seed), HERE), prior_of(HERE))
-        assert wrong.score < 0.5 * right.score
+        assert wrong.place.score < 0.5 * right.place.score
         assert wrong.scores.peak_ratio < 1.5 and wrong.scores.mid_ratio < 1.5
-        assert wrong.fit.weighted < 0.45
+        assert wrong.place.fit.weighted < 0.45
 
 
 @pytest.mark.parametrize("grey", [0, 99])
@@ -138,5 +138,5 @@ def test_blank_views_and_blank_maps_are_no_crash(reference, grey):
         candidates = [HERE, near(HERE, 80.0, 40.0), near(HERE, 1e4, 1e4)]
         refiner = CandidateRefiner(templates, LEVELS, prior_of(HERE), where)
         found = verified(refiner, candidates, LEVELS.coarse)
-        assert abs(found.score) < 30 and np.isfinite(found.fit.covariance).all()
+        assert abs(found.place.score) < 30 and np.isfinite(found.place.fit.covariance).all()
         assert math.isfinite(found.scores.peak_ratio + found.scores.mid_ratio)

@@ -35,7 +35,7 @@ def moved(pose, away_px=0.0, bearing_rad=0.0, turn_deg=0.0, scale=1.0):
     return Pose(
         pose.x_px + away_px * math.cos(bearing_rad),
         pose.y_px + away_px * math.sin(bearing_rad),
-        pose.turn_rad + math.radians(turn_deg),
+        pose.heading_rad + math.radians(turn_deg),
         pose.log_scale + math.log(scale),
     )
 
@@ -119,7 +119,7 @@ def test_a_blank_view_says_nothing(reference, grey):
         Pose(200.0, 180.0, 0.0, 0.0), DESCENT.steps, with_covariance=True
     )
     assert abs(placed.score) < 1e-3 and np.isfinite(placed.covariance).all()
-    assert math.isfinite(placed.pose.x_px + placed.pose.turn_rad + placed.pose.log_scale)
+    assert math.isfinite(placed.pose.x_px + placed.pose.heading_rad + placed.pose.log_scale)
 
 
 def placed_all(reference, level, poses, starts=None, seed=5, ground=GROUND, **view):

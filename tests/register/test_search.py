@@ -15,7 +15,7 @@ from orthonav.core.register.window import Pose
 
 SHAPE = (384, 448)
 GROUND = Ground()
-ALL_TURNS = bank(None, 0.06, turn_step_rad=math.radians(8), scale_step=0.13, sigmas=2)
+ALL_TURNS = bank(None, 0.06, heading_step_rad=math.radians(8), scale_step=0.13, sigmas=2)
 LEVEL = 1
 
 
@@ -44,7 +44,7 @@ def masked(kind, shape):
 
 
 def near(pose, turn_off=0.0, scale_off=0.0):
-    return [(pose.turn_rad + turn_off, pose.log_scale + scale_off)]
+    return [(pose.heading_rad + turn_off, pose.log_scale + scale_off)]
 
 
 @pytest.mark.parametrize("shape", [(96, 128), (128, 128), (72, 160), (140, 60)], ids=str)
@@ -53,7 +53,7 @@ def test_a_view_is_found_where_it_was_cut(window, shape):
         template = templates_of(GROUND, pose, shape).at(LEVEL)
         best, *others = search(template, window, near(pose), 6)
         assert apart_px(best.pose, pose) / 2**LEVEL < 0.25
-        assert (best.pose.turn_rad, best.pose.log_scale) == near(pose)[0]
+        assert (best.pose.heading_rad, best.pose.log_scale) == near(pose)[0]
         assert all(best.score > 2 * other.score for other in others)
         # Nearly all of what the weights and the number of pixels allow.
         allowed = sum(template.weights) * math.sqrt(template.pixels)
@@ -93,7 +93,7 @@ def test_views_of_which_a_part_is_seen(window, kind):
 def test_the_best_place_near_by_is_that_of_a_whole_search(window):
     for pose in random_poses(12, SHAPE, 90, seed=8, log_scale=0.1):
         template = templates_of(GROUND, pose).at(LEVEL)
-        guess = Pose(pose.x_px + 13.0, pose.y_px - 11.0, pose.turn_rad, pose.log_scale)
+        guess = Pose(pose.x_px + 13.0, pose.y_px - 11.0, pose.heading_rad, pose.log_scale)
         (found,) = best_near(template, window, [guess], 18.0)
         best = search(template, window, near(pose), 1)[0]
         assert apart_px(found.pose, best.pose) < 0.05

@@ -22,7 +22,7 @@ from orthonav.ground import planning
 if TYPE_CHECKING:
     from orthonav.core.geo.camera import Camera
     from orthonav.core.localize.confidence import Acceptance
-    from orthonav.core.localize.search import SearchPlan
+    from orthonav.core.localize.plan import SearchPlan
     from orthonav.core.mapfile.signature import Signature
 
 T = TypeVar("T")
@@ -266,7 +266,7 @@ def acceptance(options: argparse.Namespace) -> "Acceptance":
 
 def search_plan(options: argparse.Namespace) -> "SearchPlan":
     """The plan of the search with `--budget-ms` and `--threads`."""
-    from orthonav.core.localize.search import DEFAULT_PLAN
+    from orthonav.core.localize.plan import DEFAULT_PLAN
 
     return replace(DEFAULT_PLAN, budget_ms=options.budget_ms, threads=options.threads)
 

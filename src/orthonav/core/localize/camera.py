@@ -378,13 +378,13 @@ def _expected(seen: ViewOverGround, pose: Pose, orientation: Orientation) -> Exp
         expected, std = prior.scale_map.at(pose.x_px, pose.y_px), prior.scale_map.std
     expected_m = seen.reference_m(pose) + telemetry.agl_m * math.exp(expected)
     up_m = expected_m - float(orientation.position_m[2])
-    turn = math.degrees(prior.turn_rad or 0.0) - orientation.attitude_deg[0]
+    turn = math.degrees(prior.heading_rad or 0.0) - orientation.attitude_deg[0]
     tilt = np.array([telemetry.pitch_deg, telemetry.roll_deg]) - orientation.attitude_deg[1:]
     mean = np.array([0.0, 0.0, up_m, math.remainder(turn, 360.0), *tilt.tolist()])
     tilt_std = max(tilt_std_deg(telemetry), FITTING.min_tilt_std_deg)
     stds = np.array([1e4, 1e4, telemetry.agl_m * std, 180.0, tilt_std, tilt_std])
-    if prior.turn_rad is not None:
-        stds[3] = math.degrees(prior.turn_std_rad)
+    if prior.heading_rad is not None:
+        stds[3] = math.degrees(prior.heading_std_rad)
     else:
         mean[3] = 0.0
     return Expected(mean, np.diag(stds**-2))

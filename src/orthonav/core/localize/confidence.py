@@ -25,32 +25,33 @@ FEATURES = (
     "log_alone_gradients",
 )
 NEARBY = 2  # the last features compare with the ground nearby: it fits nowhere near as well
-CHANCES = ("total", "look", "fine")
+CHANCES = {"total": "total", "mid": "look", "fine": "fine"}
+"""Keys of maps by the names here."""
 
 
 @dataclass(frozen=True)
 class Chances:
-    """Scores of the best wrong place over the map: at the judged and final level, the judged one,
-    and with one finer."""
+    """Scores of the best wrong place over the map: at the mid and the final level, at the mid one
+    alone, and with one finer."""
 
     total: float
-    look: float
+    mid: float
     fine: float
 
     def __post_init__(self) -> None:
-        if not all(0 < value < math.inf for value in (self.total, self.look, self.fine)):
+        if not all(0 < value < math.inf for value in (self.total, self.mid, self.fine)):
             raise VariantError(f"chance values must be above 0 and finite: {self}")
 
     def of_strength(self, scores: "Scores") -> float:
         """By chance, of one level or of two."""
-        return self.look if math.isnan(scores.detail_ratio) else self.total
+        return self.mid if math.isnan(scores.detail_ratio) else self.total
 
 
 @dataclass(frozen=True)
 class Scores:
     """How well a view fits its best place, and how far that stands out.
 
-    - `strength`: at the mid and the final level, less the cost of the prior. `mid_score`: at the
+    - `strength`: at the mid and the final level, less the penalty of the prior. `mid_score`: at the
       mid level. `fine`: with one level finer, NaN: not compared there. `.._rival`: of the strongest
       rival, 0 for none.
     - `detail_ratio`: score at the final over that at the mid level, NaN where these are one.
@@ -145,20 +146,21 @@ class RegisteredConfidence:
         return {
             "biases": list(self.biases),
             "weights": dict(zip(FEATURES, self.weights, strict=True)),
-            "chances": {name: getattr(self.chances, name) for name in CHANCES},
+            "chances": {key: getattr(self.chances, name) for name, key in CHANCES.items()},
         }
 
     @classmethod
     def from_plain(cls, plain: Any) -> "RegisteredConfidence":
         try:
-            chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
+            stored = plain["chances"]
+            chances = Chances(**{name: float(stored[key]) for name, key in CHANCES.items()})
             first, second = plain["biases"]
             biases = float(first), float(second)
             weights = tuple(float(plain["weights"][name]) for name in FEATURES)
         except (KeyError, TypeError, ValueError) as error:
             raise VariantError(
                 f"confidence of registration must have two biases, weights of {FEATURES} and "
-                f"chances of {CHANCES}, got {plain!r:.200}"
+                f"chances of {tuple(CHANCES.values())}, got {plain!r:.200}"
             ) from error
         if not all(math.isfinite(number) for number in (*biases, *weights)) or min(weights) < 0:
             raise VariantError(
@@ -178,7 +180,7 @@ def features_of(scores: Scores, chances: Chances) -> NDArray[np.float64]:
     fine, fine_rival = scores.fine, scores.fine_rival
     if math.isfinite(fine + fine_rival):
         ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, stand_in * chances.fine))
-    mid_ratio = mid_score / max(scores.mid_rival, stand_in * chances.look)
+    mid_ratio = mid_score / max(scores.mid_rival, stand_in * chances.mid)
     # Less than one standard deviation above the ground nearby does not count.
     phase, gradients = (max(each, 1.0) for each in (scores.local_phase, scores.local_gradients))
     return np.log([strength / chance, ratio, mid_ratio, max(detail, 1e-3), phase, phase, gradients])

@@ -111,6 +111,11 @@ class GroundModel:
         corner = np.array([self.grid.west_m, self.grid.north_m])
         return np.asarray(corner + map_px * [self.grid.gsd_m, -self.grid.gsd_m])
 
+    def map_px(self, place_en_m: Array) -> tuple[float, float]:
+        """The inverse of `en_m`, for one place (2,)."""
+        (east, north), grid = place_en_m, self.grid
+        return (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
+
     def ground_m(self, map_px: Array) -> Array:
         """East, north, above sea (..., 3) of map coordinates; NaN where unknown."""
         points = self.en_m(map_px)
@@ -174,13 +179,13 @@ class GroundModel:
         telemetry, prior = view.telemetry, view.prior
         below, agl_m = telemetry.below, telemetry.agl_m
         ahead = np.hypot(*view.camera_px) >= SAMPLING.min_ahead * view.side_px
-        if below is None and (prior.turn_rad is None or not ahead):
+        if below is None and (prior.heading_rad is None or not ahead):
             return prior
         means, step_px = self._mean_heights(view.side_px)
         if below is not None:
             below_m: Array | float = below.height_m
         else:
-            below_m = self._at_nodes(step_px, rotation(prior.turn_rad or 0.0) @ view.camera_px)
+            below_m = self._at_nodes(step_px, rotation(prior.heading_rad or 0.0) @ view.camera_px)
         over = np.maximum(1 + (below_m - means) / agl_m, 0.05)
         values = np.log(np.where(np.isfinite(over), over, 1.0)).astype(np.float32)
         if below is None and np.abs(values).max() < SAMPLING.min_rise:
@@ -327,10 +332,26 @@ class ViewOverGround:
             return None
         telemetry = self.view.telemetry
         above_m = telemetry.agl_m * math.exp(pose.log_scale)
-        east, north = self.ground.en_m(pose.map_px(self.view.camera_px))
-        position = np.array([east, north, reference_m + above_m])
-        attitude = np.array([math.degrees(pose.turn_rad), telemetry.pitch_deg, telemetry.roll_deg])
+        position = np.array([*self.camera_en_m(pose), reference_m + above_m])
+        attitude = np.array(
+            [math.degrees(pose.heading_rad), telemetry.pitch_deg, telemetry.roll_deg]
+        )
         return Orientation(position, attitude)
+
+    def camera_en_m(self, pose: Pose) -> Array:
+        """Of the camera (2,)."""
+        return self.ground.en_m(pose.map_px(self.view.camera_px))
+
+    def camera_covariance(self, pose: Pose, covariance: Array, floor_m: float) -> Array:
+        """Of the camera (4, 4), m east and north, heading (rad) and log scale, by that of the pose;
+        `floor_m`: standard deviation with which maps of two dates agree."""
+        moved, gsd_m = pose.linear @ self.view.camera_px, self.ground.grid.gsd_m
+        camera_from_pose = np.eye(4)
+        camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
+        spread = camera_from_pose @ covariance @ camera_from_pose.T
+        spread[:2, :2] += np.eye(2) * (floor_m / gsd_m) ** 2
+        metres = np.diag([gsd_m, -gsd_m, 1.0, 1.0])
+        return np.asarray(metres @ spread @ metres)
 
     def reference_m(self, pose: Pose) -> float:
         """Mean height under the window; NaN where less than half is known."""

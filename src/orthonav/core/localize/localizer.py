@@ -1,31 +1,22 @@
 """A map, and the method that places views on it: registration, or tiles alone."""
 
-import math
 from dataclasses import replace
 from typing import Any
 
 from numpy.typing import NDArray
 
-from orthonav.core.errors import MapFileError, VariantError
+from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.swapped import swapped_hint
-from orthonav.core.localize.confidence import RegisteredConfidence
 from orthonav.core.localize.fix import fix_of
-from orthonav.core.localize.search import (
-    DEFAULT_PLAN,
-    Found,
-    PreparedMap,
-    Search,
-    SearchPlan,
-    found_by,
-)
+from orthonav.core.localize.plan import DEFAULT_PLAN, SearchPlan
+from orthonav.core.localize.prepared import PreparedMap
+from orthonav.core.localize.search import Search
 from orthonav.core.localize.tiles import TileLocalizer, TileProposer
-from orthonav.core.localize.view import PreparedView, check_view, prepare
-from orthonav.core.mapfile.layer import GreyLayer
+from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
-from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
 from orthonav.core.records import Fix, NoFix, Prior, View, has_type
 from orthonav.core.tiles.position import PositionRule
 
@@ -33,7 +24,8 @@ from orthonav.core.tiles.position import PositionRule
 class Localizer:
     """Places views on one map; threads may share it once warm.
 
-    `opened`: the map. `registration` is None where it has no layer for it, or it was switched off.
+    `opened`: the map. `registration`: made ready for it, None where the map has no layer for it, or
+    it was switched off.
     `sheet`: the part of the map that is flown on, with its `frame`, `grid` and layers. `grid`: size
     of pixels (`gsd_m`) and extent of its tiles in metres east and north of the frame."""
 
@@ -63,7 +55,7 @@ class Localizer:
         if registration:
             tiles = self.tiles
             propose = TileProposer.of(tiles.matcher, tiles.embedder, tiles.representation)
-            self.registration = RegistrationLocalizer.of_map(
+            self.registration = PreparedMap.of(
                 map, propose, plan or DEFAULT_PLAN, level_ground=level_ground
             )
 
@@ -100,7 +92,10 @@ class Localizer:
         if prior is not None:
             half_earth_m = 2e7
             prior = replace(prior, std_m=min(prior.std_m, half_earth_m))
-        found = (self.registration or self.tiles).locate(view, prior, heading_known)
+        if self.registration is None:
+            found = self.tiles.locate(view, prior, heading_known)
+        else:
+            found = registered(self.registration, view, prior, heading_known)
         if prior is not None and isinstance(found, NoFix) and found.reason == "outside_map":
             hint = swapped_hint(prior.lat_deg, prior.lon_deg, self.opened.contains)
             return replace(found, detail=found.detail + hint)
@@ -141,71 +136,10 @@ class Localizer:
         return self.locate(view, prior=prior, heading_known=heading_deg is not None)
 
 
-class RegistrationLocalizer(PreparedMap):
-    @classmethod
-    def of_map(
-        cls,
-        opened: MapFile,
-        propose: TileProposer | None,
-        plan: SearchPlan = DEFAULT_PLAN,
-        *,
-        level_ground: bool = True,
-    ) -> "RegistrationLocalizer | None":
-        """For the only sheet of a map; None without a registration layer.
-
-        Raises `MapFileError` where the manifest's registration is damaged."""
-        layer = GreyLayer.of(opened)
-        if layer is None:
-            return None
-        plain = opened.manifest.registration or {}
-        try:
-            fitted = plain.get("confidence")
-            confidence = None if fitted is None else RegisteredConfidence.from_plain(fitted)
-            radius_m, floor_px = float(plain["radius_m"]), float(plain["position_floor_px"])
-        except (VariantError, KeyError, TypeError, ValueError) as error:
-            raise MapFileError(f"map cannot be flown ({error}): {opened.path}") from error
-        if not (0 < radius_m < math.inf and 0 <= floor_px < math.inf):
-            raise MapFileError(f"map has impossible registration parameters: {opened.path}")
-        made = cls(
-            opened.manifest.sheets[0],
-            layer,
-            confidence=confidence,
-            radius_m=radius_m,
-            floor_px=floor_px,
-            propose=propose,
-            plan=plan,
-            terrain=TerrainLayer.of(opened),
-            surface=TerrainLayer.of(opened, layer=SURFACE),
-        )
-        if level_ground:
-            made.ground = made.ground.flattened()
-        return made
-
-    def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
-        found = self.found(view, prior, heading_known)
-        return found if isinstance(found, NoFix) else fix_of(*found)
-
-    def found(
-        self, view: View, prior: Prior | None = None, heading_known: bool = True
-    ) -> Found | NoFix:
-        """Where a view was taken; `NoFix` where it shows too little or fits nowhere."""
-        search = self.search(view, prior, heading_known)
-        if isinstance(search, NoFix):
-            return search
-        return found_by(search)
-
-    def search(
-        self, view: View, prior: Prior | None = None, heading_known: bool = True
-    ) -> Search | NoFix:
-        """`NoFix` where the view shows too little."""
-        prepared = self.prepared(view, heading_known)
-        if isinstance(prepared, NoFix):
-            return prepared
-        if not self.ground.is_flat:
-            prepared = replace(prepared, prior=self.ground.expected(prepared))
-        return Search(self, prepared, prior)
-
-    def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
-        return prepare(
-            view, self.grid.gsd_m, self.pyramid.levels, heading_known, finer=self.is_finer
-        )
+def registered(
+    map: PreparedMap, view: View, prior: Prior | None, heading_known: bool
+) -> Fix | NoFix:
+    """The fix of a view that was checked; `NoFix` where it shows too little or fits nowhere."""
+    search = Search.of(map, view, prior, heading_known)
+    found = search if isinstance(search, NoFix) else search.run()
+    return found if isinstance(found, NoFix) else fix_of(found)

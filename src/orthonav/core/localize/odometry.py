@@ -26,7 +26,7 @@ class OdometryLimits:
 
     view_px: int = 160  # across: half that of a fix
     levels: int = 3  # of a view that serves as the map of the next one
-    turn_step_rad: float = math.radians(8.0)
+    heading_step_rad: float = math.radians(8.0)
     scale_step: float = 0.1
     """Of the search from a coarse level: about that of `SearchPlan`."""
     candidates: int = 8
@@ -219,7 +219,7 @@ def displacement(
         return None
     prior = DirectionPrior(
         math.remainder(reported_turn, 2 * math.pi),
-        max(math.sqrt(2 * telemetry_noise[0]), ODOMETRY.turn_step_rad / 3),
+        max(math.sqrt(2 * telemetry_noise[0]), ODOMETRY.heading_step_rad / 3),
         max(math.sqrt(2 * telemetry_noise[1]), ODOMETRY.scale_step / 3),
     )
     placed = _registered(before, now, prior, expected_en_m)
@@ -238,7 +238,7 @@ def displacement(
         moved_en_m,
         np.eye(2) * variance,
         reach_m=_reach_px(before, now) * before.pixel_m,
-        turned_rad=math.remainder(pose.turn_rad - reported_rad, 2 * math.pi),
+        turned_rad=math.remainder(pose.heading_rad - reported_rad, 2 * math.pi),
         scaled=pose.log_scale + float(now.bias[1] - before.bias[1]),
         levers_m=np.stack([tilt_lever_m(now.telemetry), tilt_lever_m(before.telemetry)]),
         corrected_rad=np.stack([now.bias[2:], before.bias[2:]]),
@@ -327,13 +327,13 @@ def _registered(
         if fit.weighted >= ODOMETRY.expected_correlation:
             return fit
     tried = bank(
-        prior.turn_std_rad,
+        prior.heading_std_rad,
         prior.log_scale_std,
-        turn_step_rad=ODOMETRY.turn_step_rad,
+        heading_step_rad=ODOMETRY.heading_step_rad,
         scale_step=ODOMETRY.scale_step,
         sigmas=2.5,
     )
-    poses = [((prior.turn_rad or 0.0) + turn, scale) for turn, scale in tried]
+    poses = [((prior.heading_rad or 0.0) + turn, scale) for turn, scale in tried]
     level = refiner.levels.coarse
     recipe = refiner.levels.recipe(level)
     template = templates.at(level, recipe)
@@ -343,15 +343,15 @@ def _registered(
     found = [each.pose for each in search(template, window, poses, ODOMETRY.candidates)]
     if not found:
         return None
-    best = refiner.finished(refiner.judge(found, level))
-    return best.fit if best.scores.peak_ratio >= ODOMETRY.min_score_ratio else None
+    best = refiner.best(refiner.to_mid_level(found, level))
+    return best.place.fit if best.scores.peak_ratio >= ODOMETRY.min_score_ratio else None
 
 
 def _as_expected(
     before: OdometryView, now: OdometryView, refiner: CandidateRefiner, expected_en_m: Array
 ) -> Fit:
     """From its expected place, from coarse to fine."""
-    turned = Pose(0.0, 0.0, refiner.prior.turn_rad or 0.0, 0.0)
+    turned = Pose(0.0, 0.0, refiner.prior.heading_rad or 0.0, 0.0)
     moved_px = np.linalg.solve(before.en_from_px, expected_en_m)
     x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)
     pose = replace(turned, x_px=float(x), y_px=float(y))

@@ -1,14 +1,14 @@
-"""The places of a view: judged, placed on the terrain, finished, and compared with their rivals.
+"""The places of a view: refined from coarse to fine, and the best compared with its rivals.
 
-Candidates are refined from coarse to fine, most are dropped early. The best few are finished: the
-view is orthorectified on the terrain under each pose and registered again until it stays, or on
-flat ground where that is as good. Scores over those of the strongest rival say how far it stands
-out."""
+Candidates are refined down to the mid level, most are dropped early. The best few are refined at
+the final level: the view is orthorectified on the terrain under each pose and registered again
+until it stays, or on flat ground where that is as good. Scores over those of the strongest rival
+say how far the best place stands out."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, wraps
 from typing import Any, TypeVar
 
@@ -35,9 +35,9 @@ class Refinement:
 
     Sources: docs/decisions/registration.md, for places on a terrain docs/terrain.md."""
 
-    to_mid_level: int = 200  # candidates that go on from the coarse level, at most
-    to_finish: int = 3  # the best judged place and its rivals
-    to_finest: int = 12  # compared one level finer, at most, where they are in doubt
+    to_mid_level: int = 200  # candidates that go on from the coarse level, at most,
+    to_final_level: int = 3  # from the mid level: the best place and its rivals,
+    to_finest: int = 12  # and, where they are in doubt, one level finer
     hope_at_first: float = 0.4
     hope: float = 0.5
     """Fractions of the best score to stay, after `first_steps` and after all steps."""
@@ -49,7 +49,7 @@ class Refinement:
     small_step_px: float = 0.1  # ends a refinement
     apart: float = 0.25  # least distance of a rival from the best, over the side of the view
     rival_on_terrain: float = 0.75
-    """Rivals with less than this fraction of the best score are finished on flat ground: chance
+    """Rivals with less than this fraction of the best score are refined on flat ground: chance
     fits as well there, at half the cost."""
     moved_px: float = 1.0  # a window moved by more (px of the level) is orthorectified again,
     rounds: int = 3  # at most so often
@@ -63,7 +63,7 @@ REFINEMENT = Refinement()
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class MidPlace:
     """A place where a view may have been taken, refined at the mid level.
 
     `flat_score`: on flat ground. `terrain`: the view orthorectified there, None: `fit` is on flat
@@ -79,18 +79,22 @@ class Judged:
 
 
 @dataclass(frozen=True, eq=False)
-class Finished:
+class FinalPlace:
     """A place refined at the final level.
 
+    - `mid`: from which it was refined.
     - `fit`: by `templates`, those of flat ground or of the terrain.
-    - `total`: scores of the mid and the final level. `score`: less the cost of the prior.
-    - `mid_score`: at the mid level after finishing on the terrain, `gain`: over that on flat
-      ground; None: finished on flat ground.
+    - `camera_pose`: that of `fit`, but with the height above the ground below the camera, not above
+      that in the window.
+    - `total`: scores of the mid and the final level. `score`: less the penalty of the prior.
+    - `mid_score`: at the mid level on the terrain, `gain`: over that on flat ground; None: refined
+      on flat ground.
     - `fine`: `score` and that one level finer, NaN: not compared there.
     - `camera`: under which the view fits better there, None: that of the telemetry."""
 
-    judged: Judged
+    mid: MidPlace
     fit: Fit
+    camera_pose: Pose
     templates: ViewTemplates
     total: float
     score: float
@@ -98,26 +102,22 @@ class Finished:
     gain: float | None = None
     fine: float = math.nan
     camera: Orientation | None = None
-    below_camera: Pose | None = None
-    """The pose with the height counted from the ground below the camera."""
 
     @property
-    def pose(self) -> Pose:
-        """With the height counted from the ground below the camera, once that was asked for."""
-        return self.below_camera or self.fit.pose
-
-    def apart_px(self, other: "Finished") -> float:
-        """In pixels of level 0."""
-        return self.fit.pose.distance_px(other.fit.pose)
+    def window_pose(self) -> Pose:
+        """With the height above the ground in the window."""
+        return self.fit.pose
 
 
 @dataclass(frozen=True, eq=False)
-class BestPlace(Finished):
-    """The best of finished places; `fit` with its covariance. `rivals`: the others, best first,
-    near ones too, as strong as they are with the finer level where both were compared there."""
+class BestPlace:
+    """The best place, its fit with a covariance, and how far it stands out. `rivals`: the others,
+    best first, near ones too, as strong as they are with the finer level where both were compared
+    there."""
 
-    scores: Scores = field(kw_only=True)
-    rivals: tuple[Finished, ...] = ()
+    place: FinalPlace
+    scores: Scores
+    rivals: tuple[FinalPlace, ...]
 
 
 def once(step: "Step[Given, Made]") -> "Step[Given, Made]":
@@ -135,7 +135,7 @@ def once(step: "Step[Given, Made]") -> "Step[Given, Made]":
 
 
 class CandidateRefiner:
-    """Judges and finishes the places of one view, in one thread.
+    """Refines the places of one view, in one thread.
 
     Steps from a place to another one are marked `once`: what they find does not depend on which
     other places there are, or on what was asked before."""
@@ -166,8 +166,8 @@ class CandidateRefiner:
         return REFINEMENT.apart * self.templates.side_px
 
     def _value(self, fit: Fit) -> float:
-        """Less the cost of its prior."""
-        return fit.score - self.prior.cost(fit.pose)
+        """Score less the penalty of the prior."""
+        return fit.score - self.prior.penalty_at(fit.pose)
 
     def refiner(self, level: int, templates: ViewTemplates | None = None) -> Refiner:
         made = (templates or self.templates).at(level, self.levels.recipe(level))
@@ -181,12 +181,13 @@ class CandidateRefiner:
         """In order; by all threads, where there are some."""
         return list((self._pool.map if self._pool else map)(function, given))
 
-    # Judging
+    # At the mid level
 
-    def judge(
-        self, poses: Sequence[Pose], level: int, known: Sequence[Judged] = ()
-    ) -> list[Judged]:
-        """Refined down to the mid level, best first; the best `known` place counts too."""
+    def to_mid_level(
+        self, poses: Sequence[Pose], level: int, known: Sequence[MidPlace] = ()
+    ) -> list[MidPlace]:
+        """Candidates of a level refined down to the mid level, best first; the best `known` place
+        counts too."""
         fits: list[Fit] = []
         for at in range(level, self.levels.mid - 1, -1):
             is_last = at == self.levels.mid
@@ -194,16 +195,16 @@ class CandidateRefiner:
             if not is_last:
                 fits = fits[: min(self._hopeful(fits, REFINEMENT.hope), REFINEMENT.to_mid_level)]
             poses = [each.pose for each in fits]
-        return [Judged(each, each.score) for each in fits]
+        return [MidPlace(each, each.score) for each in fits]
 
-    def direct(self, poses: Sequence[Pose]) -> list[Judged]:
-        """Found at the final level, scored at the mid level, where refining would lose them."""
+    def at_mid_level(self, poses: Sequence[Pose]) -> list[MidPlace]:
+        """Candidates of the final level, scored at the mid one, where refining would lose them."""
         refiner = self.refiner(self.levels.mid)
         fits = [refiner.place(each, 0) for each in poses]
-        return [Judged(each, each.score) for each in fits]
+        return [MidPlace(each, each.score) for each in fits]
 
-    def best_and_rival(self, places: Sequence[Judged]) -> tuple[float, float]:
-        """Scores of the best judged place and of its strongest rival, 0 for none."""
+    def best_and_rival(self, places: Sequence[MidPlace]) -> tuple[float, float]:
+        """Scores of the best place and of its strongest rival, 0 for none."""
         values = [self._value(each.fit) for each in places]
         best = max(range(len(places)), key=lambda number: values[number])
         rivals = [
@@ -214,7 +215,7 @@ class CandidateRefiner:
         return values[best], max(rivals, default=0.0)
 
     def _compared(
-        self, refiner: Refiner, poses: Sequence[Pose], known: Sequence[Judged]
+        self, refiner: Refiner, poses: Sequence[Pose], known: Sequence[MidPlace]
     ) -> list[Fit]:
         """Best first; those without hope are refined only a little."""
         ranked = self._ranked(self._refined_all(refiner, poses, REFINEMENT.first_steps))
@@ -247,9 +248,11 @@ class CandidateRefiner:
         enough = sum(value >= max(share * values[0], least) for value in values)
         return min(max(enough, at_least), len(ranked))
 
-    def _best_apart(self, places: Sequence[Judged], count: int, apart_px: float) -> list[Judged]:
+    def _best_apart(
+        self, places: Sequence[MidPlace], count: int, apart_px: float
+    ) -> list[MidPlace]:
         """The best `count` places, best first, farther apart than `apart_px`."""
-        chosen: list[Judged] = []
+        chosen: list[MidPlace] = []
         for each in sorted(places, key=lambda each: -self._value(each.fit)):
             if len(chosen) == count:
                 break
@@ -259,9 +262,9 @@ class CandidateRefiner:
 
     # On the terrain
 
-    def on_terrain(self, places: Sequence[Judged], at_most: int) -> list[Judged]:
-        """The best judged places that lie apart, on the terrain where they are better there; the
-        first with their surroundings, for relief displaces more than refinement follows."""
+    def on_terrain(self, places: Sequence[MidPlace], at_most: int) -> list[MidPlace]:
+        """The best places that lie apart, on the terrain where they are better there; the first
+        with their surroundings, for relief displaces more than refinement follows."""
         if self.is_flat:
             return list(places)
         apart_px = REFINEMENT.apart * self._over_ground.view.side_px
@@ -275,7 +278,7 @@ class CandidateRefiner:
         return [better.get(each, each) for each in places]
 
     @once
-    def _twin(self, place: Judged) -> Judged | None:
+    def _twin(self, place: MidPlace) -> MidPlace | None:
         """A place refined on the terrain; None where flat ground is as good."""
         pose = place.pose
         if self._over_ground.is_flat_at(pose):
@@ -283,16 +286,16 @@ class CandidateRefiner:
         made = self._over_ground.templates_at(pose, self.levels.mid)
         if made is None:
             return None
-        return Judged(self.refined(pose, self.levels.mid, made), place.fit.score, made)
+        return MidPlace(self.refined(pose, self.levels.mid, made), place.fit.score, made)
 
     @once
-    def _best_around(self, place: Judged) -> Judged | None:
+    def _best_around(self, place: MidPlace) -> MidPlace | None:
         """`_twin`, or a better place by a search around it at the coarse level."""
         twin = self._twin(place)
         found = [] if twin is None else [twin, *self._found_around(place, twin)]
         return max(found, key=lambda each: each.fit.score, default=None)
 
-    def _found_around(self, place: Judged, twin: Judged) -> Iterator[Judged]:
+    def _found_around(self, place: MidPlace, twin: MidPlace) -> Iterator[MidPlace]:
         assert twin.terrain is not None
         pose, scales = place.pose, self.prior.scale_map
         starts = [(pose, twin.terrain)]
@@ -305,13 +308,13 @@ class CandidateRefiner:
         for start, templates in starts:
             for near in self._searched_around(start, templates):
                 fit = self.refined(near.pose, self.levels.mid, templates)
-                yield Judged(fit, place.fit.score, templates)
+                yield MidPlace(fit, place.fit.score, templates)
 
     def _searched_around(self, pose: Pose, templates: ViewTemplates) -> list[Peak]:
         """The best pose around another one at the coarse level."""
         level, side_px = self.levels.coarse, self._over_ground.view.side_px
         poses = [
-            (pose.turn_rad + turn, pose.log_scale + scale)
+            (pose.heading_rad + turn, pose.log_scale + scale)
             for turn in REFINEMENT.turns_around_rad
             for scale in REFINEMENT.scales_around
         ]
@@ -322,22 +325,22 @@ class CandidateRefiner:
         window = windows.part(level, recipe, side_px, middle, reach_px, half_px)
         return search(template, window, poses, 1, self.prior.scale_map)
 
-    # Finishing
+    # At the final level
 
-    def finished(
+    def best(
         self,
-        places: Sequence[Judged],
-        direct: Sequence[Judged] = (),
+        places: Sequence[MidPlace],
+        from_final: Sequence[MidPlace] = (),
         *,
-        kept: int = REFINEMENT.to_finish,
+        count: int = REFINEMENT.to_final_level,
         closer: bool = False,
     ) -> BestPlace:
-        """The best of judged places: the best `kept` and all `direct` ones at the final level; with
-        `closer` the best of these as their houses show them and one level finer, where there is
-        one."""
-        apart = self._best_apart(places, kept, self._exclusion_px)
+        """Of the best `count` places, and all that were found at the final level, refined there;
+        with `closer` the best of these as their houses show them and one level finer, where there
+        is one."""
+        apart = self._best_apart(places, count, self._exclusion_px)
         chosen = apart[: self._hopeful([each.fit for each in apart], REFINEMENT.hope, 2)]
-        finalists = _best_first(self._finish_all([*chosen, *direct]))
+        finalists = _best_first(self._to_final_level([*chosen, *from_final]))
         few = REFINEMENT.to_finest
         if closer and not self.is_flat and self._over_ground.ground.surface is not None:
             seen = [self._with_houses(each) for each in finalists[:few]]
@@ -346,15 +349,15 @@ class CandidateRefiner:
             finalists = [self._compared_finer(each) for each in finalists[:few]]
             finalists.sort(key=lambda each: -each.fine)
         best, *others = finalists
-        final = self._with_covariance(best.fit.pose, best.templates)
-        values = {each.name: getattr(best, each.name) for each in fields(Finished)}
+        fit = self._with_covariance(best.window_pose, best.templates)
+        pose = fit.pose if best.gain is None else self._over_ground.below_camera(fit.pose)
         return BestPlace(
-            **values | {"fit": final},
-            scores=self._scores(finalists, [*places, *direct], final),
-            rivals=tuple(replace(each, score=_weight(each, best)) for each in others),
+            replace(best, fit=fit, camera_pose=pose),
+            self._scores(finalists, [*places, *from_final]),
+            tuple(replace(each, score=_weight(each, best)) for each in others),
         )
 
-    def _finish_all(self, places: Sequence[Judged]) -> list[Finished]:
+    def _to_final_level(self, places: Sequence[MidPlace]) -> list[FinalPlace]:
         """On the terrain, unless flat ground is as good, too little is known, or a place is far
         below the best one."""
         starts = [self._start(each) for each in places]
@@ -366,22 +369,23 @@ class CandidateRefiner:
             for place, start in zip(places, starts, strict=True)
         ]
 
-    def _start(self, place: Judged) -> Judged | None:
-        """Where a place is finished on the terrain; None: on flat ground."""
+    def _start(self, place: MidPlace) -> MidPlace | None:
+        """Where a place is refined on the terrain; None: on flat ground."""
         if self.is_flat:
             return None
         return self._best_around(place) if place.terrain is None else self._twin(place)
 
     @once
-    def _on_flat(self, place: Judged) -> Finished:
+    def _on_flat(self, place: MidPlace) -> FinalPlace:
         fit, total = place.fit, place.fit.score
         if self.levels.final != self.levels.mid:
             fit = self.refined(place.pose, self.levels.final)
             total = fit.score + self.refiner(self.levels.mid).place(fit.pose, 0).score
-        return Finished(place, fit, self.templates, total, total - self.prior.cost(fit.pose))
+        score = total - self.prior.penalty_at(fit.pose)
+        return FinalPlace(place, fit, fit.pose, self.templates, total, score)
 
     @once
-    def _on_terrain(self, place: Judged) -> Finished:
+    def _on_terrain(self, place: MidPlace) -> FinalPlace:
         final, start = self.levels.final, self._start(place)
         assert start is not None
         pose = start.pose
@@ -402,31 +406,35 @@ class CandidateRefiner:
                 return flat
         return found
 
-    def _by_templates(self, place: Judged, fit: Fit, templates: ViewTemplates) -> Finished:
-        """Finished by orthorectified templates."""
+    def _by_templates(self, place: MidPlace, fit: Fit, templates: ViewTemplates) -> FinalPlace:
+        """Refined by orthorectified templates."""
         mid_score = total = fit.score
         if self.levels.final != self.levels.mid:
             mid_score = self.refiner(self.levels.mid, templates).place(fit.pose, 0).score
             total += mid_score
-        score, gain = total - self.prior.cost(fit.pose), mid_score / max(place.flat_score, 1e-6)
-        return Finished(place, fit, templates, total, score, mid_score, gain)
+        score, gain = (
+            total - self.prior.penalty_at(fit.pose),
+            mid_score / max(place.flat_score, 1e-6),
+        )
+        pose = self._over_ground.below_camera(fit.pose)
+        return FinalPlace(place, fit, pose, templates, total, score, mid_score, gain)
 
     @once
-    def _with_houses(self, place: Finished) -> Finished:
+    def _with_houses(self, place: FinalPlace) -> FinalPlace:
         """Under the camera that the picture shows there, not the reported one: among houses and
         trees that is the difference between the right place and chance."""
-        pose, final = place.fit.pose, self.levels.final
+        pose, final = place.window_pose, self.levels.final
         camera = approached(self._over_ground, pose)
         made = None if camera is None else self._over_ground.templates_at(pose, final, camera)
         if made is None:
             return place
-        under = self._by_templates(place.judged, self.refined(pose, final, made), made)
+        under = self._by_templates(place.mid, self.refined(pose, final, made), made)
         if under.total > place.total:
             return replace(under, camera=camera)
         return replace(place, camera=camera) if final > 0 else place  # it may fit one level finer
 
     @once
-    def _compared_finer(self, place: Finished) -> Finished:
+    def _compared_finer(self, place: FinalPlace) -> FinalPlace:
         """One level finer than the final one."""
         finer, camera = self._finer_score(place, None), None
         if place.camera is not None:
@@ -435,12 +443,12 @@ class CandidateRefiner:
                 finer, camera = score, place.camera
         return replace(place, fine=place.score + finer, camera=camera)
 
-    def _finer_score(self, place: Finished, camera: Orientation | None) -> float:
+    def _finer_score(self, place: FinalPlace, camera: Orientation | None) -> float:
         level, made = self.levels.final - 1, None
         if place.gain is not None or camera is not None:
-            made = self._over_ground.templates_at(place.fit.pose, level, camera)
+            made = self._over_ground.templates_at(place.window_pose, level, camera)
         refiner = Refiner((made or self._finer_on_flat).at(level), self.reference)
-        return refiner.place(place.fit.pose, REFINEMENT.finer_steps).score
+        return refiner.place(place.window_pose, REFINEMENT.finer_steps).score
 
     @cached_property
     def _finer_on_flat(self) -> ViewTemplates:
@@ -459,34 +467,24 @@ class CandidateRefiner:
         assert found is not None
         return found
 
-    def below_camera(self, best: BestPlace) -> BestPlace:
-        """With heights, of its rivals too, counted from the ground below the camera."""
-        rivals = tuple(replace(each, below_camera=self._below(each)) for each in best.rivals)
-        return replace(best, rivals=rivals, below_camera=self._below(best))
+    def _scores(self, finalists: Sequence[FinalPlace], places: Sequence[MidPlace]) -> Scores:
+        """Of the first finalist, among all places."""
+        best, pose, penalty = finalists[0], finalists[0].window_pose, self.prior.penalty_at
 
-    def _below(self, place: Finished) -> Pose | None:
-        return None if place.gain is None else self._over_ground.below_camera(place.fit.pose)
+        def is_far(other: Pose) -> bool:
+            return other.distance_px(pose) > self._exclusion_px
 
-    def _scores(
-        self, finalists: Sequence[Finished], judged: Sequence[Judged], final: Fit
-    ) -> Scores:
-        """Of the first finished place, `final` with its covariance."""
-        best, cost, pose = finalists[0], self.prior.cost, finalists[0].fit.pose
-        far = [each for each in finalists if each.apart_px(best) > self._exclusion_px]
-        others = [
-            self._value(each.fit)
-            for each in judged
-            if each.pose.distance_px(pose) > self._exclusion_px
-        ]
+        far = [each for each in finalists if is_far(each.window_pose)]
+        others = [self._value(each.fit) for each in places if is_far(each.pose)]
         others += [
-            each.mid_score - cost(each.fit.pose) for each in far if each.mid_score is not None
+            each.mid_score - penalty(each.window_pose) for each in far if each.mid_score is not None
         ]
         if best.mid_score is None:
-            # Of what was judged there: refined at the final level, it may be another candidate.
-            nearest = min(judged, key=lambda each: each.pose.distance_px(pose))
+            # Of the place there: refined at the final level, it may be another candidate.
+            nearest = min(places, key=lambda each: each.pose.distance_px(pose))
             mid_score = self._value(nearest.fit)
         else:
-            mid_score = best.mid_score - cost(pose)
+            mid_score = best.mid_score - penalty(pose)
         is_fine = not math.isnan(best.fine)
         detail = math.nan
         if self.levels.final != self.levels.mid:
@@ -504,11 +502,11 @@ class CandidateRefiner:
         )
 
 
-def _best_first(places: Sequence[Finished]) -> list[Finished]:
+def _best_first(places: Sequence[FinalPlace]) -> list[FinalPlace]:
     return sorted(places, key=lambda each: -each.score)
 
 
-def _weight(place: Finished, best: Finished) -> float:
+def _weight(place: FinalPlace, best: FinalPlace) -> float:
     """At most as far below that of the best as with the finer level."""
     if math.isnan(place.fine) or best.fine <= 0:
         return place.score

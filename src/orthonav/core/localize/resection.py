@@ -440,8 +440,8 @@ class Blocks:
         fit = np.maximum(odds, 0.0).sum(axis=1) + np.log((1 + np.exp(-np.abs(odds))).prod(axis=1))
         fit /= self.correlated
         off = corrections - mean
-        prior_nats = np.einsum("sp,pq,sq->s", off, information, off) / 2
-        return np.asarray(corrections[int(np.argmax(fit - prior_nats))])
+        penalty = np.einsum("sp,pq,sq->s", off, information, off) / 2
+        return np.asarray(corrections[int(np.argmax(fit - penalty))])
 
     def _usual(self, correlations: Array) -> Array:
         """Mean correlation (.., L * N) of the level."""

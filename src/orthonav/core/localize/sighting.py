@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from orthonav.core.localize.camera import CameraEstimate
 from orthonav.core.localize.confidence import RegisteredConfidence, Scores, logit
 from orthonav.core.localize.odometry import tilt_lever_m
-from orthonav.core.localize.place import BestPlace, Finished
-from orthonav.core.localize.search import Search
+from orthonav.core.localize.place import BestPlace, FinalPlace
+from orthonav.core.localize.search import Found, Search
 from orthonav.core.records import Telemetry
 
 Array = NDArray[np.float64]
@@ -24,7 +24,7 @@ class SightingLimits:
     min_log_odds: float = -12.0  # less likely places are left out
     min_probability: float = 1e-12  # of a place, and of none, for finite odds
     apart: float = 0.05  # of the side of a view: closer places are one
-    likely_nats: float = 5.0
+    examined_log_odds: float = 5.0
     """Places so much less likely than the best one are not examined for their tilt."""
     unseen_tilt_rad: float = math.radians(20.0)
     """Standard deviation of a tilt that a view does not show."""
@@ -48,18 +48,20 @@ class Sighting:
 
 
 def sightings(
-    search: Search, best: BestPlace, telemetry: Telemetry, log_scale: float, searched_share: float
+    found: Found, telemetry: Telemetry, log_scale: float, searched_share: float
 ) -> Iterator[Sighting]:
     """Of the best place and its rivals; the map has a confidence.
 
     `telemetry`: as searched, its height corrected by `log_scale`. `searched_share`: of the map."""
+    search, best = found
     confidence = search.map.confidence
     assert confidence is not None
     near_px = LIMITS.apart * search.view.side_px
     places = places_of(best, confidence, near_px, searched_share)
     for log_odds, by_view, place in places:
-        likely = log_odds > places[0][0] - LIMITS.likely_nats
-        camera = search.camera(place) if likely else None
+        likely = log_odds > places[0][0] - LIMITS.examined_log_odds
+        local_ratio = best.scores.local_ratio if place is best.place else 1.0
+        camera = search.camera(place, local_ratio) if likely else None
         if camera is None:
             mean, covariance = _by_similarity(search, place, telemetry)
         else:
@@ -71,42 +73,43 @@ def sightings(
 
 def places_of(
     best: BestPlace, confidence: RegisteredConfidence, near_px: float, searched_share: float
-) -> list[tuple[float, float, Finished]]:
+) -> list[tuple[float, float, FinalPlace]]:
     """Log odds, probability by the view alone, and place: the best, and rivals `near_px` apart.
 
     A search of a share of the map finds fewer rivals, and chance is lower: the log odds are those
     within the area times `searched_share`, or, if less, those of a whole search whose rivals are
     what chance makes (docs/tracking.md)."""
     share, chances = math.log(searched_share), confidence.chances
-    out: list[tuple[float, float, Finished]] = []
-    for place in (best, *best.rivals):
-        if any(place.pose.distance_px(other.pose) < near_px for *_, other in out):
+    out: list[tuple[float, float, FinalPlace]] = []
+    for place in (best.place, *best.rivals):
+        pose = place.camera_pose
+        if any(pose.distance_px(other.camera_pose) < near_px for *_, other in out):
             continue
         scores = _as_rival(best, place) if out else best.scores
         by_chance = replace(
             scores,
             rival=max(scores.rival, chances.of_strength(scores)),
-            mid_rival=max(scores.mid_rival, chances.look),
+            mid_rival=max(scores.mid_rival, chances.mid),
             fine_rival=max(scores.fine_rival, chances.fine),  # NaN stays
         )
         by_view = confidence(by_chance)
         edge = LIMITS.min_probability
         log_odds = min(logit(confidence(scores), edge) + share, logit(by_view, edge))
-        if out:  # the best place may have won in detail, against stronger scores elsewhere
+        if out:  # the best place may have won in detail, against stronger total scores
             log_odds, by_view = min(log_odds, out[0][0]), min(by_view, out[0][1])
         if not out or log_odds > LIMITS.min_log_odds:
             out.append((log_odds, by_view, place))
     return out
 
 
-def _as_rival(best: BestPlace, place: Finished) -> Scores:
+def _as_rival(best: BestPlace, place: FinalPlace) -> Scores:
     """As if it were the best place, and the best one its rival."""
     mid_score = best.scores.mid_score
     return replace(
         best.scores,
         strength=place.score,
-        rival=best.score,
-        mid_score=mid_score * (place.score / max(best.score, 1e-6)),
+        rival=best.place.score,
+        mid_score=mid_score * (place.score / max(best.place.score, 1e-6)),
         mid_rival=mid_score,
         fine=math.nan,
         fine_rival=math.nan,
@@ -126,16 +129,17 @@ def _by_camera(camera: CameraEstimate, telemetry: Telemetry) -> tuple[Array, Arr
     return np.array([east, north, heading, scale, pitch, roll]), covariance
 
 
-def _by_similarity(search: Search, place: Finished, telemetry: Telemetry) -> tuple[Array, Array]:
+def _by_similarity(search: Search, place: FinalPlace, telemetry: Telemetry) -> tuple[Array, Array]:
     """The same of a view that does not show its tilt."""
-    map_, pose, spread = search.map, place.pose, place.fit.covariance
+    over_ground, pose, spread = search.over_ground, place.camera_pose, place.fit.covariance
     if spread is None:
         spread = search.refiner.covariance_at(pose)
     tilt_rad = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-    mean = np.concatenate([map_.camera_state(search.view, pose), tilt_rad])
-    lever = tilt_lever_m(replace(telemetry, yaw_deg=math.degrees(pose.turn_rad)))
+    state = [*over_ground.camera_en_m(pose), pose.heading_rad, pose.log_scale]
+    mean = np.array([*state, *tilt_rad])
+    lever = tilt_lever_m(replace(telemetry, yaw_deg=math.degrees(pose.heading_rad)))
     covariance = np.zeros((6, 6))
-    covariance[:4, :4] = map_.camera_covariance(search.view, pose, spread)
+    covariance[:4, :4] = over_ground.camera_covariance(pose, spread, search.floor_m)
     covariance[:2, :2] += LIMITS.unseen_tilt_rad**2 * lever @ lever.T
     covariance[:2, 4:] = -(LIMITS.unseen_tilt_rad**2) * lever
     covariance[4:, :2] = covariance[:2, 4:].T

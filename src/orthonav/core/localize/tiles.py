@@ -55,10 +55,10 @@ def rival_score(
 
     The best score itself where there is none: that must not appear as certainty."""
     offset = centres_en_m - centres_en_m[best]
-    elsewhere = np.einsum("ij,ij->i", offset, offset) > exclusion_m**2
-    if not elsewhere.any():
+    is_far = np.einsum("ij,ij->i", offset, offset) > exclusion_m**2
+    if not is_far.any():
         return float(scores[best])
-    return float(np.max(scores, where=elsewhere, initial=-1.0))
+    return float(np.max(scores, where=is_far, initial=-1.0))
 
 
 def _ratio(best: float, second: float) -> float:
@@ -176,12 +176,14 @@ class TileProposer:
         by_direction = tiles.index.scores(queries, numbers)
         peaks = peak_directions(np.array(directions), by_direction, weights)
         found = []
-        for place, tile, (turn_rad, log_scale) in zip(chosen, numbers, peaks.tolist(), strict=True):
+        for place, tile, (heading_rad, log_scale) in zip(
+            chosen, numbers, peaks.tolist(), strict=True
+        ):
             shift_m = tiles.neighbours.offset_en_m("peak", scores, int(tile), rows)
             east, north = tiles.centres_en_m[tile] + np.array(shift_m)
             x_px = (float(east) - grid.west_m) / grid.gsd_m
             y_px = (grid.north_m - float(north)) / grid.gsd_m
-            pose = Pose(x_px, y_px, turn_rad, log_scale)
+            pose = Pose(x_px, y_px, heading_rad, log_scale)
             found.append(Peak(float(scores[place]), pose))
         return found
 

@@ -143,7 +143,7 @@ class Refiner:
             *(window.row, window.col, window.unit, steps, small_step_px),
             *(DESCENT.max_step_px, DESCENT.damping, DESCENT.min_correlation, DESCENT.whole_overlap),
         )
-        at = (pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale)
+        at = (pose.x_px, pose.y_px, pose.heading_rad, pose.log_scale)
         return window.made, template.values, template.slopes, template.numbers, at, limits
 
     def _refined_by_numpy(
@@ -388,7 +388,13 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
     if KERNEL is not None:
         moved = np.empty((3, 2 * rows + 1, 2 * cols + 1), np.float32)
         KERNEL.moved(
-            *(window.made, template.values, template.weights, window.matrix(pose), pose.turn_rad),
+            *(
+                window.made,
+                template.values,
+                template.weights,
+                window.matrix(pose),
+                pose.heading_rad,
+            ),
             *((rows, cols), size, PHASE_FLOOR, moved),
         )
         return moved
@@ -438,7 +444,7 @@ def block_scores(
     else:
         count, side = BLOCKS * BLOCKS, 2 * reach_px + 1
         found, pixels = np.empty((count, side, side)), np.empty(count)
-        at = window.matrix(pose), pose.turn_rad
+        at = window.matrix(pose), pose.heading_rad
         shares = BLOCK_GREY_SHARE * (template.weights[1] > 0), MIN_SEEN, MIN_ENERGY
         KERNEL.blocks(window.made, template.planes, *at, reach_px, shares, found, pixels)
     return BlockScores(found, pixels, _middles_px(rows, cols))
@@ -490,7 +496,7 @@ def _products_of_blocks(
 def _sampled(window: MapWindow, pose: Pose) -> Array:
     """The window (H, W, 4), edge directions turned; 0 where not valid."""
     sampled = window.sample(pose)
-    cos, sin = math.cos(2 * pose.turn_rad), math.sin(2 * pose.turn_rad)
+    cos, sin = math.cos(2 * pose.heading_rad), math.sin(2 * pose.heading_rad)
     turn = np.eye(CHANNELS, dtype=np.float32)
     turn[:2, :2] = [[cos, sin], [-sin, cos]]
     turned = np.asarray(cv2.transform(sampled, turn), np.float32)

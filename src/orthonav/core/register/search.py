@@ -9,7 +9,7 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import cv2
@@ -27,6 +27,7 @@ from orthonav.core.register.template import (
 )
 from orthonav.core.register.window import (
     MAX_SIDE_PX,
+    DirectionPrior,
     Pose,
     Reference,
     ScaleMap,
@@ -36,6 +37,9 @@ from orthonav.core.register.window import (
 )
 
 Array = NDArray[np.float32]
+Direction = tuple[float, float]
+"""Heading (rad, clockwise from north) and natural logarithm of the scale."""
+Steps = tuple[float, float]  # of headings (rad) and log scales
 DIRECTIONS_AT_ONCE = 6
 PLACES_AT_ONCE = 50
 WIDE = 8  # columns or rows that the kernel transforms together
@@ -53,19 +57,19 @@ FLOOR = EnergyFloor()
 
 
 def bank(
-    turn_std_rad: float | None,
+    heading_std_rad: float | None,
     log_scale_std: float,
     *,
-    turn_step_rad: float,
+    heading_step_rad: float,
     scale_step: float,
     sigmas: float,
 ) -> list[tuple[float, float]]:
     """Turns (rad) and log scales within `sigmas`, each with each; all turns where `None`."""
-    if turn_std_rad is None or sigmas * turn_std_rad + turn_step_rad / 2 >= math.pi:
-        count = math.ceil(2 * math.pi / turn_step_rad)
+    if heading_std_rad is None or sigmas * heading_std_rad + heading_step_rad / 2 >= math.pi:
+        count = math.ceil(2 * math.pi / heading_step_rad)
         turns = np.arange(count, dtype=np.float64) * (2 * math.pi / count)
     else:
-        turns = _spread(sigmas * turn_std_rad, turn_step_rad)
+        turns = _spread(sigmas * heading_std_rad, heading_step_rad)
     scales = _spread(sigmas * log_scale_std, scale_step)
     return [(float(turn), float(scale)) for scale in scales for turn in turns]
 
@@ -74,6 +78,39 @@ def _spread(reach: float, step: float) -> NDArray[np.float64]:
     """Around 0, so that nothing within `reach` is farther than half a step."""
     count = max(1, math.ceil(2 * reach / step))
     return (np.arange(count, dtype=np.float64) - (count - 1) / 2) * step
+
+
+def rated_directions(
+    prior: DirectionPrior, steps: Steps, sigmas: float, max_penalty: float
+) -> list[tuple[Direction, float]]:
+    """Directions within `sigmas`, with penalties by the prior up to `max_penalty`, the most likely
+    first."""
+    heading_std_rad = None if prior.heading_rad is None else prior.heading_std_rad
+    reported = prior.heading_rad or 0.0
+    return [
+        ((reported + turn, log_scale), penalty)
+        for turn, log_scale, penalty in _rated(heading_std_rad, prior.log_scale_std, steps, sigmas)
+        if penalty <= max_penalty
+    ]
+
+
+@lru_cache(64)
+def _rated(
+    heading_std_rad: float | None, log_scale_std: float, steps: Steps, sigmas: float
+) -> list[tuple[float, float, float]]:
+    """Cached: the standard deviations are mostly those of the view before."""
+    made = bank(
+        heading_std_rad,
+        log_scale_std,
+        heading_step_rad=steps[0],
+        scale_step=steps[1],
+        sigmas=sigmas,
+    )
+    known = heading_std_rad is not None
+    prior = DirectionPrior(0.0 if known else None, heading_std_rad or 0.0, log_scale_std)
+    cell = steps[0] / 2, steps[1] / 2
+    rated = [(*offset, prior.penalty(*offset, within=cell)) for offset in made]
+    return sorted(rated, key=lambda each: each[2])
 
 
 class Peak(NamedTuple):
@@ -218,7 +255,7 @@ def _rounded_side(side: float) -> int:
 def search(
     template: Template,
     window: SearchWindow,
-    directions: list[tuple[float, float]],
+    directions: list[Direction],
     count: int,
     scales: ScaleMap | None = None,
     pool: Executor | None = None,
@@ -261,7 +298,7 @@ def best_near(
     reach = math.ceil(reach_px / unit)
     places = np.array(
         [
-            (p.x_px / unit - window.col, p.y_px / unit - window.row, p.turn_rad, p.log_scale)
+            (p.x_px / unit - window.col, p.y_px / unit - window.row, p.heading_rad, p.log_scale)
             for p in poses
         ]
     ).reshape(-1, 4)
@@ -274,7 +311,7 @@ def best_near(
     found[:, 1] = (window.col + found[:, 1]) * unit
     found[:, 2] = (window.row + found[:, 2]) * unit
     return [
-        Peak(score, Pose(x, y, pose.turn_rad, pose.log_scale))
+        Peak(score, Pose(x, y, pose.heading_rad, pose.log_scale))
         for (score, x, y), pose in zip(found.tolist(), poses, strict=True)
     ]
 
@@ -301,7 +338,7 @@ def _best_near(
 def _best_of(
     template: Template,
     window: SearchWindow,
-    directions: list[tuple[float, float]],
+    directions: list[Direction],
     part: range,
     scales: ScaleMap | None,
 ) -> tuple[Array, NDArray[np.int32]]:
@@ -331,7 +368,7 @@ def _best_of(
 def _best_by_kernel(
     template: Template,
     window: SearchWindow,
-    directions: list[tuple[float, float]],
+    directions: list[Direction],
     part: range,
     scales: ScaleMap | None,
     expected: Array | None,
@@ -392,7 +429,7 @@ def posed_half_px(template: Template, log_scale: float) -> int:
     return math.ceil(math.exp(log_scale) * math.hypot(*template.mask.shape) / 2) + 1
 
 
-def largest_half_px(template: Template, directions: Sequence[tuple[float, float]]) -> int:
+def largest_half_px(template: Template, directions: Sequence[Direction]) -> int:
     return posed_half_px(template, max(log_scale for _, log_scale in directions))
 
 

@@ -40,12 +40,12 @@ class Pose:
 
     x_px: float
     y_px: float
-    turn_rad: float
+    heading_rad: float
     log_scale: float
 
     @property
     def linear(self) -> NDArray[np.float64]:
-        return rotation(self.turn_rad, math.exp(self.log_scale))
+        return rotation(self.heading_rad, math.exp(self.log_scale))
 
     def distance_px(self, other: "Pose") -> float:
         return math.hypot(self.x_px - other.x_px, self.y_px - other.y_px)
@@ -57,11 +57,11 @@ class Pose:
     def stepped(self, step: Sequence[float]) -> "Pose":
         """After the inverse of a small step (dx, dy, turn, log scale) of the window."""
         scale = math.exp(self.log_scale)
-        cos, sin = scale * math.cos(self.turn_rad), scale * math.sin(self.turn_rad)
+        cos, sin = scale * math.cos(self.heading_rad), scale * math.sin(self.heading_rad)
         return Pose(
             self.x_px - (cos * step[0] - sin * step[1]),
             self.y_px - (sin * step[0] + cos * step[1]),
-            self.turn_rad - step[2],
+            self.heading_rad - step[2],
             self.log_scale - step[3],
         )
 
@@ -118,29 +118,30 @@ class ScaleMap:
 
 @dataclass(frozen=True)
 class DirectionPrior:
-    """`turn_rad`: None: unknown. `scale_map`: None: 0 is expected everywhere."""
+    """Expected heading and log scale of a view. `heading_rad`: None: unknown. `scale_map`: None: 0
+    is expected everywhere."""
 
-    turn_rad: float | None
-    turn_std_rad: float
+    heading_rad: float | None
+    heading_std_rad: float
     log_scale_std: float
     scale_map: ScaleMap | None = None
 
-    def cost(self, pose: Pose) -> float:
-        """Units of the score: one per nat (docs/decisions/registration.md)."""
+    def penalty_at(self, pose: Pose) -> float:
+        """To be subtracted from the score, whose unit it has (docs/decisions/registration.md)."""
         if self.scale_map is None:
-            return self.negative_log_density(pose.turn_rad, pose.log_scale)
-        own = DirectionPrior(self.turn_rad, self.turn_std_rad, self.scale_map.std)
+            return self.penalty(pose.heading_rad, pose.log_scale)
+        own = DirectionPrior(self.heading_rad, self.heading_std_rad, self.scale_map.std)
         expected = self.scale_map.at(pose.x_px, pose.y_px)
-        return own.negative_log_density(pose.turn_rad, pose.log_scale - expected)
+        return own.penalty(pose.heading_rad, pose.log_scale - expected)
 
-    def negative_log_density(
-        self, turn_rad: float, log_scale: float, *, within: tuple[float, float] = (0.0, 0.0)
+    def penalty(
+        self, heading_rad: float, log_scale: float, *, within: tuple[float, float] = (0.0, 0.0)
     ) -> float:
-        """In nats, 0 at its peak; the least `within` (rad, log scale) around."""
+        """Negative log density, 0 at its peak; the least `within` (rad, log scale) around."""
         parts = [(log_scale, self.log_scale_std, within[1])]
-        if self.turn_rad is not None:
-            off = math.remainder(turn_rad - self.turn_rad, 2 * math.pi)
-            parts.append((off, self.turn_std_rad, within[0]))
+        if self.heading_rad is not None:
+            off = math.remainder(heading_rad - self.heading_rad, 2 * math.pi)
+            parts.append((off, self.heading_std_rad, within[0]))
         return sum((max(abs(o) - w, 0.0) / max(std, 0.01)) ** 2 / 2 for o, std, w in parts)
 
 
@@ -252,7 +253,7 @@ class MapWindow:
             return cls(whole, 0, 0, unit, (height, width))
         # Beyond 1, more than twice what is searched, the map counts as missing.
         scale = math.exp(min(pose.log_scale, 1.0)) / 2
-        cos, sin = abs(scale * math.cos(pose.turn_rad)), abs(scale * math.sin(pose.turn_rad))
+        cos, sin = abs(scale * math.cos(pose.heading_rad)), abs(scale * math.sin(pose.heading_rad))
         x, half_x = pose.x_px / unit, cos * width + sin * height
         y, half_y = pose.y_px / unit, sin * width + cos * height
         row, col = math.floor(y - half_y) - slack_px, math.floor(x - half_x) - slack_px
@@ -273,7 +274,7 @@ class MapWindow:
         """(2, 3), row by row, from pixels of the window to those of `made`, from pixel centres."""
         height, width = self.shape
         scale = math.exp(pose.log_scale)
-        cos, sin = scale * math.cos(pose.turn_rad), scale * math.sin(pose.turn_rad)
+        cos, sin = scale * math.cos(pose.heading_rad), scale * math.sin(pose.heading_rad)
         # Pixel-is-area to pixel centres: source and target are both half a pixel off.
         x, y = (width - 1) / 2, (height - 1) / 2
         column = pose.x_px / self.unit - self.col - 0.5 - cos * x + sin * y
@@ -327,5 +328,5 @@ def compared(template: Template, seen: Array, valid: Array, slopes: bool = True)
 
 def sampled_planes(window: MapWindow, pose: Pose) -> tuple[Array, Array]:
     """Channels (3, H, W) of the map as a view shows them, and validity (H, W)."""
-    planes = turned_planes(window.sample(pose), -pose.turn_rad)
+    planes = turned_planes(window.sample(pose), -pose.heading_rad)
     return planes[:3], planes[3]

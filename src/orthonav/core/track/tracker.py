@@ -25,7 +25,7 @@ from orthonav.core.localize.odometry import (
     displacement,
     over_terrain,
 )
-from orthonav.core.localize.search import Found, found_by
+from orthonav.core.localize.search import Found, Search
 from orthonav.core.localize.sighting import Sighting, sightings
 from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
@@ -471,14 +471,14 @@ class Tracker:
             camera=replace(view.camera, focal_std=0.0),  # part of the spread of the scale
             telemetry=known,
         )
-        search = self._registration.search(corrected, prior, self._heading_known)
+        search = Search.of(self._registration, corrected, prior, self._heading_known)
         if isinstance(search, NoFix):
             return search
         newness = max(1 - step.overlap, LEAST_NEW)
-        found = found_by(search)
+        found = search.run()
         if isinstance(found, Found):
             share = min(searched.area_m2, self.mixture.map_m2) / self.mixture.area_m2
-            self._seen = list(sightings(*found, known, bias[1], share))
+            self._seen = list(sightings(found, known, bias[1], share))
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),

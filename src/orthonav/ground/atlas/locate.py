@@ -19,7 +19,7 @@ from orthonav.core.errors import AtlasError, MapFileError
 from orthonav.core.geo.frames import LocalFrame, distances_m
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
-from orthonav.core.localize.search import DEFAULT_PLAN
+from orthonav.core.localize.plan import DEFAULT_PLAN
 from orthonav.core.localize.view import (
     LIMITS,
     RectifiedView,
@@ -31,6 +31,7 @@ from orthonav.core.localize.view import (
 )
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Telemetry, View
+from orthonav.core.register.search import rated_directions
 from orthonav.core.tiles import represent
 from orthonav.core.tiles.bank import embed_directions
 from orthonav.core.track import Model, State
@@ -109,8 +110,13 @@ class SheetSearch:
         if isinstance(coarse, NoFix):
             return coarse
         prior = pose_prior(view.telemetry, heading_known, view.camera.focal_std)
-        directions = self._policy.directions(prior, self._policy.coarse_steps)
-        poses = [pose for pose, nats in directions if nats <= self._policy.likely_nats]
+        plan = self._policy
+        poses = [
+            direction
+            for direction, _ in rated_directions(
+                prior, plan.coarse_steps, plan.bank_sigmas, plan.likely_penalty
+            )
+        ]
         embedded = embed_directions(
             *(self._embedder, self._representation, coarse.grey, coarse.valid, poses),
             self.recipe.tile_px,

@@ -20,8 +20,8 @@ from orthonav.core.files import GivenPath, Progress, no_progress, with_paths
 from orthonav.core.geo.ground import RELIEF_SLOPES
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.localize.confidence import DEFAULT_TILE_CONFIDENCE
-from orthonav.core.localize.localizer import RegistrationLocalizer
-from orthonav.core.localize.search import SearchPlan
+from orthonav.core.localize.plan import SearchPlan
+from orthonav.core.localize.prepared import PreparedMap
 from orthonav.core.localize.tiles import TileMatcher, TileProposer
 from orthonav.core.mapfile.manifest import Manifest, SheetInfo
 from orthonav.core.mapfile.reader import MapFile, write_map
@@ -327,18 +327,19 @@ def _registration(
     request, sheet = inputs.request, inputs.sheet
     radius_m = max(RADIUS_PX * sheet.grid.gsd_m, MIN_RADIUS_M)
     unfitted = {"confidence": None, "radius_m": radius_m, "position_floor_px": CALIBRATION.floor_px}
-    localizer = RegistrationLocalizer.of_map(
+    prepared = PreparedMap.of(
         MapFile(request.out, 0, replace(manifest, registration=unfitted), arrays),
         TileProposer.of(tiles, embedder, sheet.representation),
         SearchPlan(last_ms=SEARCH_MS),
+        level_ground=True,
     )
-    assert localizer is not None
+    assert prepared is not None
     crops = sheet.crops
     later = [crop for date in inputs.other_dates for crop in _crops_of(date, sheet, crops)]
     if inputs.other_dates and not later:
         log.warning("the other dates do not cover the area: nothing can be learned from them")
     found = calibrate_registration(
-        localizer, crops, later, request.calibration_views, request.seed, progress
+        prepared, crops, later, request.calibration_views, request.seed, progress
     )
     return unfitted | {
         "confidence": found.confidence.to_plain(),

@@ -31,7 +31,8 @@ from orthonav.core.localize.confidence import (
     features_of,
     logit,
 )
-from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.prepared import PreparedMap
+from orthonav.core.localize.search import Search
 from orthonav.core.localize.tiles import TileMatcher
 from orthonav.core.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
 from orthonav.core.register.window import rotation
@@ -317,7 +318,7 @@ class _Outcome:
 
 
 def calibrate_registration(
-    localizer: RegistrationLocalizer,
+    prepared: PreparedMap,
     crops: Sequence[Crop],
     other_dates: Sequence[Crop],
     views: int,
@@ -339,38 +340,39 @@ def calibrate_registration(
             # The replacement is mirrored: unmirrored it would be found at its own position.
             replaced_by = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
             picture = changed(rng, picture, replaced_by)
-        outcome = _placed(rng, localizer, crop, picture, mirror)
+        outcome = _placed(rng, prepared, crop, picture, mirror)
         if outcome is not None:
             outcomes.append(outcome)
         progress("calibrate registration", (done + 1) / len(work))
-    return _registration_calibration(outcomes, localizer.radius_m / localizer.grid.gsd_m)
+    return _registration_calibration(outcomes, prepared.radius_m / prepared.grid.gsd_m)
 
 
 def _placed(
     rng: np.random.Generator,
-    localizer: RegistrationLocalizer,
+    prepared: PreparedMap,
     crop: Crop,
     picture: NDArray[np.uint8],
     mirror: bool,
 ) -> _Outcome | None:
-    view = _view(rng, picture, localizer.grid)
-    search = localizer.search(view, _prior(rng, localizer, crop))
-    best = search if isinstance(search, NoFix) else search.run()
-    if isinstance(best, NoFix):
+    view = _view(rng, picture, prepared.grid)
+    search = Search.of(prepared, view, _prior(rng, prepared, crop))
+    found = search if isinstance(search, NoFix) else search.run()
+    if isinstance(found, NoFix):
         return None
-    error = np.array([best.pose.x_px - crop.col_px, best.pose.y_px - crop.row_px])
-    return _Outcome(best.scores, error, mirror)
+    pose = found.best.place.window_pose
+    error = np.array([pose.x_px - crop.col_px, pose.y_px - crop.row_px])
+    return _Outcome(found.best.scores, error, mirror)
 
 
-def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Crop) -> Prior | None:
+def _prior(rng: np.random.Generator, prepared: PreparedMap, crop: Crop) -> Prior | None:
     """On a large map, limits the search to a square with the crop in its middle half."""
-    grid = localizer.grid
+    grid = prepared.grid
     if grid.height_px * grid.width_px <= CALIBRATION.whole_px**2:
         return None
     side_px = CALIBRATION.searched_px
     col, row = np.array([crop.col_px, crop.row_px]) + rng.uniform(-0.25, 0.25, 2) * side_px
     place = np.array([grid.west_m + col * grid.gsd_m, grid.north_m - row * grid.gsd_m])
-    lat, lon = localizer.sheet.frame.latlon_from_en(place)
+    lat, lon = prepared.sheet.frame.latlon_from_en(place)
     return Prior(float(lat), float(lon), side_px / 2 * grid.gsd_m / PRIOR_SIGMAS)
 
 
@@ -425,12 +427,12 @@ def _registration_calibration(
 
 def _chances(negatives: Sequence[Scores]) -> Chances:
     """A view judged and finished at one level has the strength of one score, not of two."""
-    look = _median(negatives, "mid_score")
+    mid = _median(negatives, "mid_score")
     both = [each for each in negatives if math.isfinite(each.detail_ratio)]
-    total = look + DEFAULT_CHANCES.total - DEFAULT_CHANCES.look
+    total = mid + DEFAULT_CHANCES.total - DEFAULT_CHANCES.mid
     if len(both) >= CALIBRATION.min_negatives:
         total = _median(both, "strength")
-    return Chances(total, look, _fine_chance(negatives, total))
+    return Chances(total, mid, _fine_chance(negatives, total))
 
 
 def _fine_chance(scores: Sequence[Scores], total: float) -> float:

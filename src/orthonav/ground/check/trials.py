@@ -21,7 +21,8 @@ from orthonav.core.errors import AreaError, MapFileError, WorkerError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.localize import Localizer
-from orthonav.core.localize.localizer import RegistrationLocalizer
+from orthonav.core.localize.localizer import registered
+from orthonav.core.localize.prepared import PreparedMap
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import level_shape
 from orthonav.core.mapfile.manifest import SheetInfo
@@ -233,7 +234,7 @@ def _work(job: _Job) -> Trial | None:
     return _trier(job)
 
 
-def registration_of(opened: MapFile) -> RegistrationLocalizer:
+def registration_of(opened: MapFile) -> PreparedMap:
     found = Localizer(opened, level_ground=True).registration
     if found is None:
         raise MapFileError(f"only maps with a registration layer can be checked: {opened.path}")
@@ -280,7 +281,7 @@ class Trier:
         return self._placed(rng, place, view, expected)
 
     @cached_property
-    def _registration(self) -> RegistrationLocalizer:
+    def _registration(self) -> PreparedMap:
         return registration_of(open_map(self._request.map_path))
 
     @cached_property
@@ -328,7 +329,7 @@ class Trier:
             at = place_en_m + rng.normal(0, conditions.prior_std_m, 2)
             lat, lon = registration.sheet.frame.latlon_from_en(at)
             prior = Prior(float(lat), float(lon), conditions.prior_std_m)
-        fix = registration.locate(view, prior, conditions.yaw_std_deg is not None)
+        fix = registered(registration, view, prior, conditions.yaw_std_deg is not None)
         if isinstance(fix, NoFix):
             return Trial(here, math.nan, expected)
         found = registration.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
