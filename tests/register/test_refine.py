@@ -16,6 +16,7 @@ from scenes import (
     turned_rad,
 )
 
+from orthonav.core.register import refine, template
 from orthonav.core.register.refine import DESCENT, Refiner
 from orthonav.core.register.template import COARSE, FINE, ViewTemplates
 from orthonav.core.register.window import Pose, Reference
@@ -71,6 +72,15 @@ def test_a_view_is_placed_to_a_fraction_of_a_pixel(reference, level):
         assert abs(off[2]) < math.radians(0.1) and abs(off[3]) < 0.0025
         assert placed.converged and placed.overlap == pytest.approx(1.0)
         assert placed.level == level and placed.weighted > 0.9
+
+
+def test_without_a_compiler_views_are_placed_too(reference, monkeypatch):
+    monkeypatch.setattr(refine, "KERNEL", None)
+    monkeypatch.setattr(template, "KERNEL", None)
+    pose = Pose(220.0, 150.0, 0.7, 0.05)
+    near = Pose(222.0, 149.0, 0.73, 0.03)
+    placed = Refiner(templates_of(GROUND, pose).at(0), reference).place(near)
+    assert placed.converged and math.hypot(placed.pose.x_px - 220, placed.pose.y_px - 150) < 0.05
 
 
 HOLES = {
