@@ -96,21 +96,38 @@ def as_grey(values):
 
 @functools.lru_cache(maxsize=8)
 def rays(camera):
-    """Where its pixels look, (H W, 3) forward, right, down."""
+    """Where its pixels look, (H W, 3) forward, right, down.
+
+    Brown's model is undone by fixed-point iteration, the fisheye's by OpenCV."""
     cols, rows = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
-    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
-    seen = np.stack([cols, rows], axis=-1).reshape(-1, 1, 2)
-    lens = np.array(camera.distortion or (0.0, 0, 0, 0))
-    right, down = cv2.undistortPoints(seen, matrix, lens)[:, 0].T
+    seen_x = (cols.ravel() - camera.cx_px) / camera.fx_px
+    seen_y = (rows.ravel() - camera.cy_px) / camera.fy_px
+    right, down = seen_x, seen_y
+    if camera.model == "fisheye":
+        seen = np.stack([seen_x, seen_y], axis=-1)[:, None]
+        plane = cv2.fisheye.undistortPoints(seen, np.eye(3), np.array(camera.distortion))
+        right, down = plane[:, 0].T
+    elif camera.distortion:
+        k1, k2, p1, p2, k3 = (*camera.distortion, 0)[:5]
+        for _ in range(60):
+            r2, both = right**2 + down**2, 2 * right * down
+            radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+            right, down = (
+                (seen_x - p1 * both - p2 * (r2 + 2 * right**2)) / radial,
+                (seen_y - p1 * (r2 + 2 * down**2) - p2 * both) / radial,
+            )
     return np.stack([-down, right, np.ones_like(right)], axis=-1)
 
 
 def rendered(ground, place_en_m, attitude, agl_m=AGL_M, camera=CAMERA):
-    """What the camera sees (H, W) uint8: forward-right-down body, Z-Y-X angles."""
+    """What the camera sees (H, W) uint8: forward-right-down body, Z-Y-X angles; white above the
+    horizon."""
     shape = camera.height_px, camera.width_px
-    ned = Rotation.from_euler("ZYX", attitude, degrees=True).apply(rays(camera))
-    north, east = (np.reshape(ned[:, i] / ned[:, 2] * agl_m, shape) for i in (0, 1))
-    return as_grey(ground(place_en_m[0] + east, place_en_m[1] + north))
+    north, east, down = Rotation.from_euler("ZYX", attitude, degrees=True).apply(rays(camera)).T
+    depth = np.where(down > 1e-6, down, np.nan)
+    north, east = (np.reshape(along / depth * agl_m, shape) for along in (north, east))
+    seen = ground(place_en_m[0] + np.nan_to_num(east), place_en_m[1] + np.nan_to_num(north))
+    return as_grey(np.where(np.isfinite(east), seen, 255))
 
 
 GROUND = Ground()

@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 
-import blots
 import numpy as np
 import pytest
 from blots import AGL_M, CAMERA, GROUND, Ground, error_m, planned, rendered
 
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.search import Found, Search, prepared_view
-from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.register.refine import block_scores
 from orthonav.core.track.tracker import Tracker
@@ -18,7 +16,9 @@ OTHER = Ground(seed=5)
 PLACES = [(-120.0, 95.0), (60.3, -110.7), (133.1, 140.2), (-30.0, 5.5), (10.0, -80.0)]
 
 
-map_path, localizer = blots.known_path, blots.known_localizer
+@pytest.fixture(scope="module")
+def localizer(known_localizer):
+    return known_localizer
 
 
 def infrared(east_m, north_m):
@@ -83,8 +83,8 @@ def test_a_prior_beside_the_map_finds_nothing(localizer):
     assert not isinstance(found, Found) and found.reason == "outside_map"
 
 
-def test_a_search_that_was_cut_short_is_not_followed_by_another(map_path):
-    hasty = Localizer(open_map(map_path), plan=planned(budget_ms=1e-6))
+def test_a_search_that_was_cut_short_is_not_followed_by_another(opened):
+    hasty = Localizer(opened, plan=planned(budget_ms=1e-6))
     search = Search.of(hasty.registration, view(infrared, PLACES[1]))
     found = search.run()
     assert isinstance(found, Found) and found.search is search and search.budget.cut_short

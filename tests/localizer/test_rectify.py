@@ -6,6 +6,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from blots import rendered as rendered_from
 from scipy.spatial.transform import Rotation
 
 from orthonav.core.geo.camera import Camera
@@ -41,47 +42,8 @@ class Ground:
         return 128 + 20 * np.sin(angle).sum(axis=-1)
 
 
-def rays_of(camera):
-    """Directions (H, W, 3) of all pixel centres: right, down, along the optical axis.
-
-    Brown's model is undone by fixed-point iteration, the fisheye's by OpenCV.
-    """
-    cols, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-    seen_x = (cols + 0.5 - camera.cx_px) / camera.fx_px
-    seen_y = (rows + 0.5 - camera.cy_px) / camera.fy_px
-    if camera.model == "fisheye":
-        seen = np.stack([seen_x, seen_y], axis=-1).reshape(-1, 1, 2)
-        plane = cv2.fisheye.undistortPoints(seen, np.eye(3), np.array(camera.distortion))
-        return np.concatenate([plane.reshape(*rows.shape, 2), np.ones((*rows.shape, 1))], axis=-1)
-    k1, k2, p1, p2, k3 = (*camera.distortion, 0, 0, 0, 0, 0)[:5]
-    x, y = seen_x, seen_y
-    for _ in range(60):
-        r2 = x**2 + y**2
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        x, y = (
-            (seen_x - 2 * p1 * x * y - p2 * (r2 + 2 * x**2)) / radial,
-            (seen_y - p1 * (r2 + 2 * y**2) - 2 * p2 * x * y) / radial,
-        )
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
-
-
-def enu(attitude, right_down_along):
-    """East, north, up of camera directions (..., 3): forward-right-down body, Z-Y-X angles."""
-    yaw, pitch, roll = attitude
-    right, down, along = np.moveaxis(right_down_along, -1, 0)
-    body = np.stack([-down, right, along], axis=-1)
-    turn = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
-    north, east, below = np.moveaxis(turn.apply(body.reshape(-1, 3)).reshape(body.shape), -1, 0)
-    return np.stack([east, north, -below], axis=-1)
-
-
-def rendered(ground, camera, attitude, agl_m=AGL_M):
-    """What the camera sees (H, W) uint8 from above (0, 0)."""
-    direction = enu(attitude, rays_of(camera))
-    below = np.where(direction[..., 2] < -1e-6, -direction[..., 2], np.nan)
-    east, north = (direction[..., i] * agl_m / below for i in (0, 1))
-    seen = np.nan_to_num(ground(east, north), nan=255)
-    return np.rint(np.clip(seen, 0, 255)).astype(np.uint8)
+def rendered(ground, camera, attitude):
+    return rendered_from(ground, (0.0, 0.0), attitude, AGL_M, camera)
 
 
 def window_en_m(offset_en_m, size_px=SIZE_PX, gsd_m=GSD_M):
@@ -92,22 +54,17 @@ def window_en_m(offset_en_m, size_px=SIZE_PX, gsd_m=GSD_M):
 
 def seen_px(camera, attitude, east_m, north_m, agl_m=AGL_M):
     """Image column and row of ground points, NaN behind the camera."""
-    to_camera = enu(attitude, np.eye(3)).T  # rows of the identity are the camera's axes
-    east_m, north_m = np.broadcast_arrays(east_m, north_m)
-    points = np.stack([east_m, north_m, np.full_like(east_m, -agl_m)], axis=-1)
-    right, down, along = np.moveaxis(points @ to_camera, -1, 0)
+    ned = np.stack(np.broadcast_arrays(north_m, east_m, agl_m), axis=-1)
+    body = Rotation.from_euler("ZYX", attitude, degrees=True).inv().apply(ned.reshape(-1, 3))
+    forward, right, along = body.T
     along = np.where(along > 0, along, np.nan)
-    plane = np.stack([right / along, down / along, np.ones_like(along)], axis=-1)
+    plane = np.stack([right / along, -forward / along, np.ones_like(along)], axis=-1)[:, None]
+    flat = np.nan_to_num(plane, nan=1e6)
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
-    flat = np.nan_to_num(plane.reshape(-1, 3), nan=1e6)
     distortion = np.array(camera.distortion or (0, 0, 0, 0), dtype=float)
-    if camera.model == "fisheye":
-        flat = flat.reshape(-1, 1, 3)
-        seen, _ = cv2.fisheye.projectPoints(flat, np.zeros(3), np.zeros(3), matrix, distortion)
-    else:
-        seen, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), matrix, distortion)
-    seen = seen.reshape(*along.shape, 2)
-    return np.where(np.isfinite(along)[..., None], seen, np.nan)
+    project = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
+    seen = project(flat, np.zeros(3), np.zeros(3), matrix, distortion)[0].reshape(-1, 2)
+    return np.where(np.isfinite(along)[:, None], seen, np.nan).reshape(*ned.shape[:-1], 2)
 
 
 def tilted_and_prepared(grey, camera, attitude, gsd_m=GSD_M, size_px=SIZE_PX, agl_m=AGL_M):

@@ -15,7 +15,6 @@ from blots import (
     Ground,
     as_grey,
     error_m,
-    known_map,
     place_of,
     planned,
     prior_at,
@@ -34,11 +33,6 @@ from orthonav.onboard.run import SingleViews, locate_view
 NEVER_CLEAR = ClearMargin(1e9, 1e9, 1e9)
 EVIDENCE = {"score", "strength", "rival", "look", "look_rival", "peak_ratio", "look_ratio"}
 EVIDENCE |= {"gradient_correlation", "grey_correlation", "agreement", "overlap", "candidates"}
-
-
-@pytest.fixture(scope="module")
-def known(made_once, make_ortho):
-    return known_map(made_once, make_ortho)
 
 
 @pytest.fixture(scope="module")

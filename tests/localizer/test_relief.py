@@ -15,7 +15,6 @@ from blots import (
     Heights,
     as_grey,
     error_m,
-    known_map,
     rendered,
 )
 from lab.terrain import random_relief, seen_view
@@ -28,7 +27,6 @@ from orthonav.core.localize.ground import GroundModel, ViewOverGround
 from orthonav.core.localize.resection import ERRORS
 from orthonav.core.localize.search import prepared_view
 from orthonav.core.localize.view import Orientation
-from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.register.window import Pose
 from orthonav.ground.simulate.render import Raster
@@ -37,11 +35,6 @@ SIDE_M, POSTING_M = 700.0, 10.0
 PLACE = np.array([30.0, -40.0])
 ATTITUDE = (70.0, 4.0, -3.0)
 BASE_M = 100.0
-
-
-@pytest.fixture(scope="module")
-def opened(made_once, make_ortho):
-    return open_map(known_map(made_once, make_ortho).path)
 
 
 @pytest.fixture(scope="module")
@@ -96,12 +89,10 @@ def test_a_view_of_hills_is_placed_as_one_of_level_ground(opened, grey, relief):
 
 def test_the_ground_seen_is_that_of_the_middle_of_the_picture(opened, grey, relief):
     attitude = (70.0, 20.0, 0.0)
-    below = float(relief.at(PLACE[:1], PLACE[1:])[0])
-    position = np.array([*PLACE, below + AGL_M])
+    _, position = seen_from(grey, relief, attitude)
     picture, ground = seen_view(grey, relief, CAMERA, attitude, position, finer=1)
-    fix = (localizer := on_terrain(opened, relief)).locate(
-        View(picture, CAMERA, telemetry(attitude))
-    )
+    localizer = on_terrain(opened, relief)
+    fix = localizer.locate(View(picture, CAMERA, telemetry(attitude)))
     seen = localizer.sheet.frame.en_from_latlon(*fix.ground_latlon_deg)
     middle = ground[CAMERA.height_px // 2, CAMERA.width_px // 2]
     assert float(np.hypot(*(seen - middle[:2]))) < 2.0
@@ -166,10 +157,7 @@ def test_holes_are_not_compared(opened, grey, relief):
 def test_the_camera_over_a_hole_of_the_terrain_is_found(opened, grey, relief):
     """Its height is that above the ground in the picture."""
     picture, _ = seen_from(grey, relief)
-    row, col = (
-        round((SIDE_M / 2 - PLACE[1]) / POSTING_M),
-        round((PLACE[0] + SIDE_M / 2) / POSTING_M),
-    )
+    col, row = np.rint((SIDE_M / 2 + PLACE * [1, -1]) / POSTING_M).astype(int)
     holed = replace(relief, values=relief.values.copy())
     holed.values[row - 1 : row + 2, col - 1 : col + 2] = np.nan
     fix = (localizer := on_terrain(opened, holed)).locate(View(picture, CAMERA, telemetry()))
@@ -213,10 +201,8 @@ def test_formulas_for_level_ground_agree_with_those_for_any(opened, attitude):
     flat = GroundModel(
         Heights(Raster(np.zeros((70, 70), np.float32), -7e4, 7e4, 2e3)), registration.grid
     )
-    seen, any_seen = (
-        ViewOverGround(each, prepared, registration.reference)
-        for each in (registration.ground, flat)
-    )
+    grounds = registration.ground, flat
+    seen, any_seen = (ViewOverGround(g, prepared, registration.reference) for g in grounds)
     assert seen.ground.is_flat and not flat.is_flat
     pose = Pose(300.0, 290.0, 0.3, 0.01)
     assert seen.reference_m(pose) == any_seen.reference_m(pose) == 0.0

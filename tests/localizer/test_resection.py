@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, Flat, as_grey, known_map, rendered
+from blots import AGL_M, CAMERA, GROUND, Flat, as_grey, rendered
 
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize import Localizer, resection
@@ -14,7 +14,6 @@ from orthonav.core.localize.camera import camera_of
 from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.resection import _Marginal
 from orthonav.core.localize.search import Search
-from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, Prior, Telemetry, View
 
 VIEWS, TILT_DEG = 24, 4.0
@@ -22,17 +21,17 @@ YAW_STD_DEG, AGL_STD = 5.0, 0.05
 
 
 @pytest.fixture(scope="module")
-def without_terrain(made_once, make_ortho):
+def without_terrain(opened):
     """Without the displacement between dates: map and views show the same ground."""
-    made = Localizer(open_map(known_map(made_once, make_ortho).path))
+    made = Localizer(opened)
     made.registration.floor_px = 0.0
     return made
 
 
 @pytest.fixture(scope="module")
-def localizer(made_once, make_ortho):
+def localizer(opened):
     """The same on a map with a surface model."""
-    made = Localizer(open_map(known_map(made_once, make_ortho).path))
+    made = Localizer(opened)
     made.registration.floor_px = 0.0
     made.registration.ground = GroundModel(Flat(), made.grid, surface=Flat())
     return made

@@ -6,22 +6,16 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, Heights, as_grey, error_m, known_map
+from blots import AGL_M, CAMERA, GROUND, Heights, as_grey, error_m
 from lab.terrain import seen_view
 
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.camera import approached, camera_of
-from orthonav.core.localize.ground import (
-    SAMPLING,
-    GroundModel,
-    ViewOverGround,
-    _smoothed,
-)
+from orthonav.core.localize.ground import SAMPLING, GroundModel, ViewOverGround, _smoothed
 from orthonav.core.localize.prepared import PreparedMap
 from orthonav.core.localize.resection import ERRORS
 from orthonav.core.localize.search import prepared_view
 from orthonav.core.localize.view import hidden
-from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import Lean, TerrainInfo
 from orthonav.core.records import Telemetry, View
 from orthonav.core.register.window import Pose
@@ -29,16 +23,21 @@ from orthonav.ground.build.lean import as_shown
 from orthonav.ground.simulate.render import Raster
 
 SIDE_M, FINEST_M, BASE_M = 700.0, 0.5, 100.0
+AT_M = np.arange(FINEST_M / 2, SIDE_M, FINEST_M) - SIDE_M / 2
 ATTITUDE = (70.0, 30.0, 0.0)
 PLACE = np.array([30.0, -90.0])
 
 
-def pose_of(registration, view, camera_state):
-    """Of a camera (4,): m east and north, heading (rad), log scale."""
-    x, y = registration.ground.map_px(camera_state[:2])
-    turn, log_scale = camera_state[2:].tolist()
-    moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
-    return Pose(x - float(moved[0]), y - float(moved[1]), turn, log_scale)
+def placed(localizer, view, place=PLACE, heading_deg=ATTITUDE[0], scale=1.0):
+    """A view over the ground of the map, and its pose under a camera at a place."""
+    registration = localizer.registration
+    over_ground = ViewOverGround(
+        registration.ground, prepared_view(registration, view, True), registration.reference
+    )
+    x, y = registration.ground.map_px(place)
+    pose = Pose(0.0, 0.0, np.radians(heading_deg), np.log(scale))
+    moved_x, moved_y = pose.map_px(over_ground.view.camera_px).tolist()
+    return over_ground, replace(pose, x_px=x - moved_x, y_px=y - moved_y)
 
 
 def raster(values):
@@ -46,15 +45,9 @@ def raster(values):
 
 
 @pytest.fixture(scope="module")
-def opened(made_once, make_ortho):
-    return open_map(known_map(made_once, make_ortho).path)
-
-
-@pytest.fixture(scope="module")
 def town():
     """Ground of 2 % and houses of 12 m above it, up to 10 m high."""
-    at = np.arange(FINEST_M / 2, SIDE_M, FINEST_M) - SIDE_M / 2
-    east, north = np.meshgrid(at, -at)
+    east, north = np.meshgrid(AT_M, -AT_M)
     number = np.floor(east / 30.0) * 17 + np.floor(north / 30.0) * 5
     houses = (np.mod(east, 30.0) < 12.0) & (np.mod(north, 30.0) < 12.0)
     above = houses * (4.0 + np.mod(number, 7.0))
@@ -64,8 +57,9 @@ def town():
 
 def on(opened, ground, surface, lean=None):
     localizer = Localizer(opened)
-    registration = localizer.registration
-    registration.ground = GroundModel(Heights(ground), localizer.grid, None, None, surface, lean)
+    localizer.registration.ground = GroundModel(
+        Heights(ground), localizer.grid, None, None, surface, lean
+    )
     return localizer
 
 
@@ -107,14 +101,10 @@ def test_the_camera_is_found_among_houses_to_decimetres(opened, town, view):
 def test_the_camera_is_approached_from_metres_and_degrees(opened, town, view):
     """Where only the finer level shows it."""
     _, ground, above = town
-    registration = on(opened, ground, Heights(above)).registration
-    prepared = prepared_view(registration, view, True)
-    seen = ViewOverGround(registration.ground, prepared, registration.reference)
+    off = PLACE + np.array([2.0, -1.5]), ATTITUDE[0] + 1.0, 0.98
+    over_ground, pose = placed(on(opened, ground, Heights(above)), view, *off)
+    found, start = approached(over_ground, pose), over_ground.orientation(pose)
     below = float(ground.at(PLACE[:1], PLACE[1:])[0])
-    off = np.array([PLACE[0] + 2.0, PLACE[1] - 1.5, np.radians(ATTITUDE[0] + 1.0), np.log(0.98)])
-    pose = pose_of(registration, prepared, off)
-    found = approached(seen, pose)
-    start = seen.orientation(pose)
     truth = np.array([*PLACE, below + AGL_M / 2])
     assert np.linalg.norm(start.position_m - truth) > 2.0
     assert np.linalg.norm(found.position_m - truth) < 0.7
@@ -127,12 +117,9 @@ def test_a_camera_that_the_picture_does_not_show_among_houses_is_not_found(opene
     blots = cv2.GaussianBlur(rng.normal(0.0, 1.0, view.grey.shape), (0, 0), 3.0)
     other = np.clip(128 + 40 * blots / blots.std(), 0, 255).astype(np.uint8)
     for surface, shown in ((Heights(above), False), (None, True)):  # over bare ground not asked
-        registration = on(opened, ground, surface).registration
+        localizer = on(opened, ground, surface)
         for picture, found in ((view.grey, True), (other, shown)):
-            prepared = prepared_view(registration, replace(view, grey=picture), True)
-            seen = ViewOverGround(registration.ground, prepared, registration.reference)
-            pose = pose_of(registration, prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
-            camera = camera_of(seen, pose, 1.0, 0.0)
+            camera = camera_of(*placed(localizer, replace(view, grey=picture)), 1.0, 0.0)
             assert (camera is not None) == found
 
 
@@ -140,13 +127,9 @@ def test_a_camera_that_the_picture_does_not_show_among_houses_is_not_found(opene
 def test_houses_that_lean_on_the_map_are_seen_where_they_stand(opened, town, view, east, north):
     _, ground, above = town
     lean = Lean(east, north, 0.0)
-    registration = on(opened, ground, Heights(shown(above, lean)), lean).registration
-    prepared = prepared_view(registration, view, True)
-    seen = ViewOverGround(registration.ground, prepared, registration.reference)
-    pose = pose_of(registration, prepared, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
-    nodes, on_map = seen._nodes_m(pose, 0, (120, 160), smooth=False)
-    level_m = registration.ground.terrain.at_en_m(on_map[..., :2])
-    high_m = nodes[..., 2] - level_m
+    over_ground, pose = placed(on(opened, ground, Heights(shown(above, lean)), lean), view)
+    nodes, on_map = over_ground._nodes_m(pose, 0, (120, 160), smooth=False)
+    high_m = nodes[..., 2] - over_ground.ground.terrain.at_en_m(on_map[..., :2])
     off_m = on_map[..., :2] - nodes[..., :2] - high_m[..., None] * [east, north]
     assert np.nanmax(np.abs(off_m)) < 1e-6 and np.nanmax(high_m) > 5.0
 
@@ -155,8 +138,7 @@ def test_the_camera_is_found_on_a_map_whose_houses_lean(opened, town):
     """The map shows roofs beside their place; in the view they are where they stand."""
     grey, ground, above = town
     lean, high = Lean(0.3, -0.2, 0.0), above.values
-    at = np.arange(FINEST_M / 2, SIDE_M, FINEST_M) - SIDE_M / 2
-    east, north = np.meshgrid(at, -at)
+    east, north = np.meshgrid(AT_M, -AT_M)
     roofs = raster(grey.at(east + lean.east * high, north + lean.north * high))
     view = seen_by_camera(roofs, ground, above)
     found = (localizer := on(opened, ground, Heights(shown(above, lean)), lean)).locate(view)
@@ -172,14 +154,10 @@ def test_an_unknown_height_at_the_rim_hides_nothing_less(opened, town, view):
     holed = raster(np.where(np.arange(len(above.values))[:, None] < 940, above.values, np.nan))
     hides = []
     for surface in (above, holed):
-        registration = on(opened, ground, Heights(surface)).registration
-        seen = ViewOverGround(
-            registration.ground, prepared_view(registration, view, True), registration.reference
-        )
-        pose = pose_of(registration, seen.view, np.array([*PLACE, np.radians(ATTITUDE[0]), 0.0]))
-        nodes, _ = seen._nodes_m(pose, 0, (200, 260), smooth=False)
+        over_ground, pose = placed(on(opened, ground, Heights(surface)), view)
+        nodes, _ = over_ground._nodes_m(pose, 0, (200, 260), smooth=False)
         assert np.isfinite(nodes[..., :2]).all()
-        hides.append(hidden(nodes, seen.orientation(pose).position_m))
+        hides.append(hidden(nodes, over_ground.orientation(pose).position_m))
     known = np.isfinite(nodes[..., 2])
     assert hides[0][known].sum() > 50
     assert hides[1][known].sum() > 0.5 * hides[0][known].sum()  # not none
@@ -208,9 +186,9 @@ def test_a_leaning_house_hides_the_ground_behind_it():
 def test_a_hole_hides_no_more_than_itself(opened, town, view):
     """Smoothing leaves out what is unknown: a hole, and all beyond the map, next to the view."""
     _, ground, above = town
-    at = ground.west_m + FINEST_M * (np.arange(ground.values.shape[1]) + 0.5)
-    near = (np.abs(at[None, :] - PLACE[0] - 20.0) < 4.0) & (np.abs(-at[:, None] - PLACE[1]) < 4.0)
-    beyond = np.broadcast_to(at[None, :] < PLACE[0] - 40.0, near.shape)
+    east, north = np.meshgrid(AT_M, -AT_M)
+    near = (np.abs(east - PLACE[0] - 20.0) < 4.0) & (np.abs(north - PLACE[1]) < 4.0)
+    beyond = east < PLACE[0] - 40.0
     whole = on(opened, ground, Heights(above)).locate(view)
     for missing in (near, beyond):
         holed = raster(np.where(missing, np.nan, ground.values))
@@ -236,8 +214,7 @@ def test_smoothing(side):
 def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
     """A valley 40 m deep east of the camera: the scale of views that look into it is larger."""
     grey, _, _ = town
-    at = np.arange(FINEST_M / 2, SIDE_M, FINEST_M) - SIDE_M / 2
-    cliff = raster(np.broadcast_to(np.where(at > 0, 60.0, 100.0), grey.values.shape))
+    cliff = raster(np.broadcast_to(np.where(AT_M > 0, 60.0, 100.0), grey.values.shape))
     registration = on(opened, cliff, None).registration
     agl_m = AGL_M / 2
 
