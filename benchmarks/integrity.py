@@ -63,7 +63,8 @@ class Judged:
     def of(cls, rows: list[dict[str, Any]]) -> "Judged":
         """From the rows of `views_of` that have a fix."""
         made = [
-            features_of(Scores.of(each["evidence"]), Chances(**each["chances"])) for each in rows
+            features_of(Scores.of(each["evidence"]), Chances.from_plain(each["chances"]))
+            for each in rows
         ]
         features, right = np.stack(made), np.array([each["right"] for each in rows])
         scenes, place = np.array([each["scene"] for each in rows]), np.zeros(len(rows))

@@ -205,7 +205,7 @@ def _placed(
     right = case.kind in ("found", "beside") and error_m <= far_m
     return {
         "evidence": {name: float(f"{value:.5g}") for name, value in fix.evidence.items()},
-        "chances": asdict(localizer.confidence.chances),
+        "chances": localizer.confidence.chances.to_plain(),
         "off_en_m": np.round(off_m, 3).tolist(),
         "cov_en_m2": [float(f"{each:.5g}") for each in fix.cov_en_m2[[0, 0, 1], [0, 1, 1]]],
         "agl_m": round(fix.agl_m, 2),

@@ -6,12 +6,11 @@
    rectifies the rest with its own heading up. Everything wrong with a view becomes a
    `NoFix` with a reason; nothing is raised but `CameraError`, for a camera of another size.
 2. `search.Search` runs stages that find candidates, the cheapest first: a correlation with the map
-   by FFT, or the tiles whose embeddings are most similar (`tiles`). What is tried, what it costs
-   and when it ends are numbers of a `SearchPlan`.
+   by FFT, or the tiles whose embeddings are most similar (`tiles`). `prepared` is the map as all
+   searches share it; what is tried, what it costs and when it ends are the numbers of `plan`.
 3. `place.CandidateRefiner` refines candidates from coarse to fine and compares the best place with
    its strongest rival; the search ends as soon as it stands out. On a map with a terrain the best
-   are orthorectified on it first (`ground`). Where none is recognized, gradients alone decide
-   (`search.found_by`).
+   are orthorectified on it first (`ground`). Where none is recognized, gradients alone decide.
 4. `camera` fits position, height, heading, pitch and roll to the blocks of the view there, with the
    reported ones as a prior. That gives their covariance too.
 5. `fix` states what was found; `confidence` is the probability that the place is right, from its

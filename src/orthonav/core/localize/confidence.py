@@ -25,8 +25,6 @@ FEATURES = (
     "log_alone_gradients",
 )
 NEARBY = 2  # the last features compare with the ground nearby: it fits nowhere near as well
-CHANCES = {"total": "total", "mid": "look", "fine": "fine"}
-"""Keys of maps by the names here."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +40,20 @@ class Chances:
         if not all(0 < value < math.inf for value in (self.total, self.mid, self.fine)):
             raise VariantError(f"chance values must be above 0 and finite: {self}")
 
+    def to_plain(self) -> dict[str, float]:
+        return {key: getattr(self, name) for name, key in CHANCES.items()}
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "Chances":
+        return cls(**{name: float(plain[key]) for name, key in CHANCES.items()})
+
     def of_strength(self, scores: "Scores") -> float:
         """By chance, of one level or of two."""
         return self.mid if math.isnan(scores.detail_ratio) else self.total
+
+
+CHANCES = {"total": "total", "mid": "look", "fine": "fine"}
+"""Keys of maps by the names here."""
 
 
 @dataclass(frozen=True)
@@ -146,14 +155,13 @@ class RegisteredConfidence:
         return {
             "biases": list(self.biases),
             "weights": dict(zip(FEATURES, self.weights, strict=True)),
-            "chances": {key: getattr(self.chances, name) for name, key in CHANCES.items()},
+            "chances": self.chances.to_plain(),
         }
 
     @classmethod
     def from_plain(cls, plain: Any) -> "RegisteredConfidence":
         try:
-            stored = plain["chances"]
-            chances = Chances(**{name: float(stored[key]) for name, key in CHANCES.items()})
+            chances = Chances.from_plain(plain["chances"])
             first, second = plain["biases"]
             biases = float(first), float(second)
             weights = tuple(float(plain["weights"][name]) for name in FEATURES)
