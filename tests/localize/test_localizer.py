@@ -24,23 +24,20 @@ GROUND_M = 420
 
 @pytest.fixture(scope="module")
 def views(flight):
-    """Views of the second date: grey levels and telemetry by frame."""
-    return {view.frame: (view.grey(), view.telemetry) for view in flight.views}
+    """Views of the second date by frame."""
+    return {each.frame: View(each.grey(), flight.camera, each.telemetry) for each in flight.views}
 
 
 @pytest.fixture(scope="module")
-def fixes(views, flight, localizer):
+def fixes(views, localizer):
     """Their fixes, without any prior."""
-    return {
-        name: localizer.locate(View(grey, flight.camera, telemetry))
-        for name, (grey, telemetry) in views.items()
-    }
+    return {name: localizer.locate(view) for name, view in views.items()}
 
 
 @pytest.fixture(scope="module")
-def good(fixes, localizer, truth_en_m):
-    """The frame that is placed best."""
-    return min(fixes, key=lambda name: error_m(localizer, fixes[name], truth_en_m[name]))
+def good(views, fixes, localizer, truth_en_m):
+    """The view that is placed best."""
+    return views[min(fixes, key=lambda name: error_m(localizer, fixes[name], truth_en_m[name]))]
 
 
 class Ground:
@@ -56,8 +53,8 @@ class Ground:
         self.camera, self.agl_m = area.camera, area.agl_m
         self.mosaic, self.frame = Mosaic.open([area.past]), localizer.sheet.frame
 
-    def view(self, east_m, north_m, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0, camera=None):
-        """Grey levels of a view from that place, and its telemetry."""
+    def view(self, east_m, north_m, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0):
+        """A view from that place."""
         west, north = east_m - GROUND_M, north_m + GROUND_M
         sheet = self.mosaic.sheet(
             self.frame,
@@ -72,14 +69,18 @@ class Ground:
         attitude = (yaw_deg, pitch_deg, roll_deg, self.agl_m)
         corner = np.array([-GROUND_M, GROUND_M], float)
         rng = np.random.default_rng(0)
-        picture = render_view(camera or self.camera, attitude, rgb, corner, 1.0, PLAIN, rng)
+        picture = render_view(self.camera, attitude, rgb, corner, 1.0, PLAIN, rng)
         grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
-        return grey, Telemetry(0, yaw_deg, pitch_deg, roll_deg, self.agl_m)
+        return View(grey, self.camera, Telemetry(0, *attitude))
 
 
 @pytest.fixture(scope="module")
 def ground(area, localizer):
     return Ground(area, localizer)
+
+
+def reported(view, **changes):
+    return replace(view, telemetry=replace(view.telemetry, **changes))
 
 
 def test_most_views_of_another_date_are_placed(fixes, localizer, truth_en_m):
@@ -89,9 +90,9 @@ def test_most_views_of_another_date_are_placed(fixes, localizer, truth_en_m):
     assert np.median(right) > 0.5
 
 
-def test_a_fix_states_its_evidence(fixes, flight, localizer):
-    for view in flight.views:
-        fix = fixes[view.frame]
+def test_a_fix_states_its_evidence(views, fixes, localizer):
+    for frame, view in views.items():
+        fix = fixes[frame]
         assert isinstance(fix, Fix) and set(fix.evidence) >= EVIDENCE
         assert all(math.isfinite(value) for value in fix.evidence.values())
         assert fix.evidence["tiles_searched"] == localizer.sheet.tiles
@@ -106,12 +107,9 @@ def test_a_fix_states_its_evidence(fixes, flight, localizer):
             fix.evidence["score"] = 1.0
 
 
-def test_a_prior_outside_the_map(views, flight, localizer, good):
-    grey, telemetry = views[good]
+def test_a_prior_outside_the_map(localizer, good):
     for place in ([50_000.0, 0.0], [0.0, -3000.0]):
-        outcome = localizer.locate(
-            View(grey, flight.camera, telemetry), prior=prior_at(localizer, place, 100.0)
-        )
+        outcome = localizer.locate(good, prior=prior_at(localizer, place, 100.0))
         assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
 
 
@@ -119,15 +117,14 @@ def test_unknown_heading(ground, localizer):
     places = [(-150.0, 40.0), (60.0, -30.0), (170.0, 100.0), (0.0, 0.0), (-60.0, -90.0)]
     found = 0
     for place in places:
-        grey, telemetry = ground.view(*place, yaw_deg=137.0)
-        telemetry = replace(telemetry, yaw_deg=math.nan)
-        fix = localizer.locate(View(grey, ground.camera, telemetry), heading_known=False)
+        view = reported(ground.view(*place, yaw_deg=137.0), yaw_deg=math.nan)
+        fix = localizer.locate(view, heading_known=False)
         assert isinstance(fix, Fix)
         right = error_m(localizer, fix, np.array(place)) <= localizer.grid.stride_m
         found += right
         if right:
             assert abs((fix.heading_deg - 137 + 180) % 360 - 180) <= 8
-        refused = localizer.locate(View(grey, ground.camera, telemetry))
+        refused = localizer.locate(view)
         assert refused.reason == "missing_telemetry" and "yaw_deg" in refused.detail
     assert found >= 4
 
@@ -135,16 +132,11 @@ def test_unknown_heading(ground, localizer):
 @pytest.mark.parametrize("attitude", [(0, 15, -10), (75, 15, -10), (200, -12, 14), (0, 0, 25)])
 def test_tilt_is_compensated(ground, localizer, attitude):
     place = np.array([40.0, -10.0])
-    level = localizer.locate(View(*args_of(ground, place, (attitude[0], 0, 0))))
-    tilted = localizer.locate(View(*args_of(ground, place, attitude)))
+    level = localizer.locate(ground.view(*place, float(attitude[0])))
+    tilted = localizer.locate(ground.view(*place, *map(float, attitude)))
     assert error_m(localizer, level, place) <= localizer.grid.stride_m
     apart = place_of(localizer, level) - place_of(localizer, tilted)
     assert np.abs(apart).max() <= localizer.grid.stride_m
-
-
-def args_of(ground, place, attitude):
-    grey, telemetry = ground.view(*place, *map(float, attitude))
-    return grey, ground.camera, telemetry
 
 
 REFUSED_TELEMETRY = [
@@ -166,9 +158,8 @@ REFUSED_TELEMETRY = [
 
 
 @pytest.mark.parametrize("changes, reason", REFUSED_TELEMETRY)
-def test_telemetry_that_makes_no_fix(views, flight, localizer, good, changes, reason):
-    grey, telemetry = views[good]
-    outcome = localizer.locate(View(grey, flight.camera, replace(telemetry, **changes)))
+def test_telemetry_that_makes_no_fix(localizer, good, changes, reason):
+    outcome = localizer.locate(reported(good, **changes))
     assert isinstance(outcome, NoFix) and outcome.reason == reason
     assert outcome.detail and "\n" not in outcome.detail
 
@@ -190,12 +181,13 @@ def test_pictures_that_make_no_fix(localizer, grey, reason):
     assert isinstance(outcome, NoFix) and outcome.reason == reason
 
 
-def test_a_picture_that_is_turned_in_memory_is_one_like_any_other(views, flight, localizer, good):
+def test_a_picture_that_is_turned_in_memory_is_one_like_any_other(localizer, good):
     """As of a camera mounted upside down: `image[::-1, ::-1]` is no copy."""
-    grey, telemetry = views[good]
-    grey = cv2.resize(grey, None, fx=4, fy=4)
+    grey = cv2.resize(good.grey, None, fx=4, fy=4)
     turned = np.ascontiguousarray(grey[::-1, ::-1])[::-1, ::-1]
-    one, other = (localizer.locate(View(each, flight.camera, telemetry)) for each in (grey, turned))
+    one, other = (
+        localizer.locate(View(each, good.camera, good.telemetry)) for each in (grey, turned)
+    )
     assert (one.lat_deg, one.lon_deg) == (other.lat_deg, other.lon_deg)
 
 
@@ -239,10 +231,9 @@ priors = st.none() | st.builds(
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(telemetry=telemetry, prior=priors, heading_known=st.booleans() | st.just(True))
-def test_no_telemetry_raises(localizer, views, flight, good, telemetry, prior, heading_known):
-    outcome = localizer.locate(
-        View(views[good][0], flight.camera, telemetry), prior=prior, heading_known=heading_known
-    )
+def test_no_telemetry_raises(localizer, good, telemetry, prior, heading_known):
+    view = View(good.grey, good.camera, telemetry)
+    outcome = localizer.locate(view, prior=prior, heading_known=heading_known)
     if isinstance(outcome, NoFix):
         assert outcome.reason and outcome.detail
         return

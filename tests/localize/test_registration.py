@@ -4,6 +4,7 @@ import math
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from blots import (
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.place import CandidateRefiner
 from orthonav.core.localize.plan import ClearMargin
-from orthonav.core.mapfile import GreyLayer, open_map
+from orthonav.core.mapfile import GreyLayer, open_map, write_map
 from orthonav.core.mapfile.layer import part_names
 from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
 from orthonav.ground.build import BuildRequest, build_map
@@ -69,13 +70,22 @@ PLACES = [(-120.0, 95.0), (60.3, -110.7), (133.1, 140.2), (-30.0, 5.5), (10.0, -
 HEADINGS = [0.0, 77.0, 181.0, -100.0, 290.0]
 
 
+class Plain(NamedTuple):
+    """A view like any other, its place and its fix."""
+
+    view: View
+    place: np.ndarray
+    fix: Fix
+
+    def reported(self, **changes):
+        return replace(self.view, telemetry=replace(self.view.telemetry, **changes))
+
+
 @pytest.fixture(scope="module")
 def plain(localizer):
-    """A view like any other: grey levels, telemetry, place and fix."""
     place = np.array([40.0, -25.0])
-    grey, reported = rendered(GROUND, place, (33.0, 0.0, 0.0)), telemetry(33.0)
-    grey.flags.writeable = False
-    return grey, reported, place, localizer.locate(View(grey, CAMERA, reported))
+    view = View(rendered(GROUND, place, (33.0, 0.0, 0.0)), CAMERA, telemetry(33.0))
+    return Plain(view, place, localizer.locate(view))
 
 
 @pytest.mark.parametrize("place, yaw_deg", list(zip(PLACES, HEADINGS, strict=True)))
@@ -94,7 +104,7 @@ def test_a_view_is_placed_to_a_fraction_of_a_pixel(localizer, place, yaw_deg):
 
 
 def test_a_fix_states_its_evidence(localizer, plain):
-    fix = plain[3]
+    fix = plain.fix
     assert set(fix.evidence) >= EVIDENCE and fix.radius_m == localizer.registration.radius_m
     assert all(math.isfinite(fix.evidence[name]) for name in EVIDENCE)
     assert fix.evidence["overlap"] == pytest.approx(1) and fix.evidence["agreement"] > 0.9
@@ -132,48 +142,41 @@ def test_the_position_is_that_of_the_camera(localizer, attitude):
 @pytest.mark.parametrize("yaw_deg", [3.0, pytest.param(125.0, marks=pytest.mark.slow), 257.0])
 def test_unknown_heading(localizer, yaw_deg):
     place = np.array([-60.0, 50.0])
-    grey = rendered(GROUND, place, (yaw_deg, 5.0, -4.0))
     reported = telemetry(math.nan, 5.0, -4.0, tilt_std_deg=0.0)
-    fix = localizer.locate(View(grey, CAMERA, reported), heading_known=False)
+    view = View(rendered(GROUND, place, (yaw_deg, 5.0, -4.0)), CAMERA, reported)
+    fix = localizer.locate(view, heading_known=False)
     assert error_m(localizer, fix, place) < 0.15 and fix.confidence > 0.9
     assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1
-    refused = localizer.locate(View(grey, CAMERA, reported))
+    refused = localizer.locate(view)
     assert isinstance(refused, NoFix) and refused.reason == "missing_telemetry"
-    near = localizer.locate(
-        View(grey, CAMERA, reported), heading_known=False, prior=prior_at(localizer, place, 20.0)
-    )
+    near = localizer.locate(view, heading_known=False, prior=prior_at(localizer, place, 20.0))
     assert error_m(localizer, near, place) < 0.15
 
 
 def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, monkeypatch):
     """Memory has a bound: by tiles if views are as large, else not at all."""
-    grey, reported, place, free = plain
-    rows, cols = localizer.registration.pyramid.shape(0)
-    monkeypatch.setattr(localizer.registration, "plan", planned(max_search_px=40_000))
-    asked = []
-    whole = localizer.registration.windows.whole
+    registration, asked = localizer.registration, []
+    rows, cols = registration.pyramid.shape(0)
+    whole = registration.windows.whole
+    monkeypatch.setattr(registration, "plan", planned(max_search_px=40_000))
     monkeypatch.setattr(
-        localizer.registration.windows,
-        "whole",
-        lambda *window: asked.append(window[0]) or whole(*window),
+        registration.windows, "whole", lambda *window: asked.append(window[0]) or whole(*window)
     )
-    alone = localizer.locate(View(grey, CAMERA, reported))
+    alone = localizer.locate(plain.view)
     assert not [level for level in asked if (rows >> level) * (cols >> level) > 40_000]
     assert isinstance(alone, Fix) or (alone.reason == "no_match" and "prior" in alone.detail)
-    fix = localizer.locate(View(grey, CAMERA, reported), prior=prior_at(localizer, place, 5.0))
-    assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
-    monkeypatch.setattr(localizer.registration, "propose", None)
-    monkeypatch.setattr(localizer.registration, "plan", planned(max_search_px=100))
-    nothing = localizer.locate(View(grey, CAMERA, reported))
+    fix = localizer.locate(plain.view, prior=prior_at(localizer, plain.place, 5.0))
+    assert place_of(localizer, fix) == pytest.approx(place_of(localizer, plain.fix), abs=0.1)
+    monkeypatch.setattr(registration, "propose", None)
+    monkeypatch.setattr(registration, "plan", planned(max_search_px=100))
+    nothing = localizer.locate(plain.view)
     assert nothing.reason == "no_match" and "prior" in nothing.detail
 
 
-@pytest.fixture
-def from_tiles_only(localizer, monkeypatch):
-    """The localizer's plan allows no search by FFT; the candidates that it refined."""
-    registration = localizer.registration
+def test_a_view_is_found_by_tiles_alone(localizer, plain, monkeypatch):
+    """The plan allows no search by FFT."""
     plan = planned(max_search_px=100, tile_candidates=(40, 80))
-    monkeypatch.setattr(registration, "plan", plan)
+    monkeypatch.setattr(localizer.registration, "plan", plan)
     refine, candidates = CandidateRefiner.to_mid_level, []
 
     def noted(refiner, poses, *more):
@@ -181,34 +184,24 @@ def from_tiles_only(localizer, monkeypatch):
         return refine(refiner, poses, *more)
 
     monkeypatch.setattr(CandidateRefiner, "to_mid_level", noted)
-    return candidates
-
-
-def test_a_view_is_found_by_tiles_alone(localizer, plain, from_tiles_only):
-    grey, reported, _, free = plain
-    fix = localizer.locate(View(grey, CAMERA, reported))
-    assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
-    assert len(from_tiles_only) > 5
+    fix = localizer.locate(plain.view)
+    assert place_of(localizer, fix) == pytest.approx(place_of(localizer, plain.fix), abs=0.1)
+    assert len(candidates) > 5
 
 
 def test_the_prior_is_that_of_the_aircraft_not_of_the_ground_seen(localizer):
     place = np.array([-20.0, -60.0])
     grey = rendered(GROUND, place, (45.0, 30.0, 0.0))
     reported = telemetry(45.0, 30.0, yaw_std_deg=1.0)
-    for heading_known in (True, False):
-        fix = localizer.locate(
-            View(grey, CAMERA, reported),
-            prior=prior_at(localizer, place, 2.0),
-            heading_known=heading_known,
-        )
+    prior = prior_at(localizer, place, 2.0)
+    for known in (True, False):
+        fix = localizer.locate(View(grey, CAMERA, reported), prior=prior, heading_known=known)
         assert error_m(localizer, fix, place) < 0.3
 
 
 @pytest.mark.parametrize("away_en_m", [(50_000.0, 0.0), (0.0, -3000.0), (-900.0, 900.0)])
 def test_a_prior_outside_is_outside_the_map(localizer, plain, away_en_m):
-    outcome = localizer.locate(
-        View(plain[0], CAMERA, plain[1]), prior=prior_at(localizer, away_en_m, 100.0)
-    )
+    outcome = localizer.locate(plain.view, prior=prior_at(localizer, away_en_m, 100.0))
     assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
 
 
@@ -273,17 +266,15 @@ def test_a_narrow_prior_does_not_raise_the_confidence_of_negatives(localizer):
 
 def test_threads_within_a_view_change_nothing(localizer, map_path, plain):
     threaded = Localizer(open_map(map_path), plan=planned(threads=3))
-    view = View(plain[0], CAMERA, plain[1])
-    assert same(*(each.locate(view, heading_known=False) for each in (localizer, threaded)))
+    assert same(*(each.locate(plain.view, heading_known=False) for each in (localizer, threaded)))
 
 
 def test_a_spent_budget_leaves_the_best_place_so_far(map_path, plain):
     """One that ends before the first search does, so that only this one is made. No margin is
     enough to end the search here, and such a place is not confident."""
     doubting = planned(clear=NEVER_CLEAR, clear_at_mid=NEVER_CLEAR)
-    view = View(plain[0], CAMERA, plain[1])
     whole, fix = (
-        Localizer(open_map(map_path), plan=plan).locate(view)
+        Localizer(open_map(map_path), plan=plan).locate(plain.view)
         for plan in (doubting, replace(doubting, budget_ms=1e-6))
     )
     assert isinstance(whole, Fix) and isinstance(fix, Fix)
@@ -294,14 +285,12 @@ def test_a_spent_budget_leaves_the_best_place_so_far(map_path, plain):
 
 def test_threads_may_share_a_localizer(localizer, map_path):
     views = [
-        (rendered(GROUND, place, (yaw, 4.0, 0.0)), telemetry(yaw + 2, 4.0))
+        View(rendered(GROUND, place, (yaw, 4.0, 0.0)), CAMERA, telemetry(yaw + 2, 4.0))
         for place, yaw in zip(PLACES[:4], HEADINGS[:4], strict=True)
     ]
-    alone = [localizer.locate(View(grey, CAMERA, reported)) for grey, reported in views]
-    cold = Localizer(open_map(map_path))
     with ThreadPoolExecutor(2) as pool:
-        shared = list(pool.map(lambda view: cold.locate(View(view[0], CAMERA, view[1])), views))
-    assert all(same(one, other) for one, other in zip(alone, shared, strict=True))
+        shared = list(pool.map(Localizer(open_map(map_path)).locate, views))
+    assert all(same(localizer.locate(view), fix) for view, fix in zip(views, shared, strict=True))
 
 
 def test_a_map_without_the_layer_is_flown_by_its_tiles(known, tmp_path, plain):
@@ -314,14 +303,12 @@ def test_a_map_without_the_layer_is_flown_by_its_tiles(known, tmp_path, plain):
     assert GreyLayer.of(opened) is None and opened.manifest.registration is None
     made = Localizer(opened)
     assert made.registration is None
-    fix = made.locate(View(plain[0], CAMERA, plain[1]))
-    assert error_m(made, fix, plain[2]) < made.grid.stride_m
+    fix = made.locate(plain.view)
+    assert error_m(made, fix, plain.place) < made.grid.stride_m
 
 
 def damaged(map_path, folder):
     """A copy of the map whose chunks hold no picture, but their sums are right."""
-    from orthonav.core.mapfile import write_map
-
     opened = open_map(map_path)
     arrays = {name: np.array(part) for name, part in opened.arrays.items()}
     name = part_names(0)["bytes"]
@@ -333,7 +320,7 @@ def damaged(map_path, folder):
 
 def test_a_damaged_layer_gives_no_fix(map_path, tmp_path, plain, caplog):
     broken = Localizer(damaged(map_path, tmp_path))
-    outcome, latency_ms = locate_view(SingleViews(broken), View(plain[0], CAMERA, plain[1]))
+    outcome, latency_ms = locate_view(SingleViews(broken), plain.view)
     assert isinstance(outcome, NoFix) and outcome.reason == "map_damaged"
     assert "damaged" in outcome.detail and latency_ms > 0
     assert [record.exc_info for record in caplog.records] == [None]  # a line, no traceback
@@ -341,7 +328,7 @@ def test_a_damaged_layer_gives_no_fix(map_path, tmp_path, plain, caplog):
 
 def test_a_swapped_prior_is_named(localizer, plain):
     lat_deg, lon_deg = localizer.opened.frame.latlon_from_en([0.0, 0.0])
-    outcome = localizer.locate(View(plain[0], CAMERA, plain[1]), prior=Prior(lon_deg, lat_deg, 50))
+    outcome = localizer.locate(plain.view, prior=Prior(lon_deg, lat_deg, 50))
     assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
     assert "seem to be swapped" in outcome.detail
 
@@ -359,6 +346,5 @@ ODD = {
 
 @pytest.mark.parametrize("changes", ODD.values(), ids=ODD.keys())
 def test_invalid_deviations_are_tolerated(localizer, plain, changes):
-    grey, reported, place, _ = plain
-    fix = localizer.locate(View(grey, CAMERA, replace(reported, **changes)))
-    assert error_m(localizer, fix, place) < 0.5 and 0 <= fix.heading_deg < 360
+    fix = localizer.locate(plain.reported(**changes))
+    assert error_m(localizer, fix, plain.place) < 0.5 and 0 <= fix.heading_deg < 360

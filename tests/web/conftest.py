@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1] / "localizer"))  # blots.py: the known ground
+sys.path.append(str(Path(__file__).parents[1] / "localize"))  # blots.py: the known ground
 
 from small_run import PLACES_EN_M, Small, result, serving, write_small_flight, write_small_map
 
