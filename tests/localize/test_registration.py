@@ -160,7 +160,7 @@ def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, mo
     whole = registration.windows.whole
     monkeypatch.setattr(registration, "plan", planned(max_search_px=40_000))
     monkeypatch.setattr(
-        registration.windows, "whole", lambda *window: asked.append(window[0]) or whole(*window)
+        registration.windows, "whole", lambda *view: asked.append(view[0].level) or whole(*view)
     )
     alone = localizer.locate(plain.view)
     assert not [level for level in asked if (rows >> level) * (cols >> level) > 40_000]

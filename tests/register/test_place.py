@@ -32,13 +32,13 @@ def prior_of(pose, std_deg=8.0):
 
 def searched(reference, templates, prior, level, count=24):
     """Candidates anywhere on the sheet."""
-    recipe = LEVELS.recipe(level)
-    window = SearchWindows(reference).whole(level, recipe, templates.side_px)
+    template = LEVELS.template(templates, level)
+    window = SearchWindows(reference).whole(template, templates.side_px)
     std_rad = None if prior.heading_rad is None else prior.heading_std_rad
     steps = {"heading_step_rad": math.radians(8), "scale_step": 0.13, "sigmas": 2}
     poses = bank(std_rad, prior.log_scale_std, **steps)
     around = [((prior.heading_rad or 0.0) + turn, scale) for turn, scale in poses]
-    return [each.pose for each in search(templates.at(level, recipe), window, around, count)]
+    return [each.pose for each in search(template, window, around, count)]
 
 
 def verified(refiner, candidates, level, **more):

@@ -157,11 +157,12 @@ def test_nothing_to_compare_is_no_crash(reference):
 
 def test_threads_may_ask_for_windows_of_many_sizes():
     windows = SearchWindows(reference_of(GROUND, (64, 64)))
-    windows.whole(2, FINE, 20.0)
+    template = templates_of(GROUND, Pose(32.0, 32.0, 0.0, 0.0)).at(2)
+    windows.whole(template, 20.0)
 
     def ask(seed):
         for view_px in np.random.default_rng(seed).uniform(8, 300, 400):
-            windows.whole(2, FINE, float(view_px))
+            windows.whole(template, float(view_px))
 
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)

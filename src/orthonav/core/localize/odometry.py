@@ -12,7 +12,7 @@ from orthonav.core.localize.place import CandidateRefiner
 from orthonav.core.localize.view import check_footprint, downsampled, rectify_footprint
 from orthonav.core.records import Telemetry, View
 from orthonav.core.register.refine import Fit
-from orthonav.core.register.search import SearchWindows, bank, largest_half_px, search
+from orthonav.core.register.search import bank, search_around
 from orthonav.core.register.template import FINE, ChannelRecipe, Levels, ViewTemplates
 from orthonav.core.register.window import DirectionPrior, Pose, Reference
 
@@ -333,17 +333,14 @@ def _registered(
         scale_step=ODOMETRY.scale_step,
         sigmas=2.5,
     )
-    poses = [((prior.heading_rad or 0.0) + turn, scale) for turn, scale in tried]
+    directions = [((prior.heading_rad or 0.0) + turn, scale) for turn, scale in tried]
     level = refiner.levels.coarse
-    recipe = refiner.levels.recipe(level)
-    template = templates.at(level, recipe)
-    reach_px, half_px = _reach_px(before, now) + 2.0 * 2**level, largest_half_px(template, poses)
-    windows = SearchWindows(reference)
-    window = windows.part(level, recipe, side_px, before.middle_px, reach_px, half_px)
-    found = [each.pose for each in search(template, window, poses, ODOMETRY.candidates)]
+    template = refiner.levels.template(templates, level)
+    where = before.middle_px, _reach_px(before, now) + 2.0 * 2**level
+    found = search_around(template, reference, directions, *where, side_px, ODOMETRY.candidates)
     if not found:
         return None
-    best = refiner.best(refiner.to_mid_level(found, level))
+    best = refiner.best(refiner.to_mid_level([each.pose for each in found], level))
     return best.place.fit if best.scores.peak_ratio >= ODOMETRY.min_score_ratio else None
 
 

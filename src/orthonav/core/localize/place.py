@@ -20,7 +20,7 @@ from orthonav.core.localize.confidence import Scores
 from orthonav.core.localize.ground import ViewOverGround
 from orthonav.core.localize.view import Orientation
 from orthonav.core.register.refine import Fit, Refiner, sharpness
-from orthonav.core.register.search import Peak, SearchWindows, largest_half_px, search
+from orthonav.core.register.search import Peak, search_around
 from orthonav.core.register.template import Levels, ViewTemplates
 from orthonav.core.register.window import DirectionPrior, Pose, Reference
 
@@ -170,7 +170,7 @@ class CandidateRefiner:
         return fit.score - self.prior.penalty_at(fit.pose)
 
     def refiner(self, level: int, templates: ViewTemplates | None = None) -> Refiner:
-        made = (templates or self.templates).at(level, self.levels.recipe(level))
+        made = self.levels.template(templates or self.templates, level)
         return Refiner(made, self.reference)
 
     def refined(self, pose: Pose, level: int, templates: ViewTemplates | None = None) -> Fit:
@@ -312,18 +312,17 @@ class CandidateRefiner:
 
     def _searched_around(self, pose: Pose, templates: ViewTemplates) -> list[Peak]:
         """The best pose around another one at the coarse level."""
-        level, side_px = self.levels.coarse, self._over_ground.view.side_px
-        poses = [
+        side_px = self._over_ground.view.side_px
+        directions = [
             (pose.heading_rad + turn, pose.log_scale + scale)
             for turn in REFINEMENT.turns_around_rad
             for scale in REFINEMENT.scales_around
         ]
-        recipe = self.levels.recipe(level)
-        template = templates.at(level, recipe)
-        middle, half_px = (pose.x_px, pose.y_px), largest_half_px(template, poses)
-        windows, reach_px = SearchWindows(self.reference), REFINEMENT.reach_around * side_px
-        window = windows.part(level, recipe, side_px, middle, reach_px, half_px)
-        return search(template, window, poses, 1, self.prior.scale_map)
+        template = self.levels.template(templates, self.levels.coarse)
+        where = (pose.x_px, pose.y_px), REFINEMENT.reach_around * side_px
+        return search_around(
+            template, self.reference, directions, *where, side_px, 1, self.prior.scale_map
+        )
 
     # At the final level
 
@@ -489,7 +488,7 @@ class CandidateRefiner:
         detail = math.nan
         if self.levels.final != self.levels.mid:
             detail = max(best.fit.score, 1e-3) / max(best.total - best.fit.score, 1e-3)
-        template = best.templates.at(self.levels.final, self.levels.recipe(self.levels.final))
+        template = self.levels.template(best.templates, self.levels.final)
         return Scores(
             strength=best.score,
             rival=max((each.score for each in far), default=0.0),

@@ -46,6 +46,7 @@ from orthonav.core.register.search import (
     PLACES_AT_ONCE,
     Direction,
     Peak,
+    SearchWindow,
     Steps,
     best_near,
     largest_half_px,
@@ -372,15 +373,14 @@ class Search:
     def _by_fft(self, stage: Stage) -> list[Peak]:
         """The peaks of correlation, of the sheet or of what the prior allows; those of a far level
         at their best places near by."""
-        view, level, windows = self.view, stage.level, self.map.windows
-        recipe = view.levels.recipe(level)
-        template = self.sought.at(level, recipe)
+        view, level = self.view, stage.level
+        template = view.levels.template(self.sought, level)
         if self.prior is None:
-            window = windows.whole(level, recipe, view.side_px)
+            window = self.map.windows.whole(template, view.side_px)
         else:
             half_px = largest_half_px(template, stage.directions)
-            middle, reach = self.middle_px, self.reach_px
-            window = windows.part(level, recipe, view.side_px, middle, reach, half_px)
+            where = view.side_px, self.middle_px, self.reach_px, half_px
+            window = SearchWindow.around(self.map.reference, template, *where)
         # Every thread has memory for a whole window.
         fits = math.prod(window.size) * self.plan.threads <= self.plan.max_search_px
         pool = self.map.pool if fits else None
@@ -434,17 +434,16 @@ class Search:
         return kept
 
     def _moved(self, found: Sequence[Peak], reach_px: float) -> list[Peak]:
-        level, windows = self.levels.coarse, self.map.windows
-        recipe, side_px = self.levels.recipe(level), self.view.templates.side_px
-        template, whole = self.sought.at(level, recipe), None
-        if math.prod(self.map.reference.shape(level)) <= self.plan.whole_window_px:
-            whole = windows.whole(level, recipe, side_px)
+        reference, side_px = self.map.reference, self.view.templates.side_px
+        template, whole = self.levels.template(self.sought, self.levels.coarse), None
+        if math.prod(reference.shape(template.level)) <= self.plan.whole_window_px:
+            whole = self.map.windows.whole(template, side_px)
             whole.prepare_near(template)
 
         def moved(some: Sequence[Peak]) -> list[Peak]:
             place = some[0].pose.x_px, some[0].pose.y_px
-            around_px = reach_px + side_px
-            window = whole or windows.part(level, recipe, side_px, place, around_px)
+            around = template, side_px, place, reach_px + side_px
+            window = whole or SearchWindow.around(reference, *around)
             made = []
             for more in self.plan.nearby_log_scales:
                 poses = [replace(each.pose, log_scale=each.pose.log_scale + more) for each in some]

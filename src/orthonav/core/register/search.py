@@ -147,6 +147,31 @@ class SearchWindow:
         )
         self._made, self._view_px = made, view_px
 
+    @classmethod
+    def around(
+        cls,
+        reference: Reference,
+        template: Template,
+        view_px: float,
+        centre_px: tuple[float, float],
+        reach_px: float,
+        half_px: int | None = None,
+    ) -> "SearchWindow":
+        """The square whose middles of views reach `reach_px` (level 0) around a point (x, y)."""
+        unit = 2.0**template.level
+        margin = math.ceil(view_px / 2 / unit)
+        rows, cols = reference.shape(template.level)
+        low, size = [], []
+        for middle, extent in zip(centre_px, (cols, rows), strict=True):
+            # Middles farther out than half a view see nothing of the sheet.
+            first = math.floor(max((middle - reach_px) / unit, -margin))
+            last = math.ceil(min((middle + reach_px) / unit + 2, extent + margin))
+            low.append(first - margin)
+            size.append(max(last - first, 1) + 2 * margin)
+        (col, row), (width, height) = low, size
+        made = reference.window(template.level, row, col, height, width, template.recipe)
+        return cls(made, template.level, row, col, _rounded_side(view_px / unit), margin, half_px)
+
     @cached_property
     def channels(self) -> Array:
         """Divided by their local energy."""
@@ -202,15 +227,16 @@ def _by_local_energy(channels: Array, counts: Array, view_px: int) -> Array:
 
 
 class SearchWindows:
-    """Of one sheet; threads may share it."""
+    """Of one whole sheet; threads may share it."""
 
     def __init__(self, reference: Reference) -> None:
         self._reference = reference
         self._windows: dict[tuple[int, ChannelRecipe, int], SearchWindow] = {}
         self._lock = threading.Lock()
 
-    def whole(self, level: int, recipe: ChannelRecipe, view_px: float) -> SearchWindow:
+    def whole(self, template: Template, view_px: float) -> SearchWindow:
         """Views of about the same size share it."""
+        level, recipe = template.level, template.recipe
         side = _rounded_side(view_px / 2**level)
         key = (level, recipe, side)
         with self._lock:
@@ -221,30 +247,6 @@ class SearchWindows:
                     self._windows.pop(next(iter(self._windows)))
             self._windows[key] = found  # the least recently used one is the first
         return found
-
-    def part(
-        self,
-        level: int,
-        recipe: ChannelRecipe,
-        view_px: float,
-        centre_px: tuple[float, float],
-        reach_px: float,
-        half_px: int | None = None,
-    ) -> SearchWindow:
-        """The square whose middles of views reach `reach_px` (level 0) around a point (x, y)."""
-        unit = 2.0**level
-        margin = math.ceil(view_px / 2 / unit)
-        rows, cols = self._reference.shape(level)
-        low, size = [], []
-        for middle, extent in zip(centre_px, (cols, rows), strict=True):
-            # Middles farther out than half a view see nothing of the sheet.
-            first = math.floor(max((middle - reach_px) / unit, -margin))
-            last = math.ceil(min((middle + reach_px) / unit + 2, extent + margin))
-            low.append(first - margin)
-            size.append(max(last - first, 1) + 2 * margin)
-        made = self._reference.window(level, low[1], low[0], size[1], size[0], recipe)
-        side = _rounded_side(view_px / unit)
-        return SearchWindow(made, level, low[1], low[0], side, margin, half_px)
 
 
 def _rounded_side(side: float) -> int:
@@ -288,6 +290,22 @@ def search(
         pose = Pose((window.col + x) * unit, (window.row + y) * unit, turn, log_scale)
         found.append(Peak(float(best[row, col]), pose))
     return found
+
+
+def search_around(
+    template: Template,
+    reference: Reference,
+    directions: list[Direction],
+    centre_px: tuple[float, float],
+    reach_px: float,
+    view_px: float,
+    count: int,
+    scales: ScaleMap | None = None,
+) -> list[Peak]:
+    """`search` for views whose middles lie within `reach_px` of a point (x, y), level 0."""
+    half_px = largest_half_px(template, directions)
+    window = SearchWindow.around(reference, template, view_px, centre_px, reach_px, half_px)
+    return search(template, window, directions, count, scales)
 
 
 def best_near(

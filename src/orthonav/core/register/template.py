@@ -346,6 +346,10 @@ class Levels:
     def recipe(self, level: int) -> ChannelRecipe:
         return COARSE if level > self.mid else FINE
 
+    def template(self, templates: "ViewTemplates", level: int) -> Template:
+        """Of a view at a level, by its recipe."""
+        return templates.at(level, self.recipe(level))
+
 
 class ViewTemplates:
     """Templates at the levels of a map, made when asked for, of a view at level `finest`."""
