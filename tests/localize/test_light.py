@@ -62,7 +62,7 @@ def test_the_same_candidates_are_compared_again(localizer):
     search = Search.of(localizer.registration, view(infrared, PLACES[1]))
     again = search.run().search
     assert again is not search
-    assert again.found[: len(search.found)] == search.found and again.budget is search.budget
+    assert again.tried[: len(search.tried)] == search.tried and again.budget is search.budget
     assert again.candidates > search.candidates > 0
     assert again.view.templates.grey_share == again.sought.grey_share == 0
     assert 0 < search.sought.grey_share < search.view.templates.grey_share

@@ -107,24 +107,24 @@ class CameraEstimate:
     middle_covariance: Array | None
 
 
-def approached(seen: ViewOverGround, pose: Pose) -> Orientation | None:
+def approached(over_ground: ViewOverGround, pose: Pose) -> Orientation | None:
     """The camera of a view that was placed at `pose`, known to some pixels; None where too few
     blocks are seen."""
-    start = seen.orientation(pose)
+    start = over_ground.orientation(pose)
     if start is None:
         return None
-    smooth = _climbed(seen, pose, start, FITTING.first_reach_px, finer=False)
-    if seen.ground.surface is None:
+    smooth = _climbed(over_ground, pose, start, FITTING.first_reach_px, finer=False)
+    if over_ground.ground.surface is None:
         return smooth
-    end = _among_houses(seen, pose, start)
+    end = _among_houses(over_ground, pose, start)
     if end is None or smooth is None:
         return smooth if end is None else end.orientation
     if end.moves_px(_correction(end.orientation, smooth)) < (
-        FITTING.house_reaches_px[0] * 2.0 ** (seen.view.levels.final - 1)
+        FITTING.house_reaches_px[0] * 2.0 ** (over_ground.view.levels.final - 1)
     ):
         return end.orientation
     # Over roofs the fit may end at another camera; that which fits best is right.
-    other = _among_houses(seen, pose, smooth)
+    other = _among_houses(over_ground, pose, smooth)
     return end.orientation if other is None or other.fit() <= end.fit() else other.orientation
 
 
@@ -134,17 +134,17 @@ def _correction(one: Orientation, other: Orientation) -> Array:
     return np.concatenate([other.position_m - one.position_m, turn_deg])
 
 
-def _close(seen: ViewOverGround, pose: Pose) -> "_Compared | None":
+def _close(over_ground: ViewOverGround, pose: Pose) -> "_Compared | None":
     """The blocks among houses under a camera close to the reported one, where they fit."""
-    start = seen.orientation(pose)
-    if seen.ground.surface is None or start is None:
+    start = over_ground.orientation(pose)
+    if over_ground.ground.surface is None or start is None:
         return None
-    end = _among_houses(seen, pose, start, FITTING.house_reaches_px[-1:])
+    end = _among_houses(over_ground, pose, start, FITTING.house_reaches_px[-1:])
     return None if end is None or end.mean_correlation() < FITTING.close_fit else end
 
 
 def _among_houses(
-    seen: ViewOverGround,
+    over_ground: ViewOverGround,
     pose: Pose,
     start: Orientation,
     reaches_px: tuple[int, ...] = FITTING.house_reaches_px,
@@ -153,21 +153,21 @@ def _among_houses(
     orientation: Orientation | None = start
     for reach_px in reaches_px:
         if orientation is not None:
-            orientation = _climbed(seen, pose, orientation, reach_px, finer=True)
-    return None if orientation is None else _compared(seen, pose, orientation)
+            orientation = _climbed(over_ground, pose, orientation, reach_px, finer=True)
+    return None if orientation is None else _compared(over_ground, pose, orientation)
 
 
 def _climbed(
-    seen: ViewOverGround, pose: Pose, start: Orientation, reach_px: int, *, finer: bool
+    over_ground: ViewOverGround, pose: Pose, start: Orientation, reach_px: int, *, finer: bool
 ) -> Orientation | None:
-    compared = _compared(seen, pose, start, reach_px, finer=finer)
+    compared = _compared(over_ground, pose, start, reach_px, finer=finer)
     if compared is None or compared.blocks is None:
         return None
     return start.moved(compared.blocks.climb(compared.expected, compared.errors.slope))
 
 
 def camera_of(
-    seen: ViewOverGround,
+    over_ground: ViewOverGround,
     pose: Pose,
     local_ratio: float,
     floor_m: float,
@@ -178,30 +178,30 @@ def camera_of(
 
     `local_ratio`: of the scores of the place. `floor_m`: standard deviation with which maps of two
     dates agree. `start`: `approached`, where it is known."""
-    if math.isnan(seen.reference_m(pose)):  # it was placed on flat ground
-        level = GroundModel(FlatTerrain(), seen.ground.grid, land=seen.ground.land)
-        seen, start = ViewOverGround(level, seen.view, seen.reference), None
-    close = None if start is not None else _close(seen, pose)
+    if math.isnan(over_ground.reference_m(pose)):  # it was placed on flat ground
+        level = GroundModel(FlatTerrain(), over_ground.ground.grid, land=over_ground.ground.land)
+        over_ground, start = ViewOverGround(level, over_ground.view, over_ground.reference), None
+    close = None if start is not None else _close(over_ground, pose)
     if close is not None:
         start = close.orientation
-    start = start or approached(seen, pose)
+    start = start or approached(over_ground, pose)
     if start is None:
         return None
     ratio = max(local_ratio, FITTING.min_local_ratio)
     variance = FITTING.variance * ratio**FITTING.variance_power
-    near = _fitted(close or _compared(seen, pose, start), variance)
-    if near is not None and near.moved_px > FITTING.moved_px * 2.0**seen.view.levels.final:
-        near = _fitted(_compared(seen, pose, near.orientation), variance)
+    near = _fitted(close or _compared(over_ground, pose, start), variance)
+    if near is not None and near.moved_px > FITTING.moved_px * 2.0**over_ground.view.levels.final:
+        near = _fitted(_compared(over_ground, pose, near.orientation), variance)
     if near is None or not near.is_shown:
         return None
     found, orientation = near.found, near.orientation
     east, north, above_sea_m = orientation.position_m.tolist()
-    below_m = float(seen.ground.terrain.at_en_m([east, north]))
-    agl_m = above_sea_m - (seen.reference_m(pose) if math.isnan(below_m) else below_m)
+    below_m = float(over_ground.ground.terrain.at_en_m([east, north]))
+    agl_m = above_sea_m - (over_ground.reference_m(pose) if math.isnan(below_m) else below_m)
     if not agl_m > 0:
         return None
-    sight_en_m = seen.sight_en_m(orientation)
-    middle = _middle_covariance(seen, orientation, sight_en_m, found.covariance)
+    sight_en_m = over_ground.sight_en_m(orientation)
+    middle = _middle_covariance(over_ground, orientation, sight_en_m, found.covariance)
     floor_m2 = np.eye(2) * floor_m**2 * variance
     return CameraEstimate(
         orientation,
@@ -209,7 +209,7 @@ def camera_of(
         _with_floor(found.covariance, floor_m2),
         near.start.moved(found.image_only),
         _with_floor(found.image_only_covariance, floor_m2),
-        seen.middle_en_m(sight_en_m, pose),
+        over_ground.middle_en_m(sight_en_m, pose),
         None if middle is None else middle + floor_m2,
     )
 
@@ -245,7 +245,7 @@ def _fitted(near: "_Compared | None", variance: float) -> _Fitted | None:
     found = None if near is None else near.resect(variance)
     if near is None or found is None:
         return None
-    is_shown = not near.seen.ground.shows_houses(near.ground_m)
+    is_shown = not near.over_ground.ground.shows_houses(near.ground_m)
     is_shown = is_shown or near.mean_correlation(found.correction) >= FITTING.min_fit
     return _Fitted(near.orientation, found, near.moves_px(found.correction), is_shown)
 
@@ -254,14 +254,14 @@ def _fitted(near: "_Compared | None", variance: float) -> _Fitted | None:
 class _Compared:
     """Blocks of a view under an orientation, beside the map.
 
-    - `seen`: the view. `expected`: its camera by telemetry.
+    - `over_ground`: the view. `expected`: its camera by telemetry.
     - `finest`: blocks of the finest level, and its pixel in pixels of level 0.
     - `blocks`: of all levels, None: too few are seen.
     - `ground_m` (N, 3): in their middles, and its `errors`.
     - `moved_px` (N, 2, 6): they move by so many pixels of level 0 per unit of the camera.
     - `by_lens_px`: see `systematic`."""
 
-    seen: ViewOverGround
+    over_ground: ViewOverGround
     orientation: Orientation
     expected: Expected
     finest: tuple[BlockScores, float]
@@ -297,14 +297,14 @@ class _Compared:
             # Raised ground moves as under a camera that is lower by as much.
             by_height_px=-self.moved_px[:, :, 2],
             by_lens_px=self.by_lens_px,
-            block_px=self.seen.view.side_px / BLOCKS,
-            gsd_m=self.seen.ground.grid.gsd_m,
+            block_px=self.over_ground.view.side_px / BLOCKS,
+            gsd_m=self.over_ground.ground.grid.gsd_m,
         )
         return self.blocks.resect(self.expected, errors, variance)
 
 
 def _compared(
-    seen: ViewOverGround,
+    over_ground: ViewOverGround,
     pose: Pose,
     orientation: Orientation,
     reach_px: int = FITTING.reach_px,
@@ -314,9 +314,13 @@ def _compared(
     """The blocks of a view under an orientation, compared with the map, moved by up to `reach_px`
     pixels of the level; None: too few pixels. At the final level and a coarser one, or at a finer
     one too."""
-    final, reference, ground_model = seen.view.levels.final, seen.reference, seen.ground
+    final, reference, ground_model = (
+        over_ground.view.levels.final,
+        over_ground.reference,
+        over_ground.ground,
+    )
     finest = max(final - 1, 0) if finer else final
-    made = _templates(seen, pose, finest, orientation, first=not finer)
+    made = _templates(over_ground, pose, finest, orientation, first=not finer)
     if made is None:
         return None
     coarsest = min(final + 1, reference.levels - 1)
@@ -324,7 +328,7 @@ def _compared(
     if not levels:
         return None
     scores = [(block_scores(made.at(at), reference, pose, reach_px), 2.0**at) for at in levels]
-    camera = seen.view.picture_at(finest).camera
+    camera = over_ground.view.picture_at(finest).camera
     ground = ground_model.ground_m(pose.map_px(scores[0][0].middles_px * scores[0][1]))
     slopes = ground_model.slopes(ground)
     window_from_en = np.linalg.inv(pose.linear) @ np.diag([1.0, -1.0]) / ground_model.grid.gsd_m
@@ -335,11 +339,11 @@ def _compared(
         by_lens = by_picture @ lens_px(camera, orientation.seen_px(camera, ground))
     moved_px = -by_picture @ picture_by_camera(camera, orientation, ground, by_ground)
     return _Compared(
-        seen,
+        over_ground,
         orientation,
-        _expected(seen, pose, orientation),
+        _expected(over_ground, pose, orientation),
         scores[0],
-        Blocks.of(scores, moved_px, seen.view.side_px / BLOCKS),
+        Blocks.of(scores, moved_px, over_ground.view.side_px / BLOCKS),
         ground,
         ground_model.errors(ground, slopes),
         moved_px,
@@ -348,35 +352,35 @@ def _compared(
 
 
 def _templates(
-    seen: ViewOverGround, pose: Pose, level: int, orientation: Orientation, *, first: bool
+    over_ground: ViewOverGround, pose: Pose, level: int, orientation: Orientation, *, first: bool
 ) -> ViewTemplates | None:
     """Rectified under an orientation; over flat ground the first is the search's."""
-    if first and seen.is_flat_at(pose) and not is_oblique(seen.view.view):
-        return seen.view.templates
-    return seen.templates_at(pose, level, orientation, smooth=first)
+    if first and over_ground.is_flat_at(pose) and not is_oblique(over_ground.view.view):
+        return over_ground.view.templates
+    return over_ground.templates_at(pose, level, orientation, smooth=first)
 
 
 def _middle_covariance(
-    seen: ViewOverGround, orientation: Orientation, sight_en_m: Array, covariance: Array
+    over_ground: ViewOverGround, orientation: Orientation, sight_en_m: Array, covariance: Array
 ) -> Array | None:
     """Of the ground (2, 2), m2, that the middle of a view shows; None beside unknown ground."""
-    point = np.array([[*sight_en_m, float(seen.ground.terrain.at_en_m(sight_en_m))]])
-    slopes = seen.ground.slopes(point)
+    point = np.array([[*sight_en_m, float(over_ground.ground.terrain.at_en_m(sight_en_m))]])
+    slopes = over_ground.ground.slopes(point)
     if not (np.isfinite(point).all() and np.isfinite(slopes).all()):
         return None
-    camera = seen.view.picture_at(seen.view.levels.final).camera
+    camera = over_ground.view.picture_at(over_ground.view.levels.final).camera
     by_ground = picture_by_ground(camera, orientation, point)
     by_camera = picture_by_camera(camera, orientation, point, by_ground)
     moved = (ground_by_picture(by_ground, slopes) @ by_camera)[0]
     return np.asarray(moved @ covariance @ moved.T)
 
 
-def _expected(seen: ViewOverGround, pose: Pose, orientation: Orientation) -> Expected:
-    telemetry, prior = seen.view.telemetry, seen.view.prior
+def _expected(over_ground: ViewOverGround, pose: Pose, orientation: Orientation) -> Expected:
+    telemetry, prior = over_ground.view.telemetry, over_ground.view.prior
     expected, std = 0.0, prior.log_scale_std
     if prior.scale_map is not None:
         expected, std = prior.scale_map.at(pose.x_px, pose.y_px), prior.scale_map.std
-    expected_m = seen.reference_m(pose) + telemetry.agl_m * math.exp(expected)
+    expected_m = over_ground.reference_m(pose) + telemetry.agl_m * math.exp(expected)
     up_m = expected_m - float(orientation.position_m[2])
     turn = math.degrees(prior.heading_rad or 0.0) - orientation.attitude_deg[0]
     tilt = np.array([telemetry.pitch_deg, telemetry.roll_deg]) - orientation.attitude_deg[1:]

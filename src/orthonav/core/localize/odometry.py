@@ -234,7 +234,7 @@ def displacement(
     )
     variance = std_m**2 + (ODOMETRY.tilt_share * now.telemetry.agl_m * tilt_noise_rad) ** 2
     reported_rad = math.radians(now.view.telemetry.yaw_deg - before.view.telemetry.yaw_deg)
-    seen = CameraDisplacement(
+    measured = CameraDisplacement(
         moved_en_m,
         np.eye(2) * variance,
         reach_m=_reach_px(before, now) * before.pixel_m,
@@ -243,16 +243,16 @@ def displacement(
         levers_m=np.stack([tilt_lever_m(now.telemetry), tilt_lever_m(before.telemetry)]),
         corrected_rad=np.stack([now.bias[2:], before.bias[2:]]),
     )
-    return ViewDisplacement(seen, min(max(placed.overlap, 0.0), 1.0))
+    return ViewDisplacement(measured, min(max(placed.overlap, 0.0), 1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Ground that is not level: rise (2,) per metre below the camera and where both views look;
-    `rise`: of the ground there over that below, as a fraction of the height."""
+    """Ground that is not level: slopes (2,), rise per metre, below the camera and ahead, where both
+    views look; `rise`: of the ground there over that below, as a fraction of the height."""
 
-    below: Array
-    seen: Array
+    slope_below: Array
+    slope_ahead: Array
     rise: float
 
     @classmethod
@@ -261,12 +261,12 @@ class Terrain:
     ) -> "Terrain | None":
         """Below a camera at a place (2,), `agl_m` above the ground there, and where it looks; None
         where unknown. `ahead_en_m` (2,): where it would look on flat ground."""
-        seen, rise = place, 0.0
+        place_ahead, rise = place, 0.0
         for _ in range(ODOMETRY.sight_steps):
-            seen = place + (1 - rise) * ahead_en_m
-            ground_m = ground.terrain.at_en_m(np.stack([place, seen]))
+            place_ahead = place + (1 - rise) * ahead_en_m
+            ground_m = ground.terrain.at_en_m(np.stack([place, place_ahead]))
             rise = float(ground_m[1] - ground_m[0]) / agl_m
-        slopes = ground.slopes(np.stack([place, seen]))
+        slopes = ground.slopes(np.stack([place, place_ahead]))
         if not (np.isfinite(slopes).all() and math.isfinite(rise)):
             return None
         return cls(slopes[0], slopes[1], rise)
@@ -287,30 +287,31 @@ def over_terrain(
     half, about the middle of the views: this parallax displaces the camera. The displacement is
     seen at the distance of the ground there, and the height changes by what this rises
     (docs/terrain.md)."""
-    seen, ground = measured.displacement, terrain or Terrain(np.zeros(2), np.zeros(2), 0.0)
-    steep = max(1 + float(ground.seen @ ahead_en_m) / agl_m[0], ODOMETRY.min_scaled)
-    share_en = seen.moved_en_m / (agl_m[0] * steep)
-    scale = float(share_en @ ground.seen) / 2
-    turn = float(share_en[1] * ground.seen[0] - share_en[0] * ground.seen[1]) / 2
+    flat, ground = measured.displacement, terrain or Terrain(np.zeros(2), np.zeros(2), 0.0)
+    steep = max(1 + float(ground.slope_ahead @ ahead_en_m) / agl_m[0], ODOMETRY.min_scaled)
+    share_en = flat.moved_en_m / (agl_m[0] * steep)
+    scale = float(share_en @ ground.slope_ahead) / 2
+    turn = float(share_en[1] * ground.slope_ahead[0] - share_en[0] * ground.slope_ahead[1]) / 2
     parallax = np.array([[scale, -turn], [turn, scale]])
     distance = max(1 - ground.rise, ODOMETRY.min_scaled)  # over the height, as on flat ground
-    moved_en_m = distance * (seen.moved_en_m + parallax @ ahead_en_m)
+    moved_en_m = distance * (flat.moved_en_m + parallax @ ahead_en_m)
     # What remains of the slope: all of a usual one where it is unknown.
     slope = ODOMETRY.unknown_slope * (1.0 if terrain is None else ODOMETRY.left_of_slope)
     slope *= float(np.hypot(*moved_en_m)) / agl_m[0]
     aside_m = float(np.hypot(*ahead_en_m)) * slope / 2
     reported = math.log(agl_m[1] / agl_m[0])
-    seen_height = distance * (math.exp(seen.scaled + reported) - scale)
-    risen = float(moved_en_m @ ground.below) / agl_m[0]
-    height = seen_height + (1 - distance) - risen  # of the later view, over that of the earlier one
+    height_ahead = distance * (math.exp(flat.scaled + reported) - scale)
+    risen = float(moved_en_m @ ground.slope_below) / agl_m[0]
+    # Of the later view, over that of the earlier one.
+    height = height_ahead + (1 - distance) - risen
     over = replace(
-        seen,
+        flat,
         moved_en_m=moved_en_m,
-        covariance=seen.covariance + np.eye(2) * aside_m**2,
-        turned_rad=seen.turned_rad + turn,
-        turned_std_rad=math.hypot(seen.turned_std_rad, slope / 2),
+        covariance=flat.covariance + np.eye(2) * aside_m**2,
+        turned_rad=flat.turned_rad + turn,
+        turned_std_rad=math.hypot(flat.turned_std_rad, slope / 2),
         scaled=math.log(max(height, ODOMETRY.min_scaled)) - reported,
-        scaled_std=math.hypot(seen.scaled_std, 1.5 * slope),
+        scaled_std=math.hypot(flat.scaled_std, 1.5 * slope),
     )
     return replace(measured, displacement=over)
 

@@ -342,8 +342,8 @@ class CandidateRefiner:
         finalists = _best_first(self._to_final_level([*chosen, *from_final]))
         few = REFINEMENT.to_finest
         if closer and not self.is_flat and self._over_ground.ground.surface is not None:
-            seen = [self._with_houses(each) for each in finalists[:few]]
-            finalists = _best_first([*seen, *finalists[few:]])
+            shown = [self._with_houses(each) for each in finalists[:few]]
+            finalists = _best_first([*shown, *finalists[few:]])
         if closer and self.levels.final > 0:
             finalists = [self._compared_finer(each) for each in finalists[:few]]
             finalists.sort(key=lambda each: -each.fine)

@@ -325,23 +325,23 @@ class Blocks:
 
     @classmethod
     def of(
-        cls, seen: Sequence[tuple[BlockScores, float]], moved_px: Array, block_px: float
+        cls, levels: Sequence[tuple[BlockScores, float]], moved_px: Array, block_px: float
     ) -> "Blocks | None":
         """None where too few are seen.
 
-        `seen`: of each level the blocks and its pixel in pixels of level 0. `moved_px` (N, 2, 6):
+        `levels`: of each level the blocks and its pixel in pixels of level 0. `moved_px` (N, 2, 6):
         how far each moves by the camera, pixels right and down at level 0. `block_px`: their width,
         pixels of level 0."""
         correlated = max(SOLVER.correlated, 1 + (SOLVER.correlated_px / block_px) ** 2)
-        known = np.tile(np.isfinite(moved_px).all(axis=(1, 2)), len(seen))
-        pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in seen]), 0.0)
-        by_level = np.asarray(pixels.reshape(len(seen), -1) > 0, np.bool_)
+        known = np.tile(np.isfinite(moved_px).all(axis=(1, 2)), len(levels))
+        pixels = np.where(known, np.concatenate([scores.pixels for scores, _ in levels]), 0.0)
+        by_level = np.asarray(pixels.reshape(len(levels), -1) > 0, np.bool_)
         if by_level.sum(axis=1).max() < SOLVER.min_blocks:
             return None
-        correlations = np.concatenate([scores.correlations for scores, _ in seen])
+        correlations = np.concatenate([scores.correlations for scores, _ in levels])
         moved_px = np.where(by_level.any(axis=0).reshape(-1, 1, 1), moved_px, 0.0)
-        unit_px = np.repeat([unit for _, unit in seen], len(moved_px))
-        return cls(len(seen), correlated, correlations, pixels, unit_px, moved_px)
+        unit_px = np.repeat([unit for _, unit in levels], len(moved_px))
+        return cls(len(levels), correlated, correlations, pixels, unit_px, moved_px)
 
     def climb(self, expected: Expected, slope_rad: float) -> Array:
         """The correction (6,) alone, from far away."""
@@ -419,7 +419,7 @@ class Blocks:
         return np.asarray(moved.reshape(-1, moved.shape[2]))
 
     @property
-    def seen(self) -> int:
+    def used(self) -> int:
         return int((self.pixels.reshape(self.levels, -1) > 0).any(axis=0).sum())
 
     def _climbed(self, start: Array, blurs_px: Sequence[float], expected: Expected) -> Array:
@@ -473,7 +473,7 @@ class Blocks:
     ) -> float:
         """Variance of the slopes by the camera over the curvature, times `correlated`, at least 1;
         the numbers that a solution with `covariance` and inflation `before` uses do not count."""
-        numbers = 2 * self.seen
+        numbers = 2 * self.used
         left = max(1 - float((covariance * curvature).sum()) / before / numbers, SOLVER.min_left)
         values, vectors = np.linalg.eigh(curvature[CAMERA, CAMERA])
         spread = np.square(slopes[:, CAMERA] @ vectors).sum(axis=0)

@@ -135,7 +135,7 @@ class Search:
         # With a prior few candidates are sought, by both kinds; `_by_gradients` seeks the others.
         share = SOUGHT_SHARE if prior is None else math.inf
         self.sought = view.templates.weighing_grey(min(share, view.templates.grey_share))
-        self.found: list[tuple[Stage, list[Pose]]] = []
+        self.tried: list[tuple[Stage, list[Pose]]] = []
         self.budget = Budget(self.plan.budget_ms)
 
     @classmethod
@@ -152,7 +152,7 @@ class Search:
 
     @property
     def candidates(self) -> int:
-        return sum(len(poses) for _, poses in self.found)
+        return sum(len(poses) for _, poses in self.tried)
 
     @property
     def floor_m(self) -> float:
@@ -198,7 +198,7 @@ class Search:
         the time that is left."""
         made = Search(self.map, self.view.by_gradients(), self.prior)
         made.budget = self.budget
-        for each in self.found:
+        for each in self.tried:
             made._refine(*each)
         stage = made._likeliest()
         if math.isfinite(stage.cost_ms) and self.budget.allows(stage.cost_ms):
@@ -467,7 +467,7 @@ class Search:
         self._refine(stage, [each.pose for each in found])
 
     def _refine(self, stage: Stage, found: list[Pose]) -> None:
-        self.found.append((stage, found))
+        self.tried.append((stage, found))
         if stage.level < self.levels.mid:
             self.from_final = self.refiner.at_mid_level(found)
         else:

@@ -151,16 +151,16 @@ class Refiner:
     ) -> tuple[Fit, Sequence[float]]:
         unit = 2.0**self.template.level
         converged, step = False, [0.0] * 4
-        seen = best = self._compared(window, pose)
+        comparison = best = self._compared(window, pose)
         for _ in range(steps):
-            step = self._step(seen)
+            step = self._step(comparison)
             moves_px = self._moves_px(step)
             share = min(1.0, DESCENT.max_step_px / max(moves_px, 1e-9))
             step = [share * each for each in step]
-            moved = seen.pose.stepped([unit * step[0], unit * step[1], *step[2:]])
-            seen = self._compared(window, moved)
-            if seen.score > best.score:
-                best = seen
+            moved = comparison.pose.stepped([unit * step[0], unit * step[1], *step[2:]])
+            comparison = self._compared(window, moved)
+            if comparison.score > best.score:
+                best = comparison
             converged = moves_px < small_step_px
             if converged:
                 break
@@ -170,30 +170,31 @@ class Refiner:
         planes = sampled_planes(window, pose)
         return Comparison(self.template, pose, compared(self.template, *planes))
 
-    def _hessian(self, seen: "Comparison") -> NDArray[np.float64]:
+    def _hessian(self, comparison: "Comparison") -> NDArray[np.float64]:
         """Over the part of the view that lies on the map."""
-        first, second = seen.squares
+        first, second = comparison.squares
         hessians = self.template.hessians
-        if seen.overlap <= DESCENT.whole_overlap:
+        if comparison.overlap <= DESCENT.whole_overlap:
             # Block by block: derivatives weigh alike within one.
-            hessians = np.tensordot(seen.shares(), self.template.block_hessians, axes=1)
+            hessians = np.tensordot(comparison.shares(), self.template.block_hessians, axes=1)
         return np.asarray(first * hessians[0] + second * hessians[1])
 
     def _spread(self, window: MapWindow, pose: Pose) -> "SpreadSums":
         if KERNEL is None:
             pixels = _Pixels(self.template, window, pose)
-            return SpreadSums(pixels.observed(), self._hessian(pixels.seen), pixels.sums_by_block())
+            hessian = self._hessian(pixels.comparison)
+            return SpreadSums(pixels.observed(), hessian, pixels.sums_by_block())
         out = np.empty(2 * 16 + BLOCKS**2 * BLOCK_SUMS)
         KERNEL.spread(*self._for_kernel(window, pose, 0, 0.0), out)
         observed, hessian = out[:32].reshape(2, 4, 4)
         return SpreadSums(observed, hessian, out[32:].reshape(-1, BLOCK_SUMS))
 
-    def _step(self, seen: "Comparison") -> list[float]:
+    def _step(self, comparison: "Comparison") -> list[float]:
         """Of the window: x, y (px of the level), turn, log scale."""
-        hessian = self._hessian(seen)
+        hessian = self._hessian(comparison)
         hessian.flat[::5] *= 1 + DESCENT.damping
         hessian.flat[::5] += 1e-12
-        found: list[float] = np.linalg.solve(hessian, seen.slope()).tolist()
+        found: list[float] = np.linalg.solve(hessian, comparison.slope()).tolist()
         return found
 
     def _moves_px(self, step: Sequence[float]) -> float:
@@ -296,12 +297,13 @@ class _Pixels:
 
     def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
         planes, valid = sampled_planes(window, pose)
-        seen = Comparison(template, pose, compared(template, planes, valid, slopes=False))
-        self.seen = seen
+        sums = compared(template, planes, valid, slopes=False)
+        self.template, self.comparison = template, Comparison(template, pose, sums)
         self.counts = template.mask * (valid > FULLY_VALID)
         self.map = planes * self.counts
         self._view = template.channels * self.counts
-        gains, squares = (np.repeat(each, [2, 1]) for each in (seen.gains, seen.squares))
+        gains = np.repeat(self.comparison.gains, [2, 1])
+        squares = np.repeat(self.comparison.squares, [2, 1])
         self.residual = np.empty_like(self.map)
         for at in range(len(self.map)):
             cv2.addWeighted(
@@ -309,10 +311,10 @@ class _Pixels:
             )
 
     def observed(self) -> NDArray[np.float64]:
-        mine = self.seen.template.gradients
+        mine = self.template.gradients
         theirs = gradients(self.map, self.counts)
-        theirs *= np.repeat(self.seen.gains, [2, 1]).astype(np.float32)[:, None, None, None]
-        x, y = from_middle(*self.seen.template.mask.shape)
+        theirs *= np.repeat(self.comparison.gains, [2, 1]).astype(np.float32)[:, None, None, None]
+        x, y = from_middle(*self.template.mask.shape)
         rows, cols = (np.stack([np.ones(each.size, np.float32), each.ravel()]) for each in (y, x))
         sums = np.empty((2, 4, 2, 2))  # of the view along x and y, of the map by the steps
         for at in range(2):
@@ -331,11 +333,11 @@ class _Pixels:
         )
 
     def sums_by_block(self) -> NDArray[np.float64]:
-        terms = by_steps(np.einsum("cphw,chw->phw", self.seen.template.gradients, self.residual))
+        terms = by_steps(np.einsum("cphw,chw->phw", self.template.gradients, self.residual))
         products = self._view * self.map
         kinds = [products[group].sum(axis=0) for group in GROUPS]
         each = np.stack([*terms, *kinds, self.counts])
-        return self.seen.template.block_sums(each).astype(np.float64).T
+        return self.template.block_sums(each).astype(np.float64).T
 
 
 PHASE_FLOOR = 1e-3  # fraction of the mean power below which frequencies count less

@@ -305,12 +305,13 @@ class Sums(NamedTuple):
 SUMS = 22 + BLOCKS**2
 
 
-def compared(template: Template, seen: Array, valid: Array, slopes: bool = True) -> Sums:
-    """Sums of derivatives only with `slopes`. `seen` becomes 0 where view or map does not count."""
+def compared(template: Template, planes: Array, valid: Array, slopes: bool = True) -> Sums:
+    """Sums of derivatives only with `slopes`. `planes` (3, H, W) of the map become 0 where view or map
+    does not count."""
     made = Sums.of_row(np.zeros(SUMS))
     if not (template.whole and valid.min() > FULLY_VALID):
         counts = template.mask * (valid > FULLY_VALID)
-        seen *= counts
+        planes *= counts
         left = template.mask - counts
         if left.any():
             made.left_pixels[:] = template.block_sums(left)
@@ -319,10 +320,10 @@ def compared(template: Template, seen: Array, valid: Array, slopes: bool = True)
             if slopes:
                 made.left_slopes[:] = by_kind(template, view)
     for kind, group in enumerate(GROUPS):
-        mine, theirs = template.channels[group].reshape(-1), seen[group].reshape(-1)
+        mine, theirs = template.channels[group].reshape(-1), planes[group].reshape(-1)
         made.products[kind], made.energies[kind] = mine @ theirs, theirs @ theirs
     if slopes:
-        made.slopes[:] = by_kind(template, seen)
+        made.slopes[:] = by_kind(template, planes)
     return made
 
 
