@@ -306,8 +306,8 @@ SUMS = 22 + BLOCKS**2
 
 
 def compared(template: Template, planes: Array, valid: Array, slopes: bool = True) -> Sums:
-    """Sums of derivatives only with `slopes`. `planes` (3, H, W) of the map become 0 where view or map
-    does not count."""
+    """Sums of derivatives only with `slopes`. `planes` (3, H, W) of the map become 0 where the map
+    or the view does not count."""
     made = Sums.of_row(np.zeros(SUMS))
     if not (template.whole and valid.min() > FULLY_VALID):
         counts = template.mask * (valid > FULLY_VALID)
