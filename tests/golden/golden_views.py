@@ -58,18 +58,18 @@ TOLERANCES = {
     "std_m": 0.01,  # a share
 }
 """With the instructions and kernels that made the file."""
-ELSEWHERE = {
+ON_OTHER_PROCESSORS = {
     "east_m": 0.5,
     "north_m": 0.5,
     "heading_deg": 0.1,
     "confidence": 0.03,
     "std_m": 0.08,
 }
-"""On other processors, which round differently. Between AVX-512, AVX2 and SSE, confident single
+"""Others round differently. Between AVX-512, AVX2 and SSE, confident single
 views move by up to 0.4 m over terrain, a sixth of their standard deviation, tracks by 0.1 m,
 confidences by 0.02, standard deviations by 6 %."""
 FLAT_CONFIDENCE, FLAT_TIMES = 0.5, 5.0
-"""Elsewhere, fixes below this confidence may differ so much more: the score around them is nearly
+"""On these, fixes below this confidence may differ so much more: the score around them is nearly
 level, and rounding decides where its refinement ends (by up to 2.2 m)."""
 CPU_AVX2, CPU_AVX512_SKX = 11, 256
 """Numbers of OpenCV's `CpuFeatures`."""
@@ -227,14 +227,6 @@ def _simulate(flight: Flight, place: Path) -> None:
         simulate_flight(request)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """A number or word of a view that is not as it was; `times`: how often beyond its tolerance."""
-
-    times: float
-    text: str
-
-
 def instructions() -> str:
     """By which results are rounded: the widest vector instructions of this processor, and the
     kernels that NumPy's OpenBLAS takes for it (those of Haswell for a processor newer than it)."""
@@ -252,32 +244,30 @@ def report(stored: Mapping[str, Any], found: Mapping[str, list[Row]]) -> str:
     for name, rows in found.items():
         before = stored["flights"].get(name, ())
         if len(before) != len(rows):
-            text = f"{name}: {len(before)} views became {len(rows)}"
-            made.append(Difference(math.inf, text))
+            made.append((math.inf, f"{name}: {len(before)} views became {len(rows)}"))
             continue
         for number, (was, now) in enumerate(zip(before, rows, strict=True), 1):
-            worst = _worst(was, now, here)
-            if worst.times > 1:
-                made.append(Difference(worst.times, f"{name}, view {number}: {worst.text}"))
+            times, text = _worst(was, now, here)
+            if times > 1:
+                made.append((times, f"{name}, view {number}: {text}"))
     if not made:
         return ""
-    worst_first = sorted(made, key=lambda each: -each.times)[:SHOWN]
     return "\n".join(
         (
             f"{len(made)} of {sum(map(len, found.values()))} golden views differ; the worst:",
-            *(f"  {each.text}" for each in worst_first),
+            *(f"  {text}" for _, text in sorted(made, reverse=True)[:SHOWN]),
             "if this is intended: make golden, and give the reason in the commit",
         )
     )
 
 
-def _worst(was: Row, now: Row, here: bool) -> Difference:
-    """The number of a view that is farthest beyond its tolerance."""
+def _worst(was: Row, now: Row, here: bool) -> tuple[float, str]:
+    """The number of a view that is farthest beyond its tolerance: how often, and in words."""
     if _words(was) != _words(now):
-        return Difference(math.inf, f"{_words(was) or 'fix'} became {_words(now) or 'fix'}")
+        return math.inf, f"{_words(was) or 'fix'} became {_words(now) or 'fix'}"
     flat = not here and float(was.get("confidence", 1.0)) < FLAT_CONFIDENCE
-    found = [Difference(0.0, "")]
-    for name, tolerance in (TOLERANCES if here else ELSEWHERE).items():
+    found = [(0.0, "")]
+    for name, tolerance in (TOLERANCES if here else ON_OTHER_PROCESSORS).items():
         if name not in now:
             continue
         before, after = float(was[name]), float(now[name])
@@ -287,8 +277,8 @@ def _worst(was: Row, now: Row, here: bool) -> Difference:
         elif name == "std_m":
             off /= before
         times = off / (tolerance * (FLAT_TIMES if flat else 1.0))
-        found.append(Difference(times, f"{name} {before:g} became {after:g}"))
-    return max(found, key=lambda each: each.times)
+        found.append((times, f"{name} {before:g} became {after:g}"))
+    return max(found)
 
 
 def _words(row: Row) -> dict[str, str]:

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blots import AGL_M, CAMERA, GROUND, Ground, error_m, planned, rendered
+from blots import AGL_M, CAMERA, GROUND, Ground, error_m, planned, prior_at, rendered
 
 from orthonav.core.localize import Localizer
 from orthonav.core.localize.search import Found, Search, prepared_view
-from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.core.records import Fix, NoFix, Telemetry, View
 from orthonav.core.register.refine import block_scores
 from orthonav.core.track.tracker import Tracker
 
@@ -27,7 +27,7 @@ def infrared(east_m, north_m):
     return 128 - 0.8 * (seen[0] - 128) + 0.8 * (seen[1] - 128)
 
 
-def elsewhere(east_m, north_m):
+def other_ground(east_m, north_m):
     return infrared(np.asarray(east_m) + 4000.0, np.asarray(north_m) - 900.0)
 
 
@@ -54,7 +54,7 @@ def test_by_day_grey_levels_count(localizer):
 
 def test_other_ground_in_other_light_is_not_recognized(localizer):
     for place in PLACES:
-        fix = localizer.locate(view(elsewhere, place))
+        fix = localizer.locate(view(other_ground, place))
         assert isinstance(fix, NoFix) or not fix.is_confident
 
 
@@ -69,18 +69,11 @@ def test_the_same_candidates_are_compared_again(localizer):
 
 
 def test_near_a_prior_candidates_are_sought_as_they_are_compared(localizer):
-    lat, lon = localizer.sheet.frame.latlon_from_en(np.array(PLACES[1]))
-    seen = view(infrared, PLACES[1])
-    search = Search.of(localizer.registration, seen, Prior(lat, lon, 20.0))
+    seen, prior = view(infrared, PLACES[1]), prior_at(localizer, np.array(PLACES[1]), 20.0)
+    search = Search.of(localizer.registration, seen, prior)
     assert search.sought.grey_share == search.view.templates.grey_share > 0
-    fix = localizer.locate(seen, prior=Prior(lat, lon, 20.0))
+    fix = localizer.locate(seen, prior=prior)
     assert fix.is_confident and fix.evidence["grey_correlation"] == 0
-
-
-def test_a_prior_beside_the_map_finds_nothing(localizer):
-    lat, lon = localizer.sheet.frame.latlon_from_en(np.array([9000.0, 0.0]))
-    found = Search.of(localizer.registration, view(GROUND, PLACES[0]), Prior(lat, lon, 10.0)).run()
-    assert not isinstance(found, Found) and found.reason == "outside_map"
 
 
 def test_a_search_that_was_cut_short_is_not_followed_by_another(opened):
@@ -95,9 +88,8 @@ def test_a_track_follows_ground_whose_contrast_turns_over(localizer):
     for number in range(12):
         place = np.array([-100.0 + 14 * number, 60.0])
         seen = view(infrared, place)
-        fix = tracker.locate(
-            replace(seen, telemetry=replace(seen.telemetry, time_ns=number * 10**9))
-        )
+        then = replace(seen.telemetry, time_ns=number * 10**9)
+        fix = tracker.locate(replace(seen, telemetry=then))
     assert isinstance(fix, Fix) and tracker.state_name == "tracking"
     assert error_m(localizer, fix, place) < 2
 

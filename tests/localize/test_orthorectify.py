@@ -51,6 +51,14 @@ def view_of(grey, camera):
     return View(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 150.0))
 
 
+def view_above(grey, heights, camera, attitude):
+    """A view from 150 m above the middle of a relief, and its orientation."""
+    below = float(heights.at(np.array([MIDDLE_M]), np.array([MIDDLE_M]))[0])
+    position = np.array([MIDDLE_M, MIDDLE_M, below + 150.0])
+    picture, _ = seen_view(grey, heights, camera, attitude, position, finer=1)
+    return view_of(picture, camera), Orientation(position, np.array(attitude))
+
+
 @pytest.fixture(scope="module")
 def grey():
     return ground_raster()
@@ -66,30 +74,19 @@ def grey():
     ],
 )
 def test_relief_is_removed(grey, slope, camera, attitude, reach_m):
-    heights = relief(slope)
-    below = float(heights.at(np.array([MIDDLE_M]), np.array([MIDDLE_M]))[0])
-    position = np.array([MIDDLE_M, MIDDLE_M, below + 150.0])
-    picture, _ = seen_view(grey, heights, camera, attitude, position, finer=1)
+    heights, shape = relief(slope), (160, 180)
+    view, orientation = view_above(grey, heights, camera, attitude)
     turn = np.radians(attitude[0])
-    middle = position[:2] + reach_m * np.array([np.sin(turn), np.cos(turn)])
-    shape = (160, 180)
-    made, valid = orthorectified(
-        view_of(picture, camera),
-        Orientation(position, np.array(attitude)),
-        window(heights, middle, shape),
-        shape,
-    )
+    middle = orientation.position_m[:2] + reach_m * np.array([np.sin(turn), np.cos(turn)])
+    nodes = window(heights, middle, shape)
+    made, valid = orthorectified(view, orientation, nodes, shape)
     expected = on_map(grey, middle, shape)
-    inner = valid
-    assert inner.mean() > (0.5 if reach_m < 100 else 0.25)
-    same = np.corrcoef(made[inner], expected[inner])[0, 1]
+    assert valid.mean() > (0.5 if reach_m < 100 else 0.25)
+    same = np.corrcoef(made[valid], expected[valid])[0, 1]
     assert same > 0.97
     if slope > 0:  # on level ground it would be displaced by several pixels
-        level = window(relief(0.0), middle, shape)
-        level[..., 2] = below
-        flat, seen = orthorectified(
-            view_of(picture, camera), Orientation(position, np.array(attitude)), level, shape
-        )
+        nodes[..., 2] = orientation.position_m[2] - 150.0
+        flat, seen = orthorectified(view, orientation, nodes, shape)
         assert np.corrcoef(flat[seen], expected[seen])[0, 1] < same - 0.1
 
 
@@ -108,13 +105,10 @@ def test_ground_behind_a_ridge_is_hidden():
 
 def test_unknown_heights_and_ground_not_seen_are_not_valid(grey):
     heights = relief(0.2)
-    below = float(heights.at(np.array([MIDDLE_M]), np.array([MIDDLE_M]))[0])
-    position = np.array([MIDDLE_M, MIDDLE_M, below + 150.0])
-    picture, _ = seen_view(grey, heights, CAMERA, (0.0, 0.0, 0.0), position, finer=1)
-    made = window(heights, (MIDDLE_M, MIDDLE_M), (320, 320))
-    made[35:45, 30:40, 2] = np.nan
+    nodes = window(heights, (MIDDLE_M, MIDDLE_M), (320, 320))
+    nodes[35:45, 30:40, 2] = np.nan
     found, valid = orthorectified(
-        view_of(picture, CAMERA), Orientation(position, np.zeros(3)), made, (320, 320)
+        *view_above(grey, heights, CAMERA, (0.0, 0.0, 0.0)), nodes, (320, 320)
     )
     assert not valid[140:176, 120:156].any() and not valid[:20].any()
     assert (found[~valid] == 0).all()
