@@ -121,7 +121,7 @@ def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
     assert found_with(NO_PRIOR).scores.peak_ratio == pytest.approx(1, abs=0.05)
 
 
-def test_a_view_of_elsewhere_stands_out_nowhere(reference):
+def test_a_view_of_other_ground_stands_out_nowhere(reference):
     right = registered(reference, templates_of(GROUND, HERE), prior_of(HERE))
     for seed in (5, 6, 7):
         wrong = registered(reference, templates_of(Ground(seed=seed), HERE), prior_of(HERE))

@@ -115,10 +115,10 @@ def test_holes_of_the_map_attract_nothing():
     valid[:200, 240:] = False
     reference = reference_of(GROUND, SHAPE, valid)
     window = SearchWindow(reference.whole(LEVEL), LEVEL, 0, 0, 55)
-    elsewhere = templates_of(Ground(seed=9), Pose(200.0, 200.0, 0.0, 0.0)).at(LEVEL)
+    other = templates_of(Ground(seed=9), Pose(200.0, 200.0, 0.0, 0.0)).at(LEVEL)
     assert all(
         not (each.pose.x_px > 270 and each.pose.y_px < 170)
-        for each in search(elsewhere, window, ALL_TURNS[::3], 12)
+        for each in search(other, window, ALL_TURNS[::3], 12)
     )
     for pose in (Pose(120.0, 280.0, 0.7, 0.0), Pose(250.0, 250.0, -0.7, 0.0)):
         best = search(templates_of(GROUND, pose).at(LEVEL), window, near(pose), 1)[0]

@@ -182,7 +182,7 @@ def features_of(scores: Scores, chances: Chances) -> NDArray[np.float64]:
     strength, mid_score = max(scores.strength, 1e-3), max(scores.mid_score, 1e-3)
     detail, chance = scores.detail_ratio, chances.of_strength(scores)
     if math.isnan(detail):
-        detail = 1.4  # usual; the view is too small to be finished one level finer
+        detail = 1.4  # usual; the view is too small for a final level of its own
     stand_in = 0.7  # of the chance value: stands in for a rival where none was found
     ratio = strength / max(scores.rival, stand_in * chance)
     fine, fine_rival = scores.fine, scores.fine_rival

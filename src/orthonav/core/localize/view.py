@@ -441,7 +441,7 @@ class ViewLimits:
     max_tilt_deg: float = 65.0
     min_side_px: int = 32  # of the picture
     min_view_px: float = 24.0
-    """Of the map: a sixth of the size that views are finished at."""
+    """Of the map: a sixth of the size of views at the final level."""
     max_coarser: float = 4.0  # a pixel of the view, in pixels of the map
     dark: float = 16.0
     bright: float = 250.0
@@ -451,7 +451,7 @@ class ViewLimits:
     max_agl_std: float = 0.15
     """Three are scales of 0.64 to 1.57: between these chance was measured to be alike."""
     near_share: float = 0.6
-    """A part far off nadir is judged as one so many times smaller (docs/terrain.md)."""
+    """A part far off nadir has the levels of one so many times smaller (docs/terrain.md)."""
 
 
 LIMITS = ViewLimits()
