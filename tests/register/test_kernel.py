@@ -41,7 +41,7 @@ def views(request, reference, monkeypatch):
     nearby; of all pixels or without a corner; the map is cached or not."""
     level, whole, cached = request.param
     monkeypatch.setattr(reference, "caches", lambda _: cached)
-    return list(views_of(12, 6, level, whole))
+    return list(views_of(12, 5, level, whole))
 
 
 def views_of(count, seed, level, whole=True):
