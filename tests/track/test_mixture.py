@@ -19,7 +19,7 @@ from orthonav.core.track import (
     State,
 )
 from orthonav.core.track.mixture import Hypothesis
-from orthonav.core.track.model import WHITE_SHARE
+from orthonav.core.track.filter import WHITE_SHARE
 from orthonav.core.track.smooth import History
 
 AREA_M2 = 4e6

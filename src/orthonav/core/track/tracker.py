@@ -40,29 +40,27 @@ from orthonav.core.records import (
     probability_within,
 )
 from orthonav.core.register.window import rotation
-from orthonav.core.track import (
-    Estimate,
-    Mixture,
-    Model,
-    ReportedAttitude,
-    ReportedVelocity,
-    State,
-)
-from orthonav.core.track.likelihood import LEAST_NEW
-from orthonav.core.track.model import (
+from orthonav.core.track.filter import (
     BIASES,
     HEADING,
     HORIZON,
+    LEAST_NEW,
+    OBSERVES,
     POSITION,
     SCALE,
-    SEEN,
     TILT,
     VELOCITY,
     WHITE_SHARE,
+    Array,
+    Model,
+    ReportedAttitude,
+    ReportedVelocity,
+    observed,
+    usual_velocity_std_mps,
 )
-from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.core.track.hypothesis import EXACT_M, State
+from orthonav.core.track.mixture import Estimate, Mixture
 from orthonav.core.track.smooth import History, Smoothed
-from orthonav.core.track.trust import EXACT_M
 
 LOCAL_SHARE = 0.75  # Belief to search around it only. Values without a source: docs/tracking.md.
 LOCAL_SIGMAS = 4.0  # half width of that search,
@@ -76,7 +74,6 @@ LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0  # where the clock stands still or jumps back
 KNOWN_MPS = 5.0  # least certainty of an estimated velocity that predicts the next displacement
 KNOWN_PLACE_M = 50.0  # least certainty of a position whose ground is known
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 
@@ -144,7 +141,7 @@ class Tracker:
         self._usual_horizon_rad = self.model.horizon_rad
         self._past: _Past | None = None
         self._predicted_ns: int | None = None  # a view predicted, but without an outcome so far
-        self._seen: list[Sighting] = []
+        self._sightings: list[Sighting] = []
         self._whole_map = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if smooth else None
@@ -182,7 +179,7 @@ class Tracker:
             scale = math.hypot(Model.log_scale, view.camera.focal_std)
             self.mixture.model = replace(self.model, log_scale=scale)
         step = self._predict(None if refused else view, view.telemetry)
-        self._seen = []
+        self._sightings = []
         if refused is None:
             refused = self._update(view, step)
         outcome = self._outcome(view.telemetry, refused)
@@ -247,7 +244,7 @@ class Tracker:
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """The position by dead reckoning, at a view whose picture cannot be used for `reason`, as
         where `locate` raised an error."""
-        self._seen = []
+        self._sightings = []
         self.mixture.unrecognize()  # an error may have come after the places were found
         if telemetry.time_ns != self._predicted_ns:  # else the error came after the prediction
             self._predict(None, telemetry)
@@ -286,7 +283,7 @@ class Tracker:
         return max(least, high) if math.isfinite(high) else least
 
     def _outcome(self, telemetry: Telemetry, refused: NoFix | None) -> Fix | NoFix:
-        estimate = self.mixture.estimate(self._radius_m(telemetry))
+        estimate = self.mixture.conclude(self._radius_m(telemetry))
         self.state = State.SEARCHING if estimate is None else estimate.state
         outcome: Fix | NoFix = refused or NoFix("searching", "no position has been found yet")
         if estimate is not None:
@@ -308,7 +305,7 @@ class Tracker:
     def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
         """NaN where the view was not registered at the fix."""
         off_m, turn_rad = min(
-            ((float(np.hypot(*(each.mean[:2] - mean[:2]))), each.mean[2]) for each in self._seen),
+            ((math.dist(each.mean[:2], mean[:2]), each.mean[2]) for each in self._sightings),
             default=(math.inf, math.nan),
         )
         return math.degrees(turn_rad) % 360 if off_m <= fix.radius_m else math.nan
@@ -457,7 +454,7 @@ class Tracker:
     def _update(self, view: View, step: _Step) -> NoFix | None:
         """`NoFix` where the view shows too little."""
         telemetry = view.telemetry
-        expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
+        expected = self.mixture.estimate(self._radius_m(telemetry))
         if expected is not None and expected.shown.followed and self._must_compete(expected):
             self._whole_map = not self._whole_map  # the whole map and the surroundings by turns
         searched = self._search_area(expected, whole_map=self._whole_map)
@@ -478,14 +475,15 @@ class Tracker:
         found = found_by(search)
         if isinstance(found, Found):
             share = min(searched.area_m2, self.mixture.map_m2) / self.mixture.area_m2
-            self._seen = list(sightings(*found, known, bias[1], share))
+            self._sightings = list(sightings(*found, known, bias[1], share))
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
         )
+        found_at, ground = self._sightings, step.ground
         self.mixture.update(
-            attitude, self._seen, newness, searched.circle, step.ground, confirms=searched.confirms
+            attitude, found_at, newness, searched.circle, ground, confirms=searched.confirms
         )
         return None
 
@@ -507,7 +505,7 @@ class Tracker:
             variances = self.model.initial_bias()
             variances += self._telemetry_noise(telemetry)[[0, 1, 2, 2]]
             return np.zeros(4), np.diag(variances)
-        return (SEEN @ expected.mean)[2:], (SEEN @ expected.covariance @ SEEN.T)[2:, 2:]
+        return (OBSERVES @ expected.mean)[2:], observed(expected.covariance)[2:, 2:]
 
     def _must_compete(self, expected: Estimate) -> bool:
         """Whether places near the track have to compete with the whole map to confirm it.
