@@ -18,8 +18,8 @@ from orthonav.core.track import (
     ReportedVelocity,
     State,
 )
-from orthonav.core.track.mixture import Hypothesis
 from orthonav.core.track.filter import WHITE_SHARE
+from orthonav.core.track.mixture import Hypothesis
 from orthonav.core.track.smooth import History
 
 AREA_M2 = 4e6

@@ -178,11 +178,11 @@ class Tracker:
             self._usual_scale = False
             scale = math.hypot(Model.log_scale, view.camera.focal_std)
             self.mixture.model = replace(self.model, log_scale=scale)
-        step = self._predict(None if refused else view, view.telemetry)
+        if refused is not None:
+            return self.passed(view.telemetry, refused)
+        step = self._predict(view, view.telemetry)
         self._sightings = []
-        if refused is None:
-            refused = self._update(view, step)
-        outcome = self._outcome(view.telemetry, refused)
+        outcome = self._outcome(view.telemetry, self._update(view, step))
         self._predicted_ns = None
         return outcome
 
