@@ -115,7 +115,7 @@ def flown(seed, *, odometry=True, velocity=False, error=(0.0, 1.0)):
             mixture.predict(STEP_S, reported if velocity else None, camera if odometry else None)
         sighting = flight.sighting()
         mixture.update(LEVEL, [sighting])
-        found = mixture.estimate(RADIUS_M)
+        found = mixture.conclude(RADIUS_M)
         off_m = found.mean[:2] - flight.place
         tilt, spread = (OBSERVES @ found.mean)[4:], observed(found.covariance)[4:, 4:]
         rows.append(

@@ -36,6 +36,7 @@ from orthonav.core.records import (
     NoFix,
     Prior,
     Telemetry,
+    TelemetryBias,
     View,
     probability_within,
 )
@@ -546,21 +547,14 @@ class Tracker:
         telemetry: Telemetry,
         more: dict[str, float],
     ) -> Fix:
-        """Of a state (16,), (16, 16); `more` goes into its evidence."""
+        """Of a state (16,), (16, 16); `more` is its evidence."""
         lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
         spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
         spread.flags.writeable = False
         radius_m = self._radius_m(telemetry)
-        pitch, roll = np.degrees(mean[TILT])
         whole = mean[TILT] + mean[HORIZON]
-        evidence = {
-            "heading_bias_deg": math.degrees(mean[HEADING]),
-            "log_scale_bias": float(mean[SCALE]),
-            "pitch_bias_deg": float(pitch),
-            "roll_bias_deg": float(roll),
-            **_bias_stds(covariance),
-            **more,
-        }
+        units = np.array([math.degrees(1.0), 1.0, math.degrees(1.0), math.degrees(1.0)])
+        stds = np.sqrt(np.maximum(np.diag(covariance)[BIASES], 0.0)) * units
         return Fix(
             lat_deg=float(lat),
             lon_deg=float(lon),
@@ -570,7 +564,8 @@ class Tracker:
             radius_m=radius_m,
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
-            evidence=evidence,
+            evidence=more,
+            bias=TelemetryBias(*(mean[BIASES] * units).tolist(), *stds.tolist()),
             pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
             roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
             vel_en_mps=(float(mean[2]), float(mean[3])),
@@ -589,18 +584,6 @@ def _reported_velocity(past: _Past, telemetry: Telemetry) -> ReportedVelocity | 
     std = max(std, math.sqrt(max(past.velocity_variance, 0.0)))
     unaided_s = UNAIDED_S if std >= UNAIDED_STD_MPS else None
     return ReportedVelocity(now, past.velocity, std, unaided_s)
-
-
-def _bias_stds(covariance: Array) -> dict[str, float]:
-    std = np.sqrt(np.maximum(np.diag(covariance)[BIASES], 0.0))
-    names = (
-        "heading_bias_std_deg",
-        "log_scale_bias_std",
-        "pitch_bias_std_deg",
-        "roll_bias_std_deg",
-    )
-    values = np.where([True, False, True, True], np.degrees(std), std)
-    return dict(zip(names, values.tolist(), strict=True))
 
 
 def _known(corrected: Telemetry, spread: Array) -> Telemetry:

@@ -51,7 +51,7 @@ _BIASES = {
     "pitch_deg": ("pitch_bias_deg", 0.3),
     "roll_deg": ("roll_bias_deg", 0.3),
 }
-"""Keys of the estimated biases in evidence, and lower bounds of their standard deviations."""
+"""Names of the estimated biases, and lower bounds of their standard deviations."""
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 Prior = tuple[Array, Array]
@@ -109,9 +109,10 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
             f"{len(confident)} of {len(results)} views have a confidence of {CONFIDENT} or more; a "
             f"calibration needs {MIN_VIEWS}: check the map, the camera and the reported height"
         )
+    fixes = [each.outcome for each in confident if isinstance(each.outcome, Fix)]
     values, spreads = (
         {
-            name: np.array([each.outcome.evidence[key.replace("bias", bias)] for each in confident])
+            name: np.array([getattr(fix.bias, key.replace("bias", bias)) for fix in fixes])
             for name, (key, _) in _BIASES.items()
         }
         for bias in ("bias", "bias_std")
@@ -133,7 +134,7 @@ def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
         for each in results
         if isinstance(each.outcome, Fix)
         and each.outcome.confidence >= CONFIDENT
-        and "pitch_bias_deg" in each.outcome.evidence
+        and math.isfinite(each.outcome.bias.heading_bias_deg)
     ]
 
 
