@@ -101,9 +101,7 @@ def locate_view(
         return _passed(locator, view, failed), math.nan
     start = time.perf_counter()
     try:
-        outcome = finite(locator.locate(view))
-        if isinstance(outcome, NoFix) and outcome.reason == INTERNAL_ERROR:
-            failed()
+        outcome = locator.locate(view)
     except CameraError:
         raise
     except MapChangedError as error:
@@ -118,6 +116,10 @@ def locate_view(
             log.exception("view could not be processed")
             reason = _internal(error)
         outcome = _passed(locator, UnusableView(view.telemetry, reason))
+    else:
+        outcome = finite(outcome)
+        if isinstance(outcome, NoFix) and outcome.reason == INTERNAL_ERROR:
+            failed()
     return outcome, (time.perf_counter() - start) * 1e3
 
 
