@@ -425,6 +425,7 @@ def test_an_image_of_other_proportions_fails_and_one_of_another_size_does_not(fl
     flight.locator.outcome = outcome
     assert reason_of(flight.view(flight.rng.integers(0, 256, (480, 640), np.uint8))) == "fix"
     assert (cameras[0].width_px, cameras[0].fx_px) == (640, 400.0)
+    flight.locator.passed = lambda telemetry, reason: reason  # no track yet
     wrong = flight.view(flight.rng.integers(0, 256, (240, 240), np.uint8))
     assert reason_of(wrong) == "wrong_camera" and "calibrate" in wrong.outcome.detail
     assert flight.health().level is Level.FAILED

@@ -217,12 +217,12 @@ class Runner:
         change = self.options.map_change()
         if change is not None:
             return self._refuse(image, NoFix(MAP_CHANGED, f"map file was changed: {change}"))
-        taken = self._taken(image)
+        taken = _Taken(image, *self._picture(image), *self._telemetry(image))
         if latency is None:
-            return self._located_if_known(taken)
+            return self._located(taken)
         try:
             if latency.may_locate:
-                return self._located_if_known(taken)
+                return self._located(taken)
             if taken.problem is not None:
                 return self._refuse(image, taken.problem, taken.vehicle)
             return self._withhold(taken, latency)
@@ -277,20 +277,15 @@ class Runner:
             lambda sink: sink.view(image.number, image.frame, grey, telemetry, used_ms, withheld)
         )
 
-    def _located_if_known(self, taken: _Taken) -> ViewResult:
-        refused = self._unusable(taken.telemetry)
-        if refused is not None:
-            return self._refuse(taken.image, refused, taken.vehicle)
-        taken = taken._replace(telemetry=self._from_start(taken.telemetry))
-        self._say_heights(taken.telemetry)
-        known = self._above_ground(taken.telemetry)
-        if isinstance(known, NoFix):
-            return self._refuse(taken.image, known, taken.vehicle)
-        return self._located(taken, known)
-
-    def _located(self, taken: _Taken, known: Telemetry) -> ViewResult:
-        """`known`: the telemetry with its height above ground."""
+    def _located(self, taken: _Taken) -> ViewResult:
         image, heights = taken.image, self.options.heights
+        known = self._above_ground(taken.telemetry)
+        if self._start and isinstance(known, Telemetry):
+            known = self._above_ground(self._from_start(taken.telemetry))
+        if isinstance(known, NoFix):
+            return self._refuse(image, known, taken.vehicle)
+        self._track_monitor.moved(known)
+        self._say_heights(taken.telemetry)
         telemetry = self._over_gap(known, image.exposed_ns)
         taken = taken._replace(telemetry=telemetry)
         self._log_view(taken, withheld=False)
@@ -319,12 +314,9 @@ class Runner:
         return result
 
     def _from_start(self, telemetry: Telemetry) -> Telemetry:
-        if self._start:
-            prior, self._start = self.options.start(), False
-            telemetry = replace(telemetry, prior=prior or telemetry.prior)
-            self._track_monitor.started(prior, telemetry.time_ns)
-        self._track_monitor.moved(telemetry)
-        return telemetry
+        prior, self._start = self.options.start(), False
+        self._track_monitor.started(prior, telemetry.time_ns)
+        return replace(telemetry, prior=prior or telemetry.prior)
 
     def _with_altitude(
         self, vehicle: VehicleState, outcome: Fix | NoFix, telemetry: Telemetry
@@ -394,10 +386,6 @@ class Runner:
         fix = result.outcome
         return replace(result, accepted=self.options.accepts(fix) if isinstance(fix, Fix) else None)
 
-    def _taken(self, image: CameraImage) -> _Taken:
-        camera, problem = self._picture(image)
-        return _Taken(image, camera, problem, *self._telemetry(image))
-
     def _picture(self, image: CameraImage) -> tuple[Camera | None, NoFix | None]:
         """Camera and problem as in `_Taken`."""
         grey = image.grey
@@ -428,13 +416,26 @@ class Runner:
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
 
     def _above_ground(self, telemetry: Telemetry) -> Telemetry | NoFix:
-        heights = self.options.heights
+        """With the height above ground, as far as it suffices to locate a view."""
+        heights, least_m = self.options.heights, self.options.min_agl_m
         try:
-            return telemetry if heights is None else heights.corrected(telemetry)
+            known = telemetry if heights is None else heights.corrected(telemetry)
         except MapChangedError as error:
             return self._counted("internal_error", NoFix(MAP_CHANGED, str(error)))
         except MapFileError as error:  # a crafted part of the map
             return self._counted("internal_error", NoFix(MAP_DAMAGED, str(error)))
+        missing = [
+            name for name in known.missing() if name != "yaw_deg" or self.options.heading_known
+        ]
+        if missing:
+            detail = f"not reported at the exposure: {', '.join(missing)}"
+            if heights is not None and not heights.datum_known and needs_datum(telemetry):
+                detail = f"vertical datum of the map's terrain is unknown: {DATUM_ADVICE}"
+            return self._counted("no_telemetry", NoFix("no_telemetry", detail))
+        if known.agl_m < least_m:  # on the ground, and in the take-off
+            detail = f"{known.agl_m:.0f} m above ground; views are located from {least_m:.0f} m"
+            return self._counted("too_low", NoFix("too_low", detail))
+        return known
 
     def _say_heights(self, telemetry: Telemetry) -> None:
         if self._heights_said:
@@ -444,25 +445,6 @@ class Runner:
         said = assumed_heights(telemetry, name, "build the map with --dem")
         if said is not None:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
-
-    def _unusable(self, telemetry: Telemetry) -> NoFix | None:
-        known = self._above_ground(telemetry)
-        if isinstance(known, NoFix):
-            return known
-        missing = [
-            name for name in known.missing() if name != "yaw_deg" or self.options.heading_known
-        ]
-        if missing:
-            detail = f"not reported at the exposure: {', '.join(missing)}"
-            heights = self.options.heights
-            if heights is not None and not heights.datum_known and needs_datum(telemetry):
-                detail = f"vertical datum of the map's terrain is unknown: {DATUM_ADVICE}"
-            return self._counted("no_telemetry", NoFix("no_telemetry", detail))
-        least_m = self.options.min_agl_m
-        if known.agl_m < least_m:  # on the ground, and in the take-off
-            detail = f"{known.agl_m:.0f} m above ground; views are located from {least_m:.0f} m"
-            return self._counted("too_low", NoFix("too_low", detail))
-        return None
 
     def _counted(self, name: str, reason: NoFix) -> NoFix:
         self._count(name)
