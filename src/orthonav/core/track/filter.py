@@ -10,6 +10,7 @@ It is predicted by time, by the reported velocity and by the odometry of the cam
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,23 +160,25 @@ class Expected:
         return replace(self, mean=mean, covariance=covariance, cross=cross)
 
 
-def predicted(
-    model: Model,
-    mean: Array,
-    covariance: Array,
-    seconds: float,
-    velocity: ReportedVelocity | None,
-    telemetry_noise: Array,
-    camera: CameraDisplacement | None = None,
-    *,
-    overlap: float = 0.0,
-) -> Expected:
-    """The state after so many seconds, by the reported velocity or else its own.
+class Motion(NamedTuple):
+    """What is known of the motion since the view before.
 
-    `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view, added to
-    their biases unless the `camera` measured the change, and of the horizon (Gauss-Markov,
-    `Model.horizon_s`). The displacement itself is added by `by_camera`. `overlap`: fraction of the
-    view that the last one showed too."""
+    `telemetry_noise` (3,): variances of heading (rad) and log scale from view to view, and of the
+    horizon (rad). `overlap`: fraction of the view that the last one showed too."""
+
+    seconds: float
+    velocity: ReportedVelocity | None
+    camera: CameraDisplacement | None
+    telemetry_noise: Array
+    overlap: float = 0.0
+
+
+def predicted(model: Model, mean: Array, covariance: Array, motion: Motion) -> Expected:
+    """The state after a motion, by the reported velocity or else its own.
+
+    The noise of heading and log scale is added to their biases unless the camera measured the
+    change. The displacement itself is added by `by_camera`."""
+    seconds, velocity, camera, telemetry_noise, overlap = motion
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)

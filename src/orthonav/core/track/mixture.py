@@ -9,8 +9,7 @@ to it with every view, so that no error is permanent (docs/tracking.md)."""
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from orthonav.core.track.filter import (
     Expected,
     Measurement,
     Model,
+    Motion,
     ReportedAttitude,
     ReportedVelocity,
     after_bias_jump,
@@ -174,15 +174,13 @@ class Mixture:
         overlap: float = 0.0,
     ) -> None:
         """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
-        (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`. An error
-        leaves all as it was."""
+        (rad), log scale, horizon (rad), None: the model's. `overlap`: see `Motion`. An error leaves
+        all as it was."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
-        stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
-        made = [one for each in self.hypotheses for one in self._split(each, *moves)]
+        stays, motion = 1 - self.model.lost, Motion(seconds, velocity, camera, noise, overlap)
+        made = [one for each in self.hypotheses for one in self._split(each, motion)]
         blind_s = seconds if camera is None else 0.0
-        trust = self.trust.moved(
-            lambda each: self._dead_reckoned(each, 1 - overlap, *moves), blind_s
-        )
+        trust = self.trust.moved(lambda each: self._dead_reckoned(each, motion), blind_s)
         elsewhere = self.elsewhere
         if trust.rival is not None and trust.believed is not None:
             total = sum(each.share for each in made) + elsewhere
@@ -196,36 +194,28 @@ class Mixture:
         self.elsewhere = elsewhere + (1 - stays) * (1 - elsewhere)
         self._new, self._is_rival_searched, self._is_split = 1 - overlap, False, True
 
-    def _split(self, each: Hypothesis, *moves: Any) -> Iterator[Hypothesis]:
-        for share, expected in self._predictions(each, *moves):
+    def _split(self, each: Hypothesis, motion: Motion) -> Iterator[Hypothesis]:
+        for share, expected in self._predictions(each, motion):
             on_map = held_to_map(self.model, expected, self.area_m2)
             yield self._from(each, on_map, each.share * share)
 
-    def _dead_reckoned(self, each: Hypothesis, new: float, *moves: Any) -> Hypothesis:
+    def _dead_reckoned(self, each: Hypothesis, motion: Motion) -> Hypothesis:
         """As one Gaussian: odometry that may be an outlier makes it less certain. What was shown
         there is forgotten as at any view, unless the dead reckoning is exact."""
-        splits = list(self._split(replace(each, share=1.0), *moves))
+        splits = list(self._split(replace(each, share=1.0), motion))
         mean, covariance = moments(splits)
         best = max(splits, key=lambda split: split.share)
         exact = float(np.trace(covariance[POSITION, POSITION])) <= 2 * EXACT_M**2
-        shown = best.shown if exact else best.shown.missed(new)
+        shown = best.shown if exact else best.shown.missed(1 - motion.overlap)
         return replace(best, share=1.0, mean=mean, covariance=covariance, shown=shown)
 
-    def _predictions(
-        self,
-        each: Hypothesis,
-        seconds: float,
-        velocity: ReportedVelocity | None,
-        camera: CameraDisplacement | None,
-        telemetry_noise: Array,
-        overlap: float,
-    ) -> Iterator[tuple[float, Expected]]:
+    def _predictions(self, each: Hypothesis, motion: Motion) -> Iterator[tuple[float, Expected]]:
         """With their probabilities: with odometry, which may be an outlier, and without.
 
         Where no velocity is reported, the aircraft may also have made an unexpected turn."""
         model, likely = self.model, 1 - self.model.odometry_outlier
-        step = partial(predicted, model, each.mean, overlap=overlap)
-        dead_reckoned = step(each.covariance, seconds, velocity, telemetry_noise)
+        camera, velocity, unseen = motion.camera, motion.velocity, motion._replace(camera=None)
+        dead_reckoned = predicted(model, each.mean, each.covariance, unseen)
         turns, splits = [(likely, each.covariance)], []
         if each.share >= MINOR_SHARE and velocity is None:
             turns = [
@@ -234,16 +224,16 @@ class Mixture:
             ]
         if camera is not None:
             for share, covariance in turns:
-                turned = step(covariance, seconds, velocity, telemetry_noise, camera)
+                turned = predicted(model, each.mean, covariance, motion)
                 corrected, log_fit = by_camera(turned, camera)
                 if is_plausible(model, corrected.mean, velocity):
                     splits.append((math.log(share) + log_fit, corrected))
         if camera is None or not splits:
             chance = 0.0
             if velocity is None and each.share >= MAJOR_SHARE:  # nothing measures the displacement
-                chance = 1 - (1 - model.turn) ** seconds
+                chance = 1 - (1 - model.turn) ** motion.seconds
                 free = velocity_forgotten(model, each.covariance)
-                yield chance, step(free, seconds, velocity, telemetry_noise)
+                yield chance, predicted(model, each.mean, free, unseen)
             yield 1.0 - chance, dead_reckoned
             return
         # An outlier lies anywhere within the radius of the search.

@@ -54,6 +54,7 @@ from orthonav.core.track.filter import (
     WHITE_SHARE,
     Array,
     Model,
+    Motion,
     ReportedAttitude,
     ReportedVelocity,
     observed,
@@ -104,11 +105,11 @@ class _Past(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """From the view before to this one. `moves`: arguments of `Mixture.predict`, None at the first
-    view. `overlap` of both; `ground`: share that the one before cannot have shown, 0..1."""
+    """From the view before to this one. `motion`: None at the first view. `overlap` of both;
+    `ground`: share that the one before cannot have shown, 0..1."""
 
     here: _Past
-    moves: tuple[Any, ...] | None = None
+    motion: Motion | None = None
     overlap: float = 0.0
     ground: float = 1.0
 
@@ -320,13 +321,13 @@ class Tracker:
         horizon = self._usual_horizon_rad if tilt is None else math.radians(tilt)
         self.mixture.model = replace(self.model, horizon_rad=horizon)
         step, prior = self._step(view, telemetry), telemetry.prior
-        if step.moves is not None:
-            self.mixture.predict(*step.moves)
+        if step.motion is not None:
+            self.mixture.predict(*step.motion)
         elif prior is not None and (self._use_prior or self._every_prior):
             self.mixture.start(*self._position_of(prior))
         # No call comes between: it could raise an error.
         self._past, self._predicted_ns = step.here, telemetry.time_ns
-        if step.moves is not None and prior is not None and self._every_prior:
+        if step.motion is not None and prior is not None and self._every_prior:
             self.mixture.measure_position(*self._position_of(prior))
         return step
 
@@ -360,8 +361,8 @@ class Tracker:
             ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
         # An image that is not used makes no error independent.
         overlap = 1.0 if view is None else 1 - ground
-        moves = seconds, velocity, camera, noise, overlap
-        return _Step(here, moves, 0.0 if moved is None else moved.overlap, ground)
+        motion = Motion(seconds, velocity, camera, noise, overlap)
+        return _Step(here, motion, 0.0 if moved is None else moved.overlap, ground)
 
     def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
         """By the expected displacement or the largest usual speed."""
