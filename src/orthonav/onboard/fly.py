@@ -227,11 +227,12 @@ class Runner:
                 return self._refuse(image, taken.problem, taken.vehicle)
             return self._withhold(taken, latency)
         finally:
-            if taken.problem is not None and taken.problem.reason == "frozen_image":
+            view, link = taken.view, self._link
+            if taken.problem is None and isinstance(view, View) and link is not None:
+                reported = link.state_at, link.covered_ns
+                latency.observe(arrived_ns, view.grey, view.camera, *reported)
+            elif taken.problem is not None and taken.problem.reason == "frozen_image":
                 latency.frozen(arrived_ns)
-            elif taken.problem is None and self._link is not None:
-                reported = self._link.state_at, self._link.covered_ns
-                latency.observe(arrived_ns, image.grey, taken.camera, *reported)
 
     def _restart_after_jump(self, time_ns: int) -> None:
         """Begin again where a recorded image is earlier than the one before by over a second: it
