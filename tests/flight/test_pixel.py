@@ -15,17 +15,18 @@ from orthonav.ground.recordings.pixel import locate_pixel
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 FRAME = LocalFrame(48.0, 2.0)
 AGL_M = 200.0
-EVIDENCE = {"heading_std_deg": 0.8, "log_scale_std": 0.01}
+STDS = {"heading_std_deg": 0.8, "log_scale_std": 0.01}
 
 
 def telemetry(pitch_deg=0.0, roll_deg=0.0):
     return Telemetry(0, 0.0, pitch_deg, roll_deg, AGL_M)
 
 
-def fix(east_m=0.0, north_m=0.0, heading_deg=30.0, agl_m=AGL_M, std_m=1.0, evidence=EVIDENCE):
+def fix(east_m=0.0, north_m=0.0, heading_deg=30.0, agl_m=AGL_M, std_m=1.0, **stated):
     lat, lon = FRAME.latlon_from_en([east_m, north_m])
     covariance = np.eye(2) * std_m**2
-    return Fix(float(lat), float(lon), covariance, 0.99, 35.0, heading_deg, agl_m, evidence)
+    place = float(lat), float(lon), covariance
+    return Fix(*place, 0.99, 35.0, heading_deg, agl_m, **{**STDS, **stated})
 
 
 def en_of(point):
@@ -86,8 +87,7 @@ def test_ellipses_cover_what_they_state(px, tilt_deg):
         heading = 30.0 + math.degrees(rng.normal(0, heading_std))
         agl_m = AGL_M * math.exp(rng.normal(0, scale_std))
         place = rng.normal(0, 1.0, 2) + at_camera - ground(middle[0], heading, agl_m)
-        evidence = EVIDENCE | {"middle_std_m": 1.0}
-        seen = fix(*place, heading_deg=heading, agl_m=agl_m, evidence=evidence)
+        seen = fix(*place, heading_deg=heading, agl_m=agl_m, ground_cov_en_m2=np.eye(2))
         seen = replace(seen, cov_en_m2=covariance)
         found = locate_pixel(CAMERA, tilted, seen, px)
         off = en_of(found) - ground(px, 30.0, AGL_M)
@@ -121,13 +121,13 @@ def test_the_middle_is_as_exact_as_registration_where_tilt_is_uncertain(pitch_de
     lever_m = 1.05 * AGL_M * math.radians(3.0) / math.cos(math.radians(pitch_deg)) ** 2
     exact = {"heading_std_deg": 0.0, "log_scale_std": 0.0}
     seen = replace(
-        fix(agl_m=1.05 * AGL_M, evidence=exact | {"middle_std_m": 0.6}),
+        fix(agl_m=1.05 * AGL_M, **exact, ground_cov_en_m2=np.eye(2) * 0.6**2),
         cov_en_m2=np.eye(2) * (0.6**2 + lever_m**2),
     )
     found = locate_pixel(CAMERA, tilted, seen, (320, 240))
     np.testing.assert_allclose(found.cov_en_m2, np.eye(2) * 0.6**2, atol=1e-9)
     # A fix that does not say how well the middle is known is one of the camera.
-    found = locate_pixel(CAMERA, tilted, replace(seen, evidence=exact), (320, 240))
+    found = locate_pixel(CAMERA, tilted, replace(seen, ground_cov_en_m2=None), (320, 240))
     assert (np.linalg.eigvalsh(found.cov_en_m2 - seen.cov_en_m2) > 0).all()
 
 

@@ -78,7 +78,7 @@ def test_unreported_tilt_is_found(tilted):
         assert np.hypot(*off[:2]) < 0.01 * agl_m and fix.confidence > 0.9
         assert np.abs(off[4:]).max() < 0.4
         assert abs(off[2]) < 0.005 * agl_m and abs(off[3]) < 0.2
-        assert fix.evidence["pitch_bias_deg"] == pytest.approx(fix.pitch_deg)
+        assert fix.bias.pitch_bias_deg == pytest.approx(fix.pitch_deg)
 
 
 def test_covariances_are_consistent(tilted):

@@ -116,11 +116,12 @@ class FakeLocator:
         self.outcome = outcome or (
             lambda view: fix(heading_deg=view.telemetry.yaw_deg, agl_m=view.telemetry.agl_m)
         )
-        self.state_name, self.seen = state, []
+        self.state_name, self.seen, self.bridged = state, [], []
 
     def locate(self, view):
         self.seen.append(view.telemetry)
         return self.outcome(view)
 
     def passed(self, telemetry, reason):
-        return reason
+        self.bridged.append(telemetry)
+        return fix()

@@ -36,12 +36,12 @@ from paced import pace_by
 from helpers import wait_for
 from orthonav.cli import main
 from orthonav.core.errors import CameraError, MapChangedError, MapFileError
-from orthonav.core.flight.fixes import result_from_json
+from orthonav.core.flight.fixes import read_results, result_from_json
 from orthonav.core.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
 from orthonav.core.flight.heights import FlownHeights
 from orthonav.core.geo.camera import Camera
 from orthonav.core.localize.confidence import ALERT_LIMIT, Acceptance
-from orthonav.core.records import CONFIDENT, NoFix, Prior, Telemetry
+from orthonav.core.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 from orthonav.onboard import cameras
 from orthonav.onboard import fly as loop
 from orthonav.onboard import state as states
@@ -323,19 +323,6 @@ def test_the_search_of_the_whole_map_is_not_slow(begin):
     assert not any("slow" in each.get("reasons", ()) for each in flight.written())
 
 
-def test_an_internal_error_is_one_no_fix(flight, caplog):
-    whole = flight.locator.outcome
-
-    def failing(view):
-        flight.locator.outcome = whole
-        raise np.linalg.LinAlgError("singular")
-
-    flight.locator.outcome = failing
-    assert [reason_of(each) for each in flight.views(3)] == ["internal_error", "fix", "fix"]
-    health = flight.health()
-    assert (health.level, health.reasons) == (Level.DEGRADED, ("internal_error",))
-
-
 @pytest.mark.parametrize("error", [MapFileError("damaged"), ValueError("odd")])
 def test_internal_errors_bridged_by_dead_reckoning_are_counted(flight, monkeypatch, error):
     """Health shows them although every view has a position."""
@@ -354,22 +341,8 @@ def raising(error):
     return outcome
 
 
-def test_repeated_images_are_not_located(flight):
-    """The tracker does not get a repeated image, nothing is sent, and health names the reason."""
-    grey = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
-    flight.view(grey)
-    seen = len(flight.locator.seen)
-    flight.port.gone.clear()
-    results = flight.views(30, grey=grey)
-    assert {reason_of(each) for each in results} == {"frozen_image"}
-    assert len(flight.locator.seen) == seen and flight.port.sent("GPS_INPUT") == []
-    assert "frozen_image" in flight.reasons()
-    assert flight.runner.counter.total["frozen"] == 30
-    assert reason_of(flight.views(2)[1]) == "fix"
-
-
 def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
-    """One velocity does not say how far an aircraft flew that turned while images were frozen."""
+    """One velocity does not say how far an aircraft flew that turned while images were late."""
     flight, own = begin(), (1.0, 2.0)
     flight.locator.outcome = lambda view: replace(fix(), vel_en_mps=own, vel_std_mps=0.5)
 
@@ -381,11 +354,9 @@ def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
             results += flight.views(1, **options)
         return results
 
-    frozen = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
     assert views(20, 20.0)[-1].outcome.vel_en_mps == own
-    views(1, 20.0, grey=frozen)
-    views(10, 20.0, grey=frozen)
-    views(10, -10.0, grey=frozen)
+    views(10, 20.0, age_s=0.6)
+    views(10, -10.0, age_s=0.6)
     first, second = views(2, -10.0)[-2:]
     mean, now = (each.vel_en_mps for each in flight.locator.seen[-2:])
     assert mean == (0.0, pytest.approx(5.0, abs=1.5)) and now == (0.0, -10.0)
@@ -394,23 +365,38 @@ def test_over_a_gap_the_aircraft_is_followed_with_the_mean_velocity(begin):
     assert second.outcome.vel_en_mps == own
 
 
-BAD = {
-    "bad_image": NoFix("bad_image", "cut short"),
-    "too_dark": np.zeros((240, 320), np.uint8),
-    "too_bright": np.full((240, 320), 255, np.uint8),
-    "blank": np.full((240, 320), 120, np.uint8),
+SAME = np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8)
+UNUSABLE = {
+    "bad_image": (NoFix("bad_image", "cut short"), "bad_image"),
+    "frozen_image": (SAME, "frozen"),
+    "too_dark": (np.zeros((240, 320), np.uint8), "bad_image"),
+    "too_bright": (np.full((240, 320), 255, np.uint8), "bad_image"),
+    "blank": (np.full((240, 320), 120, np.uint8), "bad_image"),
 }
+DARK = UNUSABLE["too_dark"][0]
 
 
-@pytest.mark.parametrize("kind", BAD)
-def test_unusable_images_give_no_fix(flight, kind):
-    seen = len(flight.locator.seen)
-    results = flight.views(30, grey=BAD[kind])
-    assert {reason_of(each) for each in results} == {kind}
-    assert len(flight.locator.seen) == seen
-    assert flight.port.sent("GLOBAL_POSITION_SENSOR") == []
-    assert "bad_images" in flight.reasons()
-    flight.view()
+@pytest.mark.parametrize("reason", UNUSABLE)
+def test_over_unusable_images_the_track_is_predicted_and_nothing_is_sent(flight, reason):
+    """Whatever the track says there. The locator finds out itself that a picture is too dark."""
+    grey, counted = UNUSABLE[reason]
+    flight.view(grey)
+    flight.port.gone.clear()
+    predicted, located = len(flight.locator.bridged), len(flight.locator.seen)
+    logged = len(flight.log.named("view"))
+    flight.views(30, grey=grey)
+    lines = [line for line in flight.written() if "frame" in line][-30:]
+    assert {(line["withheld"], *line["sent"]) for line in lines} == {(reason,)}
+    assert flight.port.sent("GLOBAL_POSITION_SENSOR") == flight.port.sent("GPS_INPUT") == []
+    bridged = len(flight.locator.bridged) - predicted
+    assert (bridged, len(flight.locator.seen) - located) == (
+        (30, 0) if reason in ("bad_image", "frozen_image") else (0, 30)
+    )
+    # A replay of the log does as much: it has no picture to locate.
+    assert [each[2] is None for each in flight.log.named("view")[logged:]] == [bridged == 30] * 30
+    assert flight.runner.counter.total[counted] >= 30
+    assert {"frozen": "frozen_image", "bad_image": "bad_images"}[counted] in flight.reasons()
+    assert reason_of(flight.views(2)[1]) == "fix"
     assert flight.gate.resets == 0  # an interruption is no jump
 
 
@@ -422,12 +408,11 @@ def test_a_view_that_is_blank_beside_the_mask_of_the_camera_is_a_bad_image(begin
     grey = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
     assert reason_of(flight.views(2)[1]) == "fix"
     grey[:120] = 120
-    results = flight.views(30, grey=grey)
-    assert {reason_of(each) for each in results} == {"blank"}
-    assert flight.runner.counter.total["bad_image"] == 30
-    assert "bad_images" in flight.reasons()
-    large = np.repeat(np.repeat(grey, 2, axis=0), 2, axis=1)
-    assert reason_of(flight.view(large)) == "blank"  # the mask is that of its size
+    large = np.repeat(np.repeat(grey, 2, axis=0), 2, axis=1)  # the mask is that of its size
+    for each in (grey, large):
+        flight.view(each)
+        assert flight.written()[-1]["withheld"] == "blank"
+    assert flight.runner.counter.total["bad_image"] == 2
 
 
 def test_an_image_of_other_proportions_fails_and_one_of_another_size_does_not(flight):
@@ -440,6 +425,7 @@ def test_an_image_of_other_proportions_fails_and_one_of_another_size_does_not(fl
     flight.locator.outcome = outcome
     assert reason_of(flight.view(flight.rng.integers(0, 256, (480, 640), np.uint8))) == "fix"
     assert (cameras[0].width_px, cameras[0].fx_px) == (640, 400.0)
+    flight.locator.passed = lambda telemetry, reason: reason  # no track yet
     wrong = flight.view(flight.rng.integers(0, 256, (240, 240), np.uint8))
     assert reason_of(wrong) == "wrong_camera" and "calibrate" in wrong.outcome.detail
     assert flight.health().level is Level.FAILED
@@ -555,7 +541,7 @@ def test_a_camera_that_stops_is_a_failure(flight):
 def test_health_goes_to_the_ground_station(flight):
     texts = []
     for _ in range(100):
-        flight.view(grey=BAD["too_dark"])
+        flight.view(grey=DARK)
         texts += [frame for frame in flight.port.gone if b"orthonav DEGRADED: " in frame]
     assert 0 < len(texts) <= 2  # at most one in five seconds
     heard = flight.written()
@@ -619,7 +605,7 @@ def test_the_position_is_saved_about_once_a_second(begin, tmp_path, monkeypatch)
     saved = states.load(path)
     assert (saved.lat_deg, saved.lon_deg, saved.std_m) == (48.0, 2.0, pytest.approx(2.0))
     assert saved.age_s(flight.time.clocks.utc_ns(), flight.time.now_ns, states.boot_id()) < 1.2
-    flight.views(130, grey=BAD["too_dark"])
+    flight.views(130, grey=DARK)
     later = states.load(path)
     assert later.mono_ns - saved.mono_ns < S
     monkeypatch.setattr(states, "save", lambda *a: (_ for _ in ()).throw(OSError("read only")))
@@ -630,9 +616,8 @@ def test_the_position_is_saved_about_once_a_second(begin, tmp_path, monkeypatch)
 def test_the_first_located_view_gets_the_start_position(begin):
     prior = Prior(48.0, 2.0, 50.0)
     flight = begin(start=lambda: prior)
-    flight.view(BAD["too_dark"])
     flight.views(3)
-    assert [each.prior for each in flight.locator.seen] == [prior, None, None]
+    assert [each.prior for each in flight.locator.seen] == [prior, None]
 
 
 def test_time_that_goes_back_begins_the_track_again(begin, caplog):
@@ -716,33 +701,6 @@ def test_the_flight_ends_with_the_recording(flight):
     flight.runner.run(threading.Event())
     assert [name for name, _ in flight.log.calls[-1:]] == ["close"]
     assert flight.log.named("options")
-
-
-def test_after_an_unexpected_error_the_next_view_is_processed(flight, monkeypatch, caplog):
-    whole, calls = flight.runner._publisher.publish, []
-
-    def publish(*arguments, **options):
-        calls.append(1)
-        if len(calls) == 1:
-            raise ValueError("an invalid estimate")
-        return whole(*arguments, **options)
-
-    monkeypatch.setattr(flight.runner._publisher, "publish", publish)
-    stopping = threading.Event()
-
-    def take(timeout_s, whole=flight.newest.take):
-        if len(calls) == 2:
-            stopping.set()
-        flight.time.go(0.1)
-        flight.talk()
-        grey = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
-        flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey))
-        return whole(timeout_s)
-
-    monkeypatch.setattr(flight.newest, "take", take)
-    flight.runner.run(stopping)
-    assert len(calls) >= 2 and flight.runner.counter.total["internal_error"] == 1
-    assert "an invalid estimate" in caplog.text
 
 
 def test_a_camera_error_of_the_locator_is_a_wrong_camera(flight):
@@ -942,6 +900,29 @@ def test_a_flight_from_end_to_end(flown, autopilot, paced, monkeypatch, tmp_path
     assert all(m["processing_time"] > 0 for m in autopilot.named("GLOBAL_POSITION_SENSOR"))
     assert autopilot.named("HEARTBEAT") and autopilot.named("TIMESYNC")
     assert states.load(state).lat_deg == pytest.approx(confident[-1][1].outcome.lat_deg)
+
+
+def test_a_flight_is_localized_as_it_was_flown_over_dark_pictures_too(flown, paced, run, tmp_path):
+    """Dead reckoning bridges them in both; the loop sends nothing there."""
+    path, recorded, _, truth = flown
+    folder, lines = shutil.copytree(recorded, tmp_path / "flight"), tmp_path / "lines.jsonl"
+    dark = sorted(truth)[12:14]
+    for name in dark:
+        (picture,) = folder.rglob(name)
+        cv2.imwrite(str(picture), np.zeros((240, 320), np.uint8))
+    paced(lines)
+    assert run("fly", path, folder, "--recorded-telemetry", "--jsonl", lines).code == 0
+    fixes = tmp_path / "fixes.jsonl"
+    assert run("localize", path, folder, "--track", "--out", fixes).code == 0
+    written, in_flight = views_in(lines)
+    again = read_results(fixes)
+    assert [(each.frame, each.state, each.outcome) for each in in_flight] == [
+        (each.frame, each.state, each.outcome) for each in again
+    ]
+    bridged = [each for each in again if each.frame in dark]
+    assert all(isinstance(each.outcome, Fix) and each.state == "coasting" for each in bridged)
+    withheld = [line["withheld"] for line in written if line["frame"] in dark]
+    assert withheld == ["too_dark"] * 2 and again[-1].state == "tracking"
 
 
 @pytest.mark.long

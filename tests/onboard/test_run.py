@@ -36,6 +36,12 @@ def outcomes(results):
     ]
 
 
+def singly(localizer, flight, *, views=None, skip_bad_images=False, **how):
+    """Results of a flight, each view by itself."""
+    located = SingleViews(localizer, **how)
+    return localize_flight(located, flight, views=views, skip_bad_images=skip_bad_images)
+
+
 def failing_at(localizer, monkeypatch, number, error):
     """Make the localizer raise `error` inside, at one view."""
     matcher = localizer.tiles.matcher
@@ -55,7 +61,7 @@ def failing_at(localizer, monkeypatch, number, error):
 )
 def test_one_broken_view_does_not_end_a_flight(localizer, short, monkeypatch, caplog, error):
     failing_at(localizer, monkeypatch, 3, error)
-    results = list(localize_flight(SingleViews(localizer), short))
+    results = list(singly(localizer, short))
     assert outcomes(results) == ["fix"] * 3 + ["internal_error"] + ["fix"] * (VIEWS - 4)
     detail = results[3].outcome.detail
     assert detail.startswith(type(error).__name__) and "\n" not in detail
@@ -66,8 +72,8 @@ def test_an_interrupt_ends_it(localizer, short, monkeypatch):
     failing_at(localizer, monkeypatch, 2, KeyboardInterrupt())
     done = []
     with pytest.raises(KeyboardInterrupt):
-        done.extend(localize_flight(SingleViews(localizer), short))
-    flown = localize_flight(SingleViews(localizer), short)
+        done.extend(singly(localizer, short))
+    flown = singly(localizer, short)
     assert next(flown).frame == short.views[0].frame
 
 
@@ -80,11 +86,11 @@ def test_a_position_that_is_not_finite_is_no_fix(localizer, short, monkeypatch, 
         return replace(fix, **{field: np.full((2, 2), np.nan) if "cov" in field else math.nan})
 
     monkeypatch.setattr(Localizer, "locate", located)
-    assert set(outcomes(localize_flight(SingleViews(localizer), short))) == {"internal_error"}
+    assert set(outcomes(singly(localizer, short))) == {"internal_error"}
 
 
 def test_order_time_and_latency(localizer, short):
-    results = list(localize_flight(SingleViews(localizer), short))
+    results = list(singly(localizer, short))
     assert [result.frame for result in results] == [view.frame for view in short.views]
     assert [result.time_ns for result in results] == [v.telemetry.time_ns for v in short.views]
     assert all(0 < result.latency_ms < 60_000 for result in results)
@@ -99,7 +105,7 @@ def test_results_come_one_by_one(localizer, short):
             taken.append(view.frame)
             yield view
 
-    flown = localize_flight(SingleViews(localizer), short, views=views())
+    flown = singly(localizer, short, views=views())
     for number in range(1, 4):
         next(flown)
         assert len(taken) == number
@@ -120,8 +126,8 @@ def test_a_bad_image_is_an_error_or_skipped(localizer, copied, kind):
     path = Path(flight.views[2].where)
     path.write_bytes(BREAK[kind](path.read_bytes()))
     with pytest.raises(FlightError, match=path.name):
-        list(localize_flight(SingleViews(localizer), flight))
-    results = list(localize_flight(SingleViews(localizer), flight, skip_bad_images=True))
+        list(singly(localizer, flight))
+    results = list(singly(localizer, flight, skip_bad_images=True))
     assert outcomes(results) == ["fix", "fix", "bad_image", "fix"]
     assert path.name in results[2].outcome.detail and math.isnan(results[2].latency_ms)
 
@@ -130,31 +136,26 @@ def test_a_missing_image_is_named(localizer, copied):
     flight = open_flight(copied)
     Path(flight.views[0].where).unlink()
     with pytest.raises(MissingFileError, match=flight.views[0].frame):
-        list(localize_flight(SingleViews(localizer), flight))
+        list(singly(localizer, flight))
 
 
 def test_a_camera_of_another_aspect_ratio_ends_the_flight(localizer, short):
     wrong = replace(short, camera=short.camera.resized(640, 240))
     for skip in (False, True):
         with pytest.raises(CameraError, match=short.views[0].where):
-            list(localize_flight(SingleViews(localizer), wrong, skip_bad_images=skip))
+            list(singly(localizer, wrong, skip_bad_images=skip))
 
 
 def test_the_prior_is_used_only_where_it_should_be(localizer, short):
     far = Prior(0.0, 0.0, 10.0)
     views = [replace(v, telemetry=replace(v.telemetry, prior=far)) for v in short.views]
-    assert set(outcomes(localize_flight(SingleViews(localizer), short, views=views))) == {
-        "outside_map"
-    }
-    without = localize_flight(SingleViews(localizer, use_prior=False), short, views=views)
+    assert set(outcomes(singly(localizer, short, views=views))) == {"outside_map"}
+    without = singly(localizer, short, views=views, use_prior=False)
     assert set(outcomes(without)) == {"fix"}
 
 
 def test_the_heading_may_be_unknown(localizer, short):
     views = [replace(v, telemetry=replace(v.telemetry, yaw_deg=math.nan)) for v in short.views[:3]]
-    telemetry = localize_flight(SingleViews(localizer), short, views=views)
-    assert set(outcomes(telemetry)) == {"missing_telemetry"}
-    without_heading = localize_flight(
-        SingleViews(localizer, heading_known=False), short, views=views
-    )
-    assert set(outcomes(without_heading)) == {"fix"}
+    assert set(outcomes(singly(localizer, short, views=views))) == {"missing_telemetry"}
+    found = singly(localizer, short, views=views, heading_known=False)
+    assert set(outcomes(found)) == {"fix"}

@@ -9,27 +9,24 @@ import pytest
 
 from orthonav.onboard import state
 from orthonav.onboard.gnss.biases import unknown
-from orthonav.onboard.state import (
-    SavedState,
-    boot_id,
-    learnt_biases,
-    load,
-    prior_of,
-    save,
-)
+from orthonav.onboard.state import SavedState, boot_id, learnt_biases, load, prior_of, save
 
 S = 10**9
 UTC_NS, MONO_NS = 1_700_000_000 * S, 500 * S
 SAVED = SavedState(48.1, 2.3, 4.0, UTC_NS, MONO_NS, "run-1", 77)
 
 
-def test_a_saved_state_is_loaded(tmp_path, names_in):
-    path = tmp_path / "state.json"
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "state.json"
+
+
+def test_a_saved_state_is_loaded(path, names_in):
     assert load(path) is None
     for saved in (SAVED, replace(SAVED, lat_deg=-48.123456789)):
         save(path, saved)
         assert load(path) == saved
-    assert names_in(tmp_path) == ["state.json"]
+    assert names_in(path.parent) == ["state.json"]
 
 
 def test_the_age_does_not_depend_on_utc_within_one_boot():
@@ -60,31 +57,26 @@ def test_without_a_position_there_is_no_prior():
     "text",
     ["", "{", "[]", "null", "{}", '{"version": 2}', '{"version": 1, "lat_deg": "x"}', "[" * 9999],
 )
-def test_a_damaged_file_is_ignored(tmp_path, text):
-    path = tmp_path / "state.json"
+def test_a_damaged_file_is_ignored(path, text):
     path.write_text(text)
     assert load(path) is None
 
 
-def test_numbers_beyond_their_type_are_damage(tmp_path):
-    path = tmp_path / "state.json"
-    maps = {"a": {**unknown().to_plain(), "agreed_s": 10**400}}
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"utc_ns": math.inf, "maps": {"a": {**unknown().to_plain(), "agreed_s": 10**400}}},
+        {"more": "x" * state.MAX_BYTES},
+    ],
+    ids=["numbers beyond their type", "huge"],
+)
+def test_a_file_with_damaged_fields_is_ignored(path, more):
     save(path, SAVED)
-    plain = json.loads(path.read_text())
-    path.write_text(json.dumps({**plain, "utc_ns": math.inf, "maps": maps}))
+    path.write_text(json.dumps({**json.loads(path.read_text()), **more}))
     assert load(path) is None and learnt_biases(path) == {}
 
 
-def test_a_huge_file_is_ignored(tmp_path):
-    path = tmp_path / "state.json"
-    save(path, SAVED)
-    plain = json.loads(path.read_text())
-    path.write_text(json.dumps({**plain, "more": "x" * state.MAX_BYTES}))
-    assert load(path) is None
-
-
-def test_a_write_that_fails_leaves_the_old_one(tmp_path, monkeypatch, names_in):
-    path = tmp_path / "state.json"
+def test_a_write_that_fails_leaves_the_old_one(path, monkeypatch, names_in):
     save(path, SAVED)
 
     def full(*_, **__):
@@ -93,11 +85,10 @@ def test_a_write_that_fails_leaves_the_old_one(tmp_path, monkeypatch, names_in):
     monkeypatch.setattr(state.json, "dump", full)
     with pytest.raises(OSError, match="No space"):
         save(path, replace(SAVED, lat_deg=1.0))
-    assert load(path) == SAVED and names_in(tmp_path) == ["state.json"]
+    assert load(path) == SAVED and names_in(path.parent) == ["state.json"]
 
 
-def test_what_was_learnt_of_maps_is_saved_and_survives_without_the_monitor(tmp_path):
-    path = tmp_path / "state.json"
+def test_what_was_learnt_of_maps_is_saved_and_survives_without_the_monitor(path):
     learnt = replace(unknown("camera"), mean=np.array([12.5, -3.25, 0.01, -0.02, 0.125]))
     cov = (learnt.cov + np.outer(learnt.stds, learnt.stds)) / 3
     learnt = replace(learnt, cov=cov, agreed_s=3600.0)
@@ -111,8 +102,7 @@ def test_what_was_learnt_of_maps_is_saved_and_survives_without_the_monitor(tmp_p
     assert np.array_equal(found["digest"].cov, learnt.cov)
 
 
-def test_what_was_learnt_of_many_maps_fits_into_the_file(tmp_path):
-    path = tmp_path / "state.json"
+def test_what_was_learnt_of_many_maps_fits_into_the_file(path):
     third = replace(unknown("0" * 16), mean=np.full(5, 1 / 30), cov=unknown().cov / 3)
     save(path, SAVED, {f"{number:064d}": third.to_plain() for number in range(105)})
     assert len(learnt_biases(path)) == 100 and load(path) == SAVED
@@ -142,15 +132,13 @@ GOOD = unknown().to_plain()
         {"east_m": 1.0, "north_m": 2.0, "std_m": 3.0, "agreed_s": 4.0},
     ],
 )
-def test_damaged_or_impossible_biases_are_ignored(tmp_path, wrong):
-    path = tmp_path / "state.json"
+def test_damaged_or_impossible_biases_are_ignored(path, wrong):
     save(path, SAVED, {"wrong": wrong, "good": GOOD})
     assert list(learnt_biases(path)) == ["good"] and load(path) == SAVED
 
 
 @pytest.mark.parametrize("maps", [3, []])
-def test_damaged_maps_are_ignored(tmp_path, maps):
-    path = tmp_path / "state.json"
+def test_damaged_maps_are_ignored(path, maps):
     save(path, SAVED)
     path.write_text(json.dumps({**json.loads(path.read_text()), "maps": maps}))
     assert learnt_biases(path) == {} and load(path) == SAVED

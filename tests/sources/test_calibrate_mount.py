@@ -1,7 +1,6 @@
 """Calibration of a mount from a track, and correction of telemetry with it."""
 
 import math
-from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.mount import Bias, Mount
 from orthonav.core.geo.camera import Camera
-from orthonav.core.records import Fix, NoFix, Telemetry, View, ViewResult
+from orthonav.core.records import Fix, NoFix, Telemetry, TelemetryBias, View, ViewResult
 from orthonav.core.track import Model
 from orthonav.ground.recordings.calibrate import calibrate_mount
 from orthonav.onboard.run import MountCorrected, model_of
@@ -20,12 +19,13 @@ SCATTER = {"heading_bias": 1.5, "log_scale_bias": 0.02, "pitch_bias": 0.4, "roll
 
 
 def view(number, values, confidence=0.99, std=0.5):
-    evidence = {}
+    biases = {}
     for name, value in values.items():
         unit = "" if name == "log_scale_bias" else "_deg"
-        evidence[f"{name}{unit}"] = value
-        evidence[f"{name}_std{unit}"] = std * (0.01 if name == "log_scale_bias" else 1.0)
-    fix = Fix(48.0, 2.0, np.eye(2), confidence, 35.0, 0.0, 100.0, MappingProxyType(evidence))
+        biases[f"{name}{unit}"] = value
+        biases[f"{name}_std{unit}"] = std * (0.01 if name == "log_scale_bias" else 1.0)
+    bias = TelemetryBias(**biases)
+    fix = Fix(48.0, 2.0, np.eye(2), confidence, 35.0, 0.0, 100.0, bias=bias)
     return ViewResult(f"{number:03d}.jpg", number * 10**9, fix, 50.0, "tracking")
 
 

@@ -15,7 +15,7 @@ from orthonav.core.track import (
     ReportedAttitude,
     ReportedVelocity,
 )
-from orthonav.core.track.model import SEEN, WHITE_SHARE
+from orthonav.core.track.filter import OBSERVES, WHITE_SHARE, observed
 
 SIDE_M, RADIUS_M, AGL_M, STEP_S, VIEWS = 2000.0, 35.0, 300.0, 1.0, 60
 EXTENT = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
@@ -115,9 +115,9 @@ def flown(seed, *, odometry=True, velocity=False, error=(0.0, 1.0)):
             mixture.predict(STEP_S, reported if velocity else None, camera if odometry else None)
         sighting = flight.sighting()
         mixture.update(LEVEL, [sighting])
-        found = mixture.estimate(RADIUS_M)
+        found = mixture.conclude(RADIUS_M)
         off_m = found.mean[:2] - flight.place
-        tilt, spread = (SEEN @ found.mean)[4:], (SEEN @ found.covariance @ SEEN.T)[4:, 4:]
+        tilt, spread = (OBSERVES @ found.mean)[4:], observed(found.covariance)[4:, 4:]
         rows.append(
             (
                 np.hypot(*off_m),

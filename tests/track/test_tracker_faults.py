@@ -119,7 +119,7 @@ def expected_m(seen, number):
 
 PARTS_OF_A_VIEW = [
     *[(Tracker, name) for name in ("locate", "_predict", "_step", "_update", "_outcome", "_fix")],
-    *[(Mixture, name) for name in ("predict", "update", "estimate", "_merge")],
+    *[(Mixture, name) for name in ("predict", "update", "estimate", "conclude", "_merge")],
     (History, "record"),
 ]
 
@@ -253,7 +253,7 @@ def test_the_confidence_of_a_track_is_no_more_than_its_place_probability(localiz
     for view in seen:
         fix = tracker.locate(view)
         assert fix.confidence <= fix.place_probability <= 1.0
-        estimate = tracker.mixture.estimate(fix.radius_m, between_views=True)
+        estimate = tracker.mixture.estimate(fix.radius_m)
         assert estimate.confidence <= estimate.place_probability
 
 

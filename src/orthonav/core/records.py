@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -304,6 +304,23 @@ class Outcome(Result):
         object.__setattr__(self, "evidence", ReadOnly(self.evidence))
 
 
+class TelemetryBias(NamedTuple):
+    """Constant errors of the telemetry that a fix estimates, to be added to it, and their
+    standard deviations: deg, and the logarithm of the scale. NaN: unknown."""
+
+    heading_bias_deg: float = math.nan
+    log_scale_bias: float = math.nan
+    pitch_bias_deg: float = math.nan
+    roll_bias_deg: float = math.nan
+    heading_bias_std_deg: float = math.nan
+    log_scale_bias_std: float = math.nan
+    pitch_bias_std_deg: float = math.nan
+    roll_bias_std_deg: float = math.nan
+
+
+UNKNOWN_BIAS = TelemetryBias()
+
+
 @dataclass(frozen=True, eq=False)
 class Fix(Outcome):
     """The position from which a view was taken, with its uncertainty.
@@ -314,8 +331,8 @@ class Fix(Outcome):
       calibrated.
     - `heading_deg` (0..360, of the top of the image) and `agl_m` (m): estimated, or as reported
       where the method does not estimate them.
-    - `evidence`: the numbers behind the confidence, such as `score` and `strength` of a
-      registration, `heading_std_deg`, `pitch_bias_deg`; all keys are in docs/reference/formats.md.
+    - `evidence`: the numbers behind the confidence, for people, such as `score` and `strength` of a
+      registration; all keys are in docs/reference/formats.md.
     - `ground_latlon_deg`: latitude and longitude of the ground that the middle of the picture
       shows; `ground_cov_en_m2` (2, 2): covariance of its east and north, m2; None: unknown.
     - `pitch_deg`, `roll_deg`: of the camera, estimated; as reported where `pose_cov` is None.
@@ -325,7 +342,10 @@ class Fix(Outcome):
       method states only a confidence, which is then used for it.
     - `vel_en_mps`: velocity over ground of a track, east, north, m/s; `vel_std_mps`: its standard
       deviation along the worst direction; None and NaN: unknown.
-    - `recognized`: probability that this view of a track shows the map, NaN: unknown."""
+    - `recognized`: probability that this view of a track shows the map, NaN: unknown.
+    - `bias`: of the telemetry, by a track or by the camera of one view.
+    - `heading_std_deg`, `log_scale_std`: standard deviations of heading and of the logarithm of the
+      height by the registration of one view, NaN: unknown."""
 
     lat_deg: float
     lon_deg: float
@@ -344,6 +364,9 @@ class Fix(Outcome):
     vel_en_mps: tuple[float, float] | None = None
     vel_std_mps: float = math.nan
     recognized: float = math.nan
+    bias: TelemetryBias = UNKNOWN_BIAS
+    heading_std_deg: float = math.nan
+    log_scale_std: float = math.nan
 
     @property
     def is_confident(self) -> bool:
@@ -394,17 +417,13 @@ class Fix(Outcome):
         """Pitch and roll of the camera of a view with this telemetry: those of the fix, else the
         reported ones with the biases that the fix states."""
         pitch, roll = (
-            stated if math.isfinite(stated) else reported + _finite(self.evidence.get(bias))
+            stated if math.isfinite(stated) else reported + (bias if math.isfinite(bias) else 0.0)
             for stated, reported, bias in (
-                (self.pitch_deg, telemetry.pitch_deg, "pitch_bias_deg"),
-                (self.roll_deg, telemetry.roll_deg, "roll_bias_deg"),
+                (self.pitch_deg, telemetry.pitch_deg, self.bias.pitch_bias_deg),
+                (self.roll_deg, telemetry.roll_deg, self.bias.roll_bias_deg),
             )
         )
         return pitch, roll
-
-
-def _finite(value: float | None) -> float:
-    return value if value is not None and math.isfinite(value) else 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,14 +91,8 @@ class LiveCamera:
             raise CameraGoneError(f"camera delivers no images: {self._shown}")
         arrived_ns = self._clocks.mono_ns()
         self._count_interruptions(arrived_ns)
-        found, frame = self._capture.retrieve()
         self._number += 1
-        grey, why = None, "image could not be decoded"
-        try:
-            grey = grey_levels(frame) if found else None
-        except FlightError as error:  # a format that was not negotiated
-            why = str(error)
-        problem = NoFix("bad_image", why) if grey is None else None
+        grey, problem = _loaded(partial(_decoded, self._capture.retrieve(), "image"))
         return CameraImage(
             self._number,
             f"{self._number:08d}",
@@ -166,13 +160,7 @@ class Playback:
 
     def _picture(self, entry: "RecordedImage", due_ns: int) -> CameraImage:
         self._number += 1
-        grey, problem = None, None
-        try:
-            grey = entry.load()
-        except FlightError as error:
-            problem = NoFix("bad_image", str(error))
-        except OSError as error:
-            problem = NoFix("bad_image", f"image cannot be read ({error})")
+        grey, problem = _loaded(entry.load)
         return CameraImage(
             self._number, entry.frame, due_ns, entry.time_ns, grey, problem, entry.telemetry
         )
@@ -257,18 +245,28 @@ def _video(capture: Any) -> Iterator[RecordedImage]:
     try:
         while capture.grab():
             time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            found, frame = capture.retrieve()
-            grey = grey_levels(frame) if found else None
-            yield RecordedImage(f"{number:06d}", time_ns, partial(_loaded, grey, number))
+            load = partial(_decoded, capture.retrieve(), f"frame {number} of the video")
+            yield RecordedImage(f"{number:06d}", time_ns, load)
             number += 1
     finally:
         capture.release()
 
 
-def _loaded(grey: Grey | None, number: int) -> Grey:
-    if grey is None:
-        raise FlightError(f"frame {number} of the video cannot be decoded")
-    return grey
+def _decoded(retrieved: tuple[bool, Any], what: str) -> Grey:
+    found, frame = retrieved
+    if not found:
+        raise FlightError(f"{what} could not be decoded")
+    return grey_levels(frame)
+
+
+def _loaded(load: Callable[[], Grey]) -> tuple[Grey | None, NoFix | None]:
+    """The picture, or why there is none."""
+    try:
+        return load(), None
+    except FlightError as error:  # also a format that was not negotiated
+        return None, NoFix("bad_image", str(error))
+    except OSError as error:
+        return None, NoFix("bad_image", f"image cannot be read ({error})")
 
 
 def _capture(name: int | str) -> Any:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -45,9 +45,9 @@ from orthonav.onboard.monitors import (
     output_reasons,
     program_reasons,
 )
-from orthonav.onboard.motion import PAIR_INTERVAL, Grey
+from orthonav.onboard.motion import PAIR_INTERVAL
 from orthonav.onboard.outputs import Publisher
-from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
+from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, UnusableView, locate_view
 from orthonav.onboard.telemetry import VehicleState
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ MAX_AGE_S = 0.5
 """Images that are older when their processing starts are dropped; live ones count from arrival."""
 TELEMETRY_WAIT_S = 0.15
 """Longest wait for telemetry after the exposure: three attitudes at 20 Hz, the least rate."""
+UNKNOWN_VEHICLE = VehicleState(None)
 Velocity = tuple[float, float]
 
 
@@ -105,6 +106,25 @@ class FlyOptions:
         return self.accept.accepts(fix) and (by_limit or fix.confidence >= self.min_confidence)
 
 
+class _Taken(NamedTuple):
+    """An image and what was reported at its exposure. `camera`: at its size; None where its picture
+    must not be located. `problem`: of the picture; no position is sent for it."""
+
+    image: CameraImage
+    camera: Camera | None
+    problem: NoFix | None
+    vehicle: VehicleState
+    telemetry: Telemetry
+
+    @property
+    def view(self) -> View | UnusableView:
+        """What the locator gets: it bridges a picture that is too dark itself."""
+        if self.camera is None or self.image.grey is None:
+            reason = self.problem or NoFix("bad_image", "image could not be decoded")
+            return UnusableView(self.telemetry, reason)
+        return View(self.image.grey, self.camera, self.telemetry)
+
+
 class Runner:
     """Processes images until it is stopped or a recording ends. Mutable; for one thread."""
 
@@ -129,7 +149,7 @@ class Runner:
         self._link, self._sink, self._gnss, self._latency = link, sink, gnss, latency
         counter = self.counter = EventCounter(self._clocks.mono_ns())
         self._reporter = HealthReporter()
-        self._track = TrackMonitor(
+        self._track_monitor = TrackMonitor(
             counter,
             publisher,
             lambda: self._locator.state_name,
@@ -142,7 +162,7 @@ class Runner:
             partial(program_reasons, counter, options.map_change),
             partial(output_reasons, counter, publisher, link),
             *([] if gnss is None else [gnss.reasons]),
-            self._track.reasons,
+            self._track_monitor.reasons,
         ]
         self.health: Health | None = None
         self._frozen, self._heights_said, self._texts = FrozenCheck(), False, 0
@@ -181,38 +201,38 @@ class Runner:
         return result
 
     def _process(self, image: CameraImage) -> ViewResult | None:
-        now_ns = self._clocks.mono_ns()
+        now_ns, arrived_ns, latency = self._clocks.mono_ns(), image.exposed_ns, self._latency
         self._count("taken")
-        if self._latency is not None and image.interruptions is not None:
-            self._latency.arrived(image.exposed_ns, image.interruptions)
-        if now_ns - image.exposed_ns > MAX_AGE_S * 1e9:
+        if latency is not None and image.interruptions is not None:
+            latency.arrived(arrived_ns, image.interruptions)
+        if now_ns - arrived_ns > MAX_AGE_S * 1e9:
             self._count("late")
             return None
-        arrived_ns, latency = image.exposed_ns, self._latency
         if latency is not None:
             delay_ns = round(latency.delay_s * 1e9)
             exposed_ns, time_ns = image.exposed_ns - delay_ns, image.time_ns - delay_ns
             image = replace(image, exposed_ns=exposed_ns, time_ns=time_ns)
         self._restart_after_jump(image.time_ns)
-        usable = self._map_changed() or self._usable(image)
-        if isinstance(usable, NoFix):
-            if latency is not None and usable.reason == "frozen_image":
-                latency.frozen(arrived_ns)
-            return self._refused(image, usable, VehicleState(None))
-        grey, camera = usable
-        vehicle, telemetry = self._telemetry(image)
-        view = View(grey, camera, telemetry)
+        # Parts of a changed map in memory would still give positions; stopping shows it at once.
+        change = self.options.map_change()
+        if change is not None:
+            return self._refuse(image, NoFix(MAP_CHANGED, f"map file was changed: {change}"))
+        taken = _Taken(image, *self._picture(image), *self._telemetry(image))
+        if latency is None:
+            return self._located(taken)
         try:
-            if latency is not None and not latency.may_locate:
-                return self._withheld(image, view, vehicle, latency)
-            refused = self._unusable(telemetry)
-            if refused is not None:
-                return self._refused(image, refused, vehicle)
-            return self._located(image, view, vehicle)
+            if latency.may_locate:
+                return self._located(taken)
+            if taken.problem is not None:
+                return self._refuse(image, taken.problem, taken.vehicle)
+            return self._withhold(taken, latency)
         finally:
-            if latency is not None and self._link is not None:
-                reported = self._link.state_at, self._link.covered_ns
-                latency.observe(arrived_ns, grey, camera, *reported)
+            view, link = taken.view, self._link
+            if taken.problem is None and isinstance(view, View) and link is not None:
+                reported = link.state_at, link.covered_ns
+                latency.observe(arrived_ns, view.grey, view.camera, *reported)
+            elif taken.problem is not None and taken.problem.reason == "frozen_image":
+                latency.frozen(arrived_ns)
 
     def _restart_after_jump(self, time_ns: int) -> None:
         """Begin again where a recorded image is earlier than the one before by over a second: it
@@ -226,61 +246,65 @@ class Runner:
         if self.options.heights is not None:
             self.options.heights.observe(time_ns, NoFix("searching", ""), "searching")
 
-    def _refused(self, image: CameraImage, reason: NoFix, vehicle: VehicleState) -> ViewResult:
+    def _refuse(
+        self, image: CameraImage, reason: NoFix, vehicle: VehicleState = UNKNOWN_VEHICLE
+    ) -> ViewResult:
+        """The result of an image of which the locator learns nothing."""
         result = self._result(image, reason, math.nan)
         self._log(lambda sink: sink.result(result))
         self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
         return result
 
-    def _withheld(
-        self, image: CameraImage, view: View, vehicle: VehicleState, latency: LatencyMonitor
-    ) -> ViewResult:
-        """A view whose time of exposure is in doubt: the track must not get it. Some are logged,
-        for `orthonav calibrate --latency`."""
-        reason = latency.reasons()[0]
+    def _withhold(self, taken: _Taken, latency: LatencyMonitor) -> ViewResult:
+        """The result of a view whose time of exposure is in doubt: the track must not get it. Some
+        are logged, for `orthonav calibrate --latency`."""
+        image, reason = taken.image, latency.reasons()[0]
         self._count(reason)
         result = self._result(image, NoFix(reason, latency.detail()), math.nan)
         if image.exposed_ns - self._withheld_ns >= LOOP.withheld_s * 1e9:
             self._withheld_ns = image.exposed_ns
-            self._log_view(image, view, withheld=True)
+            self._log_view(taken, withheld=True)
             self._log(lambda sink: sink.result(result))
-        self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=reason)
+        self._publisher.publish(
+            result, image.exposed_ns, taken.vehicle, judged=False, withheld=reason
+        )
         return result
 
-    def _log_view(self, image: CameraImage, view: View, *, withheld: bool) -> None:
+    def _log_view(self, taken: _Taken, *, withheld: bool) -> None:
+        image, telemetry = taken.image, taken.telemetry
+        grey = None if taken.camera is None else image.grey
         used_ms = None if self._latency is None else self._latency.delay_s * 1e3
         self._log(
-            lambda sink: sink.view(
-                image.number, image.frame, view.grey, view.telemetry, used_ms, withheld
-            )
+            lambda sink: sink.view(image.number, image.frame, grey, telemetry, used_ms, withheld)
         )
 
-    def _located(self, image: CameraImage, view: View, vehicle: VehicleState) -> ViewResult:
-        view = self._from_start(view)
-        self._say_heights(view.telemetry)
-        known = self._above_ground(view.telemetry)
+    def _located(self, taken: _Taken) -> ViewResult:
+        image, heights = taken.image, self.options.heights
+        known = self._above_ground(taken.telemetry)
+        if self._start and isinstance(known, Telemetry):
+            known = self._above_ground(self._from_start(taken.telemetry))
         if isinstance(known, NoFix):
-            return self._refused(image, known, vehicle)
-        heights = self.options.heights
-        above_sea = heights is None or heights.datum_known
-        if known.below is not None and above_sea and math.isnan(vehicle.amsl_m):
-            vehicle = replace(vehicle, amsl_m=known.below.height_m + known.agl_m)
+            return self._refuse(image, known, taken.vehicle)
+        self._track_monitor.moved(known)
+        self._say_heights(taken.telemetry)
         telemetry = self._over_gap(known, image.exposed_ns)
-        view = replace(view, telemetry=telemetry)
-        self._log_view(image, view, withheld=False)
+        taken = taken._replace(telemetry=telemetry)
+        self._log_view(taken, withheld=False)
         is_search = self._locator.state_name in ("searching", "lost")
-        outcome, latency_ms = self._placed(view, known)
+        outcome, latency_ms = self._placed(taken, known)
         self._tracked_ns = image.exposed_ns
         self._count("processed")
-        vehicle = self._with_altitude(vehicle, outcome, known)
+        vehicle = self._with_altitude(taken.vehicle, outcome, known)
         if self._latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, known, self._latency.std_s)
         result = self._result(image, outcome, latency_ms)
-        doubt = self._doubt(result, image.exposed_ns)
+        doubt = self._latency_doubt(result, image.exposed_ns)
         if doubt is not None:
             self._count(doubt)
         elif heights is not None:
             heights.observe(telemetry.time_ns, outcome, result.state)
+        if taken.problem is not None:
+            doubt = taken.problem.reason
         self._publisher.publish(result, image.exposed_ns, vehicle, judged=True, withheld=doubt)
         self._log(lambda sink: sink.result(result))
         if doubt is None:
@@ -290,20 +314,20 @@ class Runner:
             self._note(result, telemetry, image.exposed_ns)
         return result
 
-    def _from_start(self, view: View) -> View:
-        telemetry = view.telemetry
-        if self._start:
-            prior, self._start = self.options.start(), False
-            view = replace(view, telemetry=replace(telemetry, prior=prior or telemetry.prior))
-            self._track.started(prior, telemetry.time_ns)
-        self._track.moved(telemetry)
-        return view
+    def _from_start(self, telemetry: Telemetry) -> Telemetry:
+        prior, self._start = self.options.start(), False
+        self._track_monitor.started(prior, telemetry.time_ns)
+        return replace(telemetry, prior=prior or telemetry.prior)
 
     def _with_altitude(
         self, vehicle: VehicleState, outcome: Fix | NoFix, telemetry: Telemetry
     ) -> VehicleState:
-        heights = self.options.heights
-        if heights is None or not isinstance(outcome, Fix) or math.isfinite(vehicle.amsl_m):
+        heights, below = self.options.heights, telemetry.below
+        if math.isfinite(vehicle.amsl_m):
+            return vehicle
+        if below is not None and (heights is None or heights.datum_known):
+            return replace(vehicle, amsl_m=below.height_m + telemetry.agl_m)
+        if heights is None or not isinstance(outcome, Fix):
             return vehicle
         try:
             return replace(vehicle, amsl_m=heights.ground_m(outcome) + telemetry.agl_m)
@@ -319,18 +343,18 @@ class Runner:
             return telemetry
         return replace(telemetry, vel_en_mps=link.mean_velocity(before_ns, exposed_ns))
 
-    def _placed(self, view: View, reported: Telemetry) -> tuple[Fix | NoFix, float]:
+    def _placed(self, taken: _Taken, reported: Telemetry) -> tuple[Fix | NoFix, float]:
+        failed = partial(self._count, "internal_error")
         try:
-            outcome, latency_ms = locate_view(
-                self._locator, view, lambda: self._count("internal_error")
-            )
+            outcome, latency_ms = locate_view(self._locator, taken.view, failed)
         except CameraError as error:  # ends `orthonav localize`, but must not end a flight
-            return self._refusal("wrong_camera", "wrong_camera", str(error)), math.nan
+            return self._counted("wrong_camera", NoFix("wrong_camera", str(error))), math.nan
         if isinstance(outcome, Fix):
-            outcome = _at_exposure(outcome, view.telemetry.vel_en_mps, reported.vel_en_mps)
+            mean = taken.telemetry.vel_en_mps
+            outcome = _at_exposure(outcome, mean, reported.vel_en_mps)
         return outcome, latency_ms
 
-    def _doubt(self, result: ViewResult, exposed_ns: int) -> str | None:
+    def _latency_doubt(self, result: ViewResult, exposed_ns: int) -> str | None:
         """Why a position is withheld although it was found: the latency is in doubt."""
         fix, latency, link = result.outcome, self._latency, self._link
         if latency is None:
@@ -349,7 +373,7 @@ class Runner:
             return
         if not fix.confidence >= self.options.min_confidence:
             return
-        self._track.found(fix, mount.corrected(telemetry) if mount else telemetry, now_ns)
+        self._track_monitor.found(fix, mount.corrected(telemetry) if mount else telemetry, now_ns)
         utc_ns = exposed_ns + self._clocks.utc_ns() - self._clocks.mono_ns()
         self._last = states.SavedState(
             fix.lat_deg, fix.lon_deg, fix.std_m, utc_ns, exposed_ns, self._boot_id
@@ -363,35 +387,29 @@ class Runner:
         fix = result.outcome
         return replace(result, accepted=self.options.accepts(fix) if isinstance(fix, Fix) else None)
 
-    def _map_changed(self) -> NoFix | None:
-        # Parts in memory would still give positions; stopping shows the fault at once.
-        change = self.options.map_change()
-        return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
-
-    def _usable(self, image: CameraImage) -> tuple[Grey, Camera] | NoFix:
-        """Picture, with the camera at its size."""
+    def _picture(self, image: CameraImage) -> tuple[Camera | None, NoFix | None]:
+        """Camera and problem as in `_Taken`."""
         grey = image.grey
         if grey is None:
-            self._count("bad_image")
-            return image.problem or NoFix("bad_image", "image could not be decoded")
+            why = image.problem or NoFix("bad_image", "image could not be decoded")
+            return None, self._counted("bad_image", why)
         repeat = self._frozen.is_repeat(grey)
         try:
             camera = fitted(self._camera, grey.shape[1], grey.shape[0], image.frame)
         except CameraError as error:
-            return self._refusal("wrong_camera", "wrong_camera", str(error))
+            return None, self._counted("wrong_camera", NoFix("wrong_camera", str(error)))
         shown = check_picture(grey, camera.mask)
         if shown is not None:
-            self._count("bad_image")
-            return shown
+            return camera, self._counted("bad_image", shown)
         if repeat:
             detail = f"{self._frozen.repeats + 1} identical images in a row"
-            return self._refusal("frozen", "frozen_image", detail)
-        return grey, camera
+            return None, self._counted("frozen", NoFix("frozen_image", detail))
+        return camera, None
 
     def _telemetry(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
         if self.options.recorded or self._link is None:
             nothing = Telemetry(image.time_ns, math.nan, math.nan, math.nan, math.nan)
-            return image.vehicle or VehicleState(None), image.telemetry or nothing
+            return image.vehicle or UNKNOWN_VEHICLE, image.telemetry or nothing
         until_ns = self._clocks.mono_ns() + round(TELEMETRY_WAIT_S * 1e9)
         while (self._link.covered_ns or 0) < image.exposed_ns and self._clocks.mono_ns() < until_ns:
             self._clocks.sleep(0.001)
@@ -399,13 +417,26 @@ class Runner:
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
 
     def _above_ground(self, telemetry: Telemetry) -> Telemetry | NoFix:
-        heights = self.options.heights
+        """With the height above ground, as far as it suffices to locate a view."""
+        heights, least_m = self.options.heights, self.options.min_agl_m
         try:
-            return telemetry if heights is None else heights.corrected(telemetry)
+            known = telemetry if heights is None else heights.corrected(telemetry)
         except MapChangedError as error:
-            return self._refusal("internal_error", MAP_CHANGED, str(error))
+            return self._counted("internal_error", NoFix(MAP_CHANGED, str(error)))
         except MapFileError as error:  # a crafted part of the map
-            return self._refusal("internal_error", MAP_DAMAGED, str(error))
+            return self._counted("internal_error", NoFix(MAP_DAMAGED, str(error)))
+        missing = [
+            name for name in known.missing() if name != "yaw_deg" or self.options.heading_known
+        ]
+        if missing:
+            detail = f"not reported at the exposure: {', '.join(missing)}"
+            if heights is not None and not heights.datum_known and needs_datum(telemetry):
+                detail = f"vertical datum of the map's terrain is unknown: {DATUM_ADVICE}"
+            return self._counted("no_telemetry", NoFix("no_telemetry", detail))
+        if known.agl_m < least_m:  # on the ground, and in the take-off
+            detail = f"{known.agl_m:.0f} m above ground; views are located from {least_m:.0f} m"
+            return self._counted("too_low", NoFix("too_low", detail))
+        return known
 
     def _say_heights(self, telemetry: Telemetry) -> None:
         if self._heights_said:
@@ -416,28 +447,9 @@ class Runner:
         if said is not None:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
 
-    def _unusable(self, telemetry: Telemetry) -> NoFix | None:
-        known = self._above_ground(telemetry)
-        if isinstance(known, NoFix):
-            return known
-        missing = [
-            name for name in known.missing() if name != "yaw_deg" or self.options.heading_known
-        ]
-        if missing:
-            detail = f"not reported at the exposure: {', '.join(missing)}"
-            heights = self.options.heights
-            if heights is not None and not heights.datum_known and needs_datum(telemetry):
-                detail = f"vertical datum of the map's terrain is unknown: {DATUM_ADVICE}"
-            return self._refusal("no_telemetry", "no_telemetry", detail)
-        least_m = self.options.min_agl_m
-        if known.agl_m < least_m:  # on the ground, and in the take-off
-            detail = f"{known.agl_m:.0f} m above ground; views are located from {least_m:.0f} m"
-            return self._refusal("too_low", "too_low", detail)
-        return None
-
-    def _refusal(self, count: str, reason: str, detail: str) -> NoFix:
-        self._count(count)
-        return NoFix(reason, detail)
+    def _counted(self, name: str, reason: NoFix) -> NoFix:
+        self._count(name)
+        return reason
 
     def _count(self, name: str) -> None:
         self.counter.add(self._clocks.mono_ns(), name)
@@ -501,7 +513,7 @@ class Runner:
 
     def _plain(self, health: Health, now_ns: int) -> dict[str, Any]:
         total, gate = self.counter.total, self._publisher.gate
-        start_off_m = self._track.start_off_m(now_ns)
+        start_off_m = self._track_monitor.start_off_m(now_ns)
         return {
             "health": health.level.name,
             "reasons": list(health.reasons),

@@ -15,7 +15,7 @@ import numpy as np
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.core.track.filter import usual_velocity_std_mps
 from orthonav.onboard.cameras import GAP_S
 from orthonav.onboard.motion import SIGMAS, WINDOW_S, Array, Grey, MotionCheck
 from orthonav.onboard.telemetry import VehicleState

@@ -9,7 +9,7 @@ import numpy as np
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import Fix, Prior, Telemetry
-from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.core.track.filter import usual_velocity_std_mps
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.outputs import Publisher
 from orthonav.onboard.state import SPEED_MPS

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthonav.core.geo.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 from orthonav.core.geo.camera import Camera, undistort
-from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.core.track.filter import usual_velocity_std_mps
 from orthonav.onboard.telemetry import VehicleState
 
 SIDE_PX = 240

@@ -81,14 +81,24 @@ def model_of(mount: Mount) -> Model:
     )
 
 
+@dataclass(frozen=True)
+class UnusableView:
+    """A view whose picture cannot be used, for `reason`."""
+
+    telemetry: Telemetry
+    reason: NoFix
+
+
 def locate_view(
-    locator: Locator, view: View, failed: Callable[[], None] = lambda: None
+    locator: Locator, view: View | UnusableView, failed: Callable[[], None] = lambda: None
 ) -> tuple[Fix | NoFix, float]:
-    """Result of one view and the time taken in ms; after an internal error dead reckoning or a
-    `NoFix`. `failed` is called at such an error.
+    """Result of one view and the time taken in ms, NaN without a picture; after an internal error
+    dead reckoning or a `NoFix`. `failed` is called at such an error.
 
     A map file that changed in place gives no position. Raises `CameraError`: it ends the flight.
     """
+    if isinstance(view, UnusableView):
+        return _passed(locator, view, failed), math.nan
     start = time.perf_counter()
     try:
         outcome = locator.locate(view)
@@ -97,26 +107,30 @@ def locate_view(
     except MapChangedError as error:
         log.error("%s", error)
         outcome = NoFix(MAP_CHANGED, str(error))
-    except MapFileError as error:  # a crafted part of the map, decoded for this view
-        log.error("%s", error)
-        failed()
-        outcome = passed_view(locator, view.telemetry, NoFix(MAP_DAMAGED, str(error)))
     except Exception as error:  # one view must not end a flight
-        log.exception("view could not be processed")
         failed()
-        outcome = passed_view(locator, view.telemetry, _internal(error))
+        if isinstance(error, MapFileError):  # a crafted part of the map, decoded for this view
+            log.error("%s", error)
+            reason = NoFix(MAP_DAMAGED, str(error))
+        else:
+            log.exception("view could not be processed")
+            reason = _internal(error)
+        outcome = _passed(locator, UnusableView(view.telemetry, reason))
     else:
         outcome = finite(outcome)
         if isinstance(outcome, NoFix) and outcome.reason == INTERNAL_ERROR:
             failed()
-    return finite(outcome), (time.perf_counter() - start) * 1e3
+    return outcome, (time.perf_counter() - start) * 1e3
 
 
-def passed_view(locator: Locator, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+def _passed(
+    locator: Locator, view: UnusableView, failed: Callable[[], None] = lambda: None
+) -> Fix | NoFix:
     try:
-        return locator.passed(telemetry, reason)
+        return finite(locator.passed(view.telemetry, view.reason))
     except Exception as error:
         log.exception("view could not be skipped")
+        failed()
         return _internal(error)
 
 

@@ -103,12 +103,18 @@ def _maps_of(path: Path) -> dict[str, Any]:
 
 def _plain_of(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            return {}
-        plain = json.loads(path.read_text(encoding="ascii"))
+        return _object(path)
     except (OSError, ValueError, RecursionError):
         return {}
-    return plain if isinstance(plain, dict) else {}
+
+
+def _object(path: Path) -> dict[str, Any]:
+    """Of a file of JSON. Raises `OSError`, `ValueError` or `RecursionError`."""
+    with path.open("rb") as stream:
+        plain = json.loads(stream.read(MAX_BYTES))  # a larger file is no JSON then
+    if not isinstance(plain, dict):
+        raise ValueError("not an object")
+    return plain
 
 
 def load(path: Path) -> SavedState | None:
@@ -153,16 +159,12 @@ def require_newest(state: Path, signature: Signature, map_path: Path) -> None:
 
 def _read(path: Path) -> dict[str, int]:
     try:
-        with path.open("rb") as stream:
-            plain = json.loads(stream.read(MAX_BYTES))
-        known = {
-            str(key): serial
-            for key, serial in plain.items()
-            if type(serial) is int and 0 <= serial <= MAX_SERIAL
-        }
+        serials = _object(path).items()
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         log.warning("serial numbers of flown maps cannot be read (%s): %s", error, path)
         return {}
-    return known
+    return {
+        key: serial for key, serial in serials if type(serial) is int and 0 <= serial <= MAX_SERIAL
+    }

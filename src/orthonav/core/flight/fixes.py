@@ -26,7 +26,7 @@ from orthonav.core.errors import ArgumentError, FlightError, MissingExtraError
 from orthonav.core.files import StrPath, require_file, write_lines
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.limits import DEFAULT_RISK
-from orthonav.core.records import Fix, NoFix, ViewResult
+from orthonav.core.records import Fix, NoFix, TelemetryBias, ViewResult
 
 KEYS = (
     "frame",  # name of the image in the flight folder
@@ -64,12 +64,9 @@ TRACK_KEYS = (
     "tracked",  # true: the position is estimated from all views so far
     "state",  # one of `STATES`
 )
-MOTION_KEYS = (  # in the evidence of a track
-    "vel_east_mps",
-    "vel_north_mps",
-    "vel_std_mps",
-    "recognized",
-)
+MOTION_KEYS = ("vel_east_mps", "vel_north_mps", "vel_std_mps", "recognized")
+STD_KEYS = ("heading_std_deg", "log_scale_std")
+"""In the evidence of a file, and fields of `Fix`, like those of `TelemetryBias`."""
 NO_VELOCITY = (math.nan, math.nan)
 STATES = ("searching", "tracking", "coasting", "lost")
 MAX_LINE_BYTES = 2**20  # limit of a line; the evidence of a view takes about 1000 bytes
@@ -173,7 +170,7 @@ def to_plain(record: Any, risk: float = DEFAULT_RISK) -> dict[str, Any]:
         values = _outcome_values(record)
         numbers = {
             **record.evidence,
-            **(motion_evidence(record) if isinstance(record, Fix) else {}),
+            **(evidence_of_fields(record) if isinstance(record, Fix) else {}),
         }
         values["evidence"] = {str(k): _or_none(v) for k, v in numbers.items()}
         if isinstance(record, Fix):
@@ -331,13 +328,14 @@ def _pose_values(fix: Fix) -> dict[str, Any]:
     return dict(zip(POSE_KEYS, (*angles, upper), strict=True))
 
 
-def motion_evidence(fix: Fix) -> dict[str, float]:
-    """Velocity of a track, and whether the view shows the map, as `fixes.jsonl` has them: those
-    that are known."""
+def evidence_of_fields(fix: Fix) -> dict[str, float]:
+    """Fields of a fix that `fixes.jsonl` has in its evidence, as far as they are known: velocity of
+    a track, whether the view shows the map, biases and standard deviations."""
     velocity = fix.known_velocity_en_mps
     east_mps, north_mps = NO_VELOCITY if velocity is None else map(float, velocity)
     values = east_mps, north_mps, fix.vel_std_mps, fix.recognized
-    stated = dict(zip(MOTION_KEYS, values, strict=True))
+    stated = dict(zip(MOTION_KEYS, values, strict=True)) | fix.bias._asdict()
+    stated |= {key: getattr(fix, key) for key in STD_KEYS}
     return {key: value for key, value in stated.items() if math.isfinite(value)}
 
 
@@ -358,6 +356,8 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
         ground = _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
     cov_en_m2 = _numbers(values, "cov_en_m2", (2, 2))
     *velocity, vel_std_mps, recognized = (evidence.pop(key, math.nan) for key in MOTION_KEYS)
+    bias = TelemetryBias(*(evidence.pop(key, math.nan) for key in TelemetryBias._fields))
+    stds = {key: evidence.pop(key, math.nan) for key in STD_KEYS}
     east_mps, north_mps = velocity
     if vel_std_mps < 0 or not (math.isnan(recognized) or 0 <= recognized <= 1):
         raise FlightError(
@@ -384,6 +384,8 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
         vel_en_mps=None if math.isnan(east_mps + north_mps) else (east_mps, north_mps),
         vel_std_mps=vel_std_mps,
         recognized=recognized,
+        bias=bias,
+        **stds,
     )
 
 

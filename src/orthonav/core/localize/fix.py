@@ -10,7 +10,13 @@ from orthonav.core.localize.camera import CameraEstimate, tilt_std_deg
 from orthonav.core.localize.place import FinalPlace
 from orthonav.core.localize.search import Found, Search
 from orthonav.core.localize.view import PreparedView, off_nadir_deg
-from orthonav.core.records import RADIUS_SHARE, Fix, probability_within
+from orthonav.core.records import (
+    RADIUS_SHARE,
+    UNKNOWN_BIAS,
+    Fix,
+    TelemetryBias,
+    probability_within,
+)
 
 
 def fix_of(found: Found) -> Fix:
@@ -28,7 +34,7 @@ def fix_of(found: Found) -> Fix:
             middle_en_m = ground.middle_en_m(ground.sight_en_m(orientation), pose)
     place = math.nan if map_.confidence is None else map_.confidence(best.scores)
     radius_m = max(map_.radius_m, RADIUS_SHARE * exterior.agl_m)
-    evidence = _evidence(found) | exterior.stds
+    evidence = _evidence(found)
     if exterior.middle_cov_en_m2 is not None:
         widest = float(np.linalg.eigvalsh(exterior.middle_cov_en_m2)[-1])
         evidence["middle_std_m"] = math.sqrt(widest)
@@ -58,6 +64,9 @@ def fix_of(found: Found) -> Fix:
         roll_deg=roll_deg,
         pose_cov=exterior.pose_cov,
         place_probability=place,
+        bias=exterior.bias,
+        heading_std_deg=exterior.heading_std_deg,
+        log_scale_std=exterior.log_scale_std,
     )
 
 
@@ -87,15 +96,15 @@ def _by_camera(view: PreparedView, camera: CameraEstimate) -> "_Exterior":
         camera.agl_m,
         camera.covariance[:2, :2].copy(),
         camera.middle_covariance,
-        {
-            "heading_std_deg": heading,
-            "log_scale_std": up_m / camera.agl_m,
-            "pitch_bias_deg": pitch_deg - view.telemetry.pitch_deg,
-            "roll_bias_deg": roll_deg - view.telemetry.roll_deg,
-            "pitch_bias_std_deg": pitch,
-            "roll_bias_std_deg": roll,
-        },
+        heading,
+        up_m / camera.agl_m,
         camera.covariance,
+        TelemetryBias(
+            pitch_bias_deg=pitch_deg - view.telemetry.pitch_deg,
+            roll_bias_deg=roll_deg - view.telemetry.roll_deg,
+            pitch_bias_std_deg=pitch,
+            roll_bias_std_deg=roll,
+        ),
     )
 
 
@@ -115,21 +124,21 @@ def _by_similarity(search: Search, place: FinalPlace) -> "_Exterior":
         agl_m,
         spread[:2, :2] + np.eye(2) * tilt_m**2,
         covariance[:2, :2] * search.map.grid.gsd_m**2 + floor_m2,
-        {
-            "heading_std_deg": math.degrees(math.sqrt(spread[2, 2])),
-            "log_scale_std": math.sqrt(spread[3, 3]),
-        },
+        math.degrees(math.sqrt(spread[2, 2])),
+        math.sqrt(spread[3, 3]),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Exterior:
-    """What a fix says of the camera; `stds` go into its evidence."""
+    """What a fix says of the camera."""
 
     place_en_m: NDArray[np.float64]
     attitude_deg: tuple[float, float, float]
     agl_m: float
     cov_en_m2: NDArray[np.float64]
     middle_cov_en_m2: NDArray[np.float64] | None
-    stds: dict[str, float]
+    heading_std_deg: float
+    log_scale_std: float
     pose_cov: NDArray[np.float64] | None = None
+    bias: TelemetryBias = UNKNOWN_BIAS

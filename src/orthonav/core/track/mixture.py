@@ -9,8 +9,7 @@ to it with every view, so that no error is permanent (docs/tracking.md)."""
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,51 +17,47 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize.confidence import within
 from orthonav.core.localize.odometry import CameraDisplacement
 from orthonav.core.localize.sighting import Sighting
+from orthonav.core.track.filter import (
+    OBSERVES,
+    POSITION,
+    STATE,
+    Array,
+    Expected,
+    Measurement,
+    Model,
+    Motion,
+    ReportedAttitude,
+    ReportedVelocity,
+    after_bias_jump,
+    by_camera,
+    held_to_map,
+    is_plausible,
+    log_densities,
+    log_density,
+    observed,
+    predicted,
+    recognition,
+    tempered,
+    updated,
+    velocity_forgotten,
+)
 from orthonav.core.track.hypothesis import (
+    BLIND,
+    EXACT_M,
     MINOR_OF_GROUP,
+    UNCERTAIN,
+    UNCONFIRMED,
+    UNRECOGNIZED,
     Hypothesis,
+    Shown,
+    State,
+    Trust,
     at_position,
     distance,
     major,
     merged,
     moments,
     moved,
-)
-from orthonav.core.track.likelihood import (
-    Measurement,
-    log_densities,
-    log_density,
-    recognition,
-    tempered,
-    updated,
-)
-from orthonav.core.track.model import (
-    POSITION,
-    SEEN,
-    STATE,
-    Array,
-    Model,
-    ReportedAttitude,
-)
-from orthonav.core.track.motion import (
-    Expected,
-    ReportedVelocity,
-    after_bias_jump,
-    by_camera,
-    held_to_map,
-    is_plausible,
-    predicted,
-    velocity_forgotten,
-)
-from orthonav.core.track.trust import (
-    BLIND,
-    EXACT_M,
-    UNCERTAIN,
-    UNCONFIRMED,
-    UNRECOGNIZED,
-    Shown,
-    State,
-    Trust,
 )
 
 MIN_SPLIT = 1e-5
@@ -90,6 +85,16 @@ class Estimate:
     state: State
     belief: float
     shown: Shown
+
+
+class _Cluster(NamedTuple):
+    """Hypotheses near the best one, as one Gaussian. `inside`: probability within the radius."""
+
+    near: list[Hypothesis]
+    mean: Array
+    covariance: Array
+    shown: Shown
+    inside: float
 
 
 class Mixture:
@@ -169,58 +174,48 @@ class Mixture:
         overlap: float = 0.0,
     ) -> None:
         """By the reported velocity and odometry; `telemetry_noise` (3,): variances of heading
-        (rad), log scale, horizon (rad), None: the model's. `overlap`: see `predicted`. An error
-        leaves all as it was."""
+        (rad), log scale, horizon (rad), None: the model's. `overlap`: see `Motion`. An error leaves
+        all as it was."""
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
-        stays, moves = 1 - self.model.lost, (seconds, velocity, camera, noise, overlap)
-        made = [one for each in self.hypotheses for one in self._split(each, *moves)]
+        stays, motion = 1 - self.model.lost, Motion(seconds, velocity, camera, noise, overlap)
+        made = [one for each in self.hypotheses for one in self._split(each, motion)]
         blind_s = seconds if camera is None else 0.0
-        trust = self.trust.moved(
-            lambda each: self._dead_reckoned(each, 1 - overlap, *moves), blind_s
-        )
+        trust = self.trust.moved(lambda each: self._dead_reckoned(each, motion), blind_s)
         elsewhere = self.elsewhere
-        if trust.rival is not None and trust.track is not None:
+        if trust.rival is not None and trust.believed is not None:
             total = sum(each.share for each in made) + elsewhere
             followed = sum(each.share for each in made if each.shown.followed)
             added = max(1 - UNCONFIRMED - followed / total, 0.0)
             made = [replace(each, share=each.share * (1 - added)) for each in made]
             elsewhere *= 1 - added
-            made.append(replace(trust.track.place, share=total * added))
+            made.append(replace(trust.believed.place, share=total * added))
         made = [replace(each, share=each.share * stays) for each in made]
         self.hypotheses, self.trust, self._measured = made, trust, None
         self.elsewhere = elsewhere + (1 - stays) * (1 - elsewhere)
         self._new, self._is_rival_searched, self._is_split = 1 - overlap, False, True
 
-    def _split(self, each: Hypothesis, *moves: Any) -> Iterator[Hypothesis]:
-        for share, expected in self._predictions(each, *moves):
+    def _split(self, each: Hypothesis, motion: Motion) -> Iterator[Hypothesis]:
+        for share, expected in self._predictions(each, motion):
             on_map = held_to_map(self.model, expected, self.area_m2)
             yield self._from(each, on_map, each.share * share)
 
-    def _dead_reckoned(self, each: Hypothesis, new: float, *moves: Any) -> Hypothesis:
+    def _dead_reckoned(self, each: Hypothesis, motion: Motion) -> Hypothesis:
         """As one Gaussian: odometry that may be an outlier makes it less certain. What was shown
         there is forgotten as at any view, unless the dead reckoning is exact."""
-        splits = list(self._split(replace(each, share=1.0), *moves))
+        splits = list(self._split(replace(each, share=1.0), motion))
         mean, covariance = moments(splits)
         best = max(splits, key=lambda split: split.share)
         exact = float(np.trace(covariance[POSITION, POSITION])) <= 2 * EXACT_M**2
-        shown = best.shown if exact else best.shown.missed(new)
+        shown = best.shown if exact else best.shown.missed(1 - motion.overlap)
         return replace(best, share=1.0, mean=mean, covariance=covariance, shown=shown)
 
-    def _predictions(
-        self,
-        each: Hypothesis,
-        seconds: float,
-        velocity: ReportedVelocity | None,
-        camera: CameraDisplacement | None,
-        telemetry_noise: Array,
-        overlap: float,
-    ) -> Iterator[tuple[float, Expected]]:
+    def _predictions(self, each: Hypothesis, motion: Motion) -> Iterator[tuple[float, Expected]]:
         """With their probabilities: with odometry, which may be an outlier, and without.
 
         Where no velocity is reported, the aircraft may also have made an unexpected turn."""
         model, likely = self.model, 1 - self.model.odometry_outlier
-        step = partial(predicted, model, each.mean, overlap=overlap)
-        dead_reckoned = step(each.covariance, seconds, velocity, telemetry_noise)
+        camera, velocity, unseen = motion.camera, motion.velocity, motion._replace(camera=None)
+        dead_reckoned = predicted(model, each.mean, each.covariance, unseen)
         turns, splits = [(likely, each.covariance)], []
         if each.share >= MINOR_SHARE and velocity is None:
             turns = [
@@ -229,16 +224,16 @@ class Mixture:
             ]
         if camera is not None:
             for share, covariance in turns:
-                turned = step(covariance, seconds, velocity, telemetry_noise, camera)
-                seen, log_fit = by_camera(turned, camera)
-                if is_plausible(model, seen.mean, velocity):
-                    splits.append((math.log(share) + log_fit, seen))
+                turned = predicted(model, each.mean, covariance, motion)
+                corrected, log_fit = by_camera(turned, camera)
+                if is_plausible(model, corrected.mean, velocity):
+                    splits.append((math.log(share) + log_fit, corrected))
         if camera is None or not splits:
             chance = 0.0
             if velocity is None and each.share >= MAJOR_SHARE:  # nothing measures the displacement
-                chance = 1 - (1 - model.turn) ** seconds
+                chance = 1 - (1 - model.turn) ** motion.seconds
                 free = velocity_forgotten(model, each.covariance)
-                yield chance, step(free, seconds, velocity, telemetry_noise)
+                yield chance, predicted(model, each.mean, free, unseen)
             yield 1.0 - chance, dead_reckoned
             return
         # An outlier lies anywhere within the radius of the search.
@@ -275,9 +270,9 @@ class Mixture:
         mounts = [(share, covariance) for share, _, covariance in self._mounts()]
         for each in sightings:
             areas_m2 = self.area_m2, searched_m2
-            seen = tempered(self.model, mounts, areas_m2, reported, each, newness)
-            made += self._updated(split, seen, found, new, confirms)
-            made += self._born(seen, confirms)
+            measured = tempered(self.model, mounts, areas_m2, reported, each, newness)
+            made += self._updated(split, measured, found, new, confirms)
+            made += self._born(measured, confirms)
         self._merge(made, self.elsewhere)
         rival = self.trust.rival
         self._is_rival_searched = rival is not None and self._is_searched(rival.place, searched)
@@ -297,31 +292,45 @@ class Mixture:
         near = searched is None or math.dist(each.mean[POSITION], searched[0]) < searched[1]
         return near and self._on_map(each.mean)
 
-    def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
-        """The best cluster, None without hypotheses. Updates the state, except `between_views`."""
+    def estimate(self, radius_m: float) -> Estimate | None:
+        """The best cluster, None without hypotheses. Changes nothing."""
+        cluster = self._cluster(radius_m)
+        return None if cluster is None else self._stated(cluster)
+
+    def conclude(self, radius_m: float) -> Estimate | None:
+        """End a view, with or without an update: judge the best cluster, and return it."""
+        if self._is_split:  # no update has followed the prediction
+            self._merge(self.hypotheses, self.elsewhere)
+        cluster = self._cluster(radius_m)
+        if cluster is None:
+            return None
+        here = Hypothesis(1.0, cluster.mean, cluster.covariance, cluster.shown, 0)
+        self.trust.judge(here, cluster.inside, self._new, self._missed_by_rival(radius_m))
+        if self.trust.state is State.TRACKING:
+            self._follow(cluster.near)
+            cluster = cluster._replace(shown=replace(cluster.shown, followed=True))
+        return self._stated(cluster)
+
+    def _cluster(self, radius_m: float) -> _Cluster | None:
         if not self.hypotheses:
             return None
-        if self._is_split and not between_views:  # no update has followed the prediction
-            self._merge(self.hypotheses, self.elsewhere)
         best = self._best(radius_m)
         near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
         mean, covariance = moments(near)
-        confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
         shown = replace(
             best.shown,
             ground=max(each.shown.ground for each in major(near)),
             now=self._shown_at(mean, covariance, near),
         )
-        if not between_views:
-            here = Hypothesis(1.0, mean, covariance, shown, 0)
-            self.trust.judge(here, confidence, self._new, self._missed_by_rival(radius_m))
-            if self.trust.state is State.TRACKING:
-                self._follow(near)
-                shown = replace(shown, followed=True)
+        inside = min(self._inside(radius_m, mean[POSITION]), 1.0)
+        return _Cluster(near, mean, covariance, shown, inside)
+
+    def _stated(self, cluster: _Cluster) -> Estimate:
+        """As far as the track is believed."""
+        near, mean, covariance, shown, inside = cluster
         belief = sum(each.share for each in near)
-        place = min(belief, self.trust.most)
-        confidence = min(confidence, place)
-        return Estimate(mean, covariance, confidence, place, self.trust.state, belief, shown)
+        place, state = min(belief, self.trust.most), self.trust.state
+        return Estimate(mean, covariance, min(inside, place), place, state, belief, shown)
 
     def _missed_by_rival(self, radius_m: float) -> float:
         """New ground of this view that counts against the rival: less where it shows nothing than
@@ -377,9 +386,9 @@ class Mixture:
         """Errors of heading (rad), log scale, pitch and roll (rad) as reported: (4,) and (4, 4)."""
         if not self.hypotheses:
             _, covariance = self._nowhere()
-            return np.zeros(4), (SEEN @ covariance @ SEEN.T)[2:, 2:]
+            return np.zeros(4), observed(covariance)[2:, 2:]
         mean, covariance = moments(self.hypotheses)
-        return (SEEN @ mean)[2:], (SEEN @ covariance @ SEEN.T)[2:, 2:]
+        return (OBSERVES @ mean)[2:], observed(covariance)[2:, 2:]
 
     def _on_map(self, mean: Array) -> bool:
         inside = (mean[:2] >= self._extent[:2]) & (mean[:2] <= self._extent[2:])
@@ -402,24 +411,24 @@ class Mixture:
     def _updated(
         self,
         starts: Sequence[Hypothesis],
-        seen: Measurement,
+        measured: Measurement,
         found: float,
         new: float,
         confirms: bool,
     ) -> Iterator[Hypothesis]:
         """After a measurement, without those for which it lies outside the gate. `found`:
         probability that a view is found. `new`: fraction that the last view did not show."""
-        near = [each for each in starts if self._is_near(each, seen)]
+        near = [each for each in starts if self._is_near(each, measured)]
         if not near:
             return
         # All at once: each is small, and calls of NumPy take longer than what they compute.
         before = np.array([each.covariance for each in near])
-        innovations = seen.mean - np.array([each.mean for each in near]) @ SEEN.T
-        expected = SEEN @ before @ SEEN.T
-        spreads = expected + seen.noise
-        log_weights = (seen.log_odds + log_densities(innovations, spreads)).tolist()
-        means, covariances = updated(np.array([each.mean for each in near]), before, seen)
-        shown = recognition(seen, expected, innovations, self.model.most_agreement).tolist()
+        innovations = measured.mean - np.array([each.mean for each in near]) @ OBSERVES.T
+        expected = observed(before)
+        spreads = expected + measured.noise
+        log_weights = (measured.log_odds + log_densities(innovations, spreads)).tolist()
+        means, covariances = updated(np.array([each.mean for each in near]), before, measured)
+        shown = recognition(measured, expected, innovations, self.model.most_agreement).tolist()
         for number, each in enumerate(near):
             self._numbers += 1
             yield replace(
@@ -427,17 +436,17 @@ class Mixture:
                 share=each.share * math.exp(min(log_weights[number], 60.0)) * found,
                 mean=means[number].copy(),  # a history of views must not keep them all
                 covariance=covariances[number].copy(),
-                shown=each.shown.seen(
-                    shown[number], seen.single_view_probability, new, competed=confirms
+                shown=each.shown.recognized(
+                    shown[number], measured.single_view_probability, new, competed=confirms
                 ),
                 number=self._numbers,
             )
 
     @staticmethod
-    def _is_near(each: Hypothesis, seen: Measurement) -> bool:
+    def _is_near(each: Hypothesis, measured: Measurement) -> bool:
         variances = each.covariance[0, 0] + each.covariance[1, 1]
-        reach = variances + seen.noise[0, 0] + seen.noise[1, 1]
-        return bool(math.dist(seen.mean[:2], each.mean[:2]) ** 2 <= GATE * reach)
+        reach = variances + measured.noise[0, 0] + measured.noise[1, 1]
+        return bool(math.dist(measured.mean[:2], each.mean[:2]) ** 2 <= GATE * reach)
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
         """Mean (16,) and covariance (16, 16), anywhere on the map."""
@@ -452,18 +461,17 @@ class Mixture:
         if off > 0:
             yield off, *self._nowhere(self.model.off_tilt_rad)
 
-    def _born(self, seen: Measurement, confirms: bool) -> Iterator[Hypothesis]:
+    def _born(self, measured: Measurement, confirms: bool) -> Iterator[Hypothesis]:
         """From the belief elsewhere, at a measurement."""
         for share, mean, covariance in self._mounts():
-            spread = SEEN @ covariance @ SEEN.T + seen.noise
-            log_weight = seen.log_odds - math.log(self.area_m2)
-            log_weight += log_density(seen.mean[2:], spread[2:, 2:])
-            mean, covariance = updated(mean, covariance, seen)
+            spread = observed(covariance) + measured.noise
+            log_weight = measured.log_odds - math.log(self.area_m2)
+            log_weight += log_density(measured.mean[2:], spread[2:, 2:])
+            mean, covariance = updated(mean, covariance, measured)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
-            shown = Shown().seen(
-                seen.single_view_probability, seen.single_view_probability, 1.0, competed=confirms
-            )
+            alone = measured.single_view_probability
+            shown = Shown().recognized(alone, alone, 1.0, competed=confirms)
             yield Hypothesis(share, mean, covariance, shown, self._numbers)
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:

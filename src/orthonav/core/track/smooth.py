@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from orthonav.core.track.filter import Array, Expected
 from orthonav.core.track.hypothesis import Hypothesis
 from orthonav.core.track.mixture import Mixture
-from orthonav.core.track.model import Array
-from orthonav.core.track.motion import Expected
 
 
 @dataclass(frozen=True, eq=False)

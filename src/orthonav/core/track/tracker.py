@@ -36,33 +36,33 @@ from orthonav.core.records import (
     NoFix,
     Prior,
     Telemetry,
+    TelemetryBias,
     View,
     probability_within,
 )
 from orthonav.core.register.window import rotation
-from orthonav.core.track import (
-    Estimate,
-    Mixture,
-    Model,
-    ReportedAttitude,
-    ReportedVelocity,
-    State,
-)
-from orthonav.core.track.likelihood import LEAST_NEW
-from orthonav.core.track.model import (
+from orthonav.core.track.filter import (
     BIASES,
     HEADING,
     HORIZON,
+    LEAST_NEW,
+    OBSERVES,
     POSITION,
     SCALE,
-    SEEN,
     TILT,
     VELOCITY,
     WHITE_SHARE,
+    Array,
+    Model,
+    Motion,
+    ReportedAttitude,
+    ReportedVelocity,
+    observed,
+    usual_velocity_std_mps,
 )
-from orthonav.core.track.motion import usual_velocity_std_mps
+from orthonav.core.track.hypothesis import EXACT_M, State
+from orthonav.core.track.mixture import Estimate, Mixture
 from orthonav.core.track.smooth import History, Smoothed
-from orthonav.core.track.trust import EXACT_M
 
 LOCAL_SHARE = 0.75  # Belief to search around it only. Values without a source: docs/tracking.md.
 LOCAL_SIGMAS = 4.0  # half width of that search,
@@ -76,7 +76,6 @@ LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0  # where the clock stands still or jumps back
 KNOWN_MPS = 5.0  # least certainty of an estimated velocity that predicts the next displacement
 KNOWN_PLACE_M = 50.0  # least certainty of a position whose ground is known
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 
@@ -106,11 +105,11 @@ class _Past(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """From the view before to this one. `moves`: arguments of `Mixture.predict`, None at the first
-    view. `overlap` of both; `ground`: share that the one before cannot have shown, 0..1."""
+    """From the view before to this one. `motion`: None at the first view. `overlap` of both;
+    `ground`: share that the one before cannot have shown, 0..1."""
 
     here: _Past
-    moves: tuple[Any, ...] | None = None
+    motion: Motion | None = None
     overlap: float = 0.0
     ground: float = 1.0
 
@@ -144,7 +143,7 @@ class Tracker:
         self._usual_horizon_rad = self.model.horizon_rad
         self._past: _Past | None = None
         self._predicted_ns: int | None = None  # a view predicted, but without an outcome so far
-        self._seen: list[Sighting] = []
+        self._sightings: list[Sighting] = []
         self._whole_map = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if smooth else None
@@ -181,11 +180,11 @@ class Tracker:
             self._usual_scale = False
             scale = math.hypot(Model.log_scale, view.camera.focal_std)
             self.mixture.model = replace(self.model, log_scale=scale)
-        step = self._predict(None if refused else view, view.telemetry)
-        self._seen = []
-        if refused is None:
-            refused = self._update(view, step)
-        outcome = self._outcome(view.telemetry, refused)
+        if refused is not None:
+            return self.passed(view.telemetry, refused)
+        step = self._predict(view, view.telemetry)
+        self._sightings = []
+        outcome = self._outcome(view.telemetry, self._update(view, step))
         self._predicted_ns = None
         return outcome
 
@@ -247,7 +246,7 @@ class Tracker:
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """The position by dead reckoning, at a view whose picture cannot be used for `reason`, as
         where `locate` raised an error."""
-        self._seen = []
+        self._sightings = []
         self.mixture.unrecognize()  # an error may have come after the places were found
         if telemetry.time_ns != self._predicted_ns:  # else the error came after the prediction
             self._predict(None, telemetry)
@@ -286,7 +285,7 @@ class Tracker:
         return max(least, high) if math.isfinite(high) else least
 
     def _outcome(self, telemetry: Telemetry, refused: NoFix | None) -> Fix | NoFix:
-        estimate = self.mixture.estimate(self._radius_m(telemetry))
+        estimate = self.mixture.conclude(self._radius_m(telemetry))
         self.state = State.SEARCHING if estimate is None else estimate.state
         outcome: Fix | NoFix = refused or NoFix("searching", "no position has been found yet")
         if estimate is not None:
@@ -308,7 +307,7 @@ class Tracker:
     def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
         """NaN where the view was not registered at the fix."""
         off_m, turn_rad = min(
-            ((float(np.hypot(*(each.mean[:2] - mean[:2]))), each.mean[2]) for each in self._seen),
+            ((math.dist(each.mean[:2], mean[:2]), each.mean[2]) for each in self._sightings),
             default=(math.inf, math.nan),
         )
         return math.degrees(turn_rad) % 360 if off_m <= fix.radius_m else math.nan
@@ -322,13 +321,13 @@ class Tracker:
         horizon = self._usual_horizon_rad if tilt is None else math.radians(tilt)
         self.mixture.model = replace(self.model, horizon_rad=horizon)
         step, prior = self._step(view, telemetry), telemetry.prior
-        if step.moves is not None:
-            self.mixture.predict(*step.moves)
+        if step.motion is not None:
+            self.mixture.predict(*step.motion)
         elif prior is not None and (self._use_prior or self._every_prior):
             self.mixture.start(*self._position_of(prior))
         # No call comes between: it could raise an error.
         self._past, self._predicted_ns = step.here, telemetry.time_ns
-        if step.moves is not None and prior is not None and self._every_prior:
+        if step.motion is not None and prior is not None and self._every_prior:
             self.mixture.measure_position(*self._position_of(prior))
         return step
 
@@ -362,8 +361,8 @@ class Tracker:
             ground = 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
         # An image that is not used makes no error independent.
         overlap = 1.0 if view is None else 1 - ground
-        moves = seconds, velocity, camera, noise, overlap
-        return _Step(here, moves, 0.0 if moved is None else moved.overlap, ground)
+        motion = Motion(seconds, velocity, camera, noise, overlap)
+        return _Step(here, motion, 0.0 if moved is None else moved.overlap, ground)
 
     def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
         """By the expected displacement or the largest usual speed."""
@@ -457,7 +456,7 @@ class Tracker:
     def _update(self, view: View, step: _Step) -> NoFix | None:
         """`NoFix` where the view shows too little."""
         telemetry = view.telemetry
-        expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
+        expected = self.mixture.estimate(self._radius_m(telemetry))
         if expected is not None and expected.shown.followed and self._must_compete(expected):
             self._whole_map = not self._whole_map  # the whole map and the surroundings by turns
         searched = self._search_area(expected, whole_map=self._whole_map)
@@ -478,14 +477,15 @@ class Tracker:
         found = search.run()
         if isinstance(found, Found):
             share = min(searched.area_m2, self.mixture.map_m2) / self.mixture.area_m2
-            self._seen = list(sightings(found, known, bias[1], share))
+            self._sightings = list(sightings(found, known, bias[1], share))
         attitude = ReportedAttitude(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
         )
+        found_at, ground = self._sightings, step.ground
         self.mixture.update(
-            attitude, self._seen, newness, searched.circle, step.ground, confirms=searched.confirms
+            attitude, found_at, newness, searched.circle, ground, confirms=searched.confirms
         )
         return None
 
@@ -507,7 +507,7 @@ class Tracker:
             variances = self.model.initial_bias()
             variances += self._telemetry_noise(telemetry)[[0, 1, 2, 2]]
             return np.zeros(4), np.diag(variances)
-        return (SEEN @ expected.mean)[2:], (SEEN @ expected.covariance @ SEEN.T)[2:, 2:]
+        return (OBSERVES @ expected.mean)[2:], observed(expected.covariance)[2:, 2:]
 
     def _must_compete(self, expected: Estimate) -> bool:
         """Whether places near the track have to compete with the whole map to confirm it.
@@ -548,21 +548,14 @@ class Tracker:
         telemetry: Telemetry,
         more: dict[str, float],
     ) -> Fix:
-        """Of a state (16,), (16, 16); `more` goes into its evidence."""
+        """Of a state (16,), (16, 16); `more` is its evidence."""
         lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
         spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
         spread.flags.writeable = False
         radius_m = self._radius_m(telemetry)
-        pitch, roll = np.degrees(mean[TILT])
         whole = mean[TILT] + mean[HORIZON]
-        evidence = {
-            "heading_bias_deg": math.degrees(mean[HEADING]),
-            "log_scale_bias": float(mean[SCALE]),
-            "pitch_bias_deg": float(pitch),
-            "roll_bias_deg": float(roll),
-            **_bias_stds(covariance),
-            **more,
-        }
+        units = np.array([math.degrees(1.0), 1.0, math.degrees(1.0), math.degrees(1.0)])
+        stds = np.sqrt(np.maximum(np.diag(covariance)[BIASES], 0.0)) * units
         return Fix(
             lat_deg=float(lat),
             lon_deg=float(lon),
@@ -572,7 +565,8 @@ class Tracker:
             radius_m=radius_m,
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
-            evidence=evidence,
+            evidence=more,
+            bias=TelemetryBias(*(mean[BIASES] * units).tolist(), *stds.tolist()),
             pitch_deg=telemetry.pitch_deg + math.degrees(whole[0]),
             roll_deg=telemetry.roll_deg + math.degrees(whole[1]),
             vel_en_mps=(float(mean[2]), float(mean[3])),
@@ -591,18 +585,6 @@ def _reported_velocity(past: _Past, telemetry: Telemetry) -> ReportedVelocity | 
     std = max(std, math.sqrt(max(past.velocity_variance, 0.0)))
     unaided_s = UNAIDED_S if std >= UNAIDED_STD_MPS else None
     return ReportedVelocity(now, past.velocity, std, unaided_s)
-
-
-def _bias_stds(covariance: Array) -> dict[str, float]:
-    std = np.sqrt(np.maximum(np.diag(covariance)[BIASES], 0.0))
-    names = (
-        "heading_bias_std_deg",
-        "log_scale_bias_std",
-        "pitch_bias_std_deg",
-        "roll_bias_std_deg",
-    )
-    values = np.where([True, False, True, True], np.degrees(std), std)
-    return dict(zip(names, values.tolist(), strict=True))
 
 
 def _known(corrected: Telemetry, spread: Array) -> Telemetry:

@@ -18,7 +18,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.limits import ALERT_LIMITS_M, CAMERA_KINDS, DEFAULT_RISK, RISKS
 from orthonav.core.records import CONFIDENT, DEFAULT_TILT_STD_DEG
-from orthonav.core.track.model import Model
+from orthonav.core.track.filter import Model
 from orthonav.ground.check.cells import CellGrid
 from orthonav.ground.check.estimate import INTERVAL, LEARNT, Prediction, Recalibration
 from orthonav.ground.planning.route import Route

@@ -45,13 +45,8 @@ from orthonav.onboard.motion import (
 MIN_VIEWS = 5
 MAD_TO_STD = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""
-_BIASES = {
-    "heading_deg": ("heading_bias_deg", 0.2),
-    "log_scale": ("log_scale_bias", 0.003),
-    "pitch_deg": ("pitch_bias_deg", 0.3),
-    "roll_deg": ("roll_bias_deg", 0.3),
-}
-"""Keys of the estimated biases in evidence, and lower bounds of their standard deviations."""
+_FLOORS = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
+"""Lower bounds of the standard deviations of the biases, in the order of `TelemetryBias`."""
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 Prior = tuple[Array, Array]
@@ -109,19 +104,14 @@ def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
             f"{len(confident)} of {len(results)} views have a confidence of {CONFIDENT} or more; a "
             f"calibration needs {MIN_VIEWS}: check the map, the camera and the reported height"
         )
-    values, spreads = (
-        {
-            name: np.array([each.outcome.evidence[key.replace("bias", bias)] for each in confident])
-            for name, (key, _) in _BIASES.items()
-        }
-        for bias in ("bias", "bias_std")
-    )
+    found = np.array([each.outcome.bias for each in confident if isinstance(each.outcome, Fix)]).T
+    values, spreads = (dict(zip(_FLOORS, rows, strict=True)) for rows in (found[:4], found[4:]))
     begin = max(_still_from(values[name], spreads[name]) for name in ("pitch_deg", "roll_deg"))
     begin = min(begin, len(confident) - MIN_VIEWS)
     used = slice(begin, None)
     biases = {
         name: _bias(values[name][used], spreads[name][used], floor)
-        for name, (_, floor) in _BIASES.items()
+        for name, floor in _FLOORS.items()
     }
     mount = Mount(**biases, views=len(confident) - begin)
     return MountCalibration(mount, confident[begin].frame, confident[-1].frame, begin > 0)
@@ -133,7 +123,7 @@ def confident_views(results: Sequence[ViewResult]) -> list[ViewResult]:
         for each in results
         if isinstance(each.outcome, Fix)
         and each.outcome.confidence >= CONFIDENT
-        and "pitch_bias_deg" in each.outcome.evidence
+        and math.isfinite(each.outcome.bias.heading_bias_deg)
     ]
 
 

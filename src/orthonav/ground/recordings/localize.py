@@ -1,16 +1,16 @@
 """Localization of recorded flights, by the same steps as in flight."""
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from orthonav.core.errors import CameraError, FlightError, MissingFileError
 from orthonav.core.flight.heights import FlownHeights
 from orthonav.core.flight.recording import Flight, RecordedView
+from orthonav.core.geo.camera import Camera
 from orthonav.core.localize.confidence import Acceptance
-from orthonav.core.records import Fix, NoFix, View, ViewResult
+from orthonav.core.records import NoFix, Telemetry, View, ViewResult
 from orthonav.core.track.tracker import Tracker
-from orthonav.onboard.run import MAP_CHANGED, Locator, finite, locate_view, passed_view
+from orthonav.onboard.run import MAP_CHANGED, Locator, UnusableView, finite, locate_view
 
 
 def localize_flight(
@@ -31,27 +31,28 @@ def localize_flight(
     not the camera's aspect ratio.
     """
     for view in flight.views if views is None else views:
-        outcome: Fix | NoFix
         telemetry = view.telemetry if heights is None else heights.corrected(view.telemetry)
         try:
-            grey = view.grey()
-        except (FlightError, MissingFileError) as error:
-            if not skip_bad_images:
-                raise
-            reason = NoFix("bad_image", str(error))
-            outcome = finite(passed_view(locator, telemetry, reason))
-            latency_ms = math.nan
-        else:
-            try:
-                seen = View(grey, flight.camera, telemetry)
-                outcome, latency_ms = locate_view(locator, seen)
-            except CameraError as error:
-                raise CameraError(f"{error}: {view.where}") from error
+            seen = _seen(view, flight.camera, telemetry, skip_bad_images)
+            outcome, latency_ms = locate_view(locator, seen)
+        except CameraError as error:
+            raise CameraError(f"{error}: {view.where}") from error
         if heights is not None:
             heights.observe(telemetry.time_ns, outcome, locator.state_name)
         state, time_ns = locator.state_name, telemetry.time_ns
         result = ViewResult(view.frame, time_ns, outcome, latency_ms, state)
         yield result if accept is None else accept.judged(result)
+
+
+def _seen(
+    view: RecordedView, camera: Camera, telemetry: Telemetry, skip_bad_images: bool
+) -> View | UnusableView:
+    try:
+        return View(view.grey(), camera, telemetry)
+    except (FlightError, MissingFileError) as error:
+        if not skip_bad_images:
+            raise
+        return UnusableView(telemetry, NoFix("bad_image", str(error)))
 
 
 def smoothed_track(

@@ -84,15 +84,14 @@ def locate_pixel(
     slopes = _slopes(camera, px, values, relief)
     if not np.isfinite(slopes).all():
         raise FlightError(f"pixel {px[0]:g}, {px[1]:g} is next to the horizon or unknown ground")
-    middle_m = fix.evidence.get("middle_std_m")
     if fix.pose_cov is not None:
         covariance = slopes @ fix.pose_cov @ slopes.T
-    elif middle_m is None or "heading_bias_std_deg" in fix.evidence:
+    elif fix.ground_cov_en_m2 is None:
         covariance = fix.cov_en_m2 + _spread(slopes[:, 2:], _stds(telemetry, fix))
     else:
         at_middle = np.nan_to_num(_slopes(camera, middle, values, relief))
         spread = _spread((slopes - at_middle)[:, 2:], _stds(telemetry, fix))
-        covariance = np.eye(2) * middle_m**2 + spread
+        covariance = np.eye(2) * error_ellipse(fix.ground_cov_en_m2)[0] ** 2 + spread
     lat, lon = frame.latlon_from_en(here)
     height_m = math.nan if terrain is None else float(terrain(np.array([lat]), np.array([lon]))[0])
     drop_m = fix.agl_m - (0.0 if terrain is None else height_m - below_m)
@@ -103,18 +102,16 @@ def locate_pixel(
 def _stds(telemetry: Telemetry, fix: Fix) -> Array:
     """Standard deviations (4,) of height (m), heading, pitch and roll (deg), taken as
     independent."""
-    evidence = fix.evidence
-    heading = evidence.get("heading_std_deg", evidence.get("heading_bias_std_deg"))
-    scale = evidence.get("log_scale_std", evidence.get("log_scale_bias_std"))
-    stated = telemetry.tilt_std_deg
+    stated, bias = telemetry.tilt_std_deg, fix.bias
     tilt = DEFAULT_TILT_STD_DEG if stated is None else stated
-    return np.array(
-        [
-            fix.agl_m * (DEFAULT_AGL_STD if scale is None else scale),
-            DEFAULT_YAW_STD_DEG if heading is None else heading,
-            *(evidence.get(f"{axis}_bias_std_deg", tilt) for axis in ("pitch", "roll")),
-        ]
+    choices = (
+        (fix.log_scale_std, bias.log_scale_bias_std, DEFAULT_AGL_STD),
+        (fix.heading_std_deg, bias.heading_bias_std_deg, DEFAULT_YAW_STD_DEG),
+        (bias.pitch_bias_std_deg, tilt),
+        (bias.roll_bias_std_deg, tilt),
     )
+    stds = [next(filter(math.isfinite, each)) for each in choices]
+    return np.array([fix.agl_m * stds[0], *stds[1:]])
 
 
 def _relief(

@@ -20,7 +20,7 @@ from orthonav import __version__
 from orthonav.core.errors import FlightError, MissingFileError, UsageError
 from orthonav.core.files import with_paths
 from orthonav.core.flight import read_truth
-from orthonav.core.flight.fixes import STATES, flight_digest, motion_evidence
+from orthonav.core.flight.fixes import STATES, evidence_of_fields, flight_digest
 from orthonav.core.flight.gnss import fault_of, gnss_of
 from orthonav.core.flight.mount import read_mount
 from orthonav.core.mapfile import open_map
@@ -159,7 +159,7 @@ class Run:
             "evidence": {str(name): value for name, value in outcome.evidence.items()},
         }
         if isinstance(outcome, Fix):
-            found["evidence"] |= motion_evidence(outcome)
+            found["evidence"] |= evidence_of_fields(outcome)
         if isinstance(outcome, NoFix):
             found |= {"reason": outcome.reason, "detail": outcome.detail}
         other = (self._second or {}).get(result.frame)

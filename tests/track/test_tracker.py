@@ -127,11 +127,11 @@ def test_biases_of_heading_height_and_mount_are_estimated(localizer, monkeypatch
         )
     )
     rows = followed(tracker, localizer, seen)
-    evidence = rows[-1][3].evidence
-    assert evidence["heading_bias_deg"] == pytest.approx(6.0, abs=1.5)
-    assert evidence["log_scale_bias"] == pytest.approx(math.log(1.05), abs=0.02)
-    assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.5)
-    assert evidence["roll_bias_deg"] == pytest.approx(-2.0, abs=1.5)
+    bias = rows[-1][3].bias
+    assert bias.heading_bias_deg == pytest.approx(6.0, abs=1.5)
+    assert bias.log_scale_bias == pytest.approx(math.log(1.05), abs=0.02)
+    assert bias.pitch_bias_deg == pytest.approx(5.0, abs=1.5)
+    assert bias.roll_bias_deg == pytest.approx(-2.0, abs=1.5)
     alone = [localizer.locate(View(grey, WIDE, telemetry)) for grey, telemetry, _ in seen[12:]]
     single = [
         np.hypot(*(place_of(localizer, a) - s[2])) for a, s in zip(alone, seen[12:], strict=True)
@@ -354,9 +354,9 @@ def test_gnss_of_a_first_leg_calibrates_the_mount(localizer):
         known = {"prior": Prior(float(lat), float(lon), 2.0), "tilt_std_deg": 1.0}
         seen.append((grey, replace(telemetry, **known), place))
     rows = followed(tracker, localizer, seen)
-    evidence = rows[-1][3].evidence
-    assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.5)
-    assert evidence["pitch_bias_std_deg"] < 1.5
+    bias = rows[-1][3].bias
+    assert bias.pitch_bias_deg == pytest.approx(5.0, abs=1.5)
+    assert bias.pitch_bias_std_deg < 1.5
     assert rows[-1][3].pitch_deg == pytest.approx(5.0, abs=1.0)
     assert rows[2][3].pitch_deg == pytest.approx(5.0, abs=2.0)
 
