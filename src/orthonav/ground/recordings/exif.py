@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
-from orthonav.core.flight.telemetry_track import measured
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
 from orthonav.ground.recordings.image_table import ImageRow, moment_of, ns_of
+from orthonav.ground.recordings.telemetry_track import measured
 
 MAX_FIELD_DEG = 110.0
 """Field of view along the longer side that is believed: wider lenses are fisheyes, whose pictures

@@ -19,12 +19,12 @@ import numpy as np
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.folder import check_latlon, number_of
-from orthonav.core.flight.telemetry_track import LATEST_NS, measured
 from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.headings import RADIANS, seem_radians
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
 from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED, UNSTATED
+from orthonav.ground.recordings.telemetry_track import LATEST_NS, measured
 
 MAX_BYTES = 100_000_000
 _SUFFIXES = (".csv", ".tsv", ".txt")

@@ -17,18 +17,6 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file
 from orthonav.core.flight.folder import csv_rows, number_of, time_ns_of
-from orthonav.core.flight.telemetry_track import (
-    RecordedTrack,
-    Samples,
-    Sources,
-    TimeSeries,
-    altitude_series,
-    attitude_of_angles,
-    attitude_series,
-    measured,
-    position_series,
-    series_of,
-)
 from orthonav.core.geo.attitude import (
     Angles,
     enu_from_body_camera,
@@ -46,6 +34,18 @@ from orthonav.core.tilt import (
     TiltSource,
 )
 from orthonav.ground.recordings.subtitles import read_srt
+from orthonav.ground.recordings.telemetry_track import (
+    RecordedTrack,
+    Samples,
+    Sources,
+    TimeSeries,
+    altitude_series,
+    attitude_of_angles,
+    attitude_series,
+    measured,
+    position_series,
+    series_of,
+)
 from orthonav.onboard.messages import mavlink
 
 DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats

@@ -18,7 +18,6 @@ from orthonav.core.errors import CameraError, FlightError, lfs_pointer
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_image
 from orthonav.core.flight.recording import RecordedView
-from orthonav.core.flight.telemetry_track import RecordedTrack
 from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
@@ -44,6 +43,7 @@ from orthonav.ground.recordings.recording import (
     with_mean_velocities,
     with_options,
 )
+from orthonav.ground.recordings.telemetry_track import RecordedTrack
 
 log = logging.getLogger(__name__)
 

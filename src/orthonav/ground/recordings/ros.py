@@ -32,14 +32,6 @@ from orthonav.core.flight.ros_messages import (
     odd_word,
     stamp_ns,
 )
-from orthonav.core.flight.telemetry_track import (
-    RecordedTrack,
-    Samples,
-    Sources,
-    TimeSeries,
-    altitude_series,
-    attitude_series,
-)
 from orthonav.core.geo.attitude import Angles, enu_from_ros_camera, rotations_of_wxyz
 from orthonav.core.geo.camera import Camera
 from orthonav.core.guard import needed, reading, without_plea
@@ -58,6 +50,14 @@ from orthonav.ground.recordings.recording import (
     known_at,
     warnings_of,
     with_mean_velocities,
+)
+from orthonav.ground.recordings.telemetry_track import (
+    RecordedTrack,
+    Samples,
+    Sources,
+    TimeSeries,
+    altitude_series,
+    attitude_series,
 )
 
 MAGICS = {b"#ROSBAG V": ".bag", MAGIC: ".mcap", b"SQLite format 3\0": ".db3"}

@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.telemetry_track import (
+from orthonav.core.geo.attitude import enu_from_gimbal_camera
+from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED
+from orthonav.ground.recordings.telemetry_track import (
     RecordedTrack,
     Samples,
     attitude_of_angles,
     measured,
 )
-from orthonav.core.geo.attitude import enu_from_gimbal_camera
-from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED
 
 _NUMBER = r"([-+]?\d{1,20}(?:\.\d{1,20})?)"  # limited, as the time of a search is
 _TIMES = re.compile(

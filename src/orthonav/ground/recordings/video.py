@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
-from orthonav.core.flight.recording import RecordedView
-from orthonav.core.flight.telemetry_track import RecordedTrack, chosen
+from orthonav.core.flight.recording import RecordedView, chosen
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.recordings.logs import end_ns, log_kind, read_log
 from orthonav.ground.recordings.recording import (
@@ -31,6 +30,7 @@ from orthonav.ground.recordings.recording import (
     warnings_of,
     with_mean_velocities,
 )
+from orthonav.ground.recordings.telemetry_track import RecordedTrack
 
 MAX_END_BYTES = 10_000_000
 _UNREAD = {

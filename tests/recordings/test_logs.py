@@ -22,10 +22,10 @@ from recorders import (
 )
 
 from orthonav.core.errors import FlightError, MissingExtraError
-from orthonav.core.flight.telemetry_track import angles_at
 from orthonav.core.tilt import MOUNT_STD_DEG
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.logs import read_log
+from orthonav.ground.recordings.telemetry_track import angles_at
 
 DOWN = (0.0, 0.0, 0.0)
 WRITERS = {
