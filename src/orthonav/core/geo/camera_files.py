@@ -12,7 +12,7 @@ import numpy as np
 
 from orthonav.core.errors import CameraError, MissingExtraError
 from orthonav.core.files import require_file
-from orthonav.core.flight.folder import camera_from_plain
+from orthonav.core.flight.folder import BROKEN, camera_from_plain
 from orthonav.core.geo.camera import Camera
 from orthonav.core.guard import needed
 
@@ -21,10 +21,6 @@ _READ = (
     "expected flight.json, or a camera of OpenCV (camera_matrix, image_width, .. as YAML, XML or "
     "JSON), ROS (camera_matrix, distortion_coefficients, ..) or Kalibr (intrinsics, resolution, ..)"
 )
-_UNREAD = {  # programs by what their files hold
-    "COLMAP": re.compile(r"^ *\d+ [A-Z_]+ \d+ \d+( [\d.e+-]+)+ *$", re.M),
-    "Metashape": re.compile(r"<(calibration|document)\b"),
-}
 
 
 def read_camera_file(path: Path) -> Camera:
@@ -41,9 +37,6 @@ def read_camera_file(path: Path) -> Camera:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise CameraError(f"camera file is not UTF-8 text: {path}") from error
-    for program, mark in _UNREAD.items():
-        if mark.search(text):
-            raise CameraError(f"camera files of {program} are not read; {_READ}: {path}")
     try:
         # Kalibr chains may begin with OpenCV's header, which is not YAML.
         chain = re.search(r"^cam\d+\s*:", text, re.MULTILINE) is not None
@@ -57,14 +50,7 @@ def read_camera_file(path: Path) -> Camera:
         return _plain(_yaml(text.removeprefix(OPENCV_HEADER)), name)
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
-    except (
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:
+    except (*BROKEN, IndexError) as error:
         found = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
         raise CameraError(f"{_READ}; {found}: {path}") from error
 

@@ -384,8 +384,7 @@ def log_kind(path: Path) -> str:
         return "dataflash"
     if len(head) > 8 and head[0] == 0 and head[8] in MAVLINK_MAGICS:
         return "tlog"
-    text = head.replace(b"\0", b"") if head[:2] in (b"\xff\xfe", b"\xfe\xff") else head
-    if re.search(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->", text):
+    if re.search(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->", head):
         return "srt"
     if b"time_s" in head.partition(b"\n")[0]:
         return "table"

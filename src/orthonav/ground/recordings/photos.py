@@ -26,7 +26,6 @@ from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, re
 from orthonav.ground.recordings.image_table import (
     ImageTable,
     is_image_table,
-    names_images,
     read_image_table,
 )
 from orthonav.ground.recordings.logs import read_log
@@ -112,7 +111,7 @@ def chosen_photos(sources: Sequence[Path], options: SourceOptions) -> ChosenPhot
 def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
     """The table that lies in a folder and names some of these photographs below it."""
     names = [path.relative_to(folder).as_posix() for path in photos]
-    ends, found = {path.name.lower() for path in photos}, []
+    found = []
     for path in sorted(folder.iterdir()):
         if is_image_table(path):
             table = read_image_table(path)
@@ -120,8 +119,6 @@ def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
                 found.append(table)
             else:
                 log.warning("table that names none of the photographs is not used: %s", path)
-        elif names_images(path, ends):
-            log.warning("not read, for want of a header such as file,yaw,pitch,roll,agl: %s", path)
     if len(found) > 1:
         several = ", ".join(table.path.name for table in found[:5])
         raise FlightError(

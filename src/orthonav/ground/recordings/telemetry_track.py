@@ -206,6 +206,9 @@ class RecordedTrack:
         yaw, pitch, roll = angles_at(self.attitude, time_ns)
         series = {"yaw_std_deg": self.yaw_std, "agl_std_m": self.agl_std}
         series |= {"home_m": self.home, "amsl_m": self.amsl, "hae_m": self.hae}
+        optional: dict[str, Any] = {name: _at(each, time_ns)[0] for name, each in series.items()}
+        if math.isfinite(pitch + roll):
+            optional |= self._tilt_stds(time_ns)
         return Telemetry(
             time_ns,
             yaw,
@@ -214,8 +217,7 @@ class RecordedTrack:
             self._agl_m(time_ns, ground_alt_m),
             prior=Prior.known(*_at(self.prior, time_ns, 3)),
             vel_en_mps=_known_pair(_at(self.velocity, time_ns, 2)),
-            **{name: _at(each, time_ns)[0] for name, each in series.items()},
-            **(self._tilt_stds(time_ns) if math.isfinite(pitch + roll) else {}),
+            **optional,
         )
 
     def mean_velocity_en_mps(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
