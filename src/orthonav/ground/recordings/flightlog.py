@@ -5,7 +5,6 @@ anywhere: all chunks that are complete are read.
 """
 
 import logging
-import re
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -39,6 +38,7 @@ from orthonav.ground.recordings.mcap_files import (
     chunk_at,
     chunks,
     messages,
+    name_and_number,
     profile_of,
 )
 from orthonav.ground.recordings.recording import (
@@ -53,7 +53,6 @@ MAX_VIEWS = 500_000  # ten a second for 14 hours; a small damaged file can claim
 MAX_MESSAGES = 10 * MAX_VIEWS
 MAX_NAME = 200
 MAX_THUMBNAIL_BYTES = 2**20
-_NUMBERED = re.compile(r"(.+)_(\d{4,9})\.mcap")
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +214,7 @@ def files_of_run(path: Path) -> list[Path]:
     """The files of one run in order: of a folder, or from the one that is given."""
     if path.is_dir():
         files = [file for file in path.glob("*.mcap") if profile_of(file) == PROFILE]
-        found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
+        found = {file: run for file in sorted(files, key=name_and_number) if (run := run_of(file))}
         runs = {run: file for file, run in reversed(found.items())}
         if len(runs) > 1:
             names = ", ".join(sorted(file.name for file in runs.values())[:5])
@@ -223,15 +222,11 @@ def files_of_run(path: Path) -> list[Path]:
                 f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
             )
         return list(found)
-    (name, number), run = _order(path), run_of(path)
-    others = [each for each in path.parent.glob("*.mcap") if _order(each)[0] == name]
-    later = sorted((each for each in others if _order(each)[1] > number), key=_order)
-    return [path, *(each for each in later if run and run_of(each) == run)]
-
-
-def _order(path: Path) -> tuple[str, int]:
-    match = _NUMBERED.fullmatch(path.name)
-    return (match[1], int(match[2])) if match else (path.name, 0)
+    run, (name, number) = run_of(path), name_and_number(path)
+    files = sorted(path.parent.glob("*.mcap"), key=name_and_number)
+    places = ((file, *name_and_number(file)) for file in files)
+    later = [file for file, its_name, place in places if its_name == name and place > number]
+    return [path, *(file for file in later if run and run_of(file) == run)]
 
 
 def run_of(path: Path) -> str | None:
