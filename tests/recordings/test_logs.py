@@ -2,7 +2,6 @@
 
 import math
 import struct
-import sys
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from recorders import (
     video,
 )
 
-from orthonav.core.errors import FlightError, MissingExtraError
+from orthonav.core.errors import FlightError
 from orthonav.core.tilt import MOUNT_STD_DEG
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.logs import read_log
@@ -378,10 +377,3 @@ def test_what_is_broken_is_one_error(tmp_path, how, capfd):
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
     print("heard")
     assert capfd.readouterr() == ("heard\n", "")
-
-
-def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
-    path = ulog(tmp_path / "a.ulg", px4_topics())
-    monkeypatch.setitem(sys.modules, "pyulog.core", None)
-    with pytest.raises(MissingExtraError, match=r"PX4 logs needs pyulog: pip install 'orthonav\[f"):
-        read_log(path, DOWN)

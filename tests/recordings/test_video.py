@@ -18,7 +18,7 @@ from recorders import (
 )
 
 from orthonav.core.errors import CameraError, FlightError
-from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.flight import read_truth
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.subtitles import blocks
 
@@ -66,16 +66,6 @@ def test_other_containers(tmp_path, name, code):
     views = list(open_source(path, options(path)).views)
     assert [view.telemetry.time_ns for view in views] == [0, 10**9]
     assert np.abs(views[1].grey().astype(int) - picture(10)).mean() < 6
-
-
-def test_import(recorded, tmp_path):
-    recording = open_source(recorded, options(recorded))
-    import_flight(recording, tmp_path / "flight")
-    flight = open_flight(tmp_path / "flight")
-    assert len(flight.views) == 3 and flight.camera == recording.camera
-    for written, view in zip(flight.views, recording.views, strict=True):
-        assert written.telemetry == view.telemetry
-        assert np.array_equal(written.grey(), view.grey()) and written.frame.endswith(".png")
 
 
 def test_a_table_beside_the_video(tmp_path):

@@ -156,13 +156,11 @@ def map_heights(
     opened: "orthonav.MapFile",
     terrain: "TerrainHeights | None" = None,
     *,
-    take_off: tuple[float, float, float] | None = None,
-    geoid: "Undulation | None" = None,
-    use_prior: bool = True,
     datum_known: bool = True,
+    **how: Any,
 ) -> "FlownHeights | None":
     """Heights above ground on a map by `terrain` (`datum_known`: whether it counts from the sea),
-    else by its own; None where it has none."""
+    else by its own; None where it has none. `how`: of `FlownHeights`."""
     from orthonav.core.flight.heights import FlownHeights
     from orthonav.core.mapfile.terrain import TerrainLayer
 
@@ -171,14 +169,7 @@ def map_heights(
     if found is None:
         return None
     known = datum_known if layer is None else layer.info.is_above_sea
-    return FlownHeights(
-        found,
-        _area_deg(opened),
-        take_off=take_off,
-        geoid=geoid,
-        use_prior=use_prior,
-        datum_known=known,
-    )
+    return FlownHeights(found, _area_deg(opened), datum_known=known, **how)
 
 
 def _area_deg(opened: "orthonav.MapFile") -> "tuple[Array, Array]":
