@@ -88,8 +88,10 @@ def camera_from_numbers(
         numbers = (*numbers, *(0.0,) * (4 - len(numbers))) if 0 < len(numbers) < 4 else numbers[:5]
     else:
         raise CameraError(f"distortion model '{model}' is not supported; brown and equidistant are")
-    k, (width, height) = _numbers(matrix, 9).reshape(3, 3), map(int, size_px)
-    return Camera.from_matrix(k, numbers, (width, height), ours, unusual=unusual)
+    k, (width, height) = np.array(matrix, dtype=np.float64), map(int, size_px)
+    if k.shape != (9,):
+        raise ValueError(f"9 numbers were expected, got {len(k)}")
+    return Camera.from_matrix(k.reshape(3, 3), numbers, (width, height), ours, unusual=unusual)
 
 
 def _yaml(text: str) -> Any:
@@ -203,10 +205,3 @@ def _data(matrix: Any) -> Any:
     if int(matrix.get("rows", 1)) * int(matrix.get("cols", len(data))) != len(data):
         raise CameraError("rows, columns and data of a matrix disagree")
     return data
-
-
-def _numbers(values: Any, count: int) -> Any:
-    numbers = np.array(values, dtype=np.float64)
-    if numbers.shape != (count,):
-        raise ValueError(f"{count} numbers were expected, got {len(numbers)}")
-    return numbers

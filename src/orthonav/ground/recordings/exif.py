@@ -221,7 +221,7 @@ def read_photo(path: Path) -> Photo:
             gps = _named(exif.get_ifd(names.IFD.GPSInfo), names.GPSTAGS)
             packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")
             width, height = image.size
-    xmp = Xmp.of(packet or tags.get("XMLPacket") or b"")
+    xmp = Xmp(packet or tags.get("XMLPacket") or b"")
     make, notes = _word(tags.get("Make")), tags.get("MakerNote")
     gimbal, heading = read_maker_notes(notes if isinstance(notes, bytes) else b"", make)
     time_ns, zone_known = (xmp.time_ns, True) if xmp.time_ns else _time(tags)
@@ -377,35 +377,30 @@ def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float]
     return (yaw, pitch, roll) if known else None, values.get(7, math.nan)
 
 
-@dataclass(frozen=True)
 class Xmp:
-    """The values of a packet by prefix and name, and what they mean; NaN and None for missing."""
+    """The values of a packet by prefix and name, and what they mean; NaN and None for missing.
 
-    values: Mapping[str, float]
-    time_ns: int | None  # UTC at exposure
-    writer: str = ""  # program that wrote the packet, empty where it is not named
-    lens: tuple[float, ...] | None = None  # `DewarpData`, see `Photo`
-    unread: tuple[str, ...] = ()
-    """Angles, heights and positions that are not numbers, as name and value."""
+    `time_ns`: UTC at exposure. `writer`: program that wrote the packet. `lens`: see `Photo`.
+    `unread`: angles, heights and positions that are not numbers, as name and value.
+    """
 
-    @classmethod
-    def of(cls, packet: str | bytes) -> "Xmp":
+    def __init__(self, packet: str | bytes) -> None:
         text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
         camera = _SKYDIO.search(text)  # its names are those of the aircraft's angles too
         skydio = camera[0].replace("drone-skydio:", "skydio:") if camera else ""
         texts = dict(_VALUE.findall(skydio + text))
         found = {name: _stated(value) for name, value in texts.items()}
-        values = {name: value for name, value in found.items() if math.isfinite(value)}
-        unread = tuple(
+        self.values = {name: value for name, value in found.items() if math.isfinite(value)}
+        self.unread = tuple(
             f"{name}={texts[name]!r:.40}"
-            for name in found.keys() - values.keys()
+            for name in found.keys() - self.values.keys()
             if _ANGLE_OR_PLACE.match(name)
         )
         exposed = texts.get("drone-dji:UTCAtExposure") or texts.get("sensefly:UTCTime", "")
+        self.time_ns = _exposed_ns(exposed)
         writer = re.search(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})", text)
-        name = writer[1].strip() if writer else ""
-        lens = _lens(texts.get("drone-dji:DewarpData", ""))
-        return cls(values, _exposed_ns(exposed), name, lens, unread)
+        self.writer = writer[1].strip() if writer else ""
+        self.lens = _lens(texts.get("drone-dji:DewarpData", ""))
 
     def first(self, *names: str) -> float:
         return next((self.values[name] for name in names if name in self.values), math.nan)

@@ -6,12 +6,12 @@ anywhere: all chunks that are complete are read.
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 from orthonav.core.errors import CameraError, FlightError, OrthonavError
 from orthonav.core.flight import decode_image
@@ -69,17 +69,13 @@ class LoggedFlight(Recording):
     arrivals: Callable[[], Iterable[tuple[RecordedView, float]]] = list
 
 
-@dataclass(frozen=True)
-class ImagePlace:
-    """Where the image of a view is: file, offset of its chunk, and its number in the chunk.
-
-    `whole`: whether it is the full image, not a thumbnail.
-    """
+class ImagePlace(NamedTuple):
+    """Where the image of a view is."""
 
     path: Path
-    offset: int
-    number: int
-    whole: bool
+    offset: int  # of its chunk in the file
+    number: int  # in the chunk
+    whole: bool  # whether it is the full image, not a thumbnail
 
 
 class BrokenLogError(FlightError):
@@ -172,8 +168,17 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
     if options.telemetry is not None:
         raise FlightError(f"a flight log has its own telemetry; omit --telemetry: {path}")
     files, content, warnings = files_of_run(path), LogContent(), list[str]()
-    for file in files:
-        warnings += _warnings_of_file(McapFile(file), content)
+    for file in map(McapFile, files):
+        before = content.broken
+        content.read(file)
+        if file.damaged or content.broken > before:
+            broken = f"{file.damaged} chunks and {content.broken - before} messages"
+            warnings.append(f"{broken} are damaged: {file.path}")
+        if not file.ended:
+            warnings.append(
+                f"flight log was cut short, {file.lost_bytes} bytes after its last complete chunk "
+                f"are lost: {file.path}"
+            )
     if not content.session:
         raise FlightError(f"no chunk of the flight log is complete: {path}")
     try:
@@ -190,7 +195,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
         note=f"{path.name}: flight log {run!s:.40} of orthonav {version!s:.40}",
         expected=len(replayable),
         stream=lambda: (_view(each, content, camera, options) for each in replayable),
-        warnings=(*warnings, *_unmasked(content, options), *_gaps(content.views, replayable)),
+        warnings=(*warnings, *_differences(content, replayable, options)),
         session=content.session,
         results=partial(_results, files),
         arrivals=lambda: (
@@ -199,15 +204,6 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
             if _has_image(each, content)
         ),
     )
-
-
-def _unmasked(content: LogContent, options: SourceOptions) -> list[str]:
-    """A warning where the flight hid a part of its pictures and this replay does not."""
-    flown = content.session.get("options")
-    mask = flown.get("mask") if isinstance(flown, dict) else None
-    if not mask or options.mask is not None:
-        return []
-    return [f"the flight was flown with --mask {mask!s:.200}: give it again to see the same ground"]
 
 
 def files_of_run(path: Path) -> list[Path]:
@@ -236,20 +232,6 @@ def run_of(path: Path) -> str | None:
             if message.topic == TOPICS.session.name:
                 return str(from_json(message.data).get("run"))
     return None
-
-
-def _warnings_of_file(file: McapFile, content: LogContent) -> list[str]:
-    before, warnings = content.broken, []
-    content.read(file)
-    damaged, broken = file.damaged, content.broken - before
-    if damaged or broken:
-        warnings.append(f"{damaged} chunks and {broken} messages are damaged: {file.path}")
-    if not file.ended:
-        warnings.append(
-            f"flight log was cut short, {file.lost_bytes} bytes after its last complete chunk "
-            f"are lost: {file.path}"
-        )
-    return warnings
 
 
 def _session(data: bytes, path: Path) -> dict[str, Any]:
@@ -305,25 +287,29 @@ def _is_name(frame: str) -> bool:
     )
 
 
-def _gaps(views: list[LoggedView], replayable: list[LoggedView]) -> list[str]:
-    """Warnings about missing views: without them the track differs from the one in flight."""
+def _differences(
+    content: LogContent, replayable: list[LoggedView], options: SourceOptions
+) -> Iterator[str]:
+    """Warnings about what this replay has not and the flight had: its mask, and views, without
+    which the track differs."""
+    flown, views = content.session.get("options"), content.views
+    mask = flown.get("mask") if isinstance(flown, dict) else None
+    if mask and options.mask is None:
+        said = f"the flight was flown with --mask {mask!s:.200}"
+        yield f"{said}: give it again to see the same ground"
     begin, end = min(view.index for view in views), max(view.index for view in views) + 1
-    warnings = []
     if begin > 0:
-        warnings.append(
+        yield (
             f"the first {begin} views of the flight are not in the log: a track begins later than "
             "in flight"
         )
     if withheld := sum(view.withheld for view in views):
-        warnings.append(
+        yield (
             f"{withheld} views were not located in flight, because the latency of the camera was "
             "not known; only `orthonav calibrate --latency` uses them"
         )
     if (missing := end - begin - len(replayable) - withheld) > 0:
-        warnings.append(
-            f"{missing} views lack a full image and are left out: a track differs after them"
-        )
-    return warnings
+        yield f"{missing} views lack a full image and are left out: a track differs after them"
 
 
 def _view(
