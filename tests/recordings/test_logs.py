@@ -15,6 +15,7 @@ from recorders import (
     px4_topics,
     quaternion_wxyz,
     record,
+    sent,
     tlog,
     ulog,
     video,
@@ -107,16 +108,9 @@ def test_logs_without_gps_count_from_boot(tmp_path):
 
 
 def test_attitude_as_a_quaternion_in_a_tlog(tmp_path):
-    from pymavlink.dialects.v20 import ardupilotmega as dialect
-
-    sender = dialect.MAVLink(None, srcSystem=7)
-    w, x, y, z = quaternion_wxyz(200, 5, -3)
-    data = b""
-    for step in range(20):
-        message = dialect.MAVLink_attitude_quaternion_message(step, w, x, y, z, 0, 0, 0)
-        stamp = struct.pack(">Q", START_S * 10**6 + step * 100_000)
-        data += stamp + message.pack(sender, force_mavlink1=step % 2 == 0)
-    (tmp_path / "a.tlog").write_bytes(data)
+    message = "attitude_quaternion", 0, *quaternion_wxyz(200, 5, -3), 0, 0, 0
+    data = (sent((7, 0), step / 10, message, old=step % 2 == 0) for step in range(20))
+    (tmp_path / "a.tlog").write_bytes(b"".join(data))
     track = read_log(tmp_path / "a.tlog", DOWN)
     assert len(track.attitude.time_ns) == 20
     assert angles_at(track.attitude, START_S * 10**9) == pytest.approx((200, 5, -3), abs=1e-4)
@@ -143,13 +137,8 @@ def test_a_log_that_was_cut_tells_what_came_before(kind, log):
 
 def appended(path, sender, *messages, t=0.0):
     """Messages of a sender (system, component) at the end of a telemetry log."""
-    from pymavlink.dialects.v20 import ardupilotmega as dialect
-
-    packer = dialect.MAVLink(None, srcSystem=sender[0], srcComponent=sender[1])
-    stamp = struct.pack(">Q", START_S * 10**6 + round(t * 1e6))
-    packed = (getattr(dialect, f"MAVLink_{name}_message")(*of) for name, *of in messages)
     with path.open("ab") as stream:
-        stream.writelines(stamp + message.pack(packer) for message in packed)
+        stream.write(sent(sender, t, *messages))
     return path
 
 
