@@ -213,17 +213,17 @@ def test_a_gimbal_that_is_0_in_all_rows_was_not_recorded(images):
     (images / "a.csv").write_text(rows.format("c.png", 0))
     found = read_image_table(images / "a.csv")
     assert any("of the gimbal are 0 throughout" in each for each in found.warnings)
-    assert [row.pose["pitch_deg"] for row in found.rows.values()] == [0, 0]
-    assert {row.pose["tilt_std_deg"] for row in found.rows.values()} == {6.0}
+    assert [row["pose"]["pitch_deg"] for row in found.rows.values()] == [0, 0]
+    assert {row["pose"]["tilt_std_deg"] for row in found.rows.values()} == {6.0}
     (images / "a.csv").write_text(
         "file,yaw,gimbal_yaw,gimbal_pitch,gimbal_roll\na.png,77,0,0,0\nc.png,80,0,0,0\n"
     )
     found = read_image_table(images / "a.csv")
-    assert [row.pose["yaw_deg"] for row in found.rows.values()] == [77, 80]
+    assert [row["pose"]["yaw_deg"] for row in found.rows.values()] == [77, 80]
     (images / "a.csv").write_text(rows.format("c.png", -90))
     found = read_image_table(images / "a.csv")
     assert not any("0 throughout" in each for each in found.warnings)
-    assert {row.pose["tilt_std_deg"] for row in found.rows.values()} == {0.5}
+    assert {row["pose"]["tilt_std_deg"] for row in found.rows.values()} == {0.5}
 
 
 def test_single_photographs(images):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import CameraError
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
-from orthonav.ground.recordings.image_table import ImageRow, moment_of, ns_of
+from orthonav.ground.recordings.image_table import moment_of, ns_of
 from orthonav.ground.recordings.telemetry_track import measured
 
 MAX_FIELD_DEG = 110.0
@@ -204,9 +204,9 @@ class Photo:
     agl_m: float = math.nan  # height above ground, where a table states it
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
-    row: ImageRow | None = None  # what a table says of it
+    order: int = 0  # number of its row in a table
     pose: Mapping[str, Any] = field(default_factory=dict)
-    """Its attitude as fields of `Telemetry`, once all photographs of the flight are known."""
+    """Its attitude as fields of `Telemetry`: by a table, or once all of the flight are known."""
 
 
 def read_photo(path: Path) -> Photo:

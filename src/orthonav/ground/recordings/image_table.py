@@ -51,15 +51,7 @@ _UNREAD = re.compile(r"omega|phi|kappa|q[wxyz]")
 _EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
 _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 Columns = Mapping[str, tuple[str, float]]  # name in the table and scale, by field
-
-
-@dataclass(frozen=True)
-class ImageRow:
-    """What a table says of an image: fields of `Photo` and of its pose by their names."""
-
-    order: int  # number of the row
-    values: Mapping[str, Any]
-    pose: Mapping[str, Any]
+ImageRow = Mapping[str, Any]  # what a table says of an image: fields of `Photo` by their names
 
 
 @dataclass(frozen=True)
@@ -216,7 +208,7 @@ def _names_gimbal(columns: Columns) -> bool:
 def _row(
     order: int, values: Mapping[str, float], time_ns: int | None, source: TiltSource
 ) -> ImageRow:
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"order": order}
     if time_ns is not None:
         found |= {"time_ns": time_ns, "zone_known": True}
     if "lat" in values and "lon" in values and (values["lat"] or values["lon"]):
@@ -234,7 +226,7 @@ def _row(
         pose |= {"pitch_deg": pitch, "roll_deg": roll, **source.stated(aided=False)}
     if math.isfinite(yaw):
         pose |= {"yaw_deg": yaw % 360, "yaw_std_deg": None}
-    return ImageRow(order, found, pose)
+    return found | {"pose": pose}
 
 
 def _time_ns(text: str, line: int, path: Path) -> int | None:

@@ -157,7 +157,7 @@ def posed(photos: Sequence[Photo], edited: Sequence[int]) -> tuple[list[Photo], 
     for number in edited:
         poses[number]["yaw_std_deg"] = 180.0
     return [
-        replace(photo, pose={**pose, **(photo.row.pose if photo.row else {})})
+        replace(photo, pose={**pose, **photo.pose})
         for photo, pose in zip(photos, poses, strict=True)
     ], warnings
 
@@ -327,20 +327,20 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
         return photos, []
     names = [photo.path.relative_to(chosen.folder).as_posix() for photo in photos]
     pairs = [(photo, table.row(name)) for photo, name in zip(photos, names, strict=True)]
-    known = [replace(photo, row=row, **row.values) for photo, row in pairs if row]
+    known = [replace(photo, **row) for photo, row in pairs if row]
     without = [photo.path for photo, row in pairs if row is None]
     if not known:
         raise FlightError(
             f"table names none of the {len(photos)} photographs, such as {without[0].name}; it "
             f"names {next(iter(table.rows))}: {table.path}"
         )
-    if len({row.order for _, row in pairs if row}) < len(known):
+    if len({photo.order for photo in known}) < len(known):
         raise FlightError(
             "a row of the table names several photographs of one name; give their paths below "
             f"{chosen.folder}: {table.path}"
         )
     warnings = [*table.warnings, *_left_out(photos, without, "not in the table")]
-    lost = len({row.order for row in table.rows.values()}) - len(known)
+    lost = len({row["order"] for row in table.rows.values()}) - len(known)
     if lost:
         warnings.append(f"{lost} rows of the table have no photograph: {table.path}")
     return known, warnings
@@ -383,7 +383,7 @@ def _in_time(
     if not untimed or options.telemetry is not None:
         ordered: list[Photo] = []
     elif chosen.singly:
-        ordered = sorted(photos, key=lambda photo: photo.row.order if photo.row else 0)
+        ordered = sorted(photos, key=lambda photo: photo.order)
     else:
         known = [
             one for one in untimed if one.gimbal_deg or one.rotation is not None or one.latlon_deg
