@@ -117,13 +117,13 @@ def place(lat, lon, alt=400.0):
 # Videos and their subtitles.
 
 
-def video(path, frames=30, fps=10.0, code="FFV1"):
-    writer = cv2.VideoWriter(
-        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), fps, (WIDTH, HEIGHT)
-    )
+def video(path, frames=30, fps=10.0, code="FFV1", shown=picture):
+    """A video whose frame of a number is `shown` of it."""
+    kind, size = cv2.VideoWriter_fourcc(*code), shown(0).shape[::-1]
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, kind, fps, size)
     assert writer.isOpened()
     for number in range(frames):
-        writer.write(cv2.cvtColor(picture(number), cv2.COLOR_GRAY2BGR))
+        writer.write(cv2.cvtColor(shown(number), cv2.COLOR_GRAY2BGR))
     writer.release()
     return path
 

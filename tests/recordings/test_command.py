@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bags import Messages, record
 from PIL import Image
-from recorders import START_S, camera_file, packet, photo, place, tlog
+from recorders import START_S, camera_file, packet, photo, place, tlog, video
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import FlightWriter, open_flight, read_image
@@ -58,13 +58,7 @@ def photographs(folder, at=None):
 def filmed(folder):
     """A lossless video of 2 s with a table of what was known."""
     folder.mkdir()
-    path = folder / "film.mkv"
-    writer = cv2.VideoWriter(
-        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 5.0, VIEW.shape
-    )
-    for index in range(10):
-        writer.write(cv2.cvtColor(seen(index), cv2.COLOR_GRAY2BGR))
-    writer.release()
+    path = video(folder / "film.mkv", 10, 5.0, shown=seen)
     path.with_suffix(".csv").write_text(
         "time_s,yaw_deg,pitch_deg,roll_deg,agl_m\n0,19,0,0,160\n1,21,0,0,160\n2,21,0,0,160\n"
     )

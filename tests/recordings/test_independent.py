@@ -15,14 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pyulog import ULog
-from recorders import (
-    SENSEFLY,
-    dji,
-    maker_notes,
-    packet,
-    photo,
-    place,
-)
+from recorders import SENSEFLY, dji, maker_notes, packet, photo, place
 
 from orthonav.ground.recordings import open_source
 from orthonav.ground.recordings.exif import read_photo

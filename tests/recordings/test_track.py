@@ -9,11 +9,7 @@ from orthonav.core.errors import UsageError
 from orthonav.core.flight.recording import RecordedView
 from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.core.tilt import ARDUPILOT, GIMBAL, MOUNT_STD_DEG, UNSTATED, stated_deg
-from orthonav.ground.recordings.recording import (
-    SourceOptions,
-    warnings_of,
-    with_mean_velocities,
-)
+from orthonav.ground.recordings.recording import SourceOptions, warnings_of, with_mean_velocities
 from orthonav.ground.recordings.telemetry_track import (
     GAP_NS,
     RecordedTrack,

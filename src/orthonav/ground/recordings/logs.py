@@ -27,12 +27,7 @@ from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.swapped import swapped_hint
 from orthonav.core.guard import needed, reading
 from orthonav.core.tables import MAX_ROWS
-from orthonav.core.tilt import (
-    ARDUPILOT,
-    AUTOPILOT,
-    UNSTATED,
-    TiltSource,
-)
+from orthonav.core.tilt import ARDUPILOT, AUTOPILOT, UNSTATED, TiltSource
 from orthonav.ground.recordings.subtitles import read_srt
 from orthonav.ground.recordings.telemetry_track import (
     RecordedTrack,

@@ -48,9 +48,10 @@ class McapFile:
 
 
 def name_and_number(path: Path) -> tuple[str, int]:
-    """The name of the recording that a file `NAME_NUMBER.*` belongs to, and its number in it."""
+    """The name of the recording that a file `NAME_NUMBER.*` belongs to, and its number in it; that
+    of the file and 0 for others."""
     found = re.fullmatch(r"(.+)_(\d{1,9})", path.stem)
-    return (found[1], int(found[2])) if found else (path.stem, 0)
+    return (found[1], int(found[2])) if found else (path.name, 0)
 
 
 def profile_of(path: Path) -> str | None:

@@ -23,11 +23,7 @@ from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
 from orthonav.core.tilt import ASSUMED, AUTOPILOT, GIMBAL, TiltSource
 from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, read_photo
-from orthonav.ground.recordings.image_table import (
-    ImageTable,
-    is_image_table,
-    read_image_table,
-)
+from orthonav.ground.recordings.image_table import ImageTable, is_image_table, read_image_table
 from orthonav.ground.recordings.logs import read_log
 from orthonav.ground.recordings.recording import (
     Recording,

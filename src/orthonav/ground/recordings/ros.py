@@ -35,12 +35,7 @@ from orthonav.core.geo.attitude import Angles, enu_from_ros_camera, rotations_of
 from orthonav.core.geo.camera import Camera
 from orthonav.core.guard import needed, reading, without_plea
 from orthonav.ground.recordings.logs import read_log
-from orthonav.ground.recordings.mcap_files import (
-    MAGIC,
-    complete_bytes,
-    inflated,
-    name_and_number,
-)
+from orthonav.ground.recordings.mcap_files import MAGIC, complete_bytes, inflated, name_and_number
 from orthonav.ground.recordings.recording import (
     ROLES,
     Recording,
