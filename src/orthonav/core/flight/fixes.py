@@ -345,14 +345,15 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
             "evidence: expected vel_std_mps of 0 or more and recognized of 0 to 1, got "
             f"{vel_std_mps:g} and {recognized:g}"
         )
-    ground = _place(values, *GROUND_KEYS[:2]) if GROUND_KEYS[0] in values else None
+    ground = None
+    if GROUND_KEYS[0] in values:
+        ground = _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
     # Absent in earlier files.
     values = {**dict.fromkeys((*INTEGRITY_KEYS, *GROUND_KEYS, *POSE_KEYS)), **values}
-    lat_deg, lon_deg = _place(values, "lat_deg", "lon_deg")
     cov_en_m2 = _numbers(values, "cov_en_m2", (2, 2))
     return Fix(
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
+        lat_deg=_angle(values, "lat_deg", 90.0),
+        lon_deg=_angle(values, "lon_deg", 180.0),
         cov_en_m2=np.full((2, 2), math.nan) if cov_en_m2 is None else cov_en_m2,
         confidence=_share(values, "confidence"),
         **{name: _number(values, name) for name in ("radius_m", "heading_deg", "agl_m")},
@@ -411,12 +412,10 @@ def _share(values: Mapping[str, Any], key: str) -> float:
     return share
 
 
-def _place(values: Mapping[str, Any], *keys: str) -> tuple[float, float]:
-    """Latitude and longitude, which are not null: a fix has a position."""
-    lat, lon = (_number(values, key) for key in keys)
-    for key, angle, limit in zip(keys, (lat, lon), (90, 180), strict=True):
-        _checked(values, key, f"-{limit} to {limit}", abs(angle) <= limit)
-    return lat, lon
+def _angle(values: Mapping[str, Any], key: str, limit_deg: float) -> float:
+    angle = _number(values, key)  # not NaN: a fix has a position
+    _checked(values, key, f"-{limit_deg:g} to {limit_deg:g}", abs(angle) <= limit_deg)
+    return angle
 
 
 def _numbers(
