@@ -240,7 +240,7 @@ def say_assumed_heights(
         log.log(logging.WARNING if terrain is None else logging.INFO, "%s", said)
 
 
-def _geoid_for(telemetry: orthonav.Telemetry) -> "Undulation | None":
+def _geoid_for(telemetry: "orthonav.Telemetry") -> "Undulation | None":
     """The geoid, where the height above the ellipsoid is known and that above the sea is not. Where
     it is needed and missing, a warning says what to install."""
     if telemetry.hae_m is None or telemetry.amsl_m is not None:
