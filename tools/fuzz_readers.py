@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
-FOLDERS = ("", "sources", "onboard", "localize", "geo", "mapfile", "imagery", "fetch", "web")
+FOLDERS = ("", "recordings", "onboard", "localize", "geo", "mapfile", "imagery", "fetch", "web")
 sys.path.extend(str(TESTS / folder) for folder in FOLDERS)
 
 import bags

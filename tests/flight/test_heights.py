@@ -11,14 +11,12 @@ import pytest
 from orthonav.core.flight.heights import (
     LIMITS,
     FlownHeights,
-    GroundHeights,
     TerrainFit,
     assumed_heights,
     is_measured,
     needs_datum,
 )
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.geo.ground import Ground
 from orthonav.core.records import Fix, NoFix, Prior, Telemetry
 
 FRAME = LocalFrame(46.5, 2.5)
@@ -66,12 +64,12 @@ def fix(east_m, north_m, confidence=0.95, std_m=5.0):
     ],
 )
 def test_each_height_becomes_one_above_ground(heights, expected_m):
-    over = GroundHeights(terrain, Ground(320.0, 0.0, 1.0), lambda lat, lon: 0 * lat + 47.0)
-    telemetry, below = reported(**heights), Ground(400.0, 0.0, 1.0)
-    found = over.above(telemetry, below, place(0, 1000))
-    assert found.agl_m == pytest.approx(expected_m) and found.agl_std_m is None
-    if len(heights) == 1 and "amsl_m" not in heights:  # no height is taken for another
-        assert GroundHeights(terrain).above(telemetry, below, place(0, 0)) == telemetry
+    telemetry = reported(prior=Prior(*place(0, 1000), 0.0), **heights)  # over ground at 400 m
+    start = {"take_off": (*place(0, 200), 0.0), "geoid": lambda lat, lon: 0 * lat + 47.0}
+    found = flown(**start).corrected(telemetry)
+    assert found.agl_m == pytest.approx(expected_m, abs=0.01) and found.agl_std_m is None
+    if heights.keys() == {"hae_m"}:  # it is not taken for another one
+        assert math.isnan(flown().corrected(telemetry).agl_m)
 
 
 def test_over_an_unknown_datum_only_heights_above_take_off_are_converted():

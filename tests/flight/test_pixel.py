@@ -58,6 +58,20 @@ def test_on_a_slope_it_is_where_the_line_of_sight_meets_it(px):
     assert found.height_m == pytest.approx(100 + 0.3 * direction[0] * drop, abs=0.02)
 
 
+MIDDLE = 320.0, 240.0
+
+
+def ground(px, heading_deg=30.0, agl_m=AGL_M, tilt_deg=(0.0, 0.0)):
+    """Metres east and north (2,) of the camera of what it shows at a pixel."""
+    return ground_en_m(CAMERA, np.array([px]), heading_deg, *tilt_deg, agl_m)[0]
+
+
+def share_inside(located, true_en_m):
+    """Fraction of these points whose 95 % ellipse holds the true one."""
+    off = [(en_of(point) - true_en_m, point.cov_en_m2) for point in located]
+    return np.mean([each @ np.linalg.solve(cov, each) < 5.991 for each, cov in off])
+
+
 @pytest.mark.parametrize(
     ("px", "tilt_deg"),
     [
@@ -69,30 +83,23 @@ def test_on_a_slope_it_is_where_the_line_of_sight_meets_it(px):
 )
 def test_ellipses_cover_what_they_state(px, tilt_deg):
     """The middle of the view is measured, the camera follows from it."""
-    rng = np.random.default_rng(4)
+    rng, tilt = np.random.default_rng(4), (tilt_deg, 0.0)
     tilted = replace(telemetry(tilt_deg), tilt_std_deg=0.0)
-    middle = np.array([[320.0, 240.0]])
-    heading_std, scale_std, count, inside = math.radians(0.8), 0.01, 300, 0
-
-    def ground(pixel, heading_deg, agl_m):
-        return ground_en_m(CAMERA, np.array([pixel]), heading_deg, tilt_deg, 0.0, agl_m)[0]
-
-    at_camera = ground(middle[0], 30.0, AGL_M)
-    arm = float(at_camera @ at_camera)
+    heading_std, scale_std = math.radians(0.8), 0.01
+    at_camera = ground(MIDDLE, tilt_deg=tilt)
     lever = np.outer(at_camera, at_camera) * scale_std**2
     lever += np.outer(at_camera[::-1] * [1, -1], at_camera[::-1] * [1, -1]) * heading_std**2
-    covariance = np.eye(2) + lever
-    assert np.trace(lever) == pytest.approx(arm * (scale_std**2 + heading_std**2))
-    for _ in range(count):
+    assert np.trace(lever) == pytest.approx(at_camera @ at_camera * (scale_std**2 + heading_std**2))
+
+    def located():
         heading = 30.0 + math.degrees(rng.normal(0, heading_std))
         agl_m = AGL_M * math.exp(rng.normal(0, scale_std))
-        place = rng.normal(0, 1.0, 2) + at_camera - ground(middle[0], heading, agl_m)
+        place = rng.normal(0, 1.0, 2) + at_camera - ground(MIDDLE, heading, agl_m, tilt)
         seen = fix(*place, heading_deg=heading, agl_m=agl_m, ground_cov_en_m2=np.eye(2))
-        seen = replace(seen, cov_en_m2=covariance)
-        found = locate_pixel(CAMERA, tilted, seen, px)
-        off = en_of(found) - ground(px, 30.0, AGL_M)
-        inside += off @ np.linalg.solve(found.cov_en_m2, off) < 5.991
-    assert 0.92 < inside / count < 0.975
+        return locate_pixel(CAMERA, tilted, replace(seen, cov_en_m2=np.eye(2) + lever), px)
+
+    share = share_inside([located() for _ in range(300)], ground(px, tilt_deg=tilt))
+    assert 0.92 < share < 0.975
 
 
 def near(lat_deg, lon_deg):
@@ -135,28 +142,26 @@ def test_the_middle_is_as_exact_as_registration_where_tilt_is_uncertain(pitch_de
 def test_a_fix_that_states_its_camera_moves_a_pixel_by_all_six(px):
     """Errors of position and tilt that belong together leave the ground seen where it is."""
     camera_std = np.array([4.0, 4.0, 2.0, 0.3, 1.0, 1.0])
-    middle = np.array([[320.0, 240.0]])
 
-    def ground(pixel, camera):
-        east, north, up, heading, pitch, roll = camera
-        seen = ground_en_m(CAMERA, np.atleast_2d(pixel), 30.0 + heading, pitch, roll, AGL_M + up)
-        return seen[0] + [east, north]
+    def seen_at(camera):
+        east, north, up, heading, *tilt = camera
+        return np.add([east, north], ground(MIDDLE, 30.0 + heading, AGL_M + up, tilt))
 
     # What the middle shows is known to 0.5 m: the covariance of a camera given that.
     step = 1e-3
-    slopes = np.stack([ground(middle, e) - ground(middle, -e) for e in np.eye(6) * step], axis=1)
-    slopes /= 2 * step
+    slopes = np.stack([seen_at(e) - seen_at(-e) for e in np.eye(6) * step], axis=1) / (2 * step)
     covariance = np.linalg.inv(np.diag(camera_std**-2) + slopes.T @ slopes / 0.5**2)
-    rng, count, inside = np.random.default_rng(5), 300, 0
-    # Eigenvectors, the default, have other signs on other processors.
-    for error in rng.multivariate_normal(np.zeros(6), covariance, count, method="cholesky"):
+
+    def located(error):
         east, north, up, heading, pitch, roll = error
         seen = fix(east, north, 30.0 + heading, AGL_M + up)
         seen = replace(seen, pitch_deg=pitch, roll_deg=roll, pose_cov=covariance)
-        found = locate_pixel(CAMERA, telemetry(9.0, 9.0), seen, px)  # not the reported tilt
-        off = en_of(found) - ground(px, np.zeros(6))
-        inside += off @ np.linalg.solve(found.cov_en_m2, off) < 5.991
-    assert 0.92 < inside / count < 0.975
+        return locate_pixel(CAMERA, telemetry(9.0, 9.0), seen, px)  # not the reported tilt
+
+    # Eigenvectors, the default, have other signs on other processors.
+    draw = np.random.default_rng(5).multivariate_normal
+    found = [located(error) for error in draw(np.zeros(6), covariance, 300, method="cholesky")]
+    assert 0.92 < share_inside(found, ground(px)) < 0.975
     # Less is known of the camera's place than of the ground, most of all in the middle.
     share = 0.05 if px == (320, 240) else 0.5
-    assert np.trace(found.cov_en_m2) < share * np.trace(covariance[:2, :2])
+    assert np.trace(found[-1].cov_en_m2) < share * np.trace(covariance[:2, :2])

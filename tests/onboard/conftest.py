@@ -1,8 +1,8 @@
 """Lets tests of flights use the known ground of `tests/localize/blots.py`, and recorded bags of
-`tests/sources/bags.py`."""
+`tests/recordings/bags.py`."""
 
 import sys
 from pathlib import Path
 
-for folder in ("localize", "sources"):
+for folder in ("localize", "recordings"):
     sys.path.append(str(Path(__file__).parents[1] / folder))

@@ -8,8 +8,8 @@ from fake_autopilot import MS, S
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.core.flight.telemetry_track import RecordedTrack, Samples, attitude_of_angles
 from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles, wxyz_of_angles
+from orthonav.ground.recordings.telemetry_track import RecordedTrack, Samples, attitude_of_angles
 from orthonav.onboard import telemetry
 from orthonav.onboard.telemetry import ClockSync, TelemetryBuffer
 

@@ -7,13 +7,7 @@ from typing import TYPE_CHECKING
 
 import orthonav
 from orthonav.cli.common import add_options, beside, counted, print_result, progress, watched
-from orthonav.cli.source import (
-    add_source,
-    dem_of,
-    flight_heights,
-    located,
-    open_source,
-)
+from orthonav.cli.source import add_source, dem_of, flight_heights, located, open_source
 from orthonav.core.errors import UsageError
 
 if TYPE_CHECKING:

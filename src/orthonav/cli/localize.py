@@ -290,13 +290,12 @@ class SetupAdvice:
 
         self._options, self._localizer = options, localizer
         self._low = LowConfidenceViews(flight.camera, corrected)
-        self._nearest: tuple[float, str] | None = None
+        self._distances: list[tuple[float, str]] = []
         self._yaw_deg: list[float] = []
 
     def take(self, view: "RecordedView", result: "orthonav.ViewResult") -> None:
-        found = far_from_map(view, self._localizer)
-        if found is not None and (self._nearest is None or found < self._nearest):
-            self._nearest = found
+        if (found := far_from_map(view, self._localizer)) is not None:
+            self._distances.append(found)
         self._yaw_deg.append(view.telemetry.yaw_deg)
         self._low.take(view, result)
 
@@ -308,7 +307,7 @@ class SetupAdvice:
         Both are empty where enough views are confident.
         """
         from orthonav.core.localize.confidence import Acceptance
-        from orthonav.ground.recordings.setups import Counts, setup_text
+        from orthonav.ground.recordings.setups import Counts
 
         if math.isfinite(accept.alert_limit_m):  # a high level is no sign of a wrong setup
             accept = Acceptance("confidence", orthonav.CONFIDENT)
@@ -317,36 +316,33 @@ class SetupAdvice:
         lines = [RADIANS] if known and seem_radians(self._yaw_deg) else []
         if not counts.few:
             return lines, []
-        if self._nearest is not None and self._nearest[0] > FAR_M:
-            return [*lines, far_text("the recorded positions are", *self._nearest)], []
+        nearest = min(self._distances, default=(0.0, ""))
+        if nearest[0] > FAR_M:
+            return [*lines, far_text("the recorded positions are", *nearest)], []
         if counts.low and not any(accept.knows(result.outcome) for result in results):
             silent = f"no fix states the criterion {accept.criterion}, so none can be confident; "
             silent += "build the map from a larger or more varied area, or give --accept "
             return [*lines, f"{silent}peak_ratio:1.3"], []
         if not self._low.views or self._options.quiet:
             return lines, []
-        end_s = time.monotonic() + BUDGET_S
         try:
-            tried = self._tried(accept, end_s)
+            said, tried = self._tried(accept)
         except KeyboardInterrupt:  # skips the search; the results are written
             return [*lines, "the search for another configuration was interrupted"], []
-        if time.monotonic() > end_s:
-            lines.append(f"the search for another configuration was ended after {BUDGET_S:.0f} s")
-        if tried:
-            lines += setup_text(tried, on_map=self._nearest is not None)
-        return lines, [
+        return lines + said, [
             {"setup": each.setup.name, "views": each.views, "confident": each.confident}
             for each in tried
         ]
 
-    def _tried(self, accept: "Acceptance", end_s: float) -> "list[Tried]":
-        from orthonav.ground.recordings.setups import try_setups
+    def _tried(self, accept: "Acceptance") -> "tuple[list[str], list[Tried]]":
+        from orthonav.ground.recordings.setups import setup_text, try_setups
 
         reporter(self._options)(
             "few views are confident: trying other configurations on some of them for up to "
             f"{BUDGET_S:.0f} s (Ctrl-C or --quiet skips this)"
         )
-        return try_setups(
+        end_s = time.monotonic() + BUDGET_S
+        tried = try_setups(
             self._localizer,
             self._low.views,
             accept.accepts,
@@ -355,6 +351,9 @@ class SetupAdvice:
             tracked=bool(self._options.track or self._options.smooth),
             stop=lambda: time.monotonic() > end_s,
         )
+        late = f"the search for another configuration was ended after {BUDGET_S:.0f} s"
+        lines = [late] if time.monotonic() > end_s else []
+        return lines + (setup_text(tried, on_map=bool(self._distances)) if tried else []), tried
 
 
 def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | None":
@@ -380,19 +379,18 @@ def _take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | No
         log.warning("the log was flown with another map (%.80s): %s", name, options.map)
     flown = logged_options(flight.session.get("options"))
     if options.as_flown:
-        for name in (*LOCALIZE_CHOICES, "track"):
+        for name in (*LOCALIZE_CHOICES, "track", "alert_limit_m", "risk"):
             setattr(options, name, flown.get(name, getattr(options, name)))
         options.accept = flown.get("accept") or options.accept
-        options.alert_limit_m = flown.get("alert_limit_m", options.alert_limit_m)
-        options.risk = flown.get("risk", options.risk)
         options.skip_bad_images = True  # a flight continues after an image that cannot be decoded
         return flown.get("mount", mount)
-    names = (*LOCALIZE_CHOICES, "accept", "alert_limit_m", "risk")
-    chosen = {name: getattr(options, name) for name in names}
-    chosen |= {"track": options.track or options.smooth, "mount": mount}
-    if flown.get("accept") is None:  # the runner logs every fix, so the default applies
-        flown.pop("accept", None)
-    differ = [name for name in chosen if name in flown and flown[name] != chosen[name]]
+    chosen = vars(options) | {"track": options.track or options.smooth, "mount": mount}
+    # The runner logs every fix without --accept, so the default applies.
+    differ = [
+        name
+        for name, value in flown.items()
+        if value != chosen[name] and (name, value) != ("accept", None)
+    ]
     if differ:
         log.warning(
             "options differ from those of the flight (%s); --as-flown uses the logged ones",

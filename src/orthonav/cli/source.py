@@ -156,13 +156,11 @@ def map_heights(
     opened: "orthonav.MapFile",
     terrain: "TerrainHeights | None" = None,
     *,
-    take_off: tuple[float, float, float] | None = None,
-    geoid: "Undulation | None" = None,
-    use_prior: bool = True,
     datum_known: bool = True,
+    **how: Any,
 ) -> "FlownHeights | None":
     """Heights above ground on a map by `terrain` (`datum_known`: whether it counts from the sea),
-    else by its own; None where it has none."""
+    else by its own; None where it has none. `how`: of `FlownHeights`."""
     from orthonav.core.flight.heights import FlownHeights
     from orthonav.core.mapfile.terrain import TerrainLayer
 
@@ -171,14 +169,7 @@ def map_heights(
     if found is None:
         return None
     known = datum_known if layer is None else layer.info.is_above_sea
-    return FlownHeights(
-        found,
-        _area_deg(opened),
-        take_off=take_off,
-        geoid=geoid,
-        use_prior=use_prior,
-        datum_known=known,
-    )
+    return FlownHeights(found, _area_deg(opened), datum_known=known, **how)
 
 
 def _area_deg(opened: "orthonav.MapFile") -> "tuple[Array, Array]":
@@ -213,13 +204,15 @@ def flight_heights(
     first = next(iter(flight.views), None)
     if first is None:
         return None
-    has_terrain = dem is not None or layer is not None
-    place = flight.take_off_latlon_deg or getattr(first, "truth_latlon_deg", None)
+    if dem is None and layer is None:
+        say_assumed_heights(flight)
+        return None
+    place = flight.take_off_latlon_deg or first.truth_latlon_deg
     heights = map_heights(
         opened,
         dem,
         take_off=None if place is None else (*place, 0.0),
-        geoid=geoid_for(flight) if has_terrain else None,
+        geoid=_geoid_for(first.telemetry),
         use_prior=getattr(options, "prior", None) != "none",
         datum_known=dem is None or dem.datum.is_known,
     )
@@ -228,10 +221,7 @@ def flight_heights(
             "the flight has heights above the sea or the ellipsoid only, and the vertical datum "
             f"of the terrain is unknown: {DATUM_ADVICE}"
         )
-    name = None
-    if heights is not None:
-        name = "the terrain of the map" if dem is None else f"the terrain of {options.dem.name}"
-    say_assumed_heights(flight, name)
+    say_assumed_heights(flight, f"the terrain of {'the map' if dem is None else options.dem.name}")
     return heights
 
 
@@ -250,18 +240,17 @@ def say_assumed_heights(
         log.log(logging.WARNING if terrain is None else logging.INFO, "%s", said)
 
 
-def geoid_for(flight: "Recording") -> "Undulation | None":
+def _geoid_for(telemetry: "orthonav.Telemetry") -> "Undulation | None":
     """The geoid, where the height above the ellipsoid is known and that above the sea is not. Where
     it is needed and missing, a warning says what to install."""
-    first = next(iter(flight.views), None)
-    if first is None or first.telemetry.hae_m is None or first.telemetry.amsl_m is not None:
+    if telemetry.hae_m is None or telemetry.amsl_m is not None:
         return None
     try:
         from orthonav.ground.imagery.terrain import geoid
 
         return geoid()
     except (ImageryError, MissingExtraError) as error:
-        if first.telemetry.home_m is None:
+        if telemetry.home_m is None:
             log.warning("%s", error)
         return None
 
@@ -279,10 +268,6 @@ def located(
     """Results of the views of a recording; `take` gets each view with its own."""
     from orthonav.ground.recordings.localize import localize_flight
 
-    how: dict[str, Any] = {
-        "skip_bad_images": getattr(options, "skip_bad_images", True),
-        "accept": accept,
-    }
     results, newest = [], list["RecordedView"]()
 
     def read() -> "Iterator[RecordedView]":
@@ -290,7 +275,9 @@ def located(
             newest[:] = [view]
             yield view
 
-    found = localize_flight(locator, flight, views=read(), heights=heights, **how)
+    skip = getattr(options, "skip_bad_images", True)
+    how: dict[str, Any] = {"skip_bad_images": skip, "accept": accept, "heights": heights}
+    found = localize_flight(locator, flight, views=read(), **how)
     for result in watched(found, flight.expected, options.command, shown):
         results.append(result)
         take(newest[0], result)

@@ -297,35 +297,21 @@ def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
     if isinstance(outcome, NoFix):
         no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
         return {**dict.fromkeys(KEYS[3:11]), **no_fix}
-    return {
-        "status": "fix",
-        "confident": outcome.is_confident,
+    values = {
+        **{"status": "fix", "confident": outcome.is_confident, "reason": None, "detail": None},
         **{key: _or_none(getattr(outcome, key)) for key in (*KEYS[4:6], *KEYS[7:11])},
         "cov_en_m2": _rows(outcome.cov_en_m2),
-        "reason": None,
-        "detail": None,
-        **_ground_values(outcome),
-        **_pose_values(outcome),
     }
-
-
-def _ground_values(fix: Fix) -> dict[str, Any]:
-    if fix.ground_latlon_deg is None:
-        return {}
-    lat, lon = fix.ground_latlon_deg
-    cov = fix.ground_cov_en_m2
-    values = _or_none(lat), _or_none(lon), None if cov is None else _rows(cov)
-    return dict(zip(GROUND_KEYS, values, strict=True))
-
-
-def _pose_values(fix: Fix) -> dict[str, Any]:
-    angles = _or_none(fix.pitch_deg), _or_none(fix.roll_deg)
-    if fix.pose_cov is None and angles == (None, None):
-        return {}
-    upper = None
-    if fix.pose_cov is not None and np.isfinite(fix.pose_cov).all():
-        upper = fix.pose_cov[np.triu_indices(6)].tolist()
-    return dict(zip(POSE_KEYS, (*angles, upper), strict=True))
+    if outcome.ground_latlon_deg is not None:
+        lat, lon = map(_or_none, outcome.ground_latlon_deg)
+        cov = outcome.ground_cov_en_m2
+        values |= zip(GROUND_KEYS, (lat, lon, None if cov is None else _rows(cov)), strict=True)
+    angles, pose_cov = (outcome.pitch_deg, outcome.roll_deg), outcome.pose_cov
+    if pose_cov is not None or any(map(math.isfinite, angles)):
+        known = pose_cov is not None and np.isfinite(pose_cov).all()
+        upper = pose_cov[np.triu_indices(6)].tolist() if pose_cov is not None and known else None
+        values |= zip(POSE_KEYS, (*map(_or_none, angles), upper), strict=True)
+    return values
 
 
 def evidence_of_fields(fix: Fix) -> dict[str, float]:
@@ -346,42 +332,38 @@ def _rows(cov: NDArray[np.float64]) -> list[list[float | None]]:
 def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
     status, evidence = values["status"], values["evidence"]
     _checked(values, "evidence", "an object", isinstance(evidence, dict))
-    evidence = {key: _as_float(each, f"evidence {key!r:.40}") for key, each in evidence.items()}
+    evidence = {key: _number(evidence, key, f"evidence {key!r:.40}") for key in evidence}
     if status == "no_fix":
         reason = _checked(values, "reason", "text", isinstance(values["reason"], str))
         return NoFix(reason=reason, detail=str(values.get("detail") or ""), evidence=evidence)
     _checked(values, "status", "'fix' or 'no_fix'", status == "fix")
-    ground = None
-    if GROUND_KEYS[0] in values:
-        ground = _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
-    cov_en_m2 = _numbers(values, "cov_en_m2", (2, 2))
     *velocity, vel_std_mps, recognized = (evidence.pop(key, math.nan) for key in MOTION_KEYS)
     bias = TelemetryBias(*(evidence.pop(key, math.nan) for key in TelemetryBias._fields))
     stds = {key: evidence.pop(key, math.nan) for key in STD_KEYS}
-    east_mps, north_mps = velocity
     if vel_std_mps < 0 or not (math.isnan(recognized) or 0 <= recognized <= 1):
         raise FlightError(
             "evidence: expected vel_std_mps of 0 or more and recognized of 0 to 1, got "
             f"{vel_std_mps:g} and {recognized:g}"
         )
+    ground = None
+    if GROUND_KEYS[0] in values:
+        ground = _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
     # Absent in earlier files.
     values = {**dict.fromkeys((*INTEGRITY_KEYS, *GROUND_KEYS, *POSE_KEYS)), **values}
+    cov_en_m2 = _numbers(values, "cov_en_m2", (2, 2))
     return Fix(
         lat_deg=_angle(values, "lat_deg", 90.0),
         lon_deg=_angle(values, "lon_deg", 180.0),
         cov_en_m2=np.full((2, 2), math.nan) if cov_en_m2 is None else cov_en_m2,
         confidence=_share(values, "confidence"),
-        radius_m=_number(values, "radius_m"),
-        heading_deg=_number(values, "heading_deg"),
-        agl_m=_number(values, "agl_m"),
+        **{name: _number(values, name) for name in ("radius_m", "heading_deg", "agl_m")},
         evidence=evidence,
         ground_latlon_deg=ground,
         ground_cov_en_m2=_numbers(values, GROUND_KEYS[2], (2, 2)),
-        pitch_deg=_number(values, "pitch_deg"),
-        roll_deg=_number(values, "roll_deg"),
+        **{name: _number(values, name) for name in POSE_KEYS[:2]},
         pose_cov=_pose_covariance(values),
         place_probability=_share(values, INTEGRITY_KEYS[0]),
-        vel_en_mps=None if math.isnan(east_mps + north_mps) else (east_mps, north_mps),
+        vel_en_mps=None if math.isnan(sum(velocity)) else (velocity[0], velocity[1]),
         vel_std_mps=vel_std_mps,
         recognized=recognized,
         bias=bias,
@@ -412,17 +394,9 @@ def _checked(values: Mapping[str, Any], key: str, expected: str, sound: bool) ->
     return values.get(key)
 
 
-def _number(values: Mapping[str, Any], key: str) -> float:
-    return _as_float(values[key], key)
-
-
-def _share(values: Mapping[str, Any], key: str) -> float:
-    share = _number(values, key)
-    _checked(values, key, "0 to 1", math.isnan(share) or 0.0 <= share <= 1.0)
-    return share
-
-
-def _as_float(value: Any, name: str) -> float:
+def _number(values: Mapping[str, Any], key: str, name: str = "") -> float:
+    """A finite number, NaN for null; `name`: of the value, for its error."""
+    value = values[key]
     if value is None:
         return math.nan
     try:
@@ -430,8 +404,14 @@ def _as_float(value: Any, name: str) -> float:
     except (TypeError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise FlightError(f"{name}: expected a finite number or null, got {value!r:.40}")
+        raise FlightError(f"{name or key}: expected a finite number or null, got {value!r:.40}")
     return number
+
+
+def _share(values: Mapping[str, Any], key: str) -> float:
+    share = _number(values, key)
+    _checked(values, key, "0 to 1", math.isnan(share) or 0.0 <= share <= 1.0)
+    return share
 
 
 def _angle(values: Mapping[str, Any], key: str, limit_deg: float) -> float:
@@ -445,15 +425,11 @@ def _numbers(
 ) -> NDArray[np.float64] | None:
     """The numbers of a list, or of a list of lists, of this shape, NaN for null; None for null in
     place of all."""
-    rows = values[key]
-    if rows is None:
+    if values[key] is None:
         return None
-    flat = rows if isinstance(rows, list) else []
-    if len(shape) == 2:
-        sound = [len(row) if isinstance(row, list) else 0 for row in flat] == [shape[1]] * shape[0]
-        flat = list(chain.from_iterable(flat)) if sound else []
-    _checked(values, key, f"numbers in lists of {shape}", len(flat) == math.prod(shape))
-    numbers = np.array([_as_float(value, key) for value in flat]).reshape(shape)
+    found = np.array(values[key], dtype=object)
+    _checked(values, key, f"numbers in lists of {shape}", found.shape == shape)
+    numbers = np.array([_number({key: each}, key) for each in found.flat]).reshape(shape)
     numbers.setflags(write=False)
     return numbers
 

@@ -89,58 +89,6 @@ def needs_datum(telemetry: Telemetry) -> bool:
     return not known and (telemetry.amsl_m is not None or telemetry.hae_m is not None)
 
 
-@dataclass(frozen=True, eq=False)
-class GroundHeights:
-    """Heights above ground over a terrain.
-
-    `terrain`: its heights above mean sea level. `take_off`: the ground where the aircraft took off,
-    None where that is unknown. `geoid`: needed for heights above the ellipsoid; None without one.
-    `datum_known`: where not, heights above the sea and the ellipsoid are ignored.
-    """
-
-    terrain: TerrainHeights
-    take_off: Ground | None = None
-    geoid: Undulation | None = None
-    datum_known: bool = True
-
-    def above(self, telemetry: Telemetry, below: Ground, place: Place) -> Telemetry:
-        """The telemetry with the height above the ground `below`, and its standard deviation.
-
-        `place`: latitude and longitude, roughly. Unchanged where the height above ground was
-        measured, and where no other height is known.
-        """
-        found = None if is_measured(telemetry) else self.above_sea(telemetry, place)
-        if found is None:
-            return telemetry
-        above_sea_m, std_m = found
-        agl_m = above_sea_m - below.height_m
-        spread_m = math.hypot(std_m, below.std_m)
-        agl_std_m = telemetry.agl_std_m
-        if spread_m > 0:
-            own_m = DEFAULT_AGL_STD * abs(agl_m) if agl_std_m is None else agl_std_m
-            agl_std_m = math.hypot(own_m, spread_m)
-        return replace(telemetry, agl_m=agl_m, agl_std_m=agl_std_m, below=below)
-
-    def mismatch_m(self, telemetry: Telemetry) -> float:
-        """Height above sea by take-off and terrain, minus the reported one; NaN where unknown."""
-        if not self.datum_known or self.take_off is None:
-            return math.nan
-        if telemetry.home_m is None or telemetry.amsl_m is None:
-            return math.nan
-        return telemetry.home_m + self.take_off.height_m - telemetry.amsl_m
-
-    def above_sea(self, telemetry: Telemetry, place: Place) -> tuple[float, float] | None:
-        """Height above the datum of the terrain and its standard deviation; None where unknown."""
-        if self.datum_known and telemetry.amsl_m is not None:
-            return telemetry.amsl_m, 0.0
-        if telemetry.home_m is not None and self.take_off is not None:
-            return telemetry.home_m + self.take_off.height_m, self.take_off.std_m
-        if self.datum_known and telemetry.hae_m is not None and self.geoid is not None:
-            lat, lon = np.array([place[0]]), np.array([place[1]])
-            return telemetry.hae_m - float(self.geoid(lat, lon)[0]), 0.0
-        return None
-
-
 class FlownHeights:
     """Heights above ground along a flight whose position is what its fixes say. Mutable.
 
@@ -159,34 +107,68 @@ class FlownHeights:
         use_prior: bool = True,
         datum_known: bool = True,
     ) -> None:
-        """`area_deg`: latitudes and longitudes spread over the area searched. `take_off`: latitude,
-        longitude and standard deviation (m) of the take-off position. `datum_known`: whether the
-        terrain counts from the sea."""
-        self._terrain, self._area_deg = terrain, area_deg
+        """`terrain`: its heights above mean sea level. `area_deg`: latitudes and longitudes spread
+        over the area searched. `take_off`: latitude, longitude and standard deviation (m) of the
+        take-off position. `geoid`: needed for heights above the ellipsoid; None without one.
+        `datum_known`: whether the terrain counts from the sea; where not, heights above the sea and
+        the ellipsoid are ignored."""
+        self._terrain, self._area_deg, self._geoid = terrain, area_deg, geoid
         self._use_prior, self.datum_known = use_prior, datum_known
         known = take_off and ground_around(terrain, take_off[:2], take_off[2])
-        self._heights = GroundHeights(terrain, known or self._whole, geoid, datum_known)
-        self._checked = known is None
+        self._take_off = known or self._whole
+        self._unchecked = known is not None
         self._last: tuple[int, Place, float] | None = None
         self._fit, self._newest = TerrainFit(terrain), Telemetry(-1, 0.0, 0.0, 0.0, math.nan)
 
     def corrected(self, telemetry: Telemetry) -> Telemetry:
-        """The telemetry with its height above ground; unchanged where that was measured, NaN where
-        the terrain does not give it: level ground is not assumed."""
+        """The telemetry with its height above ground and the standard deviation of that; unchanged
+        where it was measured, NaN where the terrain does not give it: level ground is not
+        assumed."""
         if is_measured(telemetry):
             return telemetry
-        off_m = math.nan if self._checked else self._heights.mismatch_m(telemetry)
-        if math.isfinite(off_m):
-            self._checked = True
-            warn_of_mismatch(off_m)
+        self._check(telemetry)
         self._newest = telemetry
-        place, std_m = self._place(telemetry)
-        below = None if place is None else ground_around(self._terrain, place, std_m)
+        place, place_std_m = self._place(telemetry)
+        below = None if place is None else ground_around(self._terrain, place, place_std_m)
         below = below or self._whole
         lat, lon = self._area_deg
-        middle = float(lat.mean()), float(lon.mean())
-        made = (below and self._heights.above(telemetry, below, place or middle)) or telemetry
-        return replace(telemetry, agl_m=math.nan) if made is telemetry else made
+        found = self._above_sea(telemetry, place or (float(lat.mean()), float(lon.mean())))
+        if below is None or found is None:
+            return replace(telemetry, agl_m=math.nan)
+        above_sea_m, std_m = found
+        agl_m, agl_std_m = above_sea_m - below.height_m, telemetry.agl_std_m
+        spread_m = math.hypot(std_m, below.std_m)
+        if spread_m > 0:
+            own_m = DEFAULT_AGL_STD * abs(agl_m) if agl_std_m is None else agl_std_m
+            agl_std_m = math.hypot(own_m, spread_m)
+        return replace(telemetry, agl_m=agl_m, agl_std_m=agl_std_m, below=below)
+
+    def _check(self, telemetry: Telemetry) -> None:
+        """Warn once where heights above sea and above take-off differ much over this terrain."""
+        home_m, amsl_m, take_off = telemetry.home_m, telemetry.amsl_m, self._take_off
+        if not (self._unchecked and self.datum_known) or take_off is None:
+            return
+        if home_m is None or amsl_m is None:
+            return
+        self._unchecked = False
+        off_m = home_m + take_off.height_m - amsl_m
+        if abs(off_m) > LIMITS.mismatch_m:
+            log.warning(
+                "heights above take-off and above sea level differ by %.0f m over this terrain: "
+                "check its vertical datum, the take-off position and the altitude of the autopilot",
+                off_m,
+            )
+
+    def _above_sea(self, telemetry: Telemetry, place: Place) -> tuple[float, float] | None:
+        """Height above the datum of the terrain and its standard deviation; None where unknown."""
+        if self.datum_known and telemetry.amsl_m is not None:
+            return telemetry.amsl_m, 0.0
+        if telemetry.home_m is not None and self._take_off is not None:
+            return telemetry.home_m + self._take_off.height_m, self._take_off.std_m
+        if self.datum_known and telemetry.hae_m is not None and self._geoid is not None:
+            lat, lon = np.array([place[0]]), np.array([place[1]])
+            return telemetry.hae_m - float(self._geoid(lat, lon)[0]), 0.0
+        return None
 
     def observe(self, time_ns: int, outcome: Fix | NoFix, state: str | None) -> None:
         """Take note of the outcome of a view: a confident fix says where the aircraft is.
@@ -200,7 +182,7 @@ class FlownHeights:
         if state in (None, "tracking"):
             std_m = math.sqrt(float(np.trace(outcome.cov_en_m2)) / 2)
             self._last = time_ns, (outcome.lat_deg, outcome.lon_deg), std_m
-            reported = self._heights.above_sea(self._newest, self._last[1])
+            reported = self._above_sea(self._newest, self._last[1])
             if self._newest.time_ns == time_ns and reported is not None:
                 self._fit.take(outcome, reported[0])
 
@@ -235,16 +217,6 @@ def _aged(time_ns: int, place: Place, std_m: float, telemetry: Telemetry) -> tup
     moved_m = np.array(telemetry.vel_en_mps) * seconds
     lat, lon = LocalFrame(*place).latlon_from_en(moved_m)
     return std_m + LIMITS.velocity_error * float(np.hypot(*moved_m)), (float(lat), float(lon))
-
-
-def warn_of_mismatch(off_m: float) -> None:
-    """Log a warning where heights above sea and above take-off differ by a large `off_m`."""
-    if abs(off_m) > LIMITS.mismatch_m:
-        log.warning(
-            "heights above take-off and above sea level differ by %.0f m over this terrain: check "
-            "its vertical datum, the take-off position and the altitude of the autopilot",
-            off_m,
-        )
 
 
 class TerrainFit:

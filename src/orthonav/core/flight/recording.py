@@ -14,6 +14,7 @@ from orthonav.core.records import Telemetry
 LONG_GAP_NS = 1_000_000_000
 """After so long without a view a velocity at one time no longer says how far the aircraft flew: it
 may have turned."""
+NO_SOURCE = "none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,3 +60,11 @@ def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:
         return camera.fitted(width_px, height_px)
     except CameraError as error:
         raise CameraError(f"{error}: {where}") from error
+
+
+def chosen(role: str, used: str, others: Iterable[str], why: str) -> str:
+    """Which of several sources is used for a role, and why not the others."""
+    unused = ", ".join(others)
+    if used == NO_SOURCE:
+        return f"{role}: none fits of {unused}; --topic {role}=NAME selects one"
+    return f"{role}: using {used}{f', not {unused}' * bool(unused)}: {why}"

@@ -12,7 +12,7 @@ import numpy as np
 
 from orthonav.core.errors import CameraError, MissingExtraError
 from orthonav.core.files import require_file
-from orthonav.core.flight.folder import camera_from_plain
+from orthonav.core.flight.folder import BROKEN, camera_from_plain
 from orthonav.core.geo.camera import Camera
 from orthonav.core.guard import needed
 
@@ -21,10 +21,6 @@ _READ = (
     "expected flight.json, or a camera of OpenCV (camera_matrix, image_width, .. as YAML, XML or "
     "JSON), ROS (camera_matrix, distortion_coefficients, ..) or Kalibr (intrinsics, resolution, ..)"
 )
-_UNREAD = {  # programs by what their files hold
-    "COLMAP": re.compile(r"^ *\d+ [A-Z_]+ \d+ \d+( [\d.e+-]+)+ *$", re.M),
-    "Metashape": re.compile(r"<(calibration|document)\b"),
-}
 
 
 def read_camera_file(path: Path) -> Camera:
@@ -41,9 +37,6 @@ def read_camera_file(path: Path) -> Camera:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise CameraError(f"camera file is not UTF-8 text: {path}") from error
-    for program, mark in _UNREAD.items():
-        if mark.search(text):
-            raise CameraError(f"camera files of {program} are not read; {_READ}: {path}")
     try:
         # Kalibr chains may begin with OpenCV's header, which is not YAML.
         chain = re.search(r"^cam\d+\s*:", text, re.MULTILINE) is not None
@@ -57,14 +50,7 @@ def read_camera_file(path: Path) -> Camera:
         return _plain(_yaml(text.removeprefix(OPENCV_HEADER)), name)
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
-    except (
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:
+    except (*BROKEN, IndexError) as error:
         found = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
         raise CameraError(f"{_READ}; {found}: {path}") from error
 
@@ -102,8 +88,10 @@ def camera_from_numbers(
         numbers = (*numbers, *(0.0,) * (4 - len(numbers))) if 0 < len(numbers) < 4 else numbers[:5]
     else:
         raise CameraError(f"distortion model '{model}' is not supported; brown and equidistant are")
-    k, (width, height) = _numbers(matrix, 9).reshape(3, 3), map(int, size_px)
-    return Camera.from_matrix(k, numbers, (width, height), ours, unusual=unusual)
+    k, (width, height) = np.array(matrix, dtype=np.float64), map(int, size_px)
+    if k.shape != (9,):
+        raise ValueError(f"9 numbers were expected, got {len(k)}")
+    return Camera.from_matrix(k.reshape(3, 3), numbers, (width, height), ours, unusual=unusual)
 
 
 def _yaml(text: str) -> Any:
@@ -217,10 +205,3 @@ def _data(matrix: Any) -> Any:
     if int(matrix.get("rows", 1)) * int(matrix.get("cols", len(data))) != len(data):
         raise CameraError("rows, columns and data of a matrix disagree")
     return data
-
-
-def _numbers(values: Any, count: int) -> Any:
-    numbers = np.array(values, dtype=np.float64)
-    if numbers.shape != (count,):
-        raise ValueError(f"{count} numbers were expected, got {len(numbers)}")
-    return numbers

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import ImageryError, MissingFileError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import require_file
-from orthonav.core.flight.telemetry_track import chosen
+from orthonav.core.flight.recording import chosen
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.planning.area import outline
 

@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 from orthonav.core.errors import RouteError
-from orthonav.core.flight.telemetry_track import chosen
+from orthonav.core.flight.recording import chosen
 from orthonav.ground.planning.record import (
     Height,
     HeightFrame,

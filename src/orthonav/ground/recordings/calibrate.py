@@ -263,72 +263,44 @@ class LatencyEstimate(NamedTuple):
     pairs: int
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """N pairs of pictures and the motion reported for C candidates of the latency.
-
-    `seconds` (N,): duration. `turn` (N,), `shift` (N, 2): seen. `reported` (N, C, 5): turn, tilt
-    (2), velocity (2), NaN where not known.
-    """
-
-    seconds: Array
-    turn: Array
-    shift: Array
-    reported: Array
-
-    @classmethod
-    def of(cls, pairs: Iterable[tuple[ImageMotion, Array]]) -> "_Pairs":
-        seen, reported = zip(*pairs, strict=True)
-        turns = [(each.seconds, each.turn_rad, *each.shift) for each in seen]
-        seconds, turn, *shift = np.array(turns, np.float64).T
-        return cls(seconds, turn, np.stack(shift, axis=1), np.array(reported))
-
-    def least_noise(self) -> Array:
-        """Least standard deviations (2,) of turn and shift."""
-        some = np.nan_to_num(self.reported[:, ::20, 3:])
-        size = np.sqrt(np.square(some).sum(axis=-1).mean())
-        # Relief and changes of height: 8 % of the shift by velocity.
-        return np.array([TURN_STD_RAD, np.hypot(SHIFT_STD, 0.08 * size)])
-
-    def explained(self, fit: "_Fit") -> float:
-        """Least fraction of the motion that a fit explains, of turn and of the varying part of
-        shift, where it is twice the least standard deviation; NaN where neither is."""
-        turned = explained_part(self.turn[:, None], fit.turn_off[:, None], 2 * TURN_STD_RAD)
-        shifted = explained_part(varying(self.shift, self.seconds), fit.shift_off, 2 * SHIFT_STD)
-        return float(np.fmin(turned, shifted))
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """Fit of one latency: its `cost`, `linear` (5,), differences `turn_off` (N,) and `shift_off`
-    (N, 2), and `weights` (N,)."""
+class _Fit(NamedTuple):
+    """Fit of one latency to N pairs."""
 
     cost: float
-    linear: Array
-    turn_off: Array
-    shift_off: Array
-    weights: Array
+    linear: Array  # (5,) parameters
+    off: Array  # (N, 3) differences of turn and shift, seen less reported
+    weights: Array  # (N,)
 
     def scatter(self) -> Array:
         """Standard deviations (2,) of turn and shift by the differences."""
-        known = self.weights > 0
-        middle = [np.median(np.abs(off[known])) for off in (self.turn_off, self.shift_off)]
-        return MAD_TO_STD * np.array(middle)
+        known = np.abs(self.off[self.weights > 0])
+        return MAD_TO_STD * np.array([np.median(known[:, 0]), np.median(known[:, 1:])])
+
+    def explained(self, seen: Array) -> float:
+        """Least fraction of the motion seen (N, 4) that it explains, of turn and of the varying
+        part of shift, where it is twice the least standard deviation; NaN where neither is."""
+        turned = explained_part(seen[:, 1:2], self.off[:, :1], 2 * TURN_STD_RAD)
+        shifts = varying(seen[:, 2:], seen[:, 0])
+        return float(np.fmin(turned, explained_part(shifts, self.off[:, 1:], 2 * SHIFT_STD)))
 
 
 def _estimate(
-    compared: Collection[tuple[ImageMotion, Array]], *, heading_known: bool
+    pairs: Collection[tuple[ImageMotion, Array]], *, heading_known: bool
 ) -> LatencyEstimate | None:
     """The latency in a window, None where it is not observable."""
-    if len(compared) < SEARCH.least_pairs:
+    if len(pairs) < SEARCH.least_pairs:
         return None
-    pairs = _Pairs.of(compared)
-    if (np.isfinite(pairs.reported[..., :3]).all(axis=-1).mean(axis=0) < SEARCH.known_share).any():
+    # Seen (N, 4): seconds, turn, shift (2). Reported (N, C, 5): turn, tilt (2), velocity (2).
+    motions = [(each.seconds, each.turn_rad, *each.shift) for each, _ in pairs]
+    seen, reported = np.array(motions, np.float64), np.array([each for _, each in pairs])
+    if (np.isfinite(reported[..., :3]).all(axis=-1).mean(axis=0) < SEARCH.known_share).any():
         return None  # a latency that cannot be excluded
-    prior = _prior(pairs.reported, heading_known=heading_known)
-    noise = least = pairs.least_noise()
+    prior = _prior(reported, heading_known=heading_known)
+    size = np.sqrt(np.square(np.nan_to_num(reported[:, ::20, 3:])).sum(axis=-1).mean())
+    # Relief and changes of height: 8 % of the shift by velocity.
+    noise = least = np.array([TURN_STD_RAD, np.hypot(SHIFT_STD, 0.08 * size)])
     for _ in range(2):  # the second time with the scatter of the first
-        fits = [_fitted(pairs, each, noise, prior) for each in np.moveaxis(pairs.reported, 1, 0)]
+        fits = [_fitted(seen, each, noise, prior) for each in np.moveaxis(reported, 1, 0)]
         cost = np.array([each.cost for each in fits])
         best = int(np.argmin(cost))
         fit = fits[best]
@@ -350,9 +322,9 @@ def _estimate(
         return None
     delay_s = float(candidates_s[middle]) + SEARCH.step_s * (before - after) / (2 * bend)
     std_s = math.hypot(SEARCH.floor_s, SEARCH.step_s * math.sqrt(2 * SEARCH.alike / bend))
-    if std_s > SEARCH.largest_std_s or not pairs.explained(fit) >= 0.6:
+    if std_s > SEARCH.largest_std_s or not fit.explained(seen) >= 0.6:
         return None
-    return LatencyEstimate(delay_s, std_s, len(pairs.turn))
+    return LatencyEstimate(delay_s, std_s, len(seen))
 
 
 def _prior(reported: Array, *, heading_known: bool) -> Prior:
@@ -379,13 +351,14 @@ def _rotated(vectors: Array) -> Array:
     return np.stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
-def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: Prior) -> _Fit:
-    """Fit for `reported` (N, 5), with standard deviations `noise` (2,) of turn and shift."""
+def _fitted(seen: Array, reported: Array, noise: Array, prior: Prior) -> _Fit:
+    """Fit of motions seen (N, 4) and `reported` (N, 5), with standard deviations `noise` (2,) of
+    turn and shift."""
     known = np.asarray(np.isfinite(reported[:, :3]).all(axis=1), np.float64)
     reported = np.nan_to_num(reported)
-    lines = _columns(pairs.seconds, reported)
-    turn_off = pairs.turn - reported[:, 0]
-    wanted = pairs.shift - reported[:, 1:3]
+    lines = _columns(seen[:, 0], reported)
+    turn_off = seen[:, 1] - reported[:, 0]
+    wanted = seen[:, 2:] - reported[:, 1:3]
     weights: Array = known
     for _ in range(3):
         flat = (lines * (weights / noise[1] ** 2)[:, None, None]).reshape(-1, 5)
@@ -399,7 +372,7 @@ def _fitted(pairs: _Pairs, reported: Array, noise: Array, prior: Prior) -> _Fit:
     loss = float((known * np.log1p(square / SEARCH.outlier**2)).sum()) * SEARCH.outlier**2
     off = linear - prior[0]
     cost = loss * len(known) / max(known.sum(), 1.0) + float(off @ prior[1] @ off)
-    return _Fit(cost, linear, turn_off, shift_off, weights)
+    return _Fit(cost, linear, np.column_stack([turn_off, shift_off]), weights)
 
 
 def _agreed(estimates: list[LatencyEstimate | None], intervals: list[float]) -> CameraLatency:

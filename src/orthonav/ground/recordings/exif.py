@@ -13,33 +13,28 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
-from orthonav.core.flight.telemetry_track import measured
 from orthonav.core.geo.camera import enu_from_camera
 from orthonav.core.guard import needed, reading
-from orthonav.ground.recordings.image_table import ImageRow, moment_of, ns_of
+from orthonav.ground.recordings.image_table import moment_of, ns_of
+from orthonav.ground.recordings.telemetry_track import measured
 
 MAX_FIELD_DEG = 110.0
 """Field of view along the longer side that is believed: wider lenses are fisheyes, whose pictures
 need a calibration."""
 
 
-@dataclass(frozen=True)
-class Sensor:
-    """A known camera: its largest picture, and how its focal length is found.
-
-    Smaller pictures keep the whole width or the whole height of the largest one.
-    """
+class Sensor(NamedTuple):
+    """A known camera: its largest picture, of which others keep the whole width or height."""
 
     width_px: int
     height_px: int
-    width_mm: float | None
-    """Width of the sensor, for `FocalLength`; None: the 35 mm equivalent is the better value."""
+    width_mm: float | None  # for `FocalLength`; None: the 35 mm equivalent is the better value
     std: float  # standard deviation of the focal length, as a fraction of it
 
 
@@ -103,8 +98,10 @@ def focal_length(
     """
     if optics.zoom > 1.0:
         raise CameraError(f"digital zoom of {optics.zoom:g}; give --camera FILE")
-    longer_px = max(width_px, height_px)
-    found = _found(optics, width_px, height_px, sensor_width_mm)
+    longer_px, shorter_px = max(width_px, height_px), min(width_px, height_px)
+    found = _found(optics, longer_px, shorter_px, sensor_width_mm) or _of_plane(
+        optics, width_px, longer_px
+    )
     if found is None or not math.isfinite(found.px):
         return None
     field_deg = found.field_deg(longer_px)
@@ -116,19 +113,31 @@ def focal_length(
 
 
 def _found(
-    optics: Optics, width_px: int, height_px: int, sensor_width_mm: float | None
+    optics: Optics, longer_px: int, shorter_px: int, sensor_width_mm: float | None
 ) -> FocalLength | None:
-    """By the best of the rules. Focal lengths of EXIF are rounded to 1 or 2 digits: 2 to 3 %."""
+    """By the sensor or the 35 mm equivalent. EXIF rounds focal lengths to 1 or 2 digits: 2 to 3 %.
+
+    Pictures of 16:9 are taken as parts of a sensor of 4:3; whether they are makes 9 %.
+    """
     if sensor_width_mm is not None and optics.focal_mm > 0:
-        px = optics.focal_mm / sensor_width_mm * max(width_px, height_px)
+        px = optics.focal_mm / sensor_width_mm * longer_px
         return FocalLength(px, 0.02, "EXIF and --sensor-width-mm")
     make = optics.make.upper()
     sensor = _SENSORS.get((make, optics.model.upper().removeprefix(f"{make} ")))
-    if sensor is not None and (known := _of_sensor(sensor, optics, width_px, height_px)):
-        return known
-    if optics.film_mm > 0:
-        return _of_film(optics.film_mm, width_px, height_px)
-    return _of_plane(optics, width_px, height_px)
+    if sensor is not None:
+        px = _film_px(optics.film_mm, sensor.width_px, sensor.height_px)
+        if sensor.width_mm is not None:
+            px = optics.focal_mm / sensor.width_mm * sensor.width_px
+        px *= max(longer_px / sensor.width_px, shorter_px / sensor.height_px)
+        if px > 0:
+            return FocalLength(px, sensor.std, f"EXIF, and the sensor of {optics.model}")
+    if not optics.film_mm > 0:
+        return None
+    source = "35 mm equivalent of EXIF"
+    if longer_px / shorter_px < 1.65:
+        return FocalLength(_film_px(optics.film_mm, longer_px, shorter_px), 0.03, source)
+    px = _film_px(optics.film_mm, longer_px, longer_px * 3 / 4)
+    return FocalLength(px, 0.06, f"{source}, of an uncropped 4:3 sensor")
 
 
 def _film_px(film_mm: float, width_px: float, height_px: float) -> float:
@@ -136,43 +145,18 @@ def _film_px(film_mm: float, width_px: float, height_px: float) -> float:
     return film_mm / math.hypot(36.0, 24.0) * math.hypot(width_px, height_px)
 
 
-def _of_sensor(sensor: Sensor, optics: Optics, width_px: int, height_px: int) -> FocalLength | None:
-    """The focal length of a known camera; a picture keeps the sensor's width or its height."""
-    if sensor.width_mm is not None:
-        px = optics.focal_mm / sensor.width_mm * sensor.width_px
-    else:
-        px = _film_px(optics.film_mm, sensor.width_px, sensor.height_px)
-    if not px > 0:
-        return None
-    longer_px, shorter_px = max(width_px, height_px), min(width_px, height_px)
-    px *= max(longer_px / sensor.width_px, shorter_px / sensor.height_px)
-    return FocalLength(px, sensor.std, f"EXIF, and the sensor of {optics.model}")
-
-
-def _of_film(film_mm: float, width_px: int, height_px: int) -> FocalLength:
-    """Pictures of 16:9 are taken as parts of a sensor of 4:3; whether they are makes 9 %."""
-    longer_px, shorter_px = max(width_px, height_px), min(width_px, height_px)
-    if longer_px / shorter_px < 1.65:
-        px = _film_px(film_mm, longer_px, shorter_px)
-        return FocalLength(px, 0.03, "35 mm equivalent of EXIF")
-    px = _film_px(film_mm, longer_px, longer_px * 3 / 4)
-    return FocalLength(px, 0.06, "35 mm equivalent of EXIF, of an uncropped 4:3 sensor")
-
-
-def _of_plane(optics: Optics, width_px: int, height_px: int) -> FocalLength | None:
+def _of_plane(optics: Optics, width_px: int, longer_px: int) -> FocalLength | None:
     """Of the resolution of the sensor. Some cameras write its width there instead."""
     unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(optics.plane_unit, math.nan)
-    taken_px = optics.taken_px if optics.taken_px > 0 else float(width_px)
-    thinned = width_px / taken_px
-    px, longer_px = optics.focal_mm * optics.plane / unit_mm * thinned, max(width_px, height_px)
+    thinned = width_px / (optics.taken_px if optics.taken_px > 0 else width_px)
+    px = optics.focal_mm * optics.plane / unit_mm * thinned
     if not px > 0:
         return None
     found = FocalLength(px, 0.03, "focal length and sensor resolution of EXIF")
     px = optics.focal_mm / (optics.plane * unit_mm) * width_px
-    source = "EXIF, with the sensor's width instead of its resolution"
-    as_width = FocalLength(px, 0.03, source)
-    wide = found.field_deg(longer_px) > MAX_FIELD_DEG
-    return as_width if wide and as_width.field_deg(longer_px) <= MAX_FIELD_DEG else found
+    other = FocalLength(px, 0.03, "EXIF, with the sensor's width instead of its resolution")
+    is_wide, other_is = (each.field_deg(longer_px) > MAX_FIELD_DEG for each in (found, other))
+    return other if is_wide and not other_is else found
 
 
 _VALUE = re.compile(
@@ -220,9 +204,9 @@ class Photo:
     agl_m: float = math.nan  # height above ground, where a table states it
     doubts: tuple[str, ...] = ()
     """Values that are there and cannot be used: what is wrong with each."""
-    row: ImageRow | None = None  # what a table says of it
+    order: int = 0  # number of its row in a table
     pose: Mapping[str, Any] = field(default_factory=dict)
-    """Its attitude as fields of `Telemetry`, once all photographs of the flight are known."""
+    """Its attitude as fields of `Telemetry`: by a table, or once all of the flight are known."""
 
 
 def read_photo(path: Path) -> Photo:
@@ -237,7 +221,7 @@ def read_photo(path: Path) -> Photo:
             gps = _named(exif.get_ifd(names.IFD.GPSInfo), names.GPSTAGS)
             packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")
             width, height = image.size
-    xmp = Xmp.of(packet or tags.get("XMLPacket") or b"")
+    xmp = Xmp(packet or tags.get("XMLPacket") or b"")
     make, notes = _word(tags.get("Make")), tags.get("MakerNote")
     gimbal, heading = read_maker_notes(notes if isinstance(notes, bytes) else b"", make)
     time_ns, zone_known = (xmp.time_ns, True) if xmp.time_ns else _time(tags)
@@ -393,35 +377,30 @@ def read_maker_notes(data: bytes, make: str) -> tuple[tuple[float, float, float]
     return (yaw, pitch, roll) if known else None, values.get(7, math.nan)
 
 
-@dataclass(frozen=True)
 class Xmp:
-    """The values of a packet by prefix and name, and what they mean; NaN and None for missing."""
+    """The values of a packet by prefix and name, and what they mean; NaN and None for missing.
 
-    values: Mapping[str, float]
-    time_ns: int | None  # UTC at exposure
-    writer: str = ""  # program that wrote the packet, empty where it is not named
-    lens: tuple[float, ...] | None = None  # `DewarpData`, see `Photo`
-    unread: tuple[str, ...] = ()
-    """Angles, heights and positions that are not numbers, as name and value."""
+    `time_ns`: UTC at exposure. `writer`: program that wrote the packet. `lens`: see `Photo`.
+    `unread`: angles, heights and positions that are not numbers, as name and value.
+    """
 
-    @classmethod
-    def of(cls, packet: str | bytes) -> "Xmp":
+    def __init__(self, packet: str | bytes) -> None:
         text = packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
         camera = _SKYDIO.search(text)  # its names are those of the aircraft's angles too
         skydio = camera[0].replace("drone-skydio:", "skydio:") if camera else ""
         texts = dict(_VALUE.findall(skydio + text))
         found = {name: _stated(value) for name, value in texts.items()}
-        values = {name: value for name, value in found.items() if math.isfinite(value)}
-        unread = tuple(
+        self.values = {name: value for name, value in found.items() if math.isfinite(value)}
+        self.unread = tuple(
             f"{name}={texts[name]!r:.40}"
-            for name in found.keys() - values.keys()
+            for name in found.keys() - self.values.keys()
             if _ANGLE_OR_PLACE.match(name)
         )
         exposed = texts.get("drone-dji:UTCAtExposure") or texts.get("sensefly:UTCTime", "")
+        self.time_ns = _exposed_ns(exposed)
         writer = re.search(r"\bxmp:CreatorTool\s*(?:=\s*[\"']|>)\s*([^\"'<]{1,200})", text)
-        name = writer[1].strip() if writer else ""
-        lens = _lens(texts.get("drone-dji:DewarpData", ""))
-        return cls(values, _exposed_ns(exposed), name, lens, unread)
+        self.writer = writer[1].strip() if writer else ""
+        self.lens = _lens(texts.get("drone-dji:DewarpData", ""))
 
     def first(self, *names: str) -> float:
         return next((self.values[name] for name in names if name in self.values), math.nan)

@@ -5,14 +5,13 @@ anywhere: all chunks that are complete are read.
 """
 
 import logging
-import re
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 from orthonav.core.errors import CameraError, FlightError, OrthonavError
 from orthonav.core.flight import decode_image
@@ -39,6 +38,7 @@ from orthonav.ground.recordings.mcap_files import (
     chunk_at,
     chunks,
     messages,
+    name_and_number,
     profile_of,
 )
 from orthonav.ground.recordings.recording import (
@@ -53,7 +53,6 @@ MAX_VIEWS = 500_000  # ten a second for 14 hours; a small damaged file can claim
 MAX_MESSAGES = 10 * MAX_VIEWS
 MAX_NAME = 200
 MAX_THUMBNAIL_BYTES = 2**20
-_NUMBERED = re.compile(r"(.+)_(\d{4,9})\.mcap")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +69,13 @@ class LoggedFlight(Recording):
     arrivals: Callable[[], Iterable[tuple[RecordedView, float]]] = list
 
 
-@dataclass(frozen=True)
-class ImagePlace:
-    """Where the image of a view is: file, offset of its chunk, and its number in the chunk.
-
-    `whole`: whether it is the full image, not a thumbnail.
-    """
+class ImagePlace(NamedTuple):
+    """Where the image of a view is."""
 
     path: Path
-    offset: int
-    number: int
-    whole: bool
+    offset: int  # of its chunk in the file
+    number: int  # in the chunk
+    whole: bool  # whether it is the full image, not a thumbnail
 
 
 class BrokenLogError(FlightError):
@@ -173,8 +168,17 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
     if options.telemetry is not None:
         raise FlightError(f"a flight log has its own telemetry; omit --telemetry: {path}")
     files, content, warnings = files_of_run(path), LogContent(), list[str]()
-    for file in files:
-        warnings += _warnings_of_file(McapFile(file), content)
+    for file in map(McapFile, files):
+        before = content.broken
+        content.read(file)
+        if file.damaged or content.broken > before:
+            broken = f"{file.damaged} chunks and {content.broken - before} messages"
+            warnings.append(f"{broken} are damaged: {file.path}")
+        if not file.ended:
+            warnings.append(
+                f"flight log was cut short, {file.lost_bytes} bytes after its last complete chunk "
+                f"are lost: {file.path}"
+            )
     if not content.session:
         raise FlightError(f"no chunk of the flight log is complete: {path}")
     try:
@@ -191,7 +195,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
         note=f"{path.name}: flight log {run!s:.40} of orthonav {version!s:.40}",
         expected=len(replayable),
         stream=lambda: (_view(each, content, camera, options) for each in replayable),
-        warnings=(*warnings, *_unmasked(content, options), *_gaps(content.views, replayable)),
+        warnings=(*warnings, *_differences(content, replayable, options)),
         session=content.session,
         results=partial(_results, files),
         arrivals=lambda: (
@@ -202,20 +206,11 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
     )
 
 
-def _unmasked(content: LogContent, options: SourceOptions) -> list[str]:
-    """A warning where the flight hid a part of its pictures and this replay does not."""
-    flown = content.session.get("options")
-    mask = flown.get("mask") if isinstance(flown, dict) else None
-    if not mask or options.mask is not None:
-        return []
-    return [f"the flight was flown with --mask {mask!s:.200}: give it again to see the same ground"]
-
-
 def files_of_run(path: Path) -> list[Path]:
     """The files of one run in order: of a folder, or from the one that is given."""
     if path.is_dir():
         files = [file for file in path.glob("*.mcap") if profile_of(file) == PROFILE]
-        found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
+        found = {file: run for file in sorted(files, key=name_and_number) if (run := run_of(file))}
         runs = {run: file for file, run in reversed(found.items())}
         if len(runs) > 1:
             names = ", ".join(sorted(file.name for file in runs.values())[:5])
@@ -223,15 +218,11 @@ def files_of_run(path: Path) -> list[Path]:
                 f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
             )
         return list(found)
-    (name, number), run = _order(path), run_of(path)
-    others = [each for each in path.parent.glob("*.mcap") if _order(each)[0] == name]
-    later = sorted((each for each in others if _order(each)[1] > number), key=_order)
-    return [path, *(each for each in later if run and run_of(each) == run)]
-
-
-def _order(path: Path) -> tuple[str, int]:
-    match = _NUMBERED.fullmatch(path.name)
-    return (match[1], int(match[2])) if match else (path.name, 0)
+    run, (name, number) = run_of(path), name_and_number(path)
+    files = sorted(path.parent.glob("*.mcap"), key=name_and_number)
+    places = ((file, *name_and_number(file)) for file in files)
+    later = [file for file, its_name, place in places if its_name == name and place > number]
+    return [path, *(file for file in later if run and run_of(file) == run)]
 
 
 def run_of(path: Path) -> str | None:
@@ -241,20 +232,6 @@ def run_of(path: Path) -> str | None:
             if message.topic == TOPICS.session.name:
                 return str(from_json(message.data).get("run"))
     return None
-
-
-def _warnings_of_file(file: McapFile, content: LogContent) -> list[str]:
-    before, warnings = content.broken, []
-    content.read(file)
-    damaged, broken = file.damaged, content.broken - before
-    if damaged or broken:
-        warnings.append(f"{damaged} chunks and {broken} messages are damaged: {file.path}")
-    if not file.ended:
-        warnings.append(
-            f"flight log was cut short, {file.lost_bytes} bytes after its last complete chunk "
-            f"are lost: {file.path}"
-        )
-    return warnings
 
 
 def _session(data: bytes, path: Path) -> dict[str, Any]:
@@ -310,25 +287,29 @@ def _is_name(frame: str) -> bool:
     )
 
 
-def _gaps(views: list[LoggedView], replayable: list[LoggedView]) -> list[str]:
-    """Warnings about missing views: without them the track differs from the one in flight."""
+def _differences(
+    content: LogContent, replayable: list[LoggedView], options: SourceOptions
+) -> Iterator[str]:
+    """Warnings about what this replay has not and the flight had: its mask, and views, without
+    which the track differs."""
+    flown, views = content.session.get("options"), content.views
+    mask = flown.get("mask") if isinstance(flown, dict) else None
+    if mask and options.mask is None:
+        said = f"the flight was flown with --mask {mask!s:.200}"
+        yield f"{said}: give it again to see the same ground"
     begin, end = min(view.index for view in views), max(view.index for view in views) + 1
-    warnings = []
     if begin > 0:
-        warnings.append(
+        yield (
             f"the first {begin} views of the flight are not in the log: a track begins later than "
             "in flight"
         )
     if withheld := sum(view.withheld for view in views):
-        warnings.append(
+        yield (
             f"{withheld} views were not located in flight, because the latency of the camera was "
             "not known; only `orthonav calibrate --latency` uses them"
         )
     if (missing := end - begin - len(replayable) - withheld) > 0:
-        warnings.append(
-            f"{missing} views lack a full image and are left out: a track differs after them"
-        )
-    return warnings
+        yield f"{missing} views lack a full image and are left out: a track differs after them"
 
 
 def _view(

@@ -7,7 +7,7 @@ counts it, where -90 looks straight down; any other is in the convention of orth
 import math
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -19,12 +19,12 @@ import numpy as np
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.folder import check_latlon, number_of
-from orthonav.core.flight.telemetry_track import LATEST_NS, measured
 from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.geo.headings import RADIANS, seem_radians
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
-from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED, UNSTATED
+from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED, UNSTATED, TiltSource
+from orthonav.ground.recordings.telemetry_track import LATEST_NS, measured
 
 MAX_BYTES = 100_000_000
 _SUFFIXES = (".csv", ".tsv", ".txt")
@@ -51,15 +51,7 @@ _UNREAD = re.compile(r"omega|phi|kappa|q[wxyz]")
 _EMPTY = ("", "-", "nan", "na", "n/a", "none", "null")
 _HEIGHTS = ("agl", "home", "amsl", "hae", "alt")
 Columns = Mapping[str, tuple[str, float]]  # name in the table and scale, by field
-
-
-@dataclass(frozen=True)
-class ImageRow:
-    """What a table says of an image: fields of `Photo` and of its pose by their names."""
-
-    order: int  # number of the row
-    values: Mapping[str, Any]
-    pose: Mapping[str, Any]
+ImageRow = Mapping[str, Any]  # what a table says of an image: fields of `Photo` by their names
 
 
 @dataclass(frozen=True)
@@ -133,9 +125,12 @@ def read_image_table(path: Path) -> ImageTable:
         raise FlightError(f"{error}: {path}") from error
     comma = delimiter != ","
     found = [_numbers(texts, columns, line, comma, path) for line, texts in lines]
-    gimbal = _is_gimbal(columns, found)
-    unrecorded = _is_unrecorded(gimbal, found)
-    _head(unrecorded, found)
+    source = _tilt_source(columns, found)
+    if source is ASSUMED and not any(values.get("yaw") for values in found):
+        # The heading of the gimbal was not recorded either: that of the aircraft counts.
+        turns = any(values.get("body_yaw") for values in found)
+        for values in found:
+            values["yaw"] = values.get("body_yaw", math.nan) if turns else math.nan
     rows: dict[str, ImageRow] = {}
     for order, ((line, texts), values) in enumerate(zip(lines, found, strict=True)):
         name = str(PurePosixPath(texts["file"].replace("\\", "/").lower()))
@@ -143,10 +138,10 @@ def read_image_table(path: Path) -> ImageTable:
             raise FlightError(f"table names {texts['file']!r:.80} twice: {path}")
         if texts["file"]:
             time_ns = _time_ns(texts.get("time", ""), line, path)
-            rows[name] = _row(order, values, time_ns, gimbal, unrecorded)
+            rows[name] = _row(order, values, time_ns, source)
     if not rows:
         raise FlightError(f"table names no image: {path}")
-    doubts = _doubts(columns, table.columns, found, gimbal, unrecorded)
+    doubts = _doubts(columns, table.columns, found, source)
     return ImageTable(path, rows, tuple(f"{doubt}: {path}" for doubt in doubts))
 
 
@@ -196,37 +191,24 @@ def _numbers(
     return values
 
 
-def _is_gimbal(columns: Columns, rows: Sequence[Mapping[str, float]]) -> bool:
-    if "pitch" not in columns:
-        return False
+def _tilt_source(columns: Columns, rows: Sequence[Mapping[str, float]]) -> TiltSource:
+    """What pitch and roll are of: `GIMBAL`; `ASSUMED`: of one that reports 0 in all rows, where it
+    would look at the horizon; else `UNSTATED`."""
     known = [values["pitch"] for values in rows if "pitch" in values]
     # No camera that is of use looks back by more than 45 deg.
-    looks_back = bool(known) and float(np.median(known)) <= -45.0
-    return looks_back or "gimbal" in columns["pitch"][0].lower()
+    if not known or (not _names_gimbal(columns) and float(np.median(known)) > -45.0):
+        return UNSTATED
+    return GIMBAL if any(known) or any(values.get("roll") for values in rows) else ASSUMED
 
 
-def _is_unrecorded(gimbal: bool, rows: Sequence[Mapping[str, float]]) -> bool:
-    """Whether a gimbal reports 0 in all rows, where it would look at the horizon."""
-    angles = [values.get(name, 0.0) for values in rows for name in ("pitch", "roll")]
-    return gimbal and any("pitch" in values for values in rows) and not any(angles)
-
-
-def _head(unrecorded: bool, rows: Sequence[dict[str, float]]) -> None:
-    """Give views the heading of the aircraft where that of the gimbal was not recorded either."""
-    if unrecorded and not any(values.get("yaw") for values in rows):
-        turns = any(values.get("body_yaw") for values in rows)
-        for values in rows:
-            values["yaw"] = values.get("body_yaw", math.nan) if turns else math.nan
+def _names_gimbal(columns: Columns) -> bool:
+    return "gimbal" in columns["pitch"][0].lower()
 
 
 def _row(
-    order: int,
-    values: Mapping[str, float],
-    time_ns: int | None,
-    gimbal: bool,
-    unrecorded: bool,
+    order: int, values: Mapping[str, float], time_ns: int | None, source: TiltSource
 ) -> ImageRow:
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"order": order}
     if time_ns is not None:
         found |= {"time_ns": time_ns, "zone_known": True}
     if "lat" in values and "lon" in values and (values["lat"] or values["lon"]):
@@ -235,17 +217,16 @@ def _row(
     found |= {f"{name}_m": values[name] for name in stated}
     yaw, pitch = values.get("yaw", math.nan), values.get("pitch", math.nan)
     roll = values.get("roll", 0.0)
-    if gimbal and math.isfinite(pitch) and not unrecorded:
+    if source is GIMBAL and math.isfinite(pitch):
         known = math.isfinite(yaw)
         turned = attitude_of(enu_from_gimbal_camera((yaw if known else 0.0, pitch, roll)))
         yaw, pitch, roll = (turned[0] if known else math.nan), turned[1], turned[2]
     pose: dict[str, Any] = {}
     if math.isfinite(pitch):
-        source = ASSUMED if unrecorded else GIMBAL if gimbal else UNSTATED
         pose |= {"pitch_deg": pitch, "roll_deg": roll, **source.stated(aided=False)}
     if math.isfinite(yaw):
         pose |= {"yaw_deg": yaw % 360, "yaw_std_deg": None}
-    return ImageRow(order, found, pose)
+    return found | {"pose": pose}
 
 
 def _time_ns(text: str, line: int, path: Path) -> int | None:
@@ -281,7 +262,7 @@ def ns_of(moment: datetime) -> int:
 
 
 def _doubts(
-    columns: Columns, held: list[str], rows: list[dict[str, float]], gimbal: bool, unrecorded: bool
+    columns: Columns, held: list[str], rows: list[dict[str, float]], source: TiltSource
 ) -> Iterator[str]:
     lacks = [] if "yaw" in columns else ["heading (yaw or heading)"]
     lacks += [] if set(_HEIGHTS) & columns.keys() else ["height (agl or height)"]
@@ -291,16 +272,7 @@ def _doubts(
         yield f"columns {', '.join(unread)} are not read"
     if seem_radians([values.get("yaw", math.nan) for values in rows]):
         yield RADIANS
-    if unrecorded:
+    if source is ASSUMED:
         yield UNRECORDED
-    elif gimbal and "gimbal" not in columns["pitch"][0].lower():
+    elif source is GIMBAL and not _names_gimbal(columns):
         yield "pitch is near -90, so it is taken as that of a gimbal, where -90 looks straight down"
-
-
-def names_images(path: Path, names: Collection[str]) -> bool:
-    """Whether a text names some of these images, in lower case."""
-    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        text = stream.read(64_000).decode("utf-8", errors="replace").lower()
-    return not set(re.split(r"[\s,;\"/\\]+", text)).isdisjoint(names)

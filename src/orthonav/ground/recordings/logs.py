@@ -17,7 +17,19 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError
 from orthonav.core.files import require_file
 from orthonav.core.flight.folder import csv_rows, number_of, time_ns_of
-from orthonav.core.flight.telemetry_track import (
+from orthonav.core.geo.attitude import (
+    Angles,
+    enu_from_body_camera,
+    ned_from_angles,
+    rotations_of_wxyz,
+)
+from orthonav.core.geo.camera import attitude_of
+from orthonav.core.geo.swapped import swapped_hint
+from orthonav.core.guard import needed, reading
+from orthonav.core.tables import MAX_ROWS
+from orthonav.core.tilt import ARDUPILOT, AUTOPILOT, UNSTATED, TiltSource
+from orthonav.ground.recordings.subtitles import read_srt
+from orthonav.ground.recordings.telemetry_track import (
     RecordedTrack,
     Samples,
     Sources,
@@ -29,23 +41,6 @@ from orthonav.core.flight.telemetry_track import (
     position_series,
     series_of,
 )
-from orthonav.core.geo.attitude import (
-    Angles,
-    enu_from_body_camera,
-    ned_from_angles,
-    rotations_of_wxyz,
-)
-from orthonav.core.geo.camera import attitude_of
-from orthonav.core.geo.swapped import swapped_hint
-from orthonav.core.guard import needed, reading
-from orthonav.core.tables import MAX_ROWS
-from orthonav.core.tilt import (
-    ARDUPILOT,
-    AUTOPILOT,
-    UNSTATED,
-    TiltSource,
-)
-from orthonav.ground.recordings.subtitles import read_srt
 from orthonav.onboard.messages import mavlink
 
 DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats
@@ -384,8 +379,7 @@ def log_kind(path: Path) -> str:
         return "dataflash"
     if len(head) > 8 and head[0] == 0 and head[8] in MAVLINK_MAGICS:
         return "tlog"
-    text = head.replace(b"\0", b"") if head[:2] in (b"\xff\xfe", b"\xfe\xff") else head
-    if re.search(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->", text):
+    if re.search(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->", head):
         return "srt"
     if b"time_s" in head.partition(b"\n")[0]:
         return "table"

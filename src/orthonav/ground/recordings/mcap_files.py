@@ -6,6 +6,7 @@ chunks are skipped. The format: https://mcap.dev/spec.
 """
 
 import io
+import re
 import struct
 import zlib
 from collections.abc import Iterator
@@ -44,6 +45,13 @@ class McapFile:
     damaged: int = 0  # damaged chunks
     ended: bool = False  # whether the file has a proper end
     channels: dict[int, str] = field(default_factory=dict)  # topics by id
+
+
+def name_and_number(path: Path) -> tuple[str, int]:
+    """The name of the recording that a file `NAME_NUMBER.*` belongs to, and its number in it; that
+    of the file and 0 for others."""
+    found = re.fullmatch(r"(.+)_(\d{1,9})", path.stem)
+    return (found[1], int(found[2])) if found else (path.name, 0)
 
 
 def profile_of(path: Path) -> str | None:

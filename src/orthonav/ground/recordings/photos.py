@@ -18,18 +18,12 @@ from orthonav.core.errors import CameraError, FlightError, lfs_pointer
 from orthonav.core.files import require_file
 from orthonav.core.flight import read_image
 from orthonav.core.flight.recording import RecordedView
-from orthonav.core.flight.telemetry_track import RecordedTrack
 from orthonav.core.geo.attitude import enu_from_gimbal_camera
 from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
 from orthonav.core.tilt import ASSUMED, AUTOPILOT, GIMBAL, TiltSource
 from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, read_photo
-from orthonav.ground.recordings.image_table import (
-    ImageTable,
-    is_image_table,
-    names_images,
-    read_image_table,
-)
+from orthonav.ground.recordings.image_table import ImageTable, is_image_table, read_image_table
 from orthonav.ground.recordings.logs import read_log
 from orthonav.ground.recordings.recording import (
     Recording,
@@ -44,6 +38,7 @@ from orthonav.ground.recordings.recording import (
     with_mean_velocities,
     with_options,
 )
+from orthonav.ground.recordings.telemetry_track import RecordedTrack
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +107,7 @@ def chosen_photos(sources: Sequence[Path], options: SourceOptions) -> ChosenPhot
 def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
     """The table that lies in a folder and names some of these photographs below it."""
     names = [path.relative_to(folder).as_posix() for path in photos]
-    ends, found = {path.name.lower() for path in photos}, []
+    found = []
     for path in sorted(folder.iterdir()):
         if is_image_table(path):
             table = read_image_table(path)
@@ -120,8 +115,6 @@ def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
                 found.append(table)
             else:
                 log.warning("table that names none of the photographs is not used: %s", path)
-        elif names_images(path, ends):
-            log.warning("not read, for want of a header such as file,yaw,pitch,roll,agl: %s", path)
     if len(found) > 1:
         several = ", ".join(table.path.name for table in found[:5])
         raise FlightError(
@@ -160,7 +153,7 @@ def posed(photos: Sequence[Photo], edited: Sequence[int]) -> tuple[list[Photo], 
     for number in edited:
         poses[number]["yaw_std_deg"] = 180.0
     return [
-        replace(photo, pose={**pose, **(photo.row.pose if photo.row else {})})
+        replace(photo, pose={**pose, **photo.pose})
         for photo, pose in zip(photos, poses, strict=True)
     ], warnings
 
@@ -330,20 +323,20 @@ def _with_rows(photos: list[Photo], chosen: ChosenPhotos) -> tuple[list[Photo], 
         return photos, []
     names = [photo.path.relative_to(chosen.folder).as_posix() for photo in photos]
     pairs = [(photo, table.row(name)) for photo, name in zip(photos, names, strict=True)]
-    known = [replace(photo, row=row, **row.values) for photo, row in pairs if row]
+    known = [replace(photo, **row) for photo, row in pairs if row]
     without = [photo.path for photo, row in pairs if row is None]
     if not known:
         raise FlightError(
             f"table names none of the {len(photos)} photographs, such as {without[0].name}; it "
             f"names {next(iter(table.rows))}: {table.path}"
         )
-    if len({row.order for _, row in pairs if row}) < len(known):
+    if len({photo.order for photo in known}) < len(known):
         raise FlightError(
             "a row of the table names several photographs of one name; give their paths below "
             f"{chosen.folder}: {table.path}"
         )
     warnings = [*table.warnings, *_left_out(photos, without, "not in the table")]
-    lost = len({row.order for row in table.rows.values()}) - len(known)
+    lost = len({row["order"] for row in table.rows.values()}) - len(known)
     if lost:
         warnings.append(f"{lost} rows of the table have no photograph: {table.path}")
     return known, warnings
@@ -386,7 +379,7 @@ def _in_time(
     if not untimed or options.telemetry is not None:
         ordered: list[Photo] = []
     elif chosen.singly:
-        ordered = sorted(photos, key=lambda photo: photo.row.order if photo.row else 0)
+        ordered = sorted(photos, key=lambda photo: photo.order)
     else:
         known = [
             one for one in untimed if one.gimbal_deg or one.rotation is not None or one.latlon_deg

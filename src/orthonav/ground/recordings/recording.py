@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from orthonav.core.errors import FlightError, UsageError
 from orthonav.core.files import with_paths
 from orthonav.core.flight.recording import LONG_GAP_NS, RecordedView, fitted
-from orthonav.core.flight.telemetry_track import RecordedTrack, measured
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import read_camera_file
 from orthonav.core.records import Prior, Telemetry
 from orthonav.core.tilt import ASSUMED
+from orthonav.ground.recordings.telemetry_track import RecordedTrack, measured
 
 ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
 MAX_FOV_DEG = 150.0

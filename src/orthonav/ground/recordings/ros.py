@@ -8,7 +8,6 @@ import contextlib
 import io
 import logging
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -32,23 +31,11 @@ from orthonav.core.flight.ros_messages import (
     odd_word,
     stamp_ns,
 )
-from orthonav.core.flight.telemetry_track import (
-    RecordedTrack,
-    Samples,
-    Sources,
-    TimeSeries,
-    altitude_series,
-    attitude_series,
-)
 from orthonav.core.geo.attitude import Angles, enu_from_ros_camera, rotations_of_wxyz
 from orthonav.core.geo.camera import Camera
 from orthonav.core.guard import needed, reading, without_plea
 from orthonav.ground.recordings.logs import read_log
-from orthonav.ground.recordings.mcap_files import (
-    MAGIC,
-    complete_bytes,
-    inflated,
-)
+from orthonav.ground.recordings.mcap_files import MAGIC, complete_bytes, inflated, name_and_number
 from orthonav.ground.recordings.recording import (
     ROLES,
     Recording,
@@ -59,13 +46,20 @@ from orthonav.ground.recordings.recording import (
     warnings_of,
     with_mean_velocities,
 )
+from orthonav.ground.recordings.telemetry_track import (
+    RecordedTrack,
+    Samples,
+    Sources,
+    TimeSeries,
+    altitude_series,
+    attitude_series,
+)
 
 MAGICS = {b"#ROSBAG V": ".bag", MAGIC: ".mcap", b"SQLite format 3\0": ".db3"}
 METADATA = "metadata.yaml"
 MAX_HELD_BYTES = 2**30
 WHAT = "ROS recordings"
 _ROS_2 = (".mcap", ".db3")
-_SPLIT = re.compile(r"(.+)_(\d{1,9})")
 _END = b"\x0f" + (4).to_bytes(8, "little") + bytes(4)  # data end
 _END += b"\x02" + (20).to_bytes(8, "little") + bytes(20) + MAGIC  # footer without a summary
 
@@ -99,18 +93,13 @@ def storage_files(folder: Path) -> list[Path]:
     """The files of a ROS 2 bag in a folder, by name and number."""
     found = [path for path in folder.iterdir() if path.is_file() and path.suffix in _ROS_2]
     found = [path for path in found if bag_suffix(require_file(path, "file of the bag")) in _ROS_2]
-    found.sort(key=_order)
-    if len({_order(path)[0] for path in found}) > 1 or len({path.suffix for path in found}) > 1:
+    found.sort(key=name_and_number)
+    if len({(name_and_number(path)[0], path.suffix) for path in found}) > 1:
         names = ", ".join(path.name for path in found[:5])
         raise FlightError(
             f"folder holds {len(found)} ROS 2 recordings ({names}); give one of the files: {folder}"
         )
     return found
-
-
-def _order(path: Path) -> tuple[str, int]:
-    match = _SPLIT.fullmatch(path.stem)
-    return (match[1], int(match[2])) if match else (path.stem, 0)
 
 
 @contextlib.contextmanager
@@ -258,41 +247,35 @@ class _CutMcap:
     def is_dir(self) -> bool:
         return False
 
-    def open(self, mode: str = "rb") -> io.BufferedReader:
-        return io.BufferedReader(_Ended(self.path.open(mode, buffering=0), self.complete))
+    def open(self, mode: str = "rb") -> "_Ended":
+        return _Ended(self.path.open(mode), self.complete)
 
 
-class _Ended(io.RawIOBase):
+class _Ended:
     """The first `complete` bytes of a file, then the end of an MCAP file without a summary."""
 
     def __init__(self, stream: Any, complete: int) -> None:
         self._stream, self._complete, self._at = stream, complete, 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         starts = 0, self._at, self._complete + len(_END)
         self._at = max(0, starts[whence] + offset)
         return self._at
 
-    def readinto(self, buffer: Any) -> int:
-        if self._at < self._complete:
-            self._stream.seek(self._at)
-            data = self._stream.read(min(len(buffer), self._complete - self._at))
-        else:
-            first = self._at - self._complete
-            data = _END[first : first + len(buffer)]
-        buffer[: len(data)] = data
+    def read(self, size: int | None = None) -> bytes:
+        whole = self._complete + len(_END)
+        end = whole if size is None or size < 0 else min(self._at + size, whole)
+        self._stream.seek(self._at)
+        data: bytes = self._stream.read(max(0, min(end, self._complete) - self._at))
+        data += _END[max(0, self._at - self._complete) : max(0, end - self._complete)]
         self._at += len(data)
-        return len(data)
+        return data
+
+    def tell(self) -> int:
+        return self._at
 
     def close(self) -> None:
         self._stream.close()
-        super().close()
 
 
 def bound_inflation() -> None:

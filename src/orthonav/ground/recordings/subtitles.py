@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from orthonav.core.errors import FlightError
-from orthonav.core.flight.telemetry_track import (
+from orthonav.core.geo.attitude import enu_from_gimbal_camera
+from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED
+from orthonav.ground.recordings.telemetry_track import (
     RecordedTrack,
     Samples,
     attitude_of_angles,
     measured,
 )
-from orthonav.core.geo.attitude import enu_from_gimbal_camera
-from orthonav.core.tilt import ASSUMED, GIMBAL, UNRECORDED
 
 _NUMBER = r"([-+]?\d{1,20}(?:\.\d{1,20})?)"  # limited, as the time of a search is
 _TIMES = re.compile(
@@ -51,7 +51,7 @@ class SubtitleBlock(NamedTuple):
 def read_srt(path: Path) -> RecordedTrack:
     """The track of an SRT file; times are those of its video."""
     data = path.read_bytes()
-    text = _decoded(data)
+    text = data.decode("utf-8-sig", errors="replace")
     doubtful = _GPS.search(text) is not None and _latitude_first(text) is None
     found = list(blocks(data))
     if not found:
@@ -112,7 +112,7 @@ def _zoomed(found: Sequence[SubtitleBlock]) -> list[bool]:
 def blocks(data: bytes) -> Iterator[SubtitleBlock]:
     """The blocks of an SRT file in order; those without a line of times are left out, and so is the
     last one of a file that ends within it: its last number may be cut."""
-    text = _decoded(data)
+    text = data.decode("utf-8-sig", errors="replace")
     latitude_first = _latitude_first(text)
     parts = re.split(r"\n\s*\n", text.replace("\r\n", "\n"))
     if not text.endswith(("\n", ">", "]", ")")):
@@ -122,12 +122,6 @@ def blocks(data: bytes) -> Iterator[SubtitleBlock]:
         if times:
             start, end = _ns(times.groups()[:4]), _ns(times.groups()[4:])
             yield _block(start, end, re.sub(r"<[^<>]*>", " ", part[times.end() :]), latitude_first)
-
-
-def _decoded(data: bytes) -> str:
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return data.decode("utf-16", errors="replace")
-    return data.decode("utf-8-sig", errors="replace")
 
 
 def _ns(parts: tuple[str, ...]) -> int:

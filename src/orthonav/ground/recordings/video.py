@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError
-from orthonav.core.flight.recording import RecordedView
-from orthonav.core.flight.telemetry_track import RecordedTrack, chosen
+from orthonav.core.flight.recording import RecordedView, chosen
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.recordings.logs import end_ns, log_kind, read_log
 from orthonav.ground.recordings.recording import (
@@ -31,15 +30,9 @@ from orthonav.ground.recordings.recording import (
     warnings_of,
     with_mean_velocities,
 )
+from orthonav.ground.recordings.telemetry_track import RecordedTrack
 
 MAX_END_BYTES = 10_000_000
-_UNREAD = {
-    rb"(?s)stsd.{12}(?:tx3g|text)|S_TEXT/": "subtitles (ffmpeg -i VIDEO OUT.srt extracts them)",
-    rb"(?s)stsd.{12}gpmd": "telemetry of GoPro (GPMF)",
-    rb"(?s)stsd.{12}djmd": "telemetry of DJI (djmd; let the drone record captions)",
-    rb"KLVA|\x06\x0e\x2b\x34\x02\x0b\x01\x01\x0e\x01\x03\x01\x01": "KLV (MISB ST 0601)",
-}
-"""What a video may hold, by bytes of its begin or its end."""
 
 
 def open_video(path: Path, options: SourceOptions) -> Recording:
@@ -132,11 +125,9 @@ def _track(
     ]
     telemetry_path = options.telemetry or next(iter(beside), None)
     if telemetry_path is None:
-        held = _ends(path)
-        unread = [f"{text}, not read; " for part, text in _UNREAD.items() if re.search(part, held)]
         raise FlightError(
-            f"no telemetry beside the video ({path.stem}.srt or .csv); "
-            f"{'it holds ' if unread else ''}{''.join(unread)}give --telemetry: {path}"
+            f"no telemetry beside the video ({path.stem}.srt or .csv), and none inside it is read; "
+            f"give --telemetry: {path}"
         )
     why = "subtitles come before tables; --telemetry selects another file"
     unused = [] if options.telemetry else [each.name for each in beside[1:]]

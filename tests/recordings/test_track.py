@@ -7,19 +7,15 @@ import pytest
 
 from orthonav.core.errors import UsageError
 from orthonav.core.flight.recording import RecordedView
-from orthonav.core.flight.telemetry_track import (
+from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
+from orthonav.core.tilt import ARDUPILOT, GIMBAL, MOUNT_STD_DEG, UNSTATED, stated_deg
+from orthonav.ground.recordings.recording import SourceOptions, warnings_of, with_mean_velocities
+from orthonav.ground.recordings.telemetry_track import (
     GAP_NS,
     RecordedTrack,
     Samples,
     angles_at,
     attitude_of_angles,
-)
-from orthonav.core.geo.attitude import enu_from_body_camera, ned_from_angles
-from orthonav.core.tilt import ARDUPILOT, GIMBAL, MOUNT_STD_DEG, UNSTATED, stated_deg
-from orthonav.ground.recordings.recording import (
-    SourceOptions,
-    warnings_of,
-    with_mean_velocities,
 )
 
 S = 10**9

@@ -53,67 +53,52 @@ class Messages:
         x, y, z, w = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_quat()
         return self.new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
+    def stamped(self, name, time_ns, **fields):
+        return self.new(name, **{"header": self.header(time_ns)} | fields)
+
     def image(self, time_ns, pixels, encoding="mono8", **changes):
         rows, columns = pixels.shape[:2]
-        fields = {
-            "header": self.header(time_ns),
-            "height": rows,
-            "width": columns,
-            "encoding": encoding,
-            "step": pixels[0].nbytes,
-            "data": np.frombuffer(pixels.tobytes(), dtype=np.uint8),
-        }
-        return self.new("sensor_msgs/msg/Image", **(fields | changes))
+        data = np.frombuffer(pixels.tobytes(), dtype=np.uint8)
+        fields = {"height": rows, "width": columns, "encoding": encoding, "data": data}
+        fields |= {"step": pixels[0].nbytes, **changes}
+        return self.stamped("sensor_msgs/msg/Image", time_ns, **fields)
 
     def compressed(self, time_ns, grey, suffix=".jpg"):
-        header, data = self.header(time_ns), cv2.imencode(suffix, grey)[1].ravel()
-        name = "sensor_msgs/msg/CompressedImage"
-        return self.new(name, header=header, format=suffix[1:], data=data)
+        fields = {"format": suffix[1:], "data": cv2.imencode(suffix, grey)[1].ravel()}
+        return self.stamped("sensor_msgs/msg/CompressedImage", time_ns, **fields)
 
     def camera_info(self, model="plumb_bob", lens=(0.0,) * 5, **changes):
         matrices = {"k": np.array([60.0, 0, 31.5, 0, 60.0, 23.5, 0, 0, 1]), "d": np.array(lens)}
         if self.ros1:
             matrices = {name.upper(): value for name, value in matrices.items()}
-        fields = {
-            "header": self.header(START_S * 10**9),
-            "height": HEIGHT,
-            "width": WIDTH,
-            "distortion_model": model,
-            **matrices,
-        }
-        return self.new("sensor_msgs/msg/CameraInfo", **(fields | changes))
+        fields = {"height": HEIGHT, "width": WIDTH, "distortion_model": model, **matrices}
+        time_ns = START_S * 10**9
+        return self.stamped("sensor_msgs/msg/CameraInfo", time_ns, **fields | changes)
 
     def imu(self, time_ns, turn, known=True, std_deg=0.0):
         nine = np.zeros(9)
         nine[0] = math.radians(std_deg) ** 2 if known else -1.0
-        header = self.header(time_ns)
-        name = "sensor_msgs/msg/Imu"
-        return self.new(name, header=header, orientation=turn, orientation_covariance=nine)
+        fields = {"orientation": turn, "orientation_covariance": nine}
+        return self.stamped("sensor_msgs/msg/Imu", time_ns, **fields)
 
     def odometry(self, time_ns, turn, forward=5.0, left=0.0):
-        odometry = self.new("nav_msgs/msg/Odometry", header=self.header(time_ns))
+        odometry = self.stamped("nav_msgs/msg/Odometry", time_ns)
         odometry.pose.pose.orientation = turn
         odometry.twist.twist.linear = self.new("geometry_msgs/msg/Vector3", x=forward, y=left)
         return odometry
 
     def fix(self, time_ns, lat=46.5, lon=2.5, alt=400.0, status=0):
-        return self.new(
-            "sensor_msgs/msg/NavSatFix",
-            header=self.header(time_ns),
-            status=self.new("sensor_msgs/msg/NavSatStatus", status=status, service=1),
-            latitude=lat,
-            longitude=lon,
-            altitude=alt,
-        )
+        fields = {"latitude": lat, "longitude": lon, "altitude": alt}
+        fields["status"] = self.new("sensor_msgs/msg/NavSatStatus", status=status, service=1)
+        return self.stamped("sensor_msgs/msg/NavSatFix", time_ns, **fields)
 
     def range(self, time_ns, metres):
-        header, limits = self.header(time_ns), {"min_range": 0.2, "max_range": 120.0}
-        return self.new("sensor_msgs/msg/Range", header=header, **limits, range=metres)
+        fields = {"min_range": 0.2, "max_range": 120.0, "range": metres}
+        return self.stamped("sensor_msgs/msg/Range", time_ns, **fields)
 
     def altitude(self, time_ns, relative, clearance):
-        header, heights = self.header(time_ns), {"amsl": 400.0, "relative": relative}
-        name = "mavros_msgs/msg/Altitude"
-        return self.new(name, header=header, **heights, bottom_clearance=clearance)
+        fields = {"amsl": 400.0, "relative": relative, "bottom_clearance": clearance}
+        return self.stamped("mavros_msgs/msg/Altitude", time_ns, **fields)
 
     def number(self, value):
         return self.new("std_msgs/msg/Float64", data=value)

@@ -111,26 +111,6 @@ def test_columns_of_angles_that_are_not_read_are_named(images):
 
 
 @pytest.mark.parametrize(
-    "name, text",
-    [
-        (
-            "location.txt",
-            "#name latitude/Y longitude/X height/Z yaw pitch roll SAlt\nA.png 46.5 2.5 9 1 2 3 0\n",
-        ),
-        ("geo.csv", "a.png,46.5,2.5,400\n"),
-    ],
-)
-def test_files_that_name_photographs_and_are_not_read_are_named(tmp_path, caplog, name, text):
-    """Of Mission Planner, and of Pix4D without a header."""
-    photo(tmp_path / "p/a.png", gps=place(46.5, 2.5))
-    (tmp_path / "p/notes.txt").write_text("words of b.png and others")
-    (tmp_path / "p" / name).write_text(text)
-    assert len(list(open_source(tmp_path / "p").views)) == 1
-    assert "not read, for want of a header such as file,yaw" in caplog.text
-    assert name in caplog.text and "notes.txt" not in caplog.text
-
-
-@pytest.mark.parametrize(
     "column, text, seconds",
     [
         ("timestamp", "1714557601500", 1_714_557_601.5),
@@ -233,17 +213,17 @@ def test_a_gimbal_that_is_0_in_all_rows_was_not_recorded(images):
     (images / "a.csv").write_text(rows.format("c.png", 0))
     found = read_image_table(images / "a.csv")
     assert any("of the gimbal are 0 throughout" in each for each in found.warnings)
-    assert [row.pose["pitch_deg"] for row in found.rows.values()] == [0, 0]
-    assert {row.pose["tilt_std_deg"] for row in found.rows.values()} == {6.0}
+    assert [row["pose"]["pitch_deg"] for row in found.rows.values()] == [0, 0]
+    assert {row["pose"]["tilt_std_deg"] for row in found.rows.values()} == {6.0}
     (images / "a.csv").write_text(
         "file,yaw,gimbal_yaw,gimbal_pitch,gimbal_roll\na.png,77,0,0,0\nc.png,80,0,0,0\n"
     )
     found = read_image_table(images / "a.csv")
-    assert [row.pose["yaw_deg"] for row in found.rows.values()] == [77, 80]
+    assert [row["pose"]["yaw_deg"] for row in found.rows.values()] == [77, 80]
     (images / "a.csv").write_text(rows.format("c.png", -90))
     found = read_image_table(images / "a.csv")
     assert not any("0 throughout" in each for each in found.warnings)
-    assert {row.pose["tilt_std_deg"] for row in found.rows.values()} == {0.5}
+    assert {row["pose"]["tilt_std_deg"] for row in found.rows.values()} == {0.5}
 
 
 def test_single_photographs(images):

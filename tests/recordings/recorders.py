@@ -65,17 +65,8 @@ def dji(yaw=30.0, pitch=-90.0, roll=0.0, height=120.5, body=77.7):
     )
 
 
-def photo(
-    path,
-    time="2023:11:14 22:13:20",
-    more=(),
-    gps=(),
-    xmp=None,
-    seed=0,
-    make="DJI",
-    first=(),
-    **size,
-):
+def photo(path, time="2023:11:14 22:13:20", more=(), gps=(), xmp=None, seed=0, make="DJI", first=(),
+          pixels=None, **size):  # fmt: skip
     """A JPEG, PNG or TIFF with EXIF (`more` by number of the tag, `gps` and `first`, which is the
     first directory, likewise) and XMP."""
     exif = Image.Exif()
@@ -94,7 +85,7 @@ def photo(
     elif xmp is not None:
         options["xmp"] = xmp.encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(picture(seed, **size)).save(path, **options)
+    Image.fromarray(picture(seed, **size) if pixels is None else pixels).save(path, **options)
     return path
 
 
@@ -126,13 +117,13 @@ def place(lat, lon, alt=400.0):
 # Videos and their subtitles.
 
 
-def video(path, frames=30, fps=10.0, code="FFV1"):
-    writer = cv2.VideoWriter(
-        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), fps, (WIDTH, HEIGHT)
-    )
+def video(path, frames=30, fps=10.0, code="FFV1", shown=picture):
+    """A video whose frame of a number is `shown` of it."""
+    kind, size = cv2.VideoWriter_fourcc(*code), shown(0).shape[::-1]
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, kind, fps, size)
     assert writer.isOpened()
     for number in range(frames):
-        writer.write(cv2.cvtColor(picture(number), cv2.COLOR_GRAY2BGR))
+        writer.write(cv2.cvtColor(shown(number), cv2.COLOR_GRAY2BGR))
     writer.release()
     return path
 
@@ -347,35 +338,27 @@ def dataflash(path, seconds=10, boot_us=3_000_000, attitude=True, gps=True):
     return path
 
 
-def tlog(path, seconds=10, attitude=True):
-    """A telemetry log: MAVLink 2 behind times of receipt, by pymavlink's packers."""
+def sent(sender, t, *messages, old=False):
+    """Messages (name, fields ..) of a sender (system, component) as a telemetry log holds them:
+    MAVLink 2, or 1, by pymavlink's packers, behind the time of receipt."""
     from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-    sender = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
-    other = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-    data = b""
+    packer = dialect.MAVLink(None, srcSystem=sender[0], srcComponent=sender[1])
+    stamp = struct.pack(">Q", START_S * 10**6 + round(t * 1e6))
+    packed = (getattr(dialect, f"MAVLink_{name}_message")(*of) for name, *of in messages)
+    return b"".join(stamp + message.pack(packer, force_mavlink1=old) for message in packed)
+
+
+def tlog(path, seconds=10, attitude=True):
+    """A telemetry log of an autopilot, with the heartbeat of a ground station."""
+    data, place = b"", (465_000_000, 25_000_000, 400_000)
     for t, yaw, pitch, roll in flown(seconds):
         angles = [math.radians(a) for a in (roll, pitch, yaw)]
         ms = round(t * 1000)
-        messages = [
-            (other, dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)),
-            (sender, dialect.MAVLink_attitude_message(ms, *angles, 0, 0, 0)),
-            (
-                sender,
-                dialect.MAVLink_global_position_int_message(
-                    ms, 465_000_000, 25_000_000, 400_000, 105_000 + ms, -100, 300, 0, 35_000
-                ),
-            ),
-            (
-                sender,
-                dialect.MAVLink_gps_raw_int_message(
-                    ms * 1000, 3, 465_000_000, 25_000_000, 400_000, 80, 80, 500, 9000, 12
-                ),
-            ),
-        ]
-        if not attitude:
-            del messages[1]
-        stamp = struct.pack(">Q", START_S * 10**6 + round(t * 1e6))
-        data += b"".join(stamp + message.pack(by) for by, message in messages)
+        data += sent((255, 190), t, ("heartbeat", 6, 8, 0, 0, 4, 3))
+        if attitude:
+            data += sent((1, 1), t, ("attitude", ms, *angles, 0, 0, 0))
+        above = ("global_position_int", ms, *place, 105_000 + ms, -100, 300, 0, 35_000)
+        data += sent((1, 1), t, above, ("gps_raw_int", ms * 1000, 3, *place, 80, 80, 500, 9000, 12))
     path.write_bytes(data)
     return path

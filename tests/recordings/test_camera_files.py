@@ -171,14 +171,6 @@ REFUSED |= {
         "transposed .its last row is 319.5, 239.5, 1., as MATLAB",
     ),
     "no centre": (lambda p: kalibr(p, intrinsics=[500, 500, 0, 0]), "principal point 0.5, 0.5 px"),
-    "COLMAP": (
-        written("# Camera list\n1 SIMPLE_RADIAL 640 480 500.2 320 240 -0.01\n"),
-        "of COLMAP are not read; expected flight.json, or",
-    ),
-    "Metashape": (
-        written('<?xml version="1.0"?>\n<calibration><f>500</f></calibration>\n'),
-        "of Metashape are not read",
-    ),
 }
 
 

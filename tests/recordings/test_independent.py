@@ -15,14 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pyulog import ULog
-from recorders import (
-    SENSEFLY,
-    dji,
-    maker_notes,
-    packet,
-    photo,
-    place,
-)
+from recorders import SENSEFLY, dji, maker_notes, packet, photo, place
 
 from orthonav.ground.recordings import open_source
 from orthonav.ground.recordings.exif import read_photo
@@ -48,11 +41,6 @@ def recorded(kind, *suffixes):
         return [pytest.param(path, id=path.name) for path in found]
     absent = pytest.mark.skip(reason=f"optional recordings are not there: {RECORDINGS / kind}")
     return [pytest.param(None, marks=absent, id="none")]
-
-
-def turned(first, second):
-    """The difference of two angles, -180..180."""
-    return (first - second + 180) % 360 - 180
 
 
 # Photographs and ExifTool.
@@ -125,7 +113,7 @@ def compare_pose(ours, tags):
     ahead = pitch + 90 if math.isfinite(pitch) else first(tags, "XMP-sensefly:PitchAngle")
     if heading == 0 == pitch:  # a gimbal that was not recorded
         heading, ahead = first(tags, "XMP-drone-dji:FlightYawDegree"), 0.0
-    assert turned(pose["yaw_deg"], heading) == pytest.approx(0, abs=1e-3)
+    assert math.remainder(pose["yaw_deg"] - heading, 360) == pytest.approx(0, abs=1e-3)
     assert pose["pitch_deg"] == pytest.approx(ahead, abs=1e-3)
     roll = first(tags, "XMP-sensefly:RollAngle")
     assert pose["roll_deg"] == pytest.approx(0 if math.isnan(roll) else roll, abs=1e-3)
@@ -162,7 +150,7 @@ def compare_ulog(path):
     roll = np.degrees(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
     for i in range(0, len(w), max(1, len(w) // 40)):
         ours = track.telemetry((int(body["timestamp"][i]) + shift_us) * 1000)
-        assert turned(ours.yaw_deg, yaw[i]) == pytest.approx(0, abs=0.05)
+        assert math.remainder(ours.yaw_deg - yaw[i], 360) == pytest.approx(0, abs=0.05)
         assert (ours.pitch_deg, ours.roll_deg) == pytest.approx((pitch[i], roll[i]), abs=0.05)
     for i in range(len(gps["lat"])):
         time_ns = (int(gps["timestamp"][i]) + shift_us) * 1000

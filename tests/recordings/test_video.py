@@ -1,7 +1,6 @@
 """Videos with subtitles or a table: times, dialects, and what is broken."""
 
 import math
-import struct
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from recorders import (
 )
 
 from orthonav.core.errors import CameraError, FlightError
-from orthonav.core.flight import open_flight, read_truth
+from orthonav.core.flight import read_truth
 from orthonav.ground.recordings import SourceOptions, import_flight, open_source
 from orthonav.ground.recordings.subtitles import blocks
 
@@ -67,16 +66,6 @@ def test_other_containers(tmp_path, name, code):
     views = list(open_source(path, options(path)).views)
     assert [view.telemetry.time_ns for view in views] == [0, 10**9]
     assert np.abs(views[1].grey().astype(int) - picture(10)).mean() < 6
-
-
-def test_import(recorded, tmp_path):
-    recording = open_source(recorded, options(recorded))
-    import_flight(recording, tmp_path / "flight")
-    flight = open_flight(tmp_path / "flight")
-    assert len(flight.views) == 3 and flight.camera == recording.camera
-    for written, view in zip(flight.views, recording.views, strict=True):
-        assert written.telemetry == view.telemetry
-        assert np.array_equal(written.grey(), view.grey()) and written.frame.endswith(".png")
 
 
 def test_a_table_beside_the_video(tmp_path):
@@ -138,11 +127,10 @@ DIALECTS = {
 }
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_dialects(tmp_path, dialect, encoding):
+def test_dialects(tmp_path, dialect):
     text, expected = DIALECTS[dialect]
-    path = subtitles(tmp_path / "a.srt", [text, text], encoding=encoding)
+    path = subtitles(tmp_path / "a.srt", [text, text])
     first, second = blocks(path.read_bytes())
     assert (first.start_ns, first.end_ns, second.end_ns) == (0, 10**8, 2 * 10**8)
     telemetry = (first.lat_deg, first.lon_deg, first.height_m, first.alt_m)
@@ -314,26 +302,6 @@ def test_a_video_that_players_turn_is_used_as_stored(tmp_path):
     said = "players show the video turned by 180 deg; its frames are used as stored"
     assert said in recording.warnings[0]
     assert np.abs(next(recording.views).grey().astype(int) - picture(0)).mean() < 6
-
-
-@pytest.mark.parametrize(
-    "format_, said",
-    [
-        (b"tx3g", "subtitles .ffmpeg -i"),
-        (b"gpmd", "telemetry of GoPro"),
-        (b"djmd", "telemetry of DJI"),
-    ],
-)
-def test_telemetry_in_the_video_itself_is_named(tmp_path, format_, said):
-    path = video(tmp_path / "a.mp4", 20, 10.0, "mp4v")
-    data = path.read_bytes()
-    at, end = data.index(b"moov") - 4, data.index(b"udta") - 4
-    track = data[data.index(b"trak") - 4 : end].replace(b"mp4v", format_).replace(b"vide", b"meta")
-    (size,) = struct.unpack_from(">I", data, at)
-    index = struct.pack(">I", size + len(track)) + data[at + 4 : end] + track + data[end:]
-    path.write_bytes(data[:at] + index)
-    with pytest.raises(FlightError, match=f"it holds {said}.*not read; give --telemetry"):
-        open_source(path, SourceOptions(fov_deg=60.0))
 
 
 def test_of_subtitles_and_a_table_the_subtitles_are_used_and_named(recorded):

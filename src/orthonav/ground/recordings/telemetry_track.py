@@ -2,7 +2,7 @@
 
 import math
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import FlightError
+from orthonav.core.flight.recording import NO_SOURCE, chosen
 from orthonav.core.geo.attitude import matrices_of_wxyz, slerp, wxyz_of_matrices
 from orthonav.core.geo.camera import attitude_of
 from orthonav.core.records import Prior, Telemetry
@@ -203,24 +204,20 @@ class RecordedTrack:
         Where no height above ground was measured, it is the one above take-off.
         """
         yaw, pitch, roll = angles_at(self.attitude, time_ns)
-        prior = _at(self.prior, time_ns, 3)
-        velocity = _at(self.velocity, time_ns, 2)
+        series = {"yaw_std_deg": self.yaw_std, "agl_std_m": self.agl_std}
+        series |= {"home_m": self.home, "amsl_m": self.amsl, "hae_m": self.hae}
+        optional: dict[str, Any] = {name: _at(each, time_ns)[0] for name, each in series.items()}
+        if math.isfinite(pitch + roll):
+            optional |= self._tilt_stds(time_ns)
         return Telemetry(
-            time_ns=time_ns,
-            yaw_deg=yaw,
-            pitch_deg=pitch,
-            roll_deg=roll,
-            agl_m=self._agl_m(time_ns, ground_alt_m),
-            yaw_std_deg=_number(_at(self.yaw_std, time_ns, 1)[0]),
-            agl_std_m=_number(_at(self.agl_std, time_ns, 1)[0]),
-            **(self._tilt_stds(time_ns) if math.isfinite(pitch + roll) else {}),
-            prior=Prior.known(*map(float, prior)),
-            vel_en_mps=(float(velocity[0]), float(velocity[1]))
-            if np.isfinite(velocity).all()
-            else None,
-            home_m=_number(_at(self.home, time_ns, 1)[0]),
-            amsl_m=_number(_at(self.amsl, time_ns, 1)[0]),
-            hae_m=_number(_at(self.hae, time_ns, 1)[0]),
+            time_ns,
+            yaw,
+            pitch,
+            roll,
+            self._agl_m(time_ns, ground_alt_m),
+            prior=Prior.known(*_at(self.prior, time_ns, 3)),
+            vel_en_mps=_known_pair(_at(self.velocity, time_ns, 2)),
+            **optional,
         )
 
     def mean_velocity_en_mps(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
@@ -233,36 +230,29 @@ class RecordedTrack:
             return None
         between = (series.time_ns > start_ns) & (series.time_ns < end_ns)
         mean = series.mean(start_ns, end_ns) if between.any() else series.at(end_ns)
-        east, north = mean.tolist()
-        return (east, north) if math.isfinite(east + north) else None
+        return _known_pair(mean.tolist())
 
     def latlon_deg(self, time_ns: int) -> tuple[float, float] | None:
         """Position by the aircraft's own GNSS receiver, or None."""
         lat, lon, _ = _at(self.position, time_ns, 3)
-        if not math.isfinite(lat + lon):
-            return None
-        return float(lat), float((lon + 180) % 360 - 180)
+        return _known_pair((lat, (lon + 180) % 360 - 180))
 
     def _tilt_stds(self, time_ns: int) -> dict[str, Any]:
         """Fields of the telemetry. A position says that GNSS aids the horizon."""
-        reported = _number(_at(self.tilt_std, time_ns, 1)[0])
-        if reported is not None:
-            mount = _number(_at(self.mount_std, time_ns, 1)[0])
-            return {"tilt_std_deg": reported, "mount_std_deg": mount}
-        horizon = _number(_at(self.horizon_std, time_ns, 1)[0])
-        if horizon is not None:
+        stated, mount, horizon = (
+            _at(each, time_ns)[0] for each in (self.tilt_std, self.mount_std, self.horizon_std)
+        )
+        if math.isfinite(stated):
+            return {"tilt_std_deg": stated, "mount_std_deg": mount}
+        if math.isfinite(horizon):
             return self.tilt.with_horizon(horizon)
         return self.tilt.stated(aided=self.latlon_deg(time_ns) is not None)
 
     def _agl_m(self, time_ns: int, ground_alt_m: float | None) -> float:
-        for series in (*self.heights, self.home):
-            height = measured(float(_at(series, time_ns, 1)[0]))
-            if math.isfinite(height):
-                return height
-        altitude = float(_at(self.altitude, time_ns, 1)[0])
-        if ground_alt_m is None or not math.isfinite(altitude):
-            return math.nan
-        return altitude - ground_alt_m
+        heights = (measured(_at(each, time_ns)[0]) for each in (*self.heights, self.home))
+        altitude = math.nan if ground_alt_m is None else _at(self.altitude, time_ns)[0]
+        otherwise = altitude - (ground_alt_m or 0.0)
+        return next(filter(math.isfinite, heights), otherwise)
 
 
 def angles_at(attitude: TimeSeries | None, time_ns: int) -> tuple[float, float, float]:
@@ -284,19 +274,15 @@ def angles_at(attitude: TimeSeries | None, time_ns: int) -> tuple[float, float, 
     return yaw if known else math.nan, pitch, roll
 
 
-def _at(series: TimeSeries | None, time_ns: int, width: int) -> Array:
-    return np.full(width, np.nan) if series is None else series.at(time_ns)
+def _at(series: TimeSeries | None, time_ns: int, width: int = 1) -> list[float]:
+    """The values of a series at a time; NaN where they are unknown."""
+    found: list[float] = [math.nan] * width if series is None else series.at(time_ns).tolist()
+    return found
 
 
-def chosen(role: str, used: str, others: Iterable[str], why: str) -> str:
-    """Which of several sources is used for a role, and why not the others."""
-    unused = ", ".join(others)
-    if used == NO_SOURCE:
-        return f"{role}: none fits of {unused}; --topic {role}=NAME selects one"
-    return f"{role}: using {used}{f', not {unused}' * bool(unused)}: {why}"
-
-
-NO_SOURCE = "none"
+def _known_pair(values: Sequence[float]) -> tuple[float, float] | None:
+    first, second = values
+    return (first, second) if math.isfinite(first + second) else None
 
 
 class Sources:
@@ -367,7 +353,3 @@ def _seconds(series: TimeSeries | None) -> int:
 def measured(height_m: float) -> float:
     """A height, NaN for 0, which recorders write where they measured none."""
     return math.nan if height_m == 0 else height_m
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from bags import Messages, record
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
-from recorders import START_S, camera_file, packet, photo, place, tlog
+from recorders import START_S, camera_file, packet, photo, place, tlog, video
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight import FlightWriter, open_flight, read_image
@@ -39,35 +38,27 @@ def seen(seed):
     return np.clip(VIEW + noise, 0, 255).astype(np.uint8)
 
 
-def photographs(folder):
-    """PNG photographs of DJI, an orientation tag that is not to turn them among them."""
-    xmp = packet(
-        GimbalYawDegree="20.0",
-        GimbalPitchDegree="-90.0",
-        GimbalRollDegree="0.0",
-        RelativeAltitude="160.0",
-    )
+XMP = packet(
+    GimbalYawDegree="20.0",
+    GimbalPitchDegree="-90.0",
+    GimbalRollDegree="0.0",
+    RelativeAltitude="160.0",
+)
+
+
+def photographs(folder, at=None):
+    """PNG photographs of DJI, with an orientation tag that is not to turn them."""
+    gps = () if at is None else place(*at)
     for index in range(2):
-        path = photo(folder / f"{index}.png", f"2023:11:14 22:13:2{index}", xmp=xmp)
-        with Image.open(path) as written:
-            tags, text = written.getexif(), written.info["XML:com.adobe.xmp"]
-        tags[0x0112] = 6
-        info = PngInfo()
-        info.add_itxt("XML:com.adobe.xmp", text)
-        Image.fromarray(seen(index)).save(path, exif=tags, pnginfo=info)
+        time, more = f"2023:11:14 22:13:2{index}", {"pixels": seen(index), "first": {0x0112: 6}}
+        photo(folder / f"{index}.png", time, xmp=XMP, gps=gps, **more)
     return folder
 
 
 def filmed(folder):
     """A lossless video of 2 s with a table of what was known."""
     folder.mkdir()
-    path = folder / "film.mkv"
-    writer = cv2.VideoWriter(
-        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 5.0, VIEW.shape
-    )
-    for index in range(10):
-        writer.write(cv2.cvtColor(seen(index), cv2.COLOR_GRAY2BGR))
-    writer.release()
+    path = video(folder / "film.mkv", 10, 5.0, shown=seen)
     path.with_suffix(".csv").write_text(
         "time_s,yaw_deg,pitch_deg,roll_deg,agl_m\n0,19,0,0,160\n1,21,0,0,160\n2,21,0,0,160\n"
     )
@@ -209,15 +200,12 @@ def test_damaged_input_is_one_line_and_nothing_is_written(run, how, tmp_path, ca
 
 
 def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):
-    source, camera = photographs(tmp_path / "photos"), ["--camera", camera]
-    for index in range(2):
-        add_gps(source / f"{index}.png", place(46.0, 3.0))
-    code, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)
+    localize = "localize", MAP, tmp_path / "photos", "--out", tmp_path / "a.jsonl"
+    photographs(tmp_path / "photos", (46.0, 3.0))
+    code, _, err = run(*localize, "--camera", camera)
     assert code == 0 and re.search(r"first view is 5\d km from the map; check the map", err)
-    for index in range(2):
-        add_gps(source / f"{index}.png", place(*PLACE))
-    _, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)
-    assert "from the map" not in err
+    photographs(tmp_path / "photos", PLACE)
+    assert "from the map" not in run(*localize, "--camera", camera).err
 
 
 @pytest.mark.parametrize("kind", ["photos", "video", "ros"])
@@ -230,9 +218,8 @@ def test_what_was_localized_is_evaluated_and_viewed_as_it_is(run, tmp_path, came
         rows = [f"{header},lat_deg,lon_deg", *(f"{row},{PLACE[0]},{PLACE[1]}" for row in rows)]
         source.with_suffix(".csv").write_text("\n".join(rows) + "\n")
     else:
-        source = photographs(tmp_path / "p") if kind == "photos" else bag(tmp_path / "b", "mcap")
-    for path in source.glob("*.png"):
-        add_gps(path, place(*PLACE))
+        photos = kind == "photos"
+        source = photographs(tmp_path / "p", PLACE) if photos else bag(tmp_path / "b", "mcap")
     fixes = tmp_path / "fixes.jsonl"
     assert run("localize", MAP, source, "--out", fixes, *given).code == 0
     done = run("evaluate", fixes, "--flight", source, "--map", MAP, *given, "--json")
@@ -277,13 +264,3 @@ def test_one_photograph_is_placed_and_printed(run, tmp_path):
     assert both[0] == 2 and "above ground of the views: give it or --dem" in both[2]
     refused = run("localize", MAP, tmp_path)
     assert refused[0] == 2 and "give --out FILE, or --out - for stdout" in refused[2]
-
-
-def add_gps(path, gps):
-    """Write GPS tags into a PNG, which keeps the rest."""
-    with Image.open(path) as written:
-        tags, text, pixels = written.getexif(), written.info["XML:com.adobe.xmp"], written.copy()
-    tags.get_ifd(0x8825).update(gps)
-    info = PngInfo()
-    info.add_itxt("XML:com.adobe.xmp", text)
-    pixels.save(path, exif=tags, pnginfo=info)

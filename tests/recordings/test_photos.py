@@ -237,6 +237,10 @@ def test_missing_metadata_stays_missing(tmp_path):
     options = SourceOptions(ground_alt_m=290.0, looks_down=True)
     telemetry = next(open_source(tmp_path / "q", options).views).telemetry
     assert telemetry.missing() == ["yaw_deg"] and telemetry.agl_m == 110.0
+    photo(tmp_path / "r/a.jpg", gps=place(46.5, 2.5), xmp=dji(height=0.0))  # 0 was not measured
+    recording = open_source(tmp_path / "r")
+    assert next(recording.views).telemetry.missing() == ["agl_m"]
+    assert recording.warnings[0].startswith("no height above ground was recorded")
 
 
 def test_values_that_cannot_be_used_are_counted_with_an_example(tmp_path):
@@ -258,13 +262,6 @@ def test_a_position_without_a_hemisphere_is_not_guessed(tmp_path, more):
     recording = open_source(tmp_path / "p")
     assert next(recording.views).truth_latlon_deg is None
     assert any("GPS position without N or S, or without E" in each for each in recording.warnings)
-
-
-def test_a_height_of_0_was_not_measured(tmp_path):
-    photo(tmp_path / "p/a.jpg", gps=place(46.5, 2.5), xmp=dji(height=0.0))
-    recording = open_source(tmp_path / "p")
-    assert next(recording.views).telemetry.missing() == ["agl_m"]
-    assert recording.warnings[0].startswith("no height above ground was recorded")
 
 
 def test_equal_times_are_named_at_import_and_afterwards(tmp_path):
@@ -444,11 +441,9 @@ def test_sensefly(tmp_path):
 
 @pytest.mark.parametrize("flag, hae", [("50", 431.5), ("0", None)])
 def test_altitudes_of_rtk_are_above_the_ellipsoid(tmp_path, flag, hae):
-    xmp = dji().replace('drone-dji:AbsoluteAltitude="+400.00"', "")
-    more = f'drone-dji:RtkFlag="{flag}" drone-dji:AbsoluteAltitude="+431.50" '
-    photo(
-        tmp_path / "p/a.jpg", xmp=xmp.replace("drone-dji:FlightYaw", f"{more}drone-dji:FlightYaw")
-    )
+    rtk = f'drone-dji:RtkFlag="{flag}" drone-dji:AbsoluteAltitude="+431.50"'
+    xmp = dji().replace('drone-dji:AbsoluteAltitude="+400.00"', rtk)
+    photo(tmp_path / "p/a.jpg", xmp=xmp)
     import_flight(open_source(tmp_path / "p"), tmp_path / "flight")
     (view,) = open_flight(tmp_path / "flight").views
     assert (view.telemetry.hae_m, view.telemetry.amsl_m) == (hae, None)
@@ -495,7 +490,7 @@ def test_whole_values_of_xmp_are_read_and_others_named(text, value):
     expected = {} if value is None else {"Camera:Yaw": value}
     unread = (f"Camera:Yaw='{text}'",) if value is None else ()
     for packet_of in (f'<a Camera:Yaw="{text}"/>', f"<Camera:Yaw>{text}</Camera:Yaw>"):
-        assert Xmp.of(packet_of).values == expected and Xmp.of(packet_of).unread == unread
+        assert Xmp(packet_of).values == expected and Xmp(packet_of).unread == unread
 
 
 # Photographs that an editor has written.
@@ -522,28 +517,19 @@ def test_an_editor_may_have_turned_a_photograph(tmp_path, programs, edited):
 # Photographs of another size, and without a time.
 
 
-def test_photographs_of_another_size_are_left_out(tmp_path):
-    photo(tmp_path / "p/z.jpg", "2023:11:14 22:13:19", width=48, height=64)
-    recording = open_source(series(tmp_path / "p", {}, {}, {}))
-    assert recording.warnings[0] == (
-        "1 of 4 photographs left out, of another size than most, the first: z.jpg"
-    )
-    done = import_flight(recording, tmp_path / "flight")
-    assert (done.views, done.broken) == (3, 0)
+OTHER_FOCAL = [{0xA405: 48, 0x920A: 17.6}, {0xA404: 2.0}, {0xA405: 8}]  # zoomed; cropped; too wide
 
 
 @pytest.mark.parametrize(
-    "other",
-    [{0xA405: 48, 0x920A: 17.6}, {0xA404: 2.0}, {0xA405: 8}],
-    ids=["lens zoom", "digital zoom", "too wide"],
+    "kind, other",
+    [("size", {"width": 48, "height": 64}), *(("focal length", {"more": x}) for x in OTHER_FOCAL)],
 )
-def test_photographs_of_another_focal_length_are_left_out(tmp_path, other):
-    photo(tmp_path / "p/a.jpg", "2023:11:14 22:13:19", more=other, xmp=dji())
+def test_photographs_of_another_size_or_focal_length_are_left_out(tmp_path, kind, other):
+    photo(tmp_path / "p/a.jpg", "2023:11:14 22:13:19", xmp=dji(), **other)
     photo(tmp_path / "p/none.jpg", "2023:11:14 22:13:25", {0xA405: None, 0x920A: None}, xmp=dji())
     recording = open_source(series(tmp_path / "p", {}, {}))
-    assert recording.warnings[0] == (
-        "1 of 4 photographs left out, of another focal length than most, the first: a.jpg"
-    )
+    said = f"1 of 4 photographs left out, of another {kind} than most, the first: a.jpg"
+    assert recording.warnings[0] == said
     assert [view.frame for view in recording.views] == ["0.jpg", "1.jpg", "none.jpg"]
     assert recording.camera.fx_px == pytest.approx(math.hypot(64, 48) * 24 / math.hypot(36, 24))
     given = SourceOptions(camera=camera_file(tmp_path / "camera.json"))

@@ -10,12 +10,7 @@ from orthonav.core.localize import Localizer
 from orthonav.core.localize.confidence import Acceptance
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import Fix, NoFix, Prior, View, ViewResult
-from orthonav.ground.recordings.setups import (
-    SAMPLE,
-    LowConfidenceViews,
-    setup_text,
-    try_setups,
-)
+from orthonav.ground.recordings.setups import SAMPLE, LowConfidenceViews, setup_text, try_setups
 
 ACCEPTS = Acceptance("confidence", 0.9).accepts
 

@@ -5,7 +5,7 @@ import math
 import struct
 import tracemalloc
 import zlib
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -127,11 +127,9 @@ def flown(localizer, flight, folder, mount=None, **how):
     path = localizer.map_path
     info = {"name": path.name, "manifest_sha256": map_digest(path)}
     log = FlightLog(folder / "flight.mcap", flight.camera, info, chunk_s=0.05, **how)
-    plain = None if mount is None else {
-        **{name: vars(getattr(mount, name)) for name in
-           ("heading_deg", "log_scale", "pitch_deg", "roll_deg")}, "views": mount.views,
-    }  # fmt: skip
-    log.options({"heading": "known", "track": True, "mount": plain, "accept": None})
+    log.options(
+        {"heading": "known", "track": True, "mount": mount and asdict(mount), "accept": None}
+    )
     results = []
     for number, view in enumerate(flight.views[:VIEWS]):
         grey, known = view.grey(), view.telemetry
