@@ -29,8 +29,7 @@ from orthonav.onboard.messages.estimate import (
 )
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.outputs import Publisher
-from orthonav.onboard.ros2.node import Rosout
-from orthonav.onboard.ros2.parameters import declared
+from orthonav.onboard.ros2.node import Rosout, declared
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader, loses_images
 from orthonav.onboard.telemetry import TelemetryBuffer, VehicleState
