@@ -27,7 +27,6 @@ from orthonav.onboard.messages.mavlink import (
     is_height,
     is_of_autopilot,
     repeats_height,
-    signing_timestamp,
 )
 from orthonav.onboard.ports import Transport, retry_s
 from orthonav.onboard.telemetry import (
@@ -62,8 +61,7 @@ class AutopilotLink:
         """`system_id`: by default that of the first autopilot heard. `signing`: sign outgoing
         messages and require incoming ones to be signed with the same key. `own_receiver`: number
         of the GNSS receiver that orthonav stands for. Raises `MissingExtraError` where pymavlink is
-        missing or old."""
-        dialect()
+        missing or old, `EstimateError` for an invalid system id."""
         self._opener, self._clocks = opener, clocks
         self.buffer, self.sync = buffer, ClockSync()
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
@@ -85,8 +83,7 @@ class AutopilotLink:
         self._heard_ns = self._attitude_ns = -math.inf
         self._asked: list[int] = []
         self._due = {"heartbeat": 0, "timesync": 0}
-        self._packer: Packer | None = None
-        self._sequence, self._packed, self._resign_ns = 0, 0, 0
+        self._packer = Packer(system_id or 1, signing=signing)
 
     def poll(self, timeout_s: float = 0.0) -> int:
         """Read, waiting at most `timeout_s`, and send what is due; the number of messages."""
@@ -113,7 +110,7 @@ class AutopilotLink:
             if self._silent or self._transport is None:
                 return False
             try:
-                self._transport.write(self._frame(message))
+                self._transport.write(self._packer.pack(message, self._clocks.utc_ns()))
             except OSError as error:
                 self._lost(error)
             return self._transport is not None
@@ -160,7 +157,7 @@ class AutopilotLink:
 
     def signing_now(self) -> int | None:
         with self._lock:
-            return None if self._signing is None else self._signing.timestamp_10us + self._packed
+            return None if self._signing is None else self._packer.timestamp_10us
 
     def close(self) -> None:
         with self._lock:
@@ -193,20 +190,6 @@ class AutopilotLink:
             self._failures += 1
             self._retry_ns = self._clocks.mono_ns() + round(pause_s * 1e9)
 
-    def _frame(self, message: Message) -> bytes:
-        now_ns = self._clocks.mono_ns()
-        if self._packer is None or (self._signing is not None and now_ns >= self._resign_ns):
-            if self._signing is not None:  # timestamps of signatures follow the clock
-                before = self._signing.timestamp_10us + self._packed
-                stamp = max(signing_timestamp(self._clocks.utc_ns()), before)
-                self._signing = replace(self._signing, timestamp_10us=stamp)
-            system_id = self.target.system_id if self.target else self._wanted or 1
-            self._packer = Packer(system_id, sequence=self._sequence, signing=self._signing)
-            self._packed, self._resign_ns = 0, now_ns + 10 * 10**9
-        frame = self._packer.pack(message)
-        self._sequence, self._packed = (self._sequence + 1) % 256, self._packed + 1
-        return frame
-
     def _take(self, data: bytes, now_ns: int) -> int:
         understood = 0
         try:
@@ -214,9 +197,9 @@ class AutopilotLink:
         except Exception as error:  # input is untrusted
             log.debug("incoming data could not be decoded: %s", error)
             self.counts["damaged"] += 1
-            seen = self._incoming.signing.stream_timestamps
+            signing = self._incoming.signing
             self._incoming = _decoder(self._signing)
-            self._incoming.signing.stream_timestamps = seen
+            self._incoming.signing = signing
             return 0
         for message in messages:
             if message.get_type() == "BAD_DATA":
@@ -242,7 +225,7 @@ class AutopilotLink:
                 self.others.append(heard)
             return False
         self.target = heard
-        self._packer = None
+        self._packer.set_system(system_id)
         self._due = dict.fromkeys(self._due, 0)  # send a heartbeat and TIMESYNC at once
         return True
 

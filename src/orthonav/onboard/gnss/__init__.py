@@ -1,6 +1,5 @@
-"""GNSS monitor: positions of GNSS are compared with those of the map, and never used as ours. Figures
-and choices: docs/gnss.md.
+"""GNSS monitor: positions of GNSS are compared with those of the map, and never used as ours.
 
-`biases`: the difference GNSS minus map, what is constant in it, how that is learnt, and the tests
-of a change. `monitor`: one receiver by itself and against the map. `watch`: those of a flight.
+`biases`: what is constant in GNSS minus map, how that is learnt, and the tests of a change.
+`monitor`: one receiver by itself and against the map. `watch`: those of a flight (docs/gnss.md).
 """

@@ -75,17 +75,30 @@ class Packer:
         sequence: int = 0,
         signing: Signing | None = None,
     ) -> None:
-        for name, value in (("system", system_id), ("component", component_id)):
-            if not 1 <= value <= 255:
-                raise EstimateError(f"the {name} id must be 1 to 255, got {value}")
-        self._mav = dialect().MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._mav = dialect().MAVLink(None, srcComponent=component_id)
         self._mav.seq = sequence % 256
+        if not 1 <= component_id <= 255:
+            raise EstimateError(f"the component id must be 1 to 255, got {component_id}")
+        self.set_system(system_id)
         if signing is not None:
             self._mav.signing.secret_key = signing.secret_key
             self._mav.signing.timestamp = signing.timestamp_10us
             self._mav.signing.sign_outgoing = True
 
-    def pack(self, message: Message) -> bytes:
+    def set_system(self, system_id: int) -> None:
+        if not 1 <= system_id <= 255:
+            raise EstimateError(f"the system id must be 1 to 255, got {system_id}")
+        self._mav.srcSystem = system_id
+
+    @property
+    def timestamp_10us(self) -> int:
+        """That of the next signature."""
+        return int(self._mav.signing.timestamp)
+
+    def pack(self, message: Message, utc_ns: int = 0) -> bytes:
+        """The frame; `utc_ns`: time that the timestamps of signatures follow."""
+        signing = self._mav.signing
+        signing.timestamp = max(signing.timestamp, signing_timestamp(utc_ns))
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
