@@ -212,46 +212,43 @@ def test_single_wrong_positions_of_the_map_are_ignored():
     assert all(state is not GnssState.ALARM for state, _ in air.states)
 
 
-def test_without_the_map_the_receiver_is_still_checked():
-    air = Air()
-    assert air.fly(60, map_m=None).state is GnssState.WAITING
-    assert air.fly(1, map_m=None, gnss_m=(40.0, 0.0)).fault is Fault.JUMP
+HERE = {"lat_deg": FRAME.lat_deg, "lon_deg": FRAME.lon_deg}
+NO_MAP, NO_VELOCITY = {"map_m": None}, {"vel_en_mps": None}
 
 
-def test_a_stated_inaccuracy_is_no_position():
+@pytest.mark.parametrize(
+    ("usual", "seconds", "change", "fault"),
+    [
+        (NO_MAP, 1, {"gnss_m": (40.0, 0.0)}, Fault.JUMP),
+        (NO_MAP | NO_VELOCITY, 1, {"gnss_m": (50.0, 0.0)}, Fault.JUMP),
+        ({}, 1, {"std_m": 80.0}, Fault.LOST),
+        ({}, 1, {"std_m": math.nan}, None),
+        *(({}, 1, wrong, Fault.LOST) for wrong in ({"lat_deg": math.nan}, {"lat_deg": 214.7})),
+        ({}, 1, {"lon_deg": 1e9}, Fault.LOST),
+        ({}, 6, HERE | NO_VELOCITY, Fault.FROZEN),
+        ({}, 29, {"vel_en_mps": (3.0, 20.0)}, Fault.VELOCITY),
+    ],
+)
+def test_the_receiver_is_checked_by_itself(usual, seconds, change, fault):
     air = Air()
-    air.fly(100)
-    assert air.fly(1, std_m=80.0).fault is Fault.LOST
+    assert air.fly(60, **usual).state is GnssState.WAITING
+    if fault is Fault.VELOCITY:
+        air.fly(1, **NO_VELOCITY)  # one that is missing delays it only
+    status = air.fly(seconds, **usual | change)
+    assert status.fault is fault
 
 
 def test_a_hovering_receiver_may_repeat_its_position():
     air = Air(speed_mps=0.0)
-    air.fly(100)
-    lat, lon = (float(each) for each in FRAME.latlon_from_en([0.0, 0.0]))
-    air.fly(20, lat_deg=lat, lon_deg=lon)
+    air.fly(60)
+    air.fly(20, **HERE)
     assert all(state is not GnssState.ALARM for state, _ in air.states)
-    air = Air()
-    air.fly(100)
-    status = air.fly(6, lat_deg=lat, lon_deg=lon, vel_en_mps=None)
-    assert status.state is GnssState.ALARM
-
-
-def test_a_wrong_velocity_is_named():
-    air = Air()
-    air.fly(100)
-    air.fly(1, vel_en_mps=None)  # one that is missing delays it only
-    for _ in range(30):
-        status = air.fly(1, vel_en_mps=(3.0, 20.0))
-    assert status.fault is Fault.VELOCITY
 
 
 def test_a_receiver_without_velocity_is_watched():
     air = Air()
-    assert air.fly(200, vel_en_mps=None).state is GnssState.GOOD
-    assert air.fly(6, vel_en_mps=None, gnss_m=(50.0, 0.0)).state is GnssState.ALARM
-    air = Air()  # without the map
-    assert air.fly(60, vel_en_mps=None, map_m=None).fault is None
-    assert air.fly(1, vel_en_mps=None, map_m=None, gnss_m=(50.0, 0.0)).fault is Fault.JUMP
+    assert air.fly(200, **NO_VELOCITY).state is GnssState.GOOD
+    assert air.fly(6, **NO_VELOCITY, gnss_m=(50.0, 0.0)).state is GnssState.ALARM
 
 
 def test_a_slide_past_missing_velocities_is_a_jump():
@@ -271,12 +268,6 @@ def test_a_slide_past_missing_velocities_is_a_jump():
 def test_a_receiver_that_was_never_heard_has_no_fault():
     assert Receiver().fault(10**12, 20.0) is None
     assert Air().fly(100, silent=True).state is GnssState.WAITING
-
-
-def test_invalid_samples_are_lost_not_an_error():
-    for wrong in ({"lat_deg": math.nan}, {"lat_deg": 214.7}, {"lon_deg": 1e9}):
-        assert Air().fly(1, **wrong).fault is Fault.LOST
-    assert Air().fly(1, std_m=math.nan).fault is None
 
 
 def test_a_clock_that_goes_back_begins_a_new_window():
