@@ -73,7 +73,7 @@ class GnssStatus:
     def reason(self) -> str | None:
         if self.state is GnssState.RETURNING:
             return RETURNING
-        return self.fault.value if self.state is GnssState.ALARM and self.fault else None
+        return None if self.fault is None else self.fault.value
 
 
 @dataclass(frozen=True)
@@ -155,9 +155,8 @@ class Receiver:
         if self._usable:
             velocity = np.array(sample.vel_en_mps or (math.nan, math.nan))
             points.append(self._point(time_s, en_m, velocity))
-            span_s = MONITOR.velocity_s
-            if points[0].time_s < time_s - 2 * span_s:  # rarely: deleting moves the list
-                del points[: bisect_left(points, time_s - span_s - MONITOR.gap_s, key=_TIME_S)]
+            if points[0].time_s < time_s - 2 * MONITOR.velocity_s:  # rarely: it moves the list
+                del points[: self._since(MONITOR.velocity_s + MONITOR.gap_s)]
         return self._usable
 
     def fault(self, now_ns: int, speed_mps: float) -> Fault | None:
@@ -185,9 +184,16 @@ class Receiver:
         points = self._points
         if not points or points[0].time_s > points[-1].time_s - span_s:
             return math.nan
-        begin = bisect_left(points, points[-1].time_s - span_s, key=_TIME_S)
+        begin = self._since(span_s)
         known = np.isfinite([each.vel_en_mps for each in points[begin:]]).all()
-        return _apart_m(points[begin], points[-1]) if known else math.nan
+        return self._residual_m(begin) if known else math.nan
+
+    def _since(self, span_s: float) -> int:
+        """Index of the first sample of the last seconds."""
+        return bisect_left(self._points, self._points[-1].time_s - span_s, key=_TIME_S)
+
+    def _residual_m(self, begin: int) -> float:
+        return float(np.hypot(*(self._points[-1].residual_m - self._points[begin].residual_m)))
 
     def _point(self, time_s: float, en_m: Array, velocity: Array) -> _Point:
         if not self._points:
@@ -207,19 +213,13 @@ class Receiver:
         points = self._points
         if len(points) < 2:
             return False
-        first, last, allowed_m = points[-2], points[-1], MONITOR.jump_m
-        if np.isfinite(last.vel_en_mps).all():
-            first = points[bisect_left(points, last.time_s - MONITOR.jump_s, key=_TIME_S)]
-        else:
-            allowed_m += MONITOR.acceleration_mps2 * (last.time_s - first.time_s) ** 2
-        return _apart_m(first, last) > allowed_m
+        if np.isfinite(points[-1].vel_en_mps).all():
+            return self._residual_m(self._since(MONITOR.jump_s)) > MONITOR.jump_m
+        free_m = MONITOR.acceleration_mps2 * (points[-1].time_s - points[-2].time_s) ** 2
+        return self._residual_m(-2) > MONITOR.jump_m + free_m
 
 
 _TIME_S = attrgetter("time_s")
-
-
-def _apart_m(first: _Point, last: _Point) -> float:
-    return float(np.hypot(*(last.residual_m - first.residual_m)))
 
 
 _LEFT = {Fault.JUMP: Fault.STEP} | dict.fromkeys(
@@ -323,6 +323,7 @@ class GnssMonitor:
             self._add(position, at_exposure - position.en_m, sample, now_ns)
 
     def _add(self, position: MapPosition, off_en_m: Array, sample: GnssSample, now_ns: int) -> None:
+        """Add a difference; the median of those of a second is judged."""
         velocity = position.vel_en_mps
         if velocity is None:
             velocity = np.array(sample.vel_en_mps or (0.0, 0.0))
@@ -330,11 +331,11 @@ class GnssMonitor:
         least_m = GNSS_STD_M if sample.fix_type < DIFFERENTIAL else 1.0
         std_m = max(sample.std_m, least_m) if math.isfinite(sample.std_m) else GNSS_STD_M
         time_s = position.time_ns / 1e9
-        flown = math.radians(position.heading_deg), velocity, position.agl_m
         if self._bin and math.floor(self._bin[0].time_s) != math.floor(time_s):
             second, self._bin = self._bin, []
             median = np.median([each.en_m for each in second], axis=0)
             self._judge(replace(second[len(second) // 2], en_m=median), now_ns)
+        flown = math.radians(position.heading_deg), velocity, position.agl_m
         self._bin.append(Difference(time_s, off_en_m, std_m, position.std_m, *flown))
 
     def _judge(self, value: Difference, now_ns: int) -> None:
