@@ -5,6 +5,7 @@ tables below, which were typed from the definitions; it shares nothing with the 
 """
 
 import functools
+import re
 import struct
 
 SIZES = {"B": 1, "b": 1, "s": 1, "H": 2, "I": 4, "i": 4, "f": 4, "Q": 8, "q": 8}
@@ -12,57 +13,41 @@ TYPES = {
     **{"B": "uint8_t", "b": "int8_t", "H": "uint16_t", "I": "uint32_t", "i": "int32_t"},
     **{"f": "float", "Q": "uint64_t", "q": "int64_t", "s": "char"},
 }
-# id: name, checksum seed, fields in the order of the definition, extensions after "|"
+# id, name, checksum seed; fields in the order of the definition, extensions after "|"
+DEFINITIONS = """
+0 HEARTBEAT 50
+    B:type B:autopilot B:base_mode I:custom_mode B:system_status B:mavlink_version |
+48 SET_GPS_GLOBAL_ORIGIN 41
+    B:target_system i:latitude i:longitude i:altitude | Q:time_usec
+75 COMMAND_INT 158
+    B:target_system B:target_component B:frame H:command B:current B:autocontinue
+    f:param1 f:param2 f:param3 f:param4 i:x i:y f:z |
+76 COMMAND_LONG 152
+    B:target_system B:target_component H:command B:confirmation
+    f:param1 f:param2 f:param3 f:param4 f:param5 f:param6 f:param7 |
+102 VISION_POSITION_ESTIMATE 158
+    Q:usec f:x f:y f:z f:roll f:pitch f:yaw | f:covariance:21 B:reset_counter
+111 TIMESYNC 34
+    q:tc1 q:ts1 |
+232 GPS_INPUT 151
+    Q:time_usec B:gps_id H:ignore_flags I:time_week_ms H:time_week B:fix_type i:lat i:lon
+    f:alt f:hdop f:vdop f:vn f:ve f:vd f:speed_accuracy f:horiz_accuracy f:vert_accuracy
+    B:satellites_visible | H:yaw
+253 STATUSTEXT 83
+    B:severity s:text:50 | H:id B:chunk_seq
+296 GLOBAL_POSITION_SENSOR 158
+    B:target_system B:target_component B:id Q:time_usec I:processing_time B:source B:flags
+    i:lat i:lon f:alt_ellipsoid f:alt f:eph f:epv |
+331 ODOMETRY 91
+    Q:time_usec B:frame_id B:child_frame_id f:x f:y f:z f:q:4 f:vx f:vy f:vz f:rollspeed
+    f:pitchspeed f:yawspeed f:pose_covariance:21 f:velocity_covariance:21 | B:reset_counter
+    B:estimator_type b:quality
+"""
 TABLES = {
-    0: (
-        "HEARTBEAT",
-        50,
-        "B:type B:autopilot B:base_mode I:custom_mode B:system_status B:mavlink_version |",
-    ),
-    111: ("TIMESYNC", 34, "q:tc1 q:ts1 |"),
-    253: ("STATUSTEXT", 83, "B:severity s:text:50 | H:id B:chunk_seq"),
-    296: (
-        "GLOBAL_POSITION_SENSOR",
-        158,
-        "B:target_system B:target_component B:id Q:time_usec I:processing_time B:source B:flags "
-        "i:lat i:lon f:alt_ellipsoid f:alt f:eph f:epv |",
-    ),
-    232: (
-        "GPS_INPUT",
-        151,
-        "Q:time_usec B:gps_id H:ignore_flags I:time_week_ms H:time_week B:fix_type i:lat i:lon "
-        "f:alt f:hdop f:vdop f:vn f:ve f:vd f:speed_accuracy f:horiz_accuracy f:vert_accuracy "
-        "B:satellites_visible | H:yaw",
-    ),
-    331: (
-        "ODOMETRY",
-        91,
-        "Q:time_usec B:frame_id B:child_frame_id f:x f:y f:z f:q:4 f:vx f:vy f:vz f:rollspeed "
-        "f:pitchspeed f:yawspeed f:pose_covariance:21 f:velocity_covariance:21 | B:reset_counter "
-        "B:estimator_type b:quality",
-    ),
-    102: (
-        "VISION_POSITION_ESTIMATE",
-        158,
-        "Q:usec f:x f:y f:z f:roll f:pitch f:yaw | f:covariance:21 B:reset_counter",
-    ),
-    48: (
-        "SET_GPS_GLOBAL_ORIGIN",
-        41,
-        "B:target_system i:latitude i:longitude i:altitude | Q:time_usec",
-    ),
-    76: (
-        "COMMAND_LONG",
-        152,
-        "B:target_system B:target_component H:command B:confirmation f:param1 f:param2 f:param3 "
-        "f:param4 f:param5 f:param6 f:param7 |",
-    ),
-    75: (
-        "COMMAND_INT",
-        158,
-        "B:target_system B:target_component B:frame H:command B:current B:autocontinue f:param1 "
-        "f:param2 f:param3 f:param4 i:x i:y f:z |",
-    ),
+    int(number): (name, int(seed), fields)
+    for number, name, seed, fields in re.findall(
+        r"^(\d+) (\w+) (\d+)\n(.+?)(?=^\d|\Z)", DEFINITIONS, re.MULTILINE | re.DOTALL
+    )
 }
 
 

@@ -28,11 +28,22 @@ class Flying(Linked):
     def telemetry(self, **options):
         return self.state.telemetry(0, **options)
 
+    def hear_attitude(self, **angles):
+        return self.hear(self.autopilot.attitude(self.boot_ns(), **angles))
+
+    def say(self, name, *values):
+        """Hear a message of the autopilot; how many were understood."""
+        return self.hear(self.autopilot.say(name, *values))
+
     def position(self, amsl_m, home_m):
         """GLOBAL_POSITION_INT with these heights."""
         mm = round(amsl_m * 1000), round(home_m * 1000)
-        ms = self.boot_ns() // MS
-        self.hear(self.autopilot.say("global_position_int", ms, 0, 0, *mm, 0, 0, 0, 0))
+        self.say("global_position_int", self.boot_ns() // MS, 0, 0, *mm, 0, 0, 0, 0)
+
+    def altitude(self, bottom_m=0, terrain_m=-1001.0, since_ns=0):
+        """ALTITUDE with these heights above ground; `since_ns`: the epoch of its time."""
+        us = (since_ns + self.boot_ns()) // 1000
+        self.say("altitude", us, 0, 640.0, 0, 55.0, terrain_m, bottom_m)
 
 
 @pytest.fixture
@@ -84,12 +95,11 @@ def test_telemetry_at_an_exposure(flying):
 
 
 def test_heights_above_sea_level(flying):
-    flying.hear(flying.autopilot.attitude(flying.boot_ns()))
+    flying.hear_attitude()
     flying.position(0.0, 60.0)
     state = flying.state
     assert state.home_m == state.height_m == 60.0 and math.isnan(state.amsl_m)  # 0 is "unknown"
-    us = flying.boot_ns() // 1000
-    flying.hear(flying.autopilot.say("altitude", us, 0, 640.0, 0, 55.0, -1001.0, 0))
+    flying.altitude()
     assert flying.state.amsl_m == 640.0
     flying.time.go(0.02)
     flying.position(655.0, 60.0)
@@ -110,49 +120,47 @@ PX4, ARDUPILOT = 12, 3
 )
 def test_one_height_that_is_sent_twice_is_not_taken_for_two(kind, amsl_m, home_m, known):
     flying = Flying()
-    flying.hear(flying.autopilot.heartbeat(kind), flying.autopilot.attitude(flying.boot_ns()))
+    flying.hear(flying.autopilot.heartbeat(kind))
+    flying.hear_attitude()
     flying.position(amsl_m, home_m)
     assert (flying.state.home_m, flying.state.amsl_m) == pytest.approx(known, nan_ok=True)
 
 
 def test_heights_of_every_message(flying):
-    now = flying.boot_ns()
-    flying.hear(flying.autopilot.attitude(now, roll_deg=10.0))
+    flying.hear_attitude(roll_deg=10.0)
+    down, autopilot = math.cos(math.radians(10)), flying.autopilot
 
-    def height(*frames):
-        flying.hear(*frames)
+    def height():
         return round(flying.state.height_m, 2)
 
-    unknown = -1001.0
-    say = flying.autopilot.say
-    relative = say("altitude", now // 1000, 0, 0, 0, 55.0, unknown, 0)
-    assert height(relative) == 55.0
-    assert height(flying.autopilot.home(now, 60.0)) == 60.0
+    flying.altitude()
+    assert height() == 55.0
+    flying.hear(autopilot.home(flying.boot_ns(), 60.0))
+    assert height() == 60.0
     flying.time.go(0.02)
-    # stamped since 1970, as some autopilots do
-    since_1970 = say("altitude", (UTC_NS + now) // 1000, 0, 0, 0, 55.0, 42.0, 0)
-    assert height(since_1970) == 42.0
-    down = math.cos(math.radians(10))
-    assert height(say("rangefinder", 50.0, 1.0)) == round(50 * down, 2)
+    flying.altitude(terrain_m=42.0, since_ns=UTC_NS)  # stamped since 1970, as some do
+    assert height() == 42.0
+    flying.say("rangefinder", 50.0, 1.0)
+    assert height() == round(50 * down, 2)
     flying.time.go(2.0)
-    flying.hear(flying.autopilot.attitude(flying.boot_ns(), roll_deg=10.0))
-    assert height(say("altitude", flying.boot_ns() // 1000, 0, 0, 0, 55.0, 42.0, 0)) == 42.0
-    ahead = flying.autopilot.distance(flying.boot_ns(), 7.0, orientation=0)
+    flying.hear_attitude(roll_deg=10.0)
+    flying.altitude(terrain_m=42.0)
+    assert height() == 42.0
     ms = flying.boot_ns() // MS
-    too_far = say("distance_sensor", ms, 20, 5000, 5000, 0, 0, 25, 255)
-    invalid = say("distance_sensor", ms, 20, 5000, 700, 0, 0, 25, 255, 0, 0, [0] * 4, 1)
-    no_limits = say("rangefinder", 50.0, 1.0)  # of the sensor that is out of its limits
-    assert height(ahead, too_far, invalid, no_limits) == 42.0
+    flying.hear(autopilot.distance(flying.boot_ns(), 7.0, orientation=0))  # ahead
+    flying.say("distance_sensor", ms, 20, 5000, 5000, 0, 0, 25, 255)  # too far
+    flying.say("distance_sensor", ms, 20, 5000, 700, 0, 0, 25, 255, 0, 0, [0] * 4, 1)  # invalid
+    flying.say("rangefinder", 50.0, 1.0)  # without the limits of the sensor that is out of them
+    assert height() == 42.0
     flying.time.go(0.02)
-    telemetry = flying.autopilot.distance(flying.boot_ns(), 40.0)
-    assert height(telemetry) == round(40 * down, 2)
+    flying.hear(autopilot.distance(flying.boot_ns(), 40.0))
+    assert height() == round(40 * down, 2)
 
 
 def test_a_barometer_and_the_terrain_of_px4_are_no_heights(flying):
     """The terrain is 150 m above the origin of the local frame, and the aircraft 80 m above it."""
-    now = flying.boot_ns()
-    flying.hear(flying.autopilot.attitude(now))
-    flying.hear(flying.autopilot.say("altitude", now // 1000, 489.8, 489.8, 0, 55.0, 150.0, 80.0))
+    flying.hear_attitude()
+    flying.say("altitude", flying.boot_ns() // 1000, 489.8, 489.8, 0, 55.0, 150.0, 80.0)
     state = flying.state
     assert math.isnan(state.amsl_m) and state.height_m == 80.0
 
@@ -160,7 +168,7 @@ def test_a_barometer_and_the_terrain_of_px4_are_no_heights(flying):
 def test_attitude_as_a_quaternion(flying):
     half = math.radians(45.0)
     values = math.cos(half), 0, 0, math.sin(half), 0, 0, 0
-    flying.hear(flying.autopilot.say("attitude_quaternion", flying.boot_ns() // MS, *values))
+    flying.say("attitude_quaternion", flying.boot_ns() // MS, *values)
     assert flying.telemetry().yaw_deg == pytest.approx(90.0, abs=1e-3)
     assert flying.telemetry(mount_deg=(90.0, 0.0, 0.0)).yaw_deg == pytest.approx(180.0, abs=1e-3)
 
@@ -197,19 +205,16 @@ def test_clocks_are_compared(flying):
         flying.time.go(0.004)
         there = flying.boot_ns()
         flying.time.go(0.004)
-        flying.hear(flying.autopilot.say("timesync", there, asked["ts1"]))
+        flying.say("timesync", there, asked["ts1"])
     assert flying.link.sync.is_exact
-    assert flying.link.boot_ns(flying.time.now_ns) == pytest.approx(flying.boot_ns(), abs=MS)
-    other = flying.autopilot.say("timesync", 1, 12345)  # an answer without a request
-    flying.hear(other)
-    assert flying.link.boot_ns(flying.time.now_ns) == pytest.approx(flying.boot_ns(), abs=MS)
+    for _ in range(2):
+        assert flying.link.boot_ns(flying.time.now_ns) == pytest.approx(flying.boot_ns(), abs=MS)
+        flying.say("timesync", 1, 12345)  # an answer without a request
 
 
-def test_timesync_is_answered_by_the_clock_of_the_stamps():
+def test_timesync_is_answered_by_the_clock_of_the_stamps(flying):
     """PX4 converts the stamps of ODOMETRY by the offset that TIMESYNC gives it."""
-    flying = Flying()
-    flying.hear(flying.autopilot.heartbeat())
-    flying.hear(flying.autopilot.say("timesync", 0, 776))
+    flying.say("timesync", 0, 776)
     answer = next(each for each in flying.port.sent("TIMESYNC") if each["tc1"])
     assert (answer["tc1"], answer["ts1"]) == (flying.time.clocks.utc_ns(), 776)
 
@@ -259,20 +264,15 @@ def test_a_signed_link_ignores_unsigned_messages():
 
 
 def test_the_origin_of_the_autopilot_is_stored_until_it_restarts(flying):
-    flying.hear(flying.autopilot.say("gps_global_origin", 481000000, 20000000, 120_000))
-    flying.hear(flying.autopilot.attitude(flying.boot_ns()))
+    flying.say("gps_global_origin", 481000000, 20000000, 120_000)
+    flying.say("gps_global_origin", 2**31 - 1, 20000000, 120_000)
+    assert flying.link.counts["damaged"] == 1
+    flying.hear_attitude()
     assert flying.link.origin == Origin(48.1, 2.0, 120.0)
     for number in range(40):
         flying.time.go(0.05)
         flying.hear(flying.autopilot.attitude((number + 1) * 50 * MS))
     assert flying.link.sync.jumps == 1 and flying.link.origin is None
-
-
-def stds(flying):
-    telemetry = flying.state.telemetry(0)
-    total_deg, mount_deg = telemetry.tilt_std_deg, telemetry.mount_std_deg
-    assert total_deg == math.hypot(telemetry.horizon_std_deg, mount_deg) and mount_deg == 2.5
-    return telemetry.vel_std_mps, pytest.approx(telemetry.horizon_std_deg)
 
 
 ABSOLUTE, DEAD_RECKONING = 831, 303
@@ -284,30 +284,36 @@ class Reporting(Flying):
 
     def __init__(self, **options):
         super().__init__(**options)
-        self.hear(self.autopilot.heartbeat(), self.autopilot.attitude(self.boot_ns()))
+        self.hear(self.autopilot.heartbeat())
+        self.hear_attitude()
+
+    def stds(self):
+        telemetry = self.telemetry()
+        total_deg, mount_deg = telemetry.tilt_std_deg, telemetry.mount_std_deg
+        assert total_deg == math.hypot(telemetry.horizon_std_deg, mount_deg) and mount_deg == 2.5
+        return telemetry.vel_std_mps, pytest.approx(telemetry.horizon_std_deg)
 
     def report(self, flags=ABSOLUTE, receivers=(3,), vel_std_mps=None, ardupilot=False):
-        say, us = self.autopilot.say, self.boot_ns() // 1000
+        us = self.boot_ns() // 1000
         if ardupilot:
-            self.hear(say("ekf_status_report", flags, 0, 0, 0, 0, 0))
+            self.say("ekf_status_report", flags, *[0] * 5)
         elif flags is not None:
-            self.hear(say("estimator_status", us, flags, 0, 0, 0, 0, 0, 0, 0, 0))
+            self.say("estimator_status", us, flags, *[0] * 8)
         for number, fix_type in enumerate(receivers):
-            name = ("gps_raw_int", "gps2_raw")[number]
-            more = () if number == 0 else (0, 0)
-            self.hear(say(name, us, fix_type, 0, 0, 0, 0, 0, 0, 0, 9, *more))
+            name, more = (("gps_raw_int", ()), ("gps2_raw", (0, 0)))[number]
+            self.say(name, us, fix_type, *[0] * 7, 9, *more)
         if vel_std_mps is not None:
             covariance = [0.0] * 21
             covariance[0], covariance[6] = vel_std_mps**2, 0.01
             place = us, 1, 12, 0, 0, 0, (1.0, 0, 0, 0), 0, 0, 0, 0, 0, 0
-            self.hear(say("odometry", *place, [0.0] * 21, covariance, 0, 8, 0))
-        return stds(self)
+            self.say("odometry", *place, [0.0] * 21, covariance, 0, 8, 0)
+        return self.stds()
 
 
 @pytest.mark.parametrize("ardupilot", [False, True])
 def test_velocity_and_horizon_are_accurate_only_while_gnss_holds_the_filter(ardupilot):
     flying, unaided = Reporting(), (5.0, 1.0) if ardupilot else UNAIDED  # its horizon holds
-    assert stds(flying) == UNAIDED  # nothing is known
+    assert flying.stds() == UNAIDED  # nothing is known
     assert flying.report(ardupilot=ardupilot) == GNSS_AIDED
     assert flying.report(DEAD_RECKONING, ardupilot=ardupilot) == unaided
     assert flying.report(ABSOLUTE | 1024, ardupilot=ardupilot) == unaided  # glitch, uninitialized

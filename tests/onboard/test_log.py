@@ -27,6 +27,7 @@ from orthonav.onboard.log import FlightLog
 CAMERA = Camera(64, 48, 50.5, 50.25, 32.125, 24.0, (0.1, -0.02, 0.001, 0.002))
 MAP = {"name": "area.onav", "manifest_sha256": "0" * 64}
 START_NS = 1_700_000_000_123_456_789
+STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def telemetry(index):
@@ -43,10 +44,10 @@ def outcome(index, frame):
     return ViewResult(frame, START_NS + index * 10**9, answer, 12.5, "tracking")
 
 
-def log_views(log, numbers, shape=(48, 64)):
+def log_views(log, numbers):
     for index in numbers:
         frame = f"{index:06d}.png"
-        log.view(index, frame, picture(index, shape), telemetry(index))
+        log.view(index, frame, picture(index), telemetry(index))
         log.result(outcome(index, frame))
 
 
@@ -56,15 +57,30 @@ def begun(folder, **how):
     return log
 
 
-def read(path, reader=make_reader):
+def read(folder, name="flight_0001.mcap", reader=make_reader):
     """Topic to messages, by the library's own reader; `NonSeekingReader`: of a file whose ending
     may not have had space."""
     found, allowed = {}, [EndOfFile] if reader is NonSeekingReader else []
-    with path.open("rb") as stream, contextlib.suppress(*allowed):
+    with (folder / name).open("rb") as stream, contextlib.suppress(*allowed):
         whole = reader(stream, validate_crcs=True)
         for _, channel, message in whole.iter_messages(log_time_order=False):
-            found.setdefault(channel.topic, []).append(message)
+            found.setdefault(channel.topic.removeprefix("/orthonav/"), []).append(message)
     return found
+
+
+def summary(folder):
+    with (folder / "flight_0001.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        return reader.get_header(), reader.get_summary()
+
+
+def decoded(message, kind):
+    """A message of `sensor_msgs`."""
+    return STORE.deserialize_cdr(message.data, f"sensor_msgs/msg/{kind}")
+
+
+def pictures(found):
+    return [each["picture"] for each in plain(found["telemetry"])]
 
 
 def plain(messages):
@@ -80,19 +96,14 @@ def test_the_reader_of_mcap_reads_a_log(tmp_path):
     log_views(log, range(6))
     log.health({"level": "ok", "share": math.nan})
     log.close()
-    path = tmp_path / "flight_0001.mcap"
-    found = read(path)
-    with path.open("rb") as stream:
-        reader = make_reader(stream)
-        assert reader.get_header().profile == "orthonav"
-        counts = reader.get_summary().statistics.channel_message_counts
-        assert sum(counts.values()) == sum(map(len, found.values()))
-    assert len(found["/orthonav/view"]) == len(found["/orthonav/result"]) == 6
-    assert [message.log_time for message in found["/orthonav/view"]] == [
-        START_NS + index * 10**9 for index in range(6)
-    ]
-    assert len(found["/orthonav/navsatfix"]) == 5
-    health = plain(found["/orthonav/health"])[-1]
+    found, (header, whole) = read(tmp_path), summary(tmp_path)
+    assert header.profile == "orthonav"
+    counts = whole.statistics.channel_message_counts
+    assert sum(counts.values()) == sum(map(len, found.values()))
+    times = [START_NS + index * 10**9 for index in range(6)]
+    assert [message.log_time for message in found["view"]] == times
+    assert (len(found["result"]), len(found["navsatfix"])) == (6, 5)
+    health = plain(found["health"])[-1]
     assert health == {"level": "ok", "share": "NaN", "log_lost": {"views": 0, "messages": 0}}
 
 
@@ -101,38 +112,31 @@ def test_messages_are_as_foxglove_requires(tmp_path):
     log = begun(tmp_path)
     log_views(log, range(1))
     log.close()
-    found = read(tmp_path / "flight_0001.mcap")
-    stamp = {"sec": START_NS // 10**9, "nsec": START_NS % 10**9}
-    camera = plain(found["/orthonav/camera"])[0]
+    found, stamp = read(tmp_path), divmod(START_NS, 10**9)
+    camera = plain(found["camera"])[0]
     assert (camera["width"], camera["height"]) == (64, 48)
     assert camera["distortion_model"] == "plumb_bob" and len(camera["D"]) == 5
     assert camera["K"] == [50.5, 0, 31.625, 0, 50.25, 23.5, 0, 0, 1]
     assert len(camera["R"]) == 9 and len(camera["P"]) == 12
-    with (tmp_path / "flight_0001.mcap").open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    schemas = {each.name: each for each in summary.schemas.values()}
+    schemas = {each.name: each for each in summary(tmp_path)[1].schemas.values()}
     for name in ("foxglove.CameraCalibration", "orthonav.Telemetry"):
         text = json.loads(schemas[name].data)
         assert schemas[name].encoding == "jsonschema" and text["title"] == name
-    store = get_typestore(Stores.ROS2_HUMBLE)
     for name in ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/NavSatFix"):
         assert schemas[name].encoding == "ros2msg"
         text = schemas[name].data.decode()
         for kind, (_, fields) in get_types_from_msg(text, name).items():
-            assert fields == store.fielddefs[kind][1]
-    kind = "sensor_msgs/msg/CompressedImage"
-    view = store.deserialize_cdr(found["/orthonav/view"][0].data, kind)
-    assert (view.header.stamp.sec, view.header.stamp.nanosec) == tuple(stamp.values())
-    assert (view.header.frame_id, view.format) == ("camera", "png")
+            assert fields == STORE.fielddefs[kind][1]
+    view = decoded(found["view"][0], "CompressedImage")
+    navsat = decoded(found["navsatfix"][0], "NavSatFix")
+    for each in (view, navsat):
+        assert (each.header.stamp.sec, each.header.stamp.nanosec) == stamp
+        assert each.header.frame_id == "camera"
+    assert view.format == "png"
     assert np.array_equal(cv2.imdecode(view.data, cv2.IMREAD_UNCHANGED), picture(0))
-    navsat = store.deserialize_cdr(
-        found["/orthonav/navsatfix"][0].data, "sensor_msgs/msg/NavSatFix"
-    )
-    assert (navsat.header.stamp.sec, navsat.header.stamp.nanosec) == tuple(stamp.values())
-    assert navsat.header.frame_id == "camera" and navsat.status.service == 0
     assert (navsat.latitude, navsat.longitude) == (46.5, 2.5) and math.isnan(navsat.altitude)
     assert navsat.position_covariance.tolist() == [4, 1, 0, 1, 9, 0, 0, 0, 1e8]
-    assert navsat.position_covariance_type == 3
+    assert (navsat.position_covariance_type, navsat.status.service) == (3, 0)
 
 
 @pytest.mark.parametrize(
@@ -144,10 +148,8 @@ def test_only_confident_fixes_have_a_fix_status_for_ros(tmp_path, confidence, st
     placed = replace(result.outcome, confidence=confidence)
     log.result(replace(result, outcome=placed, state=state))
     log.close()
-    (message,) = read(tmp_path / "flight_0001.mcap")["/orthonav/navsatfix"]
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    read_back = store.deserialize_cdr(message.data, "sensor_msgs/msg/NavSatFix")
-    assert read_back.status.status == status
+    (message,) = read(tmp_path)["navsatfix"]
+    assert decoded(message, "NavSatFix").status.status == status
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 70), (33, 1), (48, 65)])
@@ -157,17 +159,19 @@ def test_images_are_stored_without_loss(shape):
     assert np.array_equal(cv2.imdecode(np.frombuffer(png, np.uint8), -1), grey)
 
 
-def test_views_none_thumbnails_and_full(tmp_path):
-    for views in ("none", "thumbnails"):
-        log = begun(tmp_path / views, views=views)
-        log.view(0, "0.png", picture(0, (960, 1280)), telemetry(0))
-        log.view(1, "1.png", None, telemetry(1))
-        log.close()
-        found = read(tmp_path / views / "flight_0001.mcap")
-        found_images = [each["picture"] for each in plain(found["/orthonav/telemetry"])]
-        assert found_images == [{"none": "none", "thumbnails": "thumbnail"}[views], "bad"]
-        assert "/orthonav/view" not in found
-        assert len(found.get("/orthonav/thumbnail", [])) == (views == "thumbnails")
+@pytest.mark.parametrize(("views", "logged"), [("none", "none"), ("thumbnails", "thumbnail")])
+def test_views_may_be_small_or_left_out(tmp_path, views, logged):
+    log = begun(tmp_path, views=views)
+    log.view(0, "0.png", picture(0, (960, 1280)), telemetry(0))
+    log.view(1, "1.png", None, telemetry(1))
+    log.close()
+    found = read(tmp_path)
+    assert pictures(found) == [logged, "bad"] and "view" not in found
+    sizes = [
+        cv2.imdecode(decoded(each, "CompressedImage").data, cv2.IMREAD_UNCHANGED).shape
+        for each in found.get("thumbnail", [])
+    ]
+    assert sizes == ([] if views == "none" else [(240, 320)])
 
 
 def test_chunks_are_on_disk_before_the_end(tmp_path):
@@ -199,10 +203,10 @@ def test_a_slow_disk_does_not_block_the_flight(tmp_path, monkeypatch):
     goes_on.set()
     log.close()
     assert in_time and all(in_time)  # the flight went on while the disk was stuck
-    found = read(tmp_path / "flight_0001.mcap")
-    assert len(found["/orthonav/result"]) == len(found["/orthonav/telemetry"]) == 40
-    dropped = [each["picture"] for each in plain(found["/orthonav/telemetry"])].count("dropped")
-    assert 0 < dropped == log.lost["views"] == 40 - len(found["/orthonav/view"])
+    found = read(tmp_path)
+    assert len(found["result"]) == len(found["telemetry"]) == 40
+    dropped = pictures(found).count("dropped")
+    assert 0 < dropped == log.lost["views"] == 40 - len(found["view"])
     assert log.lost["messages"] == 0
 
 
@@ -235,12 +239,10 @@ def test_a_full_disk_drops_images_first(tmp_path, monkeypatch):
         wait_for(lambda: not log._queue)
         time.sleep(0.012)
     log.close()
-    logged = {}
-    for name in files_in(tmp_path):
-        for topic, messages in read(tmp_path / name, NonSeekingReader).items():
-            logged.setdefault(topic, []).extend(messages)
-    assert log.lost["views"] == 30 - len(logged["/orthonav/view"]) > 10
-    assert len(logged["/orthonav/result"]) > len(logged["/orthonav/view"]) >= 4
+    logged = [read(tmp_path, name, NonSeekingReader) for name in files_in(tmp_path)]
+    views, results = (sum(len(each.get(t, [])) for each in logged) for t in ("view", "result"))
+    assert log.lost["views"] == 30 - views > 10
+    assert results > views >= 4
     assert disk["room"] >= 0
 
 
@@ -255,9 +257,9 @@ def test_logging_continues_when_a_full_disk_has_space_again(tmp_path, monkeypatc
     log_views(log, range(5, 8))
     log.health({})
     log.close()
-    found = read(tmp_path / "flight_0001.mcap")
-    assert [message.sequence for message in found["/orthonav/view"]] == [5, 6, 7]
-    assert plain(found["/orthonav/health"])[0]["log_lost"] == log.lost
+    found = read(tmp_path)
+    assert [message.sequence for message in found["view"]] == [5, 6, 7]
+    assert plain(found["health"])[0]["log_lost"] == log.lost
     assert log.lost["views"] == 5
 
 
@@ -286,11 +288,11 @@ def test_files_are_limited_and_the_oldest_are_deleted(tmp_path):
     assert len(files) >= 2 and files[0].name != "flight_0001.mcap"
     last = -1
     for path in files:
-        found = read(path)
-        sessions = plain(found["/orthonav/session"])
-        assert sessions[0]["options"]["heading"] == "known" and sessions[0]["map"] == MAP
-        assert "/orthonav/camera" in found
-        numbers = [message.sequence for message in found["/orthonav/view"]]
+        found = read(tmp_path, path.name)
+        session = plain(found["session"])[0]
+        assert session["options"]["heading"] == "known" and session["map"] == MAP
+        assert "camera" in found
+        numbers = [message.sequence for message in found["view"]]
         assert numbers == sorted(numbers) and numbers[0] > last
         last = numbers[-1]
     assert last == 199
@@ -302,8 +304,8 @@ def test_existing_files_are_not_overwritten(tmp_path):
         log_views(log, range(first, first + 5))
         log.close()
     assert files_in(tmp_path) == ["flight_0001.mcap", "flight_0002.mcap"]
-    sessions = [read(tmp_path / name)["/orthonav/session"] for name in files_in(tmp_path)]
-    assert plain(sessions[0])[0]["run"] != plain(sessions[1])[0]["run"]
+    first, second = (plain(read(tmp_path, name)["session"])[0] for name in files_in(tmp_path))
+    assert first["run"] != second["run"]
 
 
 def test_messages_that_cannot_be_encoded_are_counted(tmp_path):
@@ -314,12 +316,11 @@ def test_messages_that_cannot_be_encoded_are_counted(tmp_path):
     log_views(log, range(1, 3))
     log.close()
     log_views(log, range(3, 5))
-    found = read(tmp_path / "flight_0001.mcap")
-    assert len(found["/orthonav/view"]) == 2
-    pictures = [each["picture"] for each in plain(found["/orthonav/telemetry"])]
-    assert pictures == ["none", "full", "full"]  # the telemetry is not lost
+    found = read(tmp_path)
+    assert len(found["view"]) == 2
+    assert pictures(found) == ["none", "full", "full"]  # the telemetry is not lost
     assert log.lost == {"views": 3, "messages": 6}
-    assert plain(found["/orthonav/session"])[0]["options"]["heading"] == "known"
+    assert plain(found["session"])[0]["options"]["heading"] == "known"
 
 
 def test_a_thumbnail_that_cannot_be_encoded_leaves_the_telemetry(tmp_path, monkeypatch):
@@ -327,16 +328,16 @@ def test_a_thumbnail_that_cannot_be_encoded_leaves_the_telemetry(tmp_path, monke
     log = begun(tmp_path, views="thumbnails")
     log.view(0, "0.png", picture(0), telemetry(0))
     log.close()
-    found = read(tmp_path / "flight_0001.mcap")
-    assert [each["picture"] for each in plain(found["/orthonav/telemetry"])] == ["none"]
-    assert "/orthonav/thumbnail" not in found and log.lost == {"views": 1, "messages": 0}
+    found = read(tmp_path)
+    assert pictures(found) == ["none"]
+    assert "thumbnail" not in found and log.lost == {"views": 1, "messages": 0}
 
 
 def test_the_camera_has_the_size_of_the_images(tmp_path):
     log = begun(tmp_path)
     log.view(0, "0.png", picture(0, (24, 32)), telemetry(0))
     log.close()
-    session = plain(read(tmp_path / "flight_0001.mcap")["/orthonav/session"])[-1]
+    session = plain(read(tmp_path)["session"])[-1]
     assert session["camera"]["width_px"] == 32 and session["camera"]["fx_px"] == 25.25
 
 

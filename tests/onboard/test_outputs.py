@@ -19,14 +19,7 @@ from orthonav.core.records import NoFix, ViewResult
 from orthonav.onboard.messages.estimate import NavigationEstimate, messages_averaged
 from orthonav.onboard.messages.gate import Gate, GateRules
 from orthonav.onboard.messages.mavlink import Autopilot, Origin, Packer, Target, north_east_m
-from orthonav.onboard.outputs import (
-    KINDS,
-    JsonOut,
-    Messenger,
-    NmeaOut,
-    Publisher,
-    open_sink,
-)
+from orthonav.onboard.outputs import KINDS, JsonOut, Messenger, NmeaOut, Publisher, sink_opener
 from orthonav.onboard.telemetry import VehicleState
 from wire import decode
 
@@ -105,7 +98,7 @@ def test_messages_that_the_link_does_not_take_are_not_counted_as_sent():
 
 
 def find_origin(sending, seconds, known=None, *, armed=False):
-    """What is sent while an autopilot is asked; `known`: the origin that it reports."""
+    """Names of what is sent while an autopilot is asked; `known`: the origin that it reports."""
     sending.frames.clear()
     sending.origin, sending.target, sending.armed = known, Target(3, 1), armed
     for _ in range(10 * seconds):
@@ -114,16 +107,18 @@ def find_origin(sending, seconds, known=None, *, armed=False):
     return [each["name"] for each in sending.frames]
 
 
-def test_the_autopilot_is_asked_for_its_origin_at_a_modest_interval():
-    for kind in ("odometry", "vision"):
-        sending = Sending(kind)
-        assert find_origin(sending, 10) == ["COMMAND_LONG"] * 5
-        asked = sending.frames[0]
-        assert (asked["command"], asked["param1"]) == (512, 49.0)
-        assert (asked["target_system"], asked["target_component"]) == (3, 1)
+@pytest.mark.parametrize("kind", ["odometry", "vision"])
+def test_the_autopilot_is_asked_for_its_origin_at_a_modest_interval(kind):
+    sending = Sending(kind)
+    assert find_origin(sending, 10) == ["COMMAND_LONG"] * 5
+    asked = sending.frames[0]
+    assert (asked["command"], asked["param1"]) == (512, 49.0)
+    assert (asked["target_system"], asked["target_component"]) == (3, 1)
     assert find_origin(sending, 5, ORIGIN) == []
+
+
+def test_global_messages_need_no_origin_unless_the_autopilot_starts_there():
     assert find_origin(Sending("gps-input", "global-position"), 10) == []
-    # A start without GNSS needs one whatever is sent.
     assert "SET_GPS_GLOBAL_ORIGIN" in find_origin(Sending("global-position", origin=ORIGIN), 10)
 
 
@@ -162,14 +157,12 @@ def test_the_accuracy_for_filters_grows_with_the_rate():
     for _ in range(2):
         sending.publish()
         sending.time.go(0.5)
-    first, again = sending.frames[:3], sending.frames[3:]
-    assert (first[0]["eph"], first[1]["horiz_accuracy"]) == (3.0, 3.0)
-    assert first[2]["pose_covariance"][0] == 9.0
     averaged = messages_averaged(0.5)
     assert averaged > 5
-    assert again[0]["eph"] == pytest.approx(3.0 * math.sqrt(averaged))
-    assert again[1]["horiz_accuracy"] == pytest.approx(3.0 * math.sqrt(averaged))
-    assert again[2]["pose_covariance"][0] == pytest.approx(9.0 * averaged)
+    for frames, times in ((sending.frames[:3], 1.0), (sending.frames[3:], averaged)):
+        sensor, gps, odometry = frames
+        assert sensor["eph"] == gps["horiz_accuracy"] == pytest.approx(3.0 * math.sqrt(times))
+        assert odometry["pose_covariance"][0] == pytest.approx(9.0 * times)
 
 
 def test_the_gate_judges_the_accuracy_of_the_fix():
@@ -212,22 +205,22 @@ def test_nmea_over_udp():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
         heard.bind(("127.0.0.1", 0))
         heard.settimeout(60)
-        out = NmeaOut(open_sink(f"udp:127.0.0.1:{heard.getsockname()[1]}"))
+        out = NmeaOut(sink_opener(f"udp:127.0.0.1:{heard.getsockname()[1]}"))
         out.write(ESTIMATE, UTC_NS)
         gga, rmc, gst = sentences(heard.recv(500))
         out.write(None, UTC_NS)
         none, *_ = sentences(heard.recv(500))
         out.close()
+        out.close()
     assert (gga.msgID, rmc.msgID, gst.msgID) == ("GGA", "RMC", "GST")
     assert (gga.quality, none.quality) == (6, 0)
     assert (gga.lat, rmc.lon) == pytest.approx((48.01, 2.01), abs=1e-6)
-    out.close()
 
 
 def test_nmea_over_a_serial_port_that_is_unplugged():
     ours, theirs = pty.openpty()
     name = os.ttyname(theirs)
-    out = NmeaOut(open_sink(f"serial:{name}:115200"))
+    out = NmeaOut(sink_opener(f"serial:{name}:115200"))
     out.write(ESTIMATE, UTC_NS)
     assert sentences(os.read(ours, 500))[0].quality == 6
     os.close(theirs)
@@ -238,20 +231,39 @@ def test_nmea_over_a_serial_port_that_is_unplugged():
     out.close()
 
 
-class Written:
-    """A sink that stores what is written."""
+class Port:
+    """What is written to it; a port that is not `there` fails."""
 
     def __init__(self):
-        self.data = b""
+        self.data, self.there, self.opened = b"", True, 0
+
+    def open(self):
+        self.opened += 1
+        return self
 
     def write(self, data):
+        if not self.there:
+            raise OSError("unplugged")
         self.data += data
+
+    def close(self): ...
+
+
+def test_a_port_is_opened_again_after_a_failure():
+    port = Port()
+    out = NmeaOut(port.open)
+    port.there = False
+    with pytest.raises(OSError, match="unplugged"):
+        out.write(ESTIMATE, UTC_NS)
+    port.there = True
+    out.write(ESTIMATE, UTC_NS)
+    out.write(ESTIMATE, UTC_NS)
+    assert port.opened == 2 and len(sentences(port.data)) == 6
 
 
 def test_nmea_times_are_those_of_exposures_and_never_step_back():
-    time, sink = Time(), Written()
-    gate = Gate()
-    publisher = Publisher(gate, time.clocks, nmea=[NmeaOut(sink)])
+    time, port = Time(), Port()
+    publisher = Publisher(Gate(), time.clocks, nmea=[NmeaOut(port.open)])
     begin_ns = time.now_ns
     ages_s = [(0.1, False), (0.4, True), (0.1, True), (0.3, False), (0.2, True)]
     for age_s, is_found in ages_s:
@@ -261,19 +273,19 @@ def test_nmea_times_are_those_of_exposures_and_never_step_back():
         publisher.publish(
             ViewResult("a", 5, outcome, 1.0, "tracking"), exposed_ns, VEHICLE, judged=True
         )
-    times = [each.time for each in sentences(sink.data)]
+    times = [each.time for each in sentences(port.data)]
     shown = [(each.second + each.microsecond / 1e6) for each in times]
     begin_s = (UTC_NS + begin_ns) / S % 60
     assert [each - begin_s for each in shown] == pytest.approx([0.0] * 3 + [0.2] * 3 + [0.3] * 3)
     time.utc_ahead_ns -= 3600 * S  # a clock that is set back is followed
     publisher.publish(ViewResult("a", 5, fix(), 1.0, None), time.now_ns, VEHICLE, judged=True)
-    assert len(sentences(sink.data)) == 12
+    assert len(sentences(port.data)) == 12
 
 
 @pytest.mark.parametrize("url", ["", "udp:here", "http://x", "serial:ttyS0", "tcp-listen:0"])
 def test_invalid_urls_of_outputs_are_refused(url):
     with pytest.raises(VariantError):
-        open_sink(url)
+        sink_opener(url)
 
 
 RESULT = ViewResult("000001", UTC_NS + 5, fix(), 12.5, "tracking")

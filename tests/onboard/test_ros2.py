@@ -29,8 +29,7 @@ from orthonav.onboard.messages.estimate import (
 )
 from orthonav.onboard.messages.gate import Gate
 from orthonav.onboard.outputs import Publisher
-from orthonav.onboard.ros2.node import Rosout
-from orthonav.onboard.ros2.parameters import declared
+from orthonav.onboard.ros2.node import Rosout, declared
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader, loses_images
 from orthonav.onboard.telemetry import TelemetryBuffer, VehicleState
@@ -81,13 +80,14 @@ class Reading:
         return self.read().telemetry
 
     def send_view(self, now_ns=None, angles=(90.0, 0.0, 0.0), **changes):
-        """An image among telemetry before and after it."""
+        """An image among telemetry before and after it; what is read of it."""
         now_ns = now_ns or self.now_ns
         for offset_ms in (-40, -20, 0):
             time_ns = now_ns + offset_ms * 10**6
             self.write(IMU, imu(time_ns, angles))
             self.write("/range", MESSAGES.range(time_ns, 80.0))
         self.write(IMAGE, image(now_ns - 10**7, **changes))
+        return self.read()
 
 
 def image(time_ns, **changes):
@@ -104,8 +104,7 @@ def imu(time_ns, angles=(90.0, 0.0, 0.0), **options):
 def test_an_image_has_the_telemetry_of_its_exposure():
     flying = Reading()
     now_ns, then_ns = flying.now_ns, flying.time.now_ns
-    flying.send_view(now_ns, (60.0, 3.0, -2.0))
-    seen = flying.read()
+    seen = flying.send_view(now_ns, (60.0, 3.0, -2.0))
     assert seen.problem is None and np.array_equal(seen.grey, picture(3))
     assert (seen.time_ns, seen.exposed_ns) == (now_ns - 10**7, then_ns - 10**7)
     turn = Rotation.from_euler("ZYX", (60.0, 3.0, -2.0), degrees=True)
@@ -114,8 +113,7 @@ def test_an_image_has_the_telemetry_of_its_exposure():
     angles = (seen.telemetry.yaw_deg, seen.telemetry.pitch_deg, seen.telemetry.roll_deg)
     assert angles == pytest.approx(expected, abs=1e-6)
     assert seen.telemetry.yaw_deg == pytest.approx(30.0, abs=0.2)  # ENU 60 deg is heading 30
-    tilt = turn.apply([0.0, 0.0, 1.0])[2]
-    assert seen.telemetry.agl_m == pytest.approx(80.0 * tilt, abs=1e-3)
+    assert seen.telemetry.agl_m == pytest.approx(80.0 * turn.as_matrix()[2, 2], abs=1e-3)
 
 
 def test_a_live_view_equals_that_of_a_recorded_bag(tmp_path):
@@ -138,12 +136,12 @@ def test_a_live_view_equals_that_of_a_recorded_bag(tmp_path):
             flying.write(topic, message)
     camera, live = flying.camera(), flying.read()
     assert np.array_equal(live.grey, recorded.grey())
-    for name in ("yaw_deg", "pitch_deg", "roll_deg", "agl_m"):
-        assert getattr(live.telemetry, name) == pytest.approx(
-            getattr(recorded.telemetry, name), abs=1e-9
-        )
-    assert live.time_ns == recorded.telemetry.time_ns
-    assert camera == open_source(bag).camera
+    values = [
+        [getattr(each.telemetry, name) for name in ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")]
+        for each in (live, recorded)
+    ]
+    assert values[0] == pytest.approx(values[1], abs=1e-9)
+    assert live.time_ns == recorded.telemetry.time_ns and camera == open_source(bag).camera
 
 
 def test_compressed_images_by_parameter():
@@ -170,9 +168,7 @@ def test_reliable_images_by_parameter(asked):
     ],
 )
 def test_an_image_that_cannot_be_decoded_has_a_reason(changes, said):
-    flying = Reading()
-    flying.send_view(**changes)
-    seen = flying.read()
+    seen = Reading().send_view(**changes)
     assert seen.grey is None and seen.problem.reason == "bad_image"
     assert said in seen.problem.detail and IMAGE in seen.problem.detail
 
@@ -192,32 +188,28 @@ def test_damaged_messages_end_nothing(caplog):
     assert flying.read(0.5) is None
     assert all(flying.node.undecodable[topic] >= 3 for topic in topics)
     assert caplog.text.count(f"message on {IMAGE} cannot be used") == 1
-    flying.send_view()
-    assert flying.read().telemetry.missing() == []
-
-
-def test_an_imu_without_orientation_is_no_attitude():
-    flying = Reading()
-    assert math.isnan(flying.telemetry((IMU, imu(flying.now_ns, known=False))).yaw_deg)
+    assert flying.send_view().telemetry.missing() == []
 
 
 @pytest.mark.parametrize(
     ("frame", "wxyz", "said"),
     [
-        ("livox_frame", (1.0, 0.0, 0.0, 0.0), "imu is not used: it has no orientation"),
-        ("imu", (0.0, 0.0, 0.0, 0.0), "imu is not used: it has no orientation"),
-        ("camera_imu", (0.6, 0.0, 0.0, 0.8), "imu is not used: its frame is named 'camera'"),
-        ("imu_ned", (0.6, 0.0, 0.0, 0.8), "imu is not used: its frame is named 'ned'"),
+        ("livox_frame", (1.0, 0.0, 0.0, 0.0), "it has no orientation"),
+        ("imu", (0.0, 0.0, 0.0, 0.0), "it has no orientation"),
+        ("imu", None, "it has no orientation"),
+        ("camera_imu", (0.6, 0.0, 0.0, 0.8), "its frame is named 'camera'"),
+        ("imu_ned", (0.6, 0.0, 0.0, 0.8), "its frame is named 'ned'"),
     ],
 )
 def test_an_imu_that_is_not_of_the_body_is_named_once(caplog, frame, wxyz, said):
     flying = Reading()
     for offset_ns in (0, 1):
-        message = imu(flying.now_ns + offset_ns)
+        message = imu(flying.now_ns + offset_ns, known=wxyz is not None)
         message.header.frame_id, turn = frame, message.orientation
-        turn.w, turn.x, turn.y, turn.z = wxyz
+        turn.w, turn.x, turn.y, turn.z = wxyz or (0.6, 0.0, 0.0, 0.8)
         flying.write(IMU, message)
-    assert math.isnan(flying.telemetry().yaw_deg) and caplog.text.count(said) == 1
+    assert math.isnan(flying.telemetry().yaw_deg)
+    assert caplog.text.count(f"imu is not used: {said}") == 1
 
 
 def test_a_range_ahead_is_no_height(caplog):
@@ -269,12 +261,10 @@ def test_a_fix_of_a_receiver_aids_the_horizon():
 
 def test_stamps_that_go_back(caplog):
     flying = Reading()
-    flying.send_view(now_ns := flying.now_ns)
-    first = flying.read()
+    first = flying.send_view(now_ns := flying.now_ns)
     flying.write(IMAGE, image(first.time_ns - 10**8))
     assert flying.read(0.5) is None and "go back" in caplog.text
-    flying.send_view(now_ns - 60 * S)  # a bag that begins again
-    again = flying.read()
+    again = flying.send_view(now_ns - 60 * S)  # a bag that begins again
     assert again.time_ns == first.time_ns - 60 * S and again.telemetry.missing() == []
     assert "went back by" in caplog.text and "use_sim_time" in caplog.text
 
@@ -284,8 +274,7 @@ def test_simulated_time_is_that_of_the_clock():
     sec = MESSAGES.header(begin_ns).stamp
     flying.write("/clock", MESSAGES.new("rosgraph_msgs/msg/Clock", clock=sec))
     then_ns = flying.time.now_ns
-    flying.send_view(begin_ns)
-    seen = flying.read()
+    seen = flying.send_view(begin_ns)
     assert seen.time_ns == begin_ns - 10**7 and seen.telemetry.missing() == []
     assert seen.exposed_ns == then_ns - 10**7
     assert flying.reader.now_ns() == begin_ns + flying.time.now_ns - then_ns
@@ -293,8 +282,7 @@ def test_simulated_time_is_that_of_the_clock():
 
 def test_a_missing_clock_is_logged_and_images_are_ignored(caplog):
     flying = Reading("-p", "use_sim_time:=true")
-    flying.send_view()
-    assert flying.read(2.0) is None
+    assert flying.send_view() is None
     assert "/clock" in caplog.text and flying.reader.now_ns() == 0
 
 
@@ -379,12 +367,11 @@ class Publishing:
         result = ViewResult("a", stamp_ns, outcome, 1.0, "tracking")
         return self.whole.publish(result, exposed_ns, reported or VehicleState(None), judged=True)
 
-    def horizontal(self, topic, number):
-        """Covariance (2, 2) of a message."""
-        message = self.heard[topic][number]
-        if topic == POSE:
-            return np.reshape(message.pose.covariance, (6, 6))[:2, :2]
-        return np.reshape(message.position_covariance, (3, 3))[:2, :2]
+    def covariances(self):
+        """Those of all messages, horizontal, each (2, 2), of fixes and of poses."""
+        fixes = [np.reshape(each.position_covariance, (3, 3)) for each in self.heard[FIX]]
+        poses = [np.reshape(each.pose.covariance, (6, 6)) for each in self.heard[POSE]]
+        return [[each[:2, :2] for each in found] for found in (fixes, poses)]
 
 
 FIX, POSE, ORIGIN = "/orthonav/fix", "/orthonav/pose", "/orthonav/origin"
@@ -425,22 +412,16 @@ def test_a_position_is_published_as_fix_and_pose():
         assert flu.apply(axis) == pytest.approx([ned_axis[1], ned_axis[0], -ned_axis[2]], abs=1e-12)
 
 
-def test_covariances_are_for_filters():
-    flying = Publishing()
-    flying.publish(fix())
-    flying.publish(fix(), 8 * S)  # 0.2 s later
-    averaged = messages_averaged(0.2)
-    for topic in (FIX, POSE):
-        assert flying.horizontal(topic, 0) == pytest.approx(COV)
-        assert flying.horizontal(topic, 1) == pytest.approx(COV * averaged)
-
-
-def test_covariances_of_the_fix_on_request():
-    flying = Publishing("-p", "covariance:=fix")
-    for time_s in (7, 8, 9):
+@pytest.mark.parametrize(
+    ("words", "times"),
+    [((), messages_averaged(0.2)), (("-p", "covariance:=fix"), 1.0)],  # 0.2 s apart
+)
+def test_covariances_are_for_filters_unless_those_of_the_fix_are_asked(words, times):
+    flying = Publishing(*words)
+    for time_s in (7, 8):
         flying.publish(fix(), time_s * S)
-    assert len(flying.heard[FIX]) == 3
-    assert all(flying.horizontal(FIX, n) == pytest.approx(COV) for n in range(3))
+    for first, second in flying.covariances():
+        assert first == pytest.approx(COV) and second == pytest.approx(COV * times)
 
 
 @pytest.mark.parametrize(
@@ -461,13 +442,9 @@ def test_withheld_positions_are_not_published():
     assert flying.publish(fix(confidence=0.5)) == ()
     assert flying.gate.withheld["low_confidence"] == 1
     assert flying.heard[FIX] == flying.heard[POSE] == []
-
-
-def test_the_publisher_itself_refuses_a_low_confidence():
+    low = NavigationEstimate(47.0, 8.0, COV, 0.5, time_ns=1)
     with pytest.raises(EstimateError, match="NavSatFix"):
-        Publishing().out.position(
-            NavigationEstimate(47.0, 8.0, COV, 0.5, time_ns=1), VehicleState(None), 1
-        )
+        flying.out.position(low, VehicleState(None), 1)
 
 
 def test_a_dry_run_sends_health_and_no_position():

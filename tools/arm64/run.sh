@@ -86,7 +86,7 @@ print('flown:', collections.Counter(line.get('status', 'health') for line in lin
 fi
 if asked tests; then
     [ $# -gt 0 ] || set -- -m "not slow" tests/geo tests/flight tests/mapfile tests/register \
-        tests/track tests/publish tests/localize tests/test_golden.py
+        tests/track tests/messages tests/localize tests/test_golden.py
     emulated -m pytest -p no:cacheprovider --durations=10 "$@"
 fi
 if [ "$step" = rebuild ]; then emulated tools/platforms/fixes.py --rebuild --run views; fi

@@ -364,7 +364,7 @@ def _opened_outputs(
 ) -> tuple[list[outputs.NmeaOut], list[outputs.JsonOut]]:
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
-        nmea = [outputs.NmeaOut(outputs.open_sink(url), quality=quality) for url in options.nmea]
+        nmea = [outputs.NmeaOut(outputs.sink_opener(url), quality=quality) for url in options.nmea]
         lines = [
             outputs.JsonOut(None if each == "-" else Path(each), identity=Identity(digest))
             for each in options.jsonl

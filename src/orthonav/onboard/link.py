@@ -27,7 +27,6 @@ from orthonav.onboard.messages.mavlink import (
     is_height,
     is_of_autopilot,
     repeats_height,
-    signing_timestamp,
 )
 from orthonav.onboard.ports import Transport, retry_s
 from orthonav.onboard.telemetry import (
@@ -62,8 +61,7 @@ class AutopilotLink:
         """`system_id`: by default that of the first autopilot heard. `signing`: sign outgoing
         messages and require incoming ones to be signed with the same key. `own_receiver`: number
         of the GNSS receiver that orthonav stands for. Raises `MissingExtraError` where pymavlink is
-        missing or old."""
-        dialect()
+        missing or old, `EstimateError` for an invalid system id."""
         self._opener, self._clocks = opener, clocks
         self.buffer, self.sync = buffer, ClockSync()
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
@@ -82,12 +80,10 @@ class AutopilotLink:
         self.system_status = 1  # MAV_STATE_BOOT
         self.counts: Counter[str] = Counter()
         self._limited_ns = -LIMITED_NS
-        self._heard_ns: int | None = None
-        self._attitude_ns: int | None = None
+        self._heard_ns = self._attitude_ns = -math.inf
         self._asked: list[int] = []
         self._due = {"heartbeat": 0, "timesync": 0}
-        self._packer: Packer | None = None
-        self._sequence, self._packed, self._resign_ns = 0, 0, 0
+        self._packer = Packer(system_id or 1, signing=signing)
 
     def poll(self, timeout_s: float = 0.0) -> int:
         """Read, waiting at most `timeout_s`, and send what is due; the number of messages."""
@@ -114,11 +110,10 @@ class AutopilotLink:
             if self._silent or self._transport is None:
                 return False
             try:
-                self._transport.write(self._frame(message))
+                self._transport.write(self._packer.pack(message, self._clocks.utc_ns()))
             except OSError as error:
                 self._lost(error)
-                return False
-            return True
+            return self._transport is not None
 
     @property
     def covered_ns(self) -> int | None:
@@ -154,15 +149,15 @@ class AutopilotLink:
     @property
     def heard_age_s(self) -> float:
         """Time since the last message; infinite for "never"."""
-        return _age_s(self._clocks.mono_ns(), self._heard_ns)
+        return (self._clocks.mono_ns() - self._heard_ns) / 1e9
 
     @property
     def attitude_age_s(self) -> float:
-        return _age_s(self._clocks.mono_ns(), self._attitude_ns)
+        return (self._clocks.mono_ns() - self._attitude_ns) / 1e9
 
     def signing_now(self) -> int | None:
         with self._lock:
-            return None if self._signing is None else self._signing.timestamp_10us + self._packed
+            return None if self._signing is None else self._packer.timestamp_10us
 
     def close(self) -> None:
         with self._lock:
@@ -195,20 +190,6 @@ class AutopilotLink:
             self._failures += 1
             self._retry_ns = self._clocks.mono_ns() + round(pause_s * 1e9)
 
-    def _frame(self, message: Message) -> bytes:
-        now_ns = self._clocks.mono_ns()
-        if self._packer is None or (self._signing is not None and now_ns >= self._resign_ns):
-            if self._signing is not None:  # timestamps of signatures follow the clock
-                before = self._signing.timestamp_10us + self._packed
-                stamp = max(signing_timestamp(self._clocks.utc_ns()), before)
-                self._signing = replace(self._signing, timestamp_10us=stamp)
-            system_id = self.target.system_id if self.target else self._wanted or 1
-            self._packer = Packer(system_id, sequence=self._sequence, signing=self._signing)
-            self._packed, self._resign_ns = 0, now_ns + 10 * 10**9
-        frame = self._packer.pack(message)
-        self._sequence, self._packed = (self._sequence + 1) % 256, self._packed + 1
-        return frame
-
     def _take(self, data: bytes, now_ns: int) -> int:
         understood = 0
         try:
@@ -216,9 +197,9 @@ class AutopilotLink:
         except Exception as error:  # input is untrusted
             log.debug("incoming data could not be decoded: %s", error)
             self.counts["damaged"] += 1
-            seen = self._incoming.signing.stream_timestamps
+            signing = self._incoming.signing
             self._incoming = _decoder(self._signing)
-            self._incoming.signing.stream_timestamps = seen
+            self._incoming.signing = signing
             return 0
         for message in messages:
             if message.get_type() == "BAD_DATA":
@@ -236,8 +217,7 @@ class AutopilotLink:
         system_id, component_id = message.get_srcSystem(), message.get_srcComponent()
         if self.target is not None and system_id == self.target.system_id:
             return bool(component_id == self.target.component_id)
-        heartbeat = message.get_type() == "HEARTBEAT" and is_of_autopilot(message)
-        if not heartbeat or system_id == 0:
+        if message.get_type() != "HEARTBEAT" or not is_of_autopilot(message) or system_id == 0:
             return False
         heard = Target(system_id, component_id or 1)
         if self.target is not None or self._wanted not in (None, system_id):
@@ -245,7 +225,7 @@ class AutopilotLink:
                 self.others.append(heard)
             return False
         self.target = heard
-        self._packer = None
+        self._packer.set_system(system_id)
         self._due = dict.fromkeys(self._due, 0)  # send a heartbeat and TIMESYNC at once
         return True
 
@@ -346,9 +326,9 @@ class AutopilotLink:
         self.aiding.velocity(math.sqrt(variance) if variance >= 0 else math.nan, now_ns)
 
     def _gnss(self, message: Message, now_ns: int) -> None:
-        number = 0 if message.get_type() == "GPS_RAW_INT" else 1
-        self.aiding.receiver(number, message.fix_type, now_ns)
-        self.gnss.append(gnss_sample(message, now_ns, self.sync.boot_ns(now_ns)))
+        sample = gnss_sample(message, now_ns, self.sync.boot_ns(now_ns))
+        self.aiding.receiver(sample.receiver, sample.fix_type, now_ns)
+        self.gnss.append(sample)
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request: answer with the clock that stamps our messages
@@ -363,16 +343,8 @@ class AutopilotLink:
         with self._lock:
             if now_ns >= self._due["heartbeat"]:
                 self._due["heartbeat"] = now_ns + INTERVAL_NS
-                self.send(
-                    dialect().MAVLink_heartbeat_message(
-                        18,
-                        NO_AUTOPILOT,
-                        0,
-                        0,
-                        self.system_status,
-                        3,  # an onboard computer
-                    )
-                )
+                onboard_computer = 18, NO_AUTOPILOT, 0, 0, self.system_status, 3
+                self.send(dialect().MAVLink_heartbeat_message(*onboard_computer))
             if now_ns >= self._due["timesync"] and self.target is not None:
                 self._due["timesync"] = now_ns + INTERVAL_NS
                 self._asked = [*self._asked[-4:], now_ns]
@@ -425,33 +397,23 @@ def _decoder(signing: Signing | None) -> Any:
     module = needed("pymavlink.dialects.v20.ardupilotmega", "autopilot", "a link to an autopilot")
     decoder = module.MAVLink(None)
     decoder.robust_parsing = True
-    if signing is not None:
-        decoder.signing.secret_key = signing.secret_key
-        decoder.signing.timestamp = signing.timestamp_10us  # refuse replayed older messages
-        decoder.check_signature = _without_side_effects(decoder)
-    return decoder
-
-
-def _without_side_effects(decoder: Any) -> Callable[..., bool]:
-    """The decoder's signature check, without effects of messages that fail it.
-
-    pymavlink stores the timestamp of a message before it checks the signature: one forged message
-    from the future would block the link.
-    """
+    if signing is None:
+        return decoder
+    decoder.signing.secret_key = signing.secret_key
+    decoder.signing.timestamp = signing.timestamp_10us  # refuse replayed older messages
     original = decoder.check_signature
 
-    def check(*arguments: Any) -> bool:
+    def check_signature(*arguments: Any) -> bool:
+        # pymavlink stores the timestamp of a message before it checks the signature: one forged
+        # message from the future would block the link.
         before = dict(decoder.signing.stream_timestamps)
         valid = bool(original(*arguments))
         if not valid:
             decoder.signing.stream_timestamps = before
         return valid
 
-    return check
-
-
-def _age_s(now_ns: int, then_ns: int | None) -> float:
-    return math.inf if then_ns is None else (now_ns - then_ns) / 1e9
+    decoder.check_signature = check_signature
+    return decoder
 
 
 def gnss_sample(message: Any, arrived_ns: int, arrived_boot_ns: int | None) -> GnssSample:

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -73,12 +73,6 @@ CLOSE_S = 30.0
 Grey = NDArray[np.uint8]
 
 
-class _WaitingMessage(NamedTuple):
-    make: Callable[[], list[Message]]
-    size_bytes: int
-    has_view: bool = False
-
-
 class FlightLog:
     """A flight log being written. No method waits or raises. `lost` counts dropped messages."""
 
@@ -130,7 +124,7 @@ class FlightLog:
         self._segment: Segment | None = None
         self._no_views_until = -math.inf
         self._warned = False
-        self._queue: list[_WaitingMessage] = []
+        self._queue: list[Callable[[], list[Message]]] = []
         self._queued_bytes = 0
         self._closing = False
         self._change = threading.Condition()
@@ -139,14 +133,9 @@ class FlightLog:
 
     def options(self, options: Mapping[str, Any]) -> None:
         """Log the options of the flight, named as those of `orthonav localize`, for a replay."""
-        try:
-            session = {**self._session, "options": dict(options)}
-            to_json(session)  # options that cannot be encoded must not block later messages
-        except Exception as error:
-            self._lose("messages", error)
-            return
-        self._session = session
-        self._add(lambda: [self._session_message(session)], 1000)
+        session = {**self._session, "options": dict(options)}
+        if self._json(session):  # options that cannot be encoded must not block later messages
+            self._begin_session(session)
 
     def view(
         self,
@@ -189,17 +178,25 @@ class FlightLog:
         self._add(lambda: _result(result, index), 1000)
 
     def health(self, health: Mapping[str, Any]) -> None:
-        try:
-            data = to_json({**health, "log_lost": dict(self.lost)})
-        except Exception as error:
-            self._lose("messages", error)
-            return
-        time_ns = self._time_ns
-        self._add(lambda: [_message(TOPICS.health, time_ns, data)], len(data))
+        time_ns, data = self._time_ns, self._json({**health, "log_lost": dict(self.lost)})
+        if data:
+            self._add(lambda: [_message(TOPICS.health, time_ns, data)], len(data))
 
     def gnss(self, time_ns: int, cdr: bytes) -> None:
         # A `sensor_msgs/NavSatFix` (CDR).
         self._add(lambda: [_message(TOPICS.gnss, time_ns, cdr)], len(cdr))
+
+    def _json(self, values: Mapping[str, Any]) -> bytes:
+        """Empty for values that cannot be encoded, which is counted."""
+        try:
+            return to_json(values)
+        except Exception as error:
+            self._lose("messages", error)
+            return b""
+
+    def _begin_session(self, session: dict[str, Any]) -> None:
+        self._session = session
+        self._add(lambda: [self._session_message(session)], 1000)
 
     def close(self) -> None:
         with self._change:
@@ -216,16 +213,13 @@ class FlightLog:
         except CameraError as error:
             log.warning("%s", error)
             return
-        if camera == self._camera:
-            return
-        self._camera = camera
-        session = self._session = {**self._session, "camera": self._camera.numbers()}
-        self._add(lambda: [self._session_message(session)], 1000)
+        if camera != self._camera:
+            self._camera = camera
+            self._begin_session({**self._session, "camera": camera.numbers()})
 
     def _has_room(self, size_bytes: int) -> bool:
         with self._change:
-            waiting = self._queued_bytes if self._queue else 0
-            return size_bytes <= LARGEST_BYTES and waiting + size_bytes <= QUEUE_BYTES
+            return size_bytes <= min(LARGEST_BYTES, QUEUE_BYTES - self._queued_bytes)
 
     def _add(
         self, make: Callable[[], list[Message]], size_bytes: int, *, has_view: bool = False
@@ -233,7 +227,7 @@ class FlightLog:
         with self._change:
             room = self._queued_bytes + size_bytes <= QUEUE_BYTES + SPARE_BYTES
             if not self._closing and room and len(self._queue) < QUEUE_MESSAGES:
-                self._queue.append(_WaitingMessage(make, size_bytes, has_view))
+                self._queue.append(make)
                 self._queued_bytes += size_bytes
                 if self._queued_bytes >= CHUNK_BYTES:
                     self._change.notify()
@@ -260,7 +254,13 @@ class FlightLog:
                 taken, self._queue, self._queued_bytes = self._queue, [], 0
                 closing = self._closing
             try:
-                self._write([message for each in taken for message in self._made(each)])
+                messages: list[Message] = []
+                for make in taken:
+                    try:
+                        messages += make()
+                    except Exception as error:
+                        self._lose("messages", described(error))
+                self._write(messages)
                 if closing:
                     self._end_segment()
             except Exception as error:  # must not end the log
@@ -268,13 +268,6 @@ class FlightLog:
                 self._segment = None
             if closing:
                 return
-
-    def _made(self, waiting: _WaitingMessage) -> list[Message]:
-        try:
-            return waiting.make()
-        except Exception as error:
-            self._lose("views" if waiting.has_view else "messages", described(error))
-            return []
 
     def _view(self, seen: LoggedView, kept: Grey | None) -> list[Message]:
         time_ns, images = seen.telemetry.time_ns, []
@@ -287,20 +280,17 @@ class FlightLog:
         return [_message(TOPICS.telemetry, time_ns, telemetry_message(seen), seen.index), *images]
 
     def _write(self, messages: list[Message]) -> None:
-        """Write a chunk; without its images where that fails."""
-        views = sum(message.is_view for message in messages)
-        if views and time.monotonic() < self._no_views_until:
-            self._lose("views", "no room", views)
-            messages, views = [each for each in messages if not each.is_view], 0
-        if not messages or self._put(messages):
-            return
-        if views:
-            self._no_views_until = time.monotonic() + PAUSE_S
-            self._lose("views", "no room", views)
-            messages = [each for each in messages if not each.is_view]
-            if not messages or self._put(messages):
+        """Write a chunk; without its images where that fails, and for a while after."""
+        others = [each for each in messages if not each.is_view]
+        views = len(messages) - len(others)
+        if views and time.monotonic() >= self._no_views_until:
+            if self._put(messages):
                 return
-        self._lose("messages", "no room", len(messages))
+            self._no_views_until = time.monotonic() + PAUSE_S
+        if views:
+            self._lose("views", "no room", views)
+        if others and not self._put(others):
+            self._lose("messages", "no room", len(others))
 
     def _put(self, messages: list[Message]) -> bool:
         size = sum(len(message.data) + 100 for message in messages)

@@ -21,7 +21,7 @@ from orthonav.onboard.messages.estimate import (
     NavigationEstimate,
     estimate_from_result,
 )
-from orthonav.onboard.messages.gate import MAX_AGE_S, Decision, Gate
+from orthonav.onboard.messages.gate import MAX_AGE_S, Gate
 from orthonav.onboard.messages.mavlink import (
     AUTOPILOT,
     Autopilot,
@@ -36,8 +36,8 @@ from orthonav.onboard.messages.mavlink import (
     set_gps_global_origin,
     vision_position_estimate,
 )
-from orthonav.onboard.messages.nmea import Quality, gga, gst, rmc
-from orthonav.onboard.ports import Descriptor, Udp, device_baud, host_port, open_serial
+from orthonav.onboard.messages.nmea import Quality, sentences
+from orthonav.onboard.ports import Transport, Udp, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, VehicleState
 
 if TYPE_CHECKING:
@@ -87,16 +87,11 @@ class Messenger:
         self, estimate: NavigationEstimate, vehicle: VehicleState, exposed_ns: int
     ) -> tuple[tuple[str, ...], str | None]:
         """Names of the messages sent, and why the first of the others was not; None without."""
-        sent, withheld = [], []
-        for name in self._kinds:
-            reason = self._sent(name, estimate, vehicle, exposed_ns)
-            if reason is None:
-                sent.append(KINDS[name])
-            else:
-                withheld.append(reason)
-        return tuple(sent), next((each for each in withheld if each), None)
+        why = {kind: self._send(kind, estimate, vehicle, exposed_ns) for kind in self._kinds}
+        sent = tuple(KINDS[kind] for kind, reason in why.items() if reason is None)
+        return sent, next((reason for reason in why.values() if reason), None)
 
-    def _sent(
+    def _send(
         self, kind: str, estimate: NavigationEstimate, vehicle: VehicleState, exposed_ns: int
     ) -> str | None:
         """Why a message was not sent: "" where the link did not take it; None where it was."""
@@ -107,7 +102,10 @@ class Messenger:
             made = self._make(kind, stated, vehicle)
         except EstimateError as error:
             self.incomplete += 1
-            self._say_once(f"{name} cannot be made: {error}")
+            why = f"{name} cannot be made: {error}"
+            if why not in self._said and len(self._said) < 20:
+                self._said.add(why)
+                log.warning("%s", why)
             return self._gate.withhold(f"not_made:{name}").reason
         if not self._gate.due(name, now_ns):
             return f"rate:{name}"
@@ -119,11 +117,6 @@ class Messenger:
         if kind in LOCAL and self._link.kind is not Autopilot.ARDUPILOT:
             self.too_slow += PX4_VISION_S <= interval_s < math.inf
         return None
-
-    def _say_once(self, why: str) -> None:
-        if why not in self._said and len(self._said) < 20:
-            self._said.add(why)
-            log.warning("%s", why)
 
     @property
     def needs_origin(self) -> bool:
@@ -173,18 +166,34 @@ def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
     )
 
 
-class SerialSink:
-    """A serial port; after a failure the next write opens it again."""
+def sink_opener(url: str) -> Callable[[], Transport]:
+    """Opener of an output at `udp:HOST:PORT` or `serial:DEVICE:BAUD`. Raises `VariantError`."""
+    kind, _, rest = url.partition(":")
+    if kind == "udp":
+        peer = host_port(rest, url, 10110)
+        return lambda: Udp(None, peer)
+    if kind == "serial":
+        device = device_baud(rest, url)
+        return lambda: open_serial(*device)
+    raise VariantError(f"expected udp:HOST:PORT or serial:DEVICE:BAUD, got '{url}'")
 
-    def __init__(self, device: str, baud: int) -> None:
-        self._device, self._baud = device, baud
-        self._port: Descriptor | None = open_serial(device, baud)
 
-    def write(self, data: bytes) -> None:
+class NmeaOut:
+    """GGA, RMC and GST of every view, including those without a position; after a failure the next
+    write opens the port again."""
+
+    def __init__(
+        self, opener: Callable[[], Transport], *, quality: Quality = Quality.ESTIMATED
+    ) -> None:
+        """Raises `OSError` where the port cannot be opened."""
+        self._opener, self._quality = opener, quality
+        self._port: Transport | None = opener()
+
+    def write(self, estimate: NavigationEstimate | None, utc_ns: int) -> None:
         if self._port is None:
-            self._port = open_serial(self._device, self._baud)
+            self._port = self._opener()
         try:
-            self._port.write(data)
+            self._port.write(sentences(estimate, utc_ns, self._quality))
         except OSError:
             self.close()
             raise
@@ -193,35 +202,6 @@ class SerialSink:
         if self._port is not None:
             self._port.close()
             self._port = None
-
-
-Sink = Udp | SerialSink
-
-
-def open_sink(url: str) -> Sink:
-    """Output at `udp:HOST:PORT` or `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where
-    it cannot be opened."""
-    kind, _, rest = url.partition(":")
-    if kind == "udp":
-        return Udp(None, host_port(rest, url, 10110))
-    if kind == "serial":
-        return SerialSink(*device_baud(rest, url))
-    raise VariantError(f"expected udp:HOST:PORT or serial:DEVICE:BAUD, got '{url}'")
-
-
-class NmeaOut:
-    """GGA, RMC and GST of every view to one sink, including those without a position."""
-
-    def __init__(self, sink: Sink, *, quality: Quality = Quality.ESTIMATED) -> None:
-        self._sink, self._quality = sink, quality
-
-    def write(self, estimate: NavigationEstimate | None, utc_ns: int) -> None:
-        given = estimate, utc_ns
-        sentences = gga(*given, self._quality), rmc(*given, self._quality), gst(*given)
-        self._sink.write(b"".join(sentences))
-
-    def close(self) -> None:
-        self._sink.close()
 
 
 class JsonOut:
@@ -281,8 +261,7 @@ class Publisher:
     ) -> None:
         """`min_std_m`: lower bound of the standard deviation of a fix that `graph` publishes."""
         self.gate, self.clocks, self.messenger = gate, clocks, messenger
-        self._nmea, self._lines = nmea, lines
-        self._graph = [] if graph is None else [graph]
+        self._nmea, self._lines, self._graph = nmea, lines, graph
         self._covariance = FilterCovariance(min_std_m)
         self._nmea_ns = 0
         self.failed = 0
@@ -301,14 +280,13 @@ class Publisher:
         sent: tuple[str, ...] = ()
         now_ns = self.clocks.mono_ns()
         ahead_ns = self.clocks.utc_ns() - now_ns
-        decision = Decision(None)
+        estimate = None
         if withheld is not None:
-            decision = self.gate.withhold(withheld)
+            self.gate.withhold(withheld)
         elif judged:
             by_our_clock = replace(result, time_ns=exposed_ns)
             made = estimate_from_result(by_our_clock, utc_ahead_ns=ahead_ns)
-            decision = self.gate.admit(made, now_ns)
-        estimate, withheld = decision
+            estimate, withheld = self.gate.admit(made, now_ns)
         if estimate is not None:
             if self.messenger is not None:
                 sent, withheld = self.messenger.publish(estimate, vehicle, exposed_ns)
@@ -321,7 +299,8 @@ class Publisher:
         return sent
 
     def health(self, plain: dict[str, Any]) -> None:
-        self._each([*self._lines, *self._graph], lambda out: out.health(plain))
+        graph = [] if self._graph is None else [self._graph]
+        self._each([*self._lines, *graph], lambda out: out.health(plain))
 
     def close(self) -> None:
         self._each([*self._nmea, *self._lines], lambda out: out.close())
@@ -330,17 +309,15 @@ class Publisher:
         self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState, stamp_ns: int
     ) -> tuple[tuple[str, ...], str | None]:
         """Names of the topics, and why nothing was published there; None without."""
-        sent: list[str] = []
-        if not self._graph:
+        if self._graph is None:
             return (), None
         if not self.gate.due("ROS2", self.clocks.mono_ns()):
             return (), "rate:ROS2"
-        stated = self._covariance.prepare("ROS2", estimate, exposed_ns)
+        if self._graph.for_filter:
+            estimate = self._covariance.prepare("ROS2", estimate, exposed_ns)
+        sent: list[str] = []
         self._each(
-            self._graph,
-            lambda out: sent.extend(
-                out.position(stated if out.for_filter else estimate, vehicle, stamp_ns)
-            ),
+            [self._graph], lambda out: sent.extend(out.position(estimate, vehicle, stamp_ns))
         )
         self.gate.sent["ROS2"] += bool(sent)
         self._covariance.sent("ROS2", exposed_ns)

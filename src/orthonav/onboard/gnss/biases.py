@@ -25,8 +25,6 @@ from orthonav.core.flight.gnss import Fault
 from orthonav.core.records import MAP_STD_M
 
 Array = NDArray[np.float64]
-
-
 NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
 """Biases in the order of `Biases.mean`."""
 LARGEST_M = 100.0
@@ -117,10 +115,9 @@ def biases_from_plain(plain: Mapping[str, Any]) -> Biases:
     or beyond `LIMITS`.
     """
     count = len(NAMES)
-    mean = np.array([float(each) for each in plain["mean"]])
-    lower = np.array([float(each) for each in plain["cov"]])
+    mean, lower = (np.array([float(each) for each in plain[name]]) for name in ("mean", "cov"))
     agreed_s, setup = float(plain["agreed_s"]), plain["setup"]
-    if mean.shape != (count,) or lower.shape != (count * (count + 1) // 2,):
+    if (len(mean), len(lower)) != (count, count * (count + 1) // 2):
         raise ValueError("wrong number of values")
     if not (np.isfinite(lower).all() and (np.abs(mean) <= LIMITS).all()):
         raise ValueError("value out of range")
@@ -152,12 +149,11 @@ def at_start(known: Mapping[str, Biases], digest: str, setup: str) -> Biases:
     if here is not None and here.setup == setup:
         start = here
     else:
-        mean, cov, agreed_s = start.mean.copy(), start.cov.copy(), start.agreed_s
-        if here is not None:
-            mean[:2], cov[:2, :2], agreed_s = here.mean[:2], here.cov[:2, :2], here.agreed_s
-        if same:
-            mean[2:], cov[2:, 2:] = same[-1].mean[2:], same[-1].cov[2:, 2:]
-        start = Biases(mean, cov, agreed_s, setup)
+        place, camera = here or start, same[-1] if same else start
+        cov = np.zeros_like(start.cov)
+        cov[:2, :2], cov[2:, 2:] = place.cov[:2, :2], camera.cov[2:, 2:]
+        mean = np.concatenate([place.mean[:2], camera.mean[2:]])
+        start = Biases(mean, cov, place.agreed_s, setup)
     cov = start.cov + np.diag(_BETWEEN_STD**2)
     # no less certain than where nothing was learnt, however many flights did not show a bias
     scale = np.minimum(_PRIOR_STD / np.sqrt(np.diag(cov)), 1.0)
@@ -189,7 +185,8 @@ MAP_TAU_S, MOUNT_TAU_S = 60.0, 600.0
 MOUNT_SHARE, WHITE_SHARE = 0.4, 0.2
 """Fractions of the map's variance that turn with the aircraft, as from a tilted mount, and that are
 independent from view to view."""
-LOCAL_SHARE = 1 - MOUNT_SHARE - WHITE_SHARE
+_TAUS_S = np.repeat([GNSS_TAU_S, MAP_TAU_S, MOUNT_TAU_S], 2)
+"""Of the slowly varying errors, see `Difference.slow`."""
 MULTIPATH_M, FAULT_SIGMAS = 8.0, 5.0
 """Change of the difference that is no fault; in addition, standard deviations from which it is."""
 
@@ -211,14 +208,30 @@ class Difference:
     def design(self) -> Array:
         return design(self.heading_rad, self.agl_m, self.vel_en_mps)
 
+    @cached_property
+    def slow(self) -> Array:
+        """Derivatives (2, 6) by slowly varying errors of unit variance: of GNSS, of the map, and of
+        what turns with the aircraft, two axes each."""
+        sin, cos = math.sin(self.heading_rad), math.cos(self.heading_rad)
+        local_std_m = math.sqrt(1 - MOUNT_SHARE - WHITE_SHARE) * self.map_std_m
+        turned = math.sqrt(MOUNT_SHARE) * self.map_std_m * np.array([[cos, sin], [-sin, cos]])
+        return np.hstack([self.gnss_std_m * np.eye(2), local_std_m * np.eye(2), turned])
+
+    @property
+    def white_m2(self) -> float:
+        """Variance per axis of what is independent from value to value."""
+        return WHITE_SHARE * self.map_std_m**2 + self.rolling_std_m**2
+
     def residual(self, known: Biases) -> Array:
         return self.en_m - self.design @ known.mean
 
+    def std_m(self, known: Biases) -> float:
+        """Standard deviation of the residual along the worst axis."""
+        gnss_m = max(self.gnss_std_m, GNSS_STD_M)
+        return math.sqrt(known.variance_m2(self.design) + gnss_m**2 + self.map_std_m**2)
 
-def widen_last(values: deque[Difference], rolling_std_m: float) -> None:
-    if values:
-        std_m = max(values[-1].rolling_std_m, rolling_std_m)
-        values[-1] = replace(values[-1], rolling_std_m=std_m)
+    def widened(self, rolling_std_m: float) -> "Difference":
+        return replace(self, rolling_std_m=max(self.rolling_std_m, rolling_std_m))
 
 
 class Finding(NamedTuple):
@@ -229,90 +242,57 @@ class Finding(NamedTuple):
     en_m: tuple[float, float]
 
 
-class DifferenceWindow:
-    """Differences of the last minute and their tests. Mutable; deterministic."""
-
-    def __init__(self) -> None:
-        self.values: deque[Difference] = deque()
-
-    def add(self, value: Difference) -> None:
-        """Add a value; older ones than the window are dropped."""
-        self.values.append(value)
-        while self.values[0].time_s < value.time_s - WINDOW_S:
-            self.values.popleft()
-
-    def recent(self, seconds: float) -> list[Difference]:
-        begin = self.values[-1].time_s - seconds if self.values else 0.0
-        return [each for each in self.values if each.time_s > begin]
-
-    def finding(self, known: Biases) -> Finding | None:
-        """The likeliest change that is a fault; None without one."""
-        values = self.values
-        count = len(values)
-        if count < 3:
-            return None
-        times = np.array([each.time_s for each in values])
-        signatures, named = self._signatures(times)
-        biased = np.concatenate([each.design for each in values])
-        off = np.concatenate([each.en_m for each in values]) - biased @ known.mean
-        covariance = _covariance(values) + biased @ known.cov @ biased.T
-        columns = np.kron(signatures, np.eye(2))
-        solved = np.linalg.solve(covariance, columns)
-        seen = columns.reshape(2 * count, -1, 2)
-        weights = solved.reshape(2 * count, -1, 2)
-        information = np.einsum("nka,nkb->kab", seen, weights)
-        spread = np.linalg.inv(information)
-        sizes = np.einsum("kab,nkb,n->ka", spread, weights, off)
-        length = np.hypot(*sizes.T)
-        along = np.einsum("ka,kab,kb->k", sizes, spread, sizes)
-        std = np.maximum(np.sqrt(along) / np.maximum(length, 1e-9), 1e-9)
-        excess = (length - MULTIPATH_M) / std
-        likelihood = np.einsum("ka,kab,kb->k", sizes, information, sizes)
-        likelihood[excess <= FAULT_SIGMAS] = 0.0
-        best = int(np.argmax(likelihood))
-        if likelihood[best] == 0:
-            return None
-        fault, onset = named[best]
-        east, north = sizes[best].tolist()
-        return Finding(fault, onset, (east, north))
-
-    def _signatures(self, times: Array) -> tuple[Array, list[tuple[Fault, float]]]:
-        """Unit changes (N, K): constant, steps by values before the newest, and ramps by seconds,
-        which end at 1; their names and onsets."""
-        columns, named = [np.ones(len(times))], [(Fault.OFFSET, float(times[0]))]
-        for age in (2, 3, 4, 5, 6, 8):
-            if age < len(times):
-                columns.append((np.arange(len(times)) >= len(times) - age).astype(np.float64))
-                named.append((Fault.STEP, float(times[-age])))
-        for age_s in (12.0, 18.0, 24.0, 32.0, 40.0, 50.0):
-            onset = times[-1] - age_s
-            if onset >= times[0]:
-                columns.append(np.maximum(times - onset, 0.0) / age_s)
-                named.append((Fault.DRIFT, float(onset)))
-        return np.stack(columns, axis=1), named
+def finding(values: Sequence[Difference], known: Biases) -> Finding | None:
+    """The likeliest change within a window that is a fault; None without one."""
+    count = len(values)
+    if count < 3:
+        return None
+    times = np.array([each.time_s for each in values])
+    changes = _changes(times)
+    biased = np.concatenate([each.design for each in values])
+    off = np.concatenate([each.en_m for each in values]) - biased @ known.mean
+    covariance = _covariance(values, times) + biased @ known.cov @ biased.T
+    columns = np.kron(np.stack([each[2] for each in changes], axis=1), np.eye(2))
+    seen = columns.reshape(2 * count, -1, 2)
+    weights = np.linalg.solve(covariance, columns).reshape(seen.shape)
+    information = np.einsum("nka,nkb->kab", seen, weights)
+    spread = np.linalg.inv(information)
+    sizes = np.einsum("kab,nkb,n->ka", spread, weights, off)
+    length = np.hypot(*sizes.T)
+    along = np.einsum("ka,kab,kb->k", sizes, spread, sizes)
+    std = np.maximum(np.sqrt(along) / np.maximum(length, 1e-9), 1e-9)
+    likelihood = np.einsum("ka,kab,kb->k", sizes, information, sizes)
+    likelihood[length <= MULTIPATH_M + FAULT_SIGMAS * std] = 0.0
+    best = int(np.argmax(likelihood))
+    if likelihood[best] == 0:
+        return None
+    fault, onset_s, _ = changes[best]
+    east, north = sizes[best].tolist()
+    return Finding(fault, float(onset_s), (east, north))
 
 
-def _covariance(values: Sequence[Difference]) -> Array:
+def _changes(times: Array) -> list[tuple[Fault, float, Array]]:
+    """Name, onset and course (N,) of unit changes: constant, steps by values before the newest, and
+    ramps by seconds, which end at 1."""
+    count, now_s = len(times), times[-1]
+    made = [(Fault.OFFSET, times[0], np.ones(count))]
+    for age in (2, 3, 4, 5, 6, 8):
+        if age < count:
+            made.append((Fault.STEP, times[-age], np.repeat([0.0, 1.0], [count - age, age])))
+    for age_s in (12.0, 18.0, 24.0, 32.0, 40.0, 50.0):
+        if now_s - age_s >= times[0]:
+            ramp = np.maximum(times - (now_s - age_s), 0.0) / age_s
+            made.append((Fault.DRIFT, now_s - age_s, ramp))
+    return made
+
+
+def _covariance(values: Sequence[Difference], times: Array) -> Array:
     """Covariance (2 N, 2 N) of the differences without a fault and without biases."""
-    gnss, map_std, heading, rolling, times = np.array(
-        [
-            (each.gnss_std_m, each.map_std_m, each.heading_rad, each.rolling_std_m, each.time_s)
-            for each in values
-        ]
-    ).T
-    gnss = np.maximum(gnss, GNSS_STD_M)
-    apart = np.abs(times[:, None] - times[None])
-    products = np.multiply.outer(map_std, map_std)
-    same = np.multiply.outer(gnss, gnss) * np.exp(-apart / GNSS_TAU_S)
-    same += LOCAL_SHARE * products * np.exp(-apart / MAP_TAU_S)
-    same += np.diag(WHITE_SHARE * map_std**2 + rolling**2)
-    turned = heading[:, None] - heading[None]
-    mount = MOUNT_SHARE * products * np.exp(-apart / MOUNT_TAU_S)
-    cos, sin = mount * np.cos(turned), mount * np.sin(turned)
-    blocks = np.empty((len(times), 2, len(times), 2))
-    blocks[:, 0, :, 0] = blocks[:, 1, :, 1] = same + cos
-    blocks[:, 0, :, 1], blocks[:, 1, :, 0] = sin, -sin
-    return blocks.reshape(2 * len(times), -1)
+    slow = np.array([each.slow for each in values])
+    slow[..., :2] = np.maximum(slow[..., :2], GNSS_STD_M * np.eye(2))
+    alike = np.exp(-np.abs(times[:, None] - times[None])[..., None] / _TAUS_S)
+    cov = np.einsum("iak,jbk,ijk->iajb", slow, slow, alike).reshape(2 * len(times), -1)
+    return np.asarray(cov + np.diag(np.repeat([each.white_m2 for each in values], 2)))
 
 
 LATENCY_STD_S = 0.08
@@ -328,18 +308,17 @@ def rolling_std_m(values: Sequence[Difference], known: Biases) -> float:
     """
     if len(values) < 3:
         return 0.0
-    first, middle, last = values
-    before_s, after_s = middle.time_s - first.time_s, last.time_s - middle.time_s
-    if not (0 < before_s <= 2.0 and 0 < after_s <= 2.0):
+    seconds = np.diff([each.time_s for each in values])
+    if not ((seconds > 0) & (seconds <= 2.0)).all():
         return 0.0
-    before = math.remainder(middle.heading_rad - first.heading_rad, math.tau) / before_s
-    after = math.remainder(last.heading_rad - middle.heading_rad, math.tau) / after_s
-    change = 2 * abs(after - before) / (before_s + after_s)
+    turned = np.diff([each.heading_rad for each in values])
+    before, after = np.remainder(turned + math.pi, math.tau) - math.pi
+    change = float(2 * abs(after / seconds[1] - before / seconds[0]) / seconds.sum())
     if change <= math.radians(3.0):  # per second: less is noise of headings
         return 0.0
     # in a coordinated turn the tangent of the bank is speed times turn rate over gravity
-    bank_rate = float(np.hypot(*last.vel_en_mps)) * change / 9.81
-    return math.hypot(known.mean[4], LATENCY_STD_S) * bank_rate * last.agl_m
+    bank_rate = float(np.hypot(*values[-1].vel_en_mps)) * change / 9.81
+    return math.hypot(known.mean[4], LATENCY_STD_S) * bank_rate * values[-1].agl_m
 
 
 QUARANTINE_S = 180.0
@@ -349,8 +328,8 @@ SETTLED_S = 1800.0
 _WALK = np.array([0.02, 0.02, math.radians(0.003), math.radians(0.003), 5e-4])
 """Random walk of the biases, per root second, so that old values are forgotten over an hour: the
 displacement of a map is not the same everywhere, the track corrects part of the tilt."""
-_BIAS, _GNSS, _LOCAL, _BODY = slice(0, 5), slice(5, 7), slice(7, 9), slice(9, 11)
-_STATES = 11
+_BIAS = slice(0, len(NAMES))
+"""In the state of the filter, before the slowly varying errors."""
 
 
 class BiasLearner:
@@ -358,21 +337,23 @@ class BiasLearner:
 
     def __init__(self, start: Biases, reference: Biases | None = None) -> None:
         """`reference`: of a flight that was interrupted; else it is the `start`."""
-        self._filter = _Filter(start)
+        self.waiting: deque[Difference] = deque()  # in quarantine; an alarm clears it
         self.reference = reference or start
         """What a slow drag-off of this flight has not moved: the biases before the flight, or,
         where they were not known, after the first `SETTLED_S` of agreement."""
-        self.waiting: deque[Difference] = deque()  # in quarantine; an alarm clears it
+        self.begin(start)
 
-    @property
-    def learnt(self) -> Biases:
-        """Estimate from all values whose quarantine has ended."""
-        return self._filter.biases
+    def begin(self, start: Biases) -> None:
+        self.learnt = start  # from all values whose quarantine has ended
+        self._mean = np.concatenate([start.mean, np.zeros(len(_TAUS_S))])
+        self._cov = np.eye(len(self._mean))
+        self._cov[_BIAS, _BIAS] = start.cov
+        self._time_s: float | None = None
 
     def add(self, value: Difference) -> None:
         self.waiting.append(value)
         while self.waiting and self.waiting[0].time_s <= value.time_s - QUARANTINE_S:
-            self._filter.update(self.waiting.popleft())
+            self._update(self.waiting.popleft())
         if self.reference.agreed_s < SETTLED_S <= self.learnt.agreed_s:
             self.reference = self.learnt
 
@@ -380,63 +361,37 @@ class BiasLearner:
         """Go back to the reference, if there is one: a drag-off may have been learnt since."""
         self.waiting.clear()
         if self.reference.agreed_s >= SETTLED_S:
-            self._filter = _Filter(self.reference)
+            self.begin(self.reference)
 
     def until(self, time_s: float) -> Biases:
         """Estimate with the values before a time as well, though they are in quarantine."""
-        ahead = copy.copy(self._filter)
+        ahead = copy.copy(self)  # arrays are replaced, never changed
         for value in self.waiting:
             if value.time_s < time_s:
-                ahead.update(value)
-        return ahead.biases
+                ahead._update(value)
+        return ahead.learnt
 
-
-class _Filter:
-    """The filter; its arrays are replaced, never changed, so a shallow copy is independent."""
-
-    def __init__(self, start: Biases) -> None:
-        self.biases = start
-        self._taus = np.repeat([GNSS_TAU_S, MAP_TAU_S, MOUNT_TAU_S], 2)
-        self._mean = np.concatenate([start.mean, np.zeros(_STATES - len(NAMES))])
-        self._cov = np.eye(_STATES)
-        self._cov[_BIAS, _BIAS] = start.cov
-        self._time_s: float | None = None
-
-    def update(self, value: Difference) -> None:
+    def _update(self, value: Difference) -> None:
         elapsed_s = 0.0 if self._time_s is None else value.time_s - self._time_s
         mean, cov = self._predicted(elapsed_s)
-        shown = self._design(value)
-        noise_m2 = WHITE_SHARE * value.map_std_m**2 + value.rolling_std_m**2
-        spread = shown @ cov @ shown.T + noise_m2 * np.eye(2)
+        shown = np.hstack([value.design, value.slow])
+        spread = shown @ cov @ shown.T + value.white_m2 * np.eye(2)
         off = value.en_m - shown @ mean
-        gain = np.linalg.solve(spread, shown @ cov).T
-        self._mean, self._cov, self._time_s = mean, cov, value.time_s
+        agreed_s = self.learnt.agreed_s
         if off @ np.linalg.solve(spread, off) <= 13.8:  # chi-square of two axes, 99.9 %
-            self._mean, cov = mean + gain @ off, cov - gain @ spread @ gain.T
-            self._cov = (cov + cov.T) / 2
-            agreed_s = self.biases.agreed_s + min(max(elapsed_s, 0.0), 2.0)
-            self.biases = replace(self.biases, agreed_s=agreed_s)
-        bounded = np.clip(self._mean[_BIAS], -LIMITS, LIMITS)
-        length = float(np.hypot(*bounded[:2]))
-        bounded[:2] *= min(1.0, LIMITS[0] / max(length, 1.0))
-        self._mean = np.concatenate([bounded, self._mean[len(NAMES) :]])
-        self.biases = replace(self.biases, mean=bounded, cov=self._cov[_BIAS, _BIAS])
+            gain = np.linalg.solve(spread, shown @ cov).T
+            mean, cov = mean + gain @ off, cov - gain @ spread @ gain.T
+            cov = (cov + cov.T) / 2
+            agreed_s += min(max(elapsed_s, 0.0), 2.0)
+        mean[_BIAS] = np.clip(mean[_BIAS], -LIMITS, LIMITS)
+        mean[:2] *= min(1.0, LARGEST_M / max(float(np.hypot(*mean[:2])), 1.0))
+        self._mean, self._cov, self._time_s = mean, cov, value.time_s
+        self.learnt = Biases(mean[_BIAS], cov[_BIAS, _BIAS], agreed_s, self.learnt.setup)
 
     def _predicted(self, elapsed_s: float) -> tuple[Array, Array]:
         """State and covariance after a time; a clock that went back begins new slow errors."""
         elapsed_s = elapsed_s if elapsed_s >= 0 else math.inf
-        kept = np.concatenate([np.ones(len(NAMES)), np.exp(-elapsed_s / self._taus)])
+        kept = np.concatenate([np.ones(len(NAMES)), np.exp(-elapsed_s / _TAUS_S)])
         walked_s = elapsed_s if math.isfinite(elapsed_s) else 0.0
         grown = np.concatenate([_WALK**2 * walked_s, 1 - kept[len(NAMES) :] ** 2])
         return kept * self._mean, np.multiply.outer(kept, kept) * self._cov + np.diag(grown)
-
-    def _design(self, value: Difference) -> Array:
-        """Derivatives (2, 11) of a value by the state; slow errors have unit variance."""
-        made = np.zeros((2, _STATES))
-        made[:, _BIAS] = value.design
-        made[:, _GNSS] = value.gnss_std_m * np.eye(2)
-        made[:, _LOCAL] = math.sqrt(LOCAL_SHARE) * value.map_std_m * np.eye(2)
-        sin, cos = math.sin(value.heading_rad), math.cos(value.heading_rad)
-        turned = np.array([[cos, sin], [-sin, cos]])
-        made[:, _BODY] = math.sqrt(MOUNT_SHARE) * value.map_std_m * turned
-        return made

@@ -9,11 +9,12 @@ from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from orthonav.core.flight.gnss import FAULTS, RETURNING, Fault, GnssSample
+from orthonav.core.flight.gnss import RETURNING, Fault, GnssSample
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import (
     FAULT_SIGMAS,
@@ -21,19 +22,20 @@ from orthonav.onboard.gnss.biases import (
     GNSS_TAU_S,
     LARGEST_M,
     MULTIPATH_M,
+    WINDOW_S,
     Array,
     Biases,
     BiasLearner,
     Difference,
-    DifferenceWindow,
     Finding,
+    finding,
     rolling_std_m,
     unknown,
-    widen_last,
 )
 
 DIFFERENTIAL = 4
 """GPS_FIX_TYPE from which on corrections are used."""
+_UNKNOWN_M = (math.nan, math.nan)
 
 
 class GnssState(Enum):
@@ -62,26 +64,22 @@ class GnssStatus:
     state: GnssState = GnssState.WAITING
     fault: Fault | None = None  # of the alarm, also while returning
     since_ns: int = 0  # time at which the state began
-    difference_en_m: tuple[float, float] = (math.nan, math.nan)
+    difference_en_m: tuple[float, float] = _UNKNOWN_M
     """Recent GNSS minus map, by which a switch from the map to GNSS would jump."""
-    fault_en_m: tuple[float, float] = (math.nan, math.nan)
+    fault_en_m: tuple[float, float] = _UNKNOWN_M
     """Estimated change of the difference by the fault."""
 
     @property
     def reason(self) -> str | None:
         if self.state is GnssState.RETURNING:
             return RETURNING
-        return self.fault.value if self.state is GnssState.ALARM and self.fault else None
-
-    @property
-    def code(self) -> int:
-        """Number of the reason in `FAULTS`, from 1; 0 without one."""
-        return 0 if self.reason is None else FAULTS.index(self.reason) + 1
+        return None if self.fault is None else self.fault.value
 
 
 @dataclass(frozen=True)
-class ReceiverLimits:
-    """From where on a receiver has a fault by itself."""
+class MonitorLimits:
+    """From where on a receiver has a fault by itself, when GNSS and map agree, and when a change is
+    attributed to the map."""
 
     lost_std_m: float = 50.0
     """Stated standard deviation from which a position counts as none."""
@@ -92,17 +90,28 @@ class ReceiverLimits:
     moving_mps: float = 3.0  # with an equal position only from this speed on
     gap_s: float = 2.0  # samples farther apart are not compared with each other
     jump_m: float = 15.0
-    """Positions that leave the integrated velocity by more than this have jumped: multipath makes
-    steps of up to 10 m;"""
-    jump_s: float = 3.0  # within this time
+    """Positions that leave the integrated velocity by more than this have jumped, those of the map
+    by more than this and so many standard deviations: multipath makes steps of up to 10 m;"""
+    map_jump_sigmas: float = 3.0
+    jump_s: float = 3.0  # those of a receiver within this time
     acceleration_mps2: float = 10.0
     """Largest of an aircraft, where the receiver reports no velocity."""
     velocity_s: float = 20.0  # span over which velocity and positions are compared
     velocity_std_mps: float = 0.3
     """Of a constant error of Doppler velocities: those of receivers are 0.05 to 0.2 m/s."""
+    return_s: float = 60.0  # time of agreement after which a return is announced
+    clear_s: float = 2.0  # time without a fault of the receiver after which its alarm ends
+    recent_s: float = 10.0
+    """Differences of this time are averaged for what is reported and for agreement."""
+    sigmas: float = 2.0  # GNSS agrees within this many standard deviations,
+    min_m: float = 10.0  # and always within this distance
+    before_s: float = 5.0
+    """Values so long before the onset of a fault show what GNSS has to agree with after it."""
+    map_jump_s: float = 60.0
+    """A change so soon after a jump of the map is not attributed to GNSS."""
 
 
-RECEIVER = ReceiverLimits()
+MONITOR = MonitorLimits()
 
 
 class _Point(NamedTuple):
@@ -119,36 +128,35 @@ class _Point(NamedTuple):
 
 
 class Receiver:
+    """The samples of one receiver, which are compared with each other. Mutable."""
+
     def __init__(self) -> None:
         self._points: list[_Point] = []
-        self._heard_ns: int | None = None
+        self._last: GnssSample | None = None
         self._usable = True
-        self._latlon_deg = (math.nan, math.nan)
         self._moved_ns = self._stamped_ns = 0
-        self._stamp_ns: int | None = None
 
     def add(self, sample: GnssSample, en_m: Array) -> bool:
         """Add a sample at `en_m` (2,); whether it has a usable new position."""
-        self._heard_ns = sample.arrived_ns
+        before, self._last = self._last, sample
         latlon = sample.lat_deg, sample.lon_deg
-        if latlon != self._latlon_deg:
-            self._latlon_deg, self._moved_ns = latlon, sample.arrived_ns
-        if sample.stamp_ns is None or sample.stamp_ns != self._stamp_ns:
-            self._stamp_ns, self._stamped_ns = sample.stamp_ns, sample.arrived_ns
-        accurate = not sample.std_m > RECEIVER.lost_std_m
+        if before is None or latlon != (before.lat_deg, before.lon_deg):
+            self._moved_ns = sample.arrived_ns
+        if before is None or sample.stamp_ns is None or sample.stamp_ns != before.stamp_ns:
+            self._stamped_ns = sample.arrived_ns
+        accurate = not sample.std_m > MONITOR.lost_std_m
         self._usable = sample.has_fix and accurate and bool(np.isfinite(en_m).all())
-        time_s = sample.time_ns / 1e9
-        points = self._points
-        if self._usable and points and -RECEIVER.gap_s < time_s - points[-1].time_s <= 0:
+        time_s, points = sample.time_ns / 1e9, self._points
+        elapsed_s = time_s - points[-1].time_s if points else math.inf
+        if self._usable and -MONITOR.gap_s < elapsed_s <= 0:
             return False  # a repeated solution
-        if not self._usable or (points and not 0 < time_s - points[-1].time_s <= RECEIVER.gap_s):
+        if not self._usable or not 0 < elapsed_s <= MONITOR.gap_s:
             points.clear()
         if self._usable:
             velocity = np.array(sample.vel_en_mps or (math.nan, math.nan))
             points.append(self._point(time_s, en_m, velocity))
-            span_s = RECEIVER.velocity_s
-            if points[0].time_s < time_s - 2 * span_s:  # rarely: deleting moves the list
-                del points[: bisect_left(points, time_s - span_s - RECEIVER.gap_s, key=_time_s)]
+            if points[0].time_s < time_s - 2 * MONITOR.velocity_s:  # rarely: it moves the list
+                del points[: self._since(MONITOR.velocity_s + MONITOR.gap_s)]
         return self._usable
 
     def fault(self, now_ns: int, speed_mps: float) -> Fault | None:
@@ -156,31 +164,36 @@ class Receiver:
 
         None before the first message: a receiver that was never heard is not watched.
         """
-        if self._heard_ns is None:
+        if self._last is None:
             return None
-        if not self._usable or (now_ns - self._heard_ns) / 1e9 > RECEIVER.silence_s:
+        heard_ns = self._last.arrived_ns
+        if not self._usable or (now_ns - heard_ns) / 1e9 > MONITOR.silence_s:
             return Fault.LOST
-        if (self._heard_ns - self._stamped_ns) / 1e9 >= RECEIVER.still_s:
-            return Fault.FROZEN
-        own_mps = float(np.hypot(*self._points[-1].vel_en_mps)) if self._points else math.nan
-        speed_mps = np.fmax(speed_mps, own_mps)
-        still_s = (self._heard_ns - self._moved_ns) / 1e9
-        if still_s >= RECEIVER.still_s and speed_mps > RECEIVER.moving_mps:
+        still_ns = MONITOR.still_s * 1e9
+        speed_mps = np.fmax(speed_mps, np.hypot(*self._points[-1].vel_en_mps))
+        is_moving = speed_mps > MONITOR.moving_mps
+        if heard_ns - self._stamped_ns >= still_ns or (
+            is_moving and heard_ns - self._moved_ns >= still_ns
+        ):
             return Fault.FROZEN
         return Fault.JUMP if self._has_jumped() else None
 
     def left_m(self, span_s: float) -> float:
-        """Distance by which positions left the integrated velocity within `span_s`, at the most;
-        NaN where a velocity is missing."""
-        begin_s = self._points[-1].time_s - span_s
-        points = self._points[bisect_left(self._points, begin_s, key=_time_s) :]
-        times_s, places_m, velocities, _ = map(np.array, zip(*points, strict=True))
-        steps_m = (velocities[1:] + velocities[:-1]) / 2 * np.diff(times_s)[:, None]
-        return float(np.hypot(*(places_m[-1] - places_m[0] - steps_m.sum(axis=0))))
-
-    def is_known_for(self, span_s: float) -> bool:
+        """Distance by which positions left the integrated velocity within `span_s`; NaN where a
+        velocity or the begin of that time is missing."""
         points = self._points
-        return bool(points) and points[0].time_s <= points[-1].time_s - span_s
+        if not points or points[0].time_s > points[-1].time_s - span_s:
+            return math.nan
+        begin = self._since(span_s)
+        known = np.isfinite([each.vel_en_mps for each in points[begin:]]).all()
+        return self._residual_m(begin) if known else math.nan
+
+    def _since(self, span_s: float) -> int:
+        """Index of the first sample of the last seconds."""
+        return bisect_left(self._points, self._points[-1].time_s - span_s, key=_TIME_S)
+
+    def _residual_m(self, begin: int) -> float:
+        return float(np.hypot(*(self._points[-1].residual_m - self._points[begin].residual_m)))
 
     def _point(self, time_s: float, en_m: Array, velocity: Array) -> _Point:
         if not self._points:
@@ -200,55 +213,31 @@ class Receiver:
         points = self._points
         if len(points) < 2:
             return False
-        last = points[-1]
-        first, allowed_m = points[-2], RECEIVER.jump_m
-        if np.isfinite(last.vel_en_mps).all():
-            first = points[bisect_left(points, last.time_s - RECEIVER.jump_s, key=_time_s)]
-        else:
-            allowed_m += RECEIVER.acceleration_mps2 * (last.time_s - first.time_s) ** 2
-        return float(np.hypot(*(last.residual_m - first.residual_m))) > allowed_m
+        if np.isfinite(points[-1].vel_en_mps).all():
+            return self._residual_m(self._since(MONITOR.jump_s)) > MONITOR.jump_m
+        free_m = MONITOR.acceleration_mps2 * (points[-1].time_s - points[-2].time_s) ** 2
+        return self._residual_m(-2) > MONITOR.jump_m + free_m
 
 
-def _time_s(point: _Point) -> float:
-    return point.time_s
+_TIME_S = attrgetter("time_s")
 
 
-@dataclass(frozen=True)
-class AgreementLimits:
-    """When GNSS and map agree, and when a change is attributed to the map."""
-
-    return_s: float = 60.0  # time of agreement after which a return is announced
-    clear_s: float = 2.0  # time without a fault of the receiver after which its alarm ends
-    recent_s: float = 10.0
-    """Differences of this time are averaged for what is reported and for agreement."""
-    sigmas: float = 2.0  # GNSS agrees within this many standard deviations,
-    min_m: float = 10.0  # and always within this distance
-    before_s: float = 5.0
-    """Values so long before the onset of a fault show what GNSS has to agree with after it."""
-    map_jump_m: float = 15.0
-    """The map jumped where its position leaves the track's velocity by more than this distance"""
-    map_jump_sigmas: float = 3.0  # and this many standard deviations together
-    map_jump_s: float = 60.0
-    """A change so soon after a jump of the map is not attributed to GNSS."""
-
-
-AGREEMENT = AgreementLimits()
-_LEFT = {
-    Fault.JUMP: Fault.STEP,
-    Fault.LOST: Fault.OFFSET,
-    Fault.FROZEN: Fault.OFFSET,
-    Fault.VELOCITY: Fault.OFFSET,
-}
+_LEFT = {Fault.JUMP: Fault.STEP} | dict.fromkeys(
+    (Fault.LOST, Fault.FROZEN, Fault.VELOCITY), Fault.OFFSET
+)
 """Name of a difference that is left where a fault of the receiver itself has ended."""
 
 
 class GnssMonitor:
+    """The receiver, its difference from the map, and what is learnt of it. Mutable."""
+
     def __init__(
         self, frame: LocalFrame, start: Biases | None = None, reference: Biases | None = None
     ) -> None:
         """`frame`: plane of the map. `start`, `reference`: see `BiasLearner`."""
         self._frame = frame
-        self._receiver, self._window = Receiver(), DifferenceWindow()
+        self._receiver = Receiver()
+        self._window: deque[Difference] = deque()
         self._learner = BiasLearner(start or unknown(), reference)
         self._judged: deque[Difference] = deque(maxlen=3)
         self._pending: deque[MapPosition] = deque(maxlen=100)
@@ -256,10 +245,9 @@ class GnssMonitor:
         self._bin: list[Difference] = []
         self._map: MapPosition | None = None
         self._held: MapPosition | None = None
-        self._map_jump_ns: int | None = None
         self._anchor = self._learner.learnt
         self._agreed_s, self._newest_s = 0.0, -math.inf
-        self._fault_ns = self._velocity_ns = -(10**12)
+        self._fault_ns = self._velocity_ns = self._map_jump_ns = -(10**12)
         self.status = GnssStatus()
 
     @property
@@ -270,12 +258,15 @@ class GnssMonitor:
     def undisturbed(self) -> Biases:
         """Estimate that no fault has touched: during one, from all values before it; else from
         those whose quarantine has ended."""
-        faulty = self.status.state in (GnssState.ALARM, GnssState.RETURNING)
-        return self._anchor if faulty else self._learner.learnt
+        return self._anchor if self._is_faulty else self._learner.learnt
 
     @property
     def reference(self) -> Biases:
         return self._learner.reference
+
+    @property
+    def _is_faulty(self) -> bool:
+        return self.status.state in (GnssState.ALARM, GnssState.RETURNING)
 
     def sample(self, sample: GnssSample) -> None:
         en_m = np.full(2, math.nan)
@@ -306,32 +297,33 @@ class GnssMonitor:
         named = self.status.fault in (None, Fault.VELOCITY)  # a jump contradicts the velocity too
         if fault is None and named and (now_ns - self._velocity_ns) / 1e9 >= 1.0:
             self._velocity_ns = now_ns
-            fault = self._velocity_fault()
+            gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-MONITOR.velocity_s / GNSS_TAU_S))
+            drift_m = MONITOR.velocity_std_mps * MONITOR.velocity_s
+            allowed_m = MULTIPATH_M + FAULT_SIGMAS * math.hypot(math.sqrt(gnss_m2), drift_m)
+            if self._receiver.left_m(MONITOR.velocity_s) > allowed_m:
+                fault = Fault.VELOCITY
         if fault is not None:
             self._fault_ns = now_ns
-            self._alarm(fault, now_ns, None)
+            self._alarm(fault, Finding(fault, now_ns / 1e9, _UNKNOWN_M), now_ns)
         return self.status
 
     def _pair(self, now_ns: int) -> None:
-        while self._solved and self._pending:
-            position = self._pending[0]
-            if position.time_ns > self._solved[-1][0].time_ns:
-                return
-            self._pending.popleft()
-            after = bisect_left(self._solved, position.time_ns, key=lambda each: each[0].time_ns)
-            sample, en_m = self._solved[after]
-            if after == 0 and sample.time_ns > position.time_ns:
-                continue
-            earlier, earlier_m = self._solved[max(after - 1, 0)]
-            interval_ns = sample.time_ns - earlier.time_ns
-            if interval_ns / 1e9 > RECEIVER.gap_s:
-                continue
+        """Compare each waiting position with those of GNSS before and after it."""
+        pending, solved = self._pending, self._solved
+        while pending and solved and pending[0].time_ns <= solved[-1][0].time_ns:
+            position = pending.popleft()
+            after = bisect_left(solved, position.time_ns, key=lambda each: each[0].time_ns)
+            (earlier, earlier_m), (sample, en_m) = solved[max(after - 1, 0)], solved[after]
             ahead_ns = position.time_ns - earlier.time_ns
+            interval_ns = sample.time_ns - earlier.time_ns
+            if ahead_ns < 0 or interval_ns / 1e9 > MONITOR.gap_s:
+                continue
             weight = ahead_ns / interval_ns if interval_ns else 1.0
             at_exposure = (1 - weight) * earlier_m + weight * en_m
             self._add(position, at_exposure - position.en_m, sample, now_ns)
 
     def _add(self, position: MapPosition, off_en_m: Array, sample: GnssSample, now_ns: int) -> None:
+        """Add a difference; the median of those of a second is judged."""
         velocity = position.vel_en_mps
         if velocity is None:
             velocity = np.array(sample.vel_en_mps or (0.0, 0.0))
@@ -339,140 +331,108 @@ class GnssMonitor:
         least_m = GNSS_STD_M if sample.fix_type < DIFFERENTIAL else 1.0
         std_m = max(sample.std_m, least_m) if math.isfinite(sample.std_m) else GNSS_STD_M
         time_s = position.time_ns / 1e9
-        flown = math.radians(position.heading_deg), velocity, position.agl_m
-        made = Difference(time_s, off_en_m, std_m, position.std_m, *flown)
         if self._bin and math.floor(self._bin[0].time_s) != math.floor(time_s):
-            value, self._bin = _median(self._bin), []
-            self._judge(value, now_ns)
-        self._bin.append(made)
+            second, self._bin = self._bin, []
+            median = np.median([each.en_m for each in second], axis=0)
+            self._judge(replace(second[len(second) // 2], en_m=median), now_ns)
+        flown = math.radians(position.heading_deg), velocity, position.agl_m
+        self._bin.append(Difference(time_s, off_en_m, std_m, position.std_m, *flown))
 
     def _judge(self, value: Difference, now_ns: int) -> None:
+        """Test and learn the difference of a second."""
+        window, learner = self._window, self._learner
         if value.time_s <= self._newest_s:
-            self._window.values.clear()  # the clock went back
-            self._learner.waiting.clear()
+            window.clear()  # the clock went back
+            learner.waiting.clear()
         self._newest_s = value.time_s
         self._judged.append(value)
-        rolling_m = rolling_std_m(self._judged, self._learner.learnt)
+        rolling_m = rolling_std_m(self._judged, learner.learnt)
         if rolling_m:  # headings show it a second later than the bank
-            value = replace(value, rolling_std_m=rolling_m)
-            widen_last(self._window.values, rolling_m)
-            widen_last(self._learner.waiting, rolling_m)
-        self._window.add(value)
-        recent = self._window.recent(AGREEMENT.recent_s)
+            value = value.widened(rolling_m)
+            for values in (window, learner.waiting):
+                if values:
+                    values[-1] = values[-1].widened(rolling_m)
+        window.append(value)
+        while window[0].time_s < value.time_s - WINDOW_S:
+            window.popleft()
+        recent = [each for each in window if each.time_s > value.time_s - MONITOR.recent_s]
         east, north = np.mean([each.en_m for each in recent], axis=0).tolist()
         self.status = replace(self.status, difference_en_m=(east, north))
-        if (now_ns - self._fault_ns) / 1e9 < AGREEMENT.clear_s:
+        if (now_ns - self._fault_ns) / 1e9 < MONITOR.clear_s:
             return  # the receiver has a fault by itself
-        if self.status.state in (GnssState.WAITING, GnssState.GOOD):
-            found = (
-                self._window.finding(self._learner.learnt)
-                or self._too_far(recent, value)
-                or self._crept(value)
-            )
+        if not self._is_faulty:
+            found = finding(window, learner.learnt) or self._offset(recent, value)
             if found is not None:
-                self._alarm(self._attributed(found, now_ns), now_ns, found)
+                is_ours = (now_ns - self._map_jump_ns) / 1e9 <= MONITOR.map_jump_s
+                self._alarm(Fault.DISAGREES if is_ours else found.fault, found, now_ns)
                 return
-        if self.status.state in (GnssState.WAITING, GnssState.GOOD):
-            self._learner.add(value)
+            learner.add(value)
         self._count_agreement(recent, value, now_ns)
 
     def _count_agreement(self, recent: list[Difference], value: Difference, now_ns: int) -> None:
-        anchor = self._learner.learnt if self.status.state is GnssState.GOOD else self._anchor
-        limit_m = max(AGREEMENT.min_m, AGREEMENT.sigmas * self._std_m(value, anchor))
-        if self.status.state is GnssState.WAITING and anchor.agreed_s == 0:
+        state, fault = self.status.state, self.status.fault
+        anchor = self._learner.learnt if state is GnssState.GOOD else self._anchor
+        limit_m = max(MONITOR.min_m, MONITOR.sigmas * value.std_m(anchor))
+        if state is GnssState.WAITING and anchor.agreed_s == 0:
             limit_m = max(limit_m, LARGEST_M)  # nothing is known of the map
         if float(np.hypot(*_residual(recent, anchor))) > limit_m:
             self._agreed_s = 0.0
-            if self.status.state is GnssState.WAITING:
+            if state is GnssState.WAITING:
                 self._learner.waiting.clear()
-            if self.status.state in (GnssState.ALARM, GnssState.RETURNING):
-                fault = self.status.fault
-                named = fault if fault is None else _LEFT.get(fault, fault)
-                self.status = replace(self.status, fault=named)
-                self._enter(GnssState.ALARM, now_ns)
+            if self._is_faulty:
+                named = None if fault is None else _LEFT.get(fault, fault)
+                self._enter(GnssState.ALARM, now_ns, fault=named)
             return
         self._agreed_s += 1.0
-        if self.status.state is GnssState.ALARM and self._agreed_s >= AGREEMENT.recent_s:
+        if state is GnssState.ALARM and self._agreed_s >= MONITOR.recent_s:
             self._enter(GnssState.RETURNING, now_ns)
-        if self.status.state is not GnssState.GOOD and self._agreed_s >= AGREEMENT.return_s:
-            self._enter(GnssState.GOOD, now_ns)
-            self.status = replace(self.status, fault=None, fault_en_m=(math.nan, math.nan))
+        if state is not GnssState.GOOD and self._agreed_s >= MONITOR.return_s:
+            self._enter(GnssState.GOOD, now_ns, fault=None, fault_en_m=_UNKNOWN_M)
 
-    def _alarm(self, fault: Fault, now_ns: int, found: Finding | None) -> None:
+    def _alarm(self, fault: Fault, found: Finding, now_ns: int) -> None:
         """Raise an alarm: learning stops, and what waits to be learnt is discarded."""
-        if self.status.state in (GnssState.WAITING, GnssState.GOOD):
-            begin_s = now_ns / 1e9 if found is None else found.onset_s
+        if not self._is_faulty:
             if fault is Fault.OFFSET:
                 self._learner.restore()
-            is_old = found is not None and found.fault is Fault.OFFSET
-            until_s = -math.inf if is_old else begin_s - AGREEMENT.before_s
+            is_old = found.fault is Fault.OFFSET
+            until_s = -math.inf if is_old else found.onset_s - MONITOR.before_s
             self._anchor = self._learner.until(until_s)
-        if self.status.state is GnssState.ALARM and (
-            self.status.fault is fault or (fault is Fault.JUMP and self.status.fault is Fault.STEP)
-        ):
+        known = (fault, Fault.STEP) if fault is Fault.JUMP else (fault,)
+        if self.status.state is GnssState.ALARM and self.status.fault in known:
             return
         self._learner.waiting.clear()
         self._forget()
-        size = (math.nan, math.nan) if found is None else found.en_m
-        self.status = replace(self.status, fault=fault, fault_en_m=size)
-        self._enter(GnssState.ALARM, now_ns)
+        self._agreed_s = 0.0
+        self._enter(GnssState.ALARM, now_ns, fault=fault, fault_en_m=found.en_m)
 
-    def _enter(self, state: GnssState, now_ns: int) -> None:
-        if state is GnssState.ALARM:
-            self._agreed_s = 0.0
-        if state is not self.status.state:
-            self.status = replace(self.status, state=state, since_ns=now_ns)
+    def _enter(self, state: GnssState, now_ns: int, **changed: Any) -> None:
+        since_ns = self.status.since_ns if state is self.status.state else now_ns
+        self.status = replace(self.status, state=state, since_ns=since_ns, **changed)
 
     def _forget(self) -> None:
-        self._window.values.clear()
+        self._window.clear()
         self._bin = []
 
-    def _attributed(self, found: Finding, now_ns: int) -> Fault:
-        jumped = self._map_jump_ns
-        if jumped is not None and (now_ns - jumped) / 1e9 <= AGREEMENT.map_jump_s:
-            return Fault.DISAGREES
-        return found.fault
-
-    def _too_far(self, recent: list[Difference], value: Difference) -> Finding | None:
-        others = self._learner.learnt.without_displacement()
-        east, north = _residual(recent, others).tolist()
-        off_m, std_m = math.hypot(east, north), self._std_m(value, others)
-        if len(recent) < AGREEMENT.recent_s / 2 or off_m < LARGEST_M + AGREEMENT.sigmas * std_m:
-            return None
-        begin_s = self._window.values[0].time_s
-        return Finding(Fault.OFFSET, begin_s, (east, north))
-
-    def _crept(self, value: Difference) -> Finding | None:
-        """A drag-off that was slow enough to be learnt: the biases left their reference."""
-        reference = self._learner.reference
-        moved = value.design @ (self._learner.learnt.mean - reference.mean)
-        east, north = moved.tolist()
-        std_m = math.sqrt(reference.variance_m2(value.design))
-        if math.hypot(east, north) <= MULTIPATH_M + FAULT_SIGMAS * std_m:
-            return None
-        return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north))
-
-    def _std_m(self, value: Difference, known: Biases) -> float:
-        """Standard deviation of a difference from the known biases, along the worst axis."""
-        gnss_m = max(value.gnss_std_m, GNSS_STD_M)
-        return math.sqrt(known.variance_m2(value.design) + gnss_m**2 + value.map_std_m**2)
-
-    def _velocity_fault(self) -> Fault | None:
-        gnss_m2 = 2 * GNSS_STD_M**2 * (1 - math.exp(-RECEIVER.velocity_s / GNSS_TAU_S))
-        drift_m2 = (RECEIVER.velocity_std_mps * RECEIVER.velocity_s) ** 2
-        if not self._receiver.is_known_for(RECEIVER.velocity_s):
-            return None
-        own_m = self._receiver.left_m(RECEIVER.velocity_s)
-        if own_m > MULTIPATH_M + FAULT_SIGMAS * math.sqrt(gnss_m2 + drift_m2):
-            return Fault.VELOCITY
+    def _offset(self, recent: list[Difference], value: Difference) -> Finding | None:
+        """A difference larger than the largest displacement of a map, or a drag-off that was slow
+        enough to be learnt: the biases left their reference."""
+        learnt, reference = self._learner.learnt, self._learner.reference
+        others = learnt.without_displacement()
+        far_m = LARGEST_M + MONITOR.sigmas * value.std_m(others)
+        if len(recent) < MONITOR.recent_s / 2:
+            far_m = math.inf
+        crept = value.design @ (learnt.mean - reference.mean)
+        crept_m = MULTIPATH_M + FAULT_SIGMAS * math.sqrt(reference.variance_m2(value.design))
+        for off, most_m in ((_residual(recent, others), far_m), (crept, crept_m)):
+            east, north = off.tolist()
+            if math.hypot(east, north) > most_m:
+                return Finding(Fault.OFFSET, self._window[0].time_s, (east, north))
         return None
 
     def _speed_mps(self, now_ns: int) -> float:
         """Speed by the map's track; NaN where it is not known or too old."""
         last = self._map
-        if last is None or last.vel_en_mps is None:
-            return math.nan
-        if (now_ns - last.time_ns) / 1e9 > RECEIVER.gap_s:
+        if last is None or last.vel_en_mps is None or now_ns - last.time_ns > MONITOR.gap_s * 1e9:
             return math.nan
         return float(np.hypot(*last.vel_en_mps))
 
@@ -480,19 +440,13 @@ class GnssMonitor:
 def _jumped(before: MapPosition, now: MapPosition) -> bool:
     seconds = (now.time_ns - before.time_ns) / 1e9
     velocities = [v for v in (before.vel_en_mps, now.vel_en_mps) if v is not None]
-    if not 0 < seconds <= RECEIVER.gap_s or not velocities:
+    if not 0 < seconds <= MONITOR.gap_s or not velocities:
         return False
     moved = np.mean(velocities, axis=0) * seconds
     off_m = float(np.hypot(*(now.en_m - before.en_m - moved)))
     std_m = max(before.std_m, now.std_m)
-    return off_m > AGREEMENT.map_jump_m + AGREEMENT.map_jump_sigmas * std_m
+    return off_m > MONITOR.jump_m + MONITOR.map_jump_sigmas * std_m
 
 
 def _residual(values: list[Difference], known: Biases) -> Array:
     return np.asarray(np.mean([each.residual(known) for each in values], axis=0))
-
-
-def _median(values: list[Difference]) -> Difference:
-    """Median of the differences, other fields as in the middle."""
-    middle = values[len(values) // 2]
-    return replace(middle, en_m=np.median([each.en_m for each in values], axis=0))

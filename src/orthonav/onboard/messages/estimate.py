@@ -110,6 +110,10 @@ def estimate_from_result(
         return None
     if processing_s is None:
         processing_s = result.latency_ms / 1e3 if math.isfinite(result.latency_ms) else 0.0
+    velocity, velocity_cov = None, None
+    if result.state is not None:  # of a track, which reports the deviation of the worst direction
+        velocity = fix.known_velocity_en_mps
+        velocity_cov = np.eye(2) * fix.vel_std_mps**2 if math.isfinite(fix.vel_std_mps) else None
     return NavigationEstimate(
         lat_deg=fix.lat_deg,
         lon_deg=fix.lon_deg,
@@ -118,8 +122,8 @@ def estimate_from_result(
         time_ns=result.time_ns,
         utc_ns=result.time_ns + utc_ahead_ns,
         processing_s=processing_s,
-        vel_en_mps=fix.known_velocity_en_mps if result.state is not None else None,
-        vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,
+        vel_en_mps=velocity,
+        vel_cov_en=velocity_cov,
         state=result.state,
         protection_level_m=fix.protection_level_m(result.risk),
         accepted=result.accepted is not False,
@@ -130,11 +134,6 @@ def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
     """Symmetric covariance (N, N) with a standard deviation of at least `min_std` everywhere."""
     values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
     return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
-
-
-def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
-    """Covariance from a track, which reports the standard deviation along the worst direction."""
-    return np.eye(2) * fix.vel_std_mps**2 if math.isfinite(fix.vel_std_mps) else None
 
 
 def messages_averaged(interval_s: float, averaging_s: float = 3.0) -> float:

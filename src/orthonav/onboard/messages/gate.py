@@ -116,15 +116,11 @@ class Gate:
     def availability(self, now_ns: int) -> dict[str, float | None]:
         """The alert limit, the last protection level (None: infinite), and for how long it has kept
         positions from being sent; empty without a limit."""
-        limit_m, level_m, since_ns = (
-            self.rules.alert_limit_m,
-            self._protection_level_m,
-            self._unavailable_ns,
-        )
-        if not math.isfinite(limit_m):
+        level_m, since_ns = self._protection_level_m, self._unavailable_ns
+        if not math.isfinite(self.rules.alert_limit_m):
             return {}
         return {
-            "alert_limit_m": limit_m,
+            "alert_limit_m": self.rules.alert_limit_m,
             "protection_level_m": round(level_m, 1) if math.isfinite(level_m) else None,
             "unavailable_s": 0.0 if since_ns is None else round((now_ns - since_ns) / 1e9, 1),
         }

@@ -10,7 +10,7 @@ Height, attitude and vertical velocity of messages in the autopilot's local fram
 
 import math
 from dataclasses import dataclass, field
-from enum import Enum, IntFlag
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -29,19 +29,6 @@ MAX_TEXT = 50
 """Characters of one STATUSTEXT."""
 LEAP_S, LEAP_UNIX_S = 18, 1_483_228_800
 """GPS time minus UTC, and since when: a new leap second (IERS Bulletin C) changes both."""
-
-
-class _Ignore(IntFlag):
-    """GPS_INPUT_IGNORE_FLAGS (common.xml)."""
-
-    ALT = 1
-    HDOP = 2
-    VDOP = 4
-    VEL_HORIZ = 8
-    VEL_VERT = 16
-    SPEED_ACCURACY = 32
-    HORIZ_ACCURACY = 64
-    VERT_ACCURACY = 128
 
 
 @dataclass(frozen=True)
@@ -88,17 +75,30 @@ class Packer:
         sequence: int = 0,
         signing: Signing | None = None,
     ) -> None:
-        for name, value in (("system", system_id), ("component", component_id)):
-            if not 1 <= value <= 255:
-                raise EstimateError(f"the {name} id must be 1 to 255, got {value}")
-        self._mav = dialect().MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._mav = dialect().MAVLink(None, srcComponent=component_id)
         self._mav.seq = sequence % 256
+        if not 1 <= component_id <= 255:
+            raise EstimateError(f"the component id must be 1 to 255, got {component_id}")
+        self.set_system(system_id)
         if signing is not None:
             self._mav.signing.secret_key = signing.secret_key
             self._mav.signing.timestamp = signing.timestamp_10us
             self._mav.signing.sign_outgoing = True
 
-    def pack(self, message: Message) -> bytes:
+    def set_system(self, system_id: int) -> None:
+        if not 1 <= system_id <= 255:
+            raise EstimateError(f"the system id must be 1 to 255, got {system_id}")
+        self._mav.srcSystem = system_id
+
+    @property
+    def timestamp_10us(self) -> int:
+        """That of the next signature."""
+        return int(self._mav.signing.timestamp)
+
+    def pack(self, message: Message, utc_ns: int = 0) -> bytes:
+        """The frame; `utc_ns`: time that the timestamps of signatures follow."""
+        signing = self._mav.signing
+        signing.timestamp = max(signing.timestamp, signing_timestamp(utc_ns))
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
@@ -114,7 +114,9 @@ def global_position_sensor(estimate: NavigationEstimate, *, target: Target = AUT
     eph_m = estimate.horizontal_std_m()
     if math.isnan(eph_m):
         raise EstimateError("GLOBAL_POSITION_SENSOR needs the accuracy of the position")
-    return dialect().MAVLink_global_position_sensor_message(
+    alt_m = estimate.alt_amsl_m
+    return _made(
+        dialect().MAVLink_global_position_sensor_message,
         target_system=target.system_id,
         target_component=target.component_id,
         id=1,  # that of EKF2_AGP0_ID
@@ -125,9 +127,9 @@ def global_position_sensor(estimate: NavigationEstimate, *, target: Target = AUT
         lat=deg_e7(estimate.lat_deg),
         lon=deg_e7(estimate.lon_deg),
         alt_ellipsoid=math.nan,
-        alt=float32(estimate.alt_amsl_m),
-        eph=float32(eph_m),
-        epv=float32(estimate.alt_std_m) if math.isfinite(estimate.alt_amsl_m) else math.nan,
+        alt=alt_m,
+        eph=eph_m,
+        epv=estimate.alt_std_m if math.isfinite(alt_m) else math.nan,
     )
 
 
@@ -138,35 +140,44 @@ def gps_input(estimate: NavigationEstimate, *, gps_id: int = 0) -> Message:
     of precision always, altitude and speed accuracy unless the estimate has them. `fix_type` is 3
     for a confident estimate, else 1 with all fields ignored. There are 0 satellites.
     """
-    confident = estimate.is_confident
-    eph_m = estimate.horizontal_std_m()
-    vel_cov = estimate.vel_cov_en
-    speed_std_mps = math.nan if vel_cov is None else error_ellipse(vel_cov)[0]
-    flags = _ignored(estimate, speed_std_mps) if confident else ~_Ignore(0)
+    confident, alt_std_m = estimate.is_confident, estimate.alt_std_m
+    speed_std_mps, east_north = math.nan, estimate.vel_en_mps or (math.nan, math.nan)
+    if estimate.vel_cov_en is not None:
+        speed_std_mps = error_ellipse(estimate.vel_cov_en)[0]
+    alt_known, moves = math.isfinite(estimate.alt_amsl_m), all(map(math.isfinite, east_north))
+    known = {  # by the bit of GPS_INPUT_IGNORE_FLAGS (common.xml) that marks it as not known
+        1: alt_known,
+        2 | 4 | 16: False,  # dilutions of precision, vertical velocity
+        8: moves,
+        32: moves and math.isfinite(speed_std_mps),
+        64: True,  # horizontal accuracy
+        128: alt_known and math.isfinite(alt_std_m),
+    }
+    flags = sum(bits for bits, is_known in known.items() if not (confident and is_known))
     week, week_ms = gps_time(estimate.stamp_ns)
-    vel_east, vel_north = estimate.vel_en_mps or (0.0, 0.0)
 
-    def unless(bit: _Ignore, value: float) -> float:
-        return 0.0 if flags & bit else float32(value)
+    def unless(bit: int, value: float) -> float:
+        return 0.0 if flags & bit else value
 
-    return dialect().MAVLink_gps_input_message(
+    return _made(
+        dialect().MAVLink_gps_input_message,
         time_usec=microseconds(estimate.stamp_ns),
         gps_id=clamped(gps_id, 0, 255),
-        ignore_flags=int(flags),
+        ignore_flags=flags,
         time_week_ms=week_ms,
         time_week=clamped(week, 0, 2**16 - 1),
         fix_type=3 if confident else 1,
         lat=deg_e7(estimate.lat_deg) if confident else 0,
         lon=deg_e7(estimate.lon_deg) if confident else 0,
-        alt=unless(_Ignore.ALT, estimate.alt_amsl_m),
+        alt=unless(1, estimate.alt_amsl_m),
         hdop=65535.0,
         vdop=65535.0,
-        vn=unless(_Ignore.VEL_HORIZ, vel_north),
-        ve=unless(_Ignore.VEL_HORIZ, vel_east),
+        vn=unless(8, east_north[1]),
+        ve=unless(8, east_north[0]),
         vd=0.0,
-        speed_accuracy=unless(_Ignore.SPEED_ACCURACY, speed_std_mps),
-        horiz_accuracy=unless(_Ignore.HORIZ_ACCURACY, eph_m),
-        vert_accuracy=unless(_Ignore.VERT_ACCURACY, estimate.alt_std_m),
+        speed_accuracy=unless(32, speed_std_mps),
+        horiz_accuracy=unless(64, estimate.horizontal_std_m()),
+        vert_accuracy=unless(128, alt_std_m),
         satellites_visible=0,
         yaw=0,  # the camera need not point forward
     )
@@ -179,16 +190,17 @@ def external_position_estimate(
     Raises `EstimateError` for an estimate of low confidence, which it cannot mark."""
     estimate.require_confident("MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
     wrapped_ns = estimate.sent_ns % (250 * 10**9)  # by the definition of the field
-    return dialect().MAVLink_command_int_message(
+    return _made(
+        dialect().MAVLink_command_int_message,
         target_system=target.system_id,
         target_component=target.component_id,
         frame=0,  # global
         command=43003,
         current=0,
         autocontinue=0,
-        param1=float32(wrapped_ns / 1e9),
-        param2=float32(max(estimate.processing_s, 0.0)),
-        param3=float32(estimate.horizontal_std_m()),
+        param1=wrapped_ns / 1e9,
+        param2=max(estimate.processing_s, 0.0),
+        param3=estimate.horizontal_std_m(),
         param4=0.0,
         x=deg_e7(estimate.lat_deg),
         y=deg_e7(estimate.lon_deg),
@@ -198,13 +210,8 @@ def external_position_estimate(
 
 def request_message(number: int, target: Target = AUTOPILOT) -> Message:
     """MAV_CMD_REQUEST_MESSAGE (512) as COMMAND_LONG: send the message `number` once."""
-    return dialect().MAVLink_command_long_message(
-        target.system_id,
-        target.component_id,
-        512,
-        0,
-        *(float(number), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    )
+    address = target.system_id, target.component_id
+    return dialect().MAVLink_command_long_message(*address, 512, 0, number, *[0.0] * 6)
 
 
 def status_texts(severity: int, text: str, number: int) -> list[Message]:
@@ -246,25 +253,19 @@ def clamped(value: float, low: int, high: int) -> int:
     return round(min(max(value, low), high))
 
 
-def float32(value: float) -> float:
-    """`value` clamped to the range of a 32-bit float; NaN ("not known") where it is not finite."""
-    if not math.isfinite(value):
-        return math.nan
+def _made(kind: Any, **values: Any) -> Message:
+    """A message of `kind`, its floats clamped to 32 bits; NaN ("not known") where not finite."""
     largest = (2 - 2**-23) * 2.0**127
-    return min(max(value, -largest), largest)
 
+    def float32(value: float) -> float:
+        return min(max(value, -largest), largest) if math.isfinite(value) else math.nan
 
-def _ignored(estimate: NavigationEstimate, speed_std_mps: float) -> _Ignore:
-    flags = _Ignore.HDOP | _Ignore.VDOP | _Ignore.VEL_VERT
-    if not math.isfinite(estimate.alt_amsl_m):
-        flags |= _Ignore.ALT | _Ignore.VERT_ACCURACY
-    if not math.isfinite(estimate.alt_std_m):
-        flags |= _Ignore.VERT_ACCURACY
-    if estimate.vel_en_mps is None or not all(map(math.isfinite, estimate.vel_en_mps)):
-        flags |= _Ignore.VEL_HORIZ | _Ignore.SPEED_ACCURACY
-    if not math.isfinite(speed_std_mps):
-        flags |= _Ignore.SPEED_ACCURACY
-    return flags
+    for name, value in values.items():
+        if isinstance(value, float):
+            values[name] = float32(value)
+        elif isinstance(value, list):
+            values[name] = [float32(each) for each in value]
+    return kind(**values)
 
 
 def gps_time(utc_ns: int) -> tuple[int, int]:
@@ -350,31 +351,27 @@ def odometry(estimate: NavigationEstimate, pose: LocalPose, autopilot: Autopilot
     """
     estimate.require_confident("ODOMETRY")
     position, variance = _position(estimate, pose, autopilot, "ODOMETRY")
-    velocity_ned = _velocity_ned(estimate, pose)
-    frames = 1, 1  # MAV_FRAME_LOCAL_NED
-    velocity, velocity_cov = velocity_ned, _velocity_covariance(estimate, pose)
+    east, north = estimate.vel_en_mps or (math.nan, math.nan)
+    velocity = np.array([north, east, pose.vel_down_mps])
+    frames, velocity_cov = (1, 1), _velocity_covariance(estimate, pose)  # MAV_FRAME_LOCAL_NED
     if autopilot is Autopilot.ARDUPILOT:
-        roll, pitch, yaw = pose.attitude_rad
-        body_from_ned = matrices_of_wxyz(wxyz_of_angles([yaw, pitch, roll])).T
+        body_from_ned = matrices_of_wxyz(wxyz_of_angles(pose.attitude_rad[::-1])).T
         frames = 20, 12  # MAV_FRAME_LOCAL_FRD, MAV_FRAME_BODY_FRD
-        velocity = body_from_ned @ velocity_ned
+        velocity = body_from_ned @ velocity
         velocity_cov = body_from_ned @ velocity_cov @ body_from_ned.T
         if not np.isfinite(velocity).all():
             raise EstimateError(
                 "ODOMETRY to ArduPilot needs attitude and velocity, and they are not all known: "
                 "send VISION_POSITION_ESTIMATE"
             )
-    return dialect().MAVLink_odometry_message(
+    return _made(
+        dialect().MAVLink_odometry_message,
         time_usec=microseconds(estimate.stamp_ns),
         frame_id=frames[0],
         child_frame_id=frames[1],
-        x=float32(position[0]),
-        y=float32(position[1]),
-        z=float32(position[2]),
-        q=[float32(value) for value in wxyz_of_angles(pose.attitude_rad[::-1]).tolist()],
-        vx=float32(velocity[0]),
-        vy=float32(velocity[1]),
-        vz=float32(velocity[2]),
+        **dict(zip("xyz", position, strict=True)),
+        q=wxyz_of_angles(pose.attitude_rad[::-1]).tolist(),
+        **dict(zip(("vx", "vy", "vz"), velocity.tolist(), strict=True)),
         rollspeed=math.nan,
         pitchspeed=math.nan,
         yawspeed=math.nan,
@@ -394,18 +391,14 @@ def vision_position_estimate(
     Raises `EstimateError` where height or attitude is not known, or for a low confidence.
     """
     estimate.require_confident("VISION_POSITION_ESTIMATE")
-    (x, y, z), variance = _position(estimate, pose, autopilot, "this message")
+    position, variance = _position(estimate, pose, autopilot, "this message")
     if not all(map(math.isfinite, pose.attitude_rad)):
         raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude of the autopilot")
-    roll, pitch, yaw = pose.attitude_rad
-    return dialect().MAVLink_vision_position_estimate_message(
+    return _made(
+        dialect().MAVLink_vision_position_estimate_message,
         usec=microseconds(estimate.stamp_ns),
-        x=float32(x),
-        y=float32(y),
-        z=float32(z),
-        roll=roll,
-        pitch=pitch,
-        yaw=yaw,
+        **dict(zip("xyz", position, strict=True)),
+        **dict(zip(("roll", "pitch", "yaw"), pose.attitude_rad, strict=True)),
         covariance=_triangle(variance, pose.attitude_std_rad),
         reset_counter=estimate.reset_counter,
     )
@@ -425,8 +418,12 @@ def set_gps_global_origin(origin: Origin, *, target_system: int = 1) -> Message:
 def _position(
     estimate: NavigationEstimate, pose: LocalPose, autopilot: Autopilot, message: str
 ) -> tuple[Triple, Array]:
-    """North, east, down in metres and their covariance (3, 3), all known. ArduPilot makes one
-    standard deviation of it: it gets the one that comes out as the horizontal one."""
+    """North, east, down in metres and their covariance (3, 3), all known.
+
+    ArduPilot makes one standard deviation of it, the root of the sum of the three variances: each
+    is a third, so that this is the horizontal one. Older versions take the cube root of the sum of
+    their squares, which is not smaller (`GCS_MAVLink/GCS_Common.cpp`).
+    """
     north, east = north_east_m(pose.origin, estimate.lat_deg, estimate.lon_deg, autopilot)
     down, down_std = pose.origin.alt_amsl_m - estimate.alt_amsl_m, estimate.alt_std_m
     if not math.isfinite(down):
@@ -437,17 +434,11 @@ def _position(
             "receivers drop the position or its accuracy"
         )
     if autopilot is Autopilot.ARDUPILOT:
-        std_m = estimate.horizontal_std_m()
-        return (north, east, down), np.eye(3) * ardupilot_variance(std_m)
+        return (north, east, down), np.eye(3) * (estimate.horizontal_std_m() ** 2 / 3)
     variance = np.zeros((3, 3))
     variance[:2, :2] = estimate.cov_en_m2[::-1, ::-1]
     variance[2, 2] = down_std**2
     return (north, east, down), variance
-
-
-def _velocity_ned(estimate: NavigationEstimate, pose: LocalPose) -> Array:
-    east, north = estimate.vel_en_mps or (math.nan, math.nan)
-    return np.array([north, east, pose.vel_down_mps])
 
 
 def _velocity_covariance(estimate: NavigationEstimate, pose: LocalPose) -> Array:
@@ -467,7 +458,7 @@ def _triangle(upper: Array, lower_std: Triple) -> list[float]:
     cov[3:, 3:] = np.diag(np.square(lower_std))
     if not math.isfinite(cov[0, 0]):
         cov[:] = math.nan
-    return [float32(value) for value in cov[np.triu_indices(6)].tolist()]
+    return list(cov[np.triu_indices(6)].tolist())
 
 
 def north_east_m(
@@ -485,15 +476,6 @@ def north_east_m(
     scale = max(math.cos(math.radians((lat_deg + origin.lat_deg) / 2)), 0.01)  # near the poles
     m_per_deg = 0.011131884502145034 * 1e7
     return (lat_deg - origin.lat_deg) * m_per_deg, turned_deg * m_per_deg * scale
-
-
-def ardupilot_variance(std_m: float) -> float:
-    """Variance of each of three axes that ArduPilot reads as the standard deviation `std_m`.
-
-    It takes the root of the sum of the variances of all three axes; older versions the cube root of
-    the sum of their squares, which is not smaller (`GCS_MAVLink/GCS_Common.cpp`).
-    """
-    return std_m**2 / 3
 
 
 def _px4(origin: Origin, lat_deg: float, lon_deg: float) -> tuple[float, float]:

@@ -8,6 +8,8 @@ writer of pynmeagps writes 60.00000 minutes, zeros for unknown numbers and the t
 import math
 from datetime import UTC, datetime, timedelta
 from enum import Enum
+from functools import reduce
+from operator import xor
 
 from orthonav.core.records import error_ellipse
 from orthonav.onboard.messages.estimate import NavigationEstimate
@@ -16,7 +18,6 @@ MPS_PER_KNOT = 1852 / 3600
 _MINUTE = 10**5
 """Resolution of minutes: five decimals, 2 cm."""
 _LARGEST_M, _LARGEST_KNOTS = 9999.99, 999.99
-_ALTITUDES_M = (-9999.9, 99999.9)
 _UNIX = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -27,81 +28,44 @@ class Quality(Enum):
     """As a GPS fix, for receivers that accept nothing else."""
 
 
-def gga(
+def sentences(
     estimate: NavigationEstimate | None,
     utc_ns: int | None = None,
     quality: Quality = Quality.ESTIMATED,
 ) -> bytes:
     """GGA: time, position, quality, altitude above mean sea level where known; 00 satellites.
+    RMC: time and date, status, position, speed in knots and course where velocity is known.
+    GST: one-sigma error ellipse (m, direction of the major axis from true north) and standard
+    deviations of latitude, longitude and altitude (m); the RMS of ranges is empty.
 
-    `utc_ns`: time of a sentence without an estimate.
+    `utc_ns`: time of sentences without an estimate.
     """
-    time_ns, confident = _when_and_whether(estimate, utc_ns)
-    if estimate is None or not confident:
-        return _sentence(["GGA", _time(time_ns), *_NO_PLACE, "0", "00", *[""] * 7])
-    altitude, place = _altitude(estimate.alt_amsl_m), _place(estimate)
-    tail = ["00", "", altitude, "M" if altitude else "", "", "", "", ""]
-    return _sentence(["GGA", _time(time_ns), *place, quality.value[0], *tail])
-
-
-def rmc(
-    estimate: NavigationEstimate | None,
-    utc_ns: int | None = None,
-    quality: Quality = Quality.ESTIMATED,
-) -> bytes:
-    """RMC: time and date, status, position, speed in knots and course where velocity is known."""
-    time_ns, confident = _when_and_whether(estimate, utc_ns)
-    if estimate is None or not confident:
-        fields = ["V", *_NO_PLACE, "", "", _date(time_ns), "", "", "N"]
+    time, date = _time_and_date(utc_ns if estimate is None else estimate.utc_ns)
+    if estimate is None or not estimate.is_confident:
+        gga = [*[""] * 4, "0", "00", *[""] * 7]
+        rmc = ["V", *[""] * 6, date, "", "", "N"]
+        gst = [""] * 7
     else:
-        _, status, mode = quality.value
-        speed, course = _speed_and_course(estimate.vel_en_mps)
-        fields = [status, *_place(estimate), speed, course, _date(time_ns), "", "", mode]
-    return _sentence(["RMC", _time(time_ns), *fields])
+        fix, status, mode = quality.value
+        lat, lon, alt_m = estimate.lat_deg, estimate.lon_deg, estimate.alt_amsl_m
+        north_south, east_west = "S" if lat < 0 else "N", "W" if lon < 0 else "E"
+        place = _minutes(lat, 2), north_south, _minutes(lon, 3), east_west
+        altitude = (f"{alt_m:.1f}", "M") if -9999.9 <= alt_m <= 99999.9 else ("", "")  # NaN too
+        gga = [*place, fix, "00", "", *altitude, "", "", "", ""]
+        rmc = [status, *place, *_speed_and_course(estimate.vel_en_mps), date, "", "", mode]
+        *axes_m, direction_deg = error_ellipse(estimate.cov_en_m2)
+        east_m, north_m = (math.sqrt(max(v, 0.0)) for v in estimate.cov_en_m2.diagonal().tolist())
+        axes = [_number(each, _LARGEST_M) for each in axes_m]
+        spread = [_number(each, _LARGEST_M) for each in (north_m, east_m, estimate.alt_std_m)]
+        gst = ["", *axes, f"{round(direction_deg, 1) % 180.0:.1f}", *spread]
+    made = ("GPGGA", time, *gga), ("GPRMC", time, *rmc), ("GPGST", time, *gst)
+    return b"".join(map(_sentence, made))
 
 
-def gst(estimate: NavigationEstimate | None, utc_ns: int | None = None) -> bytes:
-    """GST: one-sigma error ellipse (m, direction of the major axis from true north) and standard
-    deviations of latitude, longitude and altitude (m). The RMS of ranges is empty."""
-    time_ns, confident = _when_and_whether(estimate, utc_ns)
-    if estimate is None or not confident:
-        return _sentence(["GST", _time(time_ns), *[""] * 7])
-    major, minor, direction_deg = error_ellipse(estimate.cov_en_m2)
-    direction = f"{round(direction_deg, 1) % 180.0:.1f}"
-    north, east = (math.sqrt(max(float(estimate.cov_en_m2[i, i]), 0.0)) for i in (1, 0))
-    axes = [_number(major, _LARGEST_M), _number(minor, _LARGEST_M), direction]
-    spread = [_number(value, _LARGEST_M) for value in (north, east, estimate.alt_std_m)]
-    return _sentence(["GST", _time(time_ns), "", *axes, *spread])
-
-
-def checksum(body: str) -> str:
-    """Two hexadecimal digits: exclusive or of all characters between `$` and `*`."""
-    value = 0
-    for byte in body.encode("ascii"):
-        value ^= byte
-    return f"{value:02X}"
-
-
-_NO_PLACE = ("", "", "", "")
-
-
-def _sentence(fields: list[str]) -> bytes:
-    body = "GP" + ",".join(fields)
-    return f"${body}*{checksum(body)}\r\n".encode("ascii")
-
-
-def _when_and_whether(
-    estimate: NavigationEstimate | None, utc_ns: int | None
-) -> tuple[int | None, bool]:
-    if estimate is None:
-        return utc_ns, False
-    return estimate.utc_ns, estimate.is_confident
-
-
-def _place(estimate: NavigationEstimate) -> list[str]:
-    lat, lon = estimate.lat_deg, estimate.lon_deg
-    north_south, east_west = "S" if lat < 0 else "N", "W" if lon < 0 else "E"
-    return [_minutes(lat, 2), north_south, _minutes(lon, 3), east_west]
+def _sentence(fields: tuple[str, ...]) -> bytes:
+    """With its checksum: exclusive or of all characters between `$` and `*`."""
+    body = ",".join(fields).encode("ascii")
+    return b"$%s*%02X\r\n" % (body, reduce(xor, body))
 
 
 def _minutes(degrees: float, width: int) -> str:
@@ -111,32 +75,20 @@ def _minutes(degrees: float, width: int) -> str:
     return f"{whole:0{width}d}{minutes:02d}.{parts:05d}"
 
 
-def _moment(utc_ns: int | None) -> datetime | None:
+def _time_and_date(utc_ns: int | None) -> tuple[str, str]:
+    """Empty where the time is not known, or no date has it."""
     if utc_ns is None:
-        return None
+        return "", ""
     try:
-        return _UNIX + timedelta(milliseconds=utc_ns // 1_000_000)
+        moment = _UNIX + timedelta(milliseconds=utc_ns // 1_000_000)
     except OverflowError:
-        return None
-
-
-def _time(utc_ns: int | None) -> str:
-    moment = _moment(utc_ns)
-    return "" if moment is None else f"{moment:%H%M%S}.{moment.microsecond // 1000:03d}"
-
-
-def _date(utc_ns: int | None) -> str:
-    moment = _moment(utc_ns)
-    return "" if moment is None else f"{moment:%d%m}{moment.year % 100:02d}"
+        return "", ""
+    time = f"{moment:%H%M%S}.{moment.microsecond // 1000:03d}"
+    return time, f"{moment:%d%m}{moment.year % 100:02d}"
 
 
 def _number(value: float, largest: float) -> str:
     return f"{min(value, largest):.2f}" if math.isfinite(value) else ""
-
-
-def _altitude(alt_amsl_m: float) -> str:
-    low, high = _ALTITUDES_M
-    return f"{alt_amsl_m:.1f}" if low <= alt_amsl_m <= high else ""  # NaN too
 
 
 def _speed_and_course(vel_en_mps: tuple[float, float] | None) -> tuple[str, str]:

@@ -2,5 +2,5 @@
 
 Data flow: `node` receives raw samples and decodes them by the definitions of `rosbags` -> `reader`
 makes images with their telemetry -> the runner -> the gate -> `publisher` makes messages -> `node`
-sends them. `parameters` are those of the node; `rclpy` reads them and resolves names.
+sends them. It also reads the parameters and resolves names, by `rclpy`.
 """

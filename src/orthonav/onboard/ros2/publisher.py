@@ -15,7 +15,7 @@ from orthonav.core.flight.ros_messages import NO_ALTITUDE_M2
 from orthonav.core.geo.attitude import ros_xyzw_from_ned
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.onboard.messages.estimate import NavigationEstimate, floored
-from orthonav.onboard.ros2.node import Node
+from orthonav.onboard.ros2.node import Node, Writer
 from orthonav.onboard.telemetry import VehicleState
 
 NOT_MEASURED_RAD2 = math.pi**2
@@ -42,18 +42,18 @@ class Ros2Publisher:
         positions."""
         self._node, self._frame, self._now_ns = node, origin, now_ns
         self._floor_m, self._silent = min_std_m, silent
-        self._origin_alt_m = origin_alt_m
-        resolved = node.resolved
-        self._parameters = node.parameters
+        self._origin_alt_m, self._parameters = origin_alt_m, node.parameters
         self.for_filter = self._parameters.covariance == "filter"
-        self._fix = node.advertise(resolved("~/fix"), "sensor_msgs/msg/NavSatFix")
-        pose = "geometry_msgs/msg/PoseWithCovarianceStamped"
-        self._pose = node.advertise(resolved("~/pose"), pose)
-        self._origin = node.advertise(
-            resolved("~/origin"), "geographic_msgs/msg/GeoPointStamped", depth=1, latched=True
+
+        def topic(name: str, kind: str, **options: Any) -> Writer:
+            return node.advertise(node.resolved(name), kind, **options)
+
+        self._fix = topic("~/fix", "sensor_msgs/msg/NavSatFix")
+        self._pose = topic("~/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
+        self._origin = topic(
+            "~/origin", "geographic_msgs/msg/GeoPointStamped", depth=1, latched=True
         )
-        diagnostics = "diagnostic_msgs/msg/DiagnosticArray"
-        self._health = node.advertise(resolved("/diagnostics"), diagnostics)
+        self._health = topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         self._send_origin()
 
     def position(
@@ -67,11 +67,10 @@ class Ros2Publisher:
         definitions, place = self._node.definitions, (estimate.lat_deg, estimate.lon_deg)
         header = definitions.header(stamp_ns, self._parameters.base_frame)
         self._fix(definitions.navsatfix(header, place, cov, self._altitude_m(vehicle)))
-        east, north = self._frame.en_from_latlon(*place).tolist()
         turn = np.array([0.0, 0.0, 0.0, 1.0])  # where the attitude is not known
         if vehicle.ned_from_body is not None:
             turn = ros_xyzw_from_ned(vehicle.ned_from_body)
-        self._pose(self._posed((east, north), cov, turn, stamp_ns))
+        self._pose(self._posed(self._frame.en_from_latlon(*place), cov, turn, stamp_ns))
         return "NavSatFix", "PoseWithCovarianceStamped"
 
     def health(self, plain: dict[str, Any]) -> None:
@@ -115,9 +114,7 @@ class Ros2Publisher:
             return self._origin_alt_m + vehicle.home_m
         return math.nan if chosen == "none" else float(chosen)
 
-    def _posed(
-        self, position_en_m: tuple[float, float], cov: Array, turn: Array, stamp_ns: int
-    ) -> Any:
+    def _posed(self, position_en_m: Array, cov: Array, turn: Array, stamp_ns: int) -> Any:
         """Pose whose x and y are measured. z is 0 and the orientation is the reported one, both
         with large variances. Order: x, y, z, rotations about X, Y, Z."""
         definitions = self._node.definitions
