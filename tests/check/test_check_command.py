@@ -119,7 +119,7 @@ def code_of(result):
     return codes.pop()
 
 
-def test_what_the_map_knows_of_houses_and_trees(checked, opened, monkeypatch):
+def test_what_the_map_knows_of_houses_and_trees(checked, monkeypatch):
     """Blocks of 10 m, 30 m apart, in the west; nothing known in the north."""
     assert code_of(checked()) == "no_surface" and code_of(checked(relief_m=0.0)) == "surface"
     assert code_of(checked(agl_m=80.0)) == "houses"
@@ -191,7 +191,7 @@ def test_odd_routes(checked, frame, points, changed):
     json.dumps(check_to_plain(result), allow_nan=False)
 
 
-def test_views_that_fit_on_no_map(checked, frame):
+def test_views_that_fit_on_no_map(checked):
     with pytest.raises(AreaError, match="do not fit on the map"):
         checked(agl_m=50_000.0)
     wide = Camera(65_535, 65_535, 20_000.0, 20_000.0, 1.0, 1.0, unusual=True)
