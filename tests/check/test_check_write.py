@@ -16,6 +16,7 @@ from orthonav.core.errors import OutputError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.layers import check_to_plain, features
 from orthonav.ground.check.records import CELL_VALUES
+from orthonav.ground.check.wording import conditions_text
 from orthonav.ground.check.write import require_free, write_check
 
 FRAME = LocalFrame(48.2, -3.1)
@@ -78,6 +79,9 @@ def test_unknown_values_are_null():
     plain = strict(json.dumps(check_to_plain(result)))
     assert plain["flights"] is None and plain["summary"]["error_m"] is None
     assert plain["conditions"]["prior_std_m"] is None
+    said = conditions_text(unknown, None)
+    assert said["error of reported heading"] == "heading unknown: all headings are searched"
+    assert said["error of prior position"] == "no prior: the whole map is searched"
 
 
 # GeoTIFF
