@@ -44,12 +44,17 @@ def table(tmp_path):
     return path
 
 
-def test_a_plan_for_people(run, camera, table, dem, tmp_path):
+@pytest.fixture
+def planned(run, camera, table, dem):
+    """Function that plans the table from 400 m, with more options."""
+    terrain = ("--dem", dem, "--dem-datum", "msl")
+    asked = ("--route", table, "--band-m", 500, "--camera", camera, "--agl-m", 400, *terrain)
+    return lambda *more: run("plan", *asked, *more)
+
+
+def test_a_plan_for_people(planned, table, tmp_path):
     out = tmp_path / "route.geojson"
-    done = run(
-        "plan", "--route", table, "--band-m", 500, "--camera", camera, "--agl-m", 400,
-        "--speed-mps", 25, "--dem", dem, "--dem-datum", "msl", "--out", out,
-    )  # fmt: skip
+    done = planned("--speed-mps", 25, "--out", out)
     assert (done.code, done.err) == (0, "")
     assert "3 waypoints, 6.00 km, 240 s, heights above amsl, 1 leg with a band" in done.out
     assert "512 x 384 m from 400 m, 0.4 m per pixel" in done.out
@@ -58,12 +63,8 @@ def test_a_plan_for_people(run, camera, table, dem, tmp_path):
     assert read_route(out) == read_route(table)
 
 
-def test_a_plan_for_programs(run, camera, table, dem):
-    done = run(
-        "plan", "--route", table, "--band-m", 500, "--camera", camera, "--agl-m", 400,
-        "--dem", dem, "--dem-datum", "msl", "--json",
-    )  # fmt: skip
-    plain = json.loads(done.out)
+def test_a_plan_for_programs(planned):
+    plain = json.loads(planned("--json").out)
     assert plain["route"]["length_m"] == pytest.approx(6000, abs=1)
     assert plain["route"]["heights_above"] == ["amsl"]
     assert plain["view"]["across_px"] == pytest.approx(

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from orthonav.ground.check.cells import CellGrid
+from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.findings import likely_outages
 from orthonav.ground.check.flights import scene_shifts, shifted, simulated
 from orthonav.ground.check.records import (
@@ -69,6 +70,21 @@ def area_of(frame, points_en_m, bands_m=(), band_m=200.0):
     points, half = np.array(points_en_m, float), max(bands_m or (band_m,)) / 2
     extent = (*(points.min(axis=0) - half), *(points.max(axis=0) + half))
     return Area(frame, extent, route_of(frame, points, bands_m), 2 * half)
+
+
+def predicted(probability, error_m):
+    """A prediction of these values, with an interval of no width."""
+    nothing = np.zeros_like(probability)
+    return Prediction(probability, probability, probability, error_m, nothing, nothing)
+
+
+def straight(probability, step_m=25.0, error_m=3.0):
+    """A route to the east with these probabilities."""
+    probability = np.array(probability, float)
+    distance = np.arange(len(probability)) * step_m
+    points = np.stack([distance, np.zeros_like(distance)], axis=1)
+    place = vars(predicted(probability, np.full_like(distance, error_m)))
+    return Along(distance_m=distance, points_en_m=points, across_low=probability, **place)
 
 
 def made_cells(rows, cols, side_m, seed=1):

@@ -64,20 +64,13 @@ def kept(one, other):
     return float((first * second.conj()).real.mean())
 
 
-def changed(lasting, seed=1, grey=None, donor=None):
-    grey = textured((SIDE, SIDE), 5) if grey is None else grey
-    donor = textured((SIDE, SIDE), 6) if donor is None else donor
-    persistence = [np.full((SIDE, SIDE), lasting, np.float32)] * 3
-    return another_year(np.random.default_rng(seed), grey, donor, persistence)
-
-
 def test_the_more_lasts_the_more_is_kept():
-    grey = textured((SIDE, SIDE), 5)
-    correlation = [
-        np.mean([kept(grey, changed(each, seed)) for seed in range(3)]) for each in LASTING
-    ]
+    grey, donor = textured((SIDE, SIDE), 5), textured((SIDE, SIDE), 6)
+    correlation = []
+    for lasting in (0.01, 0.3, 0.6, 0.95):
+        expected = [np.full((SIDE, SIDE), lasting, np.float32)] * 3
+        rngs = map(np.random.default_rng, range(3))
+        changed = [another_year(rng, grey, donor, expected) for rng in rngs]
+        correlation.append(np.mean([kept(grey, each) for each in changed]))
     assert correlation[0] < 0.1 and correlation[-1] > 0.5
     assert all(np.diff(correlation) > 0)
-
-
-LASTING = (0.01, 0.3, 0.6, 0.95)

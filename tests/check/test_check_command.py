@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rasterio
-from made_check import lost, right, route_of
+from made_check import FILES, lost, right, route_of
 
 from helpers import write_dem
 from orthonav.cli import main
@@ -119,7 +119,7 @@ def code_of(result):
     return codes.pop()
 
 
-def test_what_the_map_knows_of_houses_and_trees(checked, opened, monkeypatch):
+def test_what_the_map_knows_of_houses_and_trees(checked, monkeypatch):
     """Blocks of 10 m, 30 m apart, in the west; nothing known in the north."""
     assert code_of(checked()) == "no_surface" and code_of(checked(relief_m=0.0)) == "surface"
     assert code_of(checked(agl_m=80.0)) == "houses"
@@ -191,7 +191,7 @@ def test_odd_routes(checked, frame, points, changed):
     json.dumps(check_to_plain(result), allow_nan=False)
 
 
-def test_views_that_fit_on_no_map(checked, frame):
+def test_views_that_fit_on_no_map(checked):
     with pytest.raises(AreaError, match="do not fit on the map"):
         checked(agl_m=50_000.0)
     wide = Camera(65_535, 65_535, 20_000.0, 20_000.0, 1.0, 1.0, unusual=True)
@@ -218,28 +218,33 @@ def test_routes_outside_the_map(checked, frame):
 
 
 @pytest.fixture
-def route_path(frame, tmp_path):
-    lat, lon = frame.latlon_from_en(np.array([[-350.0, -50.0], [-100.0, 60.0]]))
-    path = tmp_path / "route.csv"
-    rows = [f"{a:.7f},{b:.7f}" for a, b in zip(lat, lon, strict=True)]
-    path.write_text("\n".join(["lat_deg,lon_deg", *rows, ""]))
-    return path
+def written_route(frame, tmp_path):
+    """Function that writes a route, with a column of heights where one is given."""
+
+    def write(*column):
+        lat, lon = np.round(frame.latlon_from_en([[-350.0, -50.0], [-100.0, 60.0]]), 7).tolist()
+        columns = [("lat_deg", *lat), ("lon_deg", *lon), *([column] if column else [])]
+        path = tmp_path / "route.csv"
+        rows = zip(*columns, strict=True)
+        path.write_text("".join(f"{','.join(map(str, row))}\n" for row in rows))
+        return path
+
+    return write
 
 
 VIEWS = ("--agl-m", "170", "--prior-std-m", "50", "--workers", "1")
 
 
 @pytest.mark.long
-def test_command(run, untried, half_blank, route_path, tmp_path):
+def test_command(run, untried, half_blank, written_route, tmp_path):
     out = tmp_path / "report"
     done = run(
-        *("check", half_blank.map, "--route", route_path, "--other-date", half_blank.present),
+        *("check", half_blank.map, "--route", written_route(), "--other-date", half_blank.present),
         *(*VIEWS, "--effort", "0.05", "--out", out),
     )
     assert done.code in (0, 3, 4) and done.err == ""
     assert f"report: {out / 'index.html'}" in done.out
-    names = {path.name for path in out.iterdir()}
-    assert {"index.html", "check.json", "check.tif", "check.geojson"} == names
+    assert {path.name for path in out.iterdir()} == FILES
     plain = json.loads((out / "check.json").read_text())
     assert plain["verdict"]["exit_code"] == done.code
     assert plain["about"]["other_date"] == half_blank.present.name
@@ -267,29 +272,21 @@ def test_exit_codes(run, unwritten, half_blank, tmp_path, monkeypatch, word):
     assert plain["conditions"]["camera_pitch_deg"] == 30.0
 
 
-def test_the_height_of_a_route(run, unwritten, half_blank, route_path, tmp_path):
+@pytest.mark.parametrize("more, agl_m", [((), 150), (("--agl-m", "160"), 160)])
+def test_the_height_of_a_route(run, unwritten, half_blank, written_route, tmp_path, more, agl_m):
     """The lowest above ground, landings left out; --agl-m comes before it."""
-    route = tmp_path / "high.csv"
-    lines = route_path.read_text().splitlines()
-    heights = [",agl_m", ",150", ",180"]
-    route.write_text("\n".join(line + add for line, add in zip(lines, heights, strict=True)) + "\n")
-    found = []
-    for more in ((), ("--agl-m", "160")):
-        done = run(
-            *("check", half_blank.map, "--route", route, *more, "--json"),
-            *("--out", tmp_path / "report"),
-        )
-        found.append(json.loads(done.out)["conditions"]["agl_m"])
-    assert found == [150, 160]
+    route = written_route("agl_m", 150, 180)
+    out = ("--json", "--out", tmp_path / "report")
+    done = run("check", half_blank.map, "--route", route, *more, *out)
+    assert json.loads(done.out)["conditions"]["agl_m"] == agl_m
 
 
-def test_heights_above_sea_need_a_terrain(run, unwritten, half_blank, frame, route_path, tmp_path):
+def test_heights_above_sea_need_a_terrain(
+    run, unwritten, half_blank, frame, written_route, tmp_path
+):
     """The heights of the route as written are never taken for heights above ground."""
-    route, out = tmp_path / "high.csv", tmp_path / "report"
-    lines = route_path.read_text().splitlines()
-    rows = zip(lines, [",home_m", ",120", ",120"], strict=True)
-    route.write_text("\n".join(line + add for line, add in rows) + "\n")
-    check = ("check", half_blank.map, "--route", route, "--out", out)
+    route = written_route("home_m", 120, 120)
+    check = ("check", half_blank.map, "--route", route, "--out", tmp_path / "report")
     done = run(*check)
     assert done.code == 1 and "not above ground: give the terrain (--dem" in done.err
     assert "Checked at 160 m above ground, as given." in run(*check, "--agl-m", 160).out
@@ -301,7 +298,7 @@ def test_heights_above_sea_need_a_terrain(run, unwritten, half_blank, frame, rou
     )
     without = run(*check, "--dem", dem)  # only differences of its heights count
     assert without.out == over.out
-    route.write_text(route.read_text().replace("home_m", "amsl_m").replace(",120", ",420"))
+    written_route("amsl_m", 420, 420)
     refused = run(*check, "--dem", dem)
     assert refused.code == 1 and "above the sea" in refused.err and "--dem-datum" in refused.err
     assert "lowest over the terrain" in run(*check, "--dem", dem, "--dem-datum", "msl").out

@@ -10,7 +10,7 @@ import cv2
 import made_check
 import numpy as np
 import pytest
-from made_check import EVIL, FILES, small_route
+from made_check import EVIL, FILES, nearly_empty, small_route
 
 from html_page import Page
 from orthonav.ground.check.layers import check_to_plain
@@ -18,21 +18,24 @@ from orthonav.ground.check.records import CELL_VALUES
 from orthonav.ground.check.wording import text
 from orthonav.ground.check.write import write_check
 
-KINDS = {"tiny", "small_route", "nearly_empty", "evil"}
+
+def evil(frame):
+    """A check whose names are markup."""
+    names = dict.fromkeys(("map_name", "imagery", "route_name", "command"), EVIL)
+    about = replace(made_check.tiny(frame).about, **names, terms=(EVIL,))
+    return small_route(frame, about=about)
+
+
+KINDS = {each.__name__: each for each in (made_check.tiny, small_route, nearly_empty, evil)}
 
 
 @pytest.fixture(scope="module")
 def folder(opened, frame, tmp_path_factory):
-    """Checks of all kinds, and one whose names are markup, by name."""
+    """Checks of all kinds, by name."""
     root = tmp_path_factory.mktemp("checks")
-    for kind in ("tiny", "small_route", "nearly_empty"):
-        path = write_check(getattr(made_check, kind)(frame), opened, root / kind)
-        assert path == root / kind / "index.html"
-    names = dict.fromkeys(("map_name", "imagery", "route_name", "command"), EVIL)
-    about = replace(made_check.tiny(frame).about, **names, terms=(EVIL,))
-    evil = small_route(frame, about=about)
-    write_check(evil, opened, root / "evil")
-    assert "\x1b" not in text(evil)
+    for name, make in KINDS.items():
+        assert write_check(make(frame), opened, root / name) == root / name / "index.html"
+    assert "\x1b" not in text(evil(frame))
     return root
 
 
@@ -42,7 +45,7 @@ def page(folder):
 
 
 def test_every_kind_of_check_is_written(folder):
-    assert {path.name for path in folder.iterdir()} == KINDS
+    assert {path.name for path in folder.iterdir()} == set(KINDS)
     for each in folder.iterdir():
         assert {path.name for path in each.iterdir()} == FILES
         page = (each / "index.html").read_text(encoding="utf-8")
@@ -75,26 +78,18 @@ def test_the_map_is_transparent_where_there_is_no_imagery(page):
     assert set(np.unique(image[..., 3])) == {0, 255}
 
 
-def all_cells(cells):
-    """The cells of the page as in `check.json`: unknown ones are None, or 0 of what was counted."""
-    known = cells.pop("known")
-    for name in CELL_VALUES:
-        grid = [0 if name == "trials" else None] * (cells["rows"] * cells["cols"])
-        for number, value in zip(known, cells[name], strict=True):
-            grid[number] = value
-        starts = range(0, len(grid), cells["cols"])
-        cells[name] = [grid[start : start + cells["cols"]] for start in starts]
-
-
-def test_the_script_is_given_the_json_of_the_check(folder, frame):
-    for name in KINDS:
-        page = Page((folder / name / "index.html").read_text(encoding="utf-8"))
-        plain = json.loads(page.texts["script"][0])
-        drawn = plain.pop("drawn")
-        all_cells(plain["cells"])
-        if name != "evil":
-            assert plain == json.loads(json.dumps(check_to_plain(getattr(made_check, name)(frame))))
-        assert (drawn["route"] is None) == (name in ("tiny", "nearly_empty"))
+@pytest.mark.parametrize("name", KINDS)
+def test_the_script_is_given_the_json_of_the_check(folder, frame, name):
+    """Of the cells only the known ones: of others nothing is known, and none was tried."""
+    page = Page((folder / name / "index.html").read_text(encoding="utf-8"))
+    plain, whole = json.loads(page.texts["script"][0]), check_to_plain(KINDS[name](frame))
+    assert (plain.pop("drawn")["route"] is None) == (name in ("tiny", "nearly_empty"))
+    known = plain["cells"].pop("known")
+    for values in CELL_VALUES:
+        cells = np.array(whole["cells"].pop(values)).ravel()
+        assert plain["cells"].pop(values) == cells[known].tolist()
+        assert set(np.delete(cells, known)) <= ({0} if values == "trials" else {None})
+    assert plain == json.loads(json.dumps(whole))
 
 
 def test_who_signs_sees_what_was_checked(folder):

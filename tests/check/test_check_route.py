@@ -6,25 +6,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from made_check import CONDITIONS as GIVEN
-from made_check import area_of
+from made_check import area_of, predicted, straight
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import protection_level_m
 from orthonav.ground.check import flights
-from orthonav.ground.check.estimate import Prediction
 from orthonav.ground.check.findings import likely_outages, predicted_along
 from orthonav.ground.check.flights import scene_shifts, simulated
-from orthonav.ground.check.records import Along
 
 FRAME = LocalFrame(46.0, 3.0)
 SIDE_M = 100.0
 CONDITIONS = replace(GIVEN, width_m=SIDE_M, height_m=SIDE_M, drift=0.03)
-
-
-def predicted(probability, error_m):
-    """A prediction of these values, with an interval of no width."""
-    nothing = np.zeros_like(probability)
-    return Prediction(probability, probability, probability, error_m, nothing, nothing)
 
 
 def even(points):
@@ -60,17 +52,6 @@ def test_the_route_ends_at_its_last_waypoint():
     assert len(whole.distance_m) in (5, 6)
 
 
-def along_of(probability, step_m=25.0):
-    """A straight route to the east with these probabilities."""
-    probability = np.array(probability, float)
-    distance = np.arange(len(probability)) * step_m
-    points = np.stack([distance, np.zeros_like(distance)], axis=1)
-    error = np.full_like(distance, 3.0)
-    place = predicted(probability, error)
-    extra = {"across_low": probability}
-    return Along(distance_m=distance, points_en_m=points, **extra, **vars(place))
-
-
 GOOD, BAD = [1.0] * 8, [0.2] * 12
 
 
@@ -88,7 +69,7 @@ GOOD, BAD = [1.0] * 8, [0.2] * 12
     ids=["none", "short", "one", "two", "at first", "at last", "on the border"],
 )
 def test_where_outages_begin_and_end(available, expected):
-    along = along_of(np.full(len(available), 0.8))
+    along = straight(np.full(len(available), 0.8))
     flown = SimpleNamespace(available=np.array(available))
     found = likely_outages(along, flown, CONDITIONS)
     assert [(each.start_m, each.end_m) for each in found] == expected
@@ -96,7 +77,7 @@ def test_where_outages_begin_and_end(available, expected):
 
 
 def flights_over(probability, *, limit_m=40.0, drift=0.03, std=0.0, wrong=0.0, step_m=25.0):
-    along = along_of(probability, step_m)
+    along = straight(probability, step_m)
     along = replace(along, wrong=np.full(len(along.wrong), wrong))
     conditions = replace(CONDITIONS, alert_limit_m=limit_m, drift=drift)
     rng = np.random.default_rng(7)
@@ -115,7 +96,7 @@ def test_flights_with_certain_fixes_are_always_available():
 @pytest.mark.parametrize("side_m", [61.3, 299.7, 2000.1])
 def test_views_of_any_size_are_available_where_fixes_are_certain(side_m):
     """With a limit that is below the growth over a view of the largest size."""
-    along = replace(along_of([0.99] * 200, side_m / 4), wrong=np.zeros(200))
+    along = straight([0.99] * 200, side_m / 4)
     wide = replace(CONDITIONS, width_m=side_m, height_m=side_m, alert_limit_m=20.0, drift=0.03)
     shifts, rng = scene_shifts(0.0), np.random.default_rng(7)
     assert simulated(along, wide, shifts, 0, rng).availability.low > 0.95

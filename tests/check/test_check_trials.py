@@ -12,8 +12,6 @@ import pytest
 
 from orthonav.core.errors import MapFileError, WorkerError
 from orthonav.core.geo.camera import Camera
-from orthonav.core.localize import Localizer
-from orthonav.core.mapfile import open_map
 from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.check import trials
 from orthonav.ground.check.records import CheckRequest, Conditions
@@ -33,11 +31,6 @@ def asked(half_blank):
 def exact(asked, half_blank):
     """Views of the map's own orthophoto as it is, with exact telemetry."""
     return replace(asked, other_date=half_blank.past, yaw_std_deg=0.5, agl_std=0.0)
-
-
-@pytest.fixture(scope="module")
-def registration(half_blank):
-    return Localizer(open_map(half_blank.map)).registration
 
 
 def run_trials(request, places, workers=1, **more):

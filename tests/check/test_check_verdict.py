@@ -7,33 +7,16 @@ from dataclasses import replace
 import made_check
 import numpy as np
 import pytest
-from made_check import CONDITIONS, flown
+from made_check import CONDITIONS, flown, straight
 
 from orthonav.core.errors import UsageError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.findings import RULES, Findings, verdict_of
 from orthonav.ground.check.layers import check_to_plain
-from orthonav.ground.check.records import (
-    Along,
-    CheckRequest,
-    Conditions,
-    Range,
-    Word,
-)
+from orthonav.ground.check.records import CheckRequest, Conditions, Range, Word
 from orthonav.ground.check.wording import text
 
-ZEROS = np.zeros(201)
-ALONG = Along(
-    distance_m=np.linspace(0, 10_000, 201),
-    points_en_m=np.stack([np.linspace(0, 10_000, 201), ZEROS], axis=1),
-    probability=ZEROS + 0.95,
-    low=ZEROS + 0.9,
-    high=ZEROS + 0.97,
-    across_low=ZEROS + 0.8,
-    error_m=ZEROS + 4,
-    wrong=ZEROS,
-    persistence=ZEROS + 0.5,
-)
+ALONG = straight([0.95] * 201, step_m=50.0, error_m=4.0)
 FLOWN = flown(ALONG)
 FINE = dict(
     mean=Range(0.9, 0.8, 0.95),
@@ -136,6 +119,11 @@ def test_houses_are_displaced_by_the_tangent_of_the_angle():
     assert steep.displaced_share == pytest.approx(0.08 * math.tan(math.radians(80.0)))
 
 
+def along_a_route(**changed):
+    cells, ends = made_check.made_cells(4, 4, 50.0), ALONG.points_en_m[[0, -1]]
+    return made_check.made_check(LocalFrame(48.0, 2.0), cells, ends, outages=(), **changed)
+
+
 @pytest.mark.parametrize(
     ("probability", "limit_m", "scenes_std", "word"),
     [
@@ -149,18 +137,16 @@ def test_houses_are_displaced_by_the_tangent_of_the_angle():
 )
 def test_nothing_contradicts_the_verdict(probability, limit_m, scenes_std, word):
     """Figures, reasons and JSON are of the same flights: GO only if all meet its thresholds."""
-    along = replace(ALONG, probability=ZEROS + probability)
+    along = replace(ALONG, probability=np.full(201, probability))
     conditions = replace(LOW, alert_limit_m=limit_m)
     found = flown(along, conditions, scenes_std)
     findings = FINE | dict(mean=found.probability, flights=found, conditions=conditions)
     verdict = verdict_of(Findings(**findings))
     assert verdict.word is word or (word is None and verdict.word is not GO)
-    cells = made_check.made_cells(4, 4, 50.0)
-    result = made_check.made_check(LocalFrame(48.0, 2.0), cells, along.points_en_m[[0, -1]])
-    result = replace(
-        result, conditions=conditions, along=along, flights=found, outages=(), verdict=verdict
+    result = along_a_route(
+        conditions=conditions, along=along, flights=found, verdict=verdict, mean=found.probability
     )
-    plain = check_to_plain(replace(result, mean=found.probability))
+    plain = check_to_plain(result)
     flown_in, points = plain["flights"], plain["route"]["points"]
     assert plain["summary"]["mean_probability"] == pytest.approx(
         flown_in["probability"]["median"], abs=1e-3
@@ -183,9 +169,7 @@ def test_a_rare_risk_has_no_availability():
     found = flown(ALONG, RARE)
     assert all(map(math.isnan, (*found.availability, *found.outage_s, *found.available)))
     assert found.false_fix == FLOWN.false_fix and found.error_95_m == FLOWN.error_95_m
-    cells = made_check.made_cells(4, 4, 50.0)
-    result = made_check.made_check(LocalFrame(48.0, 2.0), cells, ALONG.points_en_m[[0, -1]])
-    result = replace(result, conditions=RARE, along=ALONG, flights=found, outages=())
+    result = along_a_route(conditions=RARE, along=ALONG, flights=found)
     assert "-  availability: at a risk of 1e-05 too few" in text(result)
     plain = check_to_plain(result)
     assert plain["flights"]["availability"] == {"median": None, "low": None, "high": None}

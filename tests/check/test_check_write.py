@@ -16,6 +16,7 @@ from orthonav.core.errors import OutputError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.ground.check.layers import check_to_plain, features
 from orthonav.ground.check.records import CELL_VALUES
+from orthonav.ground.check.wording import conditions_text
 from orthonav.ground.check.write import require_free, write_check
 
 FRAME = LocalFrame(48.2, -3.1)
@@ -36,12 +37,8 @@ def folder(written, tmp_path):
     return shutil.copytree(written[1], tmp_path / "check")
 
 
-def refuse(constant):
-    raise AssertionError(f"not strict JSON: {constant}")
-
-
 def strict(written_text):
-    return json.loads(written_text, parse_constant=refuse)
+    return json.loads(written_text, parse_constant=pytest.fail)
 
 
 def tree(folder):
@@ -82,6 +79,9 @@ def test_unknown_values_are_null():
     plain = strict(json.dumps(check_to_plain(result)))
     assert plain["flights"] is None and plain["summary"]["error_m"] is None
     assert plain["conditions"]["prior_std_m"] is None
+    said = conditions_text(unknown, None)
+    assert said["error of reported heading"] == "heading unknown: all headings are searched"
+    assert said["error of prior position"] == "no prior: the whole map is searched"
 
 
 # GeoTIFF
@@ -164,9 +164,10 @@ def test_files_of_others_are_never_touched(written, folder, opened, others):
     for name, text in others.items():
         (folder / name).write_text(text)
     before = tree(folder)
-    for write in (require_free, lambda folder: write_check(result, opened, folder)):
-        with pytest.raises(OutputError, match="no check wrote"):
-            write(folder)
+    with pytest.raises(OutputError, match="no check wrote"):
+        require_free(folder)
+    with pytest.raises(OutputError, match="no check wrote"):
+        write_check(result, opened, folder)
     assert tree(folder) == before
     with pytest.raises(OutputError, match="is a file"):
         require_free(folder / "check.tif")

@@ -75,16 +75,15 @@ def mapproxy(tmp_path_factory):
 
 @pytest.fixture
 def take(tmp_path):
-    """Function that fetches the square around the middle and returns the result and the file."""
+    """Function that fetches the square around the middle and returns the result and the file;
+    `source`: as on the command line, or a spec."""
 
     def taken(source, half_m=110.0, out="ortho.tif", limits=QUICK, terms=None, **rest):
-        asked = {
-            name: rest.pop(name)
-            for name in list(rest)
-            if name in ImageryOptions.__dataclass_fields__
-        }
-        asked.setdefault("gsd_m", 1.0)
-        spec = parse_source(source, ImageryOptions(**asked), **(terms or {}))
+        names = ImageryOptions.__dataclass_fields__.keys() & rest.keys()
+        asked = {"gsd_m": 1.0} | {name: rest.pop(name) for name in names}
+        spec = source
+        if isinstance(source, str):
+            spec = parse_source(source, ImageryOptions(**asked), **(terms or {}))
         request = FetchRequest(
             spec=spec,
             area=rest.pop("area", None) or Area.from_bounds(terrain.bounds(half_m)),

@@ -74,6 +74,9 @@ class Served:
 
         self.http = Silent(("127.0.0.1", 0), Handler)
         self.url = f"http://127.0.0.1:{self.http.server_address[1]}"
+        self.tiles = f"xyz:{self.url}/{{z}}/{{x}}/{{y}}.png"
+        self.file = f"cog:{self.url}/a.tif"
+        self.catalogue = f"stac:{self.url}/api/"
 
     def handle(self, request, body):
         parts = urlsplit(request.path)
@@ -126,7 +129,8 @@ def serving(answer):
 
 
 def files(contents, ranges=True):
-    """Answers with files by path, by ranges like any server of files."""
+    """Answers with files by path, or with one at `/a.tif`, by ranges like any server of files."""
+    contents = {"/a.tif": contents} if isinstance(contents, bytes) else contents
 
     def answer(asked):
         body = contents.get(asked.path)
@@ -144,24 +148,28 @@ def files(contents, ranges=True):
     return answer
 
 
-def searching(catalogue, server_url, asked_for):
-    """A STAC API with a search in pages of one."""
+@contextmanager
+def searching(catalogue, refused=b""):
+    """A STAC API with a search in pages of one; `server.searches` are those asked for, and one with
+    the text `refused` fails."""
     items = {k: v for k, v in catalogue.items() if not k.startswith("/")}
     pictures = files({k: v for k, v in catalogue.items() if k.startswith("/")})
 
     def answer(asked):
+        if refused and refused in asked.body:
+            return Answer(b"no", 503)
         if asked.path == "/api/":
             links = [{"rel": "search", "href": "/api/search"}, {"rel": "child", "href": "/none"}]
             return Answer(terrain.plain({"type": "Catalog", "links": links}))
         if asked.path == "/api/search":
             body = json.loads(asked.body)
-            asked_for.append(body)
+            server.searches.append(body)
             names = sorted(name for name in items if body.get("datetime", "")[:4] in name)
             if not names:
                 return Answer(terrain.plain({"features": []}))
             at = names.index(body["token"]) if "token" in body else 0
             page = {"type": "FeatureCollection", "features": [items[names[at]]]}
-            page["features"][0]["assets"]["data"]["href"] = f"{server_url[0]}/{names[at]}.tif"
+            page["features"][0]["assets"]["data"]["href"] = f"{server.url}/{names[at]}.tif"
             if at + 1 < len(names):
                 more = {"rel": "next", "href": "/api/search", "method": "POST", "merge": True}
                 page["links"] = [more | {"body": {"token": names[at + 1]}}]
@@ -170,7 +178,9 @@ def searching(catalogue, server_url, asked_for):
             return Answer(terrain.plain({"token": "se=1&sig=abcdefg"}))
         return pictures(asked)
 
-    return answer
+    with serving(answer) as server:
+        server.searches = []
+        yield server
 
 
 def tiles(asked):

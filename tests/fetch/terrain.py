@@ -142,6 +142,19 @@ def heights(lat_deg, lon_deg):
     return 40 + 0.1 * north * NORTH_M - 0.2 * east * EAST_M
 
 
+def height_cog(folder, name, values, crs, transform, **options):
+    """The bytes of a file of heights with -9999 for none, and its bounds."""
+    raw, path = folder / f"{name}.raw.tif", folder / f"{name}.tif"
+    profile = {"width": values.shape[1], "height": values.shape[0], "count": 1, "nodata": -9999}
+    with rasterio.open(
+        raw, "w", driver="GTiff", dtype="float32", crs=crs, transform=transform, **profile
+    ) as data:
+        data.write(values.astype(np.float32)[None])
+        box = tuple(data.bounds)
+    rasterio.shutil.copy(raw, path, driver="COG", **options)
+    return path.read_bytes(), box
+
+
 def height_files(folder):
     """Two files of heights in degrees, as those of Copernicus, with a hole, and their items by
     name; the step, and the corner of the eastern one."""
@@ -151,19 +164,12 @@ def height_files(folder):
     found = {}
     for name, first in (("west", west - 40 * step), ("east", west)):
         col, row = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
-        values = heights(north - row * step, first + col * step).astype(np.float32)
+        values = heights(north - row * step, first + col * step)
         if name == "east":
             values[18:20, 5:8] = -9999
-        raw, path = folder / f"{name}.raw.tif", folder / f"{name}.tif"
-        with rasterio.open(
-            raw, "w", driver="GTiff", width=40, height=40, count=1, dtype="float32",
-            crs="EPSG:4326", nodata=-9999, transform=Affine(step, 0, first, 0, -step, north),
-        ) as data:  # fmt: skip
-            data.write(values[None])
-            box = tuple(data.bounds)
-        rasterio.shutil.copy(raw, path, driver="COG", COMPRESS="DEFLATE")
-        found[f"/{name}.tif"] = path.read_bytes()
-        found[name] = item(name, f"./{name}.tif", box)
+        place = Affine(step, 0, first, 0, -step, north)
+        body, box = height_cog(folder, name, values, "EPSG:4326", place, COMPRESS="DEFLATE")
+        found |= {f"/{name}.tif": body, name: item(name, f"./{name}.tif", box)}
     return found, step, west, north
 
 
@@ -174,14 +180,10 @@ def surface_file(folder):
     west, north = round(x) - size / 4, round(y) + size / 4
     steps = (np.arange(size) + 0.5) / 2
     lon, lat = _to_degrees("EPSG:2056").transform(*np.meshgrid(west + steps, north - steps))
-    raw, path = folder / "town.raw.tif", folder / "town.tif"
-    with rasterio.open(
-        raw, "w", driver="GTiff", width=size, height=size, count=1, dtype="float32",
-        crs="EPSG:2056", nodata=-9999, transform=Affine(0.5, 0, west, 0, -0.5, north),
-    ) as data:  # fmt: skip
-        data.write(heights(lat, lon).astype(np.float32)[None])
-    rasterio.shutil.copy(raw, path, driver="COG", COMPRESS="LZW", OVERVIEW_RESAMPLING="AVERAGE")
-    return {"/town.tif": path.read_bytes(), "town": item("town", "./town.tif", bounds(256))}
+    place, options = Affine(0.5, 0, west, 0, -0.5, north), {"OVERVIEW_RESAMPLING": "AVERAGE"}
+    values = heights(lat, lon)
+    body, _ = height_cog(folder, "town", values, "EPSG:2056", place, COMPRESS="LZW", **options)
+    return {"/town.tif": body, "town": item("town", "./town.tif", bounds(256))}
 
 
 def plain(value):

@@ -55,10 +55,6 @@ def tiles_but(fault, *, among=2, lasting=True):
     return answer
 
 
-def source(server):
-    return f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png"
-
-
 REASONS = {
     "a page": "not an image: 2",
     "an error in XML": "an error of the service (down)",
@@ -73,13 +69,13 @@ TEMPORARY = ["a page", "half a picture", "cut short", "500", "429", "reset"]
 def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name):
     with servers.serving(tiles_but(FAULTS[name])) as server:
         with pytest.raises(FetchError, match=r"\d of \d+ tiles failed .*--allow-holes") as raised:
-            take(source(server))
+            take(server.tiles)
         assert not (tmp_path / "ortho.tif").exists()
         assert "ortho.tif.tiles" in str(raised.value) and "127.0.0.1" in str(raised.value)
         assert name not in REASONS or REASONS[name] in str(raised.value)
         before = len(server.log)
         server.answer = servers.tiles
-        result, path = take(source(server))  # the same command resumes
+        result, path = take(server.tiles)  # the same command resumes
         asked_again = {asked.path for asked in server.log[before:]}
     assert 0 < len(asked_again) < result.estimate.tiles
     shift, worst, valid = terrain.offset_px(path)
@@ -90,7 +86,7 @@ def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name)
 @pytest.mark.parametrize("name", TEMPORARY)
 def test_a_temporary_fault_is_overcome(take, name):
     with servers.serving(tiles_but(FAULTS[name], lasting=False)) as server:
-        result, path = take(source(server))
+        result, path = take(server.tiles)
     assert not result.failed and terrain.offset_px(path)[1] <= 1
     assert terrain.offset_px(path)[2] == 1.0
 
@@ -98,9 +94,9 @@ def test_a_temporary_fault_is_overcome(take, name):
 @pytest.mark.parametrize("name", ["a page", "another size", "500"])
 def test_allowed_holes_are_masked(take, name, caplog):
     with servers.serving(tiles_but(FAULTS[name])) as server:
-        result, path = take(source(server), allow_holes=True)
+        result, path = take(server.tiles, allow_holes=True)
         area = Area.from_bounds((10.0, 85.04, 10.02, 85.06))
-        take(source(server), area=area, gsd_m=5.0, allow_holes=True, out="north.tif")
+        take(server.tiles, area=area, gsd_m=5.0, allow_holes=True, out="north.tif")
     failed = result.failed.total()
     assert failed > 0 and f"{failed} failed" in caplog.text
     assert "outside what the service covers" in caplog.text
@@ -112,7 +108,7 @@ def test_allowed_holes_are_masked(take, name, caplog):
 @pytest.mark.parametrize("name", ABSENT)
 def test_missing_imagery_is_masked_and_counted(take, name, caplog):
     with servers.serving(tiles_but(ABSENT[name])) as server:
-        result, path = take(source(server))
+        result, path = take(server.tiles)
     plain = result.describe()
     missing = plain["not_covered"] + plain["blank"] + plain["placeholders"]
     assert 0 < missing < plain["tiles"] and not plain["failed"]
@@ -124,14 +120,14 @@ def test_missing_imagery_is_masked_and_counted(take, name, caplog):
 def test_no_imagery_at_all_is_an_error(take, tmp_path, name):
     words = "no imagery of this area"
     with servers.serving(lambda _: ABSENT[name]) as server, pytest.raises(FetchError, match=words):
-        take(source(server))
+        take(server.tiles)
     assert not (tmp_path / "ortho.tif").exists()
 
 
 def test_a_service_that_is_down_ends_the_fetch(take):
     with servers.serving(lambda _: servers.Answer(b"no", 401)) as server:
         with pytest.raises(FetchError, match=r"20 requests in a row failed.*HTTP 401"):
-            take(source(server), half_m=900)
+            take(server.tiles, half_m=900)
         assert len(server.log) < 60
 
 
@@ -164,7 +160,7 @@ def test_limits_end_a_fetch_before_it_starts(take, tmp_path, names_in, options, 
     (tmp_path / "folder.tif").mkdir()
     with servers.serving(servers.tiles) as server:
         with pytest.raises((FetchError, OutputError, UsageError), match=words):
-            take(source(server), **options)
+            take(server.tiles, **options)
         assert not server.log
     assert names_in(tmp_path) == ["folder.tif"]
 
@@ -172,7 +168,7 @@ def test_limits_end_a_fetch_before_it_starts(take, tmp_path, names_in, options, 
 def test_a_broken_entry_of_the_cache_is_fetched_again(take, tmp_path):
     with servers.serving(tiles_but(FAULTS["403"])) as server:
         with pytest.raises(FetchError, match="rerun the command to resume"):
-            take(source(server), half_m=200)
+            take(server.tiles, half_m=200)
         cells = [p for p in (tmp_path / "ortho.tif.tiles").rglob("*") if p.is_file()]
         cells[0].write_bytes(cells[0].read_bytes()[:-5])
         cells[1].write_bytes(b"")
@@ -180,7 +176,7 @@ def test_a_broken_entry_of_the_cache_is_fetched_again(take, tmp_path):
         flipped[900] ^= 1
         cells[2].write_bytes(flipped)
         before, server.answer = len(server.log), servers.tiles
-        result, path = take(source(server), half_m=200)
+        result, path = take(server.tiles, half_m=200)
         assert len(server.log) - before == result.estimate.tiles - len(cells) + 3
     assert terrain.offset_px(path)[1] <= 1
 
@@ -188,7 +184,7 @@ def test_a_broken_entry_of_the_cache_is_fetched_again(take, tmp_path):
 def command_for(server, bounds, out):
     area = [f"--bounds={bounds}", "--gsd-m", "1"]
     command = [sys.executable, "-m", "orthonav", "fetch", "--heights", "none"]
-    return [*command, *area, "--source", source(server), "--out", out]
+    return [*command, *area, "--source", server.tiles, "--out", out]
 
 
 @pytest.mark.long
@@ -210,7 +206,7 @@ def test_a_killed_fetch_resumes(take, tmp_path, names_in):
         while before != len(server.log):  # requests of the killed process may still arrive
             before = len(server.log)
             time.sleep(0.1)
-        result, _ = take(source(server), half_m=200, margin_m=200.0)
+        result, _ = take(server.tiles, half_m=200, margin_m=200.0)
         asked = len(server.log) - before
     assert 0 < asked <= result.estimate.tiles - 4
     shift, worst, valid = terrain.offset_px(out)
@@ -238,7 +234,7 @@ def test_large_patches_of_the_colour_of_nothing_are_masked(take, colour, level):
     scene[:, :100] = level  # the edge of the coverage
     scene[200:210, 200:210] = level  # a roof, or a shadow
     with servers.serving(lambda asked: servers.Answer(terrain.encoded(scene))) as server:
-        _, path = take(source(server), half_m=5, empty=colour)
+        _, path = take(server.tiles, half_m=5, empty=colour)
     with rasterio.open(path) as data:
         valid = data.dataset_mask() > 0
     assert not valid[:, :100].any() and valid[:, 100:].all()

@@ -75,7 +75,7 @@ def test_a_route_and_its_band(command, tmp_path):
     line = {"type": "LineString", "coordinates": [[west, south], [east, north]]}
     (tmp_path / "route.geojson").write_text(json.dumps(line))
     with servers.serving(servers.tiles) as server:
-        source = ["--source", f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png", "--gsd-m", "1"]
+        source = ["--source", server.tiles, "--gsd-m", "1"]
         out = ["--out", tmp_path / "o.tif", "--json"]
         route = ["--route", tmp_path / "route.geojson"]
         code, stdout, _ = command(*route, "--band-m", "50", *source, *out)
@@ -86,10 +86,10 @@ def test_a_route_and_its_band(command, tmp_path):
 
 def test_a_dry_run_fetches_no_tile(command, area, tmp_path, names_in):
     with servers.serving(servers.tiles) as server:
-        source = f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png"
-        code, stdout, _ = command(area, "--source", source, "--dry-run")
+        dry = (area, "--source", server.tiles, "--dry-run")
+        code, stdout, _ = command(*dry)
         assert code == 0 and "would fetch" in stdout and "tiles" in stdout and "MB" in stdout
-        code, stdout, _ = command(area, "--source", source, "--dry-run", "--json")
+        code, stdout, _ = command(*dry, "--json")
         assert json.loads(stdout)["tiles"] > 0 and not server.log
     assert names_in(tmp_path) == []
 
@@ -115,15 +115,10 @@ def offered(monkeypatch):
 
 def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
     found, step, west, north = terrain.height_files(tmp_path)
-    url, asked_for = [], []
     out = tmp_path / "ortho.tif"
-    with (
-        servers.serving(servers.searching(found, url, asked_for)) as heights,
-        servers.serving(servers.tiles) as server,
-    ):
-        url.append(heights.url)
+    with servers.searching(found) as heights, servers.serving(servers.tiles) as server:
         offered(heights.url)
-        fetch = (area, "--source", f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png", "--out", out)
+        fetch = (area, "--source", server.tiles, "--out", out)
         code, stdout, _ = command(*fetch, "--gsd-m", 1, terrain=True)
         assert code == 0 and "Copernicus" not in stdout and "COPERNICUS" in stdout
         (line,) = [each.strip() for each in stdout.splitlines() if "orthonav build" in each]
@@ -136,7 +131,7 @@ def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
     words = shlex.split(line)
     assert words[:6] == ["orthonav", "build", "--ortho", str(out), "--dem", str(dem_path)]
     assert area in words and words[-1] == str(tmp_path / "ortho.onav")
-    box = asked_for[0]["bbox"]  # beyond the imagery by what oblique views see
+    box = heights.searches[0]["bbox"]  # beyond the imagery by what oblique views see
     assert (box[3] - terrain.LAT_DEG) * terrain.NORTH_M > 1200
     dem = open_dem(dem_path)  # its datum is not asked for
     assert dem.datum.name == "EGM2008 height" and not dem.datum.above_ellipsoid
@@ -149,22 +144,12 @@ def test_terrain_comes_with_the_imagery(command, area, tmp_path, offered):
 @pytest.mark.parametrize("broken", [False, True])
 def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, caplog, broken):
     """In place of a terrain of Copernicus, which is fetched where the surface cannot be."""
-    found, url, asked_for = terrain.surface_file(tmp_path), [], []
-    out, dsm_path = tmp_path / "ortho.tif", tmp_path / "ortho_dsm.tif"
-    dem_path = tmp_path / "ortho_dem.tif"
+    out, dem_path, dsm_path = (tmp_path / f"ortho{end}.tif" for end in ("", "_dem", "_dsm"))
+    serving = servers.searching(terrain.surface_file(tmp_path))
     if broken:
-        found = terrain.height_files(tmp_path)[0]
-    answer = servers.searching(found, url, asked_for)
-
-    def without_surface(asked):
-        return servers.Answer(b"no", 503) if b"surface3d" in asked.body else answer(asked)
-
-    with (
-        servers.serving(without_surface if broken else answer) as heights,
-        servers.serving(servers.tiles) as server,
-    ):
-        url.append(heights.url)
-        offered(heights.url, [("town", f"{server.url}/{{z}}/{{x}}/{{y}}.png")])
+        serving = servers.searching(terrain.height_files(tmp_path)[0], refused=b"surface3d")
+    with serving as heights, servers.serving(servers.tiles) as server:
+        offered(heights.url, [("town", server.tiles.removeprefix("xyz:"))])
         fetch = (area, "--source", "town", "--gsd-m", 1, "--out", out, "--heights", "surface")
         dry = json.loads(command(*fetch, "--dry-run", "--json", terrain=True)[1])
         assert dry["surface"] == "swisssurface3d" and dry["terrain"] is None
@@ -183,7 +168,7 @@ def test_a_surface_comes_with_the_imagery(command, area, tmp_path, offered, capl
         return
     assert plain["surface"]["out"] == str(dsm_path) and plain["surface"]["datum"] == "EPSG:5728"
     assert f"{line}--surface {dsm_path} " in stdout and "--dem" not in stdout
-    assert asked_for[0]["collections"] == ["ch.swisstopo.swisssurface3d-raster"]
+    assert heights.searches[0]["collections"] == ["ch.swisstopo.swisssurface3d-raster"]
     lat, lon = terrain.LAT_DEG + np.array([-5e-4, 5e-4]), terrain.LON_DEG + np.array([0, 9e-4])
     dsm = open_dem(dsm_path)
     assert dsm.gsd_m == pytest.approx(1, rel=0.01)
@@ -208,8 +193,7 @@ def test_imagery_is_kept_where_terrain_fails(command, area, tmp_path, offered, c
         servers.serving(servers.tiles) as server,
     ):
         offered(heights.url)
-        source = f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png"
-        code, stdout, _ = command(area, "--source", source, "--out", out, terrain=True)
+        code, stdout, _ = command(area, "--source", server.tiles, "--out", out, terrain=True)
     assert code == 0 and out.is_file() and "no terrain was fetched" in caplog.text
     assert "--source copernicus-dem" in caplog.text and "--dem" not in stdout
     assert f"orthonav build --ortho {out}" in stdout
@@ -242,9 +226,8 @@ def test_keys_never_appear(command, area, tmp_path, monkeypatch):
         return servers.tiles(asked) if len(server.log) > 3 else servers.Answer(b"no", 503)
 
     with servers.serving(answer) as server:
-        source = f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png?token={{key}}"
+        source, out = f"{server.tiles}?token={{key}}", tmp_path / "ortho.tif"
         keep = ["--key-env", "MY_KEY", "-v"]
-        out = tmp_path / "ortho.tif"
         code, stdout, stderr = command(area, "--source", source, "--out", out, "--gsd-m", 1, *keep)
     assert code == 0 and SECRET not in stdout + stderr
     everything = b"".join(p.read_bytes() for p in tmp_path.rglob("*") if p.is_file())

@@ -109,7 +109,10 @@ def test_rows_of_an_own_table_replace_those_of_the_same_name(tmp_path):
                     '[[a.layers]]\nid = "x"\nyears = 2020',
                     r"a\.layers: years must be a list of years",
                 ),
-                ('[[a.layers]]\nid = "x"\ndate = "June"', "date must be YYYY"),
+                *(
+                    (f'[[a.layers]]\nid = "x"\ndate = "{date}"', "date must be YYYY")
+                    for date in ("21", "2021-13", "2021-02-40", "June", "2021/2022/2023", "")
+                ),
             )
         ),
     ],
@@ -135,14 +138,6 @@ def test_keys_come_from_the_environment_only(monkeypatch):
     with pytest.raises(FetchError, match=r"write \{key\} for the key") as raised:
         parse_source("wms:https://a.example/?apikey=abcdef", ImageryOptions())
     assert "abcdef" not in str(raised.value)
-
-
-@pytest.mark.parametrize("date", ["21", "2021-13", "2021-02-40", "June", "2021/2022/2023", ""])
-def test_dates_are_checked(date, tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(f'[a]\nprotocol = "wms"\nurl = "u"\n[[a.layers]]\nid = "x"\ndate = "{date}"')
-    with pytest.raises(FetchError, match="date must be"):
-        parse_source("a:x", ImageryOptions(), own=path)
 
 
 @pytest.mark.parametrize(

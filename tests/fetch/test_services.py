@@ -13,10 +13,8 @@ from rasterio.io import MemoryFile
 
 from orthonav.core.errors import FetchError
 from orthonav.ground.fetch.presets import CURRENT, ImageryOptions, parse_source, presets
-from orthonav.ground.fetch.run import FetchRequest, estimate_fetch, fetch
 from orthonav.ground.imagery.source import open_sources
 from orthonav.ground.imagery.terrain import open_dem
-from orthonav.ground.planning.area import Area
 
 MAX_OFF_PX = 0.05
 
@@ -175,15 +173,12 @@ def height_tiff(query, middle, no_data_m):
     ],
 )  # fmt: skip
 def test_heights_of_a_wms_and_of_a_wcs(
-    tmp_path, heights_service, name, datum, gsd_m, no_data_m, asked_for
+    take, heights_service, name, datum, gsd_m, no_data_m, asked_for
 ):
     """Numbers of 32 bits at the resolution of the preset; impossible heights are no data."""
-    area = Area.from_bounds(terrain.bounds(60))
     with heights_service(name, no_data_m=no_data_m) as (spec, middle, requests):
-        request = FetchRequest(spec, area, tmp_path / "dem.tif", margin_m=0, limits=servers.QUICK)
-        fetch(request)
+        dem = open_dem(take(spec, half_m=60)[1])
     assert asked_for.items() <= requests[-1].query.items()
-    dem = open_dem(tmp_path / "dem.tif")
     assert dem.datum.name == f"{datum} height" and dem.gsd_m == pytest.approx(gsd_m, rel=0.01)
     off = np.array([[-40.0, 31.5], [-30.0, 44.0]])
     x, y = np.array(middle)[:, None] + off
@@ -194,11 +189,10 @@ def test_heights_of_a_wms_and_of_a_wcs(
 
 @pytest.mark.parametrize("name", ["ign-terrain", "ahn-surface"])
 @pytest.mark.parametrize("broken", ["cut", "page"])
-def test_broken_heights_are_not_written(tmp_path, heights_service, name, broken):
-    area, out = Area.from_bounds(terrain.bounds(60)), tmp_path / "dem.tif"
+def test_broken_heights_are_not_written(take, tmp_path, heights_service, name, broken):
     with heights_service(name, broken) as (spec, _, _), pytest.raises(FetchError, match="tiles fa"):
-        fetch(FetchRequest(spec, area, out, margin_m=0, limits=servers.QUICK))
-    assert not out.exists()
+        take(spec, half_m=60)
+    assert not (tmp_path / "ortho.tif").exists()
 
 
 @pytest.mark.parametrize(
@@ -209,9 +203,9 @@ def test_broken_heights_are_not_written(tmp_path, heights_service, name, broken)
         ({"format": "image/jpeg"}, "not come as image/jpeg; available: GEOTIFF, GEOTIFF_FLOAT32"),
     ],
 )
-def test_what_a_wcs_does_not_have_is_listed(tmp_path, heights_service, options, words):
-    area = Area.from_bounds(terrain.bounds(60))
-    with heights_service("ahn-surface", **options) as (spec, _, _):
-        request = FetchRequest(spec, area, tmp_path / "dem.tif", limits=servers.QUICK)
-        with pytest.raises(FetchError, match=words):
-            estimate_fetch(request)
+def test_what_a_wcs_does_not_have_is_listed(take, heights_service, options, words):
+    with (
+        heights_service("ahn-surface", **options) as (spec, _, _),
+        pytest.raises(FetchError, match=words),
+    ):
+        take(spec)

@@ -86,27 +86,24 @@ def test_figures_are_replaced_whole_with_a_list_that_sha256sum_reads(tmp_path: P
     assert sorted(listed) == sorted(found)
 
 
-def changed(folder: Path) -> None:
-    (folder / "map.svg").write_text("drawn over by hand")
+def linked(svg: Path) -> None:
+    svg.rename(svg.parent.parent / "outside.svg")
+    svg.symlink_to(svg.parent.parent / "outside.svg")
 
 
-def other(folder: Path) -> None:
-    (folder / "mine.png").write_bytes(b"mine")
-
-
-def linked(folder: Path) -> None:
-    (folder / "map.svg").rename(folder.parent / "outside.svg")
-    (folder / "map.svg").symlink_to(folder.parent / "outside.svg")
-
-
-def unlisted(folder: Path) -> None:
-    (folder / LIST).write_text("\0 forged\n")
-
-
-@pytest.mark.parametrize("spoil", [changed, other, linked, unlisted])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda svg: svg.write_text("drawn over by hand"),
+        lambda svg: svg.with_name("mine.png").write_bytes(b"mine"),
+        lambda svg: svg.with_name(LIST).write_text("\0 forged\n"),
+        linked,
+    ],
+    ids=["changed", "other", "unlisted", "linked"],
+)
 def test_a_folder_with_files_that_are_not_ours_is_refused(tmp_path: Path, spoil) -> None:
     write_page(tmp_path, "before", [figure("map")])
-    spoil(tmp_path / "figures")
+    spoil(tmp_path / "figures" / "map.svg")
     before = names(tmp_path)
     with pytest.raises(OutputError, match=r"figures$"):
         write_page(tmp_path, "after", [figure("map", "b")])

@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> None:
     for kind, name in names.items():
         if name is not None and imagery:
             found |= _heights(options, request, kind, name)
-    if _falls_back(names) and imagery and not found:
+    if names["terrain"] is None and names["surface"] is not None and imagery and not found:
         found = _heights(options, request, "terrain", DEFAULT_TERRAIN)
     if options.json:
         more: dict[str, object] = dict.fromkeys(names)
@@ -111,11 +111,6 @@ def _heights_presets(options: argparse.Namespace) -> dict[str, str | None]:
     return {"terrain": terrain, "surface": surface}
 
 
-def _falls_back(names: dict[str, str | None]) -> bool:
-    """Whether the default terrain is fetched where the surface cannot be had."""
-    return names["surface"] is not None and names["terrain"] is None
-
-
 def _print_estimate(
     options: argparse.Namespace, estimate: "CostEstimate", names: dict[str, str | None]
 ) -> None:
@@ -125,7 +120,7 @@ def _print_estimate(
         print_json(vars(estimate) | {"provenance": vars(estimate.provenance), **names})
     else:
         more = "".join(f", and {kind} from {name}" for kind, name in names.items() if name)
-        if _falls_back(names):
+        if names["terrain"] is None and names["surface"] is not None:
             more += f" (terrain from {DEFAULT_TERRAIN} where that cannot be had)"
         print(f"would fetch {estimate.text()}{more}")
 
@@ -135,14 +130,13 @@ def _heights(
 ) -> "dict[str, tuple[Path, FetchResult]]":
     """Nothing, with a warning, where they cannot be had: the imagery is kept."""
     from orthonav.ground.fetch.presets import DEFAULT_TERRAIN, ImageryOptions, parse_source
-    from orthonav.ground.fetch.run import fetch_heights, heights_request
+    from orthonav.ground.fetch.run import fetch_heights
 
     say(options, f"fetching the {kind} of {name}")
     try:
         spec = parse_source(name, ImageryOptions(), own=options.services)
-        request = heights_request(imagery, kind, spec)
         with progress(options) as shown:
-            return {kind: (request.out, fetch_heights(request, shown))}
+            return {kind: fetch_heights(imagery, kind, spec, shown)}
     except (FetchError, AreaError, OutputError) as error:
         other = DEFAULT_TERRAIN if kind == "terrain" else name
         log.warning(

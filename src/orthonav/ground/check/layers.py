@@ -15,7 +15,6 @@ from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.check.records import (
     CELL_VALUES,
-    Along,
     Cells,
     CheckResult,
     Flights,
@@ -39,7 +38,7 @@ def check_to_plain(result: CheckResult) -> Plain:
         "verdict": {**to_plain(verdict), "exit_code": verdict.word.exit_code},
         "conditions": to_plain(result.conditions, 6),
         "summary": to_plain(summarize(result), BY_UNIT),
-        "flights": _flights(result),
+        "flights": None if result.flights is None else to_plain(_figures(result.flights), 4),
         "plane": {
             "origin_lat_deg": float(frame.lat_deg),
             "origin_lon_deg": float(frame.lon_deg),
@@ -51,12 +50,10 @@ def check_to_plain(result: CheckResult) -> Plain:
     }
 
 
-def _flights(result: CheckResult) -> Plain | None:
-    if result.flights is None:
-        return None
-    known = vars(result.flights).items()
+def _figures(flights: Flights) -> Plain:
+    known = vars(flights).items()
     ranges = {name: value._asdict() for name, value in known if isinstance(value, Range)}
-    return {"count": result.flights.count, **to_plain(ranges, 4)}
+    return {"count": flights.count, **ranges}
 
 
 def _stretches(result: CheckResult) -> list[Plain]:
@@ -115,37 +112,31 @@ def features(result: CheckResult) -> Iterator[Plain]:
     frame, along, flights = result.frame, result.along, result.flights
     if along is None or flights is None or result.route_en_m is None:
         return
-    yield from _route_features(result, along, flights)
-    for each, properties in zip(result.outages, _stretches(result), strict=True):
-        inside = (along.distance_m >= each.start_m) & (along.distance_m <= each.end_m)
-        yield _feature(frame, "blind", "LineString", along.points_en_m[inside], properties)
-    legs_m = np.hypot(*np.diff(result.route_en_m, axis=0).T)
-    for i, point in enumerate(result.route_en_m):
-        properties = {"number": i + 1, "distance_m": round(float(legs_m[:i].sum()), 2)}
-        yield _feature(frame, "waypoints", "Point", point[None], properties)
-
-
-def _route_features(result: CheckResult, along: Along, flights: Flights) -> Iterator[Plain]:
-    """A line from each point to the next, with the worse values of the two."""
     risks = {"confident": CONFIDENT, "likely": 0.7, "doubtful": 0.5, "unlikely": 0.0}
-    for i in range(len(along.distance_m) - 1):
+    for i in range(len(along.distance_m) - 1):  # with the worse values of the two ends
         pair = slice(i, i + 2)
-        start_m, end_m = (float(value) for value in along.distance_m[pair])
-        probability = float(along.probability[pair].min())
+        start_m, end_m = along.distance_m[pair]
+        probability = along.probability[pair].min()
         properties = {
             "number": i + 1,
             "distance_m": start_m,
             "end_m": end_m,
             "time_s": start_m / result.conditions.speed_mps,
             "probability": probability,
-            "across_low": float(along.across_low[pair].min()),
-            "error_m": float(along.error_m[pair].max()),
-            "available": float(flights.available[pair].min()),
-            "protection_m": float(flights.protection_m[pair].max()),
+            "across_low": along.across_low[pair].min(),
+            "error_m": along.error_m[pair].max(),
+            "available": flights.available[pair].min(),
+            "protection_m": flights.protection_m[pair].max(),
             "risk": next((name for name, p in risks.items() if probability >= p), "unknown"),
         }
-        line = along.points_en_m[pair]
-        yield _feature(result.frame, "route", "LineString", line, to_plain(properties, BY_UNIT))
+        yield _feature(frame, "route", "LineString", along.points_en_m[pair], properties)
+    for each, properties in zip(result.outages, _stretches(result), strict=True):
+        inside = (along.distance_m >= each.start_m) & (along.distance_m <= each.end_m)
+        yield _feature(frame, "blind", "LineString", along.points_en_m[inside], properties)
+    legs_m = np.hypot(*np.diff(result.route_en_m, axis=0).T)
+    for i, point in enumerate(result.route_en_m):
+        properties = {"number": i + 1, "distance_m": legs_m[:i].sum()}
+        yield _feature(frame, "waypoints", "Point", point[None], properties)
 
 
 def _feature(
@@ -155,7 +146,7 @@ def _feature(
     lon = frame.lon_deg + (lon - frame.lon_deg + 180) % 360 - 180  # no jump at the date line
     points = np.round(np.stack([lon, lat], axis=-1), 7).tolist()
     geometry = {"type": kind, "coordinates": points[0] if kind == "Point" else points}
-    named = {"layer": layer, **properties}
+    named = {"layer": layer, **to_plain(properties, BY_UNIT)}
     return {"type": "Feature", "properties": named, "geometry": geometry}
 
 

@@ -21,15 +21,7 @@ VERDICTS = {
     Word.MARGINAL: "This {} does not meet all requirements for GO; see the reasons.",
     Word.NO_GO: "Do not rely on this map for this {}; see the reasons.",
 }
-OUTAGE_COLUMNS = (
-    "no.",
-    "from",
-    "to",
-    "length",
-    "duration",
-    "probability of a fix",
-    "available",
-)
+OUTAGE_COLUMNS = ("no.", "from", "to", "length", "duration", "probability of a fix", "available")
 SIMULATED = "Predicted from this map alone, with simulated ageing."
 
 
@@ -61,16 +53,8 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
         "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
         "height above ground": f"{conditions.agl_m:.0f} m",
         "error of reported height": f"{100 * conditions.agl_std:.1f} % (standard deviation)",
-        "error of reported heading": (
-            "heading unknown: all headings are searched"
-            if yaw is None
-            else f"{yaw:g}° (standard deviation)"
-        ),
-        "error of prior position": (
-            "no prior: the whole map is searched"
-            if prior is None
-            else f"{metres_text(prior)} per axis (standard deviation)"
-        ),
+        "error of reported heading": "heading unknown: all headings are searched",
+        "error of prior position": "no prior: the whole map is searched",
         "error of the reported tilt": f"{conditions.tilt_std_deg:g}° (standard deviation)",
         "camera": {
             "colour": "colour or grey, in daylight, as the map's imagery",
@@ -81,6 +65,10 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
         "ground speed": f"{conditions.speed_mps:g} m/s",
         "drift between fixes": f"{100 * conditions.drift:g} % of the distance flown",
     }
+    if yaw is not None:
+        rows["error of reported heading"] = f"{yaw:g}° (standard deviation)"
+    if prior is not None:
+        rows["error of prior position"] = f"{metres_text(prior)} per axis (standard deviation)"
     if band_m is not None:
         rows["band along the route"] = f"{metres_text(band_m)} wide"
     return rows
@@ -103,15 +91,13 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
         outage_s, outage_m = flights.outage_s, flights.outage_m
         between = interval_text(flights.availability, probability_text)
         far = range_text(outage_m, metres_text)
+        name = f"longest outage {interval_text(outage_s, seconds_text)}, {far}"
         available = [
             (
                 probability_text(flights.availability.median),
                 f"availability {between} at the alert limit of {limit}",
             ),
-            (
-                seconds_text(outage_s.median),
-                f"longest outage {interval_text(outage_s, seconds_text)}, {far}",
-            ),
+            (seconds_text(outage_s.median), name),
         ]
     if flights is None:
         return [
@@ -122,17 +108,13 @@ def key_figures(result: CheckResult) -> list[tuple[str, str]]:
             (str(int(result.cells.trials.sum())), "trial views"),
         ]
     error, wrong = flights.error_95_m, flights.false_fix
-    beyond = f"a confident fix beyond {metres_text(conditions.radius_m)} on this route"
+    largest = f"largest position error, 95 % {interval_text(error, metres_text)}"
+    beyond = f"probability of a confident fix beyond {metres_text(conditions.radius_m)} on this "
+    beyond += f"route {interval_text(wrong, percent_text)}"
     return [
         *available,
-        (
-            metres_text(error.median),
-            f"largest position error, 95 % {interval_text(error, metres_text)}",
-        ),
-        (
-            percent_text(wrong.median),
-            f"probability of {beyond} {interval_text(wrong, percent_text)}",
-        ),
+        (metres_text(error.median), largest),
+        (percent_text(wrong.median), beyond),
         chance,
     ]
 

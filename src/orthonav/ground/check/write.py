@@ -89,11 +89,8 @@ def _foreign(folder: Path) -> str | None:
 def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
     about = result.about
     script, style = load_leaflet()
-    shared, own = (
-        ("format.js", "plane.js", "chart.js"),
-        ("data.js", "map.js", "profile.js", "page.js"),
-    )
-    scripts = (script, joined_scripts(shared, PACKAGE, own))
+    own = "data.js", "map.js", "profile.js", "page.js"
+    scripts = script, joined_scripts(("format.js", "plane.js", "chart.js"), PACKAGE, own)
     image = webp(*map_image(opened, visible_box(result.cells)))
     values = {
         "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
@@ -104,12 +101,10 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
         "cards": key_figures(result),
         "note": "" if result.second_date else SIMULATED,
         "layers": {
-            name: CELL_VALUES[name] for name in CELL_VALUES if name not in ("high", "trials")
+            name: meaning for name, meaning in CELL_VALUES.items() if name not in ("high", "trials")
         },
         "outage_columns": OUTAGE_COLUMNS,
-        "outages": [
-            outage_row(number, each) for number, each in enumerate(result.outages, start=1)
-        ],
+        "outages": [outage_row(*each) for each in enumerate(result.outages, start=1)],
         "radius": metres_text(result.conditions.radius_m),
         "conditions": conditions_text(result.conditions, result.band_m),
         "downloads": {
@@ -117,27 +112,22 @@ def page_of(result: CheckResult, opened: MapFile, json_sha256: str) -> str:
             TIF: "GeoTIFF: a band per layer of the map",
             JSON: "JSON: all results and conditions",
         },
-        "checked": _checked(result, json_sha256),
+        "checked": [
+            ("map", about.map_name),
+            ("SHA-256 of the map's manifest", about.map_sha256),
+            ("imagery", about.imagery),
+            ("build parameters", about.recipe),
+            ("second date", about.other_date),
+            ("route", about.route_name),
+            ("command", about.command),
+            ("orthonav", about.version),
+            ("SHA-256 of check.json", json_sha256),
+        ],
         "data": _page_data(result),
         "image": data_url(image, "image/webp"),
     }
     style += static_text("check.css", PACKAGE)
     return render(PACKAGE, "page.html", values, style=style, scripts=scripts)
-
-
-def _checked(result: CheckResult, json_sha256: str) -> list[tuple[str, str]]:
-    about = result.about
-    return [
-        ("map", about.map_name),
-        ("SHA-256 of the map's manifest", about.map_sha256),
-        ("imagery", about.imagery),
-        ("build parameters", about.recipe),
-        ("second date", about.other_date),
-        ("route", about.route_name),
-        ("command", about.command),
-        ("orthonav", about.version),
-        ("SHA-256 of check.json", json_sha256),
-    ]
 
 
 def _page_data(result: CheckResult) -> str:

@@ -8,7 +8,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from functools import cache
@@ -25,6 +25,7 @@ HEIGHTS_FORMAT = "image/geotiff"
 DEFAULT_TERRAIN = "copernicus-dem"
 PROTOCOLS = ("wmts", "wms", "wcs", "xyz", "stac", "cog")
 CURRENT = "current"
+_DATE = r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?"
 
 
 @dataclass(frozen=True)
@@ -207,8 +208,9 @@ def _preset(name: str, values: dict[str, Any]) -> Preset:
                 asked["bands"] = tuple(asked["bands"])
             about = {key: value for key, value in filled.items() if key not in options}
             layer = PresetLayer(options=ImageryOptions(**asked), **about)
-            if layer.date is not None:
-                _check_date(layer.date)
+            if layer.date is not None and not re.fullmatch(f"{_DATE}(/{_DATE})?", layer.date):
+                said = "date must be YYYY, YYYY-MM or YYYY-MM-DD, or two with /"
+                raise ValueError(f"{said}, got '{layer.date}'")
             if layer.id in layers:
                 raise ValueError(f"{name} has {layer.id} twice")
             layers[layer.id] = layer
@@ -219,39 +221,32 @@ def _preset(name: str, values: dict[str, Any]) -> Preset:
     return preset
 
 
-def _require_kinds(where: str, values: dict[str, Any]) -> None:
-    """Raise `ValueError` for a value of a table that its field cannot have."""
-    classes = Preset, PresetLayer, ImageryOptions
-    kinds = {each.name: each.type for cls in classes for each in fields(cls)}
-    kinds["years"] = list
-    for name in kinds.keys() & values.keys():
-        fits, expected = _fits(name, kinds[name], values[name])
-        if not fits:
-            raise ValueError(f"{where}: {name} must be {expected}, got {values[name]!r}")
-
-
-def _fits(name: str, kind: Any, value: Any) -> tuple[bool, str]:
-    """Whether a value is one that its field can have, and what that is."""
-    items = value if isinstance(value, list) else []
-    match name:
-        case "layers":
-            return bool(items) and all(isinstance(each, dict) for each in items), "tables"
-        case "years":
-            return bool(items), "a list of years"
-        case "bands":
-            return bool(items) and all(map(_is_whole, items)), "a list of numbers from 1"
-        case "empty":
-            return value in ("black", "white"), "black or white"
-    if kind == int | None:
-        return _is_whole(value), "a whole number from 1"
-    if kind == float | None:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        return is_number and 0 < value < math.inf, "a number above 0"
-    return isinstance(value, str), "a text"
-
-
 def _is_whole(value: Any) -> bool:
     return type(value) is int and value >= 1
+
+
+def _is_list(value: Any, fits: Callable[[Any], bool] = lambda _: True) -> bool:
+    return isinstance(value, list) and bool(value) and all(map(fits, value))
+
+
+_WHOLE = _is_whole, "a whole number from 1"
+_LENGTH = lambda x: type(x) in (int, float) and 0 < x < math.inf, "a number above 0"
+_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "layers": (lambda x: _is_list(x, lambda each: isinstance(each, dict)), "tables"),
+    "years": (_is_list, "a list of years"),
+    "bands": (lambda x: _is_list(x, _is_whole), "a list of numbers from 1"),
+    "empty": (lambda x: x in ("black", "white"), "black or white"),
+    **{"tile_px": _WHOLE, "max_zoom": _WHOLE, "gsd_m": _LENGTH, "finest_m": _LENGTH},
+}
+"""Which values a field of a table takes, and how an error names them; others are texts."""
+
+
+def _require_kinds(where: str, values: dict[str, Any]) -> None:
+    """Raise `ValueError` for a value of a table that its field cannot have."""
+    for name, value in values.items():
+        fits, expected = _KINDS.get(name, (lambda x: isinstance(x, str), "a text"))
+        if not fits(value):
+            raise ValueError(f"{where}: {name} must be {expected}, got {value!r}")
 
 
 def terrain_preset(text: str, own: Path | None = None) -> str | None:
@@ -294,7 +289,15 @@ def parse_source(
             f"--source: write the protocol before the address ({'|'.join(PROTOCOLS)}:ADDRESS): "
             f"{shown(text)}"
         )
-    preset, layer = _row(head, rest, presets(own))
+    known = presets(own)
+    if head not in known:
+        choices = listed(list(known), head, 40)
+        raise UsageError(f"--source: unknown service '{head}'; available: {choices}")
+    preset = known[head]
+    layer = preset.layers.get(rest or CURRENT)
+    if layer is None:
+        problem = f"{head} has no '{rest}'" if rest else f"add a year: {head}:YEAR"
+        raise FetchError(f"{problem}; available: {listed(list(preset.layers), rest, most=40)}")
     options = options.over(layer.options)
     terms = f"{preset.licence} ({preset.licence_url})" if preset.licence_url else preset.licence
     notes = "; ".join(note for note in (layer.note, preset.note) if note) or None
@@ -304,26 +307,6 @@ def parse_source(
     )
     secrets = _secrets(preset.protocol, preset.url, key_env or preset.key_env)
     return SourceSpec(preset.protocol, preset.url, options, provenance, secrets, preset.token_url)
-
-
-def _row(name: str, id_: str, table: dict[str, Preset]) -> tuple[Preset, PresetLayer]:
-    if name not in table:
-        raise UsageError(
-            f"--source: unknown service '{name}'; available: {listed(list(table), name, 40)}"
-        )
-    preset = table[name]
-    layer = preset.layers.get(id_ or CURRENT)
-    if layer is None:
-        problem = f"{name} has no '{id_}'" if id_ else f"add a year: {name}:YEAR"
-        raise FetchError(f"{problem}; available: {listed(list(preset.layers), id_, most=40)}")
-    return preset, layer
-
-
-def _check_date(text: str) -> None:
-    """Raise `FetchError` unless a date is YYYY[-MM[-DD]], or two with a slash between."""
-    one = r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))?)?"
-    if not re.fullmatch(f"{one}(/{one})?", text):
-        raise UsageError(f"date must be YYYY, YYYY-MM or YYYY-MM-DD, or two with /, got '{text}'")
 
 
 def _secrets(protocol: str, url: str, key_env: str | None) -> tuple[Secret, ...]:

@@ -180,32 +180,38 @@ def holds_heights(path: Path) -> bool:
         return bool(data.count == 1 and data.dtypes[0].startswith(("float", "int")))
 
 
-def heights_request(request: FetchRequest, kind: str, spec: SourceSpec) -> FetchRequest:
-    """The request for heights of a source, beside imagery of another; `kind` as in `BESIDE`."""
+def fetch_heights(
+    imagery: FetchRequest, kind: str, spec: SourceSpec, progress: Progress = no_progress
+) -> tuple[Path, FetchResult]:
+    """Fetch heights of a source beside imagery of another, and the file; `kind` as in `BESIDE`.
+
+    Raises as `fetch`, and `OutputError` where another's file has that name."""
     end, beyond_m = BESIDE[kind]
-    return replace(
-        request,
-        spec=spec,
-        out=request.out.with_name(f"{request.out.stem}_{end}{request.out.suffix}"),
-        margin_m=request.margin_m + beyond_m,
-    )
-
-
-def fetch_heights(request: FetchRequest, progress: Progress = no_progress) -> FetchResult:
-    """As `fetch`, but another's file of that name is not replaced."""
-    if request.out.exists():
-        with suppress(RasterioError), rasterio.open(request.out) as data:
-            if "ORTHONAV_FETCHED" in data.tags():
-                return fetch(request, progress)
-        raise OutputError(f"the file exists and is not a fetched one: {request.out}")
-    return fetch(request, progress)
+    out = imagery.out.with_name(f"{imagery.out.stem}_{end}{imagery.out.suffix}")
+    if out.exists():
+        fetched = False
+        with suppress(RasterioError), rasterio.open(out) as data:
+            fetched = "ORTHONAV_FETCHED" in data.tags()
+        if not fetched:
+            raise OutputError(f"the file exists and is not a fetched one: {out}")
+    wider_m = imagery.margin_m + beyond_m
+    return out, fetch(replace(imagery, spec=spec, out=out, margin_m=wider_m), progress)
 
 
 def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, CostEstimate]:
     if not (math.isfinite(request.margin_m) and request.margin_m >= 0):
         raise UsageError(f"margin must be 0 m or more, got {request.margin_m}")
-    source = open_cells(web, request.spec, request.area, request.margin_m)
-    selection = select(source.grid, request.area, request.margin_m)
+    spec, area, margin_m = request.spec, request.area, request.margin_m
+    by_protocol: dict[str, Callable[[], CellSource]] = {
+        "wmts": lambda: wmts_tiles(web, spec, area),
+        "wms": lambda: wms_cells(web, spec, area),
+        "wcs": lambda: wcs_cells(web, spec, area),
+        "xyz": lambda: xyz_tiles(spec, area),
+        "cog": lambda: cog_source(web, spec, area, [spec.url]),
+        "stac": lambda: stac_source(web, spec, area, margin_m),
+    }
+    source = by_protocol[spec.protocol]()
+    selection = select(source.grid, area, margin_m)
     height, width = selection.shape_px
     tiles = len(selection.cells)
     size = tiles * source.cell_bytes
@@ -215,22 +221,6 @@ def _planned(web: Web, request: FetchRequest) -> tuple[CellSource, Selection, Co
         tiles, selection.gsd_m, width, height, size / 1e6, seconds / 60, source.provenance
     )
     return source, selection, estimate
-
-
-def open_cells(web: Web, spec: SourceSpec, area: Area, margin_m: float) -> CellSource:
-    """The cells of the imagery requested, after reading the service's capabilities.
-
-    Raises `FetchError` with the available choices where it has no such layer, style, zoom or time.
-    """
-    by_protocol: dict[str, Callable[[], CellSource]] = {
-        "wmts": lambda: wmts_tiles(web, spec, area),
-        "wms": lambda: wms_cells(web, spec, area),
-        "wcs": lambda: wcs_cells(web, spec, area),
-        "xyz": lambda: xyz_tiles(spec, area),
-        "cog": lambda: cog_source(web, spec, area, [spec.url]),
-        "stac": lambda: stac_source(web, spec, area, margin_m),
-    }
-    return by_protocol[spec.protocol]()
 
 
 def _write_mosaic(

@@ -89,7 +89,11 @@ def wmts_tiles(web: Web, spec: SourceSpec, area: Area) -> CellSource:
     formats = list(filter(None, dict.fromkeys([*texts(layer, "Format"), *templates])))
     format_ = choose_format(formats, options, f"layer {name}")
     set_name, grids = _grids(root, layer, name, options)
-    matrix = _zoom(grids, options, area.frame)
+    scale = mean_scale(next(iter(grids.values())).crs, area.frame)
+    gsds_m = [scale * grid.res_x for grid in grids.values()]
+    named = zip(grids, gsds_m, strict=True)
+    levels = ", ".join(f"{zoom} ({gsd_m:.3g} m)" for zoom, gsd_m in named)
+    matrix = list(grids)[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {levels}")]
     values = {
         "Layer": name,
         "Style": _style(layer, name, options),
@@ -166,16 +170,16 @@ def _grids(
     finest = math.inf if options.max_zoom is None else options.max_zoom
     crs_name = texts(known[set_name], "SupportedCRS")[0]
     grids = {}
-    for element in known[set_name].iterfind("TileMatrix"):
-        for zoom in _id(element):
-            number = zoom.rpartition(":")[2]  # EPSG:3857:07 is zoom 7
-            level = int(number) if number.isdecimal() else 0
-            if zoom in limits or (not limits and level <= finest):
-                try:
-                    grids[zoom] = _grid(element, crs_name)
-                except (ValueError, IndexError, OverflowError):
-                    problem = f"tile matrix {zoom} of {set_name} cannot be read"
-                    raise FetchError(problem) from None
+    matrices = known[set_name].iterfind("TileMatrix")
+    for zoom, element in ((zoom, each) for each in matrices for zoom in _id(each)):
+        number = zoom.rpartition(":")[2]  # EPSG:3857:07 is zoom 7
+        level = int(number) if number.isdecimal() else 0
+        if zoom in limits or (not limits and level <= finest):
+            try:
+                grids[zoom] = _grid(element, crs_name)
+            except (ValueError, IndexError, OverflowError):
+                problem = f"tile matrix {zoom} of {set_name} cannot be read"
+                raise FetchError(problem) from None
     if not grids:
         raise FetchError(f"layer {name} has no zoom in its grid {set_name}")
     return set_name, grids
@@ -192,7 +196,8 @@ def _grid(matrix: Element, crs_name: str) -> CellGrid:
     else:
         is_swapped &= crs_name.startswith(("urn:", "http"))
     west, north = (second, first) if is_swapped else (first, second)
-    width, height = (_whole(matrix, tag) for tag in ("TileWidth", "TileHeight"))
+    tags = "TileWidth", "TileHeight", "MatrixWidth", "MatrixHeight"
+    width, height, cols, rows = (int(texts(matrix, tag)[0]) for tag in tags)
     # Of pixels of 0.28 mm, with degrees as long as at the equator (OGC 07-057r7, 6.1).
     unit_m = MERCATOR_HALF_M / 180
     if not known.is_geographic:
@@ -205,20 +210,7 @@ def _grid(matrix: Element, crs_name: str) -> CellGrid:
         west, north, whole = -MERCATOR_HALF_M, MERCATOR_HALF_M, 2 * MERCATOR_HALF_M / width
         exact = whole / 2.0 ** round(math.log2(whole / res))
         res = exact if math.isclose(res, exact, rel_tol=1e-4) else res
-    edges = 0, 0, _whole(matrix, "MatrixHeight") - 1, _whole(matrix, "MatrixWidth") - 1
-    return CellGrid(crs, west, north, res, res, width, height, edges)
-
-
-def _whole(element: Element, tag: str) -> int:
-    return int(texts(element, tag)[0])
-
-
-def _zoom(grids: dict[str, CellGrid], options: ImageryOptions, frame: LocalFrame) -> str:
-    scale = mean_scale(next(iter(grids.values())).crs, frame)
-    gsds_m = [scale * grid.res_x for grid in grids.values()]
-    named = zip(grids, gsds_m, strict=True)
-    levels = ", ".join(f"{zoom} ({gsd_m:.3g} m)" for zoom, gsd_m in named)
-    return list(grids)[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {levels}")]
+    return CellGrid(crs, west, north, res, res, width, height, (0, 0, rows - 1, cols - 1))
 
 
 def wms_cells(web: Web, spec: SourceSpec, area: Area) -> CellSource:

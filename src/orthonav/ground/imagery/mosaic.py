@@ -116,41 +116,34 @@ class Lattice:
     def _vrt(self, members: list[int]) -> str:
         """XML that joins members, the first on top, each where it is valid."""
         width, height = self.size_px
-        t = self.transform
-        dtype = _gdal_type(self.first.dtype)
+        dtype = typename_fwd[dtype_rev[self.first.dtype]]
+        placed = [(self.sources[at], self._place(at, dtype)) for at in reversed(members)]
         bands = "".join(
             f'<VRTRasterBand dataType="{dtype}" band="{band + 1}">'
-            + "".join(_values(*member, band) for member in self._placed(members))
+            + "".join(_values(*each, band) for each in placed)
             + "</VRTRasterBand>"
             for band in range(len(self.first.bands))
         )
-        masks = "".join(_mask(*member) for member in self._placed(members))
+        masks = "".join(_mask(*each) for each in placed)
         return (
             f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">'
             f"<SRS>{escape(self.first.system.to_wkt())}</SRS>"
-            f"<GeoTransform>{t.c!r},{t.a!r},{t.b!r},{t.f!r},{t.d!r},{t.e!r}</GeoTransform>{bands}"
+            f"<GeoTransform>{','.join(map(repr, self.transform.to_gdal()))}</GeoTransform>{bands}"
             f'<MaskBand><VRTRasterBand dataType="Byte">{masks}</VRTRasterBand></MaskBand>'
             "</VRTDataset>"
         )
 
-    def _placed(self, members: list[int]) -> Iterator[tuple[Source, str]]:
-        """Members, the last first, with the XML of file and place."""
-        for index in reversed(members):
-            source, (left, top) = self.sources[index], self.boxes_px[index, :2].tolist()
-            size = f'xSize="{source.width_px}" ySize="{source.height_px}"'
-            dtype = _gdal_type(source.dtype)
-            yield (
-                source,
-                f'<SourceFilename relativeToVRT="0">{escape(str(source.path))}</SourceFilename>'
-                f'<SourceProperties RasterXSize="{source.width_px}" '
-                f'RasterYSize="{source.height_px}" DataType="{dtype}" BlockXSize="256" '
-                f'BlockYSize="256"/><SrcRect xOff="0" yOff="0" {size}/>'
-                f'<DstRect xOff="{left}" yOff="{top}" {size}/>',
-            )
-
-
-def _gdal_type(dtype: str) -> str:
-    return str(typename_fwd[dtype_rev[dtype]])
+    def _place(self, member: int, dtype: str) -> str:
+        """The XML of a member's file and place."""
+        source, (left, top) = self.sources[member], self.boxes_px[member, :2].tolist()
+        width, height = source.width_px, source.height_px
+        return (
+            f'<SourceFilename relativeToVRT="0">{escape(str(source.path))}</SourceFilename>'
+            f'<SourceProperties RasterXSize="{width}" RasterYSize="{height}" DataType="{dtype}" '
+            f'BlockXSize="256" BlockYSize="256"/>'
+            f'<SrcRect xOff="0" yOff="0" xSize="{width}" ySize="{height}"/>'
+            f'<DstRect xOff="{left}" yOff="{top}" xSize="{width}" ySize="{height}"/>'
+        )
 
 
 def _values(source: Source, place: str, band: int) -> str:
@@ -190,7 +183,7 @@ def _lattice(members: list[int], sources: list[Source]) -> Lattice:
     corner = offsets.min(axis=0)
     sizes = np.array([(each.width_px, each.height_px) for each in sources], np.int64)
     boxes = np.concatenate([offsets - corner, offsets - corner + sizes], axis=1)
-    transform = sources[0].transform * Affine.translation(int(corner[0]), int(corner[1]))
+    transform = sources[0].transform * Affine.translation(*corner.tolist())
     return Lattice(tuple(members), tuple(sources), transform, boxes)
 
 
@@ -316,8 +309,7 @@ class Mosaic:
         self, frame: LocalFrame, grid: TileGrid, threads: int | None = None
     ) -> "SheetRaster":
         names = ("west_m", "north_m", "width_px", "height_px", "gsd_m")
-        place = {name: getattr(grid, name) for name in names}
-        return SheetRaster(self, frame, **place, threads=threads)
+        return self.sheet(frame, **{name: getattr(grid, name) for name in names}, threads=threads)
 
     @cached_property
     def lattices(self) -> list[Lattice]:
@@ -390,33 +382,27 @@ class SheetRaster:
 
     def read(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
         """Pixels of a window; outside all imagery they are 0 and invalid."""
-        return Pixels(*self._composed(Window(col, row, width_px, height_px), 3))
+        return self._composed(Window(col, row, width_px, height_px), 3)
 
     def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
         """Converted before resampling: within one level of `read`, and faster."""
-        return Pixels(*self._composed(Window(col, row, width_px, height_px), 1))
+        return self._composed(Window(col, row, width_px, height_px), 1)
 
-    def _composed(
-        self, window: Window, colours: int
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Values (H, W, colours) and valid (H, W); earlier lattices cover later ones."""
-        with quiet(), rasterio.Env(**GDAL_OPTIONS, GDAL_NUM_THREADS=str(self._threads)):
-            return self._laid_over(window, colours)
-
-    def _laid_over(
-        self, window: Window, colours: int
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        shape = window.height, window.width
+    def _composed(self, window: Window, colours: int) -> Pixels:
+        """Earlier lattices cover later ones."""
+        shape, off = (window.height, window.width), (window.row_off, window.col_off)
         out = np.zeros((*shape, colours), np.uint8)
         valid = np.zeros(shape, np.bool_)
         weight, total = np.zeros(shape, np.float32), np.zeros((*shape, colours), np.float32)
-        for lattice, (x0, y0, x1, y1) in self._parts(window):
+        for lattice, overlap in self._parts(window):
+            rows, cols = overlap.toslices()
             part = np.s_[
-                y0 - window.row_off : y1 - window.row_off, x0 - window.col_off : x1 - window.col_off
+                rows.start - off[0] : rows.stop - off[0], cols.start - off[1] : cols.stop - off[1]
             ]
             if valid[part].all():
                 continue
-            values, mask = self._warped(lattice, Window(x0, y0, x1 - x0, y1 - y0), colours)
+            with quiet(), rasterio.Env(**GDAL_OPTIONS, GDAL_NUM_THREADS=str(self._threads)):
+                values, mask = self._warped(lattice, overlap, colours)
             new = (mask >= WHOLLY_VALID) & ~valid[part]
             np.copyto(out[part], values, where=new[..., None])
             valid[part] |= new
@@ -427,10 +413,10 @@ class SheetRaster:
         # Covered only together, as along a seam: the mean.
         closed = (weight >= WHOLLY_VALID) & ~valid
         out[closed] = np.rint(total[closed] / weight[closed][:, None])
-        return out, valid | closed
+        return Pixels(out, valid | closed)
 
-    def _parts(self, window: Window) -> Iterator[tuple[Lattice, tuple[int, int, int, int]]]:
-        """Lattices that may overlap a window, and the overlap: left, top, right, bottom."""
+    def _parts(self, window: Window) -> Iterator[tuple[Lattice, Window]]:
+        """Lattices that may overlap a window, and the overlap."""
         left, top = max(window.col_off, 0), max(window.row_off, 0)
         right = min(window.col_off + window.width, self.width_px)
         bottom = min(window.row_off + window.height, self.height_px)
@@ -439,9 +425,9 @@ class SheetRaster:
             members = np.array(lattice.members)
             boxes = self._boxes_px[members[near[members]]]
             if len(boxes):
-                low = np.maximum(boxes[:, :2].min(axis=0), [left, top]).tolist()
-                high = np.minimum(boxes[:, 2:].max(axis=0), [right, bottom]).tolist()
-                yield lattice, (low[0], low[1], high[0], high[1])
+                low = np.maximum(boxes[:, :2].min(axis=0), [left, top])
+                high = np.minimum(boxes[:, 2:].max(axis=0), [right, bottom])
+                yield lattice, Window(*low.tolist(), *(high - low).tolist())
 
     def _near(self, left: int, top: int, right: int, bottom: int) -> NDArray[np.bool_]:
         boxes = self._boxes_px
@@ -466,21 +452,7 @@ class SheetRaster:
         stretch = self._mosaic.stretches[lattice.members[0]]
         picture = _in_colours(values if stretch is None else stretch.apply(values), colours)
         _fill_holes(picture, mask)
-        warped = self._resampled(lattice, picture, transform, target, shape, True)
-        warped_mask = self._resampled(lattice, mask[None], transform, target, shape, False)
-        return warped, warped_mask[..., 0]
-
-    def _resampled(
-        self,
-        lattice: Lattice,
-        bands: NDArray[np.uint8],
-        transform: Affine,
-        target: Affine,
-        shape: tuple[int, int],
-        is_picture: bool,
-    ) -> NDArray[np.uint8]:
-        """Bands (C, h, w) resampled to (H, W, C): images by cubic, masks by bilinear weights."""
-        out = np.zeros((len(bands), *shape), dtype=np.uint8)
+        out = np.zeros((colours, *shape), np.uint8), np.zeros((1, *shape), np.uint8)
         first = lattice.first
         # Sheet pixels per source pixel. GDAL would derive it from the shapes of the two windows and
         # blur narrow windows of a rotated source.
@@ -489,25 +461,24 @@ class SheetRaster:
         # GDAL treats a raster that starts at exactly (0, 0) with pixels of 1 m, as a window in the
         # middle of a sheet may, as one without georeference.
         origin_m = 1_000_000.0
+        how: dict[str, Any] = {
+            "src_transform": transform,
+            "src_crs": first.system,
+            "dst_transform": Affine.translation(origin_m, origin_m) * target,
+            "dst_crs": f"{self._frame.proj4} +x_0={origin_m} +y_0={origin_m}",
+            "num_threads": self._threads,
+            "warp_mem_limit": 64,
+            "XSCALE": scale,
+            "YSCALE": scale,
+        }
         try:
-            reproject(
-                bands,
-                out,
-                src_transform=transform,
-                src_crs=first.system,
-                dst_transform=Affine.translation(origin_m, origin_m) * target,
-                dst_crs=f"{self._frame.proj4} +x_0={origin_m} +y_0={origin_m}",
-                resampling=Resampling.cubic if is_picture else Resampling.bilinear,
-                num_threads=self._threads,
-                warp_mem_limit=64,
-                XSCALE=scale,
-                YSCALE=scale,
-            )
+            reproject(picture, out[0], **how, resampling=Resampling.cubic)
+            reproject(mask[None], out[1], **how, resampling=Resampling.bilinear)
         except MemoryError:
             raise
         except Exception as error:  # rasterio exports no class of the errors of GDAL it raises here
             raise unfit(first.path) from error
-        return np.ascontiguousarray(out.transpose(1, 2, 0))
+        return np.ascontiguousarray(out[0].transpose(1, 2, 0)), out[1][0]
 
     def _source_window(
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]

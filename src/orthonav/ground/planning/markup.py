@@ -122,7 +122,11 @@ def read_kmz(data: bytes) -> list[Route]:
     _check_archive(data)
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
-            chosen = _chosen_members(archive.namelist())
+            members = archive.namelist()
+            waylines = [name for name in members if name.lower().endswith(".wpml")]
+            names = [name for name in members if name.lower().endswith(".kml")]
+            documents = [name for name in names if name.lower() == "doc.kml"]
+            chosen = waylines or documents or names  # waylines of DJI lie beside their template
             if len(chosen) != 1:
                 raise RouteError(f"KMZ must hold one KML file, got {len(chosen)}")
             with archive.open(chosen[0]) as member:
@@ -137,16 +141,13 @@ def read_kmz(data: bytes) -> list[Route]:
     return read_wpml(text) if chosen[0].lower().endswith(".wpml") else read_kml(text)
 
 
-def _chosen_members(members: list[str]) -> list[str]:
-    """The members with the route: waylines of DJI (beside a template in KML), else `doc.kml`."""
-    waylines = [name for name in members if name.lower().endswith(".wpml")]
-    names = [name for name in members if name.lower().endswith(".kml")]
-    return waylines or [name for name in names if name.lower() == "doc.kml"] or names
-
-
 def read_kml(data: bytes) -> list[Route]:
     root = read_markup(data, "KML", "kml")
-    found = [route for mark in root.iter("Placemark") for route in _kml_routes(mark)]
+    found = []
+    for mark in root.iter("Placemark"):
+        lines = (each for each in mark.iter() if each.tag in _KML_PLACES)
+        if places := [place for each in lines for place in _KML_PLACES[each.tag](each)]:
+            found.append(_route(places, text_of(mark, "name")))
     links = [each.findtext(".//href") or "?" for each in root.iter("NetworkLink")]
     linked = f"; files that it links to are not read: {', '.join(links)}" if links else ""
     if found and linked:
@@ -156,16 +157,6 @@ def read_kml(data: bytes) -> list[Route]:
         hint = dji if root.find(".//missionConfig") is not None else ""
         raise RouteError(f"KML holds no LineString and no gx:Track{hint}{linked}")
     return found
-
-
-def _kml_routes(mark: Element) -> list[Route]:
-    places = [
-        place
-        for element in mark.iter()
-        if element.tag in ("LineString", "Track")
-        for place in (_line(element) if element.tag == "LineString" else _track(element))
-    ]
-    return [_route(places, text_of(mark, "name"))] if places else []
 
 
 def _kml_frame(element: Element) -> HeightFrame | None:
@@ -189,6 +180,9 @@ def _track(element: Element) -> Iterator[_Place]:
         text = (coordinates.text or "").strip()
         if text:  # the schema allows gaps
             yield _kml_place(text.split(), frame, text)
+
+
+_KML_PLACES = {"LineString": _line, "Track": _track}
 
 
 def _kml_place(values: list[str], frame: HeightFrame | None, text: str) -> _Place:

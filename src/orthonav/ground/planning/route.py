@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import MissingFileError, RouteError, described, lfs_pointer
+from orthonav.core.errors import MissingFileError, RouteError, described
+from orthonav.core.files import require_file
 from orthonav.core.geo.frames import distances_m
 from orthonav.core.tables import MAX_LINE_CHARS, TableError, TableRows
 from orthonav.ground.planning.markup import read_gpx, read_kml, read_kmz, read_wpml
@@ -31,13 +32,7 @@ from orthonav.ground.planning.record import (
     require_few_waypoints,
 )
 
-__all__ = [
-    "Height",
-    "Route",
-    "along_polyline_en_m",
-    "leg_lengths_m",
-    "read_route",
-]
+__all__ = ["Height", "Route", "along_polyline_en_m", "leg_lengths_m", "read_route"]
 
 Array = NDArray[np.float64]
 MAX_ROUTE_BYTES = 20_000_000  # twice 100,000 waypoints; JSON and XML take 20 times in memory
@@ -61,11 +56,11 @@ def _routes_of(plain: dict[str, Any]) -> list[Route]:
     found: list[Route] = []
     for geometry, properties in _geometries(plain):
         kind = geometry.get("type")
-        if kind == "LineString":
-            found.append(_route(geometry["coordinates"], properties))
-        elif kind == "MultiLineString":
-            joined = [point for part in geometry["coordinates"] for point in part]
-            found.append(_route(joined, properties))
+        if kind in ("LineString", "MultiLineString"):
+            points = geometry["coordinates"]
+            if kind == "MultiLineString":
+                points = [point for part in points for point in part]
+            found.append(_route(points, properties))
     if not found:
         raise RouteError("GeoJSON holds no LineString")
     return found
@@ -259,67 +254,42 @@ def read_route(path: Path) -> Route:
     if "#" in str(path) and not path.exists():
         file, _, name = str(path).partition("#")
         path = Path(file)
-    data = _bytes_of(path)
+    require_file(path, "route file")
+    if path.stat().st_size > MAX_ROUTE_BYTES:
+        raise RouteError(f"route file is larger than {MAX_ROUTE_BYTES // 10**6} MB: {path}")
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         raise RouteError(f"route must be one of {', '.join(_READERS)}, got '{path.suffix}': {path}")
     try:
-        found = _READERS[suffix](data)
-        route = _chosen(found, name)
-        _require_degrees(route)
+        route = _chosen(_READERS[suffix](path.read_bytes()), name)
     except RouteError as error:
         raise RouteError(f"{error}: {path}") from error
+    except OSError as error:
+        raise MissingFileError(f"route file cannot be read ({error.strerror}): {path}") from error
     except _BROKEN as error:
         raise RouteError(f"route cannot be read ({described(error)}): {path}") from error
-    return route
-
-
-def _require_degrees(route: Route) -> None:
     in_radians = all(abs(lat) < 1.6 and abs(lon) < 3.2 for lat, lon in route.waypoints)
     if in_radians or (0.0, 0.0) in route.waypoints:
         raise RouteError(
             "waypoints lie at or around 0, 0, in the sea: give degrees, not radians, and no "
-            "waypoints without a position"
+            f"waypoints without a position: {path}"
         )
-
-
-def _bytes_of(path: Path) -> bytes:
-    if not path.is_file():
-        raise MissingFileError(f"route file does not exist: {path}")
-    if path.stat().st_size > MAX_ROUTE_BYTES:
-        raise RouteError(f"route file is larger than {MAX_ROUTE_BYTES // 10**6} MB: {path}")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MissingFileError(f"route file cannot be read ({error.strerror}): {path}") from error
-    if pointer := lfs_pointer(data):
-        raise MissingFileError(f"route file {pointer}: {path}")
-    return data
+    return route
 
 
 def _chosen(found: list[Route], name: str) -> Route:
     """The line of that name, else of that number, from 1; without a name the only one."""
+    fitting = [route for route in found if name in ("", route.name)]
+    if not fitting and re.fullmatch(r"[1-9][0-9]{,8}", name):
+        fitting = found[int(name) - 1 : int(name)]
+    if len(fitting) == 1:
+        return fitting[0]
+    problem = f"file holds {len(found)} lines"
     if name:
-        named = [route for route in found if route.name == name]
-        number = int(name) if re.fullmatch(r"[0-9]{1,9}", name) else 0
-        if not named and 1 <= number <= len(found):
-            return found[number - 1]
-        if len(named) != 1:
-            raise RouteError(
-                f"{len(named)} lines are named {name!r:.60}; give FILE#NAME or FILE#NUMBER: "
-                f"{_listed(found)}"
-            )
-        return named[0]
-    if len(found) > 1:
-        raise RouteError(
-            f"file holds {len(found)} lines; give FILE#NAME or FILE#NUMBER: {_listed(found)}"
-        )
-    return found[0]
-
-
-def _listed(found: list[Route]) -> str:
+        problem = f"{len(fitting)} lines are named {name!r:.60}"
     named = (f"{route.name!r:.60}" if route.name else "(no name)" for route in found)
-    return listed([f"{number} {name}" for number, name in enumerate(named, 1)], 20)
+    lines = listed([f"{number} {each}" for number, each in enumerate(named, 1)], 20)
+    raise RouteError(f"{problem}; give FILE#NAME or FILE#NUMBER: {lines}")
 
 
 def leg_lengths_m(route: Route) -> Array:

@@ -48,8 +48,7 @@ def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
     parts: list[Route] = []
     first = 0
     while first < cut.legs:
-        if len(parts) == MAX_ROUTE_SHEETS:
-            raise _route_too_long(f"more than {MAX_ROUTE_SHEETS}")
+        _require_few(len(parts) + 1, f"more than {MAX_ROUTE_SHEETS}")
         last = _last_that_fits(cut, first, band_m)
         parts.append(cut.part(first, last, f"sheet-{len(parts) + 1}"))
         first = last
@@ -78,8 +77,7 @@ def _with_short_legs(route: Route, bands_m: tuple[float, ...]) -> Route:
     pieces = np.ceil(leg_lengths_m(route) / (0.99 * (MAX_SHEET_M - np.array(bands_m))))
     pieces = np.maximum(pieces, 1).astype(int)
     divided = int(pieces[pieces > 1].sum())
-    if divided > MAX_ROUTE_SHEETS:
-        raise _route_too_long(f"{divided:,} or more")
+    _require_few(divided, f"{divided:,} or more")
     waypoints, heights = [route.waypoints[0]], list(route.heights[:1])
     leg_bands: list[float | None] = []
     for leg, count in enumerate(pieces.tolist()):
@@ -114,11 +112,12 @@ def _on_great_circle(
         yield math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
 
 
-def _route_too_long(sheets: str) -> AreaError:
-    return AreaError(
-        f"route needs {sheets} sheets, at most {MAX_ROUTE_SHEETS} are planned at once; plan it in "
-        "parts, or with a narrower search band"
-    )
+def _require_few(sheets: int, said: str) -> None:
+    if sheets > MAX_ROUTE_SHEETS:
+        raise AreaError(
+            f"route needs {said} sheets, at most {MAX_ROUTE_SHEETS} are planned at once; plan it "
+            "in parts, or with a narrower search band"
+        )
 
 
 @dataclass(frozen=True)

@@ -158,12 +158,7 @@ class MapEstimate:
 
 
 def estimate_map(
-    area: Area,
-    *,
-    gsd_m: float,
-    tile_px: int,
-    overlap: float,
-    maps: int = 1,
+    area: Area, *, gsd_m: float, tile_px: int, overlap: float, maps: int = 1
 ) -> MapEstimate:
     """Tiles are counted if that is cheap, else estimated from a sample (within 2 %), which is
     smaller where this is one of many `maps`. Imagery is assumed everywhere.
@@ -174,12 +169,23 @@ def estimate_map(
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
     room = max(2_500, 200_000 // maps)  # points: a standard error of 0.1 % to 1 %
     border_m = (grid.tile_m - grid.stride_m) / 2
-    reach_m = grid.stride_m * math.sqrt(0.5)
-    tiles = round(
-        grid.rows * grid.cols * _share(area, grid, border_m, reach_m, (grid.rows, grid.cols), room)
-    )
-    size_px = grid.height_px, grid.width_px
-    pixels = math.prod(size_px) * _share(area, grid, 0.0, grid.tile_m / 2, size_px, room)
+
+    def inside(rows: int, cols: int, border_m: float, margin_m: float) -> float:
+        """How many of the cells of the grid, less its border, lie in the area or within a margin
+        of it, by the centres of all of them or of at most about `room` larger ones."""
+        if area.route is None:
+            return float(rows * cols)
+        step = max(1.0, math.sqrt(rows * cols / room))
+        down, across = math.ceil(rows / step), math.ceil(cols / step)
+        width_m = grid.width_px * gsd_m - 2 * border_m
+        height_m = grid.height_px * gsd_m - 2 * border_m
+        x = grid.west_m + border_m + (np.arange(across) + 0.5) * width_m / across
+        y = grid.north_m - border_m - (np.arange(down) + 0.5) * height_m / down
+        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        return rows * cols * float(area.contains(points, margin_m).mean())
+
+    tiles = round(inside(grid.rows, grid.cols, border_m, grid.stride_m * math.sqrt(0.5)))
+    pixels = inside(grid.height_px, grid.width_px, 0.0, grid.tile_m / 2)
     low_mb, high_mb = (pixels * per_px / 1e6 for per_px in (0.15, 0.35))
     embeddings_mb = tiles * 273 / 1e6
     return MapEstimate(
@@ -189,29 +195,6 @@ def estimate_map(
         map_mb=(embeddings_mb + low_mb, embeddings_mb + high_mb),
         build_s=40 + 0.5 * pixels / 1e6,
     )
-
-
-def _share(
-    area: Area,
-    grid: TileGrid,
-    border_m: float,
-    margin_m: float,
-    cells: tuple[int, int],
-    room: int,
-) -> float:
-    """Share of the grid without its border that lies in the area or within a margin of it, computed
-    from the centres of `cells` (rows, columns), or of at most about `room`."""
-    if area.route is None:
-        return 1.0
-    step = max(1.0, math.sqrt(math.prod(cells) / room))
-    rows, cols = (math.ceil(count / step) for count in cells)
-    width_m, height_m = (
-        count * grid.gsd_m - 2 * border_m for count in (grid.width_px, grid.height_px)
-    )
-    x = grid.west_m + border_m + (np.arange(cols) + 0.5) * width_m / cols
-    y = grid.north_m - border_m - (np.arange(rows) + 0.5) * height_m / rows
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return float(area.contains(points, margin_m).mean())
 
 
 @dataclass(frozen=True)
