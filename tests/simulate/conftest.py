@@ -36,7 +36,7 @@ def fly(ortho, tmp_path, monkeypatch):
 
         def picture(*arguments):
             asked.append(arguments)
-            return np.full((48, 64), 99, np.uint8)
+            return np.full((48, 64, 3), 99, np.uint8)
 
         folder = tmp_path / f"flight{len(list(tmp_path.glob('flight*')))}"
         request = {"agl_m": 100.0, "camera": SMALL, "effects": PLAIN, **request}

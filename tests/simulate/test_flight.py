@@ -48,7 +48,7 @@ def flown(area, path, **request):
 def unseen(area, path, **request):
     """The same without the time that pictures take: they are of one grey."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flight_module, "_picture", lambda *_: np.full((48, 64), 99, np.uint8))
+        patch.setattr(flight_module, "_picture", lambda *_: np.full((48, 64, 3), 99, np.uint8))
         return flown(area, path, **request)
 
 
