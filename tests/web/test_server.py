@@ -161,13 +161,13 @@ def test_it_only_reads(ask, method):
 
 def test_it_listens_on_the_loopback_under_its_names(server):
     assert server.server_address[0] == "127.0.0.1"
-    assert server.url() == f"http://127.0.0.1:{server.port}/"
+    assert server.url() == f"http://127.0.0.1:{server.server_port}/"
     assert all(map(is_loopback, ("localhost", "LocalHost:8000", "127.0.0.1:1", "[::1]:2")))
 
 
 def test_a_port_that_is_taken(opened, server):
     with pytest.raises(OutputError, match="cannot listen"):
-        Server(Pages(opened, {}), port=server.port)
+        Server(Pages(opened, {}), port=server.server_port)
 
 
 def test_without_leaflet_it_says_what_to_install(monkeypatch):
