@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
-FOLDERS = ("", "sources", "onboard", "localizer", "geo", "mapfile", "imagery", "fetch", "web")
+FOLDERS = ("", "sources", "onboard", "localizer", "geo", "mapfile", "imagery", "fetch", "view")
 sys.path.extend(str(TESTS / folder) for folder in FOLDERS)
 
 import bags
