@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from flights import CENTRE, flown
+from erring_flights import CENTRE, flown
 
 from orthonav.core.flight.gnss import BIASES, FAULTS
 from orthonav.ground.evaluate.metrics import compare

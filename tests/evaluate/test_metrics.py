@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flights import flown
+from erring_flights import flown
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.fixes import write_results

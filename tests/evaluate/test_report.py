@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from flights import CENTRE, flown
+from erring_flights import CENTRE, flown
 
 from html_page import Page
 from orthonav.ground.evaluate.metrics import compare, measure

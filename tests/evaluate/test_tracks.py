@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flights import CENTRE, COV, drawn, flown
+from erring_flights import CENTRE, COV, drawn, flown
 
 from orthonav.core.flight.fixes import write_results
 from orthonav.core.flight.folder import FlightWriter

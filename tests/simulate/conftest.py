@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_flight import PLAIN, SMALL, plane_of
+from simulated import PLAIN, SMALL, frame_of
 
 from helpers import textured
 from orthonav.core.flight import open_flight, read_truth
@@ -23,7 +23,7 @@ def ortho(make_ortho, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def frame(ortho):
-    return plane_of(ortho).frame
+    return frame_of(ortho)
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def fly(ortho, tmp_path, monkeypatch):
     """Function that flies at 100 m: the flight, its true places by frame, and, without `pictures`,
     which then are of one grey, what each would have been made of."""
 
-    def flown(*, pictures=True, **request):
+    def flown(*, pictures=True, over=None, **request):
         asked = []
 
         def picture(*arguments):
@@ -43,7 +43,7 @@ def fly(ortho, tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             if not pictures:
                 patch.setattr(flight_module, "_picture", picture)
-            simulate_flight(SimulateRequest([ortho], folder, **request))
+            simulate_flight(SimulateRequest([over or ortho], folder, **request))
         return open_flight(folder), read_truth(folder / "truth.csv"), asked
 
     return flown

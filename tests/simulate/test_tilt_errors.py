@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from test_flight import route_of
+from simulated import route_of
 
 from orthonav.core.flight import open_flight
 from orthonav.ground.simulate.flight import Errors
