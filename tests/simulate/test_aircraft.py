@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lab.clouds import Clouds
 from scipy.spatial.transform import Rotation
-from simulated import frame_of, route_of, write_route
+from simulated import frame_of, route_of
 
-from orthonav.core.flight import open_flight
 from orthonav.core.geo.camera import Camera, enu_from_camera
 from orthonav.ground.simulate.flight import Errors
 from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
@@ -69,16 +68,6 @@ def test_clouds_hide_some_views_and_leave_the_others(fly, frame):
     spread = np.array([b.std() for _, b in pairs])
     assert (degree == 1).sum() >= 3 and spread[degree == 1].max() < 6
     assert spread[(degree > 0.3) & (degree < 0.7)].min() > 15
-
-
-def test_the_command(run, ortho, frame, tmp_path):
-    route = write_route(tmp_path / "route.csv", route_of(frame, (0.0, 0.0), (100.0, 40.0)))
-    fly = ["simulate", "--ortho", ortho, "--route", route, "--agl-m", "100"]
-    errors = ["--agl-std", "0.05", "--velocity-drift", "0.02", "--turn-radius-m", "50"]
-    done = run(*fly, *errors, "--spacing-m", "50", "--out", tmp_path / "f")
-    assert done.code == 0 and "views written" in done.out
-    telemetry = open_flight(tmp_path / "f").views[0].telemetry
-    assert telemetry.vel_en_mps is not None and telemetry.agl_m != 100
 
 
 LINE = np.array([[0.0, 0.0], [0.0, 4000.0], [3000.0, 4000.0], [2000.0, 0.0]])
