@@ -12,17 +12,17 @@ from orthonav.ground.evaluate.track import measure_gnss
 STEP = float(FAULTS.index("gnss_step") + 1)
 
 
-def measured(views):
+def measured(views, without_fix=()):
     """Of a flight to the east at 10 m a view whose fixes are 3 m off to the north. A view: metres
-    by which GNSS is off to the east, None: unknown, and more evidence."""
+    by which GNSS is off to the east, None: unknown, and more evidence. `without_fix`: numbers."""
     evidence = []
     for number, (gnss_m, more) in enumerate(views):
-        place = (None, None)
+        known = {}
         if gnss_m is not None:
             place = map(float, CENTRE.latlon_from_en([10.0 * number + gnss_m, 0.0]))
-        known = dict(zip(("gnss_lat_deg", "gnss_lon_deg"), place, strict=True))
-        evidence.append({k: v for k, v in (known | more).items() if v is not None})
-    errors = [None if "missing" in each else (0.0, 3.0) for each in evidence]
+            known = dict(zip(("gnss_lat_deg", "gnss_lon_deg"), place, strict=True))
+        evidence.append(known | more)
+    errors = [None if number in without_fix else (0.0, 3.0) for number in range(len(views))]
     truth, results = flown(errors, "tracking", evidence=evidence)
     return measure_gnss(compare(truth, results, CENTRE), results)
 
@@ -30,7 +30,7 @@ def measured(views):
 def test_errors_differences_and_alarms_are_measured():
     assert measured([(None, {})] * 3) is None
     usual, fault = (4.0, {"gnss_fault": 0.0}), (40.0, {"gnss_fault": STEP})
-    found = measured([*[usual] * 5, *[fault] * 3, (None, {}), (4.0, {"missing": 1.0})])
+    found = measured([*[usual] * 5, *[fault] * 3, (None, {}), usual], without_fix=(9,))
     assert found.errors_m[:6] == pytest.approx([4, 4, 4, 4, 4, 40], abs=1e-3)
     assert found.differences_m[:6] == pytest.approx([5] * 5 + [np.hypot(40, 3)], abs=1e-3)
     assert np.isnan(found.errors_m[8]) and np.isnan(found.differences_m[9])

@@ -78,6 +78,9 @@ def test_what_cannot_be_compared_is_refused():
     ):
         with pytest.raises(FlightError, match=message):
             compare(known, given)
+    for risk in (-0.1, 7.0, math.nan):
+        with pytest.raises(ValueError, match="risk is a probability, 0 to 1"):
+            compare(*views(None), risk=risk)
     for radius_m in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="radius"):
             measure(three_fixes(), radius_m)

@@ -28,8 +28,9 @@ def frame(ortho):
 
 @pytest.fixture
 def fly(ortho, tmp_path, monkeypatch):
-    """Function that flies at 100 m: the flight, its true places by frame, and, without `pictures`,
-    which then are of one grey, what each would have been made of."""
+    """Function that flies at 100 m, `over` another orthophoto if given: the flight, its true places
+    by frame, and, without `pictures`, which then are of one grey, what each would have been made
+    of."""
 
     def flown(*, pictures=True, over=None, **request):
         asked = []

@@ -226,7 +226,7 @@ def evaluate(
 
     `alert_limit_m`: largest error that the mission allows, NaN: none; `risk`: of protection levels.
     Raises `MissingFileError`, `FlightError`, also where latitudes and longitudes of the file seem
-    to be swapped, or `ValueError` for a radius that is not positive.
+    to be swapped, or `ValueError` for a radius that is not positive or a risk that is not 0 to 1.
     """
     known, results = read_truth(Path(truth)), read_results(Path(fixes))
     check_truth(known, results, None, Path(truth))
@@ -298,8 +298,11 @@ def compare(
 
     `local` is the plane of the positions, by default centred on the first true position; `risk` is
     that of the protection levels. A true position that is not finite counts as missing. Raises
-    `FlightError` where no result has a truth or a frame has two results.
+    `FlightError` where no result has a truth or a frame has two results, and `ValueError` for a
+    risk that is not 0 to 1.
     """
+    if not 0.0 <= risk <= 1.0:  # also where no fix has a level
+        raise ValueError(f"a risk is a probability, 0 to 1, got {risk}")
     known = {name: at for name, at in truth.items() if all(map(math.isfinite, at))}
     twice = [name for name, n in Counter(result.frame for result in results).items() if n > 1]
     if twice:

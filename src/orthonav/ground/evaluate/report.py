@@ -98,7 +98,7 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     views = f"{metrics.n_confident} of {metrics.n_views} views have a confident fix"
     bound = f" ({wrong_bound_text(metrics)})" * (metrics.n_confident > 0)
     wrong = f"{metrics.n_confident_wrong} of {metrics.n_confident}"
-    is_bad = "bad" * (metrics.n_confident_wrong > 0)
+    kind = "bad" * (metrics.n_confident_wrong > 0)
 
     def cep(name: str, mine_m: float, all_m: float) -> tuple[str, str]:
         said = f"{name} of confident fixes; {measure_text(all_m, ' m')} of all fixes"
@@ -108,7 +108,7 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     gap = f"longest gap without a confident fix, {measure_text(metrics.gap.path_m, ' m')}"
     return (
         (percent_text(metrics.availability), f"{views} (95 % interval {low:.0f} to {high:.0f} %)"),
-        (wrong, f"false fixes among confident fixes{bound}", is_bad),
+        (wrong, f"false fixes among confident fixes{bound}", kind),
         cep("CEP50", of_confident.cep50_m, of_all.cep50_m),
         cep("CEP95", of_confident.cep95_m, of_all.cep95_m),
         (plain_text(metrics.consistency.nees_mean), nees),
@@ -165,13 +165,13 @@ def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
         "Fraction of correct fixes over their confidence, with 95 % intervals (Wilson); dashed: "
         "ideal; orange: the difference. Below: fixes per bin."
     )
-    calibrated = f"reliability diagram of confidence, ECE {plain_text(metrics.calibration.ece)}"
+    diagram = f"reliability diagram of confidence, ECE {plain_text(metrics.calibration.ece)}"
     track_map = map_picture(comparison, metrics.radius_m, track, flight.background)
     errors = over_time_picture(comparison, metrics.radius_m, track)
     figures = [
         ("map", "map of the fixes", placed, track_map),
         ("error-over-time", "error of each view over time", over_time, errors),
-        ("reliability", calibrated, reliability, reliability_picture(metrics.calibration)),
+        ("reliability", diagram, reliability, reliability_picture(metrics.calibration)),
     ]
     if metrics.integrity is not None:
         limit_m = metrics.integrity.alert_limit_m
