@@ -144,16 +144,8 @@ def flight_path(area, made_once):
 
     def make(folder):
         errors = Errors(yaw_std_deg=4.0, agl_std=0.03, attitude_std_deg=3.0)
-        request = SimulateRequest(
-            [area.present],
-            folder / "flight",
-            random=30,
-            agl_m=area.agl_m,
-            camera=area.camera,
-            errors=errors,
-            seed=SEED,
-        )
-        simulate_flight(request)
+        flown = {"agl_m": area.agl_m, "camera": area.camera, "errors": errors, "seed": SEED}
+        simulate_flight(SimulateRequest([area.present], folder / "flight", random=30, **flown))
 
     return made_once("flight", make) / "flight"
 
@@ -181,21 +173,11 @@ def make_ortho():
     def write(path, grey=None, crs="EPSG:2154", nodata=None, gsd_m=1.0):
         grey = textured() if grey is None else grey
         corner = Affine(gsd_m, 0, 700_000, 0, -gsd_m, 6_600_000)
-        height, width = grey.shape
-        count = 1 if len(np.unique(grey)) > 30 else 3  # few values in one band are a mask
-        with rasterio.open(
-            path,
-            "w",
-            driver="GTiff",
-            count=count,
-            height=height,
-            width=width,
-            dtype="uint8",
-            crs=crs,
-            transform=corner,
-            nodata=nodata,
-        ) as data:
-            data.write(np.broadcast_to(grey, (count, height, width)))
+        shape = dict(zip(("height", "width"), grey.shape, strict=True))
+        shape["count"] = 1 if len(np.unique(grey)) > 30 else 3  # few values in one are a mask
+        about = {"driver": "GTiff", "dtype": "uint8", "crs": crs, "nodata": nodata, **shape}
+        with rasterio.open(path, "w", transform=corner, **about) as data:
+            data.write(np.broadcast_to(grey, (shape["count"], *grey.shape)))
         return Path(path)
 
     return write

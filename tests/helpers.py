@@ -1,6 +1,7 @@
 """What many tests import. Not in `conftest.py`: any folder may have one of its own."""
 
 import contextlib
+import csv
 import functools
 import time
 import tracemalloc
@@ -45,12 +46,33 @@ def shorten(flight, views):
     return flight
 
 
+def change_rows(path, change):
+    """Let `change` alter every row of a CSV table, a dictionary, by its number from 0."""
+    with path.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for number, row in enumerate(rows):
+        change(number, row)
+    with path.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 class Done(NamedTuple):
     """What a command gave: exit code, stdout and stderr, those of C libraries included."""
 
     code: int
     out: str
     err: str
+
+
+def refused(done, *words, code=1):
+    """Check for exactly one line on stderr, nothing on stdout, and the exit code: 2 where the
+    command has to be typed otherwise, whatever the input."""
+    assert (done.code, done.out) == (code, ""), done
+    assert done.err.startswith("orthonav: error: ") and done.err.endswith("\n"), done
+    assert done.err.count("\n") == 1 and "Traceback" not in done.err, done
+    assert all(word in done.err for word in words), (words, done)
 
 
 def write_dem(path, frame, height_of, half_m=1500.0, px_m=25.0, change=lambda heights: heights):

@@ -8,7 +8,7 @@ from urllib.request import url2pathname
 
 import pytest
 
-from helpers import shorten
+from helpers import change_rows, shorten
 from orthonav.core.flight import read_truth
 from orthonav.core.flight.fixes import read_results
 from orthonav.core.mapfile import open_map
@@ -51,12 +51,7 @@ def test_an_orthophoto_and_a_flight_become_a_page(run, area, few, tmp_path, name
 
 
 def test_views_far_apart_in_time_are_localized_one_by_one(run, map_path, few, tmp_path):
-    table = few / "telemetry.csv"
-    head, *rows = table.read_text().splitlines()
-    at = head.split(",").index("time_s")
-    split = [row.split(",") for row in rows]
-    late = [",".join([*r[:at], str(60 * n), *r[at + 1 :]]) for n, r in enumerate(split)]
-    table.write_text("\n".join([head, *late]) + "\n")
+    change_rows(few / "telemetry.csv", lambda number, row: row.update(time_s=60 * number))
     assert run("run", few, "--map", map_path, "--out", tmp_path / "out").code == 0
     results = read_results(tmp_path / "out" / "fixes.jsonl")
     assert len(results) == 5 and not any(each.state for each in results)

@@ -75,13 +75,8 @@ assert not heavy, f"--help loaded {sorted(heavy)}"
 
 def fresh(script, *arguments, cwd):
     """What a fresh interpreter prints, which must not fail or say anything on stderr."""
-    done = subprocess.run(
-        [sys.executable, "-B", "-c", script, *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-B", "-c", script, *map(str, arguments)]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 

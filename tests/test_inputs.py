@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from helpers import shorten
+from helpers import change_rows, shorten
 from orthonav.cli import main
 from orthonav.core.errors import FlightError, VariantError
 from orthonav.core.flight import open_flight
@@ -63,10 +63,11 @@ def test_fixes_state_their_map_and_flight(fixes, few, map_path):
 
 
 def test_fixes_of_another_run_are_named(run, fixes, few, map_path, tmp_path):
+    def turn(number, row):
+        row["yaw_deg"] = float(row["yaw_deg"]) + 1
+
     other = shutil.copytree(few, tmp_path / "other")
-    rows = [line.split(",") for line in (other / "telemetry.csv").read_text().splitlines()]
-    turned = [rows[0], *([*row[:2], str(float(row[2]) + 1), *row[3:]] for row in rows[1:])]
-    (other / "telemetry.csv").write_text("\n".join(",".join(row) for row in turned) + "\n")
+    change_rows(other / "telemetry.csv", turn)
     stated = fixes.read_text().replace(open_map(map_path).manifest.sha256, "0" * 64)
     fixes = tmp_path / "fixes.jsonl"
     fixes.write_text(stated)
@@ -78,16 +79,17 @@ def test_fixes_of_another_run_are_named(run, fixes, few, map_path, tmp_path):
 
 
 def test_swapped_true_positions_end_every_command(run, fixes, few, map_path, tmp_path):
-    rows = [line.split(",") for line in (few / "truth.csv").read_text().splitlines()]
-    swapped = tmp_path / "swapped.csv"
-    swapped.write_text("\n".join(",".join([row[0], row[2], row[1]]) for row in rows[1:]))
-    swapped.write_text("frame,lat_deg,lon_deg\n" + swapped.read_text() + "\n")
+    def swap(number, row):
+        row["lat_deg"], row["lon_deg"] = row["lon_deg"], row["lat_deg"]
+
+    def lose_first(number, row):  # a receiver without a fix
+        row.update({"lat_deg": 0, "lon_deg": 0} if number == 0 else {})
+
     turned = shutil.copytree(few, tmp_path / "turned")
-    shutil.copy(swapped, turned / "truth.csv")
-    first, *others = swapped.read_text().splitlines()[1:]
-    lost = shutil.copytree(few, tmp_path / "lost")  # a receiver without a fix at first
-    lines = ["frame,lat_deg,lon_deg", f"{first.split(',')[0]},0,0", *others]
-    (lost / "truth.csv").write_text("\n".join(lines) + "\n")
+    swapped = turned / "truth.csv"
+    change_rows(swapped, swap)
+    lost = shutil.copytree(turned, tmp_path / "lost")
+    change_rows(lost / "truth.csv", lose_first)
     none = tmp_path / "none.jsonl"
     none.write_text(fixes.read_text().replace('"status": "fix"', '"status": "no_fix"'))
     none.write_text(none.read_text().replace('"reason": null', '"reason": "blank"'))
@@ -108,10 +110,8 @@ def test_only_recorded_positions_calibrate_a_mount(run, few, map_path, tmp_path,
     flight = shutil.copytree(few, tmp_path / "flight")
     header, *rows = (flight / "truth.csv").read_text().splitlines()
     (flight / "truth.csv").write_text("\n".join([header, *rows[:2]]) + "\n")
-    table = (flight / "telemetry.csv").read_text().splitlines()
-    priors = ["prior_lat_deg,prior_lon_deg,prior_std_m", *["46.5,2.5,5000"] * len(table[1:])]
-    joined = [f"{row},{prior}" for row, prior in zip(table, priors, strict=True)]
-    (flight / "telemetry.csv").write_text("\n".join(joined) + "\n")
+    guess = {"prior_lat_deg": 46.5, "prior_lon_deg": 2.5, "prior_std_m": 5000}
+    change_rows(flight / "telemetry.csv", lambda number, row: row.update(guess))
     tracked = []
 
     def located(_, tracker, flight, views, shown, heights):

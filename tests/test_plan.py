@@ -67,9 +67,8 @@ def test_a_plan_for_programs(planned):
     plain = json.loads(planned("--json").out)
     assert plain["route"]["length_m"] == pytest.approx(6000, abs=1)
     assert plain["route"]["heights_above"] == ["amsl"]
-    assert plain["view"]["across_px"] == pytest.approx(
-        plain["view"]["width_m"] * 0.75**0.5 / 1.5, 0.01
-    )
+    across_px = plain["view"]["width_m"] * 0.75**0.5 / 1.5
+    assert plain["view"]["across_px"] == pytest.approx(across_px, 0.01)
     made = plain["map"]
     assert made["tiles"] > 400 and made["map_mb"][0] < made["map_mb"][1]
     assert made["area_km2"] < made["imagery_km2"] and len(made["sheets"]) == 1
@@ -80,10 +79,8 @@ def test_a_plan_for_programs(planned):
 
 
 def test_the_height_is_that_of_the_route_over_terrain(run, camera, table, dem, tmp_path):
-    sizes = ["--camera", camera, "--json"]
-    plain = json.loads(
-        run("plan", "--route", table, "--dem", dem, "--dem-datum", "msl", *sizes).out
-    )
+    sizes, over = ["--camera", camera, "--json"], ("--dem", dem, "--dem-datum", "msl")
+    plain = json.loads(run("plan", "--route", table, *over, *sizes).out)
     assert plain["view"]["agl_m"] == pytest.approx(325, abs=1)
     assert run("plan", "--route", table, *sizes).code == 2  # above the sea says nothing alone
     low = tmp_path / "low.csv"
@@ -104,6 +101,9 @@ def test_a_large_area_is_cut_into_sheets(run, camera, tmp_path):
     assert sheet["bounds_deg"] == [2, 46, 2.5, 46.3]
 
 
+OVER_DEM = "--dem", "DEM", "--dem-datum", "msl"
+
+
 @pytest.mark.parametrize(
     "arguments, code, message",
     [
@@ -114,11 +114,7 @@ def test_a_large_area_is_cut_into_sheets(run, camera, tmp_path):
         (["--route", "TABLE", "--band-m", 99, "--camera", "CAMERA"], 2, "needs a height above"),
         (["--route", "TABLE", "--gsd-m", 1, "--speed-mps", 0], 2, "--speed-mps must be above"),
         (["--route", "TABLE", "--gsd-m", 1, "--dem-datum", "msl"], 2, "give --dem too"),
-        (
-            ["--route", "FAR", "--gsd-m", 1, "--dem", "DEM", "--dem-datum", "msl"],
-            1,
-            "outside the terrain",
-        ),
+        (["--route", "FAR", "--gsd-m", 1, *OVER_DEM], 1, "outside the terrain"),
     ],
 )
 def test_impossible_plans_are_refused(run, table, camera, dem, tmp_path, arguments, code, message):

@@ -38,12 +38,9 @@ def test_a_line_of_many_fields_is_refused(tmp_path, at, name, head, row, read, e
     lines[at - 1] = lines[at - 1].rstrip() + "," * 3_000_000 + "\n"
     path = tmp_path / name
     path.write_text("".join(lines))
-    with (
-        memory_below(10 * path.stat().st_size),
-        pytest.raises(error, match=f"line {at} is longer than") as caught,
-    ):
+    refused = pytest.raises(error, match=rf"line {at} is longer than .*{path}")
+    with memory_below(10 * path.stat().st_size), refused:
         read(path)
-    assert str(path) in str(caught.value)
 
 
 def test_a_table_may_end_within_its_last_row(tmp_path):
@@ -77,10 +74,8 @@ def test_routes_of_too_many_waypoints_take_little_memory(tmp_path, monkeypatch, 
     monkeypatch.setattr("orthonav.ground.planning.record.MAX_WAYPOINTS", 5_000)
     path = tmp_path / name
     path.write_text(text)
-    with (
-        memory_below(5_000_000),
-        pytest.raises(RouteError, match="at most 5,000 are read"),
-    ):  # mostly the 5,000 waypoints
+    refused = pytest.raises(RouteError, match="at most 5,000 are read")
+    with memory_below(5_000_000), refused:  # mostly the 5,000 waypoints
         read_route(path)
 
 

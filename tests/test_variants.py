@@ -44,9 +44,7 @@ TABLE = {"knobs": Variant(f"{__name__}:Knobs"), "bare": Variant(f"{__name__}:Bar
 def test_text_makes_the_variant(text, expected):
     made = make_variant(TABLE, text)
     assert made == expected
-    assert [type(value) for value in vars(made).values()] == [
-        type(value) for value in vars(expected).values()
-    ]
+    assert [*map(type, vars(made).values())] == [*map(type, vars(expected).values())]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 TESTS = Path(__file__).resolve().parents[1] / "tests"
-FOLDERS = ("", "recordings", "onboard", "localize", "geo", "mapfile", "imagery", "fetch", "web")
+FOLDERS = ("", "recordings", "onboard", "localize", "geo", "mapfile", "imagery", "fetch", "view")
 sys.path.extend(str(TESTS / folder) for folder in FOLDERS)
 
 import bags
@@ -263,7 +263,7 @@ def make_requests(root: Path) -> list[Path]:
     small_run.write_small_map(area)
     opened = Run(ViewRequest(*make_fixes(root), area, flight=flight))
     server = Server(Pages(opened, load_assets()))
-    PORTS.append(server.port)
+    PORTS.append(server.server_port)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     rest = "HTTP/1.1\r\nHost: localhost\r\nAccept: */*\r\nConnection: close\r\n\r\n"
     return written(root, **{f"{i}_http": f"GET {each} {rest}" for i, each in enumerate(TARGETS)})

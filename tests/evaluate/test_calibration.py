@@ -6,9 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from orthonav.core.flight.fixes import result_to_json
-from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import Fix, ViewResult
 from orthonav.ground.evaluate.statistics import (
     N_BINS,
     ConfidenceCalibration,
@@ -37,6 +34,8 @@ def test_exact_calibration_has_no_error() -> None:
     assert found.mean_confidence == pytest.approx(found.share_right) == pytest.approx(19 / 30)
     # the mean of c (1 - c), as outcomes are Bernoulli with just that c
     assert found.brier == pytest.approx((4 * 0.1875 + 10 * 0.25 + 12 * 0.1875) / 30)
+    wilson = found.bins[5].right_low, found.bins[5].right_high  # 5 of 10
+    assert wilson == pytest.approx((0.23659, 0.76341), abs=1e-5)
 
 
 def test_bins_cover_0_to_1_and_hold_their_lower_edge() -> None:
@@ -49,15 +48,12 @@ def test_bins_cover_0_to_1_and_hold_their_lower_edge() -> None:
     assert [b.n_fixes for b in below.bins] == [1] * N_BINS
 
 
-def test_fixes_without_a_confidence_are_left_out_and_a_bad_one_is_refused() -> None:
+def test_fixes_without_a_confidence_are_left_out() -> None:
     stated = np.array([0.8, math.nan, 0.8, math.nan, 0.8])
     errors_m = np.array([RIGHT_M, RIGHT_M, WRONG_M, WRONG_M, math.nan])  # the last has no fix
     found = calibrate(stated, errors_m, np.full(5, RADIUS_M), 15.0)
     assert (found.n_fixes, found.share_right) == (2, 0.5)
     assert found.ece == pytest.approx(0.3)
-    for bad in (-0.01, 1.01, math.inf):
-        with pytest.raises(ValueError, match="confidence must be 0 to 1"):
-            calibrate(np.array([0.5, bad]), np.ones(2), np.ones(2), 15.0)
 
 
 def test_right_is_within_the_radius_a_fix_states_itself() -> None:
@@ -67,17 +63,6 @@ def test_right_is_within_the_radius_a_fix_states_itself() -> None:
     assert (one.n_own_radius, one.share_right) == (2, pytest.approx(1 / 6))
     other = calibrate(np.ones(6), errors_m, own_m, 30.0)  # where none is stated
     assert other.share_right == pytest.approx(5 / 6)
-
-
-def test_drawn_as_stated_is_calibrated_and_wilson_covers() -> None:
-    random = np.random.default_rng(11)
-    stated = random.random(40_000)
-    errors_m = np.where(random.random(stated.size) < stated, RIGHT_M, WRONG_M)
-    found = calibrate(stated, errors_m, np.full(stated.size, RADIUS_M), 15.0)
-    assert found.ece < 0.015
-    assert found.brier == pytest.approx(1 / 6, abs=0.005)  # the integral of c (1 - c)
-    inside = [b.right_low <= b.mean_confidence <= b.right_high for b in found.bins]
-    assert sum(inside) >= 8
 
 
 def test_nees_against_an_inverse() -> None:
@@ -134,22 +119,3 @@ def test_an_invalid_covariance_is_counted_and_left_out(rows: list[list[float]]) 
     found = check_covariance(np.ones((2, 2)), cov, np.full(2, RADIUS_M), 15.0)
     assert (found.n, found.n_unusable, found.n_without) == (2, 1, 0)
     assert found.nees.tolist() == [2.0]
-
-
-CENTRE = LocalFrame(48.0, -4.5)
-
-
-def test_a_truth_by_which_most_confident_fixes_are_wrong_is_doubted(tmp_path, run) -> None:
-    """Of another flight, or a displaced map: false fixes are few."""
-    offsets_m = np.array([[0.0, 3.0], [0.0, 700.0], [0.0, 600.0]])
-    lat, lon = CENTRE.latlon_from_en(offsets_m)
-    fixes, truth = tmp_path / "fixes.jsonl", tmp_path / "truth.csv"
-    truth.write_text("frame,lat_deg,lon_deg\n0.jpg,48.0,-4.5\n1.jpg,48.0,-4.5\n2.jpg,48.0,-4.5\n")
-    for confidences, said in (((0.95, 0.95, 0.95), "2 of 3"), ((0.95, 0.95, 0.5), "")):
-        placed = zip(lat, lon, confidences, strict=True)
-        outcomes = [Fix(*map(float, at), np.eye(2), c, RADIUS_M, 0.0, 100.0) for *at, c in placed]
-        results = [ViewResult(f"{i}.jpg", i, each, 1.0) for i, each in enumerate(outcomes)]
-        fixes.write_text("".join(result_to_json(each) + "\n" for each in results))
-        done = run("evaluate", fixes, "--truth", truth)
-        assert done.code == 0 and done.err.startswith(f"WARNING: {said}" if said else "")
-        assert ("of the same flight, and is the map" in done.err) == bool(said)

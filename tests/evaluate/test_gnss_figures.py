@@ -1,51 +1,36 @@
 """GNSS beside the map: errors, differences and alarms, in figures, JSON and report."""
 
-from dataclasses import replace
-from types import MappingProxyType
-
 import numpy as np
 import pytest
+from erring_flights import CENTRE, flown
 
 from orthonav.core.flight.gnss import BIASES, FAULTS
-from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.metrics import compare
 from orthonav.ground.evaluate.tables import gnss_rows, gnss_to_json
 from orthonav.ground.evaluate.track import measure_gnss
 
-FRAME = LocalFrame(48.0, 2.0)
 STEP = float(FAULTS.index("gnss_step") + 1)
 
 
-def result(number, gnss_m=None, fault=0.0, found=True):
-    """A view on a flight to the east at 10 m a view; the fix is 3 m off to the north."""
-    evidence = {"gnss_fault": fault}
-    if gnss_m is not None:
-        lat, lon = FRAME.latlon_from_en([10.0 * number + gnss_m, 0.0])
-        evidence |= {"gnss_lat_deg": float(lat), "gnss_lon_deg": float(lon)}
-    lat, lon = FRAME.latlon_from_en([10.0 * number, 3.0])
-    fix = Fix(float(lat), float(lon), np.eye(2), 0.99, 35.0, 0.0, 100.0, MappingProxyType(evidence))
-    outcome = fix if found else NoFix("blank", "nothing", MappingProxyType(evidence))
-    return ViewResult(f"{number}", number * 10**9, outcome, 5.0, "tracking")
-
-
-def truth(count):
-    lat, lon = FRAME.latlon_from_en(np.stack([10.0 * np.arange(count), np.zeros(count)], axis=1))
-    return {f"{i}": (float(lat[i]), float(lon[i])) for i in range(count)}
-
-
-RESULTS = [
-    *(result(i, 4.0) for i in range(5)),
-    *(result(i, 40.0, STEP) for i in range(5, 8)),
-    result(8, None),
-    result(9, 4.0, found=False),
-]
+def measured(views, without_fix=()):
+    """Of a flight to the east at 10 m a view whose fixes are 3 m off to the north. A view: metres
+    by which GNSS is off to the east, None: unknown, and more evidence. `without_fix`: numbers."""
+    evidence = []
+    for number, (gnss_m, more) in enumerate(views):
+        known = {}
+        if gnss_m is not None:
+            place = map(float, CENTRE.latlon_from_en([10.0 * number + gnss_m, 0.0]))
+            known = dict(zip(("gnss_lat_deg", "gnss_lon_deg"), place, strict=True))
+        evidence.append(known | more)
+    errors = [None if number in without_fix else (0.0, 3.0) for number in range(len(views))]
+    truth, results = flown(errors, "tracking", evidence=evidence)
+    return measure_gnss(compare(truth, results, CENTRE), results)
 
 
 def test_errors_differences_and_alarms_are_measured():
-    without = [result(i) for i in range(3)]
-    assert measure_gnss(compare(truth(3), without, FRAME), without) is None
-    found = measure_gnss(compare(truth(10), RESULTS, FRAME), RESULTS)
+    assert measured([(None, {})] * 3) is None
+    usual, fault = (4.0, {"gnss_fault": 0.0}), (40.0, {"gnss_fault": STEP})
+    found = measured([*[usual] * 5, *[fault] * 3, (None, {}), usual], without_fix=(9,))
     assert found.errors_m[:6] == pytest.approx([4, 4, 4, 4, 4, 40], abs=1e-3)
     assert found.differences_m[:6] == pytest.approx([5] * 5 + [np.hypot(40, 3)], abs=1e-3)
     assert np.isnan(found.errors_m[8]) and np.isnan(found.differences_m[9])
@@ -58,16 +43,11 @@ def test_errors_differences_and_alarms_are_measured():
 
 
 def test_what_was_learnt_is_that_of_the_last_view_that_knows_it():
-    def learnt(number, east_m):
-        keys = [key for pair in BIASES for key in pair]
+    def learnt(east_m):
         numbers = [east_m, 1.0, -4.0, 1.0, 0.5, 0.25, -0.5, 0.25, 120.0, 30.0]
-        values = dict(zip(keys, numbers, strict=True))
-        before = result(number, 4.0)
-        evidence = MappingProxyType({**before.outcome.evidence, **values})
-        return replace(before, outcome=replace(before.outcome, evidence=evidence))
+        return 4.0, dict(zip([key for pair in BIASES for key in pair], numbers, strict=True))
 
-    results = [learnt(0, 3.0), learnt(1, 12.0), result(2, 4.0), learnt(3, float("nan"))]
-    found = measure_gnss(compare(truth(4), results, FRAME), results)
+    found = measured([learnt(3.0), learnt(12.0), (4.0, {}), learnt(float("nan"))])
     assert gnss_to_json(found)["learnt"]["gnss_map_east_m"] == 12.0
     rows = dict(gnss_rows(found))
     assert rows["learnt displacement of the map"] == "12.0 +- 1.0 m east, -4.0 +- 1.0 m north"

@@ -9,10 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from erring_flights import CENTRE, flown
 
 from html_page import Page
-from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import Fix, NoFix, ViewResult
 from orthonav.ground.evaluate.metrics import compare, measure
 from orthonav.ground.evaluate.report import write_report
 from orthonav.ground.evaluate.tables import (
@@ -23,30 +22,22 @@ from orthonav.ground.evaluate.tables import (
 from orthonav.ground.report import measure_text
 from orthonav.ground.report.page import LIST
 
-CENTRE = LocalFrame(48.0, -4.5)
 FIGURES = {"map", "error-over-time", "reliability"}
 
 
-def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: int = 3):
+def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight"):
     """A flight along a wave, one fix in ten far off, some views without a fix."""
-    random = np.random.default_rng(seed)
-    along = np.linspace(0.0, 1.0, n)
-    truth_en_m = np.stack([1200 * along, 300 * np.sin(6 * along)], axis=1)
-    lat, lon = CENTRE.latlon_from_en(truth_en_m)
-    truth = {f"{i:04d}.jpg": (float(lat[i]), float(lon[i])) for i in range(n)}
-    results = []
-    for i, frame in enumerate(truth):
-        outcome: Fix | NoFix = NoFix("too_dark", "mean grey 3", {})
-        if random.random() < share_fixed:
-            wrong = random.random() < 0.1
-            at = truth_en_m[i] + random.normal(0.0, 600.0 if wrong else 3.0, 2)
-            fix_lat, fix_lon = (float(value) for value in CENTRE.latlon_from_en(at))
-            ratio = 1.05 + random.random() * (0.2 if wrong else 2.0)
-            known = {"lowe_ratio": 1.0 + random.random() / 5}
-            confidence = min(ratio / 3, 1.0)
-            confidence = 0.95 if wrong and i % 2 else confidence
-            outcome = Fix(fix_lat, fix_lon, np.eye(2), confidence, 15.0, 0.0, 100.0, known)
-        results.append(ViewResult(frame, i * 500_000_000, outcome, 40.0 + random.random()))
+    random, along = np.random.default_rng(3), np.linspace(0.0, 1.0, n)
+    wrong = random.random(n) < 0.1
+    errors = random.normal(0.0, 1.0, (n, 2)) * np.where(wrong, 600.0, 3.0)[:, None]
+    found = random.random(n) < share_fixed
+    sure = wrong & (np.arange(n) % 2 > 0)
+    truth, results = flown(
+        [tuple(error) if is_fix else None for error, is_fix in zip(errors, found, strict=True)],
+        places_en_m=np.stack([1200 * along, 300 * np.sin(6 * along)], axis=1),
+        confidence=np.where(sure, 0.95, random.uniform(0.35, 1.0, n)).tolist(),
+        evidence=[{"lowe_ratio": 1.0 + each / 5} for each in random.random(n)],
+    )
     comparison = compare(truth, results, CENTRE)
     return FlightReport(name, comparison, measure(comparison))
 
@@ -111,7 +102,7 @@ def test_the_page_holds_metrics_and_provenance(tmp_path: Path, no_plots) -> None
     assert f"<b>{100 * metrics.availability:.1f} %</b>" in html
     assert f'<b class="bad">{metrics.n_confident_wrong} of {metrics.n_confident}</b>' in html
     median = measure_text(metrics.standard.cep50_m)
-    for cell in (median, flight.comparison.frames[worst], "too_dark"):
+    for cell in (median, flight.comparison.frames[worst], "blank"):
         assert f"<td>{cell}</td>" in html
     counted = "3 results have no true position", "2 true positions have no result"
     for said in (*counted, *made_from.values()):

@@ -50,43 +50,18 @@ def test_projection_is_that_of_opencv(yaw, pitch, roll, agl_m, distortion, seed)
     np.testing.assert_allclose(ours, expected[:, 0], atol=1e-6)
 
 
-@given(yaws, tilts, tilts, st.floats(10, 3000), st.floats(0, 640), st.floats(0, 480))
-def test_homography_agrees_with_casting_the_ray(yaw, pitch, roll, agl_m, x, y):
-    ray_camera = np.array(
-        [(x - CAMERA.cx_px) / CAMERA.fx_px, (y - CAMERA.cy_px) / CAMERA.fy_px, 1.0]
-    )
-    ray = enu_from_camera(yaw, pitch, roll) @ ray_camera
-    if ray[2] > -0.1:
-        return
-    ground = ray[:2] * (agl_m / -ray[2])
-    axes = camera_from_en(yaw, pitch, roll, agl_m) @ [*ground, 1]
-    assert axes[2] > 0
-    np.testing.assert_allclose(axes / axes[2], ray_camera, atol=1e-9)
-
-
 @given(yaws, st.floats(-15, 15), st.floats(-15, 15), st.floats(10, 3000))
 def test_footprint_projects_to_the_image_corners(yaw, pitch, roll, agl_m):
     ground = footprint_en_m(CAMERA, yaw, pitch, roll, agl_m)
     corners = [[0, 0], [640, 0], [640, 480], [0, 480]]
-    np.testing.assert_allclose(
-        px_from_en(CAMERA, yaw, pitch, roll, agl_m, ground), corners, atol=1e-6
-    )
+    seen = px_from_en(CAMERA, yaw, pitch, roll, agl_m, ground)
+    np.testing.assert_allclose(seen, corners, atol=1e-6)
 
 
 @pytest.mark.parametrize("pitch, roll", [(70, 0), (0, -75), (120, 0), (0, 180)])
 def test_a_view_of_the_horizon_has_no_footprint(pitch, roll):
     with pytest.raises(CameraError, match="horizon"):
         footprint_en_m(CAMERA, 0, pitch, roll, 100)
-
-
-@pytest.mark.parametrize("distortion", [(-0.5, 0.0, 0.0, 0.0), (-0.5, 0.05, 0.0, 0.0)])
-def test_no_point_beyond_the_fold_of_the_lens_model_is_placed(distortion):
-    """Both models stop growing near 0.8; the second grows again from 2.3 on."""
-    camera = Camera(640, 480, 500.0, 500.0, 320, 240, distortion)
-    fold = math.sqrt(min(r.real for r in np.roots([5 * distortion[1], 3 * distortion[0], 1])))
-    radius = np.array([0, 0.5, 0.99, 1.01, 1.5, 2, 3, 5, 50]) * fold
-    placed = distort(camera, np.stack([radius * 0.6, radius * 0.8], axis=-1))
-    assert np.isfinite(placed).all(axis=1).tolist() == [True] * 3 + [False] * 6
 
 
 GOOD = {"width_px": 640, "height_px": 480, "fx_px": 500, "fy_px": 500, "cx_px": 320, "cy_px": 240}
@@ -105,6 +80,8 @@ GOOD = {"width_px": 640, "height_px": 480, "fx_px": 500, "fy_px": 500, "cx_px": 
         ({"distortion": (0.1, math.nan, 0, 0)}, "not finite"),
         ({"distortion": (0.1,)}, "k1,k2,p1,p2"),
         ({"distortion": (0.1,) * 8}, "k1,k2,p1,p2"),
+        ({"distortion": (0.1,) * 5, "model": "fisheye"}, "k1,k2,k3,k4"),
+        ({"model": "omni"}, "brown or fisheye"),
         ({"width_px": 640.5}, "width_px and height_px must be whole"),
         ({"fx_px": 8.8, "fy_px": 8.8}, "focal length 8.8 px is 0.014 widths"),
         ({"fx_px": 64_899, "fy_px": 64_899}, "focal length 64899 px"),
@@ -140,12 +117,11 @@ def test_every_size_of_a_picture_has_a_camera():
 def test_fields_of_view():
     across = Camera.from_fov(84, 1280, 960, diagonal=True)
     assert across.fx_px == pytest.approx(math.hypot(1280, 960) / 2 / math.tan(math.radians(42)))
-    with pytest.raises(CameraError, match=r"64\.7 if these are radians"):
-        Camera.from_fov(1.13, 1280, 960)
     square = Camera.from_fov(90.0, 1280, 960)
     assert square.fx_px == pytest.approx(640) and square.cx_px == 640 and square.focal_std > 0
-    for wrong in (0.0, 180.0, math.nan):
-        with pytest.raises(CameraError, match="field of view"):
+    for wrong in (0.0, 180.0, math.nan, 1.13):
+        said = r"64\.7 if these are radians" if wrong == 1.13 else "field of view"
+        with pytest.raises(CameraError, match=said):
             Camera.from_fov(wrong, 1280, 960)
     whole = Camera.from_fov(65, 1280.0, 960.0)
     assert type(whole.width_px) is int and whole == Camera.from_fov(65, 1280, 960)
@@ -154,14 +130,14 @@ def test_fields_of_view():
 def test_matrices_that_are_not_those_of_opencv():
     matrix = np.array([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]])
     assert Camera.from_matrix(matrix, None, (640, 480)).cx_px == 320.0
-    with pytest.raises(CameraError, match=r"\(3, 3\)"):
-        Camera.from_matrix(np.eye(2), [], (640, 480))
-    with pytest.raises(CameraError, match=r"transposed \(its last row is 319.5, 239.5, 1\)"):
-        Camera.from_matrix(matrix.T, None, (640, 480))
+    transposed = r"transposed \(its last row is 319.5, 239.5, 1\)"
+    refused = [(np.eye(2), r"\(3, 3\)"), (matrix.T, transposed)]
     for row, col in ((0, 1), (1, 0), (2, 0)):
         other = matrix.copy()
         other[row, col] = 3.0
-        with pytest.raises(CameraError, match="without skew"):
+        refused.append((other, "without skew"))
+    for other, message in refused:
+        with pytest.raises(CameraError, match=message):
             Camera.from_matrix(other, None, (640, 480))
 
 

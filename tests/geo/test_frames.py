@@ -56,13 +56,9 @@ def test_distance_and_azimuth_are_those_of_the_geodesic(frame, distance_m, azimu
 
 
 @pytest.mark.parametrize(
-    "lat, lon", [(90, 0), (-89.95, 0), (math.nan, 0), (0, math.nan), (0, 361), (math.inf, 0)]
+    "lat, lon", [(90, 0), (-89.95, 0), (math.nan, 0), (0, math.nan), (0, 361), (120.0, 48.0)]
 )
 def test_an_invalid_centre_is_refused(lat, lon):
-    with pytest.raises(AreaError, match="centre of a sheet"):
+    swapped = "; latitude and longitude seem" if lat == 120 else ""
+    with pytest.raises(AreaError, match=f"centre of a sheet .* got {lat}, {lon}{swapped}"):
         LocalFrame(lat, lon)
-
-
-def test_a_centre_with_swapped_coordinates_is_named():
-    with pytest.raises(AreaError, match=r"got 120.0, 48.0; latitude and longitude seem"):
-        LocalFrame(120.0, 48.0)

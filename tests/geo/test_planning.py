@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers import waypoints
+from orthonav.cli.common import OPTIONS
 from orthonav.core.errors import CameraError, RouteError
 from orthonav.core.geo.camera import Camera, footprint_en_m
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
+from orthonav.core.geo.ground import RELIEF_SLOPES, unknown_slope_share
 from orthonav.ground.planning.area import Area
 from orthonav.ground.planning.route import Height, Route
 from orthonav.ground.planning.spacing import (
@@ -46,9 +48,8 @@ def test_the_view_is_the_footprint():
 
 @given(st.floats(1, 50_000), st.integers(64, 6000), st.integers(64, 6000), st.floats(0.3, 5))
 def test_the_map_that_is_advised_is_good_for_the_view(agl_m, width_px, height_px, focal):
-    camera = Camera(
-        width_px, height_px, focal * width_px, focal * width_px, 10.0, 10.0, unusual=True
-    )
+    focal_px = focal * width_px
+    camera = Camera(width_px, height_px, focal_px, focal_px, 10.0, 10.0, unusual=True)
     view = ViewPlan.of(camera, agl_m)
     gsd_m, tile_px = suited_map(view)
     assert gsd_m >= 0.995 * max(LIMITS.finest_imagery_m, view.gsd_m)
@@ -76,9 +77,8 @@ def test_the_map_that_is_advised_is_good_for_the_view(agl_m, width_px, height_px
 def test_what_speaks_against_a_map(agl_m, gsd_m, tile_px, expected):
     view = ViewPlan.of(CAMERA, agl_m)
     assert codes(view_cautions(view, gsd_m, tile_px)) == expected
-    assert (
-        view.tile_share(gsd_m * tile_px) < LIMITS.min_tile_share or "tile_too_large" not in expected
-    )
+    is_small = view.tile_share(gsd_m * tile_px) < LIMITS.min_tile_share
+    assert is_small or "tile_too_large" not in expected
 
 
 FRAME = LocalFrame(46.5, 2.5)
@@ -104,12 +104,10 @@ def slope(lat, lon):
 )
 def test_height_above_ground_leg_by_leg(heights, agl_m, expected):
     legs = profile(Route(PLACES, heights), (100.0, 100.0), agl_m, 200.0, slope)
-    assert [leg.length_m for leg in legs] == pytest.approx([4000, 2000], abs=0.1)
-    assert [leg.ground_m for leg in legs] == [
-        pytest.approx((300, 500), abs=0.1),
-        pytest.approx((500, 500), abs=0.1),
-    ]
-    for leg, over in zip(legs, expected, strict=True):
+    grounds = (300, 500), (500, 500)
+    for leg, length_m, ground_m, over in zip(legs, (4000, 2000), grounds, expected, strict=True):
+        assert leg.length_m == pytest.approx(length_m, abs=0.1)
+        assert leg.ground_m == pytest.approx(ground_m, abs=0.1)
         assert leg.agl_m == pytest.approx(over, abs=0.2)
     assert legs[0].relief == pytest.approx(10 / expected[0][0], rel=0.15)
 
@@ -184,3 +182,12 @@ def test_a_sample_agrees_with_the_count():
     rough = estimate_map(area, gsd_m=1.0, tile_px=128, overlap=0.75, maps=40)
     assert rough.tiles == pytest.approx(exact.tiles, rel=0.03)
     assert rough.imagery_km2 == pytest.approx(exact.imagery_km2, rel=0.03)
+
+
+def test_slope_and_tilt_are_told_apart_by_what_is_known_of_each():
+    assert unknown_slope_share(0) == 0
+    assert unknown_slope_share(90, "rolling") == pytest.approx(0.05 / math.sqrt(2), rel=1e-3)
+    for relief, slope in RELIEF_SLOPES.items():
+        exact = 1 / math.sqrt(1 / math.radians(1) ** 2 + 2 / slope**2)
+        assert unknown_slope_share(1, relief) == pytest.approx(exact)
+    assert OPTIONS["--relief"]["choices"] == tuple(RELIEF_SLOPES)

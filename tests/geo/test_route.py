@@ -1,7 +1,6 @@
 """Routes: what is read, what is refused, distances to them and positions along them."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,10 +57,8 @@ def polylines(least=1):
     ],
 )
 @pytest.mark.parametrize("suffix", [".geojson", ".json", ".GeoJSON"])
-def test_geojson_is_read(tmp_path, document, suffix):
-    path = tmp_path / f"route{suffix}"
-    path.write_text(json.dumps(document))
-    assert read_route(path).waypoints == WAYPOINTS
+def test_geojson_is_read(read, document, suffix):
+    assert read(document, f"route{suffix}").waypoints == WAYPOINTS
 
 
 @pytest.mark.parametrize(
@@ -74,37 +71,31 @@ def test_geojson_is_read(tmp_path, document, suffix):
     ],
     ids=["plain", "spreadsheet", "decimal commas", "tabs"],
 )
-def test_csv_is_read(tmp_path, text):
-    path = tmp_path / "route.csv"
-    path.write_text(text, encoding="utf-8")
-    assert read_route(path).waypoints == WAYPOINTS
+def test_csv_is_read(read, text):
+    assert read(text, "route.csv").waypoints == WAYPOINTS
 
 
-def test_columns_say_heights_and_bands(tmp_path):
-    path = tmp_path / "route.csv"
-    path.write_text("lat,lon,agl_m,band_m\n46.5,2.5,120,400\n46.51,2.53,,\n46.49,2.55,100,9\n")
-    route = read_route(path)
+def test_columns_say_heights_and_bands(read):
+    rows = "46.5,2.5,120,400\n46.51,2.53,,\n46.49,2.55,100,9\n"
+    route = read(f"lat,lon,agl_m,band_m\n{rows}", "route.csv")
     assert route.heights == (Height(120, "agl"), None, Height(100, "agl"))
     assert route.leg_bands_m == (400, None)  # the last row begins no leg
     assert route.bands_m(300) == (400, 300) and route.bands_m(None) is None
-    path.write_text("lat,lon,alt,band_m\n46.5,2.5,120,400\n")
-    assert read_route(path) == Route(((46.5, 2.5),), (Height(120),), (400,))
+    one = read("lat,lon,alt,band_m\n46.5,2.5,120,400\n", "route.csv")
+    assert one == Route(((46.5, 2.5),), (Height(120),), (400,))
 
 
-def test_a_mission_of_litchi_states_what_its_heights_count_from(tmp_path):
-    path = tmp_path / "litchi.csv"
-    header = "latitude,longitude,altitude({}),heading(deg),altitudemode,poi_altitude(m)\n"
-    path.write_text(header.format("m") + "46.5,2.5,100,90,0,7\n46.51,2.53,120,90,1,7\n")
-    assert read_route(path).heights == (Height(100, "home"), Height(120, "agl"))
-    path.write_text(
-        header.format("m").replace("altitudemode", "altitude_mode") + "46.5,2.5,9,0,1,7\n"
-    )
-    assert read_route(path).heights == (Height(9, "agl"),)
-    path.write_text(header.format("ft") + "46.5,2.5,100,90,0,7\n")
-    assert read_route(path).heights == (Height(30.48, "home"),)
-    path.write_text(header.format("m") + "46.5,2.5,100,90,2,7\n")
+def test_a_mission_of_litchi_states_what_its_heights_count_from(read):
+    def heights(rows, unit="m", mode="altitudemode"):
+        header = f"latitude,longitude,altitude({unit}),heading(deg),{mode},poi_altitude(m)\n"
+        return read(header + rows, "litchi.csv").heights
+
+    both = heights("46.5,2.5,100,90,0,7\n46.51,2.53,120,90,1,7\n")
+    assert both == (Height(100, "home"), Height(120, "agl"))
+    assert heights("46.5,2.5,9,0,1,7\n", mode="altitude_mode") == (Height(9, "agl"),)
+    assert heights("46.5,2.5,100,90,0,7\n", "ft") == (Height(30.48, "home"),)
     with pytest.raises(RouteError, match="altitudemode must be 0"):
-        read_route(path)
+        heights("46.5,2.5,100,90,2,7\n")
 
 
 @pytest.mark.parametrize("name, fits", [
@@ -113,39 +104,32 @@ def test_a_mission_of_litchi_states_what_its_heights_count_from(tmp_path):
     ("urn:ogc:def:crs:EPSG::2154", False),
     ("EPSG:4230", False),
 ])  # fmt: skip
-def test_the_system_of_an_older_geojson_is_wgs_84(tmp_path, name, fits):
-    line = {"type": "LineString", "coordinates": [[2.5, 46.5], [2.6, 46.5]]}
-    path = tmp_path / "a.geojson"
-    path.write_text(json.dumps(line | {"crs": {"type": "name", "properties": {"name": name}}}))
+def test_the_system_of_an_older_geojson_is_wgs_84(read, name, fits):
+    document = LINE | {"crs": {"type": "name", "properties": {"name": name}}}
     if fits:
-        assert read_route(path).waypoints == ((46.5, 2.5), (46.5, 2.6))
+        assert read(document).waypoints == WAYPOINTS
         return
     with pytest.raises(RouteError, match=f"is in {name}: convert it to WGS 84 .ogr2ogr"):
-        read_route(path)
+        read(document)
 
 
 @pytest.mark.parametrize("rows", ["46.5,2.5\n0,0\n46.6,2.5", "0.8116,0.0436\n0.8118,0.0436"])
-def test_positions_of_none_and_radians_are_refused(tmp_path, rows):
-    (tmp_path / "a.csv").write_text(f"lat,lon\n{rows}\n")
+def test_positions_of_none_and_radians_are_refused(read, rows):
     with pytest.raises(RouteError, match="at or around 0, 0, in the sea: give degrees, not rad"):
-        read_route(tmp_path / "a.csv")
+        read(f"lat,lon\n{rows}\n", "a.csv")
 
 
-def test_a_pointer_of_git_lfs_is_named(tmp_path):
-    path = tmp_path / "a.kml"
-    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+def test_a_pointer_of_git_lfs_is_named(read):
     with pytest.raises(MissingFileError, match=r"Git LFS pointer.*git lfs pull"):
-        read_route(path)
+        read("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "a.kml")
 
 
-def test_properties_say_heights_bands_and_names(tmp_path):
-    path = tmp_path / "route.json"
+def test_properties_say_heights_bands_and_names(read):
     own = {"name": "east", "band_m": [300, None], "height_frame": "amsl", "home_amsl_m": 250}
-    path.write_text(json.dumps(feature(HIGH_LINE) | {"properties": own}))
     heights = (Height(120, "amsl"),) * 3
-    assert read_route(path) == Route(WAYPOINTS, heights, (300, None), "east", 250)
-    path.write_text(json.dumps(feature(LINE) | {"properties": {"band_m": 200}}))
-    assert read_route(path).leg_bands_m == (200, 200)
+    found = read(feature(HIGH_LINE) | {"properties": own})
+    assert found == Route(WAYPOINTS, heights, (300, None), "east", 250)
+    assert read(feature(LINE) | {"properties": {"band_m": 200}}).leg_bands_m == (200, 200)
 
 
 @pytest.mark.parametrize(
@@ -159,36 +143,26 @@ def test_properties_say_heights_bands_and_names(tmp_path):
         ({"home_amsl_m": True}, "home_amsl_m must be a number"),
     ],
 )
-def test_properties_that_make_no_sense_are_refused(tmp_path, own, message):
-    path = tmp_path / "route.geojson"
-    path.write_text(json.dumps(feature(HIGH_LINE) | {"properties": own}))
+def test_properties_that_make_no_sense_are_refused(read, own, message):
     with pytest.raises(RouteError, match=message):
-        read_route(path)
+        read(feature(HIGH_LINE) | {"properties": own})
 
 
-def test_lines_are_picked_by_name(tmp_path):
-    path = tmp_path / "a.geojson"
+def test_lines_are_picked_by_name(read):
     both = collection(LINE, OTHER_LINE)
-    path.write_text(json.dumps(both))
     with pytest.raises(RouteError, match=r"2 lines; .*: 1 \(no name\), 2 \(no name\)"):
-        read_route(path)
+        read(both)
     both["features"][1]["properties"] = {"name": "x#/y"}
-    path.write_text(json.dumps(both))
-    assert read_route(Path(f"{path}#x#/y")).waypoints[0] == (9, 9)
-    with pytest.raises(
-        RouteError, match=r"2 lines; give FILE#NAME or FILE#NUMBER: 1 \(no name\), 2 'x"
-    ):
-        read_route(path)
-    with pytest.raises(RouteError, match=r"0 lines are named 'z'; give .*: 1 \(no name\), 2 'x"):
-        read_route(Path(f"{path}#z"))
-    assert read_route(Path(f"{path}#1")).waypoints == WAYPOINTS
-    assert read_route(Path(f"{path}#2")).waypoints[0] == (9, 9)
-    for number in ("0", "3", "-1", "1.0"):
-        with pytest.raises(RouteError, match=f"0 lines are named '{number}'"):
-            read_route(Path(f"{path}#{number}"))
-    both["features"][0]["properties"] = {"name": "2"}
-    path.write_text(json.dumps(both))
-    assert read_route(Path(f"{path}#2")).waypoints == WAYPOINTS  # a name comes before a number
+    named = r"give FILE#NAME or FILE#NUMBER: 1 \(no name\), 2 'x"
+    refused = {"": f"2 lines; {named}", "#z": f"0 lines are named 'z'; {named}"}
+    refused |= {f"#{n}": f"0 lines are named '{n}'" for n in ("0", "3", "-1", "1.0")}
+    for selected, message in refused.items():
+        with pytest.raises(RouteError, match=message):
+            read(both, f"a.geojson{selected}")
+    for selected, first in (("#x#/y", (9, 9)), ("#1", WAYPOINTS[0]), ("#2", (9, 9))):
+        assert read(both, f"a.geojson{selected}").waypoints[0] == first
+    both["features"][0]["properties"] = {"name": "2"}  # a name comes before a number
+    assert read(both, "a.geojson#2").waypoints == WAYPOINTS
 
 
 heights = st.none() | st.builds(
@@ -251,22 +225,19 @@ def test_any_bytes_give_a_route_or_a_route_error(suffix, content):
         ("a.shp", b"", "must be one of .geojson, .*, .gpx, got '.shp'"),
     ],
 )
-def test_bad_files_are_named(tmp_path, name, content, message):
-    path = tmp_path / name
-    path.write_bytes(content)
+def test_bad_files_are_named(read, tmp_path, name, content, message):
     with pytest.raises(RouteError, match=message) as caught:
-        read_route(path)
-    assert str(caught.value).endswith(str(path))
+        read(content, name)
+    assert str(caught.value).endswith(str(tmp_path / name))
 
 
-def test_missing_folder_and_huge_files_are_refused(tmp_path, monkeypatch):
+def test_missing_folder_and_huge_files_are_refused(read, tmp_path, monkeypatch):
     for path in (tmp_path / "none.csv", tmp_path):
         with pytest.raises(MissingFileError, match=r"does not exist|is a folder"):
             read_route(path)
     monkeypatch.setattr(route_module, "MAX_ROUTE_BYTES", 10)
-    (tmp_path / "a.csv").write_text("lat_deg,lon_deg\n1,2\n")
     with pytest.raises(RouteError, match="larger than"):
-        read_route(tmp_path / "a.csv")
+        read("lat_deg,lon_deg\n1,2\n", "a.csv")
 
 
 @pytest.mark.parametrize("reach_deg, tolerance", [(1, 5e-6), (25, 5e-3)])

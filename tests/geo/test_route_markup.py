@@ -8,7 +8,7 @@ import pytest
 
 from orthonav.core.errors import RouteError
 from orthonav.ground.planning import markup
-from orthonav.ground.planning.route import Height, read_route
+from orthonav.ground.planning.route import Height
 
 BAD_LATITUDE = "a latitude within 90"
 PLACES = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))
@@ -21,13 +21,10 @@ TRACK = (
 
 def kml_of(*marks, namespaces=True):
     spaces = 'xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2"'
-    inner = "".join(
-        f"<Placemark><name>{name}</name>{geometry}</Placemark>" for name, geometry in marks
-    )
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n'
-        f"<kml {spaces if namespaces else ''}><Document><Folder>{inner}</Folder></Document></kml>"
-    )
+    named = (f"<Placemark><name>{name}</name>{shape}</Placemark>" for name, shape in marks)
+    inner = f"<Document><Folder>{''.join(named)}</Folder></Document>"
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    return f"{head}<kml {spaces if namespaces else ''}>{inner}</kml>"
 
 
 def line(mode=None, coordinates=LINE):
@@ -42,16 +39,6 @@ def archive(*members):
             entry = zipfile.ZipInfo(name)  # of 1980: cases of pytest are named by these bytes
             zipped.writestr(entry, text, zipfile.ZIP_DEFLATED)
     return out.getvalue()
-
-
-@pytest.fixture
-def read(tmp_path):
-    def read(content, name):
-        path = tmp_path / name.partition("#")[0]
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-        return read_route(tmp_path / name)
-
-    return read
 
 
 @pytest.mark.parametrize(
@@ -76,14 +63,9 @@ def test_lines_and_tracks_of_kml(read, geometry, frame, namespaces):
 
 
 def test_lines_of_one_placemark_are_joined_and_placemarks_picked_by_name(read):
-    halves = (
-        "<coordinates>2.5, 46.5 2.53, 46.51</coordinates>",
-        "<coordinates>2.55,46.49</coordinates>",
-    )
-    both = "".join(line(coordinates=half) for half in halves)
-    text = kml_of(
-        ("way", f"<MultiGeometry>{both}</MultiGeometry>"), ("é & b".replace("&", "&amp;"), TRACK)
-    )
+    halves = ("2.5, 46.5 2.53, 46.51", "2.55,46.49")
+    both = "".join(line(coordinates=f"<coordinates>{half}</coordinates>") for half in halves)
+    text = kml_of(("way", f"<MultiGeometry>{both}</MultiGeometry>"), ("é &amp; b", TRACK))
     assert read(text, "a.kml#way").waypoints == PLACES
     assert read(text, "a.kml#é & b").waypoints == PLACES
     with pytest.raises(RouteError, match=r"2 lines; give .*: 1 'way', 2 'é & b'"):
@@ -111,20 +93,15 @@ WAYPOINT = """<Placemark><Point><coordinates>{lon},{lat},0</coordinates></Point>
 
 
 def wayline(mode="relativeToStartPoint", ident=0, order=(0, 1, 2)):
-    marks = "".join(
-        WAYPOINT.format(lat=PLACES[i][0], lon=PLACES[i][1], index=i, height=50 + i) for i in order
-    )
-    return (
-        f"<Folder><wpml:executeHeightMode>{mode}</wpml:executeHeightMode>"
-        f"<wpml:waylineId>{ident}</wpml:waylineId>{marks}</Folder>"
-    )
+    places = ((i, *PLACES[i]) for i in order)
+    marks = [WAYPOINT.format(lat=lat, lon=lon, index=i, height=50 + i) for i, lat, lon in places]
+    head = f"<wpml:executeHeightMode>{mode}</wpml:executeHeightMode>"
+    return f"<Folder>{head}<wpml:waylineId>{ident}</wpml:waylineId>{''.join(marks)}</Folder>"
 
 
 def wpml_of(*folders):
     spaces = 'xmlns="http://www.opengis.net/kml/2.2" xmlns:wpml="http://www.dji.com/wpmz/1.0.2"'
-    config = (
-        "<wpml:missionConfig><wpml:finishAction>goHome</wpml:finishAction></wpml:missionConfig>"
-    )
+    config = "<wpml:missionConfig/>"
     return f"<kml {spaces}><Document>{config}{''.join(folders)}</Document></kml>"
 
 
@@ -157,11 +134,7 @@ def test_several_waylines_are_picked_by_identifier_or_number(read):
         (wpml_of(), "a.wpml", "no wayline with waypoints"),
         (wpml_of(wayline("aboveTheMoon")), "a.wpml", "executeHeightMode must be relative"),
         (wpml_of(wayline()).replace("<wpml:index>1", "<wpml:index>x"), "a.wpml", "WPML index"),
-        (
-            wpml_of(wayline()).replace("2.5,46.5,0", "2.5"),
-            "a.wpml",
-            "position must be longitude,lat",
-        ),
+        (wpml_of(wayline()).replace("2.5,46.5,0", "2.5"), "a.wpml", "must be longitude,lat"),
         (wpml_of(), "a.kml", "template of a DJI mission: give its waylines.wpml"),
         ("<gpx/>", "a.wpml", "must begin with <kml>"),
     ],
@@ -256,12 +229,7 @@ def test_archives_of_many_members_or_with_a_password_are_refused(read):
         read(bytes(locked), "a.kmz")
 
 
-def test_spaces_in_coordinates_take_linear_time(tmp_path):
+def test_spaces_in_coordinates_take_linear_time(read):
     """The time of a search for spaces around commas would grow with the square of their number."""
-    path = tmp_path / "a.kml"
-    spaces = " " * 3_000_000
-    text = f"1 ,\n2{spaces}3 , 4, 5"
-    path.write_text(
-        f"<kml><Placemark><LineString><coordinates>{text}</coordinates></LineString></Placemark></kml>"
-    )
-    assert read_route(path).waypoints == ((2.0, 1.0), (4.0, 3.0))
+    text = f"<coordinates>1 ,\n2{' ' * 3_000_000}3 , 4, 5</coordinates>"
+    assert read(kml_of(("way", line(coordinates=text))), "a.kml").waypoints == ((2, 1), (4, 3))

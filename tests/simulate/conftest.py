@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_flight import PLAIN, SMALL, plane_of
+from simulated import PLAIN, SMALL, frame_of
 
 from helpers import textured
 from orthonav.core.flight import open_flight, read_truth
@@ -23,27 +23,28 @@ def ortho(make_ortho, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def frame(ortho):
-    return plane_of(ortho).frame
+    return frame_of(ortho)
 
 
 @pytest.fixture
 def fly(ortho, tmp_path, monkeypatch):
-    """Function that flies at 100 m: the flight, its true places by frame, and, without `pictures`,
-    which then are of one grey, what each would have been made of."""
+    """Function that flies at 100 m, `over` another orthophoto if given: the flight, its true places
+    by frame, and, without `pictures`, which then are of one grey, what each would have been made
+    of."""
 
-    def flown(*, pictures=True, **request):
+    def flown(*, pictures=True, over=None, **request):
         asked = []
 
         def picture(*arguments):
             asked.append(arguments)
-            return np.full((48, 64), 99, np.uint8)
+            return np.full((48, 64, 3), 99, np.uint8)
 
         folder = tmp_path / f"flight{len(list(tmp_path.glob('flight*')))}"
         request = {"agl_m": 100.0, "camera": SMALL, "effects": PLAIN, **request}
         with monkeypatch.context() as patch:
             if not pictures:
                 patch.setattr(flight_module, "_picture", picture)
-            simulate_flight(SimulateRequest([ortho], folder, **request))
+            simulate_flight(SimulateRequest([over or ortho], folder, **request))
         return open_flight(folder), read_truth(folder / "truth.csv"), asked
 
     return flown

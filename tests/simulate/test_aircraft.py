@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lab.clouds import Clouds
 from scipy.spatial.transform import Rotation
-from test_flight import SMALL, plane_of, route_of
+from simulated import frame_of, route_of
 
-from orthonav.core.flight import open_flight
 from orthonav.core.geo.camera import Camera, enu_from_camera
-from orthonav.ground.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.ground.simulate.flight import Errors
 from orthonav.ground.simulate.motion import drifting, mounted, rounded, steady_path
+from orthonav.ground.simulate.render import ViewEffects
 
 SEEN = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
 CORNERS = np.array([[-300.0, -200.0], [-300.0, 100.0], [200.0, 100.0]])
@@ -29,19 +29,11 @@ def pictures(flight):
     return [view.grey() for view in flight.views]
 
 
-def test_a_seed_gives_the_numbers_of_earlier_versions(area, tmp_path):
-    request = SimulateRequest(
-        [area.past],
-        tmp_path / "f",
-        route=route_of(plane_of(area.past).frame, *CORNERS),
-        agl_m=100.0,
-        camera=SMALL,
-        errors=ALL,
-        seed=1,
-        spacing_m=50.0,
-    )
-    simulate_flight(request)
-    lines = (tmp_path / "f/telemetry.csv").read_text().splitlines()
+def test_a_seed_gives_the_numbers_of_earlier_versions(area, fly):
+    route = route_of(frame_of(area.past), *CORNERS)
+    flown = {"over": area.past, "effects": ViewEffects()}
+    flight, _, _ = fly(**flown, route=route, errors=ALL, seed=1, spacing_m=50.0)
+    lines = (flight.path / "telemetry.csv").read_text().splitlines()
     assert lines[0].endswith("prior_std_m,tilt_std_deg")
     assert lines[1] == "0001.jpg,0,344.838,0.245,1.841,102.234,5,5,48.85912509,2.34941189,40,1"
     assert lines[4] == "0004.jpg,6,353.495,2.995,0.282,106.121,5,5,48.86032265,2.34959257,40,1"
@@ -76,21 +68,6 @@ def test_clouds_hide_some_views_and_leave_the_others(fly, frame):
     spread = np.array([b.std() for _, b in pairs])
     assert (degree == 1).sum() >= 3 and spread[degree == 1].max() < 6
     assert spread[(degree > 0.3) & (degree < 0.7)].min() > 15
-
-
-def test_the_command(run, ortho, frame, tmp_path):
-    points = route_of(frame, (0.0, 0.0), (100.0, 40.0)).waypoints
-    lines = ["lat_deg,lon_deg", *(f"{lat},{lon}" for lat, lon in points)]
-    (tmp_path / "route.csv").write_text("\n".join(lines))
-    fly = ["simulate", "--ortho", ortho, "--route", tmp_path / "route.csv", "--agl-m", "100"]
-    errors = ["--agl-std", "0.05", "--velocity-drift", "0.02", "--turn-radius-m", "50"]
-    done = run(*fly, *errors, "--spacing-m", "50", "--out", tmp_path / "f")
-    assert done.code == 0 and "views written" in done.out
-    telemetry = open_flight(tmp_path / "f").views[0].telemetry
-    assert telemetry.vel_en_mps is not None and telemetry.agl_m != 100
-
-
-# Motion along a route.
 
 
 LINE = np.array([[0.0, 0.0], [0.0, 4000.0], [3000.0, 4000.0], [2000.0, 0.0]])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_flight import route_of
+from simulated import route_of
 
 from helpers import write_dem
 from orthonav.core.errors import AreaError, FlightError, ImageryError

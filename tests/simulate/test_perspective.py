@@ -8,12 +8,10 @@ import pytest
 from lab.landscape import generate_area, generate_heights
 from lab.landscape.epoch import DEFAULT_DATES
 from lab.terrain import seen_view
-from test_flight import FISH, LENS, PLAIN, SEEN
+from simulated import FISH, LENS, PLAIN, SEEN
 
-from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import Camera
 from orthonav.ground.imagery.terrain import open_dem
-from orthonav.ground.simulate.flight import SimulateRequest, simulate_flight
 from orthonav.ground.simulate.render import Raster, met, rays_enu, render_view
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
@@ -55,20 +53,15 @@ def test_a_roof_stands_out_and_hides_the_ground_behind():
 
 
 @pytest.mark.long
-def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path):
+def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path, fly):
     size = {"size_m": (340.0, 320.0), "dates": (AUTUMN,), "seed": 2}
     (ortho,) = generate_area(tmp_path, **size)
     dem, dsm = (open_dem(p, None) for p in generate_heights(tmp_path, slope=0.1, **size))
-    request = {"random": 2, "agl_m": 50.0, "camera": CAMERA, "effects": PLAIN, "seed": 5}
+    request = {"random": 2, "agl_m": 50.0, "camera": CAMERA, "camera_pitch_deg": 60.0, "seed": 5}
     pictures = {}
     for name, terrain in (("dem", dem), ("dsm", dsm)):
-        simulate_flight(
-            SimulateRequest(
-                [ortho], tmp_path / name, terrain=terrain, terrain_posting_m=terrain.gsd_m,
-                camera_pitch_deg=60.0, **request,
-            )
-        )  # fmt: skip
-        flight, truth = open_flight(tmp_path / name), read_truth(tmp_path / name / "truth.csv")
+        over = {"over": ortho, "terrain": terrain, "terrain_posting_m": terrain.gsd_m}
+        flight, truth, _ = fly(**over, **request)
         telemetry = flight.views[0].telemetry
         assert telemetry.pitch_deg == 60.0 and math.isnan(telemetry.agl_m)
         below = float(terrain(*np.array([[each] for each in truth[flight.views[0].frame]]))[0])

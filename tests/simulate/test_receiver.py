@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_flight import plane_of, route_of
+from simulated import route_of, write_route
 
 from orthonav.core.errors import UsageError, VariantError
 from orthonav.core.flight.gnss import read_gnss
@@ -59,12 +59,9 @@ def test_invalid_receivers_are_refused():
         receiver_of("step:metres=-1")
 
 
-def test_a_simulated_flight_has_solutions(area, tmp_path, run):
-    route = tmp_path / "route.csv"
-    places = route_of(plane_of(area.past).frame, [-100.0, 0.0], [100.0, 0.0]).waypoints
-    rows = [f"{lat:.8f},{lon:.8f}" for lat, lon in places]
-    route.write_text("\n".join(["lat_deg,lon_deg", *rows]))
-    flown = "simulate", "--ortho", area.past, "--agl-m", 100, "--out", tmp_path / "flight"
+def test_a_simulated_flight_has_solutions(ortho, frame, tmp_path, run):
+    route = write_route(tmp_path / "route.csv", route_of(frame, [-100.0, 0.0], [100.0, 0.0]))
+    flown = "simulate", "--ortho", ortho, "--agl-m", 100, "--out", tmp_path / "flight"
     done = run(*flown, "--route", route, "--receiver", "jam:at_s=5")
     assert done.code == 0, done.err
     samples = read_gnss(tmp_path / "flight" / "gnss.csv")

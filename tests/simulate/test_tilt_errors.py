@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from test_flight import route_of
+from simulated import route_of
 
 from orthonav.core.flight import open_flight
 from orthonav.ground.simulate.flight import Errors
@@ -17,7 +17,7 @@ def tilts(fly):
 
     def flown(**request):
         flight, _, asked = fly(pictures=False, **request)
-        true = [arguments[5].attitude[1:3] for arguments in asked]
+        true = [arguments[3].attitude[1:3] for arguments in asked]
         return np.array(true), [view.telemetry for view in flight.views]
 
     return flown

@@ -99,10 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except UnicodeEncodeError as error:
         letters = f"{error.object[error.start : error.end]!a:.40}"
-        return _failed(
-            f"a name has letters ({letters}) that the locale cannot express: set PYTHONUTF8=1",
-            verbose,
-        )
+        said = f"a name has letters ({letters}) that the locale cannot express: set PYTHONUTF8=1"
+        return _failed(said, verbose)
     except OSError as error:  # a disk or a device that fails where nobody expected it
         return _failed(_one_line(error), verbose)
     except MemoryError:
@@ -247,10 +245,10 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
             module.add(command)
             notes = (command.epilog, f"example: orthonav {name} {module.EXAMPLE}".rstrip())
             command.epilog = "; ".join(filter(None, notes))
-            _name_units(command)
             everyday = getattr(module, "EVERYDAY", ())
             by_action = everyday if isinstance(everyday, dict) else {"": everyday}
             for action, part in {"": command, **_actions(command)}.items():
+                _name_units(part)
                 options = by_action.get(action, ())
                 _add_help_all(part, options, show_all="--help-all" in arguments)
     return parser
@@ -275,10 +273,7 @@ def _name_units(command: argparse.ArgumentParser) -> None:
     """Name numbers in the help by the unit that ends their option: `--agl-m M`; integers N."""
     units = ("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz")
     for action in command._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for sub_command in action.choices.values():
-                _name_units(sub_command)
-        elif action.type in (int, float) and action.metavar is None:
+        if action.type in (int, float) and action.metavar is None:
             unit = action.option_strings[0].rpartition("-")[2] if action.option_strings else ""
             if unit in units:
                 action.metavar = unit.upper()
@@ -300,8 +295,8 @@ def _add_help_all(
     shown = {*everyday, "--help", "--help-all", "--verbose", "--quiet"}
     optional = [each for each in command._actions if each.option_strings and not each.required]
     hidden = [each for each in optional if shown.isdisjoint(each.option_strings)]
-    for action in hidden:
-        action.help = argparse.SUPPRESS
+    for each in hidden:
+        each.help = argparse.SUPPRESS
     more = f"{len(hidden)} more options: {command.prog} --help-all"
     command.epilog = "; ".join(filter(None, (command.epilog, more)))
 

@@ -62,164 +62,130 @@ def _bands(text: str) -> tuple[int, ...]:
     return tuple(map(int, parts))
 
 
+FLAG: dict[str, Any] = {"action": "store_true"}
+NUMBER: dict[str, Any] = {"type": float}
+WHOLE: dict[str, Any] = {"type": int}
+FILE: dict[str, Any] = {"type": Path, "metavar": "FILE"}
+
+
+def _option(kind: Mapping[str, Any], text: str) -> dict[str, Any]:
+    return {**kind, "help": text}
+
+
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
-    "--accept": {
-        "default": "confidence:0.9",
-        "metavar": "NAME:MIN",
-        "help": "criterion of a confident fix and its threshold: confidence:0.9 (default) or "
+    "--accept": _option(
+        {"default": "confidence:0.9", "metavar": "NAME:MIN"},
+        "criterion of a confident fix and its threshold: confidence:0.9 (default) or "
         "peak_ratio:1.3",
-    },
-    "--alert-limit-m": {
-        "type": within(*ALERT_LIMITS_M),
-        "metavar": "M",
-        "help": "largest horizontal error that the mission allows: a fix is confident if its "
+    ),
+    "--alert-limit-m": _option(
+        {"type": within(*ALERT_LIMITS_M), "metavar": "M"},
+        "largest horizontal error that the mission allows: a fix is confident if its "
         "protection level is at most that (replaces --accept)",
-    },
-    "--agl-m": {"type": float, "help": "height above ground"},
-    "--allow-holes": {"action": "store_true", "help": "write the file even if imagery is missing"},
-    "--band-m": {
-        "type": float,
-        "help": "width of the search band for legs without a width of their own",
-    },
-    "--bounds": {
-        "type": numbers(4, "W,S,E,N in degrees"),
-        "metavar": "W,S,E,N",
-        "help": "area: west, south, east, north in degrees",
-    },
-    "--budget-ms": {
-        "type": within(0.001, 1e9),
-        "default": math.inf,
-        "metavar": "MS",
-        "help": "time limit per view (default: none); a search that would exceed it is not "
+    ),
+    "--agl-m": _option(NUMBER, "height above ground"),
+    "--allow-holes": _option(FLAG, "write the file even if imagery is missing"),
+    "--band-m": _option(NUMBER, "width of the search band for legs without a width of their own"),
+    "--bounds": _option(
+        {"type": numbers(4, "W,S,E,N in degrees"), "metavar": "W,S,E,N"},
+        "area: west, south, east, north in degrees",
+    ),
+    "--budget-ms": _option(
+        {"type": within(0.001, 1e9), "default": math.inf, "metavar": "MS"},
+        "time limit per view (default: none); a search that would exceed it is not "
         "started, and the result is the best position so far",
-    },
-    "--camera": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
-    },
-    "--bands": {
-        "type": _bands,
-        "metavar": "N[,N,N]",
-        "help": "bands of the files, one or three, from 1: 4 is often near infrared (default: red, "
+    ),
+    "--camera": _option(FILE, "camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)"),
+    "--bands": _option(
+        {"type": _bands, "metavar": "N[,N,N]"},
+        "bands of the files, one or three, from 1: 4 is often near infrared (default: red, "
         "green and blue, or the first)",
-    },
-    "--mask": {
-        "type": Path,
-        "metavar": "PNG",
-        "help": "grey image of the size of the camera's, black where the picture never shows "
+    ),
+    "--mask": _option(
+        {"type": Path, "metavar": "PNG"},
+        "grey image of the size of the camera's, black where the picture never shows "
         "ground: landing gear, propellers, text",
-    },
-    "--dem": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "terrain model (any raster that GDAL reads) for heights above ground",
-    },
-    "--surface": {
-        "type": Path,
-        "action": "append",
-        "default": [],
-        "metavar": "FILE",
-        "help": "surface model with houses and trees (any raster that GDAL reads), which stand on "
+    ),
+    "--dem": _option(FILE, "terrain model (any raster that GDAL reads) for heights above ground"),
+    "--surface": _option(
+        FILE | {"action": "append", "default": []},
+        "surface model with houses and trees (any raster that GDAL reads), which stand on "
         "the terrain of --dem or on its own lower envelope; may be repeated",
-    },
-    "--true-ortho": {
-        "action": "store_true",
-        "help": "houses stand upright in the orthophotos (true orthophotos): no lean is estimated "
+    ),
+    "--true-ortho": _option(
+        FLAG,
+        "houses stand upright in the orthophotos (true orthophotos): no lean is estimated "
         "from --surface",
-    },
-    "--dem-datum": {
-        "metavar": "NAME",
-        "help": "vertical datum of --dem and --surface, where the file does not state it: egm96, "
+    ),
+    "--dem-datum": _option(
+        {"metavar": "NAME"},
+        "vertical datum of --dem and --surface, where the file does not state it: egm96, "
         "egm2008, msl, ellipsoid or EPSG:NUMBER of a vertical system",
-    },
-    "--relief": {
-        "choices": ("level", "rolling", "hills"),
-        "help": "what the land is like where no terrain is given: slopes of 1, 5 (default) or "
+    ),
+    "--relief": _option(
+        {"choices": ("level", "rolling", "hills")},
+        "what the land is like where no terrain is given: slopes of 1, 5 (default) or "
         "12 %% RMS, which look like tilt of the camera",
-    },
-    "--gsd-m": {
-        "type": float,
-        "help": "ground resolution, metres per pixel (default: suited to imagery or view)",
-    },
-    "--heading": {
-        "choices": ("known", "unknown"),
-        "default": "known",
-        "help": "known: from telemetry (default); unknown: all headings are tried",
-    },
-    "--json": {"action": "store_true", "help": "print as JSON"},
-    "--mount": {
-        "type": Path,
-        "metavar": "mount.json",
-        "help": "calibration by `orthonav calibrate`, which corrects heading, height, pitch and "
+    ),
+    "--gsd-m": _option(
+        NUMBER, "ground resolution, metres per pixel (default: suited to imagery or view)"
+    ),
+    "--heading": _option(
+        {"choices": ("known", "unknown"), "default": "known"},
+        "known: from telemetry (default); unknown: all headings are tried",
+    ),
+    "--json": _option(FLAG, "print as JSON"),
+    "--mount": _option(
+        {"type": Path, "metavar": "mount.json"},
+        "calibration by `orthonav calibrate`, which corrects heading, height, pitch and "
         "roll; without it the mount counts as known to 2.5 deg",
-    },
-    "--mount-deg": {
-        "type": float,
-        "nargs": 3,
-        "default": (0.0, 0.0, 0.0),
-        "metavar": ("YAW", "PITCH", "ROLL"),
-        "help": "orientation of the camera in the aircraft; 0 0 0 (default) looks straight down "
+    ),
+    "--mount-deg": _option(
+        NUMBER | {"nargs": 3, "default": (0.0, 0.0, 0.0), "metavar": ("YAW", "PITCH", "ROLL")},
+        "orientation of the camera in the aircraft; 0 0 0 (default) looks straight down "
         "with the top of the image forward",
-    },
-    "--not-before": {
-        "metavar": "DATE|SERIAL",
-        "help": "refuse a map signed before this date (2026-05-31, UTC) or with a lower serial "
-        "number",
-    },
-    "--ortho": {
-        "action": "extend",
-        "nargs": "+",
-        "required": True,
-        "type": Path,
-        "metavar": "FILE",
-        "help": "orthophoto (any georeferenced raster that GDAL reads), or a folder of them, "
+    ),
+    "--not-before": _option(
+        {"metavar": "DATE|SERIAL"},
+        "refuse a map signed before this date (2026-05-31, UTC) or with a lower serial number",
+    ),
+    "--ortho": _option(
+        FILE | {"action": "extend", "nargs": "+", "required": True},
+        "orthophoto (any georeferenced raster that GDAL reads), or a folder of them, "
         "where newer files take precedence; may be repeated, earlier ones take precedence",
-    },
-    "--overlap": {
-        "type": float,
-        "metavar": "FRACTION",
-        "help": "overlap of neighbouring tiles, as a fraction of their width (default 0.875)",
-    },
-    "--prior": {
-        "choices": ("telemetry", "none"),
-        "default": "telemetry",
-        "help": "telemetry: search around the prior position, if any (default); none: search the "
-        "whole map",
-    },
-    "--radius-m": {
-        "type": float,
-        "default": 15.0,
-        "help": "largest error of a correct fix (default 15)",
-    },
-    "--require-signed": {
-        "type": Path,
-        "metavar": "public.pem",
-        "help": "refuse a map that was not signed with this key (see `orthonav sign`)",
-    },
-    "--risk": {
-        "type": within(*RISKS),
-        "default": DEFAULT_RISK,
-        "metavar": "P",
-        "help": "probability with which the error exceeds the protection level "
-        f"(default {DEFAULT_RISK:g})",
-    },
-    "--route": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan "
+    ),
+    "--overlap": _option(
+        NUMBER | {"metavar": "FRACTION"},
+        "overlap of neighbouring tiles, as a fraction of their width (default 0.875)",
+    ),
+    "--prior": _option(
+        {"choices": ("telemetry", "none"), "default": "telemetry"},
+        "telemetry: search around the prior position, if any (default); none: search the whole map",
+    ),
+    "--radius-m": _option(
+        NUMBER | {"default": 15.0}, "largest error of a correct fix (default 15)"
+    ),
+    "--require-signed": _option(
+        {"type": Path, "metavar": "public.pem"},
+        "refuse a map that was not signed with this key (see `orthonav sign`)",
+    ),
+    "--risk": _option(
+        {"type": within(*RISKS), "default": DEFAULT_RISK, "metavar": "P"},
+        f"probability with which the error exceeds the protection level (default {DEFAULT_RISK:g})",
+    ),
+    "--route": _option(
+        FILE,
+        "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan "
         "or a waypoint file (FILE#NAME or FILE#NUMBER selects one of several)",
-    },
-    "--seed": {"type": int, "help": "seed of all random draws"},
-    "--speed-mps": {"type": float, "help": "ground speed"},
-    "--threads": {
-        "type": within(1, 64, int),
-        "default": 1,
-        "metavar": "N",
-        "help": "threads that search for one view (default 1); positions do not depend on them",
-    },
-    "--tile-px": {"type": int, "help": "width of a tile (default 256, or suited to the view)"},
-    "--workers": {"type": int, "help": "number of parallel workers (default: one per core)"},
+    ),
+    "--seed": _option(WHOLE, "seed of all random draws"),
+    "--speed-mps": _option(NUMBER, "ground speed"),
+    "--threads": _option(
+        {"type": within(1, 64, int), "default": 1, "metavar": "N"},
+        "threads that search for one view (default 1); positions do not depend on them",
+    ),
+    "--tile-px": _option(WHOLE, "width of a tile (default 256, or suited to the view)"),
+    "--workers": _option(WHOLE, "number of parallel workers (default: one per core)"),
 }
 """Options of several commands, with what `argparse` needs to know."""
 

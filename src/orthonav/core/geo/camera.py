@@ -321,7 +321,9 @@ def distort(camera: Camera, xy: Array) -> Array:
         return xy
     if camera.model == "fisheye":
         return _fisheye_distort(camera.distortion, xy)
-    return _brown_distort(camera.distortion, xy)
+    out = _brown(camera.distortion, xy)
+    out[(xy**2).sum(axis=-1) >= _fold_r2(camera.distortion)] = np.nan
+    return out
 
 
 def undistort(camera: Camera, xy: Array) -> Array:
@@ -347,14 +349,8 @@ def footprint_en_m(
     """Ground positions (4, 2), m from below the camera, of the corners clockwise from top left.
 
     Without distortion. Raises `CameraError` where a corner looks at or above the horizon."""
-    corners = np.array(
-        [
-            [0, 0, 1.0],
-            [camera.width_px, 0, 1],
-            [camera.width_px, camera.height_px, 1],
-            [0, camera.height_px, 1],
-        ]
-    )
+    wide, high = camera.width_px, camera.height_px
+    corners = np.array([[0, 0, 1.0], [wide, 0, 1], [wide, high, 1], [0, high, 1]])
     rays = corners @ np.linalg.inv(camera.matrix).T
     enu = rays @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
     if (enu[:, 2] >= -1e-9).any():
@@ -378,13 +374,6 @@ def camera_rays(camera: Camera, px: Array) -> Array:
     return np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
 
 
-def _brown_distort(distortion: tuple[float, ...], xy: Array) -> Array:
-    k1, k2, _, _, k3 = (*distortion, 0.0)[:5]
-    out, r2 = _brown(distortion, xy), (xy**2).sum(axis=-1)
-    out[r2 >= _fold_r2(k1, k2, k3)] = np.nan
-    return out
-
-
 def _brown_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
     """By Newton's method; NaN if there is none."""
     k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
@@ -401,16 +390,11 @@ def _brown_undistort(distortion: tuple[float, ...], xy: Array) -> Array:
             error = _brown(distortion, ideal) - xy
             if np.abs(error).max(initial=0.0) < 1e-14:
                 break  # NaN never converges: points beyond the lens take all steps
-            step = np.stack(
-                [
-                    dyy * error[..., 0] - dxy * error[..., 1],
-                    dxx * error[..., 1] - dxy * error[..., 0],
-                ],
-                axis=-1,
-            )
+            off_x, off_y = error[..., 0], error[..., 1]
+            step = np.stack([dyy * off_x - dxy * off_y, dxx * off_y - dxy * off_x], axis=-1)
             ideal = ideal - step / (dxx * dyy - dxy * dxy)[..., None]
         found = np.abs(_brown(distortion, ideal) - xy).max(axis=-1) < 1e-9
-        found &= (ideal**2).sum(axis=-1) < _fold_r2(k1, k2, k3)
+        found &= (ideal**2).sum(axis=-1) < _fold_r2(distortion)
     ideal[~found] = np.nan
     return ideal
 
@@ -449,18 +433,15 @@ def _brown(distortion: tuple[float, ...], xy: Array) -> Array:
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    seen_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    seen_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([seen_x, seen_y], axis=-1)
 
 
 @lru_cache(maxsize=16)
-def _fold_r2(k1: float, k2: float, k3: float) -> float:
+def _fold_r2(distortion: tuple[float, ...]) -> float:
     """Squared radius at which the radial model stops growing, or infinity."""
+    k1, k2, _, _, k3 = (*distortion, 0.0)[:5]
     inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # of 1 / r2: the leading 1 keeps it sound
     largest = inverse.real[np.abs(inverse.imag) < 1e-9].max(initial=0.0)
     return float(1 / largest) if largest > 1e-12 else math.inf

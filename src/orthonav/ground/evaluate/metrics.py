@@ -7,10 +7,12 @@ criterion, Lowe's ratio. A share is 0 to 1, and NaN where it is not defined.
 import logging
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import TypeGuard
+from typing import Any
 
 import numpy as np
 
@@ -224,7 +226,7 @@ def evaluate(
 
     `alert_limit_m`: largest error that the mission allows, NaN: none; `risk`: of protection levels.
     Raises `MissingFileError`, `FlightError`, also where latitudes and longitudes of the file seem
-    to be swapped, or `ValueError` for a radius that is not positive.
+    to be swapped, or `ValueError` for a radius that is not positive or a risk that is not 0 to 1.
     """
     known, results = read_truth(Path(truth)), read_results(Path(fixes))
     check_truth(known, results, None, Path(truth))
@@ -296,8 +298,11 @@ def compare(
 
     `local` is the plane of the positions, by default centred on the first true position; `risk` is
     that of the protection levels. A true position that is not finite counts as missing. Raises
-    `FlightError` where no result has a truth or a frame has two results.
+    `FlightError` where no result has a truth or a frame has two results, and `ValueError` for a
+    risk that is not 0 to 1.
     """
+    if not 0.0 <= risk <= 1.0:  # also where no fix has a level
+        raise ValueError(f"a risk is a probability, 0 to 1, got {risk}")
     known = {name: at for name, at in truth.items() if all(map(math.isfinite, at))}
     twice = [name for name, n in Counter(result.frame for result in results).items() if n > 1]
     if twice:
@@ -319,7 +324,11 @@ def compare(
     outcomes = [result.outcome for result in matched]
     truth_en_m = places_en_m(local, [known[result.frame] for result in matched])
     fix_en_m = places_en_m(local, [place_of(outcome) for outcome in outcomes])
-    radii_m = [outcome.radius_m if isinstance(outcome, Fix) else math.nan for outcome in outcomes]
+
+    def stated(value: Callable[[Fix], Any], unknown: Any = math.nan) -> FloatArray:
+        """(N, ..), `unknown` without a fix."""
+        return frozen([value(each) if isinstance(each, Fix) else unknown for each in outcomes])
+
     return Comparison(
         lat_deg=local.lat_deg,
         lon_deg=local.lon_deg,
@@ -328,15 +337,13 @@ def compare(
         truth_en_m=truth_en_m,
         fix_en_m=fix_en_m,
         errors_m=frozen(np.hypot(*(fix_en_m - truth_en_m).T)),
-        cov_en_m2=frozen(np.array([_covariance(outcome) for outcome in outcomes])),
-        own_radius_m=frozen(radii_m),
+        cov_en_m2=stated(attrgetter("cov_en_m2"), np.full((2, 2), math.nan)),
+        own_radius_m=stated(attrgetter("radius_m")),
         confident=np.array([result.is_confident for result in matched], dtype=np.bool_),
-        criteria={n: frozen([_criterion(each, n) for each in outcomes]) for n, _ in CRITERIA},
+        criteria={name: stated(partial(_criterion, name=name)) for name, _ in CRITERIA},
         reasons=tuple(reason_of(outcome) for outcome in outcomes),
         latency_ms=frozen([result.latency_ms for result in matched]),
-        place_probability=frozen(
-            [each.place_probability if isinstance(each, Fix) else math.nan for each in outcomes]
-        ),
+        place_probability=stated(attrgetter("place_probability")),
         protection_levels_m=protection_levels_m(matched, risk),
         risk=risk,
         followed=frozen([*(np.diff(before) == 0), 1.0 if is_whole else math.nan]),
@@ -349,14 +356,15 @@ def protection_levels_m(results: Sequence[ViewResult], risk: float | None = None
     """(N,) m, infinite where the place is too uncertain, NaN without a fix; `risk`: None: that of
     each result."""
     levels_m = np.full(len(results), math.nan)
-    risks = np.array([each.risk if risk is None else risk for each in results])
-    outcomes = [each.outcome for each in results]
-    is_fix = np.array([_is_fix(each) for each in outcomes], np.bool_)
-    place = np.array([each.right_probability if _is_fix(each) else 0.0 for each in outcomes])
-    covs = np.array([_covariance(each) for each in outcomes]).reshape(-1, 2, 2)
-    for each in np.unique(risks):
-        chosen = is_fix & (risks == each)
-        levels_m[chosen] = records.protection_levels_m(place[chosen], covs[chosen], float(each))
+    by_risk: dict[float, list[tuple[int, Fix]]] = {}
+    for i, result in enumerate(results):
+        if isinstance(result.outcome, Fix):
+            own = result.risk if risk is None else risk
+            by_risk.setdefault(own, []).append((i, result.outcome))
+    for own, fixes in by_risk.items():
+        place = np.array([fix.right_probability for _, fix in fixes])
+        covs = np.array([fix.cov_en_m2 for _, fix in fixes])
+        levels_m[[i for i, _ in fixes]] = records.protection_levels_m(place, covs, own)
     return frozen(levels_m)
 
 
@@ -366,31 +374,23 @@ def measure(
     """All metrics of `comparison`; `radius_m` defines right fixes and joins `RADII_M`;
     `alert_limit_m`: largest error that the mission allows, NaN: none.
 
-    Raises `ValueError` for a radius that is not a positive finite number, and for a confidence that
-    is not 0 to 1.
+    Raises `ValueError` for a radius that is not a positive finite number.
     """
     if not 0.0 < radius_m < math.inf:
         raise ValueError(f"a radius must be positive and finite, got {radius_m} m")
-    radii = sorted({float(radius_m), *RADII_M})
+    radius_m = float(radius_m)
+    truth_en_m, fix_en_m = comparison.truth_en_m, comparison.fix_en_m
     errors_m, own_radius_m = comparison.errors_m, comparison.own_radius_m
-    errors_en_m = comparison.fix_en_m - comparison.truth_en_m
     of_fixes_m = errors_m[np.isfinite(errors_m)]
-    of_confident_m = errors_m[comparison.confident & np.isfinite(errors_m)]
-    n_confident = of_confident_m.size
-    wrong_above_m, n_views = float(max(FAR_M, radius_m)), comparison.n_views
+    n_confident = int(np.count_nonzero(comparison.confident & np.isfinite(errors_m)))
+    wrong_above_m, n_views = max(FAR_M, radius_m), comparison.n_views
     n_wrong = int(np.count_nonzero(comparison.confident_wrong(wrong_above_m)))
-    reasons = Counter(reason for reason in comparison.reasons if reason)
-    if comparison.n_without_result:
-        reasons["no_result"] += comparison.n_without_result
-    standard, of_confident = (
-        standard_figures(comparison.truth_en_m, fix_en_m)
-        for fix_en_m in (
-            comparison.fix_en_m,
-            np.where(comparison.confident[:, None], comparison.fix_en_m, np.nan),
-        )
-    )
+    reasons = Counter(filter(None, comparison.reasons))
+    reasons += Counter(no_result=comparison.n_without_result)
+    radii = sorted({radius_m, *RADII_M})
+    confident_en_m = np.where(comparison.confident[:, None], fix_en_m, np.nan)
     return Metrics(
-        radius_m=float(radius_m),
+        radius_m=radius_m,
         n_views=n_views,
         n_fixes=of_fixes_m.size,
         n_without_truth=comparison.n_without_truth,
@@ -411,14 +411,12 @@ def measure(
         criteria=tuple(
             _criterion_row(comparison, name, threshold, radius_m) for name, threshold in CRITERIA
         ),
-        calibration=calibrate(
-            comparison.criteria["confidence"], errors_m, own_radius_m, float(radius_m)
-        ),
+        calibration=calibrate(comparison.criteria["confidence"], errors_m, own_radius_m, radius_m),
         consistency=check_covariance(
-            errors_en_m, comparison.cov_en_m2, own_radius_m, float(radius_m)
+            fix_en_m - truth_en_m, comparison.cov_en_m2, own_radius_m, radius_m
         ),
-        standard=standard,
-        of_confident=of_confident,
+        standard=standard_figures(truth_en_m, fix_en_m),
+        of_confident=standard_figures(truth_en_m, confident_en_m),
         integrity=measure_integrity(comparison, alert_limit_m),
     )
 
@@ -430,13 +428,9 @@ def measure_integrity(comparison: Comparison, alert_limit_m: float) -> Integrity
     levels_m, errors_m = comparison.protection_levels_m, comparison.errors_m
     finite = np.isfinite(levels_m) & np.isfinite(errors_m)
     available = finite & (levels_m <= alert_limit_m)
-    n_levels, n_beyond, n_available, n_false = (
-        int(np.count_nonzero(each))
-        for each in (
-            *(finite, finite & (errors_m > levels_m)),
-            *(available, available & (errors_m > alert_limit_m)),
-        )
-    )
+    n_levels, n_available = int(finite.sum()), int(available.sum())
+    n_beyond = int((errors_m > levels_m)[finite].sum())
+    n_false = int((errors_m > alert_limit_m)[available].sum())
     return Integrity(
         risk=comparison.risk,
         n_levels=n_levels,
@@ -464,12 +458,11 @@ def _criterion_row(
     comparison: Comparison, name: str, threshold: float, radius_m: float
 ) -> CriterionRow:
     values, errors_m = comparison.criteria[name], comparison.errors_m
-    known = bool(np.any(~np.isnan(values)))
-    accepted = values >= threshold  # NaN is never accepted
-    n_accepted = int(np.count_nonzero(accepted))
-    n_right = int(np.count_nonzero(errors_m[accepted] <= radius_m))
-    n_far = int(np.count_nonzero(errors_m[accepted] > FAR_M))
-    n_all_right = int(np.count_nonzero(errors_m <= radius_m))
+    known = not np.isnan(values).all()
+    accepted_m = errors_m[values >= threshold]  # NaN is never accepted
+    n_accepted = accepted_m.size
+    n_right, n_far = int((accepted_m <= radius_m).sum()), int((accepted_m > FAR_M).sum())
+    n_all_right = int((errors_m <= radius_m).sum())
     return CriterionRow(
         name=name,
         threshold=threshold,
@@ -504,33 +497,17 @@ def _longest_without(comparison: Comparison, flags: BoolArray) -> Longest:
     return longest(without, seconds_s, path_so_far_m(comparison.truth_en_m))
 
 
-def _covariance(outcome: Fix | NoFix) -> FloatArray:
-    """(2, 2) m2; NaN without one, and for one of another shape."""
-    stated = np.asarray(outcome.cov_en_m2 if isinstance(outcome, Fix) else math.nan, np.float64)
-    return stated if stated.shape == (2, 2) else np.full((2, 2), np.nan)
-
-
-def _is_fix(outcome: Fix | NoFix) -> TypeGuard[Fix]:
-    return place_of(outcome) is not None
-
-
 def place_of(outcome: Fix | NoFix) -> LatLon | None:
-    if isinstance(outcome, NoFix) or not math.isfinite(outcome.lat_deg + outcome.lon_deg):
-        return None
-    return outcome.lat_deg, outcome.lon_deg
+    return (outcome.lat_deg, outcome.lon_deg) if isinstance(outcome, Fix) else None
 
 
 def reason_of(outcome: Fix | NoFix) -> str:
     """Why there is no position; "" for a fix."""
-    if isinstance(outcome, NoFix):
-        return outcome.reason or "not_said"
-    return "" if _is_fix(outcome) else "not_finite"
+    return "" if isinstance(outcome, Fix) else outcome.reason or "not_said"
 
 
-def _criterion(outcome: Fix | NoFix, name: str) -> float:
-    if not _is_fix(outcome):
-        return math.nan
-    return outcome.confidence if name == "confidence" else outcome.evidence.get(name, math.nan)
+def _criterion(fix: Fix, name: str) -> float:
+    return fix.confidence if name == "confidence" else fix.evidence.get(name, math.nan)
 
 
 def places_en_m(local: LocalFrame, places: Sequence[LatLon | None]) -> FloatArray:

@@ -5,7 +5,7 @@ track differ in colour and in mark.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,26 +98,19 @@ def _cards(metrics: Metrics) -> tuple[tuple[str, ...], ...]:
     views = f"{metrics.n_confident} of {metrics.n_views} views have a confident fix"
     bound = f" ({wrong_bound_text(metrics)})" * (metrics.n_confident > 0)
     wrong = f"{metrics.n_confident_wrong} of {metrics.n_confident}"
-    cep = [
-        (
-            measure_text(mine, " m"),
-            f"{name} of confident fixes; {measure_text(all_, ' m')} of all fixes",
-        )
-        for name, mine, all_ in (
-            ("CEP50", of_confident.cep50_m, of_all.cep50_m),
-            ("CEP95", of_confident.cep95_m, of_all.cep95_m),
-        )
-    ]
+    kind = "bad" * (metrics.n_confident_wrong > 0)
+
+    def cep(name: str, mine_m: float, all_m: float) -> tuple[str, str]:
+        said = f"{name} of confident fixes; {measure_text(all_m, ' m')} of all fixes"
+        return measure_text(mine_m, " m"), said
+
     nees = "NEES, mean of correct fixes: 2 expected, more where covariances are too small"
     gap = f"longest gap without a confident fix, {measure_text(metrics.gap.path_m, ' m')}"
     return (
         (percent_text(metrics.availability), f"{views} (95 % interval {low:.0f} to {high:.0f} %)"),
-        (
-            wrong,
-            f"false fixes among confident fixes{bound}",
-            "bad" * (metrics.n_confident_wrong > 0),
-        ),
-        *cep,
+        (wrong, f"false fixes among confident fixes{bound}", kind),
+        cep("CEP50", of_confident.cep50_m, of_all.cep50_m),
+        cep("CEP95", of_confident.cep95_m, of_all.cep95_m),
         (plain_text(metrics.consistency.nees_mean), nees),
         (measure_text(metrics.gap.seconds_s, " s"), gap),
     )
@@ -127,20 +120,17 @@ def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
     metrics = flight.metrics
     return {
         "name": flight.name,
+        "metrics": metrics,
         "verdict": verdict(metrics),
         "verdict_kind": "bad" if metrics.n_confident_wrong else "good" * (metrics.n_confident > 0),
         "cards": _cards(metrics),
-        "n_without_truth": metrics.n_without_truth,
-        "n_without_result": metrics.n_without_result,
-        "n_fixes": metrics.n_fixes,
         "view_command": flight.view_command,
         "figures": [
             Figure(f"{prefix}{name}", f"{flight.name}: {alt}", caption, drawing)
             for name, alt, caption, drawing in _figures(flight)
         ],
         "track": track_rows(flight),
-        "worst": _worst(flight.comparison, metrics),
-        "reasons": [(reason, str(count)) for reason, count in metrics.reasons.items()],
+        "worst": list(_worst(flight.comparison, metrics)),
         "standard": standard_table(metrics),
         "criteria": criteria_table(metrics),
         "confidence": confidence_text(metrics),
@@ -149,23 +139,19 @@ def _section(flight: FlightReport, prefix: str) -> dict[str, Any]:
     }
 
 
-def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = []
+def _worst(comparison: Comparison, metrics: Metrics) -> Iterator[tuple[str, ...]]:
     wrong = comparison.confident_wrong(metrics.wrong_above_m)
     for i in worst_views(comparison, 10, metrics.wrong_above_m):
         east_m, north_m = comparison.fix_en_m[i] - comparison.truth_en_m[i]
         confidence = plain_text(comparison.criteria["confidence"][i])
-        rows.append(
-            (
-                comparison.frames[i],
-                f"{comparison.time_ns[i] / 1e9:.2f}",
-                measure_text(comparison.errors_m[i]) + (" ✗" if wrong[i] else ""),
-                f"{east_m:+.1f}",
-                f"{north_m:+.1f}",
-                confidence + ("" if comparison.confident[i] else ", low confidence"),
-            )
+        yield (
+            comparison.frames[i],
+            f"{comparison.time_ns[i] / 1e9:.2f}",
+            measure_text(comparison.errors_m[i]) + (" ✗" if wrong[i] else ""),
+            f"{east_m:+.1f}",
+            f"{north_m:+.1f}",
+            confidence + ("" if comparison.confident[i] else ", low confidence"),
         )
-    return rows
 
 
 def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
@@ -174,29 +160,18 @@ def _figures(flight: FlightReport) -> list[tuple[str, str, str, Drawing]]:
     over_time = "Error over time; shaded where there is no fix."
     if track is not None:
         over_time += " Shaded below: 1 sigma and the 95 % bound that the covariance states."
+    placed = "Map, north up: each fix is joined to its true position."
     reliability = (
         "Fraction of correct fixes over their confidence, with 95 % intervals (Wilson); dashed: "
         "ideal; orange: the difference. Below: fixes per bin."
     )
+    diagram = f"reliability diagram of confidence, ECE {plain_text(metrics.calibration.ece)}"
+    track_map = map_picture(comparison, metrics.radius_m, track, flight.background)
+    errors = over_time_picture(comparison, metrics.radius_m, track)
     figures = [
-        (
-            "map",
-            "map of the fixes",
-            "Map, north up: each fix is joined to its true position.",
-            map_picture(comparison, metrics.radius_m, track, flight.background),
-        ),
-        (
-            "error-over-time",
-            "error of each view over time",
-            over_time,
-            over_time_picture(comparison, metrics.radius_m, track),
-        ),
-        (
-            "reliability",
-            f"reliability diagram of confidence, ECE {plain_text(metrics.calibration.ece)}",
-            reliability,
-            reliability_picture(metrics.calibration),
-        ),
+        ("map", "map of the fixes", placed, track_map),
+        ("error-over-time", "error of each view over time", over_time, errors),
+        ("reliability", diagram, reliability, reliability_picture(metrics.calibration)),
     ]
     if metrics.integrity is not None:
         limit_m = metrics.integrity.alert_limit_m

@@ -92,17 +92,14 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def seconds_since_first(times_ns: Sequence[float]) -> FloatArray:
-    """(N,) seconds since the first view; all NaN where times are unknown, fall or stand still.
+def seconds_since_first(times_ns: Sequence[int]) -> FloatArray:
+    """(N,) seconds since the first view; all NaN where times fall or stand still.
 
     Nanoseconds since 1970 do not fit a float64: they are subtracted before they become one.
     """
-    unknown = np.full(len(times_ns), math.nan)
-    if not times_ns or not all(math.isfinite(time) for time in times_ns):
-        return unknown
     seconds = np.array([(time - times_ns[0]) / 1e9 for time in times_ns], dtype=np.float64)
-    rises = bool((np.diff(seconds) >= 0.0).all()) and seconds[-1] > 0.0
-    return seconds if rises or len(seconds) == 1 else unknown
+    rises = (np.diff(seconds) >= 0.0).all() and (seconds > 0.0)[-1:].all()
+    return seconds if rises or len(seconds) == 1 else np.full(len(seconds), math.nan)
 
 
 def path_so_far_m(truth_en_m: FloatArray) -> FloatArray:
@@ -276,13 +273,10 @@ def calibrate(
     AAAI 2015; Guo et al., "On calibration of modern neural networks", ICML 2017, arXiv 1706.04599).
     A bin includes its lower edge, not its upper, so that the last bin is what a criterion of 0.9
     accepts; Guo et al. do the reverse. The Brier score is the mean of (confidence - right)^2. Views
-    without a confidence or an error are left out. Raises `ValueError` for a confidence that is not
-    0 to 1.
+    without a confidence or an error are left out.
     """
     known = ~np.isnan(confidence) & np.isfinite(errors_m)
     stated = confidence[known]
-    if not np.all((stated >= 0.0) & (stated <= 1.0)):
-        raise ValueError(f"a confidence must be 0 to 1, got {stated.min():g} to {stated.max():g}")
     right = errors_m[known] <= stated_radius_m(own_radius_m[known], radius_m)
     edges = np.arange(N_BINS + 1) / N_BINS
     place = np.searchsorted(edges[1:-1], stated, side="right")

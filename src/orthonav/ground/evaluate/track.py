@@ -114,8 +114,6 @@ def measure_track(
     if not any(result.state for result in results):
         return None
     number = {result.frame: i for i, result in enumerate(results)}
-    if not set(comparison.frames) <= set(number):
-        raise ValueError("the comparison has views that are not among the results")
     rows = np.array([number[frame] for frame in comparison.frames], dtype=np.intp)
     states = np.array([result.state or "" for result in results])
     seconds_s = seconds_since_first([result.time_ns for result in results])

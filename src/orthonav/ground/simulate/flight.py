@@ -198,9 +198,9 @@ def simulate_flight(
         gsd_m=gsd_m,
     )
     with replacing_folder(request.out) as folder, raster:
-        coverage = Coverage(mosaic, area)
-        poses = list(_poses(request, area, agl_m, coverage))
-        mirror_en_m = coverage.box_en_m() if request.in_perspective else None
+        scene = _Scene(request, area, agl_m, Coverage(mosaic, area))
+        poses = list(scene.poses())
+        mirror_en_m = scene.coverage.box_en_m() if request.in_perspective else None
         ground = GroundImagery(raster, west, north, gsd_m, mirror_en_m)
         surface = None
         if request.in_perspective:
@@ -214,10 +214,12 @@ def simulate_flight(
         digits = max(4, len(str(len(poses))))
         for number, pose in enumerate(poses):
             rng = np.random.default_rng([request.seed, 1, number])
-            image = _picture(request, ground, surface, clouds, number, pose, rng)
+            image = _picture(request.camera, ground, surface, pose)
+            if clouds is not None:
+                image = clouds(number, request.camera, pose.attitude, pose.position_en_m, image)
+            image = degraded(image, request.effects, rng)
             lat, lon = area.frame.latlon_from_en(pose.position_en_m)
-            telemetry = _telemetry(request, area, pose, rng)
-            quality = request.effects.jpeg_quality
+            telemetry, quality = scene.telemetry(pose, rng), request.effects.jpeg_quality
             name = f"{number + 1:0{digits}d}.jpg"
             writer.add(name, image, telemetry, (float(lat), float(lon)), quality)
             if progress is not None:
@@ -269,82 +271,132 @@ def _require_above(surface: Raster, poses: Sequence[_Pose]) -> None:
             )
 
 
-def _sees_ground(coverage: Coverage, request: SimulateRequest, pose: _Pose) -> bool:
-    if request.camera_pitch_deg > 0:
-        angles = pose.yaw_deg, pose.pitch_deg, pose.roll_deg
-        outline = near_ground_en_m(request.camera, angles, pose.agl_m)
-        return outline is not None and coverage.whole(pose.position_en_m + outline)
-    try:
-        return coverage.whole(_corners_en_m(request.camera, pose))
-    except CameraError:
-        return False
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """A requested flight in the plane of its imagery; `agl_m`: height of the first view."""
 
+    request: SimulateRequest
+    area: Area
+    agl_m: float
+    coverage: Coverage
 
-def _poses(
-    request: SimulateRequest, area: Area, agl_m: float, coverage: Coverage
-) -> Iterator[_Pose]:
-    if request.route is not None:
-        yield from _route_poses(request, request.route, area, agl_m, coverage)
-        return
-    west, south, east, north = area.extent_en_m
-    count, seed, errors = request.random or 0, request.seed, request.errors
-    mount_deg = errors.mount_deg(seed)
-    horizon = np.random.default_rng([seed, 7]).normal(0, 1, (count, 2)) * errors.horizon_std_deg
-    for number in range(count):
-        tilt_deg = horizon[number], mount_deg
-        rng = np.random.default_rng([request.seed, 0, number])
-        for _ in range(400):  # suffices if imagery covers 2 % of random positions
-            place = rng.uniform([west, south], [east, north])
-            yaw_deg = rng.uniform(0, 360)
-            pose = _tilted(request, rng, place, yaw_deg, agl_m, number * 1.0, tilt_deg)
-            if _sees_ground(coverage, request, pose):
-                if request.terrain is not None:
-                    below_m = ground_below_m(request.terrain, area.frame, place[None])
-                    pose = replace(pose, amsl_m=pose.agl_m + float(below_m[0]))
-                yield pose
-                break
-        else:
-            wide, high = np.ptp(footprint_en_m(request.camera, 0, 0, 0, agl_m), axis=0)
-            raise AreaError(
-                f"found no position where a view of {wide:.0f} x {high:.0f} m lies within the "
-                f"imagery of {east - west:.0f} x {north - south:.0f} m; fly lower (--agl-m)"
-            )
+    def poses(self) -> Iterator[_Pose]:
+        route = self.request.route
+        return self._random_poses() if route is None else self._route_poses(route)
 
+    def _random_poses(self) -> Iterator[_Pose]:
+        request, errors = self.request, self.request.errors
+        west, south, east, north = self.area.extent_en_m
+        count, rng = request.random or 0, np.random.default_rng([request.seed, 7])
+        horizon = rng.normal(0, 1, (count, 2)) * errors.horizon_std_deg
+        for number in range(count):
+            rng = np.random.default_rng([request.seed, 0, number])
+            for _ in range(400):  # suffices if imagery covers 2 % of random positions
+                place = rng.uniform([west, south], [east, north])
+                yaw_deg = rng.uniform(0, 360)
+                pose = self._pose(rng, place, yaw_deg, self.agl_m, float(number), horizon[number])
+                if self._sees_ground(pose):
+                    break
+            else:
+                wide, high = np.ptp(footprint_en_m(request.camera, 0, 0, 0, self.agl_m), axis=0)
+                raise AreaError(
+                    f"found no position where a view of {wide:.0f} x {high:.0f} m lies within the "
+                    f"imagery of {east - west:.0f} x {north - south:.0f} m; fly lower (--agl-m)"
+                )
+            if request.terrain is not None:
+                below_m = ground_below_m(request.terrain, self.area.frame, place[None])
+                pose = replace(pose, amsl_m=pose.agl_m + float(below_m[0]))
+            yield pose
 
-def _route_poses(
-    request: SimulateRequest, route: Route, area: Area, agl_m: float, coverage: Coverage
-) -> Iterator[_Pose]:
-    path = _path(request, route.points_en_m(area.frame))
-    velocities = _reported_velocities(request, path)
-    mount_deg = request.errors.mount_deg(request.seed)
-    tilt_rng = np.random.default_rng([request.seed, 7])
-    horizon = horizon_errors(request.errors.horizon_std_deg, path.times_s, tilt_rng)
-    views = zip(path.places_en_m, path.headings_deg, strict=True)
-    ground_m = None
-    if request.terrain is not None:
-        ground_m = ground_below_m(request.terrain, area.frame, path.places_en_m)
-    for number, (place, heading) in enumerate(views):
-        rng = np.random.default_rng([request.seed, 0, number])
-        time_s, velocity = float(path.times_s[number]), velocities[number]
-        tilt_deg = horizon[number], mount_deg
-        above_m = agl_m
-        if ground_m is not None:
-            above_m += float(ground_m[0] - ground_m[number])
-        if not above_m >= 1:
-            raise FlightError(
-                f"view {number + 1} of the route is {above_m:.0f} m above the terrain; fly higher "
-                "(--agl-m)"
-            )
-        pose = _tilted(request, rng, place, float(heading), above_m, time_s, tilt_deg, velocity)
-        if ground_m is not None:
-            pose = replace(pose, home_m=agl_m, amsl_m=agl_m + float(ground_m[0]))
-        if not _sees_ground(coverage, request, pose):
-            lat, lon = (float(value) for value in area.frame.latlon_from_en(place))
-            raise AreaError(
-                f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
-                f"does not lie completely within the imagery{_swapped(area, route)}"
-            )
-        yield pose
+    def _route_poses(self, route: Route) -> Iterator[_Pose]:
+        request, errors, frame = self.request, self.request.errors, self.area.frame
+        path = _path(request, route.points_en_m(frame))
+        rng = np.random.default_rng([request.seed, 7])
+        horizon = horizon_errors(errors.horizon_std_deg, path.times_s, rng)
+        reported = None
+        if errors.velocity_drift is not None:
+            rng = np.random.default_rng([request.seed, 4])
+            reported = drifting(path.velocities_en_mps, path.times_s, errors.velocity_drift, rng)
+        ground_m = None
+        if request.terrain is not None:
+            ground_m = ground_below_m(request.terrain, frame, path.places_en_m)
+        for number, place in enumerate(path.places_en_m):
+            rng = np.random.default_rng([request.seed, 0, number])
+            above_m = self.agl_m
+            if ground_m is not None:
+                above_m += float(ground_m[0] - ground_m[number])
+            if not above_m >= 1:
+                raise FlightError(
+                    f"view {number + 1} of the route is {above_m:.0f} m above the terrain; fly "
+                    "higher (--agl-m)"
+                )
+            heading_deg, time_s = float(path.headings_deg[number]), float(path.times_s[number])
+            pose = self._pose(rng, place, heading_deg, above_m, time_s, horizon[number])
+            if reported is not None:
+                east_mps, north_mps = (round(float(each), 4) for each in reported[number])
+                pose = replace(pose, reported_en_mps=(east_mps, north_mps))
+            if ground_m is not None:
+                amsl_m = self.agl_m + float(ground_m[0])
+                pose = replace(pose, home_m=self.agl_m, amsl_m=amsl_m)
+            if not self._sees_ground(pose):
+                lat, lon = (float(value) for value in frame.latlon_from_en(place))
+                raise AreaError(
+                    f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
+                    f"does not lie completely within the imagery{_swapped(self.area, route)}"
+                )
+            yield pose
+
+    def _pose(
+        self,
+        rng: np.random.Generator,
+        place: Array,
+        yaw_deg: float,
+        agl_m: float,
+        time_s: float,
+        horizon_deg: Array,
+    ) -> _Pose:
+        """A pose at a place; `horizon_deg`: unreported pitch and roll (2,) of the horizon."""
+        request = self.request
+        tilt = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * request.errors.attitude_std_deg
+        reported = yaw_deg, request.camera_pitch_deg + float(tilt[0]), float(tilt[1])
+        true = camera_attitude(reported, horizon_deg, request.errors.mount_deg(request.seed))
+        return _Pose(place, *true, agl_m, time_s, reported)
+
+    def _sees_ground(self, pose: _Pose) -> bool:
+        camera, angles_deg = self.request.camera, pose.attitude[:3]
+        if self.request.camera_pitch_deg > 0:
+            outline = near_ground_en_m(camera, angles_deg, pose.agl_m)
+            return outline is not None and self.coverage.whole(pose.position_en_m + outline)
+        try:
+            return self.coverage.whole(_corners_en_m(camera, pose))
+        except CameraError:
+            return False
+
+    def telemetry(self, pose: _Pose, rng: np.random.Generator) -> Telemetry:
+        """What is reported of the pose, with its errors."""
+        errors, height = self.request.errors, 1 + self.request.errors.agl_bias
+        yaw_deg, pitch_deg, roll_deg = pose.reported_deg
+        yaw_deg += errors.yaw_bias_deg
+        prior = None
+        if errors.prior_std_m is not None:
+            place = pose.position_en_m + rng.normal(0, errors.prior_std_m, 2)
+            lat, lon = self.area.frame.latlon_from_en(place)
+            prior = Prior(float(lat), float(lon), errors.prior_std_m)
+        telemetry = Telemetry(
+            time_ns=round(pose.time_s * 1e9),
+            yaw_deg=round((yaw_deg + rng.normal(0, 1) * errors.yaw_std_deg) % 360, 3),
+            pitch_deg=round(pitch_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
+            roll_deg=round(roll_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
+            agl_m=round(pose.agl_m * max(0.05, height + rng.normal(0, 1) * errors.agl_std), 3),
+            yaw_std_deg=errors.yaw_std_deg or None,
+            agl_std_m=errors.agl_std * pose.agl_m or None,
+            tilt_std_deg=errors.reported_tilt_std_deg,
+            prior=prior,
+            vel_en_mps=pose.reported_en_mps,
+        )
+        if pose.amsl_m is None:
+            return telemetry
+        return reported_heights(telemetry, pose.agl_m, pose.home_m, pose.amsl_m)
 
 
 def _swapped(area: Area, route: Route) -> str:
@@ -370,86 +422,17 @@ def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
     return steady_path(line, spacing_m, airspeed_mps)
 
 
-def _reported_velocities(
-    request: SimulateRequest, path: FlownPath
-) -> list[tuple[float, float] | None]:
-    drift = request.errors.velocity_drift
-    if drift is None:
-        return [None] * len(path.places_en_m)
-    rng = np.random.default_rng([request.seed, 4])
-    reported = drifting(path.velocities_en_mps, path.times_s, drift, rng)
-    return [(round(float(east), 4), round(float(north), 4)) for east, north in reported]
-
-
-def _tilted(
-    request: SimulateRequest,
-    rng: np.random.Generator,
-    place: Array,
-    yaw_deg: float,
-    agl_m: float,
-    time_s: float,
-    unreported_deg: tuple[Array, Array],
-    reported_en_mps: tuple[float, float] | None = None,
-) -> _Pose:
-    """A pose at a place; `unreported_deg`: pitch and roll (2,) of horizon and of mount."""
-    tilt = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * request.errors.attitude_std_deg
-    pitch_deg = request.camera_pitch_deg + float(tilt[0])
-    reported = (float(yaw_deg), pitch_deg, float(tilt[1]))
-    true = camera_attitude(reported, *unreported_deg)
-    return _Pose(place, *true, agl_m, time_s, reported, reported_en_mps)
-
-
 def _corners_en_m(camera: Camera, pose: _Pose) -> Array:
-    corners = footprint_en_m(camera, pose.yaw_deg, pose.pitch_deg, pose.roll_deg, pose.agl_m)
-    return pose.position_en_m + corners
+    return pose.position_en_m + footprint_en_m(camera, *pose.attitude)
 
 
 def _picture(
-    request: SimulateRequest,
-    ground: GroundImagery,
-    surface: Raster | None,
-    clouds: Clouds | None,
-    number: int,
-    pose: _Pose,
-    rng: np.random.Generator,
+    camera: Camera, ground: GroundImagery, surface: Raster | None, pose: _Pose
 ) -> NDArray[np.uint8]:
-    camera, attitude = request.camera, pose.attitude
     if surface is not None:
         above_m = pose.agl_m if pose.amsl_m is None else pose.amsl_m
         position = np.array([*pose.position_en_m, above_m])
-        picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m)
-    else:
-        rgb, corner_en_m = ground.window(_corners_en_m(camera, pose))
-        corner = corner_en_m - pose.position_en_m
-        picture = projected(camera, attitude, rgb, corner, ground.gsd_m)
-    if clouds is not None:
-        picture = clouds(number, camera, attitude, pose.position_en_m, picture)
-    return degraded(picture, request.effects, rng)
-
-
-def _telemetry(
-    request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Generator
-) -> Telemetry:
-    errors, height = request.errors, 1 + request.errors.agl_bias
-    yaw_deg, pitch_deg, roll_deg = pose.reported_deg
-    yaw_deg += errors.yaw_bias_deg
-    prior = None
-    if errors.prior_std_m is not None:
-        place = pose.position_en_m + rng.normal(0, errors.prior_std_m, 2)
-        lat, lon = area.frame.latlon_from_en(place)
-        prior = Prior(float(lat), float(lon), errors.prior_std_m)
-    telemetry = Telemetry(
-        time_ns=round(pose.time_s * 1e9),
-        yaw_deg=round((yaw_deg + rng.normal(0, 1) * errors.yaw_std_deg) % 360, 3),
-        pitch_deg=round(pitch_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
-        roll_deg=round(roll_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
-        agl_m=round(pose.agl_m * max(0.05, height + rng.normal(0, 1) * errors.agl_std), 3),
-        yaw_std_deg=errors.yaw_std_deg or None,
-        agl_std_m=errors.agl_std * pose.agl_m or None,
-        tilt_std_deg=errors.reported_tilt_std_deg,
-        prior=prior,
-        vel_en_mps=pose.reported_en_mps,
-    )
-    if pose.amsl_m is None:
-        return telemetry
-    return reported_heights(telemetry, pose.agl_m, pose.home_m, pose.amsl_m)
+        return seen_over(surface, ground, camera, pose.attitude[:3], position, pose.agl_m)
+    rgb, corner_en_m = ground.window(_corners_en_m(camera, pose))
+    corner = corner_en_m - pose.position_en_m
+    return projected(camera, pose.attitude, rgb, corner, ground.gsd_m)

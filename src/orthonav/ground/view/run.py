@@ -141,12 +141,8 @@ class Run:
 
     def views(self) -> dict[str, Any]:
         """All views as columns, and what else was recorded."""
-        recorded = self.recorded
-        return {
-            "columns": self._columns,
-            "health": recorded.health,
-            "problems": recorded.problems,
-        }
+        health, problems = self.recorded.health, self.recorded.problems
+        return {"columns": self._columns, "health": health, "problems": problems}
 
     def detail(self, index: int) -> dict[str, Any]:
         result = self._result(index)
@@ -236,22 +232,18 @@ def columns_of(
     second: Mapping[str, ViewResult] | None = None,
 ) -> dict[str, list[Any]]:
     """The columns of `results`, in order; `second`: of another run, by frame."""
-    fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
     fix_en_m = places_en_m(sheet.frame, [place_of(r.outcome) for r in results])
     truth_en_m = places_en_m(sheet.frame, [truth.get(r.frame) for r in results])
     gnss_en_m = places_en_m(sheet.frame, [gnss_of(r.outcome.evidence) for r in results])
     error_m = np.hypot(*(fix_en_m - truth_en_m).T)
-    radii_m = np.array([math.nan if f is None else f.radius_m for f in fixes], dtype=np.float64)
-    trusted = [
-        f is not None and (r.is_confident or r.state == "tracking")
-        for f, r in zip(fixes, results, strict=True)
-    ]
-    wrong = np.array(trusted, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), radii_m))
-    major_m, minor_m, direction_deg = _ellipses(fixes).T
+    major_m, minor_m, direction_deg = _ellipses(results).T
 
-    def stated(name: str) -> list[float]:
-        return [math.nan if fix is None else getattr(fix, name) for fix in fixes]
+    def stated(name: str) -> Array:
+        """(N,), NaN without a fix."""
+        return np.array([getattr(r.outcome, name, math.nan) for r in results], np.float64)
 
+    trusted = np.array([r.is_confident or r.state == "tracking" for r in results], np.bool_)
+    wrong = trusted & (error_m > np.fmax(max(FAR_M, radius_m), stated("radius_m")))
     columns: dict[str, list[Any]] = {
         "frame": [r.frame for r in results],
         "t": to_plain([(r.time_ns - results[0].time_ns) / 1e9 for r in results], 3),
@@ -267,7 +259,7 @@ def columns_of(
         "gfault": [fault_of(r.outcome.evidence) for r in results],
         # As the fix states it: confidence, its radius (m), protection level (m) at a risk.
         "conf": to_plain(stated("confidence"), 4),
-        "radius": to_plain(radii_m, 1),
+        "radius": to_plain(stated("radius_m"), 1),
         "level": to_plain(protection_levels_m(results), 1),
         "risk": [r.risk for r in results],
         # Axes of one standard deviation (m); angle of the longer one, counter-clockwise from east.
@@ -301,10 +293,10 @@ def _drawn(names: tuple[str, str], en_m: Array, sheet: SheetImagery) -> dict[str
     return {name: to_plain(each, 2) for name, each in zip(names, px.T, strict=True)}
 
 
-def _ellipses(fixes: Sequence[Fix | None]) -> Array:
+def _ellipses(results: Sequence[ViewResult]) -> Array:
     """Axes of one standard deviation, longer first, and the angle of the longer one (N, 3)."""
     unknown = np.full((2, 2), math.nan)
-    found = [error_ellipse(unknown if fix is None else fix.cov_en_m2) for fix in fixes]
+    found = [error_ellipse(getattr(r.outcome, "cov_en_m2", unknown)) for r in results]
     return np.array(found, np.float64).reshape(-1, 3)
 
 

@@ -66,8 +66,8 @@ def load_assets() -> dict[str, Response]:
     own: list[Any] = list(files("orthonav.ground.view").joinpath("static").iterdir())
     own += [files("orthonav.ground.report").joinpath("static", name) for name in SHARED]
     paths = {f"/static/{entry.name}": entry for entry in own}
-    for name, path in zip(LEAFLET, leaflet_files(*LEAFLET), strict=True):
-        paths[f"/leaflet/{name}"] = path
+    leaflet = zip(LEAFLET, leaflet_files(*LEAFLET), strict=True)
+    paths |= {f"/leaflet/{name}": path for name, path in leaflet}
     paths["/"] = paths.pop("/static/index.html")
     return {
         at: Response(HTTPStatus.OK, path.read_bytes(), MEDIA_TYPES[PurePath(path.name).suffix])
@@ -101,19 +101,15 @@ class Pages:
         path = target.partition("?")[0]
         if path in self._assets:
             return self._assets[path]
-        for pattern, made in self._routes.items():
-            match = re.fullmatch(pattern, path)
-            if match is not None:
-                return self._made(made, match.groups())
-        return _error(HTTPStatus.NOT_FOUND, "not found")
-
-    def _made(self, made: Callable[..., Response], parts: tuple[str, ...]) -> Response:
         try:
-            return made(*parts)
+            for pattern, made in self._routes.items():
+                if match := re.fullmatch(pattern, path):
+                    return made(*match.groups())
         except (IndexError, FlightError) as error:
             return _error(HTTPStatus.NOT_FOUND, str(error))
         except (OrthonavError, OSError) as error:
             return _error(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
+        return _error(HTTPStatus.NOT_FOUND, "not found")
 
     def _tile(self, level: str, col: str, row: str) -> Response:
         found = self._run.sheet.tile(int(level), int(col), int(row))
@@ -154,14 +150,10 @@ class Server(ThreadingHTTPServer):
     def server_bind(self) -> None:
         """Bind without the library's look-up of the host name, which may use the network."""
         socketserver.TCPServer.server_bind(self)
-        self.server_name, self.server_port = "127.0.0.1", self.port
-
-    @property
-    def port(self) -> int:
-        return int(self.server_address[1])
+        self.server_name, self.server_port = "127.0.0.1", int(self.server_address[1])
 
     def url(self) -> str:
-        return f"http://127.0.0.1:{self.port}/"
+        return f"http://127.0.0.1:{self.server_port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         log.debug("request of %s", client_address, exc_info=True)

@@ -44,7 +44,7 @@ def ask(server):
     """Function that asks for a path: status, headers (lower case) and body."""
 
     def asked(path, method="GET", **headers):
-        connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=120)
+        connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)
         try:
             fields = {key.replace("_", "-"): value for key, value in headers.items()}
             connection.request(method, path, headers=fields)

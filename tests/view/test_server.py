@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,11 +19,13 @@ from small_run import (
     WRONG,
     name,
     plane,
+    result,
     write_small_map,
 )
 
 from orthonav.core.errors import MissingExtraError, OutputError
-from orthonav.ground.view.run import Run, ViewRequest
+from orthonav.core.flight.gnss import FAULTS
+from orthonav.ground.view.run import Run, ViewRequest, columns_of
 from orthonav.ground.view.server import Pages, Server, is_loopback, load_assets
 
 
@@ -63,6 +66,37 @@ def test_views_come_as_columns(ask):
     assert columns["turn"][0] == pytest.approx(np.degrees(np.arctan2(8, -7)) / 2, abs=0.1)
 
 
+def gnss_view(number, off_en_m=None, fault=0.0, **fix):
+    """A view whose GNSS is so far off its fix."""
+    evidence = {"gnss_fault": fault}
+    if off_en_m is not None:
+        place = FRAME.latlon_from_en(np.add(PLACES_EN_M[0], off_en_m))
+        evidence |= dict(zip(("gnss_lat_deg", "gnss_lon_deg"), map(float, place), strict=True))
+    plain = result(0)
+    outcome = replace(plain.outcome, evidence=evidence, **fix)
+    return replace(plain, frame=f"{number}", outcome=outcome)
+
+
+def test_the_protection_level_is_that_of_the_risk_of_the_run(opened):
+    sure = replace(gnss_view(0, place_probability=0.9999), risk=0.01)
+    columns = columns_of([sure, gnss_view(1)], {}, opened.sheet, 15.0)
+    level_m = sure.outcome.protection_level_m(0.01)
+    assert columns["level"] == [pytest.approx(level_m, abs=0.1), None]  # none at 0.95
+    assert columns["risk"] == [0.01, 1e-3]
+
+
+def test_gnss_is_shown_beside_the_fix(opened):
+    drift = float(FAULTS.index("gnss_drift") + 1)
+    results = [gnss_view(0, (3.0, 4.0)), gnss_view(1, (30.0, 40.0), drift), gnss_view(2)]
+    east_m, north_m = PLACES_EN_M[0]
+    truth = {"0": tuple(map(float, FRAME.latlon_from_en((east_m, north_m + 4.0))))}
+    columns = columns_of(results, truth, opened.sheet, 15.0)
+    assert columns["gdiff"] == [5.0, 50.0, None] and columns["gerr"] == [3.0, None, None]
+    assert columns["gfault"] == ["", "gnss_drift", ""]
+    assert columns["gx"][0] == pytest.approx((east_m + 3.0 - WEST_M) / GSD_M, abs=0.02)
+    assert columns["gy"][0] == pytest.approx((NORTH_M - north_m - 4.0) / GSD_M, abs=0.02)
+
+
 def test_a_tile_is_the_chunk_of_its_place(ask):
     """The pixel of a tile shows the ground at its place, on every level."""
     for level, col, row in ((0, 1, 0), (0, 2, 1), (1, 0, 1), (2, 0, 0)):
@@ -101,9 +135,8 @@ def test_the_detail_says_all(ask):
     found = as_json(ask("/api/views/0"))
     assert found["time_s"] == "100.000000000" and found["evidence"] == {"score": 0.5}
     assert found["telemetry"]["pitch_deg"] == 4.0
-    assert FRAME.en_from_latlon(found["lat_deg"], found["lon_deg"]) == pytest.approx(
-        PLACES_EN_M[0], abs=1e-3
-    )
+    place_en_m = FRAME.en_from_latlon(found["lat_deg"], found["lon_deg"])
+    assert place_en_m == pytest.approx(PLACES_EN_M[0], abs=1e-3)
     nothing = as_json(ask(f"/api/views/{NO_FIX}"))
     assert nothing["reason"] == "blank" and "window" in nothing and "lat_deg" not in nothing
     assert ask(f"/api/views/{NO_FIX}/map-fix.png")[0] == 404
@@ -161,13 +194,13 @@ def test_it_only_reads(ask, method):
 
 def test_it_listens_on_the_loopback_under_its_names(server):
     assert server.server_address[0] == "127.0.0.1"
-    assert server.url() == f"http://127.0.0.1:{server.port}/"
+    assert server.url() == f"http://127.0.0.1:{server.server_port}/"
     assert all(map(is_loopback, ("localhost", "LocalHost:8000", "127.0.0.1:1", "[::1]:2")))
 
 
 def test_a_port_that_is_taken(opened, server):
     with pytest.raises(OutputError, match="cannot listen"):
-        Server(Pages(opened, {}), port=server.port)
+        Server(Pages(opened, {}), port=server.server_port)
 
 
 def test_without_leaflet_it_says_what_to_install(monkeypatch):

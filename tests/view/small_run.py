@@ -4,8 +4,8 @@ import csv
 import json
 import threading
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -117,8 +117,7 @@ def result(i, state="tracking"):
     return ViewResult(name(i), (100 + i) * 10**9, outcome, 12.5, state)
 
 
-@dataclass(frozen=True)
-class Small:
+class Small(NamedTuple):
     """Where the run lies."""
 
     map_path: Path

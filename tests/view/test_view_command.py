@@ -9,15 +9,9 @@ from dataclasses import replace
 import pytest
 from small_run import NO_FIX, WRONG, result
 
+from helpers import refused
 from orthonav.core.flight.fixes import Identity, write_results
 from orthonav.ground.view.run import Run, ViewRequest
-
-
-def refused(done, *words, code=1):
-    assert done.code == code and done.out == ""
-    assert done.err.startswith("orthonav: error: ") and done.err.count("\n") == 1
-    for word in words:
-        assert word in done.err
 
 
 @pytest.fixture
