@@ -17,11 +17,10 @@ import pickle
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,11 +29,11 @@ from numpy.typing import NDArray
 from orthonav.core.errors import OutputError, VariantError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import replacing
+from orthonav.core.variants import Checked, choice, within
 from orthonav.research.pretrained import (
     chosen_device,
     pretrained,
     quiet,
-    require_device,
     transformers,
     weights_stamp,
 )
@@ -52,8 +51,6 @@ WHERE = (
     "https://dl.fbaipublicfiles.com/segment_anything/"
 )
 
-
-PER = ("sheet", "tile")
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 CACHE_FORMAT = b"orthonav sam boundaries 2"
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as in training
@@ -69,7 +66,7 @@ Predict = Callable[[NDArray[np.float32]], tuple[torch.Tensor, torch.Tensor]]
 
 
 @dataclass(frozen=True)
-class SamBoundaries:
+class SamBoundaries(Checked):
     """Binary map of the boundaries of all automatic Segment Anything masks of a picture.
 
     Defaults of `grid`, `iou`, `stability`, `offset` and `overlap` are those of the original
@@ -96,39 +93,24 @@ class SamBoundaries:
     """
 
     weights: str = ""
-    grid: int = 32
-    iou: float = 0.88
-    stability: float = 0.95
-    offset: float = 1.0
-    overlap: float = 0.7
+    grid: int = within(32, 1, 256)
+    iou: float = within(0.88, 0, 1)
+    stability: float = within(0.95, 0, 1)
+    offset: float = within(1.0, 0, above=True)
+    overlap: float = within(0.7, 0, 1)
     window: int = 256
-    per: str = "sheet"
-    prompts: int = 64
-    device: str = "auto"
-    precision: str = "fp32"
+    per: str = choice("sheet", "tile")
+    prompts: int = within(64, 1, 4096)
+    device: str = choice("auto", "cpu", "cuda")
+    precision: str = choice(*PRECISIONS)
     cache: str = ""
 
     def __post_init__(self) -> None:
         if not self.path:
             raise VariantError(f"sam needs weights=PATH, or {WEIGHTS_VARIABLE}: {WHERE}")
-        ranges = {"grid": (1, 256), "prompts": (1, 4096)}
-        ranges |= dict.fromkeys(("iou", "stability", "overlap"), (0, 1))
-        for name, (least, most) in ranges.items():
-            if not least <= getattr(self, name) <= most:
-                raise VariantError(
-                    f"sam {name} must be {least} to {most}, got {getattr(self, name)}"
-                )
-        if not self.offset > 0:
-            raise VariantError(f"sam offset must be above 0, got {self.offset}")
+        super().__post_init__()
         if self.window and not 16 <= self.window <= 4096:
-            raise VariantError(f"sam window must be 0 or 16 to 4096 px, got {self.window}")
-        if self.per not in PER:
-            raise VariantError(f"sam per must be {' or '.join(PER)}, got '{self.per}'")
-        if self.precision not in PRECISIONS:
-            raise VariantError(
-                f"sam precision must be {', '.join(PRECISIONS)}, got '{self.precision}'"
-            )
-        require_device(self.device)
+            raise VariantError(f"window must be 0 or 16 to 4096 px, got {self.window}")
 
     @property
     def path(self) -> str:
@@ -160,19 +142,6 @@ class SamBoundaries:
         if not valid.all():
             inner = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1)
             out[0][inner.reshape(valid.shape) == 0] = 0
-        return out
-
-    def batch(
-        self,
-        greys: NDArray[np.uint8],
-        valid: NDArray[np.bool_],
-        report: Callable[[float], None] = lambda share: None,
-    ) -> NDArray[np.float32]:
-        """Boundaries (N, 1, H, W) of pictures (N, H, W); `report` receives the share done."""
-        out = np.zeros((len(greys), 1, *greys.shape[1:]), dtype=np.float32)
-        for index, (grey, seen) in enumerate(zip(greys, valid, strict=True)):
-            out[index] = self(grey, seen)
-            report((index + 1) / len(greys))
         return out
 
     def _window(self, grey: Grey, valid: Mask) -> Mask:
@@ -211,12 +180,8 @@ def _windows(shape: tuple[int, ...], window: int) -> Iterator[tuple[slice, slice
     yield from itertools.product(*sides)
 
 
-class _Box(NamedTuple):
-    """An accepted mask: bits of (H, W), corners (x0, y0, x1, y1) of its pixels, expected IoU."""
-
-    bits: NDArray[np.uint8]
-    corners: NDArray[np.int64]
-    iou: float
+Box = tuple[NDArray[np.uint8], NDArray[np.int64], float]
+"""An accepted mask: bits of (H, W), corners (x0, y0, x1, y1) of its pixels, expected IoU."""
 
 
 def automatic_masks(
@@ -232,21 +197,21 @@ def automatic_masks(
     x, y = np.meshgrid(centres, centres)
     resized = _resized_shape(shape, side)
     points = np.stack([x.ravel() * resized[1], y.ravel() * resized[0]], axis=1).astype(np.float32)
-    found: list[_Box] = []
+    found: list[Box] = []
     for start in range(0, len(points), rules.prompts):
         logits, iou = predict(points[start : start + rules.prompts])
         found += _trusted(logits.flatten(0, 1), iou.flatten(), shape, side, rules)
     if not found:
         return
-    corners = np.stack([mask.corners for mask in found])
-    for index in suppressed(corners, np.array([mask.iou for mask in found]), rules.overlap):
-        bits = np.unpackbits(found[index].bits, count=height * width)
+    packed, corners, ious = zip(*found, strict=True)
+    for index in suppressed(np.stack(corners), np.array(ious), rules.overlap):
+        bits = np.unpackbits(packed[index], count=height * width)
         yield bits.reshape(height, width).astype(bool)
 
 
 def _trusted(
     logits: torch.Tensor, iou: torch.Tensor, shape: tuple[int, ...], side: int, rules: SamBoundaries
-) -> Iterator[_Box]:
+) -> Iterator[Box]:
     """Masks (M, h, w) whose expected IoU (M,) and stability reach the limits of `rules`."""
     good = iou > rules.iou
     logits, iou = logits[good], iou[good]
@@ -263,16 +228,12 @@ def _trusted(
         masks = (full[stable] > 0).cpu().numpy()
         for mask, trust in zip(masks, iou[start : start + chunk][stable].tolist(), strict=True):
             if mask.any():
-                yield _Box(np.packbits(mask), _corners(mask), trust)
+                x, y = (np.flatnonzero(mask.any(axis=axis)) for axis in (0, 1))
+                yield np.packbits(mask), np.array([x[0], y[0], x[-1], y[-1]]), trust
 
 
 def _scaled(logits: torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
     return torch.nn.functional.interpolate(logits, shape, mode="bilinear", align_corners=False)
-
-
-def _corners(mask: Mask) -> NDArray[np.int64]:
-    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    return np.array([columns[0], rows[0], columns[-1], rows[-1]], dtype=np.int64)
 
 
 def suppressed(
@@ -332,11 +293,7 @@ def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
     Positions are always encoded in float32: half precision would lose their phases.
     """
     device = model.device
-    half = (
-        nullcontext()
-        if dtype == torch.float32
-        else torch.autocast(device_type=device.type, dtype=dtype)
-    )
+    half = torch.autocast(device.type, dtype, enabled=dtype != torch.float32)
     pixels = network_pixels(grey, int(model.config.vision_config.image_size)).to(device)
     with torch.inference_mode():
         with half:
@@ -357,20 +314,20 @@ def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
 
 @lru_cache(maxsize=1)
 def _model(weights: str, stamp: tuple[int, ...], device: str) -> Any:
+    """Network in float32, from a Hugging Face folder or an original checkpoint."""
     del stamp  # part of the key only: files may change
-    return network(weights).to(device)
+    path = Path(weights).expanduser()
+    found = pretrained(weights, "sam", "SamModel") if path.is_dir() else original_model(path)
+    return found.to(device)
 
 
 def _cache_folder(cache: str) -> Path | None:
     """Folder of entries: `cache`, ORTHONAV_CACHE or the user's cache folder; None for "none"."""
     if cache == "none":
         return None
-    if cache:
-        return Path(cache).expanduser()
-    if own := os.environ.get("ORTHONAV_CACHE"):
-        return Path(own) / "sam"
     users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(users).expanduser() / "orthonav" / "sam"
+    own = os.environ.get("ORTHONAV_CACHE") or f"{users}/orthonav"
+    return Path(cache or f"{own}/sam").expanduser()
 
 
 def _cached(path: Path, shape: tuple[int, ...]) -> Mask | None:
@@ -394,15 +351,6 @@ def _keep(path: Path, edges: Mask) -> None:
         log.warning("could not write the cache entry: %s", error)
 
 
-def network(weights: str) -> Any:
-    """Network in float32 on the CPU, from a Hugging Face folder or an original checkpoint.
-
-    Raises `VariantError` if the path holds neither.
-    """
-    path = Path(weights).expanduser()
-    return pretrained(weights, "sam", "SamModel") if path.is_dir() else original_model(path)
-
-
 @lru_cache(maxsize=8)
 def weights_digest(weights: str, stamp: tuple[int, ...]) -> str:
     """SHA-256 of the weights file, or of the config and weights of a folder."""
@@ -418,35 +366,30 @@ def weights_digest(weights: str, stamp: tuple[int, ...]) -> str:
     return digest.hexdigest()
 
 
-_RENAMES = [
-    (re.compile(pattern), name)
-    for pattern, name in (
-        (r"^image_encoder\.", "vision_encoder."),
-        (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
-        (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
-        (r"\.neck\.0\.", ".neck.conv1."),
-        (r"\.neck\.1\.", ".neck.layer_norm1."),
-        (r"\.neck\.2\.", ".neck.conv2."),
-        (r"\.neck\.3\.", ".neck.layer_norm2."),
-        (
-            r"\.pe_layer\.positional_encoding_gaussian_matrix$",
-            ".shared_embedding.positional_embedding",
-        ),
-        (r"\.point_embeddings\.", ".point_embed."),
-        (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
-        (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
-        (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
-        (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
-        (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
-        (r"\.output_upscaling\.0\.", ".upscale_conv1."),
-        (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
-        (r"\.output_upscaling\.3\.", ".upscale_conv2."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.0\.", r".\1.proj_in."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.1\.", r".\1.layers.0."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.2\.", r".\1.proj_out."),
-        (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
-    )
-]
+_HEADS = r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers"
+_RENAMES = {  # patterns of original names, and what replaces them, in this order
+    r"^image_encoder\.": "vision_encoder.",
+    r"\.patch_embed\.proj\.": ".patch_embed.projection.",
+    r"^vision_encoder\.blocks\.": "vision_encoder.layers.",
+    r"\.neck\.0\.": ".neck.conv1.",
+    r"\.neck\.1\.": ".neck.layer_norm1.",
+    r"\.neck\.2\.": ".neck.conv2.",
+    r"\.neck\.3\.": ".neck.layer_norm2.",
+    r"\.pe_layer\.positional_encoding_gaussian_matrix$": ".shared_embedding.positional_embedding",
+    r"\.point_embeddings\.": ".point_embed.",
+    r"\.mask_downscaling\.0\.": ".mask_embed.conv1.",
+    r"\.mask_downscaling\.1\.": ".mask_embed.layer_norm1.",
+    r"\.mask_downscaling\.3\.": ".mask_embed.conv2.",
+    r"\.mask_downscaling\.4\.": ".mask_embed.layer_norm2.",
+    r"\.mask_downscaling\.6\.": ".mask_embed.conv3.",
+    r"\.output_upscaling\.0\.": ".upscale_conv1.",
+    r"\.output_upscaling\.1\.": ".upscale_layer_norm.",
+    r"\.output_upscaling\.3\.": ".upscale_conv2.",
+    rf"{_HEADS}\.0\.": r".\1.proj_in.",
+    rf"{_HEADS}\.1\.": r".\1.layers.0.",
+    rf"{_HEADS}\.2\.": r".\1.proj_out.",
+    r"\.norm(\d|_final_attn)\.": r".layer_norm\1.",
+}
 _POSITIONS = "prompt_encoder.shared_embedding.positional_embedding"
 
 
@@ -454,8 +397,8 @@ def converted_weights(original: Mapping[str, torch.Tensor]) -> dict[str, torch.T
     """Weights of an original checkpoint, renamed as `transformers` expects them."""
     converted = {}
     for key, value in original.items():
-        for pattern, name in _RENAMES:
-            key = pattern.sub(name, key)
+        for pattern, name in _RENAMES.items():
+            key = re.sub(pattern, name, key)
         converted[key] = value
     converted["shared_image_embedding.positional_embedding"] = converted[_POSITIONS]
     return converted

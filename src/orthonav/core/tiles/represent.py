@@ -12,22 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
-from orthonav.core.variants import Variant
+from orthonav.core.variants import Checked, Variant, choice, within
 
 HARMONICS = 3  # chosen on imagery of two dates (docs/decisions/embedding.md)
 
 
 @dataclass(frozen=True)
-class OrientedGradients:
+class OrientedGradients(Checked):
     """(7, H, W), levels per pixel: magnitude, real and imaginary part of harmonics 1 to 3."""
 
-    sigma_px: float = 1.5
-
-    def __post_init__(self) -> None:
-        if not 0 < self.sigma_px <= 16:
-            raise VariantError(
-                f"gradient sigma_px must be above 0 and at most 16, got {self.sigma_px}"
-            )
+    sigma_px: float = within(1.5, 0, 16, above=True)
 
     channels = 1 + 2 * HARMONICS
 
@@ -101,7 +95,7 @@ class Gray:
 
 
 @dataclass(frozen=True)
-class Canny:
+class Canny(Checked):
     """Binary edges, by default of "a threshold in the interval [100, 200] and a kernel of size 3".
 
     We read this as the low and the high threshold, on the Sobel gradient of 8-bit grey levels; the
@@ -109,13 +103,12 @@ class Canny:
 
     low: float = 100.0
     high: float = 200.0
-    kernel: int = 3
+    kernel: int = choice(3, 5, 7)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 <= self.low <= self.high:
             raise VariantError(f"canny needs 0 <= low <= high, got {self.low}, {self.high}")
-        if self.kernel not in (3, 5, 7):
-            raise VariantError(f"canny kernel must be 3, 5 or 7, got {self.kernel}")
 
     channels = 1
 
