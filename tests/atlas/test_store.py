@@ -57,12 +57,6 @@ def trouble(monkeypatch):
     return Trouble.fails
 
 
-@pytest.fixture(autouse=True)
-def no_memory_left():
-    yield
-    fsspec.filesystem("memory").store.clear()
-
-
 @pytest.fixture(params=["folder", "memory", "trouble"])
 def store(request, tmp_path):
     root = tmp_path / "atlas"
