@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import OutputError, VariantError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import replacing
+from orthonav.core.tiles.represent import Grey, Mask, filled, inner
 from orthonav.core.variants import Checked, choice, within
 from orthonav.research.pretrained import (
     chosen_device,
@@ -59,8 +60,6 @@ _CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 24}
 window against 1.18 s at 1 << 24 (small network)."""
 
 WEIGHTS_VARIABLE = "ORTHONAV_SAM_WEIGHTS"
-Grey = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Predict = Callable[[NDArray[np.float32]], tuple[torch.Tensor, torch.Tensor]]
 """Points (P, 2), x and y in pixels of the network, to logits (P, 3, h, w) and IoU (P, 3)."""
 
@@ -139,34 +138,32 @@ class SamBoundaries(Checked):
         for part in _windows(grey.shape, self.window):
             if valid[part].any():
                 out[0][part] = np.maximum(out[0][part], self._window(grey[part], valid[part]))
-        if not valid.all():
-            inner = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1)
-            out[0][inner.reshape(valid.shape) == 0] = 0
+        out[0] *= inner(valid, 5)
         return out
 
     def _window(self, grey: Grey, valid: Mask) -> Mask:
         """Boundaries (H, W) of one window, from the cache where it is there."""
-        filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
+        grey = filled(grey, valid)
         stamp = weights_stamp(self.path, WHERE)
         folder = _cache_folder(self.cache)
-        path = folder / f"{self._key(filled, stamp)}.edges" if folder else None
+        path = folder / f"{self._key(grey, stamp)}.edges" if folder else None
         edges = _cached(path, grey.shape) if path else None
         if edges is None:
             device = chosen_device(self.device)
             model = _model(self.path, stamp, str(device))
-            predict = _predictor(model, filled, PRECISIONS[self.precision])
+            predict = _predictor(model, grey, PRECISIONS[self.precision])
             side = int(model.config.vision_config.image_size)
             edges = boundary_map(automatic_masks(predict, grey.shape, side, self), grey.shape)
             if path:
                 _keep(path, edges)
         return edges
 
-    def _key(self, filled: Grey, stamp: tuple[int, ...]) -> str:
+    def _key(self, grey: Grey, stamp: tuple[int, ...]) -> str:
         """Cache key of a window: digest of its pixels, the weights and the settings."""
         rules = (self.grid, self.iou, self.stability, self.offset, self.overlap, self.precision)
         digest = hashlib.sha256(CACHE_FORMAT)
-        digest.update(repr((filled.shape, rules, weights_digest(self.path, stamp))).encode())
-        digest.update(filled.tobytes())
+        digest.update(repr((grey.shape, rules, weights_digest(self.path, stamp))).encode())
+        digest.update(grey.tobytes())
         return digest.hexdigest()
 
 

@@ -10,12 +10,11 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.extras import needed
-from orthonav.core.tiles.words import filled
+from orthonav.core.tiles.represent import filled, inner
 from orthonav.core.variants import Checked, within
 
 MARGIN_PX = 32
@@ -64,11 +63,7 @@ class Segments(Checked):
         )
         edges = boundaries(labels)
         if not valid.all():
-            reach = 2 * (math.ceil(2 * self.sigma) + 2) + 1
-            edges &= (
-                cv2.erode(valid.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1)
-                > 0
-            ).reshape(grey.shape)
+            edges &= inner(valid, 2 * (math.ceil(2 * self.sigma) + 2) + 1)
         return edges.astype(np.float32)[None]
 
 

@@ -15,16 +15,14 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 from orthonav.core.extras import needed
+from orthonav.core.tiles.represent import Grey, Mask, filled
 from orthonav.core.tiles.words import (
     DIMS,
     Array,
     Detector,
-    Grey,
-    Mask,
     WordsEmbedder,
     WordsRecipe,
     describe,
-    filled,
     seen,
     sift_features,
 )

@@ -14,7 +14,23 @@ from numpy.typing import NDArray
 from orthonav.core.errors import VariantError
 from orthonav.core.variants import Checked, Variant, choice, within
 
+Grey = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 HARMONICS = 3  # chosen on imagery of two dates (docs/decisions/embedding.md)
+
+
+def filled(grey: Grey, valid: Mask) -> Grey:
+    """The picture (H, W) with the mean grey level where it is not valid."""
+    if not valid.all():
+        grey = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
+    return np.ascontiguousarray(grey)
+
+
+def inner(valid: Mask, side_px: int) -> Mask:
+    """Pixels (H, W) around which a square is valid, as far as it lies within the picture."""
+    square = np.ones((side_px, side_px), np.uint8)
+    eroded = cv2.erode(valid.astype(np.uint8), square, borderValue=1)
+    return np.asarray(eroded.reshape(valid.shape) > 0)
 
 
 @dataclass(frozen=True)
@@ -41,10 +57,7 @@ class OrientedGradients(Checked):
         power += south2
         np.sqrt(power, out=out[0])
         if not valid.all():
-            reach = 2 * self.margin_px + 1
-            out[0] *= cv2.erode(
-                valid.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1
-            )
+            out[0] *= inner(valid, 2 * self.margin_px + 1)
         power += np.float32(1e-6)
         cos /= power
         sin = np.multiply(east, south, out=south2)
@@ -121,8 +134,5 @@ class Canny(Checked):
         """None along the border of `valid`."""
         edges = cv2.Canny(np.ascontiguousarray(grey), self.low, self.high, apertureSize=self.kernel)
         if not valid.all():
-            reach = self.kernel + 2
-            edges = edges * cv2.erode(
-                valid.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1
-            )
+            edges = edges * inner(valid, self.kernel + 2)
         return (edges > 0).astype(np.float32)[None]

@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError, VariantError
+from orthonav.core.tiles.represent import Grey, Mask, filled
 from orthonav.core.variants import Checked, Part, choice, within
 
 DIMS = {"sift": 128, "superpoint": 256}  # numbers per descriptor
 
-Grey = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Array = NDArray[np.float32]
 Detector = Callable[[Grey], tuple[Array, Array, Array]]
 """Points (N, 2) from the outer corner, radii (N,) and descriptors (N, D) of a picture."""
@@ -167,13 +166,6 @@ def describe(
     else:
         points, radii, descriptors = detector(picture)
     return descriptors[seen(valid, points, radii)]
-
-
-def filled(grey: Grey, valid: Mask) -> Grey:
-    """The picture (H, W) with the mean grey level where it is not valid."""
-    if not valid.all():
-        grey = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
-    return np.ascontiguousarray(grey)
 
 
 def seen(valid: Mask, points: Array, radii: Array) -> Mask:
