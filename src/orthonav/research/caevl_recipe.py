@@ -14,19 +14,17 @@ from orthonav.core.variants import choice, within
 class CaevlRecipe(AutoEncoderRecipe):
     """Parameters of CAEVL: an auto-encoder, then its encoder fine-tuned with VICReg.
 
-    Defaults are those of the authors' released configuration. `epochs`, `learning_rate`: of the
-    auto-encoder. `tuning_epochs`, `tuning_rate`: of the fine-tuning. `batch`: of both.
-    `projector`: numbers per layer of the global projection head. `alpha`: weight of the global
-    loss, the rest is that of the local one, 0 to 1. The others are as in `AutoEncoderRecipe`.
+    Defaults are those of the authors' released configuration; other fields are those of
+    `AutoEncoderRecipe`. Its `epochs` and `learning_rate` are those of the auto-encoder.
     """
 
-    batch: int = within(128, 2, 65_536)
+    batch: int = within(128, 2, 65_536)  # of both trainings
     learning_rate: float = within(6e-5, 0, 1, above=True)
     similarity: str = choice("cosine", "product")
     tuning_epochs: int = within(100, 1, 100_000)
     tuning_rate: float = within(6e-5, 0, 1, above=True)
-    projector: int = within(4096, 1, 16_384)
-    alpha: float = within(0.75, 0, 1)
+    projector: int = within(4096, 1, 16_384)  # numbers per layer of the global projection head
+    alpha: float = within(0.75, 0, 1)  # weight of the global loss; the rest is the local one's
 
     def first(self) -> AutoEncoderRecipe:
         return AutoEncoderRecipe(

@@ -69,40 +69,24 @@ class SamBoundaries(Checked):
     """Binary map of the boundaries of all automatic Segment Anything masks of a picture.
 
     Defaults of `grid`, `iou`, `stability`, `offset` and `overlap` are those of the original
-    generator.
-
-    - `weights`: path of a Hugging Face folder or of an original `.pth` checkpoint (Base, Large or
-      Huge); by default ORTHONAV_SAM_WEIGHTS.
-    - `grid`: points along one side of a window, 1 to 256.
-    - `iou`: smallest IoU with the truth that the network may expect of a mask, 0 to 1.
-    - `stability`: smallest IoU between the masks cut at logits `offset` above and below zero, 0 to
-      1.
-    - `offset`: offset of the logits for `stability`, above 0.
-    - `overlap`: IoU of boxes above which the mask with the lower expected IoU is dropped, 0 to 1.
-    - `window`: side of the windows into which larger pictures are cut, 16 to 4096 px, so that point
-      spacing and magnification are those of a tile; 0: no windows.
-    - `per`: "sheet": a sheet is segmented once, in windows, and tiles are cut out of its
-      boundaries; "tile": every reference tile is segmented by itself, as a view is and as in the
-      paper, some 64 times the work at an overlap of 87.5 %.
-    - `prompts`: points per call of the network, 1 to 4096.
-    - `device`: "auto", "cpu" or "cuda".
-    - `precision`: "fp32", or "bf16" or "fp16" for the two transformers.
-    - `cache`: folder of finished windows, "none" for no cache; by default ORTHONAV_CACHE or the
-      user's cache folder.
+    generator. Larger pictures are cut into windows, so that point spacing and magnification are
+    those of a tile. `per`: "sheet": a sheet is segmented once and tiles are cut out of its
+    boundaries; "tile": every reference tile is segmented by itself, as a view is and as in the
+    paper, some 64 times the work at an overlap of 87.5 %.
     """
 
-    weights: str = ""
-    grid: int = within(32, 1, 256)
-    iou: float = within(0.88, 0, 1)
-    stability: float = within(0.95, 0, 1)
+    weights: str = ""  # Hugging Face folder or original checkpoint; else ORTHONAV_SAM_WEIGHTS
+    grid: int = within(32, 1, 256)  # points along one side of a window
+    iou: float = within(0.88, 0, 1)  # least IoU with the truth that is expected of a mask
+    stability: float = within(0.95, 0, 1)  # least IoU of the masks cut at logits +-`offset`
     offset: float = within(1.0, 0, above=True)
-    overlap: float = within(0.7, 0, 1)
-    window: int = 256
+    overlap: float = within(0.7, 0, 1)  # IoU of boxes above which the less expected is dropped
+    window: int = 256  # side of the windows, 16 to 4096 px; 0: none
     per: str = choice("sheet", "tile")
-    prompts: int = within(64, 1, 4096)
+    prompts: int = within(64, 1, 4096)  # points per call of the network
     device: str = choice("auto", "cpu", "cuda")
-    precision: str = choice(*PRECISIONS)
-    cache: str = ""
+    precision: str = choice(*PRECISIONS)  # of the two transformers
+    cache: str = ""  # folder of finished windows or "none"; else ORTHONAV_CACHE or the user's
 
     def __post_init__(self) -> None:
         if not self.path:
@@ -113,20 +97,12 @@ class SamBoundaries(Checked):
 
     @property
     def path(self) -> str:
-        """Path of the weights: `weights`, else ORTHONAV_SAM_WEIGHTS.
-
-        Maps do not store it: it is a path of the machine that built them.
-        """
+        """Of the weights. Maps do not store it: it is one of the machine that built them."""
         return self.weights or os.environ.get(WEIGHTS_VARIABLE, "")
 
-    @property
-    def channels(self) -> int:
-        return 1
+    channels = 1
 
-    @property
-    def margin_px(self) -> int:
-        """Always 0: a mask depends on the whole window, and no margin would change that."""
-        return 0
+    margin_px = 0  # a mask depends on the whole window, and no margin would change that
 
     def __call__(self, grey: Grey, valid: Mask) -> NDArray[np.float32]:
         """Boundaries (1, H, W), 1 on a boundary, else 0; none along the border of `valid`.

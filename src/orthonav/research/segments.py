@@ -40,9 +40,7 @@ class Segments(Checked):
     sigma: float = within(1.5, 0, 16)
     min_size: int = within(30, 1, 1_000_000)
 
-    @property
-    def channels(self) -> int:
-        return 1
+    channels = 1
 
     @property
     def margin_px(self) -> int:

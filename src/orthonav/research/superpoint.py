@@ -35,18 +35,11 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class SuperPoint(Checked):
-    """Keypoints and descriptors of grey pictures.
+    """Keypoints and descriptors of grey pictures, by the thresholds of the folder's config.json."""
 
-    Thresholds are those of the folder's config.json.
-
-    - `weights`: path of a Hugging Face folder.
-    - `max_points`: largest number of points per picture, the strongest first; 0 for all.
-    - `device`: "auto" (a GPU if there is one), "cpu" or "cuda".
-    """
-
-    weights: str = ""
-    max_points: int = within(0, 0)
-    device: str = choice("auto", "cpu", "cuda")
+    weights: str = ""  # path of a Hugging Face folder
+    max_points: int = within(0, 0)  # most points per picture, the strongest first; 0 for all
+    device: str = choice("auto", "cpu", "cuda")  # "auto": a GPU if there is one
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -65,19 +65,15 @@ Recipe = AutoEncoderRecipe | TripletRecipe
 class Means:
     """Options for the speed of training; the learned weights are the same up to rounding.
 
-    - `bf16`: mixed precision with bfloat16; None: if the processor has its instructions, else with
-      float16 on a GPU.
-    - `chunk`: tiles of a triplet batch held for gradients at once; batch norms use each chunk.
-    - `workers`: threads that make batches; None: 2 for a CPU, one per core up to 16 for a GPU.
-    - `save_every_s`: shortest time between checkpoints, s.
-    - `device`: name for PyTorch; None: a GPU if there is one.
+    `bf16`: mixed precision with bfloat16; None: if the processor has its instructions, else with
+    float16 on a GPU.
     """
 
     bf16: bool | None = None
-    chunk: int = 128
-    workers: int | None = None
-    save_every_s: float = 300.0
-    device: str | None = None
+    chunk: int = 128  # tiles of a triplet batch held for gradients at once, and of a batch norm
+    workers: int | None = None  # threads that make batches; None: 2, one per core for a GPU
+    save_every_s: float = 300.0  # shortest time between checkpoints
+    device: str | None = None  # name for PyTorch; None: a GPU if there is one
 
 
 def device_of(means: Means) -> torch.device:
