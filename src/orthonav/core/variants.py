@@ -37,7 +37,7 @@ def within(default: Any, least: float, most: float = math.inf, *, above: bool = 
 def choice(default: Any, *others: Any) -> Any:
     """A field of `Checked` with one of these values."""
     known = (default, *others)
-    return _field(default, lambda value: value in known, " or ".join(map(str, known)))
+    return _field(default, lambda value: value in known, f"one of {', '.join(map(str, known))}")
 
 
 def _field(default: Any, fits: Callable[[Any], bool], expected: str) -> Any:

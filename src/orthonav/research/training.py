@@ -109,7 +109,7 @@ def _kept_memory() -> Iterator[None]:
     Every step allocates and frees hundreds of MB of activations and gradients. Zero-filled pages
     from the system cost as much as the arithmetic (mallopt(3)).
     """
-    library = ctypes.CDLL(None) if sys.platform == "linux" else None
+    library: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
     if not hasattr(library, "mallopt") or not hasattr(library, "malloc_trim"):
         yield
         return

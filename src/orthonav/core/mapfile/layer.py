@@ -108,7 +108,8 @@ class Chunks(Generic[Content]):
         number = self.table.number(level, chunk_row, chunk_col)
         if all(each.is_empty(number) for each in self.blobs):
             return None
-        return self._read(level, chunk_row, chunk_col)
+        found: Content = self._read(level, chunk_row, chunk_col)
+        return found
 
 
 def _read_chunk(
