@@ -1,7 +1,6 @@
 """`orthonav info`: print the contents of a map."""
 
 import argparse
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -72,17 +71,13 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
 
 def _registration(manifest: "Manifest") -> dict[str, Any] | None:
     """`ground_km2` extends beyond the tile centres."""
-    import numpy as np
-
     from orthonav.core.mapfile.layer import part_names
 
     sheet = manifest.sheets[0]
     if sheet.grey is None:
         return None
     parts = [manifest.parts.get(name) for name in part_names(0).values()]
-    size = sum(
-        math.prod(part["shape"]) * np.dtype(part["dtype"]).itemsize for part in parts if part
-    )
+    size = sum(_part_bytes(part) for part in parts if part is not None)
     ground_km2 = sheet.grey.valid_px * sheet.grid.gsd_m**2 / 1e6
     return {
         "levels": sheet.grey.levels,
@@ -100,6 +95,12 @@ def _bounds_deg(sheet: "SheetInfo") -> list[float]:
     corners = grid.centres_en_m(np.array([[grid.rows - 1, 0], [0, grid.cols - 1]]))
     lat, lon = sheet.frame.latlon_from_en(corners)
     return [round(float(value), 7) for value in (lon[0], lat[0], lon[1], lat[1])]
+
+
+def _part_bytes(part: dict[str, Any]) -> int:
+    import numpy as np
+
+    return int(np.prod(part["shape"]) * np.dtype(part["dtype"]).itemsize)
 
 
 def summary_text(plain: dict[str, Any]) -> str:
@@ -155,11 +156,10 @@ def summary_text(plain: dict[str, Any]) -> str:
 
 def _source_text(terrain: Mapping[str, Any]) -> list[str]:
     source_m, roughness_m = terrain["source_posting_m"], terrain["roughness_m"]
-    said = []
-    if source_m not in (None, terrain["posting_m"]):
-        said.append(f"from heights every {source_m:g} m")
-    if roughness_m is not None:
-        said.append(f"which differ from these by {roughness_m:.2g} m RMS")
+    said = (
+        [] if source_m in (None, terrain["posting_m"]) else [f"from heights every {source_m:g} m"]
+    )
+    said += [] if roughness_m is None else [f"which differ from these by {roughness_m:.2g} m RMS"]
     return [", ".join(said)] if said else []
 
 

@@ -273,7 +273,7 @@ class Training:
             state.scaler.update()
             done = len(state.losses)
             if done == self.batches_per_epoch:  # reported and saved as an epoch
-                break
+                continue
             if time.monotonic() - self._said_s >= PROGRESS_EVERY_S:
                 at = f"epoch {len(state.history) + 1} of {self.recipe.epochs}, batch {done} of "
                 self._say(f"{at}{self.batches_per_epoch}, loss {float(loss):.5g}")
