@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -45,8 +46,9 @@ for arguments in json.loads(sys.argv[1]):
 """
 
 
-def refused(*commands):
-    """What commands in a process of their own with little memory say on stderr, a line each."""
+def ended(*commands):
+    """What commands in a process of their own with little memory say: on
+    stderr each, their codes, and on stdout."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV")}
     done = subprocess.run(
         [sys.executable, "-c", MANY, json.dumps([[*map(str, each)] for each in commands])],
@@ -56,9 +58,16 @@ def refused(*commands):
         text=True,
         timeout=60,
     )
-    assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr
-    *parts, last = done.stderr.split("ended with 1\n")
-    assert len(parts) == len(commands) and last == ""
+    assert done.returncode == 0 and "Traceback" not in done.stderr
+    said = re.split(r"ended with (\d+)\n", done.stderr)
+    assert len(said) == 2 * len(commands) + 1
+    return said[0:-1:2], list(map(int, said[1::2])), done.stdout
+
+
+def refused(*commands):
+    """The line that each of these commands says when it refuses."""
+    parts, codes, out = ended(*commands)
+    assert set(codes) == {1} and out == ""
     errors = [
         [line for line in part.splitlines() if line.startswith("orthonav: error: ")]
         for part in parts
@@ -93,6 +102,19 @@ def test_pictures_that_claim_gigapixels(flight_path, tmp_path):
 
 
 # Maps.
+
+
+def test_masks_that_inflate_to_gigabytes(tmp_path, flight_path):
+    bytes_, offsets = "sheet0/grey/mask_bytes", "sheet0/grey/mask_offsets"
+    has_one = np.diff(open_map(GOLDEN).arrays[offsets]) > 0
+    bomb = zlib.compress(bytes(100_000_000), 1)
+    ends = np.cumsum([0, *(has_one * len(bomb))], dtype=np.int64)
+    data = np.frombuffer(bomb * int(has_one.sum()), np.uint8)
+    path = changed(tmp_path / "a.onav", {bytes_: data, offsets: ends})
+    localize = ("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl", "-q")
+    check = ("check", path, "--agl-m", "270", "--out", tmp_path / "check", "-q")
+    _, codes, _ = ended(localize, (*localize, "--track"), check, ("info", path))
+    assert set(codes) <= {0, 1, 3, 4}
 
 
 def test_a_preview_that_claims_gigapixels(tmp_path, run):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import sys
 
 import pytest
 
@@ -13,6 +14,19 @@ COARSE = (5.0, 64, 0.875)
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
+
+
+@pytest.fixture(autouse=True)
+def no_memory_left():
+    """An atlas at memory:// ends with its test."""
+    yield
+    if fsspec := sys.modules.get("fsspec"):
+        fsspec.filesystem("memory").store.clear()
+
+
+@pytest.fixture(params=["folder", "memory"])
+def url(request, tmp_path):
+    return {"folder": str(tmp_path / "atlas"), "memory": "memory://test/atlas"}[request.param]
 
 
 @pytest.fixture(scope="module")

@@ -18,10 +18,17 @@ from orthonav.core.errors import MissingExtraError, UsageError
 from orthonav.ground.atlas.build import AtlasRequest, build_atlas
 from orthonav.ground.atlas.catalog import Atlas
 from orthonav.ground.atlas.cluster import RayRunner
+from orthonav.ground.build.calibrate import CROPS
 
 LONGER = {**SMALL, "calibration_views": 96}
 """A sheet takes about a second."""
-START_S, END_S = 60.0, 240.0
+START_S, END_S = 120.0, 240.0
+
+
+@pytest.fixture(scope="module")
+def crops():
+    """As many as usual: what is patched here does not reach the processes of Ray."""
+    return CROPS
 
 
 @pytest.fixture(scope="module")

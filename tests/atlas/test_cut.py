@@ -3,7 +3,6 @@
 import math
 import shutil
 from dataclasses import asdict, replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -176,10 +175,6 @@ def test_relief_is_the_steepest_of_the_sheets():
         assert steepest([member(each) for each in stated]) == expected
 
 
-def sheet_file(atlas, name):
-    return Path(atlas.url) / atlas.sheets()[name].files["map"].name
-
-
 def test_threads_do_not_change_the_map(folder, cut, middle, tmp_path, names_in):
     again = tmp_path / "again.onav"
     stages = []
@@ -267,59 +262,51 @@ def centre_of(name):
 
 
 def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):
-    atlas = Atlas.open(str(folder))
-    with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
-        cut_map(atlas, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
+    area = Area.from_bounds((12.0, 50.0, 12.01, 50.01))
     empty = Atlas.open_or_create(str(tmp_path / "empty"), RECIPE)
-    with pytest.raises(AreaError, match="0 sheets"):
-        cut_map(empty, tmp_path / "o.onav", Area.from_bounds((12.0, 50.0, 12.01, 50.01)))
+    for atlas, count in ((Atlas.open(str(folder)), len(names)), (empty, 0)):
+        with pytest.raises(AreaError, match=f"{count} sheets"):
+            cut_map(atlas, tmp_path / "o.onav", area)
 
 
 @pytest.mark.parametrize("change", ["recipe", "grid", "method"])
 def test_sheets_of_another_recipe_are_refused(atlas, names, middle, tmp_path, change):
-    opened = open_map(sheet_file(atlas, sorted(names)[1]))
-    manifest = opened.manifest
-    if change == "grid":
-        sheet = manifest.sheets[0]
-        grid = replace(sheet.grid, gsd_m=1.5)
-        manifest = replace(manifest, sheets=(replace(sheet, grid=grid),))
-    elif change == "recipe":
-        other = {**manifest.recipe["represent"], "sigma_px": 2.0}
-        manifest = replace(manifest, recipe={**manifest.recipe, "represent": other})
-    else:
-        manifest = replace(manifest, recipe={**manifest.recipe, "embed": {"name": "bovw"}})
-    write_map(tmp_path / "s.onav", manifest, opened.arrays)
-    atlas.put({"map": tmp_path / "s.onav"}, atlas.sheets()[sorted(names)[1]])
-    with pytest.raises(AtlasError, match=sorted(names)[1]):
+    stored = atlas.sheets()[names[1]]
+    opened = open_map(atlas.path(stored))
+    sheet, recipe = opened.manifest.sheets[0], opened.manifest.recipe
+    others = {
+        "recipe": {"recipe": {**recipe, "represent": {**recipe["represent"], "sigma_px": 2.0}}},
+        "grid": {"sheets": (replace(sheet, grid=replace(sheet.grid, gsd_m=1.5)),)},
+        "method": {"recipe": {**recipe, "embed": {"name": "bovw"}}},
+    }
+    write_map(tmp_path / "s.onav", replace(opened.manifest, **others[change]), opened.arrays)
+    atlas.put({"map": tmp_path / "s.onav"}, stored)
+    with pytest.raises(AtlasError, match=names[1]):
         cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=1)
 
 
-def test_a_damaged_sheet_is_named(atlas, names, middle, tmp_path):
-    path = sheet_file(atlas, names[1])
+def test_a_damaged_sheet_or_chunk_is_named(atlas, names, middle, tmp_path):
+    area, out, sheet = area_around(middle, 100), tmp_path / "o.onav", atlas.sheets()[names[1]]
+    opened = open_map(atlas.path(sheet))
+    grey = np.full_like(opened.arrays["sheet0/grey/bytes"], 7)
+    write_map(tmp_path / "s.onav", opened.manifest, {**opened.arrays, "sheet0/grey/bytes": grey})
+    changed = atlas.put({"map": tmp_path / "s.onav"}, sheet)
+    with pytest.raises(MapFileError, match=rf"damaged.*{names[1]}"):
+        cut_map(atlas, out, area, workers=2)
+    path = atlas.path(changed)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
     with pytest.raises(StorageError, match=names[1]):
-        cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=1)
-
-
-def test_a_damaged_chunk_is_found_by_any_thread(atlas, names, middle, tmp_path):
-    opened = open_map(sheet_file(atlas, names[1]))
-    parts = {name: part.copy() for name, part in opened.arrays.items()}
-    parts["sheet0/grey/bytes"][:] = 7
-    write_map(tmp_path / "s.onav", opened.manifest, parts)
-    atlas.put({"map": tmp_path / "s.onav"}, atlas.sheets()[names[1]])
-    with pytest.raises(MapFileError, match=rf"damaged.*{names[1]}"):
-        cut_map(atlas, tmp_path / "o.onav", area_around(middle, 100), workers=2)
+        cut_map(atlas, out, area, workers=1)
 
 
 def test_impossible_requests_are_refused(folder, middle, tmp_path):
     atlas, out = Atlas.open(str(folder)), tmp_path / "o.onav"
-    area = area_around(middle, 60)
     with pytest.raises(AreaError, match="larger than the area"):
         cut_map(atlas, out, area_around(middle, 20))
     with pytest.raises(VariantError, match="workers"):
-        cut_map(atlas, out, area, workers=0)
+        cut_map(atlas, out, area_around(middle, 60), workers=0)
 
 
 def test_the_affine_agrees_with_the_geodesy():

@@ -7,32 +7,14 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import fsspec
 import pytest
+from atlases import EAST, HERE, PLACES, RECIPE, described
 
-from orthonav.cli import main
-from orthonav.ground.atlas.catalog import Atlas, AtlasRecipe, Sheet, StoredFile, canonical
+from orthonav.ground.atlas.catalog import Atlas, StoredFile, canonical
 from orthonav.ground.atlas.index import IndexManifest
 from orthonav.ground.atlas.integrity import check_atlas
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.atlas.vectors import Part, ShardInfo, VectorRecipe
-
-RECIPE = AtlasRecipe(gsd_m=2.5, tile_px=128, calibration_views=24)
-PLACES = [(46.6, 1.9), (46.6, 2.1)]
-HERE, EAST = (RECIPE.sheets.name_at(*place) for place in PLACES)
-DAYS_S = 24 * 3600
-
-
-def described(sheet, tiles=7, dates=("2020-06-14",)):
-    imagery = ({"name": "BD ORTHO", "attribution": "IGN", "licence": "Etalab-2.0"},)
-    bounds = RECIPE.sheets.bounds_deg(sheet)
-    return Sheet(sheet, bounds, 2.5, tiles, 3.25, dates, imagery, "r", {"orthonav": "1.0"})
-
-
-@pytest.fixture(params=["folder", "memory"])
-def place(request, tmp_path):
-    yield str(tmp_path / "atlas") if request.param == "folder" else "memory://test/atlas"
-    fsspec.filesystem("memory").store.clear()
 
 
 def two_sheets(url, tmp_path):
@@ -44,8 +26,8 @@ def two_sheets(url, tmp_path):
 
 
 @pytest.fixture
-def atlas(place, tmp_path):
-    return two_sheets(place, tmp_path)
+def atlas(url, tmp_path):
+    return two_sheets(url, tmp_path)
 
 
 @pytest.fixture
@@ -151,25 +133,20 @@ def test_a_sheet_finished_meanwhile_is_no_orphan(near, tmp_path, monkeypatch):
     assert found(near, clean=True, min_age_s=-5) == []
 
 
-def test_a_full_disk_is_reported(near, monkeypatch):
+def test_a_full_disk_is_reported(near, monkeypatch, run):
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("orthonav.ground.atlas.store.shutil.copyfile", full)
-    assert main(["atlas", "add", near.url + "2", near.url, "-q"]) == 1
+    assert run("atlas", "add", near.url + "2", near.url).code == 1
 
 
-def run(capfd, *arguments):
-    code = main(["atlas", *map(str, arguments), "-q"])
-    return code, capfd.readouterr()
-
-
-def test_info(near, capfd):
-    code, done = run(capfd, "info", near.url)
-    assert code == 0 and "sheets           2" in done.out
-    for words in ("6.5", "gsd_m 2.5", "2020-06-14", "BD ORTHO, IGN, Etalab-2.0"):
+def test_info(near, run):
+    done = run("atlas", "info", near.url)
+    assert done.code == 0 and "sheets           2" in done.out
+    for words in ("6.5", "gsd_m 1.0", "2020-06-14", "BD ORTHO, IGN, Etalab-2.0"):
         assert words in done.out
-    code, done = run(capfd, "info", near.url, "--json")
+    done = run("atlas", "info", near.url, "--json")
     plain = json.loads(done.out)
     assert plain["sheets"] == 2 and plain["names"] == [HERE, EAST] and plain["area_km2"] == 6.5
     assert plain["bytes"] == 2 * len("map of r000000c000000")
@@ -178,51 +155,55 @@ def test_info(near, capfd):
     assert all(west < lon < east and south < lat < north for lat, lon in PLACES)
 
 
-def test_info_of_an_empty_folder_and_an_empty_atlas(tmp_path, capfd):
-    code, done = run(capfd, "info", tmp_path)
-    assert code == 1 and done.err.startswith("orthonav: error: no atlas")
+def test_info_of_an_empty_folder_and_an_empty_atlas(tmp_path, run):
+    done = run("atlas", "info", tmp_path)
+    assert done.code == 1 and done.err.startswith("orthonav: error: no atlas")
     Atlas.open_or_create(tmp_path / "atlas", RECIPE)
-    code, done = run(capfd, "info", tmp_path / "atlas")
-    assert code == 0 and "date             unknown" in done.out and "sheets           0" in done.out
+    done = run("atlas", "info", tmp_path / "atlas")
+    assert (
+        done.code == 0
+        and "date             unknown" in done.out
+        and "sheets           0" in done.out
+    )
 
 
-def test_check(near, capfd):
-    code, done = run(capfd, "check", near.url)
-    assert (code, done.out) == (0, f"whole, by names and sizes: {near.url}\n")
+def test_check(near, run):
+    done = run("atlas", "check", near.url)
+    assert (done.code, done.out) == (0, f"whole, by names and sizes: {near.url}\n")
     near.store.remove(near.sheets()[HERE].files["map"].name)
     near.store.write(".atlas.json.a1b2c3d4.tmp.json", b"")
     os.utime(Path(near.url, ".atlas.json.a1b2c3d4.tmp.json"), (0, 0))
-    code, done = run(capfd, "check", near.url, "--clean")
-    assert code == 3 and "missing file    sheets/" in done.out and "1 problems" in done.out
+    done = run("atlas", "check", near.url, "--clean")
+    assert done.code == 3 and "missing file    sheets/" in done.out and "1 problems" in done.out
     assert "(fixed)" in done.out
-    code, done = run(capfd, "check", near.url, "--json", "--deep")
+    done = run("atlas", "check", near.url, "--json", "--deep")
     plain = json.loads(done.out)
-    assert code == 3 and not plain["whole"] and plain["deep"]
+    assert done.code == 3 and not plain["whole"] and plain["deep"]
     assert {each["kind"] for each in plain["problems"]} == {"missing file"}
 
 
-def test_add_and_retire(near, tmp_path, capfd):
+def test_add_and_retire(near, tmp_path, run):
     copy = tmp_path / "copy"
-    code, done = run(capfd, "add", copy, near.url)
-    assert (code, done.out) == (0, f"2 sheets added, 0 unchanged: {copy}\n")
-    code, done = run(capfd, "add", copy, near.url, "--replace")
+    done = run("atlas", "add", copy, near.url)
+    assert (done.code, done.out) == (0, f"2 sheets added, 0 unchanged: {copy}\n")
+    done = run("atlas", "add", copy, near.url, "--replace")
     assert done.out.startswith("0 sheets added, 2 unchanged")
     assert list(Atlas.open(copy).sheets()) == [HERE, EAST] and found(Atlas.open(copy)) == []
-    code, done = run(capfd, "retire", copy, HERE, EAST)
-    assert code == 0 and Atlas.open(copy).sheets() == {} and found(Atlas.open(copy)) == []
-    code, done = run(capfd, "retire", copy, HERE)
-    assert code == 1 and "has no sheet" in done.err
+    done = run("atlas", "retire", copy, HERE, EAST)
+    assert done.code == 0 and Atlas.open(copy).sheets() == {} and found(Atlas.open(copy)) == []
+    done = run("atlas", "retire", copy, HERE)
+    assert done.code == 1 and "has no sheet" in done.err
     shutil.rmtree(copy)
     Atlas.open_or_create(copy, replace(RECIPE, overlap=0.5))
-    code, done = run(capfd, "add", copy, near.url)
-    assert code == 1 and "overlap: 0.5, not 0.875" in done.err
+    done = run("atlas", "add", copy, near.url)
+    assert done.code == 1 and "overlap: 0.5, not 0.875" in done.err
 
 
-def test_sheets_are_listed_even_if_no_index_can_be_made(near, tmp_path, capfd):
+def test_sheets_are_listed_even_if_no_index_can_be_made(near, tmp_path, run):
     files = {"map": tmp_path / "map", "coarse": tmp_path / "coarse"}
     for path in files.values():
         path.write_text("no tiles")
     near.put(files, described(HERE))
-    code, done = run(capfd, "index", near.url)
-    assert code == 1 and "coarse" in done.err
+    done = run("atlas", "index", near.url)
+    assert done.code == 1 and "coarse" in done.err
     assert len(json.loads(near.store.read("items.geojson"))["features"]) == 2

@@ -1,6 +1,7 @@
 """The index of vectors: against exact search, its files, its shards, what is refused."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,22 +106,17 @@ def test_fewer_vectors_than_requested(tmp_path, vectors, quantizers):
 @pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.vectors.npy"])
 def test_truncated_and_missing_files_are_refused(folder, name, quantizers):
     contents = (folder / name).read_bytes()
-    (folder / name).write_bytes(contents[: len(contents) // 2])
-    with pytest.raises(AtlasError):
-        ShardedIndex(folder.joinpath, SHARDS, quantizers)
-    (folder / name).unlink()
-    with pytest.raises(AtlasError):
-        ShardedIndex(folder.joinpath, SHARDS, quantizers)
+    for damage in (lambda path: path.write_bytes(contents[: len(contents) // 2]), Path.unlink):
+        damage(folder / name)
+        with pytest.raises(AtlasError):
+            ShardedIndex(folder.joinpath, SHARDS, quantizers)
 
 
-def test_damaged_codes_are_refused(folder, vectors, quantizers):
+def test_damaged_codes_and_a_shard_of_another_size_are_refused(folder, vectors, quantizers):
+    other = (replace(SHARDS[0], parts=SHARDS[0].parts[:1]),)
+    with pytest.raises(AtlasError, match="expected 1500 rows"):
+        ShardedIndex(folder.joinpath, other, quantizers)
     size = (folder / "a.codes").stat().st_size
     (folder / "a.codes").write_bytes(b"\x7f" * size)
     with pytest.raises(AtlasError, match="damaged"):
         ShardedIndex(folder.joinpath, SHARDS, quantizers).search(vectors[:1], 5, 64, 100)
-
-
-def test_a_shard_of_another_size_is_refused(folder, quantizers):
-    other = (replace(SHARDS[0], parts=SHARDS[0].parts[:1]),)
-    with pytest.raises(AtlasError, match="expected 1500 rows"):
-        ShardedIndex(folder.joinpath, other, quantizers)

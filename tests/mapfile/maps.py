@@ -59,6 +59,17 @@ def put_together(path, header, plain=None, data=b"", *, sign=True):
     return path
 
 
+def altered(path, **changes):
+    """The map with other entries of its manifest, signed anew."""
+    header, plain, data = taken_apart(path)
+    return put_together(path, header, {**plain, **changes}, data)
+
+
+def altered_sheet(path, **changes):
+    """The same of its sheet."""
+    return altered(path, sheets=[{**taken_apart(path)[1]["sheets"][0], **changes}])
+
+
 def described(array, first=0):
     """A part as the header and as the manifest describe it, and its bytes."""
     names = {"float16": "F16", "float32": "F32", "uint8": "U8", "int32": "I32"}

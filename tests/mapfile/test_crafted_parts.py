@@ -1,11 +1,5 @@
 """Maps whose checksums are right and whose parts are not: the decoders themselves are reached."""
 
-import json
-import os
-import resource
-import subprocess
-import sys
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +15,6 @@ from orthonav.core.records import NoFix, Telemetry, View
 from orthonav.onboard.run import SingleViews, locate_view
 
 GOLDEN = Path(__file__).parent.parent / "data" / "golden_v1.onav"
-MASKS, MASK_OFFSETS = "sheet0/grey/mask_bytes", "sheet0/grey/mask_offsets"
 CAMERA = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
 
 
@@ -94,58 +87,17 @@ def test_any_values_of_a_part_give_our_errors(tmp_path, name, caplog):
     assert not any(record.exc_info for record in caplog.records)
 
 
-def masked(mask, tmp_path):
-    """The golden map with `mask` as the mask of every chunk that has one."""
-    _, arrays = golden()
-    has = np.diff(arrays[MASK_OFFSETS]) > 0
-    data = np.frombuffer(mask * int(has.sum()), np.uint8)
-    offsets = np.concatenate([[0], np.cumsum(has * len(mask))]).astype(np.int64)
-    return written(tmp_path / "a.onav", {MASKS: data, MASK_OFFSETS: offsets})
-
-
-COMMANDS = """
-import json, sys
-from orthonav.cli import main
-print([main(arguments) for arguments in json.loads(sys.argv[1])], file=sys.stderr)
-"""
-
-
-@pytest.mark.long
-def test_crafted_maps_print_no_traceback(tmp_path, flight_path):
-    """Commands in a process of its own, whose memory is limited."""
-
-    def limit():
-        resource.setrlimit(resource.RLIMIT_AS, (3 * 2**29,) * 2)
-
-    path = masked(zlib.compress(bytes(100_000_000), 1), tmp_path)
-    commands = (
-        ("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl", "-q"),
-        ("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl", "-q", "--track"),
-        ("check", path, "--agl-m", "270", "--out", tmp_path / "check", "-q"),
-        ("info", path),
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", COMMANDS, json.dumps([[*map(str, each)] for each in commands])],
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        preexec_fn=limit,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
-    codes = json.loads(done.stderr.splitlines()[-1])
-    assert len(codes) == len(commands) and set(codes) <= {0, 1, 3, 4}
-
-
 def test_a_coarsest_level_of_gigapixels(tmp_path):
     """Its chunks are empty, so the file is small; programs read this level as a whole."""
     manifest, _ = golden()
     sheet = manifest.sheets[0]
-    for rows, levels, sane in ((600, 1, False), (600, 4, True), (250, 1, True)):
+    for rows, levels in ((600, 4), (250, 1), (600, 1)):
         grid = replace(sheet.grid, rows=rows, cols=2, stride_px=32, gsd_m=0.1)
-        sheets = (replace(sheet, grid=grid, tiles=2, grey=replace(sheet.grey, levels=levels)),)
-        if not sane:
-            with pytest.raises(MapFileError, match="impossible registration layer"):
-                open_map(written(tmp_path / "a.onav", {}, sheets=sheets))
-        else:
-            open_map(written(tmp_path / "a.onav", {}, sheets=sheets))
+        grey = replace(sheet.grey, levels=levels)
+        path = written(
+            tmp_path / "a.onav", {}, sheets=(replace(sheet, grid=grid, tiles=2, grey=grey),)
+        )
+        if (rows, levels) != (600, 1):
+            open_map(path)
+    with pytest.raises(MapFileError, match="impossible registration layer"):
+        open_map(path)

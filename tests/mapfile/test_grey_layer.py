@@ -1,16 +1,18 @@
 """Windows of the registration layer are read right, from no more than is needed, or refused."""
 
 import dataclasses
+import shutil
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from maps import arrays, manifest, put_together, taken_apart
+from maps import altered_sheet, arrays, manifest, put_together, taken_apart
 
 from helpers import memory_below, textured
 from orthonav.core.errors import MapFileError
@@ -111,7 +113,7 @@ def test_any_window(opened, level, row, col, size):
     assert found_grey.flags.writeable and found_valid.flags.writeable
 
 
-def test_only_the_chunks_touched_are_decoded_and_once(layer, decoded):
+def test_only_the_chunks_touched_are_decoded_and_once(decoded, layer):
     layer.read(0, 3, 130, 60, 60)
     assert decoded == [(64, 64)]
     layer.read(0, 0, 128, 64, 64)
@@ -153,55 +155,40 @@ def test_a_map_without_a_layer(tmp_path):
             GreyLayer.of(opened, sheet)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"codec": "webp"},
-        {"codec": None},
-        {"chunk_px": 0},
-        {"chunk_px": 65},
-        {"chunk_px": 8},
-        {"chunk_px": 2048},
-        {"chunk_px": 64.0},
-        {"levels": 0},
-        {"levels": 11},
-        {"levels": True},
-        {"quality": 0},
-        {"quality": 101},
-        {"valid_px": -1},
-        {"valid_px": 150 * 210 + 1},
-        {"valid_px": "all"},
-    ],
-    ids=str,
-)
-def test_a_signed_layer_of_nonsense(opened, tmp_path, changes):
-    header, plain, data = taken_apart(opened.path)
-    plain["sheets"][0]["grey"].update(changes)
+WRONG = {
+    "codec": ("webp", None),
+    "chunk_px": (0, 65, 8, 2048, 64.0),
+    "levels": (0, 11, True),
+    "quality": (0, 101),
+    "valid_px": (-1, 150 * 210 + 1, "all"),
+}
+
+
+@pytest.mark.parametrize("name, value", [(name, x) for name, all_ in WRONG.items() for x in all_])
+def test_a_signed_layer_of_nonsense(opened, tmp_path, name, value):
+    path = Path(shutil.copy(opened.path, tmp_path / "odd.onav"))
+    grey = taken_apart(path)[1]["sheets"][0]["grey"]
     with pytest.raises(MapFileError, match=r"registration layer|manifest of the map"):
-        open_map(put_together(tmp_path / "odd.onav", header, plain, data))
-    for other in ([], "grey", 5):
-        plain["sheets"][0]["grey"] = other
-        with pytest.raises(MapFileError, match="manifest of the map"):
-            open_map(put_together(tmp_path / "odd.onav", header, plain, data))
+        open_map(altered_sheet(path, grey={**grey, name: value}))
 
 
-def offsets_changed(parts, kind, change):
-    places = parts[NAMES[kind]].copy()
-    return {**parts, NAMES[kind]: change(places)}
+@pytest.mark.parametrize("grey", [[], "grey", 5])
+def test_a_layer_that_is_no_record(opened, tmp_path, grey):
+    path = Path(shutil.copy(opened.path, tmp_path / "odd.onav"))
+    with pytest.raises(MapFileError, match="manifest of the map"):
+        open_map(altered_sheet(path, grey=grey))
 
 
 def one_set(at, value):
-    def change(places):
-        places[at] = value
-        return places
-
-    return change
+    return lambda places: np.where(np.arange(len(places)) == at % len(places), value, places)
 
 
 @pytest.mark.parametrize("kind", ["offsets", "mask_offsets"])
 @pytest.mark.parametrize(
     "change",
     [
+        *(one_set(at, value) for at, value in ((0, -1), (0, 1), (-1, 2**62), (3, 2**62))),
+        one_set(3, -(2**63)),
         lambda places: places[:-1],
         lambda places: np.append(places, places[-1]),
         lambda places: places[:0],
@@ -209,19 +196,14 @@ def one_set(at, value):
         lambda places: places[None],
         lambda places: places[::-1],
         lambda places: places + 1,
-        one_set(0, -1),
-        one_set(0, 1),
-        one_set(-1, 2**62),
-        one_set(3, 2**62),
-        one_set(3, -(2**63)),
     ],
     ids=range(12),
 )
 def test_wrong_offsets(made, tmp_path, kind, change):
     info, parts = made
-    odd = write_layer(tmp_path / "odd.onav", info, offsets_changed(parts, kind, change))
+    wrong = {**parts, NAMES[kind]: change(parts[NAMES[kind]])}
     with pytest.raises(MapFileError, match=r"grey/(mask_)?offsets must .*odd.onav"):
-        GreyLayer.of(odd)
+        GreyLayer.of(write_layer(tmp_path / "odd.onav", info, wrong))
 
 
 @pytest.mark.parametrize("kind", NAMES)
@@ -232,27 +214,22 @@ def test_missing_parts(made, tmp_path, kind):
         GreyLayer.of(write_layer(tmp_path / "odd.onav", info, left))
 
 
-def blobs_of(parts, kind):
-    places = parts[NAMES[f"{kind}offsets"]]
-    data = parts[NAMES[f"{kind}bytes"]].tobytes()
-    return [data[first:last] for first, last in pairwise(places)]
-
-
-def with_chunk(parts, number, **blobs):
-    """The parts with the `jpeg` or the `mask` of a chunk replaced."""
-    changed = dict(parts)
-    for name, blob in blobs.items():
-        kind = {"jpeg": "", "mask": "mask_"}[name]
-        all_blobs = blobs_of(parts, kind)
-        all_blobs[number] = blob
-        changed |= blob_parts(NAMES[f"{kind}bytes"], NAMES[f"{kind}offsets"], all_blobs)
-    return changed
+def with_chunk(parts, number, kind="", *, blob):
+    """The parts with the JPEG of a chunk replaced, or with its mask (`kind` is "mask_")."""
+    data, offsets = NAMES[f"{kind}bytes"], NAMES[f"{kind}offsets"]
+    stored = parts[data].tobytes()
+    blobs = [stored[first:last] for first, last in pairwise(parts[offsets])]
+    blobs[number] = blob
+    return {**parts, **blob_parts(data, offsets, blobs)}
 
 
 def image(shape=(64, 64), extension=".jpg", options=()):
     picture = textured(shape[:2])
     picture = picture if len(shape) == 2 else np.dstack([picture] * shape[2])
     return cv2.imencode(extension, picture, list(options))[1].tobytes()
+
+
+GOOD = image()
 
 
 def framed(rows, cols, *, bits=8, channels=1, marker=0xC0):
@@ -265,17 +242,10 @@ def framed(rows, cols, *, bits=8, channels=1, marker=0xC0):
 
 
 def with_segment(marker, content):
-    data = image()
-    return (
-        data[:2]
-        + bytes([0xFF, marker])
-        + (len(content) + 2).to_bytes(2, "big")
-        + content
-        + data[2:]
-    )
+    length = (len(content) + 2).to_bytes(2, "big")
+    return b"".join([GOOD[:2], bytes([0xFF, marker]), length, content, GOOD[2:]])
 
 
-GOOD = image()
 JPEGS = {
     "junk": b"\x93" * 500,
     "one byte": b"\xff",
@@ -318,15 +288,15 @@ MASKS = {
 }
 
 
-CHUNKS = [("jpeg", name) for name in JPEGS] + [("mask", name) for name in MASKS]
+CHUNKS = [("", name) for name in JPEGS] + [("mask_", name) for name in MASKS]
 
 
 @pytest.mark.parametrize(("kind", "name"), CHUNKS)
 def test_a_chunk_that_is_no_grey_jpeg_of_its_size_or_has_no_mask_of_it(made, tmp_path, kind, name):
     info, parts = made
-    blob = (JPEGS if kind == "jpeg" else MASKS)[name]
-    odd = write_layer(tmp_path / "odd.onav", info, with_chunk(parts, 2, **{kind: blob}))
-    layer, said = GreyLayer.of(odd), "mask" if kind == "mask" else ""
+    blob = (MASKS if kind else JPEGS)[name]
+    odd = write_layer(tmp_path / "odd.onav", info, with_chunk(parts, 2, kind, blob=blob))
+    layer, said = GreyLayer.of(odd), kind.rstrip("_")
     with (
         memory_below(1e6),
         pytest.raises(MapFileError, match=rf"damaged \(level 0, chunk 0, 2: {said}.*odd.onav"),
@@ -353,9 +323,9 @@ def test_whatever_is_done_to_a_chunk_only_our_errors_come_out(data):
 
 def test_a_mask_without_a_picture(made, tmp_path):
     info, parts = made
-    layer = GreyLayer.of(write_layer(tmp_path / "odd.onav", info, with_chunk(parts, 2, jpeg=b"")))
+    layer = GreyLayer.of(write_layer(tmp_path / "odd.onav", info, with_chunk(parts, 2, blob=b"")))
     assert not layer.read(0, 0, 130, 10, 10)[1].any()  # wholly valid, had no mask
     number = ChunkTable(*SHAPE, info.levels, CHUNK_PX).number(0, 0, 0)
-    odd = write_layer(tmp_path / "odd.onav", info, with_chunk(parts, number, jpeg=b""))
+    odd = write_layer(tmp_path / "odd.onav", info, with_chunk(parts, number, blob=b""))
     with pytest.raises(MapFileError, match="damaged"):
         GreyLayer.of(odd).read(0, 0, 0, 10, 10)

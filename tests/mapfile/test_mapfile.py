@@ -11,7 +11,15 @@ import safetensors
 import safetensors.numpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from maps import arrays, described, manifest, put_together, taken_apart
+from maps import (
+    altered,
+    altered_sheet,
+    arrays,
+    described,
+    manifest,
+    put_together,
+    taken_apart,
+)
 
 from helpers import memory_below
 from orthonav.core.errors import MapFileError, MapVersionError, MissingFileError, OutputError
@@ -84,22 +92,7 @@ def test_the_safetensors_library_reads_the_same(path):
         assert other.metadata()["orthonav"].startswith("{")
 
 
-def test_no_flipped_bit_goes_unnoticed(path, content):
-    rng = np.random.default_rng(0)
-    header_end = 8 + int.from_bytes(content[:8], "little")
-    places = [*rng.integers(0, len(content), 100), *rng.integers(0, header_end, 100), *range(10)]
-    for place in map(int, places):
-        flipped = bytearray(content)
-        flipped[place] ^= 1 << rng.integers(8)
-        path.write_bytes(flipped)
-        try:
-            opened = open_map(path)
-        except MapFileError:
-            continue
-        assert same_as_written(opened), f"byte {place}"  # such as 1e-05 become 1E-05
-
-
-@settings(max_examples=100)
+@settings(max_examples=200)
 @given(data=st.data())
 def test_whatever_is_done_to_a_map_only_our_errors_come_out(tmp_path_factory, content, data):
     path = tmp_path_factory.getbasetemp() / "mutated.onav"
@@ -165,72 +158,56 @@ def test_a_file_that_may_not_be_read(path, monkeypatch):
 
 
 def test_a_newer_schema_is_named(path):
-    header, plain, data = taken_apart(path)
-    put_together(path, header, {**plain, "schema": 2, "sheets": "of another kind"}, data)
+    altered(path, schema=2, sheets="of another kind")
     refused(path, r"has schema 2, this program reads up to 1; update", MapVersionError)
 
 
-@pytest.mark.parametrize("schema", [0, -1, 1.0, True, "1", None])
-def test_a_schema_that_never_was(path, schema):
-    header, plain, data = taken_apart(path)
-    refused(put_together(path, header, {**plain, "schema": schema}, data))
+WRONG = {
+    "schema": (0, -1, 1.0, True, "1", None),
+    "sheets": ([], [5], {}),
+    "recipe": ([],),
+    "imagery": (None,),
+    "view": (5, {"heading_step_deg": 10**400}),
+    "radius_m": ("24", True, 10**400),
+    "parts": ([], {}),
+    "format": ("other",),
+}
+WRONG_SHEET = {
+    "origin_lat_deg": (90.5, None),
+    "origin_lon_deg": (1e9,),
+    "tiles": (13, 0, 1.5),
+    "area_km2": ("1",),
+}
+WRONG_GRID = {
+    "gsd_m": (0, 1e300),
+    "tile_px": (8, 10**6),
+    "stride_px": (0, 65),
+    "rows": (0, True),
+    "cols": (10**9, 10**400),
+    "west_m": (-(10**400),),
+    "north_m": ([],),
+}
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"sheets": []},
-        {"sheets": [5]},
-        {"sheets": {}},
-        {"recipe": []},
-        {"imagery": None},
-        {"view": 5},
-        {"radius_m": "24"},
-        {"radius_m": True},
-        {"radius_m": 10**400},
-        {"view": {"heading_step_deg": 10**400}},
-        {"parts": []},
-        {"parts": {}},
-        {"format": "other"},
-    ],
-    ids=lambda changes: str(changes)[:50],
-)
-def test_a_signed_manifest_of_nonsense(path, changes):
-    header, plain, data = taken_apart(path)
-    refused(put_together(path, header, {**plain, **changes}, data))
+def each_of(wrong):
+    cases = [(name, value) for name, values in wrong.items() for value in values]
+    return pytest.mark.parametrize("name, value", cases, ids=lambda each: str(each)[:30])
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"origin_lat_deg": 90.5},
-        {"origin_lon_deg": 1e9},
-        {"origin_lat_deg": None},
-        {"tiles": 13},
-        {"tiles": 0},
-        {"tiles": 1.5},
-        {"area_km2": "1"},
-        {"grid": {"gsd_m": 0}},
-        {"grid": {"gsd_m": 1e300}},
-        {"grid": {"tile_px": 8}},
-        {"grid": {"tile_px": 10**6}},
-        {"grid": {"stride_px": 0}},
-        {"grid": {"stride_px": 65}},
-        {"grid": {"rows": 0}},
-        {"grid": {"cols": 10**9}},
-        {"grid": {"cols": 10**400}},
-        {"grid": {"west_m": -(10**400)}},
-        {"grid": {"north_m": []}},
-        {"grid": {"rows": True}},
-    ],
-    ids=lambda changes: str(changes)[:50],
-)
-def test_a_signed_sheet_of_nonsense(path, changes):
-    header, plain, data = taken_apart(path)
-    sheet = plain["sheets"][0]
-    if "grid" in changes:
-        changes = {"grid": {**sheet["grid"], **changes["grid"]}}
-    refused(put_together(path, header, {**plain, "sheets": [{**sheet, **changes}]}, data))
+@each_of(WRONG)
+def test_a_signed_manifest_of_nonsense(path, name, value):
+    refused(altered(path, **{name: value}))
+
+
+@each_of(WRONG_SHEET)
+def test_a_signed_sheet_of_nonsense(path, name, value):
+    refused(altered_sheet(path, **{name: value}))
+
+
+@each_of(WRONG_GRID)
+def test_a_signed_grid_of_nonsense(path, name, value):
+    grid = taken_apart(path)[1]["sheets"][0]["grid"]
+    refused(altered_sheet(path, grid={**grid, name: value}))
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
@@ -273,22 +250,10 @@ def test_an_additional_or_missing_part_is_refused(path):
 @pytest.mark.parametrize(
     "shape",
     [
-        [6],
-        [8],
-        [7, 1],
-        [1, 7],
-        [-7],
-        [-1, -7],
-        [7.0],
-        [True, 7],
-        "7",
-        7,
-        None,
-        [],
-        [2**62],
-        [2**64],
+        *([6], [8], [7, 1], [1, 7], [-7], [-1, -7], [7.0], [True, 7]),
+        *("7", 7, None, [], [2**62], [2**64]),
     ],
-    ids=lambda changes: str(changes)[:50],
+    ids=lambda shape: str(shape)[:50],
 )
 def test_wrong_shapes(path, shape):
     header, plain, data = taken_apart(path)

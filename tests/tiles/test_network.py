@@ -18,31 +18,27 @@ RECIPE = AutoEncoderRecipe(dims=DIMS, width=8)
 WEIGHTS = np.random.default_rng(0).normal(size=(DIMS, 2 * SIDE * SIDE)).astype(np.float32)
 
 
-def graph(
-    *,
-    nodes=None,
-    weights=WEIGHTS,
-    inputs=None,
-    outputs=None,
-    opsets=None,
-    functions=(),
-    name="maps",
-):
-    """Bytes of an encoder of one dense layer, or of a changed one."""
-    nodes = nodes or [
-        helper.make_node("Flatten", [name], ["flat"], axis=1),
-        helper.make_node("Gemm", ["flat", "w"], ["embedding"], transB=1),
-    ]
-    inputs = inputs or [helper.make_tensor_value_info(name, FLOAT, ["N", 2, SIDE, SIDE])]
-    outputs = outputs or [helper.make_tensor_value_info("embedding", FLOAT, ["N", DIMS])]
+def graph(*, nodes=None, weights=WEIGHTS, inputs=None, outputs=None, functions=(), name="maps"):
+    """An encoder of one dense layer, or a changed one."""
+    nodes = nodes or [helper.make_node("Flatten", [name], ["flat"], axis=1), dense("flat")]
+    inputs = inputs or [info(name, ["N", 2, SIDE, SIDE])]
+    outputs = outputs or [info("embedding", ["N", DIMS])]
     tensors = [onnx.numpy_helper.from_array(weights, "w")]
     made = helper.make_model(
         helper.make_graph(nodes, "encoder", inputs, outputs, tensors),
-        opset_imports=opsets or [helper.make_opsetid("", 17)],
+        opset_imports=[helper.make_opsetid("", 17)],
         functions=functions,
     )
     made.ir_version = 8
     return made
+
+
+def dense(source):
+    return helper.make_node("Gemm", [source, "w"], ["embedding"], transB=1)
+
+
+def info(name, shape):
+    return helper.make_tensor_value_info(name, FLOAT, shape)
 
 
 def embedder(model=None, recipe=RECIPE):
@@ -159,22 +155,18 @@ def test_weights_in_other_files_are_refused():
         embedder(pointed)
 
 
-def dense(source):
-    return helper.make_node("Gemm", [source, "w"], ["embedding"], transB=1)
-
-
 def strange_graphs():
     flat = helper.make_node("Flatten", ["maps"], ["flat"], axis=1)
     inner = helper.make_graph([], "inner", [], [])
     tensor = onnx.numpy_helper.from_array(np.zeros(2, np.float32), "t")
-    with_tensor = helper.make_node("Identity", ["flat"], ["same"], value=tensor)
-    with_graph = helper.make_node("Identity", ["flat"], ["same"], body=inner)
-    elsewhere = helper.make_node("Identity", ["flat"], ["same"], domain="com.microsoft")
-    loop = helper.make_node("Loop", ["flat"], ["same"], body=inner)
-    huge = helper.make_node("ConstantOfShape", ["w"], ["same"])
-    nodes = (with_tensor, with_graph, elsewhere, loop, huge)
-    names = ("tensor", "graph", "domain", "loop", "huge")
-    for name, node in zip(names, nodes, strict=True):
+    for name, operator, source, more in (
+        ("tensor", "Identity", "flat", {"value": tensor}),
+        ("graph", "Identity", "flat", {"body": inner}),
+        ("domain", "Identity", "flat", {"domain": "com.microsoft"}),
+        ("loop", "Loop", "flat", {"body": inner}),
+        ("huge", "ConstantOfShape", "w", {}),
+    ):
+        node = helper.make_node(operator, [source], ["same"], **more)
         yield pytest.param(graph(nodes=[flat, node, dense("same")]), id=name)
     opset = helper.make_opsetid("", 17)
     function = helper.make_function("x", "F", ["a"], ["a"], [], [opset])
@@ -188,10 +180,6 @@ def test_anything_but_plain_layers_is_refused_before_it_is_loaded(model, monkeyp
     )
     with pytest.raises(MapFileError, match=r"encoder (holds|needs)"):
         embedder(model)
-
-
-def info(name, shape, kind=FLOAT):
-    return helper.make_tensor_value_info(name, kind, shape)
 
 
 @pytest.mark.parametrize(

@@ -149,19 +149,6 @@ def test_triplet_loss_of_three_embeddings(margin, loss):
     assert float(triplet_loss(anchors, positives, apart, margin=margin, semi_hard=False)) == loss
 
 
-@pytest.mark.parametrize("semi_hard, rows", [(False, [1, 0, 1]), (True, [2, 0, 0])])
-def test_the_hardest_negative_is_the_nearest_one(semi_hard, rows):
-    """At 0, 1 and 3 on a line; semi-hard: squared distances above 4, where there are any."""
-    import torch
-
-    from orthonav.research.triplet import hard_negatives
-
-    anchors = torch.tensor([[0.0], [1], [3]])
-    near, apart = torch.full((3,), 4.0), ~torch.eye(3, dtype=torch.bool)
-    made = hard_negatives(anchors, near, apart, semi_hard=semi_hard)
-    assert made.tolist() == rows
-
-
 def test_words_are_the_centres_of_clusters():
     """Of descriptors 0, 2, 10 and 12: the means 1 and 11."""
     from orthonav.research import words as learning

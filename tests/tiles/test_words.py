@@ -1,8 +1,5 @@
 """Bags of visual words: frequencies of known features, and places distinguished by them."""
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
@@ -146,25 +143,3 @@ def test_words_of_a_tile_are_those_of_its_strongest_features(learnt):
 def test_too_few_features_are_refused(greys):
     with pytest.raises(VariantError, match=r"1024 words cannot be learned from \d+ features"):
         learn_words(WordsRecipe(), pictures_of(greys))
-
-
-# Values.
-
-
-def test_sift_words_need_no_torch_and_no_faiss():
-    script = """
-import sys
-import numpy as np
-from orthonav.core.tiles.words import WordsEmbedder, WordsRecipe
-
-rng = np.random.default_rng(0)
-words = rng.integers(0, 99, (256, 128), dtype=np.uint8)
-embedder = WordsEmbedder(WordsRecipe(words=256), words, np.zeros(0, np.float32))
-grey = rng.random((1, 96, 96), dtype=np.float32)
-assert embedder.view(grey, np.ones((96, 96), bool)).any()
-print({name.partition(".")[0] for name in sys.modules} & {"torch", "faiss", "transformers"})
-"""
-    done = subprocess.run(
-        [sys.executable, "-B", "-c", script], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stdout.strip()) == (0, "set()"), done.stderr

@@ -23,6 +23,42 @@ class Variant:
     extra: str | None = None
 
 
+def within(default: Any, least: float, most: float = math.inf, *, above: bool = False) -> Any:
+    """A field of `Checked` of at least `least`, or `above` it, and at most `most`."""
+    expected = f"above {least:g}" if above else f"at least {least:g}"
+    expected += f" and at most {most:g}" if most < math.inf else ""
+
+    def fits(value: Any) -> bool:
+        return bool((least < value if above else least <= value) and value <= most)
+
+    return _field(default, fits, expected)
+
+
+def choice(default: Any, *others: Any) -> Any:
+    """A field of `Checked` with one of these values."""
+    known = (default, *others)
+    return _field(default, lambda value: value in known, f"one of {', '.join(map(str, known))}")
+
+
+def _field(default: Any, fits: Callable[[Any], bool], expected: str) -> Any:
+    return dataclasses.field(default=default, metadata={"fits": fits, "expected": expected})
+
+
+class Checked:
+    """Base of variants: raises `VariantError` for a field with a value that it may not have."""
+
+    def __post_init__(self) -> None:
+        for each in dataclasses.fields(self):  # type: ignore[arg-type]  # of those derived
+            if "fits" in each.metadata:
+                fits, expected = each.metadata["fits"], each.metadata["expected"]
+                require_fits(each.name, getattr(self, each.name), fits, expected)
+
+
+def require_fits(name: str, value: Any, fits: Callable[[Any], bool], expected: str) -> None:
+    if not fits(value):
+        raise VariantError(f"{name} must be {expected}, got {value}")
+
+
 Table = Mapping[str, Variant]
 Part = Callable[[str, Any, int], NDArray[Any]]
 """Gives a part of a map by name, type and number of dimensions."""

@@ -31,7 +31,7 @@ from torch.nn import functional
 from orthonav.core.files import Progress
 from orthonav.research.caevl_recipe import CaevlRecipe
 from orthonav.research.tiles import SheetTiles
-from orthonav.research.training import Means, TrainedNetwork, finished, learn_network, train
+from orthonav.research.training import Means, TrainedNetwork, Training, finished, learn_network
 
 GEOMETRY, LIGHT = 0.8, 0.5
 """Probability of a change of geometry, and of each of blur, contrast and brightness."""
@@ -276,5 +276,7 @@ def learn_caevl(
     def tuning(text: str, done: float) -> None:
         report(f"fine-tuning: {text}", share + (1 - share) * done)
 
-    train(task, recipe.exchanged(), tiles, seed=seed, work=work, report=tuning, means=means)
+    Training(
+        task, recipe.exchanged(), tiles, seed=seed, work=work, report=tuning, means=means
+    ).run()
     return finished(encoder, recipe, tiles, tuning, means)

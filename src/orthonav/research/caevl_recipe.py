@@ -6,41 +6,25 @@ Geo-Localization from Reference Imagery Alone", WACV 2026 (arXiv 2512.02737).
 
 from dataclasses import dataclass, fields, replace
 
-from orthonav.core.errors import VariantError
 from orthonav.core.tiles.network import AutoEncoderRecipe
+from orthonav.core.variants import choice, within
 
 
 @dataclass(frozen=True)
 class CaevlRecipe(AutoEncoderRecipe):
     """Parameters of CAEVL: an auto-encoder, then its encoder fine-tuned with VICReg.
 
-    Defaults are those of the authors' released configuration. `epochs`, `learning_rate`: of the
-    auto-encoder. `tuning_epochs`, `tuning_rate`: of the fine-tuning. `batch`: of both.
-    `projector`: numbers per layer of the global projection head. `alpha`: weight of the global
-    loss, the rest is that of the local one, 0 to 1. The others are as in `AutoEncoderRecipe`.
+    Defaults are those of the authors' released configuration; other fields are those of
+    `AutoEncoderRecipe`. Its `epochs` and `learning_rate` are those of the auto-encoder.
     """
 
-    batch: int = 128
-    learning_rate: float = 6e-5
-    similarity: str = "cosine"
-    tuning_epochs: int = 100
-    tuning_rate: float = 6e-5
-    projector: int = 4096
-    alpha: float = 0.75
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not (1 <= self.tuning_epochs <= 100_000 and 0 < self.tuning_rate <= 1):
-            raise VariantError(
-                "tuning_epochs must be 1 to 100000 and tuning_rate above 0, at most 1, got "
-                f"{self.tuning_epochs} and {self.tuning_rate}"
-            )
-        if not 1 <= self.projector <= 16_384:
-            raise VariantError(f"projector must be 1 to 16384, got {self.projector}")
-        if not 0 <= self.alpha <= 1:
-            raise VariantError(f"alpha must be 0 to 1, got {self.alpha}")
-        if self.batch < 2:
-            raise VariantError(f"batch must be at least 2, got {self.batch}")
+    batch: int = within(128, 2, 65_536)  # of both trainings
+    learning_rate: float = within(6e-5, 0, 1, above=True)
+    similarity: str = choice("cosine", "product")
+    tuning_epochs: int = within(100, 1, 100_000)
+    tuning_rate: float = within(6e-5, 0, 1, above=True)
+    projector: int = within(4096, 1, 16_384)  # numbers per layer of the global projection head
+    alpha: float = within(0.75, 0, 1)  # weight of the global loss; the rest is the local one's
 
     def first(self) -> AutoEncoderRecipe:
         return AutoEncoderRecipe(

@@ -27,20 +27,11 @@ OPSET, IR_VERSION = 17, 8
 FLOAT_TOLERANCE = 1e-3
 """Largest accepted difference between ONNX and PyTorch, relative to the largest embedding value."""
 LEAST_COSINE = {"float32": 0.99999, "float16": 0.9999, "int8": 0.97}
-"""Smallest accepted cosine between embeddings in a precision and in PyTorch float32.
-
-It holds for every held-out tile. Measured on 256 px, one tile at a time, onnxruntime 1.31, one
-thread of an AMD EPYC with AVX-512 VNNI, processor time; the triplet network on tiles of another
-date:
-
-    auto-encoder, width 32   float32  8.5 MB 0.6 ms   float16  4.2 MB 0.4 ms, cosine 1.0000
-                                                      int8     2.1 MB 0.6 ms, least 0.9998
-    triplet, width 16        float32  5.3 MB 5.8 ms   float16  2.7 MB 6.0 ms, cosine 1.0000
-                                                      int8     1.4 MB 2.9 ms, least 0.986
+"""Smallest accepted cosine between embeddings in a precision and in PyTorch float32, of every
+held-out tile.
 
 float16 halves the file and saves no time: weights are converted back when it is loaded. On
 processors without 8-bit products, and in small networks, int8 only reduces the file.
-`benchmarks.training` at d63ac91 measures the auto-encoder.
 """
 CALIBRATION_BATCH = 8
 
@@ -53,20 +44,11 @@ class ExportError(OrthonavError, RuntimeError):
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """An exported encoder.
-
-    - `embedder`: the ONNX embedder.
-    - `precision`: its precision; "float32" if the recipe's precision was not accurate enough.
-    - `cosine`: for each precision tried, smallest cosine to the PyTorch embeddings of the tiles.
-    - `least_cosine`: smallest cosine that was required of the recipe's precision.
-    - `sizes_mb`: for each precision tried, size of the ONNX model, MB.
-    """
-
     embedder: NetworkEmbedder
-    precision: str
-    cosine: dict[str, float]
-    least_cosine: float
-    sizes_mb: dict[str, float]
+    precision: str  # "float32" if the recipe's precision was not accurate enough
+    cosine: dict[str, float]  # of each precision tried, smallest to the PyTorch embeddings
+    least_cosine: float  # required of the recipe's precision
+    sizes_mb: dict[str, float]  # of the ONNX model in each precision tried
 
 
 def export_encoder(
@@ -137,11 +119,7 @@ def encoder_graph(encoder: nn.Module, shape: tuple[int, ...]) -> Any:
 
 def int8(model: Any, calibration: Array) -> bytes:
     """The model with 8-bit weights and activations, ranges from calibration tiles (N, C, S, S)."""
-    from onnxruntime.quantization import (
-        CalibrationDataReader,
-        QuantType,
-        quantize_static,
-    )
+    from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
     class Tiles(CalibrationDataReader):  # type: ignore[misc]  # untyped
         def __init__(self) -> None:
@@ -176,6 +154,7 @@ def float16(model: Any) -> bytes:
     """The model with weights in 16 bits, converted to 32 when it is loaded."""
     import onnx
 
+    float32 = onnx.TensorProto.FLOAT
     small = onnx.ModelProto()
     small.CopyFrom(model)
     casts = []
@@ -186,9 +165,7 @@ def float16(model: Any) -> bytes:
         name = weights.name
         halved = onnx.numpy_helper.from_array(values.astype(np.float16), f"{name}_16")
         weights.CopyFrom(halved)
-        casts.append(
-            onnx.helper.make_node("Cast", [f"{name}_16"], [name], to=onnx.TensorProto.FLOAT)
-        )
+        casts.append(onnx.helper.make_node("Cast", [halved.name], [name], to=float32))
     nodes = [*casts, *small.graph.node]
     del small.graph.node[:]
     small.graph.node.extend(nodes)

@@ -21,12 +21,6 @@ except ImportError as error:
     raise missing_extra("a neural network", "train", "torch", error) from error
 
 
-def require_device(device: str) -> None:
-    """Raise `VariantError` unless `device` is "auto", "cpu" or "cuda"."""
-    if device not in ("auto", "cpu", "cuda"):
-        raise VariantError(f"device must be auto, cpu or cuda, got '{device}'")
-
-
 def chosen_device(device: str) -> torch.device:
     """Device for "auto", "cpu" or "cuda"; raises `VariantError` for "cuda" without a GPU."""
     available = torch.cuda.is_available()

@@ -17,11 +17,10 @@ import pickle
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,11 +29,12 @@ from numpy.typing import NDArray
 from orthonav.core.errors import OutputError, VariantError
 from orthonav.core.extras import missing_extra
 from orthonav.core.files import replacing
+from orthonav.core.tiles.represent import Grey, Mask, filled, inner
+from orthonav.core.variants import Checked, choice, within
 from orthonav.research.pretrained import (
     chosen_device,
     pretrained,
     quiet,
-    require_device,
     transformers,
     weights_stamp,
 )
@@ -52,8 +52,6 @@ WHERE = (
     "https://dl.fbaipublicfiles.com/segment_anything/"
 )
 
-
-PER = ("sheet", "tile")
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 CACHE_FORMAT = b"orthonav sam boundaries 2"
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as in training
@@ -62,90 +60,49 @@ _CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 24}
 window against 1.18 s at 1 << 24 (small network)."""
 
 WEIGHTS_VARIABLE = "ORTHONAV_SAM_WEIGHTS"
-Grey = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Predict = Callable[[NDArray[np.float32]], tuple[torch.Tensor, torch.Tensor]]
 """Points (P, 2), x and y in pixels of the network, to logits (P, 3, h, w) and IoU (P, 3)."""
 
 
 @dataclass(frozen=True)
-class SamBoundaries:
+class SamBoundaries(Checked):
     """Binary map of the boundaries of all automatic Segment Anything masks of a picture.
 
     Defaults of `grid`, `iou`, `stability`, `offset` and `overlap` are those of the original
-    generator.
-
-    - `weights`: path of a Hugging Face folder or of an original `.pth` checkpoint (Base, Large or
-      Huge); by default ORTHONAV_SAM_WEIGHTS.
-    - `grid`: points along one side of a window, 1 to 256.
-    - `iou`: smallest IoU with the truth that the network may expect of a mask, 0 to 1.
-    - `stability`: smallest IoU between the masks cut at logits `offset` above and below zero, 0 to
-      1.
-    - `offset`: offset of the logits for `stability`, above 0.
-    - `overlap`: IoU of boxes above which the mask with the lower expected IoU is dropped, 0 to 1.
-    - `window`: side of the windows into which larger pictures are cut, 16 to 4096 px, so that point
-      spacing and magnification are those of a tile; 0: no windows.
-    - `per`: "sheet": a sheet is segmented once, in windows, and tiles are cut out of its
-      boundaries; "tile": every reference tile is segmented by itself, as a view is and as in the
-      paper, some 64 times the work at an overlap of 87.5 %.
-    - `prompts`: points per call of the network, 1 to 4096.
-    - `device`: "auto", "cpu" or "cuda".
-    - `precision`: "fp32", or "bf16" or "fp16" for the two transformers.
-    - `cache`: folder of finished windows, "none" for no cache; by default ORTHONAV_CACHE or the
-      user's cache folder.
+    generator. Larger pictures are cut into windows, so that point spacing and magnification are
+    those of a tile. `per`: "sheet": a sheet is segmented once and tiles are cut out of its
+    boundaries; "tile": every reference tile is segmented by itself, as a view is and as in the
+    paper, some 64 times the work at an overlap of 87.5 %.
     """
 
-    weights: str = ""
-    grid: int = 32
-    iou: float = 0.88
-    stability: float = 0.95
-    offset: float = 1.0
-    overlap: float = 0.7
-    window: int = 256
-    per: str = "sheet"
-    prompts: int = 64
-    device: str = "auto"
-    precision: str = "fp32"
-    cache: str = ""
+    weights: str = ""  # Hugging Face folder or original checkpoint; else ORTHONAV_SAM_WEIGHTS
+    grid: int = within(32, 1, 256)  # points along one side of a window
+    iou: float = within(0.88, 0, 1)  # least IoU with the truth that is expected of a mask
+    stability: float = within(0.95, 0, 1)  # least IoU of the masks cut at logits +-`offset`
+    offset: float = within(1.0, 0, above=True)
+    overlap: float = within(0.7, 0, 1)  # IoU of boxes above which the less expected is dropped
+    window: int = 256  # side of the windows, 16 to 4096 px; 0: none
+    per: str = choice("sheet", "tile")
+    prompts: int = within(64, 1, 4096)  # points per call of the network
+    device: str = choice("auto", "cpu", "cuda")
+    precision: str = choice(*PRECISIONS)  # of the two transformers
+    cache: str = ""  # folder of finished windows or "none"; else ORTHONAV_CACHE or the user's
 
     def __post_init__(self) -> None:
         if not self.path:
             raise VariantError(f"sam needs weights=PATH, or {WEIGHTS_VARIABLE}: {WHERE}")
-        ranges = {"grid": (1, 256), "prompts": (1, 4096)}
-        ranges |= dict.fromkeys(("iou", "stability", "overlap"), (0, 1))
-        for name, (least, most) in ranges.items():
-            if not least <= getattr(self, name) <= most:
-                raise VariantError(
-                    f"sam {name} must be {least} to {most}, got {getattr(self, name)}"
-                )
-        if not self.offset > 0:
-            raise VariantError(f"sam offset must be above 0, got {self.offset}")
+        super().__post_init__()
         if self.window and not 16 <= self.window <= 4096:
-            raise VariantError(f"sam window must be 0 or 16 to 4096 px, got {self.window}")
-        if self.per not in PER:
-            raise VariantError(f"sam per must be {' or '.join(PER)}, got '{self.per}'")
-        if self.precision not in PRECISIONS:
-            raise VariantError(
-                f"sam precision must be {', '.join(PRECISIONS)}, got '{self.precision}'"
-            )
-        require_device(self.device)
+            raise VariantError(f"window must be 0 or 16 to 4096 px, got {self.window}")
 
     @property
     def path(self) -> str:
-        """Path of the weights: `weights`, else ORTHONAV_SAM_WEIGHTS.
-
-        Maps do not store it: it is a path of the machine that built them.
-        """
+        """Of the weights. Maps do not store it: it is one of the machine that built them."""
         return self.weights or os.environ.get(WEIGHTS_VARIABLE, "")
 
-    @property
-    def channels(self) -> int:
-        return 1
+    channels = 1
 
-    @property
-    def margin_px(self) -> int:
-        """Always 0: a mask depends on the whole window, and no margin would change that."""
-        return 0
+    margin_px = 0  # a mask depends on the whole window, and no margin would change that
 
     def __call__(self, grey: Grey, valid: Mask) -> NDArray[np.float32]:
         """Boundaries (1, H, W), 1 on a boundary, else 0; none along the border of `valid`.
@@ -157,47 +114,32 @@ class SamBoundaries:
         for part in _windows(grey.shape, self.window):
             if valid[part].any():
                 out[0][part] = np.maximum(out[0][part], self._window(grey[part], valid[part]))
-        if not valid.all():
-            inner = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1)
-            out[0][inner.reshape(valid.shape) == 0] = 0
-        return out
-
-    def batch(
-        self,
-        greys: NDArray[np.uint8],
-        valid: NDArray[np.bool_],
-        report: Callable[[float], None] = lambda share: None,
-    ) -> NDArray[np.float32]:
-        """Boundaries (N, 1, H, W) of pictures (N, H, W); `report` receives the share done."""
-        out = np.zeros((len(greys), 1, *greys.shape[1:]), dtype=np.float32)
-        for index, (grey, seen) in enumerate(zip(greys, valid, strict=True)):
-            out[index] = self(grey, seen)
-            report((index + 1) / len(greys))
+        out[0] *= inner(valid, 5)
         return out
 
     def _window(self, grey: Grey, valid: Mask) -> Mask:
         """Boundaries (H, W) of one window, from the cache where it is there."""
-        filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
+        grey = filled(grey, valid)
         stamp = weights_stamp(self.path, WHERE)
         folder = _cache_folder(self.cache)
-        path = folder / f"{self._key(filled, stamp)}.edges" if folder else None
+        path = folder / f"{self._key(grey, stamp)}.edges" if folder else None
         edges = _cached(path, grey.shape) if path else None
         if edges is None:
             device = chosen_device(self.device)
             model = _model(self.path, stamp, str(device))
-            predict = _predictor(model, filled, PRECISIONS[self.precision])
+            predict = _predictor(model, grey, PRECISIONS[self.precision])
             side = int(model.config.vision_config.image_size)
             edges = boundary_map(automatic_masks(predict, grey.shape, side, self), grey.shape)
             if path:
                 _keep(path, edges)
         return edges
 
-    def _key(self, filled: Grey, stamp: tuple[int, ...]) -> str:
+    def _key(self, grey: Grey, stamp: tuple[int, ...]) -> str:
         """Cache key of a window: digest of its pixels, the weights and the settings."""
         rules = (self.grid, self.iou, self.stability, self.offset, self.overlap, self.precision)
         digest = hashlib.sha256(CACHE_FORMAT)
-        digest.update(repr((filled.shape, rules, weights_digest(self.path, stamp))).encode())
-        digest.update(filled.tobytes())
+        digest.update(repr((grey.shape, rules, weights_digest(self.path, stamp))).encode())
+        digest.update(grey.tobytes())
         return digest.hexdigest()
 
 
@@ -211,12 +153,8 @@ def _windows(shape: tuple[int, ...], window: int) -> Iterator[tuple[slice, slice
     yield from itertools.product(*sides)
 
 
-class _Box(NamedTuple):
-    """An accepted mask: bits of (H, W), corners (x0, y0, x1, y1) of its pixels, expected IoU."""
-
-    bits: NDArray[np.uint8]
-    corners: NDArray[np.int64]
-    iou: float
+Box = tuple[NDArray[np.uint8], NDArray[np.int64], float]
+"""An accepted mask: bits of (H, W), corners (x0, y0, x1, y1) of its pixels, expected IoU."""
 
 
 def automatic_masks(
@@ -232,21 +170,21 @@ def automatic_masks(
     x, y = np.meshgrid(centres, centres)
     resized = _resized_shape(shape, side)
     points = np.stack([x.ravel() * resized[1], y.ravel() * resized[0]], axis=1).astype(np.float32)
-    found: list[_Box] = []
+    found: list[Box] = []
     for start in range(0, len(points), rules.prompts):
         logits, iou = predict(points[start : start + rules.prompts])
         found += _trusted(logits.flatten(0, 1), iou.flatten(), shape, side, rules)
     if not found:
         return
-    corners = np.stack([mask.corners for mask in found])
-    for index in suppressed(corners, np.array([mask.iou for mask in found]), rules.overlap):
-        bits = np.unpackbits(found[index].bits, count=height * width)
+    packed, corners, ious = zip(*found, strict=True)
+    for index in suppressed(np.stack(corners), np.array(ious), rules.overlap):
+        bits = np.unpackbits(packed[index], count=height * width)
         yield bits.reshape(height, width).astype(bool)
 
 
 def _trusted(
     logits: torch.Tensor, iou: torch.Tensor, shape: tuple[int, ...], side: int, rules: SamBoundaries
-) -> Iterator[_Box]:
+) -> Iterator[Box]:
     """Masks (M, h, w) whose expected IoU (M,) and stability reach the limits of `rules`."""
     good = iou > rules.iou
     logits, iou = logits[good], iou[good]
@@ -263,16 +201,12 @@ def _trusted(
         masks = (full[stable] > 0).cpu().numpy()
         for mask, trust in zip(masks, iou[start : start + chunk][stable].tolist(), strict=True):
             if mask.any():
-                yield _Box(np.packbits(mask), _corners(mask), trust)
+                x, y = (np.flatnonzero(mask.any(axis=axis)) for axis in (0, 1))
+                yield np.packbits(mask), np.array([x[0], y[0], x[-1], y[-1]]), trust
 
 
 def _scaled(logits: torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
     return torch.nn.functional.interpolate(logits, shape, mode="bilinear", align_corners=False)
-
-
-def _corners(mask: Mask) -> NDArray[np.int64]:
-    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    return np.array([columns[0], rows[0], columns[-1], rows[-1]], dtype=np.int64)
 
 
 def suppressed(
@@ -332,11 +266,7 @@ def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
     Positions are always encoded in float32: half precision would lose their phases.
     """
     device = model.device
-    half = (
-        nullcontext()
-        if dtype == torch.float32
-        else torch.autocast(device_type=device.type, dtype=dtype)
-    )
+    half = torch.autocast(device.type, dtype, enabled=dtype != torch.float32)
     pixels = network_pixels(grey, int(model.config.vision_config.image_size)).to(device)
     with torch.inference_mode():
         with half:
@@ -357,20 +287,20 @@ def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
 
 @lru_cache(maxsize=1)
 def _model(weights: str, stamp: tuple[int, ...], device: str) -> Any:
+    """Network in float32, from a Hugging Face folder or an original checkpoint."""
     del stamp  # part of the key only: files may change
-    return network(weights).to(device)
+    path = Path(weights).expanduser()
+    found = pretrained(weights, "sam", "SamModel") if path.is_dir() else original_model(path)
+    return found.to(device)
 
 
 def _cache_folder(cache: str) -> Path | None:
     """Folder of entries: `cache`, ORTHONAV_CACHE or the user's cache folder; None for "none"."""
     if cache == "none":
         return None
-    if cache:
-        return Path(cache).expanduser()
-    if own := os.environ.get("ORTHONAV_CACHE"):
-        return Path(own) / "sam"
     users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(users).expanduser() / "orthonav" / "sam"
+    own = os.environ.get("ORTHONAV_CACHE") or f"{users}/orthonav"
+    return Path(cache or f"{own}/sam").expanduser()
 
 
 def _cached(path: Path, shape: tuple[int, ...]) -> Mask | None:
@@ -394,15 +324,6 @@ def _keep(path: Path, edges: Mask) -> None:
         log.warning("could not write the cache entry: %s", error)
 
 
-def network(weights: str) -> Any:
-    """Network in float32 on the CPU, from a Hugging Face folder or an original checkpoint.
-
-    Raises `VariantError` if the path holds neither.
-    """
-    path = Path(weights).expanduser()
-    return pretrained(weights, "sam", "SamModel") if path.is_dir() else original_model(path)
-
-
 @lru_cache(maxsize=8)
 def weights_digest(weights: str, stamp: tuple[int, ...]) -> str:
     """SHA-256 of the weights file, or of the config and weights of a folder."""
@@ -418,35 +339,30 @@ def weights_digest(weights: str, stamp: tuple[int, ...]) -> str:
     return digest.hexdigest()
 
 
-_RENAMES = [
-    (re.compile(pattern), name)
-    for pattern, name in (
-        (r"^image_encoder\.", "vision_encoder."),
-        (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
-        (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
-        (r"\.neck\.0\.", ".neck.conv1."),
-        (r"\.neck\.1\.", ".neck.layer_norm1."),
-        (r"\.neck\.2\.", ".neck.conv2."),
-        (r"\.neck\.3\.", ".neck.layer_norm2."),
-        (
-            r"\.pe_layer\.positional_encoding_gaussian_matrix$",
-            ".shared_embedding.positional_embedding",
-        ),
-        (r"\.point_embeddings\.", ".point_embed."),
-        (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
-        (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
-        (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
-        (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
-        (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
-        (r"\.output_upscaling\.0\.", ".upscale_conv1."),
-        (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
-        (r"\.output_upscaling\.3\.", ".upscale_conv2."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.0\.", r".\1.proj_in."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.1\.", r".\1.layers.0."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.2\.", r".\1.proj_out."),
-        (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
-    )
-]
+_HEADS = r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers"
+_RENAMES = {  # patterns of original names, and what replaces them, in this order
+    r"^image_encoder\.": "vision_encoder.",
+    r"\.patch_embed\.proj\.": ".patch_embed.projection.",
+    r"^vision_encoder\.blocks\.": "vision_encoder.layers.",
+    r"\.neck\.0\.": ".neck.conv1.",
+    r"\.neck\.1\.": ".neck.layer_norm1.",
+    r"\.neck\.2\.": ".neck.conv2.",
+    r"\.neck\.3\.": ".neck.layer_norm2.",
+    r"\.pe_layer\.positional_encoding_gaussian_matrix$": ".shared_embedding.positional_embedding",
+    r"\.point_embeddings\.": ".point_embed.",
+    r"\.mask_downscaling\.0\.": ".mask_embed.conv1.",
+    r"\.mask_downscaling\.1\.": ".mask_embed.layer_norm1.",
+    r"\.mask_downscaling\.3\.": ".mask_embed.conv2.",
+    r"\.mask_downscaling\.4\.": ".mask_embed.layer_norm2.",
+    r"\.mask_downscaling\.6\.": ".mask_embed.conv3.",
+    r"\.output_upscaling\.0\.": ".upscale_conv1.",
+    r"\.output_upscaling\.1\.": ".upscale_layer_norm.",
+    r"\.output_upscaling\.3\.": ".upscale_conv2.",
+    rf"{_HEADS}\.0\.": r".\1.proj_in.",
+    rf"{_HEADS}\.1\.": r".\1.layers.0.",
+    rf"{_HEADS}\.2\.": r".\1.proj_out.",
+    r"\.norm(\d|_final_attn)\.": r".layer_norm\1.",
+}
 _POSITIONS = "prompt_encoder.shared_embedding.positional_embedding"
 
 
@@ -454,8 +370,8 @@ def converted_weights(original: Mapping[str, torch.Tensor]) -> dict[str, torch.T
     """Weights of an original checkpoint, renamed as `transformers` expects them."""
     converted = {}
     for key, value in original.items():
-        for pattern, name in _RENAMES:
-            key = pattern.sub(name, key)
+        for pattern, name in _RENAMES.items():
+            key = re.sub(pattern, name, key)
         converted[key] = value
     converted["shared_image_embedding.positional_embedding"] = converted[_POSITIONS]
     return converted

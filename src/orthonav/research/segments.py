@@ -10,20 +10,19 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import VariantError
 from orthonav.core.extras import needed
-from orthonav.core.tiles.words import filled
+from orthonav.core.tiles.represent import filled, inner
+from orthonav.core.variants import Checked, within
 
 MARGIN_PX = 32
 """Most changes by cropping end there, see `Segments`."""
 
 
 @dataclass(frozen=True)
-class Segments:
+class Segments(Checked):
     """Binary boundaries between the regions of a graph-based segmentation of the grey levels.
 
     `scale`: k of Felzenszwalb and Huttenlocher for grey levels 0..255; larger means larger regions.
@@ -37,23 +36,11 @@ class Segments:
     fifth at any depth.
     """
 
-    scale: float = 100.0
-    sigma: float = 1.5
-    min_size: int = 30
+    scale: float = within(100.0, 0, 1e6, above=True)
+    sigma: float = within(1.5, 0, 16)
+    min_size: int = within(30, 1, 1_000_000)
 
-    def __post_init__(self) -> None:
-        if not 0 < self.scale <= 1e6:
-            raise VariantError(
-                f"segments scale must be above 0 and at most 1000000, got {self.scale}"
-            )
-        if not 0 <= self.sigma <= 16:
-            raise VariantError(f"segments sigma must be 0 to 16, got {self.sigma}")
-        if not 1 <= self.min_size <= 1_000_000:
-            raise VariantError(f"segments min_size must be 1 to 1000000, got {self.min_size}")
-
-    @property
-    def channels(self) -> int:
-        return 1
+    channels = 1
 
     @property
     def margin_px(self) -> int:
@@ -74,11 +61,7 @@ class Segments:
         )
         edges = boundaries(labels)
         if not valid.all():
-            reach = 2 * (math.ceil(2 * self.sigma) + 2) + 1
-            edges &= (
-                cv2.erode(valid.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1)
-                > 0
-            ).reshape(grey.shape)
+            edges &= inner(valid, 2 * (math.ceil(2 * self.sigma) + 2) + 1)
         return edges.astype(np.float32)[None]
 
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 from orthonav.core.extras import missing_extra
-from orthonav.research.pretrained import chosen_device, pretrained, require_device, weights_stamp
+from orthonav.core.variants import Checked, choice, within
+from orthonav.research.pretrained import chosen_device, pretrained, weights_stamp
 
 try:
     import torch
@@ -33,26 +34,17 @@ Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class SuperPoint:
-    """Keypoints and descriptors of grey pictures.
+class SuperPoint(Checked):
+    """Keypoints and descriptors of grey pictures, by the thresholds of the folder's config.json."""
 
-    Thresholds are those of the folder's config.json.
-
-    - `weights`: path of a Hugging Face folder.
-    - `max_points`: largest number of points per picture, the strongest first; 0 for all.
-    - `device`: "auto" (a GPU if there is one), "cpu" or "cuda".
-    """
-
-    weights: str = ""
-    max_points: int = 0
-    device: str = "auto"
+    weights: str = ""  # path of a Hugging Face folder
+    max_points: int = within(0, 0)  # most points per picture, the strongest first; 0 for all
+    device: str = choice("auto", "cpu", "cuda")  # "auto": a GPU if there is one
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.weights:
             raise VariantError(f"superpoint needs weights=PATH: {WHERE}")
-        if self.max_points < 0:
-            raise VariantError(f"superpoint max_points must be 0 or more, got {self.max_points}")
-        require_device(self.device)
 
     def __call__(self, grey: NDArray[np.uint8]) -> tuple[Array, Array, Array]:
         """Points (N, 2), radii (N,) and unit descriptors (N, 256) of a picture (H, W), strongest

@@ -15,26 +15,17 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class SheetTiles:
-    """Tiles of one sheet picture.
+    """Tiles of one sheet picture, an array or a memory map."""
 
-    - `pixels`: (C, H, W) uint8, an array or a memory map.
-    - `valid`: (H, W) bool, pixels that are imagery.
-    - `tiles_px`: (N, 2), row and column of the first pixel of each tile.
-    - `tile_px`: side S of a tile, pixels.
-    - `scale`: value of `pixels` that stands for 1.0: 255 for grey levels, 1 for edge maps.
-    - `grey`: (H, W) uint8, the source of the positives of triplets; None: first channel of
-      `pixels`.
-    - `singles`: (N, C, S, S) uint8, tiles that were represented each by itself; None: tiles are cut
-      out of `pixels`.
-    """
-
-    pixels: NDArray[np.uint8]
-    valid: NDArray[np.bool_]
-    tiles_px: NDArray[np.integer[Any]]
-    tile_px: int
-    scale: float = 255.0
+    pixels: NDArray[np.uint8]  # (C, H, W)
+    valid: NDArray[np.bool_]  # (H, W), pixels that are imagery
+    tiles_px: NDArray[np.integer[Any]]  # (N, 2), row and column of the first pixel of each tile
+    tile_px: int  # side S of a tile, pixels
+    scale: float = 255.0  # value that stands for 1.0: 255 for grey levels, 1 for edge maps
     grey: NDArray[np.uint8] | None = None
+    """(H, W), the source of the positives of triplets; None: first channel of `pixels`."""
     singles: NDArray[np.uint8] | None = None
+    """(N, C, S, S), tiles represented each by itself; None: they are cut out of `pixels`."""
 
     def __len__(self) -> int:
         return len(self.tiles_px)

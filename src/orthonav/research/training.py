@@ -65,19 +65,15 @@ Recipe = AutoEncoderRecipe | TripletRecipe
 class Means:
     """Options for the speed of training; the learned weights are the same up to rounding.
 
-    - `bf16`: mixed precision with bfloat16; None: if the processor has its instructions, else with
-      float16 on a GPU.
-    - `chunk`: tiles of a triplet batch held for gradients at once; batch norms use each chunk.
-    - `workers`: threads that make batches; None: 2 for a CPU, one per core up to 16 for a GPU.
-    - `save_every_s`: shortest time between checkpoints, s.
-    - `device`: name for PyTorch; None: a GPU if there is one.
+    `bf16`: mixed precision with bfloat16; None: if the processor has its instructions, else with
+    float16 on a GPU.
     """
 
     bf16: bool | None = None
-    chunk: int = 128
-    workers: int | None = None
-    save_every_s: float = 300.0
-    device: str | None = None
+    chunk: int = 128  # tiles of a triplet batch held for gradients at once, and of a batch norm
+    workers: int | None = None  # threads that make batches; None: 2, one per core for a GPU
+    save_every_s: float = 300.0  # shortest time between checkpoints
+    device: str | None = None  # name for PyTorch; None: a GPU if there is one
 
 
 def device_of(means: Means) -> torch.device:
@@ -113,23 +109,39 @@ def _kept_memory() -> Iterator[None]:
     Every step allocates and frees hundreds of MB of activations and gradients. Zero-filled pages
     from the system cost as much as the arithmetic (mallopt(3)).
     """
-    try:
-        library = ctypes.CDLL(None) if sys.platform == "linux" else None
-        mallopt, trim = library and library.mallopt, library and library.malloc_trim
-    except (OSError, AttributeError):
-        mallopt = trim = None
-    if not mallopt or not trim:
+    library: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
+    if not hasattr(library, "mallopt") or not hasattr(library, "malloc_trim"):
         yield
         return
     trim_threshold, mmap_max = -1, -4
-    mallopt(mmap_max, 0)
-    mallopt(trim_threshold, -1)
+    library.mallopt(mmap_max, 0)
+    library.mallopt(trim_threshold, -1)
     try:
         yield
     finally:
-        mallopt(mmap_max, 65_536)
-        mallopt(trim_threshold, 128 * 1024)
-        trim(0)
+        library.mallopt(mmap_max, 65_536)
+        library.mallopt(trim_threshold, 128 * 1024)
+        library.malloc_trim(0)
+
+
+class Task(Protocol):
+    """A training task: a model, and how a batch becomes gradients."""
+
+    @property
+    def model(self) -> nn.Module: ...
+
+    @property
+    def encoder(self) -> nn.Module:
+        """The part of the model that flies."""
+        ...
+
+    def arrays(self, epoch: int, indices: NDArray[np.intp]) -> tuple[NDArray[Any], ...]:
+        """Arrays for a batch of tiles (B,); called from several threads."""
+        ...
+
+    def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
+        """Loss, after adding its gradients times `scale`."""
+        ...
 
 
 class TrainingError(OrthonavError, RuntimeError):
@@ -184,97 +196,160 @@ class TrainingState:
         self.losses = list(parts.get("losses", []))  # absent in older checkpoints
 
 
-class Checkpoints:
-    """Reports the progress of one training and writes its checkpoints and pictures to a folder.
+class Training:
+    """One training of `task.model`, in place: its batches, epochs, reports and checkpoints.
 
-    `batches`: number of batches of an epoch.
+    `dates`: sheets of the positives, part of the key of a checkpoint. The other arguments are those
+    of `learn_network`.
     """
 
     def __init__(
         self,
-        state: TrainingState,
+        task: Task,
+        recipe: Recipe,
         tiles: SheetTiles,
-        fingerprint: str,
         *,
+        seed: int,
         work: Path | None,
-        epochs: int,
-        batches: int,
-        every_s: float,
         report: Progress,
+        means: Means,
+        dates: Sequence[SheetTiles] = (),
     ) -> None:
-        self._state, self._tiles, self._fingerprint = state, tiles, fingerprint
-        self._work, self._epochs, self._batches = work, epochs, batches
-        self._every_s, self._report = every_s, report
-        self._saved_s = self._progress_s = self._start_s = time.monotonic()
-        self._start = self._share()
+        self.task, self.recipe, self.tiles, self.means = task, recipe, tiles, means
+        self.seed, self.work, self.report = seed, work, report
+        self.device = device_of(means)
+        self.mixed = mixed_precision(means, self.device)
+        task.model.to(self.device)
+        scaler = torch.amp.GradScaler(self.device.type, enabled=self.mixed == torch.float16)
+        self.state = TrainingState(task.model, recipe, scaler)
+        self.batches_per_epoch = math.ceil(len(tiles) / recipe.batch)
+        self._key = fingerprint(recipe, tiles, dates, seed, means)
+        self._load()
+        self._start, self._start_s = self._share(), time.monotonic()
+        self._said_s = self._saved_s = self._start_s
 
-    def load(self, device: torch.device) -> None:
+    def run(self) -> None:
+        """Train from the checkpoint, if there is one, to the last epoch."""
+        kind = self.mixed or torch.float32
+        log.info("training on %s in %s, contiguous tensors (NCHW)", self.device, kind)
+        state, model = self.state, self.task.model
+        # By default convolutions on a GPU are not deterministic.
+        with _kept_memory(), torch.backends.cudnn.flags(enabled=True, deterministic=True):
+            while len(state.history) < self.recipe.epochs:
+                model.train()
+                self._epoch()
+                loss = state.history[-1]
+                self._say(f"epoch {len(state.history)} of {self.recipe.epochs}, loss {loss:.5g}")
+                self._save(last=len(state.history) == self.recipe.epochs)
+            self._settle()
+        model.eval()
+
+    def batches(self, epoch: int, first: int = 0, end: int | None = None) -> Iterator[list[Tensor]]:
+        """Tensors of each batch, from number `first` up to `end`, exclusive."""
+        plan = epoch_batches(len(self.tiles), self.recipe.batch, self.seed, epoch)
+        workers = workers_of(self.means, self.device)
+        for tensors in in_order(partial(self.batch, epoch), plan[first:end], workers):
+            yield [each.to(self.device, non_blocking=True) for each in tensors]
+
+    def batch(self, epoch: int, indices: NDArray[np.intp]) -> list[Tensor]:
+        """Tensors of a batch, for a GPU in pinned memory, from which copies are asynchronous."""
+        arrays = self.task.arrays(epoch, indices)
+        made = [torch.from_numpy(np.ascontiguousarray(each)) for each in arrays]
+        return [each.pin_memory() for each in made] if self.device.type == "cuda" else made
+
+    def _autocast(self) -> torch.autocast:
+        kind = self.mixed or torch.bfloat16
+        return torch.autocast(self.device.type, kind, enabled=self.mixed is not None)
+
+    def _epoch(self) -> None:
+        """A resumed epoch starts after its finished batches."""
+        state, one = self.state, torch.ones((), device=self.device)
+        for tensors in self.batches(len(state.history), len(state.losses)):
+            state.optimizer.zero_grad(set_to_none=True)
+            with self._autocast():
+                loss = self.task.backward(*tensors, scale=state.scaler.scale(one))
+            state.losses.append(loss)
+            state.scaler.step(state.optimizer)
+            state.scaler.update()
+            done = len(state.losses)
+            if done == self.batches_per_epoch:  # reported and saved as an epoch
+                continue
+            if time.monotonic() - self._said_s >= PROGRESS_EVERY_S:
+                at = f"epoch {len(state.history) + 1} of {self.recipe.epochs}, batch {done} of "
+                self._say(f"{at}{self.batches_per_epoch}, loss {float(loss):.5g}")
+            self._save(last=False)
+        state.end_epoch(float(torch.stack(state.losses).double().mean()))
+
+    def _settle(self) -> None:
+        """Recompute the means and variances of batch norms for the final weights.
+
+        Running averages lag some ten steps behind, and a small area has few steps in an epoch.
+        """
+        model = self.task.model
+        norms = [module for module in model.modules() if isinstance(module, nn.BatchNorm2d)]
+        momenta = [norm.momentum for norm in norms]
+        for norm in norms:
+            norm.reset_running_stats()
+            norm.momentum = None  # plain mean over all batches
+        model.train()
+        with torch.no_grad(), self._autocast():
+            for maps, *_ in self.batches(0, end=SETTLING_BATCHES):
+                for part in torch.split(maps, max(2, self.means.chunk // 2 * 2)):
+                    model(part)
+        for norm, momentum in zip(norms, momenta, strict=True):
+            norm.momentum = momentum
+
+    def _load(self) -> None:
         """Restore any checkpoint, and remove temporary files of interrupted writes.
 
         Raises `OutputError` if it belongs to another training, or has more epochs.
         """
-        for left in self._work.glob(".checkpoint.pt.*.tmp.pt") if self._work else ():
+        for left in self.work.glob(".checkpoint.pt.*.tmp.pt") if self.work else ():
             left.unlink(missing_ok=True)
-        path = None if self._work is None else self._work / "checkpoint.pt"
+        path = None if self.work is None else self.work / "checkpoint.pt"
         if path is None or not path.exists():
             return
         try:
-            found = torch.load(path, map_location=device, weights_only=True)
-            same = found.pop("fingerprint") == self._fingerprint
+            found = torch.load(path, map_location=self.device, weights_only=True)
+            same = found.pop("fingerprint") == self._key
         except Exception as error:
             # Unpickling a broken file may raise any exception.
             raise OutputError(f"checkpoint cannot be read; delete it: {path}") from error
         if not same:
             raise OutputError(f"folder holds another training; choose another folder: {path}")
-        if len(found["history"]) > self._epochs:
+        if len(found["history"]) > self.recipe.epochs:
             raise OutputError(
-                f"folder holds a training of {len(found['history'])} epochs, {self._epochs} are "
-                f"asked for; give as many, or choose another folder: {path}"
+                f"folder holds a training of {len(found['history'])} epochs, {self.recipe.epochs} "
+                f"are asked for; give as many, or choose another folder: {path}"
             )
-        self._state.take(found)
-        self._start = self._share()
+        self.state.take(found)
 
-    def after_batch(self) -> None:
-        """Report and write if due; the last batch of an epoch is left to `after_epoch`."""
-        epoch, done = len(self._state.history), len(self._state.losses)
-        if done == self._batches:
+    def _save(self, *, last: bool) -> None:
+        """Write checkpoint, losses and pictures, unless the last ones are recent."""
+        state, due_s = self.state, self._saved_s + self.means.save_every_s
+        if self.work is None or not (last or time.monotonic() >= due_s):
             return
-        if time.monotonic() - self._progress_s >= PROGRESS_EVERY_S:
-            at = f"epoch {epoch + 1} of {self._epochs}, batch {done} of {self._batches}"
-            self._say(f"{at}, loss {float(self._state.losses[-1]):.5g}")
-        self._write(last=False)
-
-    def after_epoch(self) -> None:
-        """Report the mean loss; write if due, and always after the last epoch."""
-        history = self._state.history
-        self._say(f"epoch {len(history)} of {self._epochs}, loss {history[-1]:.5g}")
-        self._write(last=len(history) == self._epochs)
-
-    def _write(self, *, last: bool) -> None:
-        state = self._state
-        if self._work is None or not (last or time.monotonic() - self._saved_s >= self._every_s):
-            return
-        with replacing(self._work / "checkpoint.pt") as temporary:
-            torch.save({"fingerprint": self._fingerprint, **state.parts()}, temporary)
+        with replacing(self.work / "checkpoint.pt") as temporary:
+            torch.save({"fingerprint": self._key, **state.parts()}, temporary)
         self._saved_s = time.monotonic()
-        write_text(self._work / "history.json", json.dumps({"loss": state.history}) + "\n")
+        write_text(self.work / "history.json", json.dumps({"loss": state.history}) + "\n")
         picture = loss_picture(state.history)
         if not state.history:
             picture = loss_picture([float(loss) for loss in state.losses], "batch")
-        _write_png(self._work / "loss.png", picture)
+        _write_png(self.work / "loss.png", picture)
         if isinstance(state.model, AutoEncoder):
-            _write_png(self._work / "tiles.png", reconstructions(state.model, self._tiles))
+            _write_png(self.work / "tiles.png", reconstructions(state.model, self.tiles))
 
     def _share(self) -> float:
-        batches = len(self._state.history) * self._batches + len(self._state.losses)
-        return batches / (self._epochs * self._batches)
+        batches = len(self.state.history) * self.batches_per_epoch + len(self.state.losses)
+        return batches / (self.recipe.epochs * self.batches_per_epoch)
 
     def _say(self, text: str) -> None:
         """Report with the time left, at the speed since this process began."""
-        self._progress_s, share = time.monotonic(), self._share()
-        speed = (share - self._start) / max(self._progress_s - self._start_s, 1e-9)
+        self._said_s, share = time.monotonic(), self._share()
+        speed = (share - self._start) / max(self._said_s - self._start_s, 1e-9)
         left = f", {_duration((1 - share) / speed)} left" if speed > 0 and share < 1 else ""
-        self._report(f"{text}{left}", share)
+        self.report(f"{text}{left}", share)
 
 
 def loss_picture(history: Sequence[float], unit: str = "epoch") -> NDArray[np.uint8]:
@@ -322,26 +397,6 @@ def fingerprint(
     if dates:
         key["dates"] = [zlib.crc32(date.batch(some).tobytes()) for date in dates]
     return json.dumps(key, sort_keys=True)
-
-
-class Task(Protocol):
-    """A training task: a model, and how a batch becomes gradients."""
-
-    @property
-    def model(self) -> nn.Module: ...
-
-    @property
-    def encoder(self) -> nn.Module:
-        """The part of the model that flies."""
-        ...
-
-    def arrays(self, epoch: int, indices: NDArray[np.intp]) -> tuple[NDArray[Any], ...]:
-        """Arrays for a batch of tiles (B,); called from several threads."""
-        ...
-
-    def backward(self, *tensors: Tensor, scale: Tensor) -> Tensor:
-        """Loss, after adding its gradients times `scale`."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,7 +454,7 @@ def learn_network(
     task = _task(recipe, tiles, binary=binary, positive=positive, seed=seed, means=means)
     dates = () if positive is None or callable(positive) else positive
     given: dict[str, Any] = {"seed": seed, "work": work, "report": progress, "means": means}
-    train(task, recipe, tiles, dates=dates, **given)
+    Training(task, recipe, tiles, dates=dates, **given).run()
     return finished(task.encoder, recipe, tiles, progress, means)
 
 
@@ -446,120 +501,9 @@ def _task(
         return Triplets(recipe, tiles, positive, seed=seed, chunk=means.chunk)
 
 
-def train(
-    task: Task,
-    recipe: Recipe,
-    tiles: SheetTiles,
-    *,
-    seed: int,
-    work: Path | None,
-    report: Progress,
-    means: Means,
-    dates: Sequence[SheetTiles] = (),
-) -> list[float]:
-    """Mean loss of each epoch, after training `task.model` in place from any checkpoint.
-
-    `dates`: sheets of the positives, part of the key of a checkpoint.
-    """
-    device = device_of(means)
-    mixed = mixed_precision(means, device)
-    log.info("training on %s in %s, contiguous tensors (NCHW)", device, mixed or torch.float32)
-    task.model.to(device)
-    scaler = torch.amp.GradScaler(device.type, enabled=mixed == torch.float16)
-    state = TrainingState(task.model, recipe, scaler)
-    feed = _Feed(task, recipe.batch, seed, len(tiles), device, mixed, means)
-    checkpoints = Checkpoints(
-        state,
-        tiles,
-        fingerprint(recipe, tiles, dates, seed, means),
-        work=work,
-        epochs=recipe.epochs,
-        batches=feed.per_epoch,
-        every_s=means.save_every_s,
-        report=report,
-    )
-    checkpoints.load(device)
-    # By default convolutions on a GPU are not deterministic.
-    with _kept_memory(), torch.backends.cudnn.flags(enabled=True, deterministic=True):
-        while len(state.history) < recipe.epochs:
-            task.model.train()
-            loss = _epoch(feed, state, checkpoints)
-            state.end_epoch(float(loss))
-            checkpoints.after_epoch()
-        _settle(feed)
-    task.model.eval()
-    return state.history
-
-
 def _duration(seconds: float) -> str:
     """Seconds in the unit that people would name."""
     for size, name in ((3600, "h"), (60, "min")):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.{int(seconds < 10 * size)}f} {name}"
     return f"{seconds:.0f} s"
-
-
-@dataclass(frozen=True, eq=False)
-class _Feed:
-    task: Task
-    batch: int
-    seed: int
-    count: int
-    device: torch.device
-    precision: torch.dtype | None
-    means: Means
-
-    @property
-    def per_epoch(self) -> int:
-        return math.ceil(self.count / self.batch)
-
-    def batches(self, epoch: int, first: int = 0, end: int | None = None) -> Iterator[list[Tensor]]:
-        """Tensors of each batch, from number `first` up to `end`, exclusive."""
-        plan = epoch_batches(self.count, self.batch, self.seed, epoch)
-        workers = workers_of(self.means, self.device)
-        for tensors in in_order(partial(self._made, epoch), plan[first:end], workers):
-            yield [each.to(self.device, non_blocking=True) for each in tensors]
-
-    def _made(self, epoch: int, indices: NDArray[np.intp]) -> list[Tensor]:
-        """Tensors of a batch, for a GPU in pinned memory, from which copies are asynchronous."""
-        arrays = self.task.arrays(epoch, indices)
-        made = [torch.from_numpy(np.ascontiguousarray(each)) for each in arrays]
-        return [each.pin_memory() for each in made] if self.device.type == "cuda" else made
-
-    def mixed(self) -> torch.autocast:
-        wanted, kind = self.precision is not None, self.precision or torch.bfloat16
-        return torch.autocast(self.device.type, kind, enabled=wanted)
-
-
-def _epoch(feed: _Feed, state: TrainingState, checkpoints: Checkpoints) -> Tensor:
-    """Mean loss of one epoch; a resumed epoch starts after its finished batches."""
-    one = torch.ones((), device=feed.device)
-    for tensors in feed.batches(len(state.history), len(state.losses)):
-        state.optimizer.zero_grad(set_to_none=True)
-        with feed.mixed():
-            loss = feed.task.backward(*tensors, scale=state.scaler.scale(one))
-        state.losses.append(loss)
-        state.scaler.step(state.optimizer)
-        state.scaler.update()
-        checkpoints.after_batch()
-    return torch.stack(state.losses).double().mean()
-
-
-def _settle(feed: _Feed) -> None:
-    """Recompute the means and variances of batch norms for the final weights.
-
-    Running averages lag some ten steps behind, and a small area has few steps in an epoch.
-    """
-    model = feed.task.model
-    norms = [module for module in model.modules() if isinstance(module, nn.BatchNorm2d)]
-    momenta = [norm.momentum for norm in norms]
-    for norm in norms:
-        norm.reset_running_stats()
-        norm.momentum = None  # plain mean over all batches
-    model.train()
-    with torch.no_grad(), feed.mixed():
-        for maps, *_ in feed.batches(0, end=SETTLING_BATCHES):
-            for part in torch.split(maps, max(2, feed.means.chunk // 2 * 2)):
-                model(part)
-    for norm, momentum in zip(norms, momenta, strict=True):
-        norm.momentum = momentum

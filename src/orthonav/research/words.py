@@ -15,16 +15,14 @@ from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
 from orthonav.core.extras import needed
+from orthonav.core.tiles.represent import Grey, Mask, filled
 from orthonav.core.tiles.words import (
     DIMS,
     Array,
     Detector,
-    Grey,
-    Mask,
     WordsEmbedder,
     WordsRecipe,
     describe,
-    filled,
     seen,
     sift_features,
 )
@@ -40,33 +38,32 @@ ITERATIONS = 20
 
 
 class _Sample:
-    """Uniform random sample of a stream of rows of unknown length (reservoir sampling)."""
+    """Uniform random sample of the descriptors of a stream of pictures (reservoir sampling)."""
 
     def __init__(self, size: int, seed: int) -> None:
-        self.size = size
-        self._random = np.random.default_rng(seed)
-        self._rows: list[NDArray[Any]] = []
-        self._tickets: list[NDArray[np.float64]] = []
+        self.size, self._random = size, np.random.default_rng(seed)
+        self._parts: list[tuple[NDArray[Any], ...]] = []
         self._count = 0
 
-    def put(self, rows: NDArray[Any]) -> None:
-        self._rows.append(rows)
-        self._tickets.append(self._random.random(len(rows)))
+    def put(self, rows: NDArray[Any], picture: int) -> None:
+        tickets = self._random.random(len(rows))
+        self._parts.append((tickets, rows, np.full(len(rows), picture)))
         self._count += len(rows)
         if self._count >= 2 * self.size:
             self._draw()
 
-    def rows(self) -> NDArray[Any]:
+    def drawn(self) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Rows (N, D), and the pictures (N,) to which they belong."""
         self._draw()
-        return self._rows[0]
+        _, rows, pictures = self._parts[0]
+        return rows, pictures
 
     def _draw(self) -> None:
-        """Keep the rows with the lowest tickets."""
-        rows, tickets = np.concatenate(self._rows), np.concatenate(self._tickets)
-        if len(rows) > self.size:
-            drawn = np.sort(np.argsort(tickets, kind="stable")[: self.size])
-            rows, tickets = rows[drawn], tickets[drawn]
-        self._rows, self._tickets, self._count = [rows], [tickets], len(rows)
+        """Leave the rows with the lowest tickets."""
+        joined = tuple(np.concatenate(each) for each in zip(*self._parts, strict=True))
+        lowest = np.sort(np.argsort(joined[0], kind="stable")[: self.size])
+        self._parts = [tuple(each[lowest] for each in joined)]
+        self._count = len(lowest)
 
 
 def learn_words(
@@ -89,16 +86,13 @@ def learn_words(
         from orthonav.research.superpoint import SuperPoint  # only here is PyTorch needed
 
         detector = SuperPoint(recipe.weights, max_points=recipe.max_features)
-    sample = _Sample(max(MIN_SAMPLES, SAMPLES_PER_WORD * recipe.words), seed)
-    owners = _Sample(sample.size, seed)  # draws the same tickets: the picture of each row
     stored = np.uint8 if recipe.features == "sift" else np.float16
-    count = 0
+    sample, count = _Sample(max(MIN_SAMPLES, SAMPLES_PER_WORD * recipe.words), seed), 0
+    sample.put(np.zeros((0, DIMS[recipe.features]), stored), count)
     for grey, valid in pictures:
-        rows = describe(recipe, grey, valid, detector).astype(stored)
-        sample.put(rows)
-        owners.put(np.full(len(rows), count, dtype=np.int64))
+        sample.put(describe(recipe, grey, valid, detector).astype(stored), count)
         count += 1
-    drawn = sample.rows() if count else np.zeros((0, DIMS[recipe.features]), stored)
+    drawn, pictures_of = sample.drawn()
     if len(drawn) < recipe.words:
         raise VariantError(
             f"{recipe.words} words cannot be learned from {len(drawn)} features in {count} "
@@ -111,7 +105,7 @@ def learn_words(
     embedder = WordsEmbedder(plain, vocabulary.astype(stored), nothing, detector)
     if not recipe.tfidf:
         return embedder
-    pairs = np.unique(np.stack([embedder.assigned(drawn), owners.rows()]), axis=1)
+    pairs = np.unique(np.stack([embedder.assigned(drawn), pictures_of]), axis=1)
     pictures_with = np.bincount(pairs[0], minlength=recipe.words)
     idf = np.log((count + 1) / np.maximum(1, pictures_with)).astype(np.float32)
     return WordsEmbedder(recipe, embedder.vocabulary, idf, detector)

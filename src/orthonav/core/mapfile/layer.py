@@ -4,9 +4,11 @@ Only the chunks (JPEG and mask) that a window touches are decoded. Maps are untr
 every length, size and offset is checked before it is used."""
 
 import zlib
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -19,6 +21,8 @@ from orthonav.core.mapfile.reader import Blobs, MapFile
 CACHE_BYTES = 64 * 2**20  # grey and mask of 33 km2 at 1 m
 MAX_PREVIEW_PX = 384
 
+Content = TypeVar("Content")
+Window = tuple[slice, slice]  # rows and columns
 Chunk = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 """Grey (H, W), 0 where not valid, and valid (H, W) or None where all is; read-only."""
 
@@ -57,6 +61,73 @@ class ChunkTable:
         side = self.chunk_px
         return min(side, rows - chunk_row * side), min(side, cols - chunk_col * side)
 
+    def parts(
+        self, level: int, row: int, col: int, height: int, width: int
+    ) -> Iterator[tuple[tuple[int, int], Window, Window]]:
+        """Row and column of each chunk that a window of a level touches, what is in the window in
+        pixels of the chunk, and in those of the window. The window may reach beyond the level."""
+        side, (rows, cols) = self.chunk_px, self.shapes[level]
+        for (top, bottom), (left, right) in product(
+            _cuts(row, row + height, rows, side), _cuts(col, col + width, cols, side)
+        ):
+            y, x = top % side, left % side
+            inside = slice(y, y + bottom - top), slice(x, x + right - left)
+            target = slice(top - row, bottom - row), slice(left - col, right - col)
+            yield (top // side, left // side), inside, target
+
+
+def _cuts(first: int, last: int, size: int, side: int) -> list[tuple[int, int]]:
+    """[first, last) within [0, size), divided at multiples of `side`."""
+    first, last = max(first, 0), min(last, size)
+    edges = [first, *range((first // side + 1) * side, last, side), last]
+    return list(pairwise(edges)) if first < last else []
+
+
+class Chunks(Generic[Content]):
+    """Chunks of a layer, decoded when they are read; the last `cached` stay decoded.
+
+    `parts`: names of bytes and offsets of each part that a chunk has. `decode` takes the bytes of
+    these and the shape, and raises `MapFileError`."""
+
+    def __init__(
+        self,
+        opened: MapFile,
+        table: ChunkTable,
+        parts: Sequence[tuple[str, str]],
+        decode: Callable[..., Content],
+        layer: str,
+        cached: int,
+    ) -> None:
+        self.table = table
+        self.blobs = [Blobs(opened, *names, table.count) for names in parts]
+        read = partial(_read_chunk, self.blobs, table, decode, layer, opened.path)
+        self._read = lru_cache(cached)(read)
+
+    def __call__(self, level: int, chunk_row: int, chunk_col: int) -> Content | None:
+        """None where nothing is stored. Raises `MapFileError` for a damaged one."""
+        number = self.table.number(level, chunk_row, chunk_col)
+        if all(each.is_empty(number) for each in self.blobs):
+            return None
+        found: Content = self._read(level, chunk_row, chunk_col)
+        return found
+
+
+def _read_chunk(
+    blobs: Sequence[Blobs],
+    table: ChunkTable,
+    decode: Callable[..., Any],
+    layer: str,
+    path: Path,
+    *place: int,
+) -> Any:
+    number = table.number(*place)
+    data = [each.blob(number) for each in blobs]
+    try:
+        return decode(*data, table.shape(*place))
+    except MapFileError as error:
+        where = f"level {place[0]}, chunk {place[1]}, {place[2]}"
+        raise MapFileError(f"map's {layer} layer is damaged ({where}: {error}): {path}") from error
+
 
 class GreyLayer:
     """Grey pyramid of one sheet; threads may share it.
@@ -69,13 +140,13 @@ class GreyLayer:
     ) -> None:
         grid = opened.manifest.sheets[sheet].grid
         self.levels = info.levels
-        self._path = opened.path
         self._table = ChunkTable(grid.height_px, grid.width_px, info.levels, info.chunk_px)
         names = part_names(sheet)
-        self._jpegs = Blobs(opened, names["bytes"], names["offsets"], self._table.count)
-        self._masks = Blobs(opened, names["mask_bytes"], names["mask_offsets"], self._table.count)
-        decode = partial(_read_chunk, self._jpegs, self._masks, self._table, self._path)
-        self._decoded = lru_cache(cache_bytes // (2 * info.chunk_px**2))(decode)
+        parts = [(names[f"{kind}bytes"], names[f"{kind}offsets"]) for kind in ("", "mask_")]
+        cached = cache_bytes // (2 * info.chunk_px**2)
+        self._chunk: Chunks[Chunk] = Chunks(
+            opened, self._table, parts, decode_chunk, "registration", cached
+        )
 
     @classmethod
     def of(
@@ -99,21 +170,14 @@ class GreyLayer:
         """Grey and valid of a window, also beyond the sheet: 0 and not valid, as without imagery.
 
         Raises `MapFileError` if a chunk is damaged."""
-        rows, cols = self.shape(level)
+        self.shape(level)  # raises `IndexError`
         if height < 0 or width < 0:
             raise ValueError(f"window must have 0 or more rows and columns, got {height} x {width}")
         grey = np.zeros((height, width), dtype=np.uint8)
         valid = np.zeros((height, width), dtype=bool)
-        side = self._table.chunk_px
-        for top, bottom in cuts(row, row + height, rows, side):
-            for left, right in cuts(col, col + width, cols, side):
-                chunk = self._chunk(level, top // side, left // side)
-                if chunk is None:
-                    continue
-                inside = np.s_[
-                    top % side : top % side + bottom - top, left % side : left % side + right - left
-                ]
-                target = np.s_[top - row : bottom - row, left - col : right - col]
+        for place, inside, target in self._table.parts(level, row, col, height, width):
+            chunk = self._chunk(level, *place)
+            if chunk is not None:
                 grey[target] = chunk[0][inside]
                 valid[target] = True if chunk[1] is None else chunk[1][inside]
         return grey, valid
@@ -127,41 +191,8 @@ class GreyLayer:
         chunk = self._chunk(level, chunk_row, chunk_col)
         if chunk is None or chunk[1] is not None:
             return None
-        return self._jpegs.blob(self._table.number(level, chunk_row, chunk_col)).tobytes()
-
-    def _chunk(self, level: int, chunk_row: int, chunk_col: int) -> Chunk | None:
-        """None if no pixel is valid."""
         number = self._table.number(level, chunk_row, chunk_col)
-        if self._jpegs.is_empty(number) and self._masks.is_empty(number):
-            return None
-        return self._decoded(level, chunk_row, chunk_col)
-
-
-def _read_chunk(
-    jpegs: Blobs,
-    masks: Blobs,
-    table: ChunkTable,
-    path: Path,
-    level: int,
-    chunk_row: int,
-    chunk_col: int,
-) -> Chunk:
-    number = table.number(level, chunk_row, chunk_col)
-    jpeg, mask = jpegs.blob(number), masks.blob(number)
-    try:
-        return decode_chunk(jpeg, mask, table.shape(level, chunk_row, chunk_col))
-    except MapFileError as error:
-        where = f"level {level}, chunk {chunk_row}, {chunk_col}"
-        raise MapFileError(
-            f"map's registration layer is damaged ({where}: {error}): {path}"
-        ) from error
-
-
-def cuts(first: int, last: int, size: int, side: int) -> list[tuple[int, int]]:
-    """[first, last) within [0, size), divided at multiples of `side`."""
-    first, last = max(first, 0), min(last, size)
-    edges = [first, *range((first // side + 1) * side, last, side), last]
-    return list(pairwise(edges)) if first < last else []
+        return self._chunk.blobs[0].blob(number).tobytes()
 
 
 def decode_chunk(jpeg: NDArray[np.uint8], mask: NDArray[np.uint8], shape: tuple[int, int]) -> Chunk:

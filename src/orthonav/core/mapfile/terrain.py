@@ -3,10 +3,6 @@
 A chunk is a grey PNG of 16 bits. Untrusted, so its size and parts are checked before it is
 decoded."""
 
-from functools import lru_cache, partial
-from itertools import product
-from pathlib import Path
-
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import bilinear, by_value
-from orthonav.core.mapfile.layer import ChunkTable, cuts
+from orthonav.core.mapfile.layer import Chunks, ChunkTable
 from orthonav.core.mapfile.manifest import MAX_CODE, TerrainInfo
-from orthonav.core.mapfile.reader import Blobs, MapFile
+from orthonav.core.mapfile.reader import MapFile
 
 FEW_CHUNKS, FEW_SAMPLES = 16, 2**18  # that are read as one part, as those under a view
 TERRAIN, SURFACE = "terrain", "surface"
@@ -39,11 +35,15 @@ class TerrainLayer:
     ) -> None:
         self.info = info
         self.frame: LocalFrame = opened.manifest.sheets[sheet].frame
-        self._table = ChunkTable(info.rows, info.cols, 1, info.chunk_px)
-        self._blobs = Blobs(opened, *terrain_part_names(sheet, layer), self._table.count)
-        decode = partial(_read_chunk, self._blobs, self._table, info, layer, opened.path)
+        table = ChunkTable(info.rows, info.cols, 1, info.chunk_px)
+
+        def decode(data: NDArray[np.uint8], shape: tuple[int, int]) -> Heights:
+            return decode_terrain(data, shape, info)
+
         # 400 km2 of terrain every 10 m, 4 km2 of surface every 1 m.
-        self._decoded = lru_cache(2**22 // info.chunk_px**2)(decode)
+        cached = 2**22 // info.chunk_px**2
+        parts = [terrain_part_names(sheet, layer)]
+        self._chunk: Chunks[Heights] = Chunks(opened, table, parts, decode, layer, cached)
 
     @classmethod
     def of(cls, opened: MapFile, sheet: int = 0, layer: str = TERRAIN) -> "TerrainLayer | None":
@@ -71,7 +71,7 @@ class TerrainLayer:
 
     def _part(self, col: Array, row: Array) -> tuple[Array, int, int] | None:
         """Samples around places, the first row and column of these; None where they are many."""
-        info, side = self.info, self.info.chunk_px
+        info = self.info
         firsts, ends = [], []
         for at, count in ((row, info.rows), (col, info.cols)):
             low, high = (min(max(float(end), 0.0), count - 1.0) for end in (at.min(), at.max()))
@@ -80,18 +80,17 @@ class TerrainLayer:
             firsts.append(int(low))
             ends.append(min(int(high) + 2, count))
         (top, left), (bottom, right) = firsts, ends
-        row_cuts = cuts(top, bottom, info.rows, side)
-        col_cuts = cuts(left, right, info.cols, side)
-        samples, chunks = (bottom - top) * (right - left), len(row_cuts) * len(col_cuts)
-        if samples > FEW_SAMPLES or chunks > FEW_CHUNKS:
+        height, width = bottom - top, right - left
+        if height * width > FEW_SAMPLES:
             return None
-        part = np.full((bottom - top, right - left), np.nan)
-        for (row_0, row_1), (col_0, col_1) in product(row_cuts, col_cuts):
-            heights = self._chunk(row_0 // side, col_0 // side)
+        chunks = list(self._chunk.table.parts(0, top, left, height, width))
+        if len(chunks) > FEW_CHUNKS:
+            return None
+        part = np.full((height, width), np.nan)
+        for place, inside, target in chunks:
+            heights = self._chunk(0, *place)
             if heights is not None:
-                y, x = row_0 % side, col_0 % side
-                inside = heights[y : y + row_1 - row_0, x : x + col_1 - col_0]
-                part[row_0 - top : row_1 - top, col_0 - left : col_1 - left] = inside
+                part[target] = heights[inside]
         return part, top, left
 
     def _samples(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Array:
@@ -100,34 +99,11 @@ class TerrainLayer:
         found = np.full(rows.shape, np.nan)
         across = int(chunk_cols.max(initial=0)) + 1
         for key, here in by_value((chunk_rows * across + chunk_cols).ravel()):
-            heights = self._chunk(*divmod(key, across))
+            heights = self._chunk(0, *divmod(key, across))
             if heights is not None:
                 row, col = (each.ravel()[here] % side for each in (rows, cols))
                 found.ravel()[here] = heights[row, col]
         return found
-
-    def _chunk(self, chunk_row: int, chunk_col: int) -> Heights | None:
-        """None if it has no height."""
-        if self._blobs.is_empty(self._table.number(0, chunk_row, chunk_col)):
-            return None
-        return self._decoded(chunk_row, chunk_col)
-
-
-def _read_chunk(
-    blobs: Blobs,
-    table: ChunkTable,
-    info: TerrainInfo,
-    layer: str,
-    path: Path,
-    chunk_row: int,
-    chunk_col: int,
-) -> Heights:
-    data = blobs.blob(table.number(0, chunk_row, chunk_col))
-    try:
-        return decode_terrain(data, table.shape(0, chunk_row, chunk_col), info)
-    except MapFileError as error:
-        where = f"chunk {chunk_row}, {chunk_col}"
-        raise MapFileError(f"map's {layer} layer is damaged ({where}: {error}): {path}") from error
 
 
 def decode_terrain(data: NDArray[np.uint8], shape: tuple[int, int], info: TerrainInfo) -> Heights:

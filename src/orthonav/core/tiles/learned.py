@@ -11,7 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +18,7 @@ from orthonav.core.errors import VariantError
 from orthonav.core.extras import needed
 from orthonav.core.files import require_file
 from orthonav.core.tiles.network import session_of
+from orthonav.core.tiles.represent import filled, inner
 
 VARIABLE = "ORTHONAV_EDGES"
 MAX_BYTES = 64 << 20  # larger networks are not meant for an aircraft
@@ -60,12 +60,9 @@ class LearnedEdges:
         if not valid.any():
             return out
         session, margin = _network(self.path, self.sha256)
-        filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
-        out[0] = _run(session, np.pad(filled.astype(np.float32) / 255, margin, mode="edge")) > 0
-        if not valid.all():
-            kernel = np.ones((2 * margin + 1,) * 2, np.uint8)
-            inner = cv2.erode(valid.astype(np.uint8), kernel, borderValue=1)
-            out[0][inner.reshape(valid.shape) == 0] = 0
+        levels = filled(grey, valid).astype(np.float32) / 255
+        edges = _run(session, np.pad(levels, margin, mode="edge")) > 0
+        out[0] = edges & inner(valid, 2 * margin + 1)
         return out
 
 

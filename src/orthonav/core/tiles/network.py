@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.errors import MapFileError, VariantError
+from orthonav.core.errors import MapFileError
 from orthonav.core.extras import needed
-from orthonav.core.variants import Part
+from orthonav.core.variants import Checked, Part, choice, require_fits, within
 
 OPERATORS = frozenset(
     [
@@ -37,26 +37,24 @@ OPERATORS = frozenset(
 
 
 @dataclass(frozen=True)
-class AutoEncoderRecipe:
+class AutoEncoderRecipe(Checked):
     """Parameters of the auto-encoder; defaults are the paper's (section Methodology).
 
     `width`: channels before its dense layer, a multiple of 8. `epochs`, `batch`, `learning_rate`:
     of AdamW. `similarity`: "product" (the paper) or "cosine". `precision`: "float32", "float16"
     (weights only) or "int8"."""
 
-    dims: int = 1024
-    width: int = 512
-    epochs: int = 200
-    batch: int = 32
-    learning_rate: float = 3e-4
-    similarity: str = "product"
-    precision: str = "float32"
+    dims: int = within(1024, 1, 4096)
+    width: int = within(512, 8, 1024)
+    epochs: int = within(200, 1, 100_000)
+    batch: int = within(32, 1, 65_536)
+    learning_rate: float = within(3e-4, 0, 1, above=True)
+    similarity: str = choice("product", "cosine")
+    precision: str = choice("float32", "float16", "int8")
 
     def __post_init__(self) -> None:
-        _require("dims", self.dims, 1 <= self.dims <= 4096, "1 to 4096")
-        fits = 8 <= self.width <= 1024 and self.width % 8 == 0
-        _require("width", self.width, fits, "a multiple of 8, 8 to 1024")
-        _require_training(self)
+        super().__post_init__()
+        require_fits("width", self.width, lambda width: width % 8 == 0, "a multiple of 8")
 
     def embedder(self, part: Part, channels: int) -> "NetworkEmbedder":
         """From a map."""
@@ -64,7 +62,7 @@ class AutoEncoderRecipe:
 
 
 @dataclass(frozen=True)
-class TripletRecipe:
+class TripletRecipe(Checked):
     """Parameters of the triplet network; defaults are the paper's, and ours where it has none.
 
     `width`: channels of its first stage, 64 in ResNet34; embeddings have 16 times as many numbers.
@@ -72,23 +70,15 @@ class TripletRecipe:
     negatives (ours). `apart`: distance of another place in tile widths (ours). The others are as in
     `AutoEncoderRecipe`, for Adam."""
 
-    width: int = 64
-    epochs: int = 200
-    batch: int = 512
-    learning_rate: float = 1e-3
-    margin: float = 1.0
-    mining: str = "hardest"
-    apart: float = 0.25
-    similarity: str = "product"
-    precision: str = "float32"
-
-    def __post_init__(self) -> None:
-        _require("width", self.width, 1 <= self.width <= 256, "1 to 256")
-        _require("margin", self.margin, 0 < self.margin <= 1e6, "above 0, at most 1000000")
-        _require_one_of("mining", self.mining, ("hardest", "semihard"))
-        _require("apart", self.apart, 0 <= self.apart <= 100, "0 to 100")
-        _require("batch", self.batch, self.batch >= 2, "at least 2")
-        _require_training(self)
+    width: int = within(64, 1, 256)
+    epochs: int = within(200, 1, 100_000)
+    batch: int = within(512, 2, 65_536)
+    learning_rate: float = within(1e-3, 0, 1, above=True)
+    margin: float = within(1.0, 0, 1e6, above=True)
+    mining: str = choice("hardest", "semihard")
+    apart: float = within(0.25, 0, 100)
+    similarity: str = choice("product", "cosine")
+    precision: str = choice("float32", "float16", "int8")
 
     @property
     def dims(self) -> int:
@@ -97,24 +87,6 @@ class TripletRecipe:
     def embedder(self, part: Part, channels: int) -> "NetworkEmbedder":
         """From a map."""
         return NetworkEmbedder.of(self, part, channels)
-
-
-def _require_training(recipe: AutoEncoderRecipe | TripletRecipe) -> None:
-    _require("epochs", recipe.epochs, 1 <= recipe.epochs <= 100_000, "1 to 100000")
-    _require("batch", recipe.batch, 1 <= recipe.batch <= 65_536, "1 to 65536")
-    rate = recipe.learning_rate
-    _require("learning_rate", rate, 0 < rate <= 1, "above 0, at most 1")
-    _require_one_of("similarity", recipe.similarity, ("product", "cosine"))
-    _require_one_of("precision", recipe.precision, ("float32", "float16", "int8"))
-
-
-def _require_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    _require(name, value, value in known, " or ".join(known))
-
-
-def _require(name: str, value: object, fits: bool, what: str) -> None:
-    if not fits:
-        raise VariantError(f"{name} must be {what}, got {value}")
 
 
 @dataclass(frozen=True, eq=False)

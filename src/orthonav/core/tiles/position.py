@@ -96,15 +96,10 @@ class TileNeighbours:
         self, scores: NDArray[np.float32], best: int, rows: NDArray[np.intp] | None = None
     ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """With those next to it, corners too, that have a score."""
-        steps = [(east, north) for east in (-1, 0, 1) for north in (-1, 0, 1)]
-        known = [(tile, _score(scores, rows, tile)) for tile in self._besides(best, steps)]
-        kept = [(tile, score) for tile, score in known if np.isfinite(score)]
-        tiles, values = zip(*kept, strict=True)
+        beside = [self.beside(best, east, north) for east in (-1, 0, 1) for north in (-1, 0, 1)]
+        known = [(tile, _score(scores, rows, tile)) for tile in beside if tile is not None]
+        tiles, values = zip(*(each for each in known if np.isfinite(each[1])), strict=True)
         return np.array(tiles, dtype=np.intp), np.array(values, dtype=np.float64)
-
-    def _besides(self, best: int, steps: list[tuple[int, int]]) -> list[int]:
-        found = (self.beside(best, east, north) for east, north in steps)
-        return [tile for tile in found if tile is not None]
 
 
 def parabola_peak(behind: float, middle: float, ahead: float) -> float:

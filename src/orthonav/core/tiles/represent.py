@@ -12,22 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import VariantError
-from orthonav.core.variants import Variant
+from orthonav.core.variants import Checked, Variant, choice, within
 
+Grey = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 HARMONICS = 3  # chosen on imagery of two dates (docs/decisions/embedding.md)
 
 
+def filled(grey: Grey, valid: Mask) -> Grey:
+    """The picture (H, W) with the mean grey level where it is not valid."""
+    if not valid.all():
+        grey = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
+    return np.ascontiguousarray(grey)
+
+
+def inner(valid: Mask, side_px: int) -> Mask:
+    """Pixels (H, W) around which a square is valid, as far as it lies within the picture."""
+    square = np.ones((side_px, side_px), np.uint8)
+    eroded = cv2.erode(valid.astype(np.uint8), square, borderValue=1)
+    return np.asarray(eroded.reshape(valid.shape) > 0)
+
+
 @dataclass(frozen=True)
-class OrientedGradients:
+class OrientedGradients(Checked):
     """(7, H, W), levels per pixel: magnitude, real and imaginary part of harmonics 1 to 3."""
 
-    sigma_px: float = 1.5
-
-    def __post_init__(self) -> None:
-        if not 0 < self.sigma_px <= 16:
-            raise VariantError(
-                f"gradient sigma_px must be above 0 and at most 16, got {self.sigma_px}"
-            )
+    sigma_px: float = within(1.5, 0, 16, above=True)
 
     channels = 1 + 2 * HARMONICS
 
@@ -47,10 +57,7 @@ class OrientedGradients:
         power += south2
         np.sqrt(power, out=out[0])
         if not valid.all():
-            reach = 2 * self.margin_px + 1
-            out[0] *= cv2.erode(
-                valid.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1
-            )
+            out[0] *= inner(valid, 2 * self.margin_px + 1)
         power += np.float32(1e-6)
         cos /= power
         sin = np.multiply(east, south, out=south2)
@@ -101,7 +108,7 @@ class Gray:
 
 
 @dataclass(frozen=True)
-class Canny:
+class Canny(Checked):
     """Binary edges, by default of "a threshold in the interval [100, 200] and a kernel of size 3".
 
     We read this as the low and the high threshold, on the Sobel gradient of 8-bit grey levels; the
@@ -109,13 +116,12 @@ class Canny:
 
     low: float = 100.0
     high: float = 200.0
-    kernel: int = 3
+    kernel: int = choice(3, 5, 7)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 <= self.low <= self.high:
             raise VariantError(f"canny needs 0 <= low <= high, got {self.low}, {self.high}")
-        if self.kernel not in (3, 5, 7):
-            raise VariantError(f"canny kernel must be 3, 5 or 7, got {self.kernel}")
 
     channels = 1
 
@@ -128,8 +134,5 @@ class Canny:
         """None along the border of `valid`."""
         edges = cv2.Canny(np.ascontiguousarray(grey), self.low, self.high, apertureSize=self.kernel)
         if not valid.all():
-            reach = self.kernel + 2
-            edges = edges * cv2.erode(
-                valid.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1
-            )
+            edges = edges * inner(valid, self.kernel + 2)
         return (edges > 0).astype(np.float32)[None]

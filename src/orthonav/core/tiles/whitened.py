@@ -20,8 +20,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from orthonav.core.cores import in_order
-from orthonav.core.errors import MapFileError, UsageError, VariantError
-from orthonav.core.variants import Part
+from orthonav.core.errors import MapFileError, UsageError
+from orthonav.core.variants import Checked, Part, choice, within
 
 MICRO = 32  # along one side of a tile
 
@@ -83,20 +83,12 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
-class WhitenedRecipe:
+class WhitenedRecipe(Checked):
     """`cells`: along a side of a tile. `floor`: norm below which a cell counts as empty."""
 
-    cells: int = 8
-    dims: int = 128
-    floor: float = 0.6
-
-    def __post_init__(self) -> None:
-        if self.cells < 1 or MICRO % self.cells:
-            raise VariantError(f"cells must divide {MICRO}, got {self.cells}")
-        if not 1 <= self.dims <= 4096:
-            raise VariantError(f"dims must be 1 to 4096, got {self.dims}")
-        if not self.floor > 0:
-            raise VariantError(f"floor must be above 0, got {self.floor}")
+    cells: int = choice(8, 1, 2, 4, 16, 32)
+    dims: int = within(128, 1, 4096)
+    floor: float = within(0.6, 0, above=True)
 
     def embedder(self, part: Part, channels: int) -> "WhitenedEmbedder":
         """From a map."""

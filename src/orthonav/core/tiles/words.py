@@ -18,48 +18,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import MapFileError, VariantError
-from orthonav.core.variants import Part
+from orthonav.core.tiles.represent import Grey, Mask, filled
+from orthonav.core.variants import Checked, Part, choice, within
 
 DIMS = {"sift": 128, "superpoint": 256}  # numbers per descriptor
 
-Grey = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Array = NDArray[np.float32]
 Detector = Callable[[Grey], tuple[Array, Array, Array]]
 """Points (N, 2) from the outer corner, radii (N,) and descriptors (N, D) of a picture."""
 
 
 @dataclass(frozen=True)
-class WordsRecipe:
+class WordsRecipe(Checked):
     """Parameters of a bag of visual words.
 
     `words`: clusters k; the paper tries 256 to 10000. `max_features`: the strongest of a picture.
     `similarity`: "product" compares frequencies (the paper), "cosine" unit vectors. `tfidf`: 1
     weighs words by how rare they are."""
 
-    words: int = 1024
-    features: str = "sift"
+    words: int = within(1024, 256, 10_000)
+    features: str = choice("sift", "superpoint")
     weights: str = ""
-    max_features: int = 2000
-    similarity: str = "product"
-    tfidf: int = 0
+    max_features: int = within(2000, 1, 100_000)
+    similarity: str = choice("product", "cosine")
+    tfidf: int = choice(0, 1)
 
     def __post_init__(self) -> None:
-        if not 256 <= self.words <= 10_000:
-            raise VariantError(f"words must be 256 to 10000, got {self.words}")
-        if self.features not in DIMS:
-            raise VariantError(f"features must be sift or superpoint, got '{self.features}'")
+        super().__post_init__()
         if bool(self.weights) != (self.features == "superpoint"):
             raise VariantError(
                 "weights=PATH is for superpoint and needed there, got "
                 f"features={self.features}, weights='{self.weights}'"
             )
-        if not 1 <= self.max_features <= 100_000:
-            raise VariantError(f"max_features must be 1 to 100000, got {self.max_features}")
-        if self.similarity not in ("product", "cosine"):
-            raise VariantError(f"similarity must be product or cosine, got '{self.similarity}'")
-        if self.tfidf not in (0, 1):
-            raise VariantError(f"tfidf must be 0 or 1, got {self.tfidf}")
 
     def embedder(self, part: Part, _: int) -> "WordsEmbedder":
         """From a map."""
@@ -176,13 +166,6 @@ def describe(
     else:
         points, radii, descriptors = detector(picture)
     return descriptors[seen(valid, points, radii)]
-
-
-def filled(grey: Grey, valid: Mask) -> Grey:
-    """The picture (H, W) with the mean grey level where it is not valid."""
-    if not valid.all():
-        grey = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
-    return np.ascontiguousarray(grey)
 
 
 def seen(valid: Mask, points: Array, radii: Array) -> Mask:

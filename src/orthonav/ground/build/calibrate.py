@@ -93,45 +93,29 @@ ENOUGH_RIGHT = 10
 
 @dataclass(frozen=True)
 class CalibrationParameters:
-    slow_crops: int = 32
-    """Views searched with representations that take minutes per view."""
-    crop_tiles: float = 1.5
-    """Width of crops in tiles: a rotated tile fits into it."""
-    small_tiles: float = 2.5
-    """Sheets less wide whose border is not all imagery have few crops of that width."""
-    enough_crops: int = 48
-    """Whole crops, below which others of at least `min_valid` are used too."""
-    min_valid: float = 0.9
-    """Least fraction of valid pixels of a crop."""
-    heading_std_deg: float = 5.0
+    slow_crops: int = 32  # views searched with representations that take minutes per view
+    crop_tiles: float = 1.5  # width of crops in tiles: a rotated tile fits into it
+    small_tiles: float = 2.5  # narrower sheets with a border of nodata have few such crops
+    enough_crops: int = 48  # whole crops, below which others are used too ..
+    min_valid: float = 0.9  # .. with at least this fraction of valid pixels
+    heading_std_deg: float = 5.0  # errors of heading and height: those of the benchmarks
     scale_std: float = 0.05
-    """Errors of heading and height: those of the benchmarks."""
-    heading_step_deg: float = 6.0
-    """Spacing of the headings that tile matching tries."""
-    pasted_share: float = 0.25
-    """Of replacements by another position of the map; the others are mirrored."""
-    mirrored_weight: float = 0.25
-    """A flight sees fewer places outside the map than inside."""
-    radius_strides: float = 0.75
-    """A fix is correct if its error is below this many strides."""
-    floor_px: float = 0.6
-    """Usual standard deviation per axis between orthophotos of two dates."""
+    heading_step_deg: float = 6.0  # spacing of the headings that tile matching tries
+    pasted_share: float = 0.25  # of replacements by another place of the map, not mirrored
+    mirrored_weight: float = 0.25  # a flight sees fewer places outside the map than inside
+    radius_strides: float = 0.75  # a fix is correct if its error is below this many strides
+    floor_px: float = 0.6  # usual standard deviation per axis between two dates, and its limits
     floor_limits_px: tuple[float, float] = (0.25, 3.0)
-    min_negatives: int = 5
-    """Mirrored views from which on the scores of chance are their medians."""
-    usual_fine: float = 1.45
-    """Ratio by which one more level raises the score of a chance match: prior, .."""
-    usual_fine_views: float = 8.0
-    """.. and its weight."""
+    min_negatives: int = 5  # mirrored views from which the scores of chance are their medians
+    usual_fine: float = 1.45  # prior of how one more level raises the score of a chance match ..
+    usual_fine_views: float = 8.0  # .. and its weight
     whole_px: int = 6144
     searched_px: int = 4096
     """Maps larger than a square of the first are searched in a square of the second for each view:
     on a map of 50 x 5 km a full search took 7 GB and minutes per view, and too few views were found
     for a fit (4 of 24 on 10 x 5 km; 9 of 24 in the square)."""
-    ridge: float = 3e-2
-    """Weight of the usual bias of registered views."""
-    tile_ridge: float = 1e-3
-    """Only against weights without bound where right and wrong separate fully."""
+    ridge: float = 3e-2  # weight of the usual bias of registered views
+    tile_ridge: float = 1e-3  # only against weights without bound
 
 
 CALIBRATION = CalibrationParameters()
@@ -226,40 +210,23 @@ def calibrate(
         other = crops[int(rng.integers(len(crops)))].grey
         if rng.random() > CALIBRATION.pasted_share:
             other = other[:, ::-1]
+        truth = grid.west_m + crop.col_px * grid.gsd_m, grid.north_m - crop.row_px * grid.gsd_m
         for mirror in (False, True):
             picture = crop.grey[:, ::-1] if mirror else crop.grey
             aged = changed_picture(rng, picture, other)
             match = tiles.match(_queries(rng, aged, grid, representation, embedder))
             features.append([match.evidence[name] for name in TILE_FEATURES])
-            truth = [
-                grid.west_m + crop.col_px * grid.gsd_m,
-                grid.north_m - crop.row_px * grid.gsd_m,
-            ]
             errors.append(tiles.centres_en_m[match.tile] + np.array(match.shift_en_m) - truth)
             mirrored.append(mirror)
         progress("calibrate", (done + 1) / len(crops))
-    return _tile_calibration(
-        np.array(features).reshape(-1, len(TILE_FEATURES)),
-        np.array(errors).reshape(-1, 2),
-        np.array(mirrored, dtype=bool),
-        grid,
-        usual,
-    )
-
-
-def _tile_calibration(
-    features: NDArray[np.float64],
-    errors_en_m: NDArray[np.float64],
-    mirrored: NDArray[np.bool_],
-    grid: TileGrid,
-    usual: LogisticConfidence | None,
-) -> TileCalibration:
+    errors_en_m, is_mirrored = np.reshape(errors, (-1, 2)), np.array(mirrored, bool)
     near = np.hypot(*errors_en_m.T) <= CALIBRATION.radius_strides * grid.stride_m
-    right = near & ~mirrored
-    weight = np.where(mirrored, CALIBRATION.mirrored_weight, 1.0)
+    right = near & ~is_mirrored
+    weight = np.where(is_mirrored, CALIBRATION.mirrored_weight, 1.0)
+    evidence = np.reshape(np.array(features, float), (-1, len(TILE_FEATURES)))
     if right.sum() < 10:
-        return TileCalibration(fit_few(features, right, weight, usual), grid.stride_m)
-    confidence = LogisticConfidence(*fit_weights(features, right, weight))
+        return TileCalibration(fit_few(evidence, right, weight, usual), grid.stride_m)
+    confidence = LogisticConfidence(*fit_weights(evidence, right, weight))
     std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
     return TileCalibration(confidence, max(std_m, grid.gsd_m))
 
@@ -310,13 +277,6 @@ class RegistrationCalibration:
     floor_px: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Outcome:
-    scores: Scores
-    error_px: NDArray[np.float64]
-    mirrored: bool
-
-
 def calibrate_registration(
     prepared: PreparedMap,
     crops: Sequence[Crop],
@@ -331,7 +291,7 @@ def calibrate_registration(
     later = [other_dates[i] for i in rng.permutation(len(other_dates))[:views]]
     mirrored = (later or [crops[i] for i in order])[:views]
     work = [(crop, False) for crop in later] + [(crop, True) for crop in mirrored]
-    outcomes: list[_Outcome] = []
+    found: list[tuple[Scores, float, bool]] = []
     for done, (crop, mirror) in enumerate(work):
         picture = crop.grey
         if mirror:
@@ -340,28 +300,35 @@ def calibrate_registration(
             # The replacement is mirrored: unmirrored it would be found at its own position.
             replaced_by = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
             picture = changed(rng, picture, replaced_by)
-        outcome = _placed(rng, prepared, crop, picture, mirror)
-        if outcome is not None:
-            outcomes.append(outcome)
+        view = _view(rng, picture, prepared.grid)
+        search = Search.of(prepared, view, _prior(rng, prepared, crop))
+        outcome = search if isinstance(search, NoFix) else search.run()
+        if not isinstance(outcome, NoFix):
+            pose = outcome.best.place.window_pose
+            off_px = np.hypot(pose.x_px - crop.col_px, pose.y_px - crop.row_px)
+            found.append((outcome.best.scores, float(off_px), mirror))
         progress("calibrate registration", (done + 1) / len(work))
-    return _registration_calibration(outcomes, prepared.radius_m / prepared.grid.gsd_m)
+    return _fitted(found, prepared.radius_m / prepared.grid.gsd_m)
 
 
-def _placed(
-    rng: np.random.Generator,
-    prepared: PreparedMap,
-    crop: Crop,
-    picture: NDArray[np.uint8],
-    mirror: bool,
-) -> _Outcome | None:
-    view = _view(rng, picture, prepared.grid)
-    search = Search.of(prepared, view, _prior(rng, prepared, crop))
-    found = search if isinstance(search, NoFix) else search.run()
-    if isinstance(found, NoFix):
-        return None
-    pose = found.best.place.window_pose
-    error = np.array([pose.x_px - crop.col_px, pose.y_px - crop.row_px])
-    return _Outcome(found.best.scores, error, mirror)
+def _fitted(
+    found: Sequence[tuple[Scores, float, bool]], radius_px: float
+) -> RegistrationCalibration:
+    """From scores, error in pixels and whether it was mirrored, of each view that was placed."""
+    scores, errors_px, is_mirrored = zip(*found, strict=True) if found else ((), (), ())
+    negatives = [each for each, mirror in zip(scores, is_mirrored, strict=True) if mirror]
+    chances = _chances(negatives)
+    confidence, floor_px = RegisteredConfidence.usual(chances), CALIBRATION.floor_px
+    right = ~np.array(is_mirrored, bool) & (np.array(errors_px, float) <= radius_px)
+    if right.sum() >= ENOUGH_RIGHT:
+        # From the median: Rayleigh's is 1.1774 standard deviations.
+        spread = float(np.median(np.array(errors_px)[right])) / 1.1774
+        low_px, high_px = CALIBRATION.floor_limits_px
+        floor_px = min(max(spread, low_px), high_px)
+        # Without a mirrored view nothing would show what a wrong place looks like.
+        if negatives:
+            confidence = fit_registered(scores, right, chances)
+    return RegistrationCalibration(confidence, floor_px)
 
 
 def _prior(rng: np.random.Generator, prepared: PreparedMap, crop: Crop) -> Prior | None:
@@ -404,29 +371,10 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
     return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
 
 
-def _registration_calibration(
-    outcomes: Sequence[_Outcome], radius_px: float
-) -> RegistrationCalibration:
-    negatives = [each.scores for each in outcomes if each.mirrored]
-    enough = len(negatives) >= CALIBRATION.min_negatives
-    chances = _chances(negatives) if enough else DEFAULT_CHANCES
-    confidence, floor_px = RegisteredConfidence.usual(chances), CALIBRATION.floor_px
-    errors_px = np.array([np.hypot(*each.error_px) for each in outcomes])
-    mirrored = np.array([each.mirrored for each in outcomes], np.bool_)
-    right = ~mirrored & (errors_px <= radius_px)
-    if right.sum() >= ENOUGH_RIGHT:
-        # From the median: Rayleigh's is 1.1774 standard deviations.
-        spread = float(np.median(errors_px[right])) / 1.1774
-        low_px, high_px = CALIBRATION.floor_limits_px
-        floor_px = min(max(spread, low_px), high_px)
-        # Without a mirrored view nothing would show what a wrong place looks like.
-        if negatives:
-            confidence = fit_registered([each.scores for each in outcomes], right, chances)
-    return RegistrationCalibration(confidence, floor_px)
-
-
 def _chances(negatives: Sequence[Scores]) -> Chances:
     """A view judged and finished at one level has the strength of one score, not of two."""
+    if len(negatives) < CALIBRATION.min_negatives:
+        return DEFAULT_CHANCES
     mid = _median(negatives, "mid_score")
     both = [each for each in negatives if math.isfinite(each.detail_ratio)]
     total = mid + DEFAULT_CHANCES.total - DEFAULT_CHANCES.mid

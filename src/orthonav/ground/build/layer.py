@@ -118,26 +118,14 @@ class GreyLayerWriter:
     def _add(
         self, level: int, row: int, col: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
     ) -> None:
-        side = self._chunk_px
-        height, width = grey.shape
-        for chunk_row in range(row // side, -(-(row + height) // side)):
-            for chunk_col in range(col // side, -(-(col + width) // side)):
-                place = (chunk_row, chunk_col)
-                chunk = self._pending[level].get(place)
-                if chunk is None:
-                    chunk = _Pending(self._table.shape(level, *place))
-                    self._pending[level][place] = chunk
-                top, left = chunk_row * side, chunk_col * side
-                source = np.s_[
-                    max(top - row, 0) : top + side - row, max(left - col, 0) : left + side - col
-                ]
-                part = grey[source]
-                y, x = max(row - top, 0), max(col - left, 0)
-                target = np.s_[y : y + part.shape[0], x : x + part.shape[1]]
-                chunk.grey[target], chunk.valid[target] = part, valid[source]
-                chunk.missing_px -= part.size
-                if chunk.missing_px == 0:
-                    self._complete(level, place)
+        for place, inside, part in self._table.parts(level, row, col, *grey.shape):
+            chunk = self._pending[level].get(place)
+            if chunk is None:
+                chunk = self._pending[level][place] = _Pending(self._table.shape(level, *place))
+            chunk.grey[inside], chunk.valid[inside] = grey[part], valid[part]
+            chunk.missing_px -= grey[part].size
+            if chunk.missing_px == 0:
+                self._complete(level, place)
 
     def _complete(self, level: int, place: tuple[int, int]) -> None:
         chunk = self._pending[level].pop(place)

@@ -3,11 +3,11 @@
 import cv2
 import numpy as np
 import pytest
+from builders import WITH_LAYER, built
 
 from helpers import textured, waypoints
-from orthonav.core.mapfile import GreyLayer, open_map
+from orthonav.core.mapfile import GreyLayer
 from orthonav.core.mapfile.layer import part_names
-from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.layer import (
     CHUNK_PX,
     MAX_BYTES_PER_PX,
@@ -92,16 +92,10 @@ def test_how_the_blocks_come_does_not_matter(steps):
             np.testing.assert_array_equal(part, other[name])
 
 
-def noise(kind, shape=(700, 600)):
-    rng = np.random.default_rng(0)
-    if kind == "black and white":
-        return (rng.integers(0, 2, shape) * 255).astype(np.uint8)
-    return rng.integers(0, 256, shape).astype(np.uint8)
-
-
-@pytest.mark.parametrize("kind", ["even", "black and white"])
-def test_noise_cannot_make_it_large(kind):
-    grey = noise(kind)
+@pytest.mark.parametrize("levels", [256, 2])
+def test_noise_cannot_make_it_large(levels):
+    noise = np.random.default_rng(0).integers(0, levels, (700, 600))
+    grey = (noise * (255 // (levels - 1))).astype(np.uint8)
     parts = written(grey, np.ones(grey.shape, bool))[1]
     assert total_bytes(parts) < 4 / 3 * MAX_BYTES_PER_PX * grey.size
     holed = written(grey, np.random.default_rng(1).random(grey.shape) < 0.7)[1]
@@ -116,24 +110,18 @@ def ortho(make_ortho, tmp_path_factory):
     return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif", grey, nodata=0)
 
 
-def built(ortho, folder, name="map.onav", **request):
-    request = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2, **request}
-    build_map(BuildRequest([ortho], folder / name, **request))
-    return open_map(folder / name)
-
-
 @pytest.fixture(scope="module")
 def small_map(ortho, tmp_path_factory):
     """A map of it, for tests that only read one; not to be changed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.ground.build.calibrate.CROPS", 16)
-        return built(ortho, tmp_path_factory.mktemp("map"))
+        return built(ortho, tmp_path_factory.mktemp("map"), **WITH_LAYER)
 
 
 @pytest.mark.parametrize("block_px", [1024, 150])
 def test_a_map_carries_its_imagery(ortho, tmp_path, monkeypatch, block_px):
     monkeypatch.setattr("orthonav.ground.build.sheet.BLOCK_PX", block_px)
-    opened = built(ortho, tmp_path)
+    opened = built(ortho, tmp_path, **WITH_LAYER)
     sheet, layer = opened.manifest.sheets[0], GreyLayer.of(opened)
     with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
         pixels = raster.read(0, 0, sheet.grid.width_px, sheet.grid.height_px)
@@ -164,7 +152,7 @@ def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
     outline = Mosaic.open([wide]).outline_latlon_deg
     frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
     route = Route(waypoints(frame, [[-400.0, -400.0], [400.0, 400.0]]))
-    opened = built(wide, tmp_path, route=route, band_m=100.0)
+    opened = built(wide, tmp_path, route=route, band_m=100.0, **WITH_LAYER)
     layer = GreyLayer.of(opened)
     rows, cols = layer.shape(0)
     middle = layer.read(0, rows // 2 - 100, cols // 2 - 100, 200, 200)[1]

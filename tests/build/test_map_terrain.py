@@ -46,16 +46,21 @@ def dem(frame, tmp_path_factory):
     return write_dem(tmp_path_factory.mktemp("dem") / "hill.tif", frame, hill)
 
 
-@pytest.fixture(scope="module")
-def hill_map(map_path, dem, tmp_path_factory):
+def with_terrain(path, dem, out):
     """The map of the session with terrain."""
-    opened = open_map(map_path)
+    opened = open_map(path)
     sheet = opened.manifest.sheets[0]
     low, high = [sheet.grid.west_m, -500.0], [-sheet.grid.west_m, 500.0]
-    made = terrain_of_dem(open_dem(dem, "msl"), Area(sheet.frame, (*low, *high)), sheet.grid)
-    out = tmp_path_factory.mktemp("map") / "hill.onav"
+    made = terrain_of_dem(dem, Area(sheet.frame, (*low, *high)), sheet.grid)
     manifest = replace(opened.manifest, sheets=(replace(sheet, terrain=made.info),))
     write_map(out, manifest, {**opened.arrays, **made.arrays})
+    return made.info
+
+
+@pytest.fixture(scope="module")
+def hill_map(map_path, dem, tmp_path_factory):
+    out = tmp_path_factory.mktemp("map") / "hill.onav"
+    with_terrain(map_path, open_dem(dem, "msl"), out)
     return out
 
 
@@ -125,13 +130,8 @@ def test_what_the_samples_of_a_map_do_not_show_is_its_roughness(tmp_path):
 
 def test_heights_over_an_unknown_datum(run, map_path, flown, dem, tmp_path):
     """Those above ground and take-off are used, those above the sea are refused."""
-    opened = open_map(map_path)
-    sheet = opened.manifest.sheets[0]
-    low, high = [sheet.grid.west_m, -500.0], [-sheet.grid.west_m, 500.0]
-    made = terrain_of_dem(open_dem(dem), Area(sheet.frame, (*low, *high)), sheet.grid)
-    assert made.info.datum == "unknown" and not made.info.is_above_sea
-    manifest = replace(opened.manifest, sheets=(replace(sheet, terrain=made.info),))
-    write_map(tmp_path / "a.onav", manifest, {**opened.arrays, **made.arrays})
+    info = with_terrain(map_path, open_dem(dem), tmp_path / "a.onav")
+    assert info.datum == "unknown" and not info.is_above_sea
     few = shutil.copytree(flown, tmp_path / "flight")
     table = rows(few)[:2]
 

@@ -72,20 +72,10 @@ mask_decoder.output_hypernetworks_mlps.0.layers.2.bias
 mask_decoder.iou_prediction_head.layers.0.weight mask_decoder.iou_prediction_head.layers.1.bias
 mask_decoder.iou_prediction_head.layers.2.bias
 """
-SIZES = {
-    "base": {},
-    "large": {
-        "hidden_size": 1024,
-        "num_hidden_layers": 24,
-        "num_attention_heads": 16,
-        "global_attn_indexes": [5, 11, 17, 23],
-    },
-    "huge": {
-        "hidden_size": 1280,
-        "num_hidden_layers": 32,
-        "num_attention_heads": 16,
-        "global_attn_indexes": [7, 15, 23, 31],
-    },
+SIZES = {  # width, layers, heads and layers that see the whole picture
+    "base": (768, 12, 12, [2, 5, 8, 11]),
+    "large": (1024, 24, 16, [5, 11, 17, 23]),
+    "huge": (1280, 32, 16, [7, 15, 23, 31]),
 }
 
 
@@ -212,19 +202,15 @@ def test_points_form_an_even_grid_and_are_sent_in_batches():
     assert sorted(set(x)) == [16, 48, 80, 112] and sorted(set(y)) == [8, 24, 40, 56]
 
 
-@pytest.mark.parametrize("iou, left", [(0.8, 3), (0.92, 2), (0.97, 1), (1.0, 0)])
-def test_masks_with_a_low_expected_iou_are_dropped(iou, left):
+@pytest.mark.parametrize(
+    "iou, sharpness, left",
+    [(0.8, 50.0, 3), (0.92, 50.0, 2), (0.97, 50.0, 1), (1.0, 50.0, 0), (0.8, 2.1, 0)],
+)
+def test_masks_with_a_low_expected_iou_and_unstable_ones_are_dropped(iou, sharpness, left):
+    """Where logits fall slowly across a border, the mask depends on where it is cut."""
     rules = SamBoundaries("somewhere", grid=1, iou=iou)
-    predict = fake(THREE, [0.95, 0.99, 0.9])
+    predict = fake(THREE, [0.95, 0.99, 0.9], sharpness)
     assert len(list(automatic_masks(predict, (64, 64), 64, rules))) == left
-
-
-def test_unstable_masks_are_dropped():
-    """Logits that fall slowly across a border: the mask depends on where it is cut."""
-    rules = SamBoundaries("somewhere", grid=1)
-    for sharpness, left in ((50.0, 3), (2.1, 0)):
-        predict = fake(THREE, [0.99, 0.99, 0.99], sharpness)
-        assert len(list(automatic_masks(predict, (64, 64), 64, rules))) == left
 
 
 def test_suppression_equals_that_of_opencv():
@@ -320,16 +306,6 @@ def test_large_pictures_are_cut_into_windows(weights):
     assert not np.array_equal(whole, drawn(variant(weights, window=0), grey))
 
 
-def test_a_batch_equals_single_calls(weights):
-    greys = np.stack([picture(seed=seed) for seed in range(3)])
-    valid = np.ones(greys.shape, bool)
-    shares = []
-    out = variant(weights).batch(greys, valid, shares.append)
-    for grey, seen, edges in zip(greys, valid, out, strict=True):
-        np.testing.assert_array_equal(edges, variant(weights)(grey, seen))
-    assert out.shape == (3, 1, 48, 64) and shares == pytest.approx([1 / 3, 2 / 3, 1])
-
-
 # The cache.
 
 
@@ -352,18 +328,12 @@ def test_second_call_does_not_run_the_network(weights, tmp_path, asked, monkeypa
 
 
 def test_the_cache_distinguishes_pictures_and_parameters(weights, tmp_path, asked):
-    cache = {"cache": str(tmp_path)}
-    for chosen, grey in [
-        (variant(weights, **cache), picture()),
-        (variant(weights, **cache), picture(seed=1)),
-        (variant(weights, **cache), picture().reshape(64, 48)),
-        (variant(weights, grid=3, **cache), picture()),
-        (variant(weights, overlap=0.5, **cache), picture()),
-        (variant(weights, precision="bf16", **cache), picture()),
-    ]:
-        drawn(chosen, grey)
+    for grey in (picture(), picture(seed=1), picture().reshape(64, 48)):
+        drawn(variant(weights, cache=str(tmp_path)), grey)
+    for changed in ({"grid": 3}, {"overlap": 0.5}, {"precision": "bf16"}):
+        drawn(variant(weights, cache=str(tmp_path), **changed), picture())
     assert len(asked) == 6
-    drawn(variant(weights, prompts=3, **cache), picture())  # changes nothing but speed
+    drawn(variant(weights, cache=str(tmp_path), prompts=3), picture())  # only speed changes
     assert len(asked) == 6
 
 
@@ -422,11 +392,8 @@ def test_the_environment_sets_the_cache_folder(weights, tmp_path, monkeypatch, n
 def test_original_checkpoints_are_read(weights, checkpoint):
     names = set(torch.load(checkpoint, weights_only=True))
     assert set(PUBLISHED.split()) <= names and len(names) > 100
-    assert {name.partition(".")[0] for name in names} == {
-        "image_encoder",
-        "prompt_encoder",
-        "mask_decoder",
-    }
+    parts = {"image_encoder", "prompt_encoder", "mask_decoder"}
+    assert {name.partition(".")[0] for name in names} == parts
     model = sam.original_model(checkpoint)
     expected = transformers.SamModel.from_pretrained(weights)
     assert model.state_dict().keys() == expected.state_dict().keys()
@@ -440,7 +407,9 @@ def test_original_checkpoints_are_read(weights, checkpoint):
 
 @pytest.mark.parametrize("size", sorted(SIZES))
 def test_sizes_follow_from_the_shapes_of_the_weights(size):
-    expected = transformers.SamConfig(vision_config=transformers.SamVisionConfig(**SIZES[size]))
+    names = "hidden_size", "num_hidden_layers", "num_attention_heads", "global_attn_indexes"
+    vision = transformers.SamVisionConfig(**dict(zip(names, SIZES[size], strict=True)))
+    expected = transformers.SamConfig(vision_config=vision)
     with torch.device("meta"):
         original = original_weights(transformers.SamModel(expected))
     made = sam._config(original)
@@ -495,16 +464,8 @@ def test_missing_weights_name_their_source(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "grid=0",
-        "iou=1.1",
-        "stability=-1",
-        "offset=0",
-        "overlap=2",
-        "window=8",
-        "per=view",
-        "prompts=0",
-        "device=tpu",
-        "precision=fp8",
+        *("grid=0", "iou=1.1", "stability=-1", "offset=0", "overlap=2", "window=8"),
+        *("per=view", "prompts=0", "device=tpu", "precision=fp8"),
     ],
 )
 def test_invalid_parameters_are_refused(text):
@@ -532,18 +493,13 @@ def test_a_network_learns_from_the_boundaries_of_sheets_or_tiles(
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 4)
     monkeypatch.setenv(sam.WEIGHTS_VARIABLE, str(weights))
     given = "grid=4,iou=0,stability=0,cache=none,device=cpu,window=64"
-    request = BuildRequest(
-        [area.past],
-        tmp_path / "a.onav",
-        method="autoencoder:width=8,dims=32,epochs=2,similarity=cosine",
-        edges=f"sam:per={per},{given}",
-        registration=False,
-        tile_px=64,
-        gsd_m=5.0,
-        overlap=0.5,
-        work=tmp_path / "work",
-    )
-    build_map(request)
+    made_by = {
+        "method": "autoencoder:width=8,dims=32,epochs=2,similarity=cosine",
+        "edges": f"sam:per={per},{given}",
+        "work": tmp_path / "work",
+    }
+    size = {"tile_px": 64, "gsd_m": 5.0, "overlap": 0.5, "registration": False}
+    build_map(BuildRequest([area.past], tmp_path / "a.onav", **made_by, **size))
     opened = open_map(tmp_path / "a.onav")
     assert opened.manifest.recipe["represent"]["per"] == per
     localizer = Localizer(opened, registration=False, flying=False, position="best")

@@ -1,15 +1,13 @@
 """What a map learns of its own registration: which views to believe, and how dates agree."""
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import built
 
 from helpers import textured
 from orthonav.core.localize.confidence import DEFAULT_CONFIDENCE
-from orthonav.core.mapfile import open_map
-from orthonav.ground.build import BuildRequest, build_map
 from orthonav.ground.build.calibrate import CALIBRATION
 
 GREY = textured((240, 240), 11)
@@ -24,9 +22,8 @@ def small(make_ortho, tmp_path, monkeypatch):
     def build(made_of=GREY[20:220, 20:220], *other_dates):
         ortho = make_ortho(tmp_path / "2020.tif", made_of)
         later = [make_ortho(tmp_path / "later.tif", picture) for picture in other_dates]
-        request = BuildRequest([ortho], tmp_path / "map.onav", tile_px=64, other_dates=later)
-        build_map(replace(request, calibration_views=9))
-        return open_map(request.out).manifest.registration
+        with_layer = {"registration": True, "calibration_views": 9, "overlap": 0.875}
+        return built(ortho, tmp_path, other_dates=later, **with_layer).manifest.registration
 
     return build
 

@@ -11,6 +11,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from builders import WITH_LAYER, built
 
 from helpers import box_deg, textured, waypoints
 from orthonav.core.cores import AHEAD, in_order
@@ -55,17 +56,6 @@ def fewer_crops(map_path, monkeypatch):
     """Calibration from few crops and views, but for the map that all tests share."""
     monkeypatch.setattr("orthonav.ground.build.calibrate.CROPS", 24)
     monkeypatch.setattr("orthonav.ground.build.calibrate.ENOUGH_RIGHT", 1)
-
-
-WITH_LAYER = {"registration": True, "calibration_views": 2}
-
-
-def built(ortho, folder, name="map.onav", **request):
-    """A map; by default without the registration layer, whose calibration takes longest."""
-    request = {"tile_px": 64, "overlap": 0.75, "registration": False, **request}
-    orthos = ortho if isinstance(ortho, list) else [ortho]
-    build_map(BuildRequest(orthos, folder / name, **request))
-    return open_map(folder / name)
 
 
 def centres_en_m(opened):
@@ -200,12 +190,11 @@ def test_few_results_wait_for_a_reader():
 
 
 def test_the_manifest(small_ortho, tmp_path):
-    calls = []
-    out = tmp_path / "deep" / "map.onav"
+    calls, out = [], tmp_path / "deep" / "map.onav"
     request = BuildRequest([small_ortho], out, tile_px=64, calibration_views=4)
     result = build_map(request, lambda stage, share: calls.append((stage, share)))
-    manifest = open_map(request.out).manifest
-    assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
+    manifest = open_map(out).manifest
+    assert manifest == result.manifest and result.size_bytes == out.stat().st_size
     assert manifest.imagery[0]["date"] == "2019-06" and manifest.imagery[0]["name"] == "2019-06.tif"
     assert manifest.radius_m == CALIBRATION.radius_strides * manifest.sheets[0].grid.stride_m
     stages = ["imagery", "learn", "calibrate", "calibrate registration"]

@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import built
 
 from helpers import box_deg, write_dem
 from orthonav.core.errors import AreaError, ImageryError, MapFileError
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.grid import TileGrid
-from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.manifest import SheetInfo
-from orthonav.core.mapfile.terrain import SURFACE, TerrainLayer
-from orthonav.ground.build import BuildRequest, build_map
+from orthonav.core.mapfile.terrain import SURFACE, TERRAIN, TerrainLayer
 from orthonav.ground.build.layer import height_layers
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.planning.area import Area
@@ -56,20 +55,14 @@ def surface(tmp_path_factory):
 @pytest.fixture(scope="module")
 def town_map(make_ortho, surface, tmp_path_factory):
     folder = tmp_path_factory.mktemp("map")
-    ortho, out = make_ortho(folder / "past.tif"), folder / "a.onav"
-    sizes = {"tile_px": 64, "overlap": 0.5, "registration": False, "calibration_views": 1}
-    build_map(BuildRequest([ortho], out, surface=[surface], dem_datum="msl", **sizes))
-    return open_map(out)
-
-
-def sums(layers, opened, points_en_m):
-    terrain, surface = (TerrainLayer.of(opened, layer=each) for each in layers)
-    return terrain.at_en_m(points_en_m), surface.at_en_m(points_en_m)
+    ortho = make_ortho(folder / "past.tif")
+    return built(ortho, folder, overlap=0.5, surface=[surface], dem_datum="msl")
 
 
 def test_houses_stand_on_the_lower_envelope(town_map):
     points = np.random.default_rng(0).uniform(-150, 150, (2000, 2))
-    ground, above = sums(("terrain", SURFACE), town_map, points)
+    layers = (TerrainLayer.of(town_map, layer=each) for each in (TERRAIN, SURFACE))
+    ground, above = (each.at_en_m(points) for each in layers)
     there = LOCAL.en_from_latlon(*town_map.manifest.sheets[0].frame.latlon_from_en(points))
     np.testing.assert_allclose(ground, slope(*there.T), atol=0.2)
     np.testing.assert_allclose(np.median(ground + above - town(*there.T)), 0.0, atol=0.3)
@@ -152,16 +145,13 @@ def test_a_surface_elsewhere(grid, surface, tmp_path):
     assert height_layers(None, [open_dem(surface)], far, there, needed=False)[:2] == (None, None)
 
 
-def test_a_true_orthophoto_needs_a_surface(run, make_ortho, tmp_path):
+def test_options_that_need_or_exclude_a_surface(run, make_ortho, surface, tmp_path):
     ortho = make_ortho(tmp_path / "past.tif")
-    told = run("build", "--ortho", ortho, "--true-ortho", "--out", tmp_path / "a.onav")
-    assert told.code != 0 and "--surface" in told.err
-
-
-def test_a_surface_says_what_the_land_is_like(run, make_ortho, surface, tmp_path):
-    ortho = make_ortho(tmp_path / "past.tif")
-    build = ("build", "--ortho", ortho, "--out", tmp_path / "a.onav", "--surface", surface)
-    assert "--dem, --surface or --relief" in run(*build, "--relief", "level").err
+    build = ("build", "--ortho", ortho, "--out", tmp_path / "a.onav")
+    alone = run(*build, "--true-ortho")
+    assert alone.code != 0 and "--surface" in alone.err
+    told = run(*build, "--surface", surface, "--relief", "level").err
+    assert "--dem, --surface or --relief" in told
     assert "would replace" in run(*build[:4], surface, "--surface", surface).err
 
 

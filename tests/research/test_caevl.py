@@ -2,10 +2,11 @@
 
 import dataclasses
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from test_training import TILE_PX, ground
+from test_training import sheet as grey_sheet
 
 from orthonav.core.errors import VariantError
 from orthonav.core.tiles.embed import TABLE, embedder_of
@@ -15,10 +16,8 @@ from orthonav.research import caevl
 from orthonav.research.autoencoder import AutoEncoder
 from orthonav.research.caevl import augmented, local_vicreg, vicreg
 from orthonav.research.caevl_recipe import CaevlRecipe
-from orthonav.research.tiles import SheetTiles
 from orthonav.research.training import Means
 
-TILE_PX = 32
 QUICK = Means(save_every_s=1e6, workers=1, device="cpu", bf16=False)
 RECIPE = CaevlRecipe(
     dims=8, width=8, epochs=2, tuning_epochs=3, batch=8, projector=16,
@@ -26,18 +25,10 @@ RECIPE = CaevlRecipe(
 )  # fmt: skip
 
 
-def ground(size=128):
-    noise = np.random.default_rng(3).normal(size=(size, size)).astype(np.float32)
-    smooth = cv2.GaussianBlur(noise, (0, 0), 3)
-    return np.clip(128 + 70 * smooth / smooth.std(), 0, 255).astype(np.uint8)
-
-
 def sheet():
-    grey = ground()
-    at = np.arange(0, 97, 24)
-    tiles_px = np.stack(np.meshgrid(at, at, indexing="ij"), -1).reshape(-1, 2)
+    grey = ground(3)
     edges = Canny()(grey, np.ones(grey.shape, bool)).astype(np.uint8)
-    return SheetTiles(edges, np.ones(grey.shape, bool), tiles_px, TILE_PX, 1.0, grey)
+    return dataclasses.replace(grey_sheet(grey), pixels=edges, scale=1.0, grey=grey)
 
 
 def learn(work=None, recipe=RECIPE, report=lambda text, share: None):

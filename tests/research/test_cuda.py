@@ -64,7 +64,7 @@ def test_tiles_are_embedded_on_the_gpu_as_in_flight(recipe, similarity, tmp_path
 def test_batches_are_pinned_and_made_by_many_threads():
     assert training.workers_of(GPU, torch.device("cuda")) >= 1
     task = training._task(AUTO, sheet(), binary=False, positive=None, seed=0, means=GPU)
-    device = torch.device("cuda")
-    feed = training._Feed(task, 8, 0, len(sheet()), device, None, GPU)
-    assert all(each.is_pinned() for each in feed._made(0, np.arange(4)))
-    assert all(each.is_cuda for batch in feed.batches(0) for each in batch)
+    given = {"seed": 0, "work": None, "report": lambda text, share: None, "means": GPU}
+    made = training.Training(task, AUTO, sheet(), **given)
+    assert all(each.is_pinned() for each in made.batch(0, np.arange(4)))
+    assert all(each.is_cuda for batch in made.batches(0) for each in batch)

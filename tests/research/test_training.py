@@ -44,16 +44,8 @@ def noisy(rng, grey):
 
 def learn(recipe, work=None, tiles=None, means=QUICK, seed=1, report=None):
     positive = noisy if isinstance(recipe, TripletRecipe) else None
-    return learn_network(
-        recipe,
-        tiles or sheet(),
-        binary=False,
-        seed=seed,
-        work=work,
-        positive=positive,
-        means=means,
-        report=report,
-    ).embedder
+    given = {"seed": seed, "work": work, "means": means, "report": report, "positive": positive}
+    return learn_network(recipe, tiles or sheet(), binary=False, **given).embedder
 
 
 def losses(work):
@@ -165,32 +157,26 @@ def test_pictures_show_the_progress(tmp_path):
     }
 
 
-@pytest.mark.parametrize("change", ["recipe", "seed", "tiles"])
-def test_a_folder_of_another_training_is_refused(change, tmp_path):
-    learn(dataclasses.replace(AUTO, epochs=1), tmp_path)
+def test_a_folder_of_another_training_is_refused(tmp_path):
+    once = dataclasses.replace(AUTO, epochs=1)
+    learn(once, tmp_path)
     before = (tmp_path / "checkpoint.pt").read_bytes()
-    changes = {
-        "recipe": {"recipe": dataclasses.replace(AUTO, epochs=1, learning_rate=1e-3)},
-        "seed": {"seed": 2},
-        "tiles": {"tiles": sheet(ground(7))},
-    }
-    given = {"recipe": dataclasses.replace(AUTO, epochs=1), "work": tmp_path, **changes[change]}
-    with pytest.raises(OutputError, match="another training"):
-        learn(**given)
+    for change in (
+        {"recipe": dataclasses.replace(once, learning_rate=1e-3)},
+        {"seed": 2},
+        {"tiles": sheet(ground(7))},
+    ):
+        with pytest.raises(OutputError, match="another training"):
+            learn(**{"recipe": once, "work": tmp_path, **change})
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
 
 def test_a_finished_training_is_exported_in_another_precision(tmp_path):
     plain = learn(AUTO, tmp_path)
-    messages = []
-    small = learn(
-        dataclasses.replace(AUTO, precision="float16"),
-        tmp_path,
-        report=lambda text, share: messages.append(text),
-    )
-    assert len(messages) == 2 and messages[1].startswith(
-        "export: float16"
-    )  # nothing was trained again
+    messages, smaller = [], dataclasses.replace(AUTO, precision="float16")
+    small = learn(smaller, tmp_path, report=lambda text, share: messages.append(text))
+    # Nothing was trained again.
+    assert len(messages) == 2 and messages[1].startswith("export: float16")
     assert small.recipe.precision == "float16" and small.onnx.nbytes < 0.6 * plain.onnx.nbytes
 
 
@@ -213,16 +199,12 @@ def test_a_broken_checkpoint_is_refused_and_runs_no_code(tmp_path):
 
 
 def test_a_loss_that_is_not_finite_ends_the_training():
+    def unknown(rng, grey):
+        return np.full((1, *grey.shape), np.nan, np.float32)
+
+    given = {"binary": False, "seed": 0, "work": None, "means": QUICK}
     with pytest.raises(TrainingError, match="learning_rate"):
-        learn_network(
-            TRIPLET,
-            sheet(),
-            binary=False,
-            seed=0,
-            work=None,
-            positive=lambda rng, grey: np.full((1, *grey.shape), np.nan, np.float32),
-            means=QUICK,
-        )
+        learn_network(TRIPLET, sheet(), positive=unknown, **given)
 
 
 def test_triplets_need_positives():
@@ -239,3 +221,17 @@ def test_scaled_gradients_give_the_same_result(tmp_path, monkeypatch):
     learn(AUTO, tmp_path)
     monkeypatch.undo()
     np.testing.assert_allclose(losses(tmp_path), undisturbed(AUTO).losses, rtol=1e-3)
+
+
+@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
+def test_tensors_stay_contiguous(recipe, monkeypatch):
+    """In `channels_last` oneDNN gives wrong gradients for narrow shortcuts, or crashes."""
+    found, convolve = set(), torch.nn.Conv2d.forward
+
+    def noted(layer, values):
+        found.update((values.is_contiguous(), layer.weight.is_contiguous()))
+        return convolve(layer, values)
+
+    monkeypatch.setattr(torch.nn.Conv2d, "forward", noted)
+    learn(dataclasses.replace(recipe, epochs=1))
+    assert found == {True}

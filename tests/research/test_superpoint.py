@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import transformers
+from safetensors.torch import load_file, save_file
 
 from orthonav.core.errors import MissingFileError, VariantError
 from orthonav.research.superpoint import SuperPoint
@@ -108,31 +109,22 @@ def test_missing_weights_name_their_source(tmp_path):
         SuperPoint()
 
 
-def test_weights_of_another_model_are_refused(weights, tmp_path):
-    with pytest.raises(VariantError, match=r"config\.json"):
-        describe(tmp_path, picture())
-    (tmp_path / "config.json").write_text('{"model_type": "sam"}')
-    with pytest.raises(VariantError, match="superpoint"):
-        describe(tmp_path, picture())
-
-
-def test_incomplete_weights_are_refused(weights, tmp_path):
-    """The library would fill missing weights with random numbers."""
-    from safetensors.torch import load_file, save_file
-
-    shutil.copy(weights / "config.json", tmp_path)
-    tensors = load_file(weights / "model.safetensors")
-    tensors.pop("descriptor_decoder.conv_descriptor_b.weight")
-    save_file(tensors, tmp_path / "model.safetensors", metadata={"format": "pt"})
+def test_other_incomplete_and_damaged_weights_are_refused(weights, tmp_path):
+    folder = shutil.copytree(weights, tmp_path / "copy")
+    tensors = load_file(folder / "model.safetensors")
+    del tensors["descriptor_decoder.conv_descriptor_b.weight"]  # the library would make one up
+    save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
     with pytest.raises(VariantError, match="conv_descriptor_b"):
-        describe(tmp_path, picture())
-
-
-def test_damaged_weights_are_refused(weights, tmp_path):
-    shutil.copy(weights / "config.json", tmp_path)
-    (tmp_path / "model.safetensors").write_bytes(b"not safetensors")
+        describe(folder, picture())
+    (folder / "model.safetensors").write_bytes(b"not safetensors")
     with pytest.raises(VariantError, match="cannot read"):
-        describe(tmp_path, picture())
+        describe(folder, picture())
+    (folder / "config.json").write_text('{"model_type": "sam"}')
+    with pytest.raises(VariantError, match="superpoint"):
+        describe(folder, picture())
+    (folder / "config.json").unlink()
+    with pytest.raises(VariantError, match=r"config\.json"):
+        describe(folder, picture())
 
 
 @pytest.mark.parametrize("parameters", [{"max_points": -1}, {"device": "tpu"}])
