@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks.record import say
 from benchmarks.scenes import DATA
 
-from experiments.paper import curves, dates, field, matchers, page, runs, scenes, tables
+from experiments.paper import curves, dates, field, matchers, runs, scenes, tables
 from experiments.paper.methods import (
     BETWEEN_DATES,
     FIELD_SCENES,
@@ -50,7 +50,7 @@ def main(arguments: list[str]) -> int:
     if options.what == "keep":
         for name in keep(options.out, options.setting):
             say(f"stored: {name}")
-        page.PAGE.write_text(page.page(stored()), encoding="utf-8")
+        tables.PAGE.write_text(tables.page(stored()), encoding="utf-8")
         curves.figure(stored(), curves.FIGURE)
         return 0
     if options.what == "pictures":

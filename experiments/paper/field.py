@@ -237,43 +237,27 @@ class Placed:
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
-    """Each method over all scenes, and scene by scene."""
+    """Each method over all scenes, and within 15 m and not wrong on each."""
     rows = [each for each in results if FIELD in each.plain]
     if not rows:
         return []
+    first = rows[0].plain[FIELD]
     names = list(dict.fromkeys(name for each in rows for name in each.plain[FIELD]))
     flying = [Method(**plain) for each in rows for plain in each.plain["methods"]]
     labels = dict(zip(names, names, strict=True)) | {each.key: each.label for each in flying}
-    return [_summary(rows, labels), _by_scene(rows, labels)]
-
-
-def _summary(rows: Sequence[Result], labels: dict[str, str]) -> Table:
-    lines = []
-    for name, label in labels.items():
-        placed = Placed.of(rows, name)
-        parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
-        own = placed.accepted(CONFIDENT) if name.endswith("registration") else None
-        lines.append(
-            [
-                label,
-                percent(placed.within()),
-                percent(float(placed.right.mean())),
-                percent(placed.trusted()),
-                "-" if own is None else f"{percent(own[0])} / {own[1]}",
-                number(placed.median_m()),
-                number(max(part["cpu_s"] for part in parts)),
-                number(max(part["peak_mb"] for part in parts)),
-                number(sum(part["carried_mb"] for part in parts)),
-            ]
-        )
-    errors = rows[0].plain["errors"]
-    counts = Placed.of(rows, next(iter(labels)))
+    lines = [_line(rows, *each) for each in labels.items()]
+    guess = ["the prior itself", *"-" * 8]
+    for each in rows:
+        away = np.array(next(iter(each.plain[FIELD].values()))["prior_m"])
+        radii = ACCURACY_M, far_m(each.trajectory.gsd_m)
+        guess.append("/".join(percent(float((away <= radius).mean())) for radius in radii))
+    errors, counts = rows[0].plain["errors"], Placed.of(rows, next(iter(first)))
     header = (
         *("method", "15 m", "35 m or 10 px", "accepted at no wrong"),
         *("accepted / wrong", "median m", "CPU s per view", "peak MB", "carried MB"),
+        *(each.scene for each in rows),
     )
     notes = (
-        f"scenes: {', '.join(each.scene for each in rows)}; "
         f"{len(counts.error_m)} views anywhere, of the later date, and {len(counts.mirrored)} "
         "mirrored; "
         f"standard deviations of the reported heading, {errors['yaw_std_deg']:g} deg, the height, "
@@ -285,23 +269,27 @@ def _summary(rows: Sequence[Result], labels: dict[str, str]) -> Table:
         f"{CONFIDENT:g}, where a method states one",
         "CPU s, peak MB: the largest of the scenes' medians and peaks, one core; carried: "
         "keypoints (descriptors in 16 bits) or maps with their encoders, all scenes",
+        "by scene: within 15 m / within 35 m or 10 px",
     )
-    return Table("The field today: all scenes", header, lines, notes)
+    return [Table("The field today", header, [*lines, guess], notes)]
 
 
-def _by_scene(rows: Sequence[Result], labels: dict[str, str]) -> Table:
-    lines = []
-    for name, label in labels.items():
-        lines.append([label])
-        for each in rows:
-            placed = Placed.of([each], name)
-            shares = (placed.within(), float(placed.right.mean())) if placed.error_m.size else ()
-            lines[-1].append("/".join(map(percent, shares)) or "-")
-    guess = ["the prior itself"]
-    for each in rows:
-        away = np.array(next(iter(each.plain[FIELD].values()))["prior_m"])
-        radii = ACCURACY_M, far_m(each.trajectory.gsd_m)
-        guess.append("/".join(percent(float((away <= radius).mean())) for radius in radii))
-    header = ("method", *(each.scene for each in rows))
-    notes = ("fraction of the views within 15 m / within 35 m or 10 px, in %",)
-    return Table("The field today, scene by scene", header, [*lines, guess], notes)
+def _line(rows: Sequence[Result], name: str, label: str) -> list[str]:
+    placed = Placed.of(rows, name)
+    parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
+    right, wrong = placed.accepted(CONFIDENT)
+    cells = [
+        label,
+        percent(placed.within()),
+        percent(float(placed.right.mean())),
+        percent(placed.trusted()),
+        f"{percent(right)} / {wrong}" if name.endswith("registration") else "-",
+        number(placed.median_m()),
+        number(max(part["cpu_s"] for part in parts)),
+        number(max(part["peak_mb"] for part in parts)),
+        number(sum(part["carried_mb"] for part in parts)),
+    ]
+    for each in (Placed.of([row], name) for row in rows):
+        shares = (each.within(), float(each.right.mean())) if each.error_m.size else ()
+        cells.append("/".join(map(percent, shares)) or "-")
+    return cells

@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict
 
-from experiments.paper import dates, page, results
+from experiments.paper import dates, results, tables
 from experiments.paper.__main__ import main
 from experiments.paper.methods import REDUCED, TABLE_1, methods
 from experiments.paper.results import Result, compact, stored
@@ -40,18 +40,18 @@ def row(key="autoencoder-canny", scene="B"):
 
 
 def test_the_page_is_made_of_the_rows_in_the_repository():
-    assert page.PAGE.read_text(encoding="utf-8") == page.page(stored())
+    assert tables.PAGE.read_text(encoding="utf-8") == tables.page(stored())
 
 
 def test_a_page_names_commit_and_date_of_every_row():
-    text = page.page([row(), row("gradient-gradient")])
+    text = tables.page([row(), row("gradient-gradient")])
     (line,) = [each for each in text.splitlines() if each.startswith("| 0123456789 ")]
     assert "2026-11-01" in line and "B-autoencoder-canny B-gradient-gradient" in line
 
 
 def test_results_are_kept_and_the_page_follows(tmp_path, monkeypatch):
     shown = tmp_path / "page.md"
-    monkeypatch.setattr(page, "PAGE", shown)
+    monkeypatch.setattr(tables, "PAGE", shown)
     monkeypatch.setattr(results, "ROWS", tmp_path / "rows")
     monkeypatch.setattr("experiments.paper.curves.FIGURE", tmp_path / "epochs.png")
     folder = tmp_path / "results" / "reduced"
