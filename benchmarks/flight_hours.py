@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from benchmarks.closed_loop.inertial import FILTERS
 from benchmarks.closed_loop.loop import Course, Located, Scenario, fly, scenario
 from benchmarks.closed_loop.physics import VEHICLES
-from benchmarks.closed_loop.replays import Area, stated
+from benchmarks.closed_loop.replays import Area
 from benchmarks.integrity import LIMIT_M
 from benchmarks.real_ground.maps import COARSE, COARSE_STD_M, relief_file
 from benchmarks.record import Section, Table, number, percent, resumed, rows_path, run, say
@@ -97,7 +97,7 @@ class Task:
 
     @property
     def flown(self) -> Scenario:
-        return scenario(self.scenario, self.minutes, "position")
+        return scenario(self.scenario, self.minutes)
 
     @property
     def hours(self) -> float:
@@ -129,7 +129,6 @@ def row_of(task: Task) -> dict[str, Any]:
         vehicle=task.vehicle,
         autopilot=task.autopilot,
         seed=task.seed,
-        rule=stated,
         course=course,
     )
     return {

@@ -36,6 +36,9 @@ ROUGHNESS = 1.5
 measured terrain (2.1 to 2.5)."""
 BASE_M = 200.0
 BARE, FLAT, COARSE, SURFACE, WORN = "bare", "flat", "coarse", "surface", "worn"
+DRAPED, DISPLACED, HIGH, HOLES = "draped", "displaced", "high", "holes"
+"""As `BARE` for imagery that is draped over hills; this displaced by 200 m, 50 m too high, or with
+eight holes of 400 m."""
 GONE_SHARE, WORN_STD_M, WORN_POSTING_M, LEAST_HOUSE_M = 0.1, 0.3, 1.0, 2.5
 """Of a `WORN` surface: share of the houses and groups of trees, at least so high, that it lacks,
 and its noise, independent at so many metres."""
@@ -48,7 +51,7 @@ class Map:
 
     - `ortho`: orthophoto as `scenes.ortho` takes it, `scaled:GSD:NAME` or
       `strip:NUMBER:NAME`.
-    - `ground`: one of `BARE` to `WORN` of `relief`, or a file of heights below `DATA`; None: the
+    - `ground`: one of `BARE` to `HOLES` of `relief`, or a file of heights below `DATA`; None: the
       map has no terrain.
     - `relief`: root mean square slope of the ground in per cent; None: the ground is not rendered.
     - `land`: what the build says of land without terrain; None: nothing.
@@ -82,7 +85,7 @@ class Map:
         assert self.ground is not None
         if self.relief is None:
             return found(self.ground, work)
-        if self.ortho.startswith("generated:") and self.ground != FLAT:
+        if self.ortho.startswith("generated:") and self.ground not in (FLAT, DRAPED):
             return landscape_heights(self.ortho, work, self.relief, self.ground)
         return relief_file(self.ortho, work, self.relief, self.ground)
 
@@ -152,10 +155,16 @@ def relief_file(name: str, work: Path, slope: float, kind: str) -> Path:
         made, posting_m = fractal_relief(shape, TRUE_POSTING_M, slope / 100, seed), TRUE_POSTING_M
     if kind == COARSE:
         made, posting_m = coarse_of(made, posting_m, seed + 1), COARSE_POSTING_M
-    corner = bounds.left - 5 * COARSE_POSTING_M, bounds.top + 5 * COARSE_POSTING_M
-    return written(
-        out, made, rasterio.Affine(posting_m, 0, corner[0], 0, -posting_m, corner[1]), crs
-    )
+    if kind == HIGH:
+        made += np.float32(50)
+    if kind == HOLES:
+        side = round(200 / posting_m)
+        for row, col in np.random.default_rng(7).uniform(0, made.shape, (8, 2)).astype(int):
+            made[max(0, row - side) : row + side, max(0, col - side) : col + side] = np.nan
+    west_m = bounds.left - 5 * COARSE_POSTING_M + (200 if kind == DISPLACED else 0)
+    north_m = bounds.top + 5 * COARSE_POSTING_M
+    step = rasterio.Affine(posting_m, 0, west_m, 0, -posting_m, north_m)
+    return written(out, made, step, crs)
 
 
 def written(out: Path, heights: Heights, transform: Any, crs: Any) -> Path:

@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from benchmarks.record import number
 from benchmarks.scenes import FAR_M
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
 from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, View, protection_level_m
 from orthonav.onboard.run import Locator, locate_view
 
@@ -37,6 +39,25 @@ class Seen:
     height_m: float
     judged: bool = True
     of_ground: bool = False
+
+
+class Source:
+    """Where the views of a row come from. `std_m`: error of the truth per axis."""
+
+    std_m: float = 0.0
+
+    @property
+    def imagery(self) -> str:
+        """Name of what must be there, as `maps.found` takes it or below `DATA`."""
+        raise NotImplementedError
+
+    def pictures(self) -> str:
+        """Name of pictures that several rows share, and that are made first; empty: none."""
+        return ""
+
+    def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
+        """So many views on the map of `base`; more for a track."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
