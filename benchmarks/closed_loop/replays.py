@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.faults import Ground
-from benchmarks.looped_flight import read_rows
+from benchmarks.record import read_rows
 from benchmarks.scenes import PAST, PRESENT, map_of
 from orthonav.cli.demo import IMAGERY
 from orthonav.core.geo.attitude import wxyz_of_angles

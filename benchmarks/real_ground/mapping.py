@@ -110,7 +110,9 @@ class Windows(Source):
 
     strip: int
     tilt_std_deg: float
-    imagery = FOLDER
+
+    def imagery(self) -> str:
+        return FOLDER
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
         heights, rng = terrain(), np.random.default_rng([SEED, self.strip])

@@ -106,7 +106,7 @@ def questions() -> list[Question]:
 
 def _is_there(built: Map, source: Source) -> bool:
     """Whether the files of a leg are there, or are generated."""
-    names = [each for each in (built.ortho, source.imagery) if "generated:" not in each]
+    names = [each for each in (built.ortho, source.imagery()) if "generated:" not in each]
     return all((DATA / name.rpartition(":")[2]).exists() for name in names)
 
 
@@ -202,15 +202,19 @@ def _relief() -> Iterator[Question]:
 
 def _hills() -> Iterator[Question]:
     """Steep ground; terrain that is wrong, where heights above sea are reported; and far ahead."""
-    steep = [(slope, ground, False) for slope in (20.0, 30.0) for ground in (None, BARE)]
-    wrong = [(20.0, ground, True) for ground in (BARE, DISPLACED, HIGH, HOLES)]
-    for slope, ground, above_sea in (*steep, *wrong):
+    places = {"farmland": _farmland(), "naip": [SCENES["naip"].pair("20090818", "20180716")]}
+    asked = (
+        *(("farmland", *each, False) for each in product((20.0, 30.0), (None, BARE))),
+        *((*each, BARE, True) for each in product(places, (20.0, 30.0))),
+        *(("farmland", 20.0, ground, True) for ground in (DISPLACED, HIGH, HOLES)),
+    )
+    for place, slope, ground, above_sea in asked:
         legs = tuple(
             (Map(pair.map, ground, slope), OverRelief(pair, slope, above_sea=above_sea))
-            for pair in _farmland()
+            for pair in places[place]
         )
         height = ", height above sea" * above_sea
-        yield Question(f"farmland {slope:g} %{height}, {ground or 'no'} terrain", "hills", legs)
+        yield Question(f"{place} {slope:g} %{height}, {ground or 'no'} terrain", "hills", legs)
     pair = Scene("hills", "generated:3", 1.0, (PAST, PRESENT)).pair(PAST, PRESENT)
     for ahead_deg, ground in product((30.0, 45.0, 60.0), (None, DRAPED)):
         ahead = OverRelief(

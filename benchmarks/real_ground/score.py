@@ -46,7 +46,6 @@ class Source:
 
     std_m: float = 0.0
 
-    @property
     def imagery(self) -> str:
         """Name of what must be there, as `maps.found` takes it or below `DATA`."""
         raise NotImplementedError

@@ -65,7 +65,6 @@ class OverRelief(Source):
     draped: bool = False
     above_sea: bool = False
 
-    @property
     def imagery(self) -> str:
         return self.pair.views
 
@@ -191,7 +190,6 @@ class OverLevel(Source):
     stated_deg: float | None = None
     std_m: float = 0.0
 
-    @property
     def imagery(self) -> str:
         return self.pair.views
 
@@ -242,15 +240,18 @@ class Recording(Source):
     these frames only.
     """
 
-    imagery: str
+    folder: str
     std_m: float
     truth: str = "truth.csv"
     of_ground: bool = False
     only: str = ""
     track: int = 5
 
+    def imagery(self) -> str:
+        return self.folder
+
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
-        folder = DATA / self.imagery
+        folder = DATA / self.folder
         flight, truth = open_flight(folder), read_truth(folder / self.truth)
         flown = [each for each in flight.views if each.frame in truth and self.only in each.frame]
         if tracked:
@@ -268,16 +269,19 @@ class Replay(Source):
     """A recorded flight of an autopilot: a track begins with GNSS. `with_stds`: whether the
     telemetry states deviations. `phase`: what is judged; `OFF` ends before any disturbance."""
 
-    imagery: str
+    folder: str
     with_stds: bool
     phase: str = OFF
     step: int = 5
 
+    def imagery(self) -> str:
+        return self.folder
+
     def pictures(self) -> str:
-        return f"{self.imagery}-{self.phase}"
+        return f"{self.folder}-{self.phase}"
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
-        recorded, area = Recorded(DATA / self.imagery), Area.demo(work)
+        recorded, area = Recorded(DATA / self.folder), Area.demo(work)
         area.__dict__["localizer"] = base  # the same area; its own map would be built once more
         autopilot = recorded.folder.name.partition("_")[0]
         aided = [each.number for each in recorded.exposures if each.phase == ON]
