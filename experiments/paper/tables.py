@@ -4,7 +4,6 @@
 experiments. The paper's own figures are of other imagery: compare the order.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -14,7 +13,7 @@ from pathlib import Path
 from benchmarks.record import Table, number
 
 from experiments.paper import curves, dates, field, words
-from experiments.paper.methods import BETWEEN_DATES, CANNY, GREY, SAM, SEGMENTS, SETTINGS, STUDIED
+from experiments.paper.methods import CANNY, GREY, SAM, SEGMENTS, SETTINGS, STUDIED
 from experiments.paper.results import (
     BASELINES,
     ORDER,
@@ -40,11 +39,12 @@ HEAD = """# Results of the paper's experiments
 
 Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit. [The paper's
 experiments](paper.md) has the protocol, the scenes and the discussion. Generated landscapes: seed
-1. `python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds and
-rules of position, and other imagery; the file of a row has its command, machine and versions.
+1. `python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds,
+rules of position, rows above the default and other imagery; the file of a row has command and
+versions.
 """
 OTHER = "other imagery"
-ONLY_IN_REPORTS = "Accepted at", "Rules of position", OTHER
+ONLY_IN_REPORTS = "Accepted at", "Rules of position", "Rows above", OTHER
 TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
 TRAJECTORIES = "A", "B", "C", "D"
 TABLE_2 = {
@@ -92,7 +92,7 @@ def page(rows: Sequence[Result]) -> str:
                 notes = [note for note in table.notes if note not in noted]
                 text.append(replace(table, notes=notes).markdown())
                 noted.update(notes)
-    return "\n".join([*text, agreement().markdown(), words.table().markdown()])
+    return "\n".join([*text, words.table().markdown()])
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
@@ -124,12 +124,9 @@ def scenes(results: Sequence[Result]) -> list[Table]:
         flown = first.trajectory
         views = "/".join(str(len(first.plain["views"][name])) for name in PLACEMENTS)
         size = [f"{flown.length_m:g} x {flown.band_m:g}", f"{flown.agl_m:g}"]
-        grid = [f"{flown.gsd_m:g}", f"{first.plain['tiles']:,}", f"{flown.stride_m:g}"]
+        grid = [f"{flown.gsd_m:g}", f"{first.plain['tiles']:,}"]
         rows.append([scene, *size, *grid, percent(ceiling(flown.stride_m)), views])
-    header = (
-        *("scene", "area m", "height m", "m per pixel", "tiles", "tile step m"),
-        *("upper bound %", "views"),
-    )
+    header = ("scene", "area m", "height m", "m per pixel", "tiles", "upper bound %", "views")
     notes = (
         "upper bound: accuracy at 15 m, anywhere, of a method that always finds the correct tile; "
         "views: along the route (at most one per tile step), on the grid of tiles, anywhere",
@@ -352,22 +349,3 @@ def above_default(results: Sequence[Result]) -> list[Table]:
         "within the noise: less than two standard errors of the difference",
     )
     return [Table("Rows above orthonav's default", header, rows, notes)]
-
-
-def agreement() -> Table:
-    """How the edges of two dates agree on landscapes that the network was not learnt from."""
-    found = json.loads(BETWEEN_DATES.with_suffix(".json").read_text(encoding="utf-8"))
-    rows = []
-    for gsd_m in sorted({each["gsd_m"] for each in found}):
-        pairs = [each for each in found if each["gsd_m"] == gsd_m]
-        names = ("canny", "learnt", "share_canny", "share_learnt")
-        *alike, canny, learnt = (sum(each[name] for each in pairs) / len(pairs) for name in names)
-        rows.append([f"{gsd_m:g}", *(f"{v:.2f}" for v in alike), percent(canny), percent(learnt)])
-    notes = (
-        "correlation of the edges of two dates, smoothed by a Gaussian of 1 px, mean of three "
-        "pairs; density: pixels that are edges, in %; generated landscapes that were not learnt "
-        "from",
-        "made by `python -m experiments.paper.between_dates` at d63ac91",
-    )
-    header = ("m per pixel", "Canny", "learnt", "density Canny", "density learnt")
-    return Table("Edges between dates", header, rows, notes)
