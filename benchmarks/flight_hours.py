@@ -124,12 +124,7 @@ def row_of(task: Task) -> dict[str, Any]:
     mount = np.random.default_rng([task.seed, 5]).normal(0.0, TILT_STD_DEG, 2).tolist()
     area = Area(task.map_path, ortho(pair.views, work), tuple(mount))
     found = fly(
-        flown,
-        area,
-        vehicle=task.vehicle,
-        autopilot=task.autopilot,
-        seed=task.seed,
-        course=course,
+        flown, area, vehicle=task.vehicle, autopilot=task.autopilot, seed=task.seed, course=course
     )
     return {
         "scene": place_of(pair),
