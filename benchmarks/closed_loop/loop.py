@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.closed_loop.inertial import FILTERS, STATES, Filter
 from benchmarks.closed_loop.physics import (
-    CALM,
+    CALIBRATED,
     CONSUMER,
     STEP_S,
     VEHICLES,
@@ -64,7 +64,7 @@ CARROT_M, CORNER_M = 70.0, 60.0
 """Distance of the point that is steered to; corners count as reached from so far away."""
 LATENCY_S = 0.1
 """What a view gives reaches the filter so late."""
-GRADES = {"px4": CONSUMER, "ardupilot": CALM}
+GRADES = {"px4": CONSUMER, "ardupilot": CALIBRATED}
 START_STD_M, PRIOR_STD_M = 30.0, 100.0
 """Error of the position at a start without GNSS, and the deviation of every prior."""
 SBAS_STD_M = 1.0
@@ -194,7 +194,7 @@ class Sight:
     def frame(self) -> LocalFrame:
         return self._area.frame
 
-    def hear(self, time_s: float, place_ne: Array, velocity: Array) -> None:
+    def receive(self, time_s: float, place_ne: Array, velocity: Array) -> None:
         """A solution of a receiver with corrections by SBAS."""
         lat, lon = self.frame.latlon_from_en(place_ne[::-1])
         time_ns, vel_en_mps = round(time_s * 1e9), (float(velocity[1]), float(velocity[0]))
@@ -331,7 +331,7 @@ def fly(
         _sense(step, estimator, instruments, aircraft, wind, sight, gnss=gnss)
         before = aircraft.motion
         aircraft.step(wind.next())
-        estimator.feel(instruments.imu(increments(before, aircraft.motion)))
+        estimator.add_imu(instruments.imu(increments(before, aircraft.motion)))
     if sight is not None:
         flown.withheld = dict(sight.gate.withheld)
     return flown
@@ -396,7 +396,7 @@ def _sense(
     if gnss and step % 10 == 0:
         place, velocity = instruments.gnss(motion)
         if sight is not None:
-            sight.hear(step * STEP_S, place, velocity)
+            sight.receive(step * STEP_S, place, velocity)
         tuning = estimator.tuning
         estimator.measure(lambda: estimator.fuse_position(place, tuning.gnss_m))
         estimator.measure(lambda: estimator.fuse_velocity(velocity, tuning.gnss_mps))

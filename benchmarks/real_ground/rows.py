@@ -17,8 +17,8 @@ from benchmarks.real_ground.maps import (
     FLAT,
     HIGH,
     HOLES,
+    OUTDATED,
     SURFACE,
-    WORN,
     Map,
 )
 from benchmarks.real_ground.pairs import SINGLE, TRACKED
@@ -160,7 +160,7 @@ def _grounds(name: str, slope: float) -> Iterator[tuple[str, Map]]:
     if slope in LAND:
         yield f"no terrain, {LAND[slope]}", Map(name, relief=slope, land=LAND[slope])
     if name.startswith("generated:"):
-        kinds = {"bare earth": BARE, "surface": SURFACE, "surface of another year": WORN}
+        kinds = {"bare earth": BARE, "surface": SURFACE, "surface of another year": OUTDATED}
     else:
         kinds = {"30 m terrain": COARSE, "bare earth": BARE}
     for kind, ground in kinds.items():
@@ -180,14 +180,14 @@ def _rendered(
 ) -> Iterator[Question]:
     """Rows over one relief: true and stated tilt, and what the map knows of the ground."""
     for tilt, stated in TILTS:
-        told = "" if stated is None else f" stated {stated:g}"
+        tilt_text = "" if stated is None else f" stated {stated:g}"
         maps = [dict(_grounds(pair.map, slope)) for pair in pairs]
         for ground in maps[0]:
             legs = tuple(
                 (on[ground], OverRelief(pair, slope, tilt, stated, nominal))
                 for on, pair in zip(maps, pairs, strict=True)
             )
-            yield Question(f"{name} {slope:g} %, tilt {tilt:g}{told}, {ground}", part, legs)
+            yield Question(f"{name} {slope:g} %, tilt {tilt:g}{tilt_text}, {ground}", part, legs)
 
 
 def _relief() -> Iterator[Question]:
@@ -282,9 +282,9 @@ def _steady() -> Iterator[Question]:
     for date in ("20120731", "20180716"):
         pair = naip.pair("20090818", date)
         for stated in (None, 0.5):
-            told = "default" if stated is None else f"tilt stated {stated:g}"
+            tilt_text = "default" if stated is None else f"tilt stated {stated:g}"
             leg = Map(pair.map), OverLevel(pair, 0.0, stated)
-            yield Question(f"naip {date}, steady, {told}", "flat", (leg,))
+            yield Question(f"naip {date}, steady, {tilt_text}", "flat", (leg,))
     folder = f"scaled:{SUBURB_GSD_M}:scenes/garching"
     suburb = [
         Pair("garching", f"{folder}/{past}.tif", f"{folder}/{present}.tif", SUBURB_GSD_M)

@@ -134,24 +134,24 @@ class Row:
 
     def values(self) -> dict[str, Any]:
         """The numbers of the row and its fixes, as JSON; None where nothing is confident."""
-        sure = [each for each in self.found if each.confident]
+        accepted = [each for each in self.found if each.confident]
         right = [each for each in self.found if not each.wrong]
         views = len(self.times_ms)
 
         def of(name: str) -> Array:
-            return np.array([getattr(each, name) for each in sure], np.float64)
+            return np.array([getattr(each, name) for each in accepted], np.float64)
 
         found: dict[str, Any] = {
             "fixes": [asdict(each) for each in self.found],
             "views": views,
-            "confident": len(sure) / max(views, 1),
+            "confident": len(accepted) / max(views, 1),
             "of_right": sum(each.confident for each in right) / max(len(right), 1),
-            "exceeded": sum(each.error_m > each.level_m for each in sure),
-            "bounded": sum(math.isfinite(each.level_m) for each in sure),
-            "false": sum(each.wrong for each in sure),
+            "exceeded": sum(each.error_m > each.level_m for each in accepted),
+            "bounded": sum(math.isfinite(each.level_m) for each in accepted),
+            "false": sum(each.wrong for each in accepted),
             "ms": float(np.median(self.times_ms)) if views else None,
         }
-        if not sure:
+        if not accepted:
             return found | dict.fromkeys(("median_m", "p95_m", "std_m", "nees", "nees_median"))
         return found | {
             "median_m": float(np.median(of("error_m"))),
