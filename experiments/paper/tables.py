@@ -37,11 +37,10 @@ from orthonav.core.records import CONFIDENT
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "paper-results.md"
 HEAD = """# Results of the paper's experiments
 
-Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit. [The paper's
-experiments](paper.md) has the protocol, the scenes and the discussion. Generated landscapes: seed
-1. `python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds,
-rules of position, rows above the default and other imagery; the file of a row has command and
-versions.
+Made by `python -m experiments.paper keep` from `experiments/paper/rows`, which hold commands and
+versions; do not edit. [The paper's experiments](paper.md) has protocol, scenes and discussion.
+`python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds, rules
+of position, rows above the default and other imagery.
 """
 OTHER = "other imagery"
 ONLY_IN_REPORTS = "Accepted at", "Rules of position", "Rows above", OTHER
@@ -314,15 +313,12 @@ def provenance(results: Sequence[Result]) -> Table:
     made: dict[tuple[str, str], list[str]] = {}
     for each in sorted(results, key=name_of):
         about = each.plain["provenance"]
-        commit = str(about["commit"])[:10] + (", changed" if about["dirty"] else "")
+        commit = str(about["commit"])[:10] + (", with changes" if about["dirty"] else "")
         made.setdefault((str(about["date"])[:10], commit), []).append(name_of(each))
     rows = [[commit, day, " ".join(names)] for (day, commit), names in sorted(made.items())]
     setting = str(results[0].plain["setting"]["name"])
     processors = ", ".join(sorted({str(each.plain["provenance"]["cpu"]) for each in results}))
-    notes = (
-        f"`{PROGRAM} --setting {setting}`; changed: with files that were not committed",
-        f"processor: {processors}",
-    )
+    notes = (f"`{PROGRAM} --setting {setting}`", f"processor: {processors}")
     return Table("Measured at", ("commit", "date", "rows"), rows, notes)
 
 
