@@ -197,7 +197,7 @@ TELEMETRY_FAULTS = (
         "no telemetry for 1 s of 2",
         "telemetry",
         20.0,
-        state=lambda f, s, t: s if t % 2 > 1 else None,
+        state=lambda f, s, t: None if t % 2 < 1 else s,
     ),
     Fault("no telemetry", "telemetry", state=lambda f, state, t: None),
     Fault("autopilot's clock set by 30 s", "telemetry", begins=_autopilot_jumps),
