@@ -62,7 +62,6 @@ class Outcome:
     - `width_px`, `prior`: of the views.
     - `shares`: of trials that are placed, where each view was; `right`: whether the view was
       placed, right and with confidence; `wrong`: how many were confident and wrong.
-    - `error_m`, `measured_m`: expected and measured error of right views, root mean square.
     """
 
     scene: str
@@ -72,8 +71,6 @@ class Outcome:
     shares: list[float] = field(default_factory=list)
     right: list[bool] = field(default_factory=list)
     wrong: int = 0
-    error_m: float = math.nan
-    measured_m: float = math.nan
 
     @property
     def side_px(self) -> float:
@@ -120,8 +117,9 @@ def measure(options: argparse.Namespace) -> Section:
             tasks[name] = (pair, width_px, prior, views, options)
     found = []
     for each in resumed(rows_path(options.work, f"conditions-{options.seed}"), _measured, tasks):
-        found.append(Outcome(**each))
-        say(" ".join(_row(found[-1], LEARNT)))
+        if each["right"]:  # views on the map
+            found.append(Outcome(**each))
+            say(" ".join(_row(found[-1], LEARNT)))
     if options.fit:
         print("LEARNT =", fitted(found))
     return Section("Checks, scenes left out", tables(found, options))
@@ -161,29 +159,21 @@ def _measured(task: tuple[Pair, int, bool, int, argparse.Namespace]) -> dict[str
     cells = check_map(asked)[0].cells
     grid = cells.grid
     found = Outcome(place_of(pair), pair.map, width_px, prior)
-    off_m, expected_m, frame = [], [], localizer.sheet.frame
-    alone = SingleViews(localizer)
+    frame, single = localizer.sheet.frame, SingleViews(localizer)
     for each in views_in(folder):
         true = frame.en_from_latlon(*each.truth_latlon_deg)
         counts = grid.counts(np.array([true]))
         share = float(cells.probability.ravel()[np.argmax(counts)]) if counts.any() else math.nan
         if not share > 0:  # beside the map
             continue
-        fix, _ = locate_view(alone, each.view)
-        confident = isinstance(fix, Fix) and fix.confidence >= CONFIDENT
-        error_m = math.inf
+        fix, _ = locate_view(single, each.view)
+        confident = near = False
         if isinstance(fix, Fix):
-            error_m = math.dist(frame.en_from_latlon(fix.lat_deg, fix.lon_deg), true)
-        near = isinstance(fix, Fix) and error_m <= fix.radius_m
+            off_m = math.dist(frame.en_from_latlon(fix.lat_deg, fix.lon_deg), true)
+            confident, near = fix.confidence >= CONFIDENT, off_m <= fix.radius_m
         found.shares.append(round(share, 4))
         found.right.append(confident and near)
         found.wrong += confident and not near
-        if confident and near:
-            off_m.append(error_m)
-            expected_m.append(float(cells.error_m.ravel()[np.argmax(counts)]))
-    found.error_m, found.measured_m = (
-        math.sqrt(np.mean(np.square(each))) if each else math.nan for each in (expected_m, off_m)
-    )
     return asdict(found)
 
 
@@ -219,15 +209,14 @@ def _between_scenes(found: Sequence[Outcome], by: Recalibration) -> tuple[float,
 
     Those of the narrowest intervals that hold in 80 % of the conditions of every width of views.
     """
-    above = [each for each in found if each.right]
 
     def width(stds: tuple[float, float]) -> float:
         spread = replace(by, std=stds[0], std_narrow=stds[1])
         held: dict[int, list[bool]] = {}
-        for each in above:
+        for each in found:
             held.setdefault(each.width_px, []).append(each.holds(spread))
         missing = sum(max(0.0, HOLDS - float(np.mean(each))) for each in held.values())
-        means = [each.mean(spread) for each in above]
+        means = [each.mean(spread) for each in found]
         return missing * MISSED + float(np.mean([mean.high - mean.low for mean in means]))
 
     every = [(float(std), float(narrow)) for std in STDS for narrow in STDS_NARROW]
@@ -238,41 +227,27 @@ def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]
     """Predicted and measured: by condition, and by the width of views."""
     scenes = sorted({each.scene for each in found})
     by = {s: fitted([each for each in found if each.scene != s]) for s in scenes}
-    rows = [_row(each, by[each.scene]) for each in found if each.right]
-    header = (
-        *("scene, map", "views", "n", "predicted", "80 % interval", "measured", "holds"),
-        *("error m expected", "measured", "false"),
-    )
-    above = [each for each in found if each.right]
-    gone = [each for each in above if each.is_go(by[each.scene])]
-    bad = [each for each in gone if np.mean(each.right) < RULES.fixes.go]
+    rows = [_row(each, by[each.scene]) for each in found]
+    header = ("scene, map", "views", "n", "predicted", "interval", "measured", "holds", "false")
+    go = [each for each in found if each.is_go(by[each.scene])]
+    bad = [each for each in go if np.mean(each.right) < RULES.fixes.go]
     notes = (
         f"heading sd 10 deg, height sd 10 %, prior {PRIOR_PX:g} px or none; "
         f"{options.views} views over the later date each, those beside the map left out, checks of "
-        f"effort {EFFORT:g} (40 to 75 trials); recalibrated by the other scenes",
-        f"go by the mean chance alone: {len(gone)} of {len(above)}, of which {len(bad)} measured "
+        f"effort {EFFORT:g} (40 to 75 trials); recalibrated by the other scenes; interval: of 80 %",
+        f"go by the mean chance only: {len(go)} of {len(found)}, of which {len(bad)} measured "
         f"below {RULES.fixes.go:g}",
     )
-    return [
-        Table("Checks and what came out", header, rows, notes),
-        _widths_table(above, by),
-    ]
+    return [Table("Checks and what came out", header, rows, notes), _widths_table(found, by)]
 
 
 def _row(found: Outcome, by: Recalibration) -> list[str]:
-    mean = found.mean(by)
-    return [
-        f"{found.scene}, {Path(found.map).stem}",
-        f"{found.width_px} px{', prior' * found.prior}",
-        str(len(found.right)),
-        f"{mean.median:.2f}" if found.right else "-",
-        f"{mean.low:.2f} to {mean.high:.2f}" if found.right else "-",
-        f"{float(np.mean(found.right)):.2f}" if found.right else "-",
-        "yes" if found.right and found.holds(by) else "no",
-        f"{found.error_m:.1f}",
-        f"{found.measured_m:.1f}",
-        str(found.wrong),
-    ]
+    views = f"{found.width_px} px{', prior' * found.prior}"
+    about = [f"{found.scene}, {Path(found.map).stem}", views, str(len(found.right))]
+    mean, measured = found.mean(by), f"{float(np.mean(found.right)):.2f}"
+    interval = f"{mean.low:.2f} to {mean.high:.2f}"
+    holds = "yes" if found.holds(by) else "no"
+    return [*about, f"{mean.median:.2f}", interval, measured, holds, str(found.wrong)]
 
 
 def _widths_table(found: Sequence[Outcome], by: dict[str, Recalibration]) -> Table:

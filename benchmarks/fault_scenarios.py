@@ -23,6 +23,7 @@ from benchmarks.fault_flights import (
 FROZEN_NOISE = 3.0
 """Grey levels, standard deviation."""
 JUMP_S = 30.0
+StateOf = Callable[[FaultFlight, State, float], State]
 BOOTED_BEFORE_NS = 20 * 10**9
 """The other vehicle was switched on so long before: its times of the same moment are greater."""
 
@@ -128,8 +129,17 @@ CAMERA_FAULTS = (
 )
 
 
-def _turned(degrees: float) -> Callable[[FaultFlight, State, float], State]:
-    return lambda flight, state, t: replace(state, yaw=state.yaw + degrees)
+def _changed(**fields: Callable[[State, float], float]) -> StateOf:
+    """The state with these fields replaced, each by a function of it and the time."""
+
+    def made(_: FaultFlight, state: State, t: float) -> State:
+        return replace(state, **{name: of(state, t) for name, of in fields.items()})
+
+    return made
+
+
+def _unknown(_: State, t: float) -> float:
+    return math.nan
 
 
 def _attitude_of(flight: FaultFlight, state: State, seconds: float) -> State:
@@ -164,48 +174,30 @@ def _same_system(flight: FaultFlight, state: State, boot_ns: int) -> list[bytes]
 
 
 TELEMETRY_FAULTS = (
-    Fault("heading off by 86 deg", "telemetry", state=_turned(86)),
-    Fault("heading off by 180 deg", "telemetry", state=_turned(180)),
+    Fault("heading off by 86 deg", "telemetry", state=_changed(yaw=lambda s, t: s.yaw + 86)),
+    Fault("heading off by 180 deg", "telemetry", state=_changed(yaw=lambda s, t: s.yaw + 180)),
     Fault(
         "heading drifts by 2 deg/s",
         "telemetry",
         30.0,
-        state=lambda f, state, t: replace(state, yaw=state.yaw + 2 * t),
+        state=_changed(yaw=lambda s, t: s.yaw + 2 * t),
     ),
-    Fault(
-        "height times 0.5",
-        "telemetry",
-        state=lambda f, state, t: replace(state, height=0.5 * state.height),
-    ),
-    Fault(
-        "height times 2",
-        "telemetry",
-        state=lambda f, state, t: replace(state, height=2 * state.height),
-    ),
+    Fault("height times 0.5", "telemetry", state=_changed(height=lambda s, t: 0.5 * s.height)),
+    Fault("height times 2", "telemetry", state=_changed(height=lambda s, t: 2 * s.height)),
     Fault(
         "velocity reversed",
         "telemetry",
-        state=lambda f, state, t: replace(state, north=-state.north, east=-state.east),
+        state=_changed(north=lambda s, t: -s.north, east=lambda s, t: -s.east),
     ),
-    Fault(
-        "velocity 3 m/s off",
-        "telemetry",
-        20.0,
-        state=lambda f, state, t: replace(state, north=state.north + 3),
-    ),
-    Fault(
-        "no velocity",
-        "telemetry",
-        20.0,
-        state=lambda f, state, t: replace(state, north=math.nan, east=math.nan),
-    ),
+    Fault("velocity 3 m/s off", "telemetry", 20.0, state=_changed(north=lambda s, t: s.north + 3)),
+    Fault("no velocity", "telemetry", 20.0, state=_changed(north=_unknown, east=_unknown)),
     Fault("attitude frozen", "telemetry", 15.0, state=_attitude_of),
     Fault("attitude 1 s late", "telemetry", 15.0, state=lambda f, s, t: _attitude_of(f, s, 1.0)),
     Fault(
         "no telemetry for 1 s of 2",
         "telemetry",
         20.0,
-        state=lambda f, state, t: None if t % 2 < 1 else state,
+        state=lambda f, s, t: None if t % 2 < 1 else s,
     ),
     Fault("no telemetry", "telemetry", state=lambda f, state, t: None),
     Fault("autopilot's clock set by 30 s", "telemetry", begins=_autopilot_jumps),

@@ -144,16 +144,16 @@ def _fly(job: tuple[Path, str, int, bool]) -> tuple[int, Report]:
         opened = open_map(broken)
         world, change = replace(world, localizer=Localizer(opened)), opened.change
         fault = replace(fault, begins=lambda _: os.truncate(broken, broken.stat().st_size // 3))
-    calm = fault.group == "none"
-    if quick and not calm and not fault.leaves_map and not fault.from_start:
+    is_undisturbed = fault.group == "none"
+    if quick and not is_undisturbed and not fault.leaves_map and not fault.from_start:
         fault = replace(fault, seconds=min(fault.seconds, QUICK_FAULT_S))
     recovery_s = QUICK_RECOVERY_S if quick else RECOVERY_S
     report = FaultFlight(
         world,
         fault,
         seed=seed,
-        lead_s=0.0 if calm else QUICK_LEAD_S if quick else LEAD_S,
-        recovery_s=0.0 if calm or name == TRUNCATED.name else recovery_s,
+        lead_s=0.0 if is_undisturbed else QUICK_LEAD_S if quick else LEAD_S,
+        recovery_s=0.0 if is_undisturbed or name == TRUNCATED.name else recovery_s,
         map_change=change,
     ).fly()
     # Functions cannot be passed between processes.
@@ -177,7 +177,7 @@ def _row(report: Report) -> list[str]:
     ]
 
 
-def calm_cells(report: Report) -> list[str]:
+def undisturbed_cells(report: Report) -> list[str]:
     """First message, share sent after it, median and largest error, and false messages."""
     begin = report.sent[0].at_s if report.sent else np.inf
     views = sum(each >= begin for each in report.views)
@@ -207,13 +207,15 @@ def measure(options: argparse.Namespace) -> Section:
             if fault.group == "none":
                 seeds = list(CALM_SEEDS[: 1 if options.quick else None])
             jobs += [(options.work, fault.name, seed, options.quick) for seed in seeds]
-    rows, calm, wrong = [], [], 0
+    rows, undisturbed_rows, wrong = [], [], 0
     for seed, report in side_by_side(_fly, jobs, options.jobs):
         if report.fault.group == "none":
-            calm.append([f"seed {seed}", str(len(report.views)), *calm_cells(report)])
+            cells = [f"seed {seed}", str(len(report.views)), *undisturbed_cells(report)]
+            undisturbed_rows.append(cells)
         else:
-            rows.append(_row(report))
-        say(f"{' | '.join((calm if report.fault.group == 'none' else rows)[-1])} {report.withheld}")
+            cells = _row(report)
+            rows.append(cells)
+        say(f"{' | '.join(cells)} {report.withheld}")
         wrong += len(report.wrong()) * report.fault.detectable
     notes = (
         f"{AGL_M:g} m above generated ground of another date than the map's, {SPEED_MPS:g} m/s "
@@ -223,9 +225,9 @@ def measure(options: argparse.Namespace) -> Section:
         f"fault to a correct message within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s)",
     )
     tables = [Table("Faults", HEADER, rows, notes)] if rows else []
-    if calm:
+    if undisturbed_rows:
         header = ("undisturbed", "views", "first message s", "sent", "median m", "worst m", "false")
-        tables.append(Table("Undisturbed flights", header, calm))
+        tables.append(Table("Undisturbed flights", header, undisturbed_rows))
     return Section("Faults", tables, failed=wrong > 0)
 
 

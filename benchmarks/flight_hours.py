@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from benchmarks.closed_loop.inertial import FILTERS
 from benchmarks.closed_loop.loop import Course, Located, Scenario, fly, scenario
 from benchmarks.closed_loop.physics import VEHICLES
-from benchmarks.closed_loop.replays import Area, stated
+from benchmarks.closed_loop.replays import Area
 from benchmarks.integrity import LIMIT_M
 from benchmarks.real_ground.maps import COARSE, COARSE_STD_M, relief_file
 from benchmarks.record import Section, Table, number, percent, resumed, rows_path, run, say
@@ -97,7 +97,7 @@ class Task:
 
     @property
     def flown(self) -> Scenario:
-        return scenario(self.scenario, self.minutes, "position")
+        return scenario(self.scenario, self.minutes)
 
     @property
     def hours(self) -> float:
@@ -124,13 +124,7 @@ def row_of(task: Task) -> dict[str, Any]:
     mount = np.random.default_rng([task.seed, 5]).normal(0.0, TILT_STD_DEG, 2).tolist()
     area = Area(task.map_path, ortho(pair.views, work), tuple(mount))
     found = fly(
-        flown,
-        area,
-        vehicle=task.vehicle,
-        autopilot=task.autopilot,
-        seed=task.seed,
-        rule=stated,
-        course=course,
+        flown, area, vehicle=task.vehicle, autopilot=task.autopilot, seed=task.seed, course=course
     )
     return {
         "scene": place_of(pair),

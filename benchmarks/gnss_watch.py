@@ -259,17 +259,8 @@ def false_alarm_table(hours: float) -> Table:
             alarms, last = false_alarms(hours, len(rows), receiver, errors)
             learnt = last.learnt
             off_m = math.hypot(*(learnt.en_m - errors.displaced_en_m))
-            std = receiver_of(receiver).std_m
-            rows.append(
-                [
-                    f"{std:g} m",
-                    name,
-                    number(hours),
-                    str(len(alarms)),
-                    f"{off_m:.1f}",
-                    f"{learnt.std_m:.1f}",
-                ]
-            )
+            figures = [number(hours), str(len(alarms)), f"{off_m:.1f}", f"{learnt.std_m:.1f}"]
+            rows.append([f"{receiver_of(receiver).std_m:g} m", name, *figures])
             say(" | ".join(rows[-1]))
     header = ["GNSS error", "map", "hours", "false alarms", "displacement off, m", "stated, m"]
     return Table("No fault", header, rows)

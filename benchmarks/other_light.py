@@ -62,21 +62,21 @@ the map shows other ground."""
 @dataclass(frozen=True)
 class Row:
     """Views of `views` on the map of `map`, names as of `benchmarks.scenes.ortho`; a folder of
-    views, or imagery they are rendered of, of which `band` is seen (0: colour). `elsewhere`: the
-    map shows other ground. `spoilt`: one of `SPOILT`, what the camera does to its pictures."""
+    views, or imagery they are rendered of, of which `band` is seen (0: colour). `negative`: the
+    map shows other ground. `defect`: one of `DEFECTS`, what the camera does to its pictures."""
 
     name: str
     map: str
     views: str
     band: int = 0
-    elsewhere: bool = False
-    spoilt: str = ""
+    negative: bool = False
+    defect: str = ""
 
     def cases(self, work: Path, count: int) -> Iterator[Case]:
         """As the camera shows them."""
-        spoil, rng = SPOILT.get(self.spoilt), np.random.default_rng(SEED)
+        damage, rng = DEFECTS.get(self.defect), np.random.default_rng(SEED)
         for view, place, of_ground in self.seen(work, count):
-            seen = view if spoil is None else replace(view, grey=spoil(view.grey, rng))
+            seen = view if damage is None else replace(view, grey=damage(view.grey, rng))
             yield seen, place, of_ground
 
     def seen(self, work: Path, count: int) -> Iterator[Case]:
@@ -85,7 +85,7 @@ class Row:
             recorded = open_flight(folder)
             truth = read_truth(folder / "truth_ground.csv")
             for each in list(recorded.views)[:count]:
-                place = None if self.elsewhere else truth[each.frame]
+                place = None if self.negative else truth[each.frame]
                 yield View(each.grey(), recorded.camera, each.telemetry), place, True
             return
         path = ortho(self.views, work) if self.band == 0 else _band(self.views, self.band, work)
@@ -93,7 +93,7 @@ class Row:
         for flown in views_in(
             flight(path, work, views=count, errors=USUAL, seed=SEED, agl_m=agl_m)
         ):
-            yield flown.view, None if self.elsewhere else flown.truth_latlon_deg, False
+            yield flown.view, None if self.negative else flown.truth_latlon_deg, False
 
 
 def _band(name: str, band: int, work: Path) -> Path:
@@ -158,7 +158,7 @@ def _aimed(grey: Grey, _: np.random.Generator) -> Grey:
     return made
 
 
-SPOILT: dict[str, Callable[[Grey, np.random.Generator], Grey]] = {
+DEFECTS: dict[str, Callable[[Grey, np.random.Generator], Grey]] = {
     "noise of 12 grey levels": _noisy,
     "motion blur": _moved,
     "1 % dead and hot pixels": _dotted,
@@ -196,12 +196,12 @@ def rows() -> Iterator[Row]:
             found.append(Row(name, f"{folder}:{PAST}", f"{folder}:{date}"))
     for date in (PRESENT, "2021-07-thermal"):
         views = f"generated:{SEEDS[0]}:{date}"
-        for spoilt in SPOILT:
-            name = f"rendered {date}, {spoilt}"
-            found.append(Row(name, f"generated:{SEEDS[0]}:{PAST}", views, spoilt=spoilt))
+        for defect in DEFECTS:
+            name = f"rendered {date}, {defect}"
+            found.append(Row(name, f"generated:{SEEDS[0]}:{PAST}", views, defect=defect))
     for each in OTHER_LIGHT:
         names = f"generated:1:{PAST}", f"generated:{SEEDS[0]}:{each.name}"
-        found.append(Row(f"other ground: rendered {each.name}", *names, elsewhere=True))
+        found.append(Row(f"other ground: rendered {each.name}", *names, negative=True))
     for name, where, views in (
         ("Chongqing on Bordeaux", bordeaux, chongqing),
         ("Bordeaux on Chongqing", chongqing, bordeaux),
@@ -209,7 +209,7 @@ def rows() -> Iterator[Row]:
         ("night lights on Bordeaux", bordeaux, f"{night}/views"),
         ("Chongqing on night lights' map", night, chongqing),
     ):
-        found.append(Row(f"other ground: {name}", f"{where}/map.tif", views, elsewhere=True))
+        found.append(Row(f"other ground: {name}", f"{where}/map.tif", views, negative=True))
     for row in found:
         if all(
             each.startswith("generated") or (DATA / each).exists() for each in (row.map, row.views)
@@ -234,10 +234,10 @@ def measure(options: argparse.Namespace) -> Section:
     lines, total = [], {True: np.zeros(2, int), False: np.zeros(2, int)}
     stored = rows_path(options.work, "rows")
     for row, found in zip(asked, resumed(stored, measured, tasks, options.workers), strict=True):
-        total[row.elsewhere] += [found["wrong"][DEFAULT], found["views"]]
+        total[row.negative] += [found["wrong"][DEFAULT], found["views"]]
         cells = [row.name, str(found["views"])]
         for way in WAYS:
-            right = "-" if row.elsewhere else str(found["right"][way])
+            right = "-" if row.negative else str(found["right"][way])
             cells.append(f"{right}, {found['accepted'][way]}")
         cells += [str(found["wrong"][DEFAULT])]
         lines.append([*cells, *(number(found["ms"][way]) for way in (BOTH, DEFAULT))])

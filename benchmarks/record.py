@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import csv
 import datetime
 import json
 import math
@@ -160,6 +161,12 @@ def resumed(
                 stream.write(json.dumps([key, found[key]]) + "\n")
                 stream.flush()
             yield found[key]
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a table with a header, as text."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
 
 
 def _save(out: Path, section: Section, started: dict[str, Any], wall_s: float) -> None:

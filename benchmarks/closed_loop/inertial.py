@@ -51,11 +51,10 @@ class Tuning:
     baro_m: float = 3.5
     heading: float = 0.3
     airspeed_mps: float = 1.4
-    slip: float = 0.3
+    sideslip: float = 0.3
     gnss_m: float = 0.5
     gnss_mps: float = 0.3
     least_m: float = 0.9
-    least_mps: float = 0.3
     gravity: float | None = 0.316
     reset_s: float = 5.0
     gate: float = 3.0
@@ -79,7 +78,7 @@ class Filter:
         self.covariance = np.diag(np.square(stds))
         self.gyro_bias, self.accel_bias, self.wind = np.zeros(3), np.zeros(3), np.zeros(2)
         self._steps, self._fused_step = 0, 0
-        self._felt = Increments(np.zeros(3), np.zeros(3))
+        self._last_imu = Increments(np.zeros(3), np.zeros(3))
         self._imu: deque[Increments] = deque()
         self._waiting: deque[tuple[int, Callable[[], None]]] = deque()
 
@@ -92,7 +91,7 @@ class Filter:
         """Whether no position was accepted for a while."""
         return (self._steps - self._fused_step) * STEP_S > self.tuning.reset_s
 
-    def feel(self, measured: Increments) -> None:
+    def add_imu(self, measured: Increments) -> None:
         """Take the increments of one step, and move on by one once there are enough."""
         self._imu.append(measured)
         if len(self._imu) <= DELAY_STEPS:
@@ -117,9 +116,9 @@ class Filter:
         )
 
     def _predict(self, measured: Increments) -> None:
-        felt, before, tuning = self._unbiased(measured), self.motion, self.tuning
-        self._felt = felt
-        self.motion = integrated(before, felt)
+        imu, before, tuning = self._unbiased(measured), self.motion, self.tuning
+        self._last_imu = imu
+        self.motion = integrated(before, imu)
         rotation = before.rotation
         push = self.motion.velocity - before.velocity - GRAVITY * STEP_S
         step = np.eye(STATES)
@@ -210,13 +209,13 @@ class Filter:
         right = self.motion.rotation[:, 1]
         row = np.zeros(STATES)
         row[TILT], row[VEL], row[WIND] = np.cross(right, through), right, -right[:2]
-        self._fuse(-float(right @ through), row, (self.tuning.slip * speed) ** 2)
+        self._fuse(-float(right @ through), row, (self.tuning.sideslip * speed) ** 2)
 
     def fuse_gravity(self) -> None:
         """Fuse that the accelerometer points up, where it feels about that much."""
         if self.tuning.gravity is None:
             return
-        push = self._felt.push / STEP_S
+        push = self._last_imu.push / STEP_S
         strength = float(np.linalg.norm(push))
         if not 0.9 * GRAVITY[2] < strength < 1.1 * GRAVITY[2]:
             return

@@ -3,16 +3,17 @@
 import argparse
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.closed_loop.inertial import FILTERS, STATES, Filter
 from benchmarks.closed_loop.physics import (
-    CALM,
+    CALIBRATED,
     CONSUMER,
     STEP_S,
     VEHICLES,
@@ -25,12 +26,21 @@ from benchmarks.closed_loop.physics import (
     euler_rad,
     increments,
 )
-from benchmarks.closed_loop.replays import CAMERA, Area, Grey, Rule, is_wrong, plain, stated
+from benchmarks.closed_loop.replays import CAMERA, Area, Grey, stated
 from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.record import Section, Table, number, quantiles, say
 from orthonav.core.flight.gnss import GnssSample
 from orthonav.core.geo.frames import LocalFrame
-from orthonav.core.records import MAP_STD_M, Fix, NoFix, Prior, Telemetry, View, ViewResult
+from orthonav.core.records import (
+    MAP_STD_M,
+    Fix,
+    NoFix,
+    Prior,
+    Telemetry,
+    View,
+    ViewResult,
+    error_ellipse,
+)
 from orthonav.core.track.tracker import Tracker
 from orthonav.onboard.cameras import FrozenCheck
 from orthonav.onboard.gnss.monitor import DIFFERENTIAL
@@ -54,7 +64,7 @@ CARROT_M, CORNER_M = 70.0, 60.0
 """Distance of the point that is steered to; corners count as reached from so far away."""
 LATENCY_S = 0.1
 """What a view gives reaches the filter so late."""
-GRADES = {"px4": CONSUMER, "ardupilot": CALM}
+GRADES = {"px4": CONSUMER, "ardupilot": CALIBRATED}
 START_STD_M, PRIOR_STD_M = 30.0, 100.0
 """Error of the position at a start without GNSS, and the deviation of every prior."""
 SBAS_STD_M = 1.0
@@ -71,21 +81,20 @@ Array = NDArray[np.float64]
 class Scenario:
     """What happens. GNSS is on for `gnss_s`, then off until `seconds`.
 
-    `send`: what the filter gets of orthonav, "position", "position+velocity", or None for nothing;
-    then no views are taken. `fault`: "shifted", "mirrored" or "frozen" pictures, from `fault_s` on
-    for `lasts_s`.
+    `sends`: whether the filter gets positions of orthonav, else no views are taken. `fault_s`,
+    `lasts_s`: when the pictures are those of the fault that the `name` says.
     """
 
     name: str
     seconds: float
     gnss_s: float = 60.0
-    send: str | None = "position"
-    fault: str | None = None
+    sends: bool = True
     fault_s: float = math.inf
     lasts_s: float = 0.0
 
-    def faulty(self, time_s: float) -> bool:
-        return self.fault_s <= time_s < self.fault_s + self.lasts_s
+    def fault(self, time_s: float) -> str:
+        """ "shifted", "mirrored" or "frozen"; empty without a fault."""
+        return self.name if self.fault_s <= time_s < self.fault_s + self.lasts_s else ""
 
 
 @dataclass(frozen=True)
@@ -121,8 +130,8 @@ class Located:
     """A view: what orthonav made of it.
 
     `error_m`: of the fix, NaN without one. `nees`: by its covariance. `level_m`: its protection
-    level, infinite without a fix. `is_wrong`: see `replays`. `sent_std_m`: as stated in the
-    message, NaN where none was sent.
+    level, infinite without a fix. `is_wrong`: beyond `FAR_M` and `FAR_STD` stated deviations.
+    `sent_std_m`: as stated in the message, NaN where none was sent.
     """
 
     time_s: float
@@ -171,14 +180,9 @@ class Sight:
 
     The map is displaced by what fixes state."""
 
-    def __init__(
-        self,
-        area: Area,
-        scenario: Scenario,
-        rule: Callable[[Telemetry, bool], Telemetry],
-        seed: int,
-    ) -> None:
-        self._area, self._scenario, self._rule, self._seed = area, scenario, rule, seed
+    def __init__(self, area: Area, scenario: Scenario, autopilot: str, seed: int) -> None:
+        self._area, self._scenario, self._seed = area, scenario, seed
+        self._autopilot = autopilot
         self._tracker, self.gate = Tracker(area.localizer), Gate()
         self._solutions: deque[GnssSample] = deque()
         self._watch = GnssWatch(area.frame, self._solutions)
@@ -190,7 +194,7 @@ class Sight:
     def frame(self) -> LocalFrame:
         return self._area.frame
 
-    def hear(self, time_s: float, place_ne: Array, velocity: Array) -> None:
+    def receive(self, time_s: float, place_ne: Array, velocity: Array) -> None:
         """A solution of a receiver with corrections by SBAS."""
         lat, lon = self.frame.latlon_from_en(place_ne[::-1])
         time_ns, vel_en_mps = round(time_s * 1e9), (float(velocity[1]), float(velocity[0]))
@@ -218,28 +222,22 @@ class Sight:
             outcome = result.outcome
             made = estimate_from_result(result, processing_s=LATENCY_S)
         admitted, _ = self.gate.admit(made, telemetry.time_ns + round(LATENCY_S * 1e9))
-        stated = None if admitted is None else self.stated(admitted, telemetry.time_ns)
-        return self._judged(time_s, truth, outcome, stated), admitted
-
-    def stated(self, admitted: NavigationEstimate, exposed_ns: int) -> NavigationEstimate:
-        """As its message states it."""
-        return self._covariance.prepare("", admitted, exposed_ns)
+        sent_std_m = math.nan
+        if admitted is not None:
+            prepared = self._covariance.prepare("", admitted, telemetry.time_ns)
+            sent_std_m = prepared.horizontal_std_m()
+        return self._judged(time_s, truth, outcome, sent_std_m), admitted
 
     def message(
         self, admitted: NavigationEstimate, seen: Motion, time_s: float, now: Motion
-    ) -> NavigationEstimate:
-        """Of an estimate, with the errors that it had when `seen`, at another moment: the errors of
-        overlapping views are alike."""
+    ) -> tuple[Array, float]:
+        """Position (2,) north and east of an estimate with the errors that it had when `seen`, at
+        another moment, because the errors of overlapping views are alike, and as stated, m."""
         place = self.frame.en_from_latlon(admitted.lat_deg, admitted.lon_deg)
-        lat, lon = self.frame.latlon_from_en(place + (now.position - seen.position)[[1, 0]])
-        velocity = admitted.vel_en_mps
-        if velocity is not None:
-            east, north = (np.array(velocity) + (now.velocity - seen.velocity)[[1, 0]]).tolist()
-            velocity = east, north
         exposed_ns = round(time_s * 1e9)
-        sent = self.stated(admitted, exposed_ns)
+        std_m = self._covariance.prepare("", admitted, exposed_ns).horizontal_std_m()
         self._covariance.sent("", exposed_ns)
-        return replace(sent, lat_deg=float(lat), lon_deg=float(lon), vel_en_mps=velocity)
+        return place[::-1] + (now.position - seen.position)[:2], std_m
 
     def _telemetry(self, time_s: float, estimate: Motion, gnss: bool) -> Telemetry:
         yaw, pitch, roll = np.degrees(euler_rad(estimate.rotation)).tolist()
@@ -250,10 +248,10 @@ class Sight:
         telemetry = Telemetry(
             round(time_s * 1e9), yaw % 360, pitch, roll, -down, prior=prior, vel_en_mps=velocity
         )
-        return self._rule(replace(telemetry, home_m=-down), gnss)
+        return stated(self._autopilot, replace(telemetry, home_m=-down), gnss)
 
     def _picture(self, time_s: float, truth: Motion) -> Grey:
-        fault = self._scenario.fault if self._scenario.faulty(time_s) else None
+        fault = self._scenario.fault(time_s)
         if fault == "frozen" and self._before is not None:
             return self._before
         yaw, pitch, roll = np.degrees(euler_rad(truth.rotation)).tolist()
@@ -267,11 +265,7 @@ class Sight:
         return self._before
 
     def _judged(
-        self,
-        time_s: float,
-        truth: Motion,
-        outcome: Fix | NoFix,
-        stated: NavigationEstimate | None,
+        self, time_s: float, truth: Motion, outcome: Fix | NoFix, sent_std_m: float
     ) -> Located:
         error_m, nees, level_m, wrong = math.nan, math.nan, math.inf, False
         if isinstance(outcome, Fix):
@@ -280,16 +274,9 @@ class Sight:
             nees = float(off @ np.linalg.solve(outcome.cov_en_m2, off))
             error_m = float(np.hypot(*off))
             level_m = outcome.protection_level_m()
-            wrong = is_wrong(error_m, outcome.cov_en_m2)
-        return Located(
-            time_s,
-            self._tracker.state_name,
-            error_m,
-            nees,
-            level_m,
-            wrong,
-            math.nan if stated is None else stated.horizontal_std_m(),
-        )
+            wrong = error_m > max(FAR_M, FAR_STD * error_ellipse(outcome.cov_en_m2)[0])
+        state = self._tracker.state_name
+        return Located(time_s, state, error_m, nees, level_m, wrong, sent_std_m)
 
 
 def fly(
@@ -299,13 +286,12 @@ def fly(
     vehicle: str,
     autopilot: str,
     seed: int,
-    rule: Rule,
     grade: Grade | None = None,
     course: Course = DEMO_COURSE,
 ) -> Flown:
     """Fly a scenario with a vehicle of `VEHICLES` and a filter of `FILTERS`.
 
-    `area` is needed where orthonav sends. `rule`: deviations of the telemetry (`replays.Rule`).
+    `area` is needed where orthonav sends.
     """
     rng = np.random.default_rng([seed, 3])
     wind = Wind(rng, np.array([*(WIND_MPS * _direction(rng)), 0.0]))
@@ -315,8 +301,8 @@ def fly(
     instruments = Instruments(rng, grade or GRADES[autopilot])
     estimator = _started(rng, aircraft, instruments, autopilot, scenario.gnss_s > 0)
     sight = None
-    if scenario.send is not None and area is not None:
-        sight = Sight(area, scenario, partial(rule, autopilot), seed)
+    if scenario.sends and area is not None:
+        sight = Sight(area, scenario, autopilot, seed)
     flown, route = Flown(scenario), Route(course)
     view_steps = round(course.view_s / STEP_S)
     held: tuple[NavigationEstimate, Motion] | None = None  # what is sent, and the truth at its view
@@ -338,13 +324,14 @@ def fly(
                 flown.views.append(located)
                 held = None if admitted is None else (admitted, truth)
         if sight is not None and held is not None and step % MESSAGE_STEPS == 0:
-            sent = sight.message(*held, time_s, aircraft.motion)
-            if not gnss:
-                _give(estimator, sight.frame, sent, scenario.send == "position+velocity")
+            place_ne, std_m = sight.message(*held, time_s, aircraft.motion)
+            if not gnss:  # fused at its exposure, which the filter has yet to reach
+                std_m = max(std_m, estimator.tuning.least_m)
+                estimator.measure(partial(estimator.fuse_position, place_ne, std_m))
         _sense(step, estimator, instruments, aircraft, wind, sight, gnss=gnss)
         before = aircraft.motion
         aircraft.step(wind.next())
-        estimator.feel(instruments.imu(increments(before, aircraft.motion)))
+        estimator.add_imu(instruments.imu(increments(before, aircraft.motion)))
     if sight is not None:
         flown.withheld = dict(sight.gate.withheld)
     return flown
@@ -385,21 +372,6 @@ def _started(
     return made
 
 
-def _give(
-    estimator: Filter, frame: LocalFrame, sent: NavigationEstimate, with_velocity: bool
-) -> None:
-    """Give the filter a message; it is fused at its exposure, which the filter has yet to reach."""
-    east, north = frame.en_from_latlon(sent.lat_deg, sent.lon_deg).tolist()
-    tuning, place = estimator.tuning, np.array([north, east])
-    std_m = max(sent.horizontal_std_m(), tuning.least_m)
-    estimator.measure(lambda: estimator.fuse_position(place, std_m))
-    if with_velocity and sent.vel_en_mps is not None and sent.vel_cov_en is not None:
-        velocity = np.array(sent.vel_en_mps[::-1])
-        largest = float(np.linalg.eigvalsh(sent.vel_cov_en)[-1])
-        std_mps = max(math.sqrt(largest), tuning.least_mps)
-        estimator.measure(lambda: estimator.fuse_velocity(velocity, std_mps))
-
-
 def _sense(
     step: int,
     estimator: Filter,
@@ -424,7 +396,7 @@ def _sense(
     if gnss and step % 10 == 0:
         place, velocity = instruments.gnss(motion)
         if sight is not None:
-            sight.hear(step * STEP_S, place, velocity)
+            sight.receive(step * STEP_S, place, velocity)
         tuning = estimator.tuning
         estimator.measure(lambda: estimator.fuse_position(place, tuning.gnss_m))
         estimator.measure(lambda: estimator.fuse_velocity(velocity, tuning.gnss_mps))
@@ -433,15 +405,15 @@ def _sense(
 def spans(flown: Flown) -> tuple[Sequence[Sample], Sequence[Located]]:
     """Samples and views that are judged: without GNSS, `SETTLING_S` after it was cut or, where it
     never was on, after the start."""
-    gnss_s, seconds = flown.scenario.gnss_s, flown.scenario.seconds
-    begin_s = 30.0 if gnss_s >= seconds else gnss_s + SETTLING_S[gnss_s > 0]
+    gnss_s = flown.scenario.gnss_s
+    begin_s = gnss_s + SETTLING_S[gnss_s > 0]
     samples = [each for each in flown.samples if each.time_s >= begin_s]
     return samples, [each for each in flown.views if each.time_s >= begin_s]
 
 
 GNSS_S, BEFORE_S, AFTER_S = 60.0, 60.0, 60.0
 """With GNSS, then without it before a disturbance, and after it."""
-SCENARIOS = ("gnss", "nothing", "fixes", "start", "shifted", "mirrored", "frozen")
+SCENARIOS = ("nothing", "fixes", "start", "shifted", "mirrored", "frozen")
 LASTS_S = {"shifted": 40.0, "mirrored": 40.0, "frozen": 10.0}
 HEADER = (
     *("scenario", "position median m", "95 %", "max", "position NEES"),
@@ -449,21 +421,14 @@ HEADER = (
 )
 
 
-def scenario(name: str, minutes: float, send: str) -> Scenario:
+def scenario(name: str, minutes: float) -> Scenario:
     """A scenario of `SCENARIOS`; `minutes` without GNSS, unless it has a disturbance."""
-    alone_s = 60 * minutes
-    whole = Scenario(name, GNSS_S + alone_s, GNSS_S, send)
-    if name == "gnss":
-        return replace(whole, gnss_s=whole.seconds, send=None)
-    if name == "nothing":
-        return replace(whole, send=None)
     if name == "start":
-        return replace(whole, seconds=min(alone_s, 240.0), gnss_s=0.0)
-    if name == "fixes":
-        return whole
-    lasts_s = LASTS_S[name]
-    begin_s = GNSS_S + BEFORE_S
-    return Scenario(name, begin_s + lasts_s + AFTER_S, GNSS_S, send, name, begin_s, lasts_s)
+        return Scenario(name, min(60 * minutes, 240.0), gnss_s=0.0)
+    if name not in LASTS_S:
+        return Scenario(name, GNSS_S + 60 * minutes, GNSS_S, sends=name == "fixes")
+    begin_s, lasts_s = GNSS_S + BEFORE_S, LASTS_S[name]
+    return Scenario(name, begin_s + lasts_s + AFTER_S, GNSS_S, True, begin_s, lasts_s)
 
 
 def cells(flown: Flown) -> list[str]:
@@ -485,27 +450,29 @@ def cells(flown: Flown) -> list[str]:
     ]
 
 
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--vehicle", choices=VEHICLES, default="plane")
+    parser.add_argument("--filter", choices=FILTERS, default="px4", help="instruments and tuning")
+    parser.add_argument("--only", nargs="+", choices=SCENARIOS, default=SCENARIOS)
+    parser.add_argument("--minutes", type=float, default=10.0, help="without GNSS (default 10)")
+    parser.add_argument("--seed", type=int, nargs="+", default=[1], help="one flight each")
+
+
 def measure(options: argparse.Namespace) -> Section:
-    """All scenarios of a vehicle with a filter, or only some, each with each seed."""
+    """Scenarios of a vehicle with a filter, each with each seed."""
     area, rows = Area.demo(options.work), []
-    for seed in options.seed:
-        for name in options.only or SCENARIOS:
-            flown = fly(
-                scenario(name, options.minutes, options.send),
-                area,
-                vehicle=options.vehicle,
-                autopilot=options.filter,
-                seed=seed,
-                rule=plain if options.plain else stated,
-            )
-            rows.append(cells(flown))
-            if len(options.seed) > 1:
-                rows[-1][0] += f", seed {seed}"
-            say(f"{' | '.join(rows[-1])} {flown.withheld}")
+    minutes = 0.5 if options.quick else options.minutes
+    for seed, name in product(options.seed, options.only):
+        aircraft = {"vehicle": options.vehicle, "autopilot": options.filter}
+        flown = fly(scenario(name, minutes), area, seed=seed, **aircraft)
+        rows.append(cells(flown))
+        if len(options.seed) > 1:
+            rows[-1][0] += f", seed {seed}"
+        say(f"{' | '.join(rows[-1])} {flown.withheld}")
     notes = (
-        f"{options.minutes:g} minutes without GNSS, {GNSS_S:g} s with it; the map is displaced by "
+        f"{minutes:g} minutes without GNSS, {GNSS_S:g} s with it; the map is displaced by "
         f"{MAP_STD_M:g} m per axis; position: errors of the autopilot; false: sent, and "
         f"more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
-    title = f"{options.vehicle}, filter like {options.filter}'s, sent: {options.send}"
+    title = f"{options.vehicle}, filter like {options.filter}'s"
     return Section("Flights in the loop", [Table(title, HEADER, rows, notes)])

@@ -95,12 +95,12 @@ def increments(before: Motion, after: Motion) -> Increments:
     return Increments(turn, middle.T @ (after.velocity - before.velocity - GRAVITY * STEP_S))
 
 
-def integrated(motion: Motion, felt: Increments) -> Motion:
+def integrated(motion: Motion, imu: Increments) -> Motion:
     """The motion a step later, by increments: the inverse of `increments`."""
-    push = motion.rotation @ turned(felt.turn / 2) @ felt.push
+    push = motion.rotation @ turned(imu.turn / 2) @ imu.push
     velocity = motion.velocity + push + GRAVITY * STEP_S
     position = motion.position + (motion.velocity + velocity) / 2 * STEP_S
-    return Motion(position, velocity, motion.rotation @ turned(felt.turn))
+    return Motion(position, velocity, motion.rotation @ turned(imu.turn))
 
 
 class Wander:
@@ -182,7 +182,7 @@ class Plane:
         self._rate += (self._wanted_rate - self._rate) * (STEP_S / 0.15)
         self._climb += (self._wanted_climb / self.AIRSPEED_MPS - self._climb) * STEP_S
         self._roll += self._rate * STEP_S
-        shake_roll, shake_pitch, slip = self._shake.next().tolist()
+        shake_roll, shake_pitch, sideslip = self._shake.next().tolist()
         roll = self._roll + shake_roll
         self._yaw += G_MPS2 * math.tan(roll) / self.AIRSPEED_MPS * STEP_S
         path = about(2, self._yaw) @ about(1, self._climb)
@@ -191,7 +191,9 @@ class Plane:
             self.motion = Motion(self.motion.position, velocity, path)
         tilted = about(0, roll) @ about(1, self.ALPHA / math.cos(roll) + shake_pitch)
         moved = (self.motion.velocity + velocity) / 2 * STEP_S
-        self.motion = Motion(self.motion.position + moved, velocity, path @ tilted @ about(2, slip))
+        self.motion = Motion(
+            self.motion.position + moved, velocity, path @ tilted @ about(2, sideslip)
+        )
 
 
 class Quad:
@@ -279,7 +281,9 @@ class Grade:
 
 CONSUMER = Grade()
 """Uncalibrated consumer MEMS in an aircraft that vibrates."""
-CALM = Grade(gyro_noise=1e-4, accel_noise=0.005, gyro_bias=math.radians(0.01), accel_bias=0.015)
+CALIBRATED = Grade(
+    gyro_noise=1e-4, accel_noise=0.005, gyro_bias=math.radians(0.01), accel_bias=0.015
+)
 """Calibrated for temperature and well damped, as those of ArduPilot's simulator."""
 
 
@@ -295,14 +299,14 @@ class Instruments:
         self._scale = 1 + grade.airspeed_scale * float(rng.normal())
         self._place = np.zeros(2)
 
-    def imu(self, felt: Increments) -> Increments:
+    def imu(self, ideal: Increments) -> Increments:
         grade, kept = self.grade, math.exp(-STEP_S / self.grade.bias_s)
         fresh = math.sqrt(1 - kept**2)
         self.gyro_bias = kept * self.gyro_bias + fresh * grade.gyro_bias * self._rng.normal(size=3)
         self._accel = kept * self._accel + fresh * grade.accel_bias * self._rng.normal(size=3)
         noise = math.sqrt(STEP_S) * self._rng.normal(size=(2, 3))
-        turn = felt.turn + self.gyro_bias * STEP_S + grade.gyro_noise * noise[0]
-        push = felt.push + self._accel * STEP_S + grade.accel_noise * noise[1]
+        turn = ideal.turn + self.gyro_bias * STEP_S + grade.gyro_noise * noise[0]
+        push = ideal.push + self._accel * STEP_S + grade.accel_noise * noise[1]
         return Increments(turn, push)
 
     def height_m(self, motion: Motion, since_s: float) -> float:

@@ -6,9 +6,8 @@ of a closed loop; what is located now is not fed back. A flight folder has `trut
 exposure) and `events.csv`.
 """
 
-import argparse
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,37 +16,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.fault_flights import FAR_M, FAR_STD
 from benchmarks.faults import Ground
-from benchmarks.looped_flight import read_rows
-from benchmarks.record import Section, Table, number, quantiles, say
-from benchmarks.scenes import DATA, PAST, PRESENT, map_of
+from benchmarks.record import read_rows
+from benchmarks.scenes import PAST, PRESENT, map_of
 from orthonav.cli.demo import IMAGERY
 from orthonav.core.geo.attitude import wxyz_of_angles
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.localize import Localizer
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import (
-    CONFIDENT,
-    Fix,
-    Prior,
-    Telemetry,
-    View,
-    ViewResult,
-    error_ellipse,
-)
-from orthonav.core.track.tracker import Tracker
+from orthonav.core.records import Prior, Telemetry, View
 from orthonav.ground.simulate.render import ViewEffects
-from orthonav.onboard.messages.estimate import estimate_from_result
-from orthonav.onboard.messages.gate import Gate
-from orthonav.onboard.run import Locator, SingleViews, locate_view
-from orthonav.onboard.telemetry import (
-    ABSOLUTE,
-    FIX_3D,
-    Aiding,
-    TelemetryBuffer,
-)
+from orthonav.onboard.telemetry import ABSOLUTE, FIX_3D, Aiding, TelemetryBuffer
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 """The camera of the recorded flights; it looks straight down the body, image top to the nose."""
@@ -191,8 +171,20 @@ class Recorded:
             yield exposure, replace(telemetry, prior=Prior(lat, lon, PRIOR_STD_M))
 
     def view(self, area: Area, cache: Path, exposure: Exposure, telemetry: Telemetry) -> View:
-        """The view of an exposure; its picture is kept in a folder."""
-        return View(_shown(area, exposure, cache / self.folder.name), CAMERA, telemetry)
+        """The view of an exposure; its picture is rendered once and kept in a folder."""
+        path = cache / self.folder.name / f"{exposure.number:04d}.jpg"
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            rng = np.random.default_rng([1, exposure.number])
+            place = area.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
+            if exposure.phase == SHIFTED:
+                place = place + SHIFT_EN_M
+            grey = area.picture(place, exposure.attitude_deg, exposure.agl_m, rng)
+            if exposure.phase == MIRRORED:
+                grey = np.asarray(grey[:, ::-1])
+            cv2.imwrite(str(path), grey, (cv2.IMWRITE_JPEG_QUALITY, EFFECTS.jpeg_quality))
+        grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+        return View(grey, CAMERA, telemetry)
 
 
 def _give(buffer: TelemetryBuffer, time_ns: int, value: dict[str, float]) -> None:
@@ -204,213 +196,13 @@ def _give(buffer: TelemetryBuffer, time_ns: int, value: dict[str, float]) -> Non
     buffer.add_local(time_ns, velocity, -value["home_m"])
 
 
-def _shown(area: Area, exposure: Exposure, cache: Path) -> Grey:
-    """The picture of an exposure, rendered once."""
-    path = cache / f"{exposure.number:04d}.jpg"
-    if not path.is_file():
-        cache.mkdir(parents=True, exist_ok=True)
-        rng = np.random.default_rng([1, exposure.number])
-        place = area.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
-        if exposure.phase == SHIFTED:
-            place = place + SHIFT_EN_M
-        grey = area.picture(place, exposure.attitude_deg, exposure.agl_m, rng)
-        if exposure.phase == MIRRORED:
-            grey = np.asarray(grey[:, ::-1])
-        cv2.imwrite(str(path), grey, (cv2.IMWRITE_JPEG_QUALITY, EFFECTS.jpeg_quality))
-    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-
-
-RECORDED = DATA / "closed_loop"
-METHODS = ("single", "track")
-HEADER = (
-    *("flight", "method", "views", "median m", "95 % m", "NEES", "confident"),
-    *("tracking", "300 m east", "mirrored"),
-)
-Rule = Callable[[str, Telemetry, bool], Telemetry]
-"""From the autopilot (px4, ardupilot), telemetry, and whether GNSS aids it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Row:
-    """One view located by one method.
-
-    `error_en_m`, `cov_en_m2`: of the fix, None without one. `confidence`: 0 without a fix.
-    `sent`: the gate admits it.
-    """
-
-    flight: str
-    method: str
-    exposure: Exposure
-    state: str | None
-    error_en_m: Array | None
-    cov_en_m2: Array | None
-    confidence: float
-    sent: bool
-
-    @property
-    def error_m(self) -> float:
-        """Distance from the truth; infinite without a fix."""
-        return np.inf if self.error_en_m is None else float(np.hypot(*self.error_en_m))
-
-    @property
-    def nees(self) -> float:
-        """Normalized error squared: 2 in the mean where the covariance is right."""
-        if self.error_en_m is None or self.cov_en_m2 is None:
-            return np.nan
-        return float(self.error_en_m @ np.linalg.solve(self.cov_en_m2, self.error_en_m))
-
-    @property
-    def is_wrong(self) -> bool:
-        """Whether it was sent and is wrong."""
-        return self.sent and is_wrong(self.error_m, self.cov_en_m2)
-
-
-def is_wrong(error_m: float, cov_en_m2: Array | None) -> bool:
-    """Whether a position with an error and a covariance (2, 2) is wrong."""
-    return cov_en_m2 is not None and error_m > max(FAR_M, FAR_STD * error_ellipse(cov_en_m2)[0])
-
-
 def stated(autopilot: str, telemetry: Telemetry, gnss: bool) -> Telemetry:
-    """Telemetry with the deviations that `orthonav fly` states for an autopilot."""
+    """Telemetry with the deviations that `orthonav fly` states for an autopilot (px4, ardupilot);
+    `gnss`: whether GNSS aids it."""
     aiding = Aiding()
-    aiding.status(0, 0, ardupilot=autopilot == "ardupilot")
+    aiding.status(ABSOLUTE if gnss else 0, 0, ardupilot=autopilot == "ardupilot")
     if gnss:
-        aiding.status(ABSOLUTE, 0, ardupilot=autopilot == "ardupilot")
         aiding.receiver(0, FIX_3D, 0)
     vel_std_mps, tilt_std_deg = aiding.stds(0)
     known = math.isfinite(vel_std_mps)
     return replace(telemetry, tilt_std_deg=tilt_std_deg, vel_std_mps=vel_std_mps if known else None)
-
-
-def plain(autopilot: str, telemetry: Telemetry, gnss: bool) -> Telemetry:
-    """Telemetry without deviations, as version 0.1 has it."""
-    return telemetry
-
-
-def flights(only: Sequence[str] = ()) -> list[Path]:
-    """Folders of the recorded flights; empty where they are absent."""
-    found = sorted(path.parent for path in RECORDED.glob("*/exposures.csv"))
-    if unknown := set(only) - {path.name for path in found}:
-        raise SystemExit(f"no such flight: {', '.join(sorted(unknown))}")
-    return [path for path in found if not only or path.name in only]
-
-
-def replay(
-    flight: Path,
-    work: Path,
-    *,
-    methods: Sequence[str] = METHODS,
-    rule: Rule = stated,
-    views: int | None = None,
-) -> list[Row]:
-    """Locate the views of a flight folder by some of `METHODS`; `work` holds demo and pictures.
-
-    `rule` sets the deviations of the telemetry. `views`: only the first so many without GNSS.
-    """
-    recorded, area = Recorded(flight), Area.demo(work)
-    locators: dict[str, Locator] = {
-        "single": SingleViews(area.localizer),
-        "track": Tracker(area.localizer),
-    }
-    gates = {name: Gate() for name in methods}
-    autopilot, _, _ = flight.name.partition("_")
-    rows, alone = [], 0
-    for exposure, reported in recorded.stated():
-        alone += exposure.phase == OFF
-        if views is not None and alone > views:
-            break
-        telemetry = rule(autopilot, reported, exposure.phase == ON)
-        if telemetry.missing():
-            continue
-        view = recorded.view(area, work / "views", exposure, telemetry)
-        for name in methods:
-            if name == "single" and exposure.phase == ON:
-                continue  # a track begins with GNSS; single views are judged without it
-            rows.append(_row(recorded, area, name, locators[name], gates[name], exposure, view))
-    return rows
-
-
-def _row(
-    recorded: Recorded,
-    area: Area,
-    method: str,
-    locator: Locator,
-    gate: Gate,
-    exposure: Exposure,
-    view: View,
-) -> Row:
-    outcome, latency_ms = locate_view(locator, view)
-    state = locator.state_name
-    result = ViewResult(str(exposure.number), exposure.time_ns, outcome, latency_ms, state)
-    admitted, _ = gate.admit(estimate_from_result(result), exposure.time_ns)
-    error = cov = None
-    confidence = 0.0
-    if isinstance(outcome, Fix):
-        place = area.frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg)
-        error = place - area.frame.en_from_latlon(exposure.lat_deg, exposure.lon_deg)
-        cov, confidence = outcome.cov_en_m2, outcome.confidence
-    name, sent = recorded.folder.name, admitted is not None
-    return Row(name, method, exposure, state, error, cov, confidence, sent)
-
-
-def judged(rows: Sequence[Row]) -> list[Row]:
-    """Fixes without GNSS and without disturbance: confident single ones, those of a track while
-    it is tracking."""
-    alone = [row for row in rows if row.exposure.phase == OFF and row.error_en_m is not None]
-    return [
-        row
-        for row in alone
-        if (row.confidence >= CONFIDENT if row.state is None else row.state == "tracking")
-    ]
-
-
-def _cells(rows: Sequence[Row]) -> list[str]:
-    """A row of the table from all views of one flight by one method."""
-    alone = [row for row in rows if row.exposure.phase == OFF]
-    good = judged(rows)
-    errors = [row.error_m for row in good]
-    wrong = []
-    for phase in (SHIFTED, MIRRORED):
-        sent = [row for row in rows if row.exposure.phase == phase]
-        wrong.append(f"{sum(row.is_wrong for row in sent)}/{len(sent)}" if sent else "-")
-    confident = sum(row.confidence >= CONFIDENT for row in alone) / max(len(alone), 1)
-    tracking = sum(row.state == "tracking" for row in alone) / max(len(alone), 1)
-    return [
-        rows[0].flight,
-        rows[0].method,
-        str(len(alone)),
-        *quantiles(errors, 50, 95),
-        number(float(np.mean([row.nees for row in good] or [np.nan]))),
-        f"{confident:.0%}",
-        f"{tracking:.0%}" if rows[0].state is not None else "-",
-        *wrong,
-    ]
-
-
-def table(rows: Sequence[Row]) -> Table:
-    """Errors without GNSS per flight and method."""
-    keys = dict.fromkeys((row.flight, row.method) for row in rows)
-    cells = [_cells([row for row in rows if (row.flight, row.method) == key]) for key in keys]
-    notes = (
-        "errors of confident single views, and of tracked views in the state tracking, while GNSS "
-        "is off and before any disturbance; NEES: mean, 2 is right",
-        "300 m east, mirrored: wrong positions that the gate admits, of all views while the camera "
-        f"is so disturbed; wrong: more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
-    )
-    return Table("Replays", HEADER, cells, notes)
-
-
-def measure(options: argparse.Namespace) -> Section:
-    """All flights, or only those named."""
-    rows: list[Row] = []
-    for flight in flights(options.only or ()):
-        found = replay(
-            flight,
-            options.work,
-            methods=options.methods,
-            rule=plain if options.plain else stated,
-            views=options.views,
-        )
-        say(table(found).markdown())
-        rows += found
-    return Section("Replays of flights with autopilots", [table(rows)] if rows else [])

@@ -18,7 +18,7 @@ from rasterio.crs import CRS
 from rasterio.warp import transform as transform_points
 from scipy.spatial.transform import Rotation
 
-from benchmarks.real_ground.score import Seen
+from benchmarks.real_ground.score import Seen, Source
 from benchmarks.scenes import DATA
 from orthonav.core.files import replacing
 from orthonav.core.geo.camera import Camera, attitude_of
@@ -102,7 +102,7 @@ def strip_ortho(strip: int, work: Path) -> Path:
 
 
 @dataclass(frozen=True)
-class Windows:
+class Windows(Source):
     """Windows of the photographs of the other strip than that of the map, attitude as it is.
 
     `tilt_std_deg`: error of the reported pitch and roll, stated; 0: exact, and stated so.
@@ -110,14 +110,9 @@ class Windows:
 
     strip: int
     tilt_std_deg: float
-    std_m: float = 0.0
-    name: str = FOLDER
 
-    def pictures(self) -> str:
-        return ""
-
-    def prepare(self, work: Path, base: Localizer, views: int) -> None:
-        """Nothing."""
+    def imagery(self) -> str:
+        return FOLDER
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
         heights, rng = terrain(), np.random.default_rng([SEED, self.strip])
@@ -147,14 +142,14 @@ class Windows:
     ) -> Seen | None:
         """A window by its first column and row; None where it leaves the imagery of the map."""
         high, wide = photograph.grey.shape
-        middle = wide / 2 - col, high / 2 - row
-        camera = Camera(WINDOW_PX, WINDOW_PX, FOCAL_PX, FOCAL_PX, *middle, unusual=True)
+        principal = wide / 2 - col, high / 2 - row
+        camera = Camera(WINDOW_PX, WINDOW_PX, FOCAL_PX, FOCAL_PX, *principal, unusual=True)
         ray = np.array([WINDOW_PX / 2 - camera.cx_px, WINDOW_PX / 2 - camera.cy_px, FOCAL_PX])
         rays = (photograph.grid_from_camera @ ray)[None, None]
         middle = met(heights, rays, photograph.position_m)[0, 0]
         reach = WINDOW_PX * ORTHO_M * 0.45
         around = middle[:2] + np.array([[-1, -1], [-1, 1], [1, -1], [1, 1], [0, 0]]) * reach
-        if not np.isfinite(middle).all() or not ortho.holds(around).all():
+        if not (np.isfinite(middle).all() and ortho.holds(around).all()):
             return None
         if not (ortho.at(around[:, 0], around[:, 1]) > 0).all():
             return None

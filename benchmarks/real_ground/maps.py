@@ -35,10 +35,13 @@ ROUGHNESS = 1.5
 """Power of the wavelength with which amplitudes grow: a fractal dimension of 2.5, the rough end of
 measured terrain (2.1 to 2.5)."""
 BASE_M = 200.0
-BARE, FLAT, COARSE, SURFACE, WORN = "bare", "flat", "coarse", "surface", "worn"
-GONE_SHARE, WORN_STD_M, WORN_POSTING_M, LEAST_HOUSE_M = 0.1, 0.3, 1.0, 2.5
-"""Of a `WORN` surface: share of the houses and groups of trees, at least so high, that it lacks,
-and its noise, independent at so many metres."""
+BARE, FLAT, COARSE, SURFACE, OUTDATED = "bare", "flat", "coarse", "surface", "outdated"
+DRAPED, DISPLACED, HIGH, HOLES = "draped", "displaced", "high", "holes"
+"""As `BARE` for imagery that is draped over hills; this displaced by 200 m, 50 m too high, or with
+eight holes of 400 m."""
+GONE_SHARE, OUTDATED_STD_M, OUTDATED_POSTING_M, LEAST_HOUSE_M = 0.1, 0.3, 1.0, 2.5
+"""Of an `OUTDATED` surface: share of the houses and groups of trees, at least so high, that it
+lacks, and its noise, independent at so many metres."""
 Heights = NDArray[np.float32]
 
 
@@ -48,7 +51,7 @@ class Map:
 
     - `ortho`: orthophoto as `scenes.ortho` takes it, `scaled:GSD:NAME` or
       `strip:NUMBER:NAME`.
-    - `ground`: one of `BARE` to `WORN` of `relief`, or a file of heights below `DATA`; None: the
+    - `ground`: one of `BARE` to `HOLES` of `relief`, or a file of heights below `DATA`; None: the
       map has no terrain.
     - `relief`: root mean square slope of the ground in per cent; None: the ground is not rendered.
     - `land`: what the build says of land without terrain; None: nothing.
@@ -73,7 +76,7 @@ class Map:
             more: dict[str, Any] = {} if self.land is None else {"relief": self.land}
             if self.ground is not None:
                 heights, datum = self.heights(work), {"dem_datum": self.datum}
-                is_surface = Path(self.ground).stem in (SURFACE, WORN)
+                is_surface = Path(self.ground).stem in (SURFACE, OUTDATED)
                 more |= datum | ({"surface": [heights]} if is_surface else {"dem": heights})
             build_map(BuildRequest([found(self.ortho, work)], out, **more))
 
@@ -82,7 +85,7 @@ class Map:
         assert self.ground is not None
         if self.relief is None:
             return found(self.ground, work)
-        if self.ortho.startswith("generated:") and self.ground != FLAT:
+        if self.ortho.startswith("generated:") and self.ground not in (FLAT, DRAPED):
             return landscape_heights(self.ortho, work, self.relief, self.ground)
         return relief_file(self.ortho, work, self.relief, self.ground)
 
@@ -152,10 +155,17 @@ def relief_file(name: str, work: Path, slope: float, kind: str) -> Path:
         made, posting_m = fractal_relief(shape, TRUE_POSTING_M, slope / 100, seed), TRUE_POSTING_M
     if kind == COARSE:
         made, posting_m = coarse_of(made, posting_m, seed + 1), COARSE_POSTING_M
-    corner = bounds.left - 5 * COARSE_POSTING_M, bounds.top + 5 * COARSE_POSTING_M
-    return written(
-        out, made, rasterio.Affine(posting_m, 0, corner[0], 0, -posting_m, corner[1]), crs
-    )
+    if kind == DISPLACED:
+        made = np.roll(made, round(200 / posting_m), axis=1)
+    if kind == HIGH:
+        made += np.float32(50)
+    if kind == HOLES:
+        side = round(200 / posting_m)
+        for row, col in np.random.default_rng(7).uniform(0, made.shape, (8, 2)).astype(int):
+            made[max(0, row - side) : row + side, max(0, col - side) : col + side] = np.nan
+    west_m, north_m = bounds.left - 5 * COARSE_POSTING_M, bounds.top + 5 * COARSE_POSTING_M
+    step = rasterio.Affine(posting_m, 0, west_m, 0, -posting_m, north_m)
+    return written(out, made, step, crs)
 
 
 def written(out: Path, heights: Heights, transform: Any, crs: Any) -> Path:
@@ -171,13 +181,13 @@ def written(out: Path, heights: Heights, transform: Any, crs: Any) -> Path:
 
 def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
     """Heights under generated imagery: `BARE`, or the `SURFACE` of the date of the name, or this as
-    a survey of another year would have it (`WORN`)."""
+    a survey of another year would have it (`OUTDATED`)."""
     seed, gsd_m, side_m, date = generated(name)
     folder = work / f"area-{seed}-{side_m}m-{gsd_m:g}m-hills{slope:g}"
-    if kind == WORN:
-        out = folder / f"{date}_worn.tif"
+    if kind == OUTDATED:
+        out = folder / f"{date}_outdated.tif"
         if not out.is_file():
-            _worn(out, landscape_heights(name, work, slope, SURFACE), seed)
+            _outdated(out, landscape_heights(name, work, slope, SURFACE), seed)
         return out
     path = folder / ("dem.tif" if kind == BARE else f"{date}_dsm.tif")
     if not path.is_file():
@@ -187,7 +197,7 @@ def landscape_heights(name: str, work: Path, slope: float, kind: str) -> Path:
     return path
 
 
-def _worn(out: Path, surface: Path, seed: int) -> None:
+def _outdated(out: Path, surface: Path, seed: int) -> None:
     rng = np.random.default_rng([seed, 6])
     with rasterio.open(surface) as source:
         heights, transform, crs = source.read(1), source.transform, source.crs
@@ -200,8 +210,10 @@ def _worn(out: Path, surface: Path, seed: int) -> None:
     gone[0] = False  # the ground
     lacking = cv2.dilate(gone[labels].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     heights[lacking] = bare[lacking]
-    coarse = tuple(math.ceil(side * transform.a / WORN_POSTING_M) for side in heights.shape)
-    noise = cv2.resize(rng.normal(0.0, WORN_STD_M, coarse), size, interpolation=cv2.INTER_NEAREST)
+    coarse = tuple(math.ceil(side * transform.a / OUTDATED_POSTING_M) for side in heights.shape)
+    noise = cv2.resize(
+        rng.normal(0.0, OUTDATED_STD_M, coarse), size, interpolation=cv2.INTER_NEAREST
+    )
     written(out, np.asarray(heights + noise, np.float32), transform, crs)
 
 

@@ -9,8 +9,8 @@ import cv2
 
 from benchmarks.real_ground import gate, pairs
 from benchmarks.real_ground.maps import Map, code
-from benchmarks.real_ground.rows import PARTS, AnySource, Question, questions
-from benchmarks.real_ground.score import HEADER, RISK, cells
+from benchmarks.real_ground.rows import PARTS, Question, questions
+from benchmarks.real_ground.score import HEADER, RISK, Source, cells
 from benchmarks.record import Section, Table, resumed, rows_path, say, side_by_side
 from benchmarks.scenes import DATA, FAR_M
 from orthonav.core.records import CONFIDENT, RADIUS_SHARE
@@ -100,7 +100,7 @@ def prepare(asked: list[Question], views: Views, work: Path, workers: int) -> No
     say(f"{len(maps)} maps")
     for _ in side_by_side(built_in, [(built, work) for built in maps], workers):
         pass
-    shared: dict[tuple[str, str], tuple[Map, AnySource, int, Path]] = {}
+    shared: dict[tuple[str, str], tuple[Map, Source, int, Path]] = {}
     for built, source, count in legs:
         key = built.ortho, source.pictures()
         if source.pictures() and (key not in shared or shared[key][2] < count):
@@ -116,7 +116,8 @@ def built_in(task: tuple[Map, Path]) -> None:
     built.build(work)
 
 
-def prepared(task: tuple[Map, AnySource, int, Path]) -> None:
+def prepared(task: tuple[Map, Source, int, Path]) -> None:
     built, source, count, work = task
     cv2.setNumThreads(1)
-    source.prepare(work, built.localizer(work), count)
+    for _ in source.seen(work, built.localizer(work), count, True):
+        pass

@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from benchmarks.record import number
 from benchmarks.scenes import FAR_M
 from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.localize import Localizer
 from orthonav.core.records import RADIUS_SHARE, Fix, NoFix, View, protection_level_m
 from orthonav.onboard.run import Locator, locate_view
 
@@ -37,6 +39,24 @@ class Seen:
     height_m: float
     judged: bool = True
     of_ground: bool = False
+
+
+class Source:
+    """Where the views of a row come from. `std_m`: error of the truth per axis."""
+
+    std_m: float = 0.0
+
+    def imagery(self) -> str:
+        """Name of what must be there, as `maps.found` takes it or below `DATA`."""
+        raise NotImplementedError
+
+    def pictures(self) -> str:
+        """Name of pictures that several rows share, and that are made first; empty: none."""
+        return ""
+
+    def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
+        """So many views on the map of `base`; more for a track."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -114,24 +134,24 @@ class Row:
 
     def values(self) -> dict[str, Any]:
         """The numbers of the row and its fixes, as JSON; None where nothing is confident."""
-        sure = [each for each in self.found if each.confident]
+        accepted = [each for each in self.found if each.confident]
         right = [each for each in self.found if not each.wrong]
         views = len(self.times_ms)
 
         def of(name: str) -> Array:
-            return np.array([getattr(each, name) for each in sure], np.float64)
+            return np.array([getattr(each, name) for each in accepted], np.float64)
 
         found: dict[str, Any] = {
             "fixes": [asdict(each) for each in self.found],
             "views": views,
-            "confident": len(sure) / max(views, 1),
+            "confident": len(accepted) / max(views, 1),
             "of_right": sum(each.confident for each in right) / max(len(right), 1),
-            "exceeded": sum(each.error_m > each.level_m for each in sure),
-            "bounded": sum(math.isfinite(each.level_m) for each in sure),
-            "false": sum(each.wrong for each in sure),
+            "exceeded": sum(each.error_m > each.level_m for each in accepted),
+            "bounded": sum(math.isfinite(each.level_m) for each in accepted),
+            "false": sum(each.wrong for each in accepted),
             "ms": float(np.median(self.times_ms)) if views else None,
         }
-        if not sure:
+        if not accepted:
             return found | dict.fromkeys(("median_m", "p95_m", "std_m", "nees", "nees_median"))
         return found | {
             "median_m": float(np.median(of("error_m"))),

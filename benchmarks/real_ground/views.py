@@ -3,8 +3,6 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import count as numbers
 from pathlib import Path
 
 import cv2
@@ -12,11 +10,12 @@ import numpy as np
 from lab.terrain import seen_view
 from numpy.typing import NDArray
 
-from benchmarks.closed_loop.replays import OFF, ON, Area, Recorded, plain, stated
+from benchmarks.closed_loop.replays import OFF, ON, Area, Recorded, stated
 from benchmarks.judged_views import is_covered
 from benchmarks.real_ground.maps import BARE, SURFACE, found, landscape_heights, relief_file
-from benchmarks.real_ground.score import Seen
+from benchmarks.real_ground.score import Seen, Source
 from benchmarks.scenes import DATA, Pair, flight, root_agl_of, views_in
+from orthonav.cli.source import map_heights
 from orthonav.core.files import replacing
 from orthonav.core.flight import open_flight, read_truth
 from orthonav.core.geo.camera import FOV_STD, Camera, axis_on_ground_en_m
@@ -40,7 +39,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class OverRelief:
+class OverRelief(Source):
     """Views rendered over relief, or over the surface of generated ground; heights count from bare
     ground.
 
@@ -51,6 +50,8 @@ class OverRelief:
     - `agl_m`: height; None: that from which a view is `WIDTH_PX` of the map across. `ahead_deg`:
       how far the camera looks ahead. `within_m`: ground in the middle of the view lies so far from
       the middle of the map at most.
+    - `draped`: generated imagery is draped over hills, as other imagery is.
+    - `above_sea`: the height above sea is reported, and not that above ground.
     """
 
     pair: Pair
@@ -58,23 +59,21 @@ class OverRelief:
     tilt_std_deg: float = 0.0
     stated_deg: float | None = None
     nominal: bool = False
-    std_m: float = 0.0
     agl_m: float | None = None
     ahead_deg: float = 0.0
     within_m: float = math.inf
+    draped: bool = False
+    above_sea: bool = False
+
+    def imagery(self) -> str:
+        return self.pair.views
 
     def pictures(self) -> str:
-        """Name of the folder of pictures, which rows share."""
         lens = "-nominal" if self.nominal else ""
         if self.agl_m is not None:
             lens += f"-{self.agl_m:g}m-{self.ahead_deg:g}deg-within-{self.within_m:g}m"
         name = self.pair.name.replace(" ", "").replace(">", "-")
         return f"{name}-{self.slope:g}-{self.tilt_std_deg:g}{lens}"
-
-    def prepare(self, work: Path, base: Localizer, views: int) -> None:
-        """Render the pictures."""
-        for _ in self.seen(work, base, views, False):
-            pass
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
         folder = work / f"pictures-{self.pictures()}"
@@ -82,6 +81,7 @@ class OverRelief:
         imagery, inside_m = self._imagery(work, base)
         relief: Raster | None = None
         ground = open_dem(self._heights(work, BARE))
+        flown = map_heights(base.opened) if self.above_sea else None
         for number in range(views):
             rng = np.random.default_rng([SEED, number])
             true, place = self._pose(base, inside_m, rng)
@@ -100,10 +100,14 @@ class OverRelief:
             grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
             rng = np.random.default_rng([SEED, number, 1])
             reported = level_telemetry(true, rng, self.stated_deg, self.ahead_deg)
+            if flown is not None:
+                amsl_m = float(ground(lat[None], lon[None])[0]) + true.agl_m
+                unknown = replace(reported, agl_m=math.nan, agl_std_m=None, amsl_m=amsl_m)
+                reported = flown.corrected(unknown)
             yield Seen(View(grey, camera, reported), (float(lat), float(lon)), true.agl_m)
 
     def _heights(self, work: Path, kind: str) -> Path:
-        if self.pair.views.startswith("generated:"):
+        if self.pair.views.startswith("generated:") and not self.draped:
             return landscape_heights(self.pair.views, work, self.slope, kind)
         return relief_file(self.pair.map, work, self.slope, BARE)
 
@@ -178,7 +182,7 @@ class OverRelief:
 
 
 @dataclass(frozen=True)
-class OverLevel:
+class OverLevel(Source):
     """Views of flat ground, true and reported tilt as of `OverRelief`."""
 
     pair: Pair
@@ -186,27 +190,24 @@ class OverLevel:
     stated_deg: float | None = None
     std_m: float = 0.0
 
+    def imagery(self) -> str:
+        return self.pair.views
+
     def pictures(self) -> str:
         return f"level-{self.pair.name}-{self.tilt_std_deg:g}"
 
-    def prepare(self, work: Path, base: Localizer, views: int) -> None:
-        """Fly the flight."""
-        self._flight(work, base, views)
-
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
         assert base.registration is not None
-        for number, each in enumerate(views_in(self._flight(work, base, views))):
+        path = found(self.pair.views, work)
+        errors = Errors(attitude_std_deg=self.tilt_std_deg)
+        agl_m = root_agl_of(WIDTH_PX, base.grid.gsd_m)
+        folder = flight(path, work, views=views, errors=errors, seed=SEED, agl_m=agl_m)
+        for number, each in enumerate(views_in(folder)):
             place, true = each.truth_latlon_deg, each.view.telemetry
             if is_covered(base.registration, place, WIDTH_PX):
                 rng = np.random.default_rng([SEED, number])
                 reported = level_telemetry(true, rng, self.stated_deg)
                 yield Seen(replace(each.view, telemetry=reported), place, true.agl_m)
-
-    def _flight(self, work: Path, base: Localizer, views: int) -> Path:
-        path = found(self.pair.views, work)
-        errors = Errors(attitude_std_deg=self.tilt_std_deg)
-        agl_m = root_agl_of(WIDTH_PX, base.grid.gsd_m)
-        return flight(path, work, views=views, errors=errors, seed=SEED, agl_m=agl_m)
 
 
 def level_telemetry(
@@ -231,7 +232,7 @@ def level_telemetry(
 
 
 @dataclass(frozen=True)
-class Recording:
+class Recording(Source):
     """A flight folder of real pictures. Single views are spread over it, a track takes `track`
     times as many.
 
@@ -239,21 +240,19 @@ class Recording:
     these frames only.
     """
 
-    name: str
+    folder: str
     std_m: float
     truth: str = "truth.csv"
     of_ground: bool = False
     only: str = ""
     track: int = 5
 
-    def pictures(self) -> str:
-        return ""  # they are there
-
-    def prepare(self, work: Path, base: Localizer, views: int) -> None:
-        """Nothing."""
+    def imagery(self) -> str:
+        return self.folder
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
-        flight, truth = open_flight(DATA / self.name), read_truth(DATA / self.name / self.truth)
+        folder = DATA / self.folder
+        flight, truth = open_flight(folder), read_truth(folder / self.truth)
         flown = [each for each in flight.views if each.frame in truth and self.only in each.frame]
         if tracked:
             flown = flown[: self.track * views]
@@ -266,39 +265,36 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Replay:
-    """A recorded flight of an autopilot, judged after GNSS is off and before any disturbance; the
-    track begins with GNSS. `with_stds`: whether the telemetry states deviations."""
+class Replay(Source):
+    """A recorded flight of an autopilot: a track begins with GNSS. `with_stds`: whether the
+    telemetry states deviations. `phase`: what is judged; `OFF` ends before any disturbance."""
 
-    name: str
+    folder: str
     with_stds: bool
-    std_m: float = 0.0
+    phase: str = OFF
     step: int = 5
 
-    def pictures(self) -> str:
-        return self.name
+    def imagery(self) -> str:
+        return self.folder
 
-    def prepare(self, work: Path, base: Localizer, views: int) -> None:
-        for _ in self.seen(work, base, views, True):
-            pass
+    def pictures(self) -> str:
+        return f"{self.folder}-{self.phase}"
 
     def seen(self, work: Path, base: Localizer, views: int, tracked: bool) -> Iterator[Seen]:
-        recorded, area = Recorded(DATA / "closed_loop" / self.name), Area.demo(work)
+        recorded, area = Recorded(DATA / self.folder), Area.demo(work)
         area.__dict__["localizer"] = base  # the same area; its own map would be built once more
-        autopilot = self.name.partition("_")[0]
-        rule = partial(stated if self.with_stds else plain, autopilot)
-        alone = numbers()
+        autopilot = recorded.folder.name.partition("_")[0]
         aided = [each.number for each in recorded.exposures if each.phase == ON]
-        kept = set(aided[-LEAD:] if tracked else [])
-        for exposure in recorded.exposures:
-            if exposure.phase == OFF:
-                at = next(alone)
-                if at < self.step * views and (tracked or at % self.step == 0):
-                    kept.add(exposure.number)
+        judged = [each.number for each in recorded.exposures if each.phase == self.phase]
+        judged = judged[: self.step * views : 1 if tracked else self.step]
+        led = {*judged, *(aided[-LEAD:] if tracked else ())}
+        if self.phase != OFF:  # all that the track has seen before
+            led = set(range(aided[-LEAD], judged[-1] + 1))
         for exposure, telemetry in recorded.stated():
-            if exposure.number not in kept or telemetry.missing():
+            if exposure.number not in led or telemetry.missing():
                 continue
-            reported = rule(telemetry, exposure.phase == ON)
-            view = recorded.view(area, work / "views", exposure, reported)
+            if self.with_stds:
+                telemetry = stated(autopilot, telemetry, exposure.phase == ON)
+            view = recorded.view(area, work / "views", exposure, telemetry)
             place = exposure.lat_deg, exposure.lon_deg
-            yield Seen(view, place, exposure.agl_m, judged=exposure.phase == OFF)
+            yield Seen(view, place, exposure.agl_m, judged=exposure.phase == self.phase)

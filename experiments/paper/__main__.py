@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks.record import say
 from benchmarks.scenes import DATA
 
-from experiments.paper import curves, dates, field, matchers, page, runs, scenes, tables
+from experiments.paper import curves, dates, field, matchers, runs, scenes, tables
 from experiments.paper.methods import (
     BETWEEN_DATES,
     FIELD_SCENES,
@@ -50,7 +50,7 @@ def main(arguments: list[str]) -> int:
     if options.what == "keep":
         for name in keep(options.out, options.setting):
             say(f"stored: {name}")
-        page.PAGE.write_text(page.page(stored()), encoding="utf-8")
+        tables.PAGE.write_text(tables.page(stored()), encoding="utf-8")
         curves.figure(stored(), curves.FIGURE)
         return 0
     if options.what == "pictures":
@@ -182,36 +182,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--data", type=Path, default=DATA, metavar="DIR", help="optional real imagery")
     add("--jobs", type=int, help="runs at a time (default one per core; 1 in the full setting)")
     add("--dry-run", action="store_true", help="every step once, on two tiles of every scene")
-    add(
-        "--device",
-        default="auto",
-        choices=("auto", "cpu", "cuda"),
-        help="where networks are learnt (default auto: a GPU if there is one)",
-    )
-    add(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="threads that make batches and read imagery (default up to 16 with a GPU, else 2)",
-    )
-    add(
-        "--keep-checkpoints",
-        action="store_true",
-        help="keep checkpoints of finished rows, so that epochs can be added",
-    )
-    add(
-        "--epochs",
-        type=int,
-        metavar="N",
-        help="epochs of networks; added to a training whose checkpoint was kept",
-    )
+    add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="to learn networks")
+    add("--workers", type=int, metavar="N", help="threads that make batches and read imagery")
+    add("--keep-checkpoints", action="store_true", help="so that epochs can be added")
+    add("--epochs", type=int, metavar="N", help="of networks; added to a kept checkpoint")
     add("--past", type=Path, help="an orthophoto of your own, for the map")
     add("--present", type=Path, help="the same ground at another date")
-    add(
-        "--gsd-m",
-        type=float,
-        help="ground resolution for --past (default its own), and of A to D, as further scenes",
-    )
+    add("--gsd-m", type=float, help="ground resolution of --past, or of A to D as further scenes")
     add("--sam", metavar="PATH", help="weights of Segment Anything: adds its rows")
     return parser
 

@@ -8,7 +8,6 @@ imagery stay where they are written: the imagery is not ours.
 import json
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -147,7 +146,7 @@ OURS = Method(DEFAULT, DEFAULT, DEFAULT, registration=True).label
 DIFFERENCE = "Canny minus grey"
 MEASURED = ("alike: grey", "alike: Canny", "SIFT found again")
 HEADER = (
-    *("scene", "dates", "m per pixel", CANNY_EDGES, GREY_LEVELS, DIFFERENCE, *OTHERS),
+    *("scene", CANNY_EDGES, GREY_LEVELS, DIFFERENCE, *OTHERS),
     *("default, anywhere", *MEASURED),
 )
 
@@ -185,11 +184,7 @@ def table(results: Sequence[Result]) -> list[Table]:
 def _row(rows: dict[str, Result], measured: dict[str, float] | None) -> dict[str, str]:
     """A scene, by column: its results by label, and how alike its dates are."""
     first = rows[CANNY_EDGES]
-    row = {"scene": first.scene, "m per pixel": f"{first.trajectory.gsd_m:g}"}
-    stems = [Path(name).stem for name in list(first.plain.get("inputs", {}))[:2]]
-    if stems:
-        start = f"{first.scene.replace('-', '_')}_"
-        row["dates"] = " / ".join(stem.removeprefix(start) for stem in stems)
+    row = {"scene": first.scene}
     row |= {each: _accuracy(rows[each]) + rows[each].star for each in COMPARED if each in rows}
     if GREY_LEVELS in rows:
         apart = difference(first, rows[GREY_LEVELS], "grid")

@@ -237,71 +237,63 @@ class Placed:
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
-    """Each method over all scenes, and scene by scene."""
+    """Each method over all scenes, and within 15 m and not wrong on each."""
     rows = [each for each in results if FIELD in each.plain]
     if not rows:
         return []
+    first = rows[0].plain[FIELD]
     names = list(dict.fromkeys(name for each in rows for name in each.plain[FIELD]))
     flying = [Method(**plain) for each in rows for plain in each.plain["methods"]]
     labels = dict(zip(names, names, strict=True)) | {each.key: each.label for each in flying}
-    return [_summary(rows, labels), _by_scene(rows, labels)]
-
-
-def _summary(rows: Sequence[Result], labels: dict[str, str]) -> Table:
-    lines = []
-    for name, label in labels.items():
-        placed = Placed.of(rows, name)
-        parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
-        own = placed.accepted(CONFIDENT) if name.endswith("registration") else None
-        lines.append(
-            [
-                label,
-                percent(placed.within()),
-                percent(float(placed.right.mean())),
-                percent(placed.trusted()),
-                "-" if own is None else f"{percent(own[0])} / {own[1]}",
-                number(placed.median_m()),
-                number(max(part["cpu_s"] for part in parts)),
-                number(max(part["peak_mb"] for part in parts)),
-                number(sum(part["carried_mb"] for part in parts)),
-            ]
-        )
-    errors = rows[0].plain["errors"]
-    counts = Placed.of(rows, next(iter(labels)))
-    header = (
-        *("method", "15 m", "35 m or 10 px", "accepted at no wrong"),
-        *("accepted / wrong", "median m", "CPU s per view", "peak MB", "carried MB"),
-    )
-    notes = (
-        f"scenes: {', '.join(each.scene for each in rows)}; "
-        f"{len(counts.error_m)} views anywhere, of the later date, and {len(counts.mirrored)} "
-        "mirrored; "
-        f"standard deviations of the reported heading, {errors['yaw_std_deg']:g} deg, the height, "
-        f"{errors['agl_std']:.0%}, and the prior, {errors['prior_std_px']:g} px: the same for all",
-        "views in %; accepted at no wrong: of those correct within 35 m or 10 px, the "
-        "largest fraction that one threshold over all scenes accepts without a wrong one; every "
-        "answer to a mirrored view is wrong; evidence: inliers, Lowe's ratio, or the confidence",
-        f"accepted / wrong: of the correct ones, and number of wrong ones, at a confidence of "
-        f"{CONFIDENT:g}, where a method states one",
-        "CPU s, peak MB: the largest of the scenes' medians and peaks, one core; carried: "
-        "keypoints (descriptors in 16 bits) or maps with their encoders, all scenes",
-    )
-    return Table("The field today: all scenes", header, lines, notes)
-
-
-def _by_scene(rows: Sequence[Result], labels: dict[str, str]) -> Table:
-    lines = []
-    for name, label in labels.items():
-        lines.append([label])
-        for each in rows:
-            placed = Placed.of([each], name)
-            shares = (placed.within(), float(placed.right.mean())) if placed.error_m.size else ()
-            lines[-1].append("/".join(map(percent, shares)) or "-")
-    guess = ["the prior itself"]
+    lines = [_line(rows, *each) for each in labels.items()]
+    guess = ["the prior itself", *"-" * 7]
     for each in rows:
         away = np.array(next(iter(each.plain[FIELD].values()))["prior_m"])
         radii = ACCURACY_M, far_m(each.trajectory.gsd_m)
         guess.append("/".join(percent(float((away <= radius).mean())) for radius in radii))
-    header = ("method", *(each.scene for each in rows))
-    notes = ("fraction of the views within 15 m / within 35 m or 10 px, in %",)
-    return Table("The field today, scene by scene", header, [*lines, guess], notes)
+    confident = [
+        f"{labels[name]}, at a confidence of {CONFIDENT:g}: {percent(right)} % of the correct ones "
+        f"accepted, {wrong} wrong"
+        for name in labels
+        if name.endswith("registration")
+        for right, wrong in [Placed.of(rows, name).accepted(CONFIDENT)]
+    ]
+    errors, counts = rows[0].plain["errors"], Placed.of(rows, next(iter(first)))
+    header = (
+        *("method", "15 m", "35 m or 10 px", "accepted at no wrong", "median m"),
+        *("CPU s per view", "peak MB", "carried MB"),
+        *(each.scene for each in rows),
+    )
+    notes = (
+        f"{len(counts.error_m)} views anywhere, of the later date, and {len(counts.mirrored)} "
+        "mirrored; "
+        f"standard deviations of the reported heading, {errors['yaw_std_deg']:g} deg, the height, "
+        f"{errors['agl_std']:.0%}, and the prior, {errors['prior_std_px']:g} px",
+        "views in %; accepted at no wrong: of those correct within 35 m or 10 px, the "
+        "largest fraction that one threshold over all scenes accepts without a wrong one; every "
+        "answer to a mirrored view is wrong; evidence: inliers, Lowe's ratio, or the confidence",
+        *confident,
+        "CPU s, peak MB: the largest of the scenes' medians and peaks, one core; carried: "
+        "keypoints (descriptors in 16 bits) or maps with their encoders, all scenes",
+        "by scene: within 15 m / within 35 m or 10 px",
+    )
+    return [Table("The field today", header, [*lines, guess], notes)]
+
+
+def _line(rows: Sequence[Result], name: str, label: str) -> list[str]:
+    placed = Placed.of(rows, name)
+    parts = [each.plain[FIELD][name] for each in rows if name in each.plain[FIELD]]
+    cells = [
+        label,
+        percent(placed.within()),
+        percent(float(placed.right.mean())),
+        percent(placed.trusted()),
+        number(placed.median_m()),
+        number(max(part["cpu_s"] for part in parts)),
+        number(max(part["peak_mb"] for part in parts)),
+        number(sum(part["carried_mb"] for part in parts)),
+    ]
+    for each in (Placed.of([row], name) for row in rows):
+        shares = (each.within(), float(each.right.mean())) if each.error_m.size else ()
+        cells.append("/".join(map(percent, shares)) or "-")
+    return cells

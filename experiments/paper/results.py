@@ -199,9 +199,6 @@ def ceiling(stride_m: float) -> float:
     return float((np.hypot(axis[:, None], axis) <= ACCURACY_M).mean())
 
 
-TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
-
-
 def best_words(found: Sequence[Result]) -> list[Result]:
     """All but the worse ones of several vocabularies: "the best performances will be displayed"."""
     words = [each for each in found if each.method.family == "bovw"]

@@ -35,7 +35,6 @@ from experiments.paper.posed import (
     TemplateSurface,
     store,
 )
-from experiments.paper.published import most_views
 from experiments.paper.results import ACCURACY_M, BASELINES, compact
 from experiments.paper.scenes import Scene
 from orthonav.core.cores import usable_cores
@@ -284,7 +283,7 @@ def placements(scene: Scene, localizer: Localizer, count: int) -> Grounds:
     centres = localizer.tiles.centres_en_m
     anywhere = views.places_en_m(centres, count)
     places = {
-        "route": views.along_route(centres, most_views(scene.name)),
+        "route": views.along_route(centres, views.most_views(scene.name)),
         "grid": views.on_grid(anywhere, centres),
         "anywhere": anywhere,
     }

@@ -1,21 +1,19 @@
-"""Tables of one setting from result files alone: the paper's Tables 1 to 3 and Figure 3, costs."""
+"""Tables from result files alone: the paper's Tables 1 to 3 and Figure 3, costs.
+
+`page` is `docs/paper-results.md`: tables of the rows in the repository and of the further
+experiments. The paper's own figures are of other imagery: compare the order.
+"""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import groupby, product
 from pathlib import Path
 
 from benchmarks.record import Table, number
 
-from experiments.paper import curves, dates, field
-from experiments.paper.methods import DEFAULT, STUDIED
-from experiments.paper.published import (
-    LOWE,
-    TRAJECTORIES,
-    published_accuracy,
-    published_criterion,
-    stands_for,
-)
+from experiments.paper import curves, dates, field, words
+from experiments.paper.methods import CANNY, GREY, SAM, SEGMENTS, SETTINGS, STUDIED
 from experiments.paper.results import (
     BASELINES,
     ORDER,
@@ -36,24 +34,64 @@ from experiments.paper.results import (
 from experiments.paper.scenes import PLACEMENTS
 from orthonav.core.records import CONFIDENT
 
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "paper-results.md"
+HEAD = """# Results of the paper's experiments
+
+Made by `python -m experiments.paper keep` from `experiments/paper/rows`, which hold commands and
+versions; do not edit. [The paper's experiments](paper.md) has protocol, scenes and discussion.
+`python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds, rules
+of position, rows above the default and other imagery.
+"""
+OTHER = "other imagery"
+ONLY_IN_REPORTS = "Accepted at", "Rules of position", "Rows above", OTHER
 TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
-SHOWN_RULES = ("product best", "product weighted", "cosine best", "cosine neighbours")
-STEPS = (("heading_deg", "orientation, deg"), ("drop_m", "altitude drop, m"))
+TRAJECTORIES = "A", "B", "C", "D"
+TABLE_2 = {
+    ("bovw", GREY): (50.40, 23.92, 2.67, 1.20),
+    ("triplet", GREY): (16.02, 82.16, 78.60, 54.21),
+    ("triplet", CANNY): (43.91, 67.94, 85.28, 44.58),
+    ("triplet", SAM): (12.42, 30.06, 78.26, 67.47),
+    ("autoencoder", GREY): (86.24, 71.20, 92.00, 50.00),
+    ("autoencoder", CANNY): (88.16, 90.20, 99.67, 88.10),
+    ("autoencoder", SAM): (89.76, 90.40, 98.00, 83.33),
+}
+"""The paper's Table 2: accuracy at 15 m in per cent for A, B, C and D."""
+TABLE_3 = {
+    ("autoencoder", GREY): ((0, 0), (89.5, 72.8), (99.2, 91.3), (82.0, 46.4)),
+    ("autoencoder", CANNY): ((96.0, 12.1), (99.7, 91.0), (98.6, 85.7), (100, 79.7)),
+    ("autoencoder", SAM): ((95.0, 0.2), (96.4, 89.8), (99.3, 98.6), (100, 67.8)),
+}
+"""The paper's Table 3: accuracy and accepted share in per cent at Lowe's ratio 1.13."""
+LOWE = 1.13
+SHOWN_RULES = "product best", "product weighted", "cosine best", "cosine neighbours"
 Cell = Callable[[Result], str]
-Published = Callable[[str, str, str], str]
-"""The paper's figure of a family, an input and a scene."""
+Published = dict[tuple[str, str], tuple[str, ...]]
+"""Cells of the paper for A to D, by family and input."""
 
 
 def report(out: Path, setting: str) -> Path | None:
     """Write `tables.md` beside the result files; None without results."""
-    folder = out / setting
-    results = read(folder)
+    results = read(out / setting)
     if not results:
         return None
-    path = folder / "tables.md"
+    path = out / setting / "tables.md"
     text = "\n".join(table.markdown() for table in tables(results))
     path.write_text(text + "\n", encoding="utf-8")
     return path
+
+
+def page(rows: Sequence[Result]) -> str:
+    """Text of the page: tables of each setting; a note is shown once."""
+    text, noted = [HEAD], set[str]()
+    for name in SETTINGS:
+        found = [row for row in rows if row.plain["setting"]["name"] == name]
+        text += [f"## The {name} setting\n"] if found else []
+        for table in tables(found) if found else ():
+            if not any(part in table.title for part in ONLY_IN_REPORTS):
+                notes = [note for note in table.notes if note not in noted]
+                text.append(replace(table, notes=notes).markdown())
+                noted.update(notes)
+    return "\n".join([*text, words.table().markdown()])
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
@@ -71,7 +109,7 @@ def tables(results: Sequence[Result]) -> list[Table]:
         *above_default(made),
         *rules(made),
         *sensitivity(made),
-        *baselines(results, made),
+        *baselines(results),
         *field.tables(results),
         *costs(made),
         provenance(results),
@@ -85,12 +123,9 @@ def scenes(results: Sequence[Result]) -> list[Table]:
         flown = first.trajectory
         views = "/".join(str(len(first.plain["views"][name])) for name in PLACEMENTS)
         size = [f"{flown.length_m:g} x {flown.band_m:g}", f"{flown.agl_m:g}"]
-        grid = [f"{flown.gsd_m:g}", f"{first.plain['tiles']:,}", f"{flown.stride_m:g}"]
+        grid = [f"{flown.gsd_m:g}", f"{first.plain['tiles']:,}"]
         rows.append([scene, *size, *grid, percent(ceiling(flown.stride_m)), views])
-    header = (
-        *("scene", "area m", "height m", "m per pixel", "tiles", "tile step m"),
-        *("upper bound %", "views"),
-    )
+    header = ("scene", "area m", "height m", "m per pixel", "tiles", "upper bound %", "views")
     notes = (
         "upper bound: accuracy at 15 m, anywhere, of a method that always finds the correct tile; "
         "views: along the route (at most one per tile step), on the grid of tiles, anywhere",
@@ -108,15 +143,15 @@ def accuracy(results: Sequence[Result]) -> list[Table]:
         return _joined(each.plain["chance"].get(name, math.nan) for name in PLACEMENTS)
 
     notes = ("views along the route / on the grid / anywhere", TUNED)
-    title = "Table 2: accuracy at 15 m, %"
-    return _by_scene(title, results, cell, notes, published_accuracy, chance)
+    paper = {key: tuple(f"{value:.1f}" for value in row) for key, row in TABLE_2.items()}
+    return _by_scene("Table 2: accuracy at 15 m, %", results, cell, notes, paper, chance)
 
 
 def criterion(results: Sequence[Result]) -> list[Table]:
     """Table 3: accuracy of the views that the confidence criterion accepts."""
 
     def cell(each: Result) -> str:
-        name, threshold = ("lowe_ratio", LOWE)
+        name, threshold = "lowe_ratio", LOWE
         if each.method.registration:
             name, threshold = "confidence", CONFIDENT
         return _joined(confident(each.right("grid"), each.column("grid", name), threshold))
@@ -127,7 +162,8 @@ def criterion(results: Sequence[Result]) -> list[Table]:
         f"criterion: Lowe's ratio of {LOWE}; orthonav, default: confidence {CONFIDENT:g}",
     )
     found = [each for each in results if each.method.family != "bovw"]
-    return _by_scene("Table 3: with the criterion, %", found, cell, notes, published_criterion)
+    paper = {key: tuple(f"{a:g}/{b:g}" for a, b in row) for key, row in TABLE_3.items()}
+    return _by_scene("Table 3: with the criterion, %", found, cell, notes, paper)
 
 
 def accepted(results: Sequence[Result]) -> list[Table]:
@@ -163,17 +199,17 @@ def _by_scene(
 ) -> list[Table]:
     """A table of the paper's trajectories and one of other imagery: methods by scenes."""
     made: list[Table] = []
-    for papers, what in ((True, "trajectories"), (False, "other imagery")):
+    for papers, what in ((True, "trajectories"), (False, OTHER)):
         found = {s: rows for s, rows in by_scene(results).items() if (s in TRAJECTORIES) == papers}
         if found:
-            rows = _rows(found, cell, paper)
+            rows = _rows(found, cell, paper or {})
             if chance:
                 rows.append(["random tile", *(chance(each[0]) for each in found.values())])
-            made.append(Table(f"{title}: {what}", ("method", *found), rows, () if made else notes))
+            made.append(Table(f"{title}: {what}", ("method", *found), rows, notes))
     return made
 
 
-def _rows(found: dict[str, list[Result]], cell: Cell, paper: Published | None) -> list[list[str]]:
+def _rows(found: dict[str, list[Result]], cell: Cell, paper: Published) -> list[list[str]]:
     """A row of cells for each method, and below it the paper's figures."""
     shown = [each for results in found.values() for each in best_words(results)]
     rows = []
@@ -182,10 +218,12 @@ def _rows(found: dict[str, list[Result]], cell: Cell, paper: Published | None) -
         method = next(iter(placed.values())).method
         cells = {scene: cell(each) + each.star for scene, each in placed.items()}
         rows.append([method.label, *(cells.get(scene, "-") for scene in found)])
-        figures = [paper(method.family, method.input, scene) for scene in found] if paper else []
-        if any(each != "-" for each in figures):
-            known = " (Segment Anything)" if stands_for(method.input) != method.input else ""
-            rows.append([f"- in the paper{known}", *figures])
+        stands_in = method.input in (SEGMENTS, f"{SAM}-tile")
+        figures = paper.get((method.family, SAM if stands_in else method.input))
+        by_name = dict(zip(TRAJECTORIES, figures or (), strict=False))
+        if by_name.keys() & found.keys():
+            known = " (Segment Anything)" if stands_in else ""
+            rows.append([f"- in the paper{known}", *(by_name.get(scene, "-") for scene in found)])
     return rows
 
 
@@ -215,24 +253,27 @@ def rules(results: Sequence[Result]) -> list[Table]:
 
 def sensitivity(results: Sequence[Result]) -> list[Table]:
     """Accuracy at each error of heading and height, on the trajectory that the paper sweeps."""
-    made: list[Table] = []
     swept = [each for each in best_words(results) if each.plain.get("sweep")]
-    for step, title in STEPS if swept else ():
-        found = [each.plain["sweep"][step] for each in swept]
-        counts = [[percent(share(each[value])) for value in found[0]] for each in found]
-        rows = [[each.label, *cells] for each, cells in zip(swept, counts, strict=True)]
-        _, count = next(iter(found[0].values()))
-        notes = (
-            f"{count} views on the grid of {swept[0].scene}; the default searches headings, "
-            "the other methods take the reported one as exact",
-        )
-        header = ("method", *found[0])
-        made.append(Table(f"Figure 3: accuracy at 15 m, %, by {title}", header, rows, notes))
-    return made
+    if not swept:
+        return []
+    turns, drops = (swept[0].plain["sweep"][name] for name in ("heading_deg", "drop_m"))
+    names = [("heading_deg", each) for each in turns] + [("drop_m", each) for each in drops][1:]
+    rows = [
+        [each.label, *(percent(share(each.plain["sweep"][sweep][value])) for sweep, value in names)]
+        for each in swept
+    ]
+    _, count = next(iter(turns.values()))
+    notes = (
+        f"{count} views on the grid of {swept[0].scene}; the default searches headings, the other "
+        "methods take the reported one as exact",
+    )
+    header = ("method", *(f"{value} {'deg' if sweep[0] == 'h' else 'm'}" for sweep, value in names))
+    title = "Figure 3: accuracy at 15 m, %, by orientation and by altitude drop"
+    return [Table(title, header, rows, notes)]
 
 
-def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
-    """Methods that carry the reference images, and orthonav on the same trajectory."""
+def baselines(results: Sequence[Result]) -> list[Table]:
+    """Methods that carry the reference images."""
     found = []
     for tried in (each for each in results if BASELINES in each.plain):
         rows = []
@@ -240,13 +281,8 @@ def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
             grid, anywhere = (plain["views"][placement] for placement in ("grid", "anywhere"))
             cells = [percent(share(grid)), percent(share(anywhere)), str(anywhere[1])]
             rows.append([name, *cells, number(plain["view_ms"])])
-        for each in made:
-            if each.method.family == DEFAULT and each.scene == tried.scene:
-                cells = [percent(each.accuracy(name)) for name in ("grid", "anywhere")]
-                cells.append(str(len(each.plain["views"]["anywhere"])))
-                rows.append([each.label, *cells, number(each.plain["view_ms"])])
         header = ("method", "on grid", "anywhere", "of", "ms per view")
-        notes = ("the baselines carry the orthophoto itself; reported pose, whole map, no prior",)
+        notes = ("they carry the orthophoto itself; reported pose, whole map, no prior",)
         title = f"Related work, {tried.scene}: accuracy at 15 m, %"
         found.append(Table(title, header, rows, notes))
     return found
@@ -273,25 +309,17 @@ def costs(results: Sequence[Result]) -> list[Table]:
 
 
 def provenance(results: Sequence[Result]) -> Table:
-    """Commit, day, command and core minutes of the rows."""
-    made: dict[tuple[str, str, str], list[Result]] = {}
+    """Commit and day of the rows."""
+    made: dict[tuple[str, str], list[str]] = {}
     for each in sorted(results, key=name_of):
         about = each.plain["provenance"]
-        commit = str(about["commit"])[:10] + (", changed" if about["dirty"] else "")
-        key = (str(about["date"])[:10], commit, str(each.plain.get("command", PROGRAM)))
-        made.setdefault(key, []).append(each)
-    rows = []
-    for (day, commit, command), found in sorted(made.items()):
-        minutes = sum(each.plain.get("cpu_minutes", each.plain["minutes"]) for each in found)
-        options = f"`{command.removeprefix(PROGRAM).strip()}`"
-        rows.append([commit, day, number(minutes), options, " ".join(map(name_of, found))])
-    header = ("commit", "date", "core minutes", "options", "rows")
+        commit = str(about["commit"])[:10] + (", with changes" if about["dirty"] else "")
+        made.setdefault((str(about["date"])[:10], commit), []).append(name_of(each))
+    rows = [[commit, day, " ".join(names)] for (day, commit), names in sorted(made.items())]
+    setting = str(results[0].plain["setting"]["name"])
     processors = ", ".join(sorted({str(each.plain["provenance"]["cpu"]) for each in results}))
-    notes = (
-        f"options: of `{PROGRAM}`; processor: {processors}; changed: with files that were not "
-        "committed",
-    )
-    return Table("Measured at", header, rows, notes)
+    notes = (f"`{PROGRAM} --setting {setting}`", f"processor: {processors}")
+    return Table("Measured at", ("commit", "date", "rows"), rows, notes)
 
 
 def above_default(results: Sequence[Result]) -> list[Table]:
@@ -308,7 +336,7 @@ def above_default(results: Sequence[Result]) -> list[Table]:
                 size = "within the noise" if mean <= 2 * error else "significant"
                 count = str(len(each.plain["views"][name]))
                 rows.append([scene, name, count, shares[0], each.label, shares[1], size])
-    if not compared:
+    if not rows:
         return []
     header = ("scene", "views", "of", "default", "method", "accuracy", "difference")
     notes = (

@@ -3,7 +3,7 @@
 Everything is a function of seed, position and date, so any window can be rendered on its own. The
 steps: `network` (roads, settlements, rivers), `parcels` and `plan` (content of each macro-cell,
 with the years of changes), `crops` (appearance at a date), `surface` and `relief` (colour, height,
-shadow), `hills`, `sensor`, and `scene` and `area`, which combine them.
+shadow), and `scene` and `area`, which combine them.
 """
 
 from lab.landscape.area import generate_area, generate_heights

@@ -25,32 +25,24 @@ def main(arguments: Sequence[str]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m lab.landscape", description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
-    parser.add_argument(
-        "--size-m",
-        type=float,
-        nargs=2,
-        default=(2000.0, 2000.0),
-        metavar=("EAST", "NORTH"),
-        help="extent of the area (default 2000 2000)",
-    )
-    parser.add_argument(
-        "--gsd-m", type=float, default=1.0, help="ground resolution, metres per pixel (default 1)"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    add("--size-m", type=float, nargs=2, default=(2000.0, 2000.0), metavar=("EAST", "NORTH"))
+    add("--gsd-m", type=float, default=1.0, help="metres per pixel (default 1)")
+    add(
         "--hills",
         type=float,
         metavar="SLOPE",
         help="also write the terrain dem.tif, hills of this root mean square slope (0.15), "
         "and for each date the surface model *_dsm.tif with its buildings and trees",
     )
-    parser.add_argument(
+    add(
         "--other-light",
         action="store_true",
         help="also write the area under snow and flood, with bare trees, in near infrared, at "
         "night, and by a thermal camera",
     )
-    parser.add_argument("--seed", type=int, default=1, help="seed of the landscape (default 1)")
+    add("--seed", type=int, default=1, help="seed of the landscape (default 1)")
     return parser
 
 

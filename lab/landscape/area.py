@@ -1,7 +1,7 @@
 """Orthophotos and heights of a generated landscape as GeoTIFF files."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from math import ceil, isfinite
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,7 @@ from rasterio.windows import Window
 from tqdm import tqdm
 
 from lab.landscape.epoch import DEFAULT_DATES, Epoch
-from lab.landscape.hills import hills
-from lab.landscape.noise import Float32
+from lab.landscape.noise import Float32, Float64, fractal_grid, key_of
 from lab.landscape.scene import ORIGIN_M, Landscape, check_gsd
 from lab.landscape.window import chunks
 from orthonav.core.errors import AreaError
@@ -28,6 +27,8 @@ PxWindow = tuple[int, int, int, int]
 """Column, row, width and height."""
 TERRAIN_POSTING_M = 5.0
 """Distance of the heights of the generated terrain."""
+HILLS_M, HILLS_GAIN, MEAN_HEIGHT_M = (1700.0, 900.0, 500.0), 0.55, 200.0
+"""Wavelengths of the hills, amplitude of each by that before, and mean height above the sea."""
 
 
 def generate_area(
@@ -148,3 +149,20 @@ def _write(
         windows = list(chunks(*size_px, _WINDOW_PX))
         for window in tqdm(windows, path.name, disable=None, leave=False, delay=2):
             target.write(made(window), window=Window(*window))
+
+
+def hills(seed: int, east_m: Float64, north_m: Float64, slope: float) -> Float32:
+    """Return heights (H, W) of the bare ground on the grid of `north_m` x `east_m`.
+
+    `slope`: root mean square of the gradient.
+    """
+    made = fractal_grid(key_of(seed, "hills"), east_m, north_m, HILLS_M, HILLS_GAIN)
+    return np.asarray(MEAN_HEIGHT_M + made * np.float32(slope / _unit_slope()), np.float32)
+
+
+@cache
+def _unit_slope() -> float:
+    """Root mean square of the gradient of noise of amplitude 1."""
+    at = np.arange(0.0, 40_000.0, 100.0)
+    made = fractal_grid(key_of("hills"), at, at, HILLS_M, HILLS_GAIN)
+    return float(np.sqrt(sum(np.mean(part**2) for part in np.gradient(made, 100.0))))

@@ -1,9 +1,10 @@
 """The landscape: renders any window at any date and resolution."""
 
-from collections import OrderedDict
 from collections.abc import Iterator
+from functools import lru_cache, partial
 from math import ceil
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +12,7 @@ from lab.landscape.crops import appearance_of
 from lab.landscape.epoch import Epoch
 from lab.landscape.looks import Cover, Look, seen
 from lab.landscape.network import Network
-from lab.landscape.noise import Float32
+from lab.landscape.noise import Float32, key_of, noise_grid, white_grid
 from lab.landscape.plan import CellPlan, make_plan, outline_box
 from lab.landscape.relief import (
     lighting,
@@ -21,9 +22,8 @@ from lab.landscape.relief import (
     paint_wood,
     shadow_reach_m,
 )
-from lab.landscape.sensor import develop, expose
 from lab.landscape.surface import label_parcels, paint_lines, paint_parcels
-from lab.landscape.window import Box, PixelWindow, chunks
+from lab.landscape.window import PixelWindow, chunks
 from orthonav.core.errors import AreaError
 
 ORIGIN_M = (652000.0, 6862000.0)
@@ -34,6 +34,10 @@ GSD_RANGE_M = (0.2, 10.0)
 
 _CHUNK_PX = 1024
 _CACHED_CELLS = 96  # enough for one row of chunks
+_SKY = np.array([0.40, 0.43, 0.48], np.float32)  # share of diffuse light, which shadows receive too
+_HAZE_RGB = np.array([196.0, 204.0, 214.0], np.float32)
+_MIDDLE = 120.0
+_FADE = 0.15  # colours are less saturated from the air
 
 
 class Landscape:
@@ -43,9 +47,9 @@ class Landscape:
         if seed < 0:
             raise AreaError(f"the seed of a landscape must not be negative, got {seed}")
         self.seed = seed
-        self._network = Network(seed)
-        self._plans: OrderedDict[tuple[int, int], CellPlan] = OrderedDict()
-        self._boxes: OrderedDict[tuple[int, int], Box] = OrderedDict()
+        self._network = network = Network(seed)
+        self._plan = lru_cache(_CACHED_CELLS)(partial(make_plan, network))
+        self._box = lru_cache(64 * _CACHED_CELLS)(partial(outline_box, network))
 
     def render(
         self,
@@ -112,24 +116,7 @@ class Landscape:
     def _plans_in(self, window: PixelWindow) -> list[CellPlan]:
         """Return the plans of the macro-cells that reach into a window, in a fixed order."""
         cells = self._network.cells_near(window.bounds_m)
-        near = [cell for cell in cells if window.touches(self._box(cell))]
-        plans = [self._plan(cell) for cell in near]
-        while len(self._plans) > max(_CACHED_CELLS, len(near)):
-            self._plans.popitem(last=False)
-        while len(self._boxes) > 64 * _CACHED_CELLS:
-            self._boxes.popitem(last=False)
-        return plans
-
-    def _box(self, cell: tuple[int, int]) -> Box:
-        if cell not in self._boxes:
-            self._boxes[cell] = outline_box(self._network, *cell)
-        return self._boxes[cell]
-
-    def _plan(self, cell: tuple[int, int]) -> CellPlan:
-        if cell not in self._plans:
-            self._plans[cell] = make_plan(self._network, *cell)
-        self._plans.move_to_end(cell)
-        return self._plans[cell]
+        return [self._plan(*cell) for cell in cells if window.touches(self._box(*cell))]
 
 
 def _parts(
@@ -162,3 +149,34 @@ def check_gsd(gsd_m: float) -> None:
     low, high = GSD_RANGE_M
     if not (low <= gsd_m <= high):
         raise AreaError(f"gsd_m must be between {low} and {high} m per pixel, got {gsd_m}")
+
+
+def expose(rgb: NDArray[np.uint8], light: Float32, window: PixelWindow, epoch: Epoch) -> Float32:
+    """Return the picture (H, W, 3) float before noise: colours (H, W, 3) under `light` (H, W)."""
+    out = rgb.astype(np.float32)
+    drift = noise_grid(key_of("drift", epoch.name), window.east_m, window.north_m, 2600.0)
+    gain = np.float32(epoch.exposure) * (1.0 + 0.05 * drift)
+    balance = np.array(epoch.white_balance, np.float32)
+    grey = out.mean(axis=2) * np.float32(_FADE)
+    out *= np.float32(1.0 - _FADE)
+    for channel in range(3):
+        plane = out[..., channel]
+        plane += grey
+        plane *= gain * (_SKY[channel] + (1.0 - _SKY[channel]) * light)
+        plane *= np.float32((1.0 - epoch.haze) * epoch.contrast) * balance[channel]
+        plane += np.float32(
+            epoch.haze * _HAZE_RGB[channel] * epoch.contrast + _MIDDLE * (1.0 - epoch.contrast)
+        )
+    return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.55), np.float32)
+
+
+def develop(picture: Float32, window: PixelWindow, seed: int, epoch: Epoch) -> NDArray[np.uint8]:
+    """Return the 8-bit picture (H, W, 3) with sensor noise, one number per pixel and channel."""
+    out = picture.copy()
+    shared = white_grid(key_of(seed, "noise", epoch.name), window.columns, window.rows)
+    for channel in range(3):
+        own = white_grid(key_of(seed, "noise", epoch.name, channel), window.columns, window.rows)
+        out[..., channel] += np.float32(0.75 * epoch.noise) * shared
+        out[..., channel] += np.float32(0.65 * epoch.noise) * own
+    np.rint(out, out=out)
+    return np.clip(out, 0.0, 255.0).astype(np.uint8)

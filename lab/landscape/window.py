@@ -45,25 +45,14 @@ class PixelWindow:
 
     def part(self, col: int, row: int, width_px: int, height_px: int) -> "PixelWindow":
         """Return the window that starts at pixel (row, col) of this one; it may reach outside."""
-        return PixelWindow(
-            self.first_col + col,
-            self.first_row + row,
-            width_px,
-            height_px,
-            self.gsd_m,
-            self.phase_en_m,
-        )
+        first = self.first_col + col, self.first_row + row
+        return PixelWindow(*first, width_px, height_px, self.gsd_m, self.phase_en_m)
 
     def finer(self, factor: int) -> "PixelWindow":
         """Return the same window with `factor` times as many pixels along each axis."""
-        return PixelWindow(
-            self.first_col * factor,
-            self.first_row * factor,
-            self.width_px * factor,
-            self.height_px * factor,
-            self.gsd_m / factor,
-            self.phase_en_m,
-        )
+        first = self.first_col * factor, self.first_row * factor
+        size = self.width_px * factor, self.height_px * factor
+        return PixelWindow(*first, *size, self.gsd_m / factor, self.phase_en_m)
 
     @property
     def shape(self) -> tuple[int, int]:

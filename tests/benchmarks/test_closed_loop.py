@@ -11,7 +11,6 @@ from benchmarks.closed_loop.physics import (
     increments,
     integrated,
 )
-from benchmarks.closed_loop.replays import plain
 
 PERFECT = Grade(*(0.0,) * 4, 90.0, *(0.0,) * 8)
 
@@ -41,8 +40,8 @@ def test_imu_gives_the_motion_back(kind):
 @pytest.mark.parametrize("kind", VEHICLES)
 @pytest.mark.parametrize("gnss_s", [6.0, 12.0])
 def test_filter_with_exact_instruments_follows(kind, gnss_s):
-    scenario = Scenario("", 12.0, gnss_s=gnss_s, send=None)
-    flown = fly(scenario, None, vehicle=kind, autopilot="px4", seed=2, rule=plain, grade=PERFECT)
+    scenario = Scenario("", 12.0, gnss_s=gnss_s, sends=False)
+    flown = fly(scenario, None, vehicle=kind, autopilot="px4", seed=2, grade=PERFECT)
     off = [each.estimate.position - each.truth.position for each in flown.samples]
     late = slice(-10, None)
     assert np.abs(off[late]).max() < (1.0 if gnss_s == 12.0 else 8.0)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from experiments.paper import dates, published, runs, scenes, words
+from experiments.paper import dates, runs, scenes, words
 from experiments.paper.__main__ import main
 from experiments.paper.methods import FULL, REDUCED, TABLE_1, Method, methods
 from experiments.paper.results import accepted_at, confident
@@ -182,7 +182,7 @@ def test_one_view_per_tile_step_as_many_as_the_paper():
     """B and D are flown in the tile steps of their pixels; C in every third or fourth one."""
     for name in ("B", "D"):
         flown = FULL.trajectory(name)
-        assert round(flown.length_m / flown.stride_m + 0.5) == published.most_views(name)
+        assert round(flown.length_m / flown.stride_m + 0.5) == scenes.most_views(name)
     places = scenes.along_route(CENTRES, 500)
     assert np.array_equal(places[:, 0], np.arange(0, 320, 32))
     assert (places[:, 1] == 64).all()

@@ -22,7 +22,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-NOT_RUN = "<!-- not run -->"
+STEP = re.compile(
+    r"(?P<skip>^<!-- not run -->\n+)?^```bash\n(?P<run>.*?)^```$"
+    r"(?:\n+^```text\n(?P<shown>.*?)^```$)?",
+    re.MULTILINE | re.DOTALL,
+)
+COMMAND = re.compile(r"(?:.*\\\n)*.+")
 ELIDED = "..."
 MARK = "@@ step"
 VERDICTS = (0, 3, 4)
@@ -32,79 +37,31 @@ LIMIT_S = 1800
 
 @dataclass(frozen=True)
 class Step:
-    """A block of commands and the output shown below it.
-
-    `first` and `end` are the lines (from 0) of the shown output; equal, where none is shown.
-    """
+    """A block of commands and the output shown below it, `at` these characters of the page."""
 
     commands: tuple[str, ...]
     shown: tuple[str, ...]
-    first: int
-    end: int
+    at: slice
+    line: int
     is_run: bool
-
-    @property
-    def command(self) -> str:
-        """All commands as one text."""
-        return "\n".join(self.commands)
-
-
-@dataclass(frozen=True)
-class Printed:
-    """Output of a step, stdout and stderr together, and the exit code of its last command."""
-
-    lines: tuple[str, ...]
-    code: int
 
 
 def read_steps(text: str) -> list[Step]:
     """All steps of a page, in order."""
-    lines = text.splitlines()
-    steps: list[Step] = []
-    for begin, end in _blocks(lines, "```bash"):
-        is_run = NOT_RUN not in [line for line in lines[max(0, begin - 3) : begin - 1] if line]
-        first, last = _output_after(lines, end)
-        commands = tuple(_commands(lines[begin:end]))
+    steps = []
+    for found in STEP.finditer(text):
+        line = text.count("\n", 0, found.start("shown" if found["shown"] else "run"))
+        commands = tuple(COMMAND.findall(found["run"]))
         if not commands:
-            raise ValueError(f"line {begin}: a block without a command")
-        steps.append(Step(commands, tuple(lines[first:last]), first, last, is_run))
+            raise ValueError(f"line {line}: a block without a command")
+        shown = tuple((found["shown"] or "").splitlines())
+        steps.append(Step(commands, shown, slice(*found.span("shown")), line, not found["skip"]))
     return steps
 
 
-def _blocks(lines: list[str], fence: str) -> Iterator[tuple[int, int]]:
-    """First line after the opening fence, and the closing fence, of each block."""
-    begin = None
-    for row, line in enumerate(lines):
-        if begin is None and line == fence:
-            begin = row + 1
-        elif line.startswith("```") and begin is not None:
-            yield begin, row
-            begin = None
-
-
-def _output_after(lines: list[str], fence: int) -> tuple[int, int]:
-    """Lines of the `text` block that follows a closing fence, with only blank lines between."""
-    row = fence + 1
-    while row < len(lines) and not lines[row].strip():
-        row += 1
-    if row < len(lines) and lines[row] == "```text":
-        return row + 1, next(at for at in range(row + 1, len(lines)) if lines[at] == "```")
-    return fence, fence
-
-
-def _commands(lines: list[str]) -> Iterator[str]:
-    """Commands, each with the lines it continues on."""
-    command: list[str] = []
-    for line in lines:
-        command.append(line)
-        if not line.endswith("\\"):
-            if "".join(command).strip():
-                yield "\n".join(command)
-            command = []
-
-
-def run_steps(steps: list[Step], folder: Path) -> list[Printed]:
-    """Run steps in a folder as one shell session; raises `RuntimeError` where a command fails."""
+def run_steps(steps: list[Step], folder: Path) -> list[tuple[str, ...]]:
+    """Lines printed by each step, run in a folder as one shell session; raises `RuntimeError` where
+    a command fails."""
     commands = [command for step in steps for command in step.commands]
     script = "\n".join(f"{command}\nprintf '\\n{MARK} %d\\n' $?" for command in commands) + "\n"
     done = subprocess.run(
@@ -121,18 +78,14 @@ def run_steps(steps: list[Step], folder: Path) -> list[Printed]:
     pieces = re.split(rf"\n{MARK} (\d+)\n", "\n" + done.stdout)
     outputs = []
     for command, text, code in zip(commands, pieces[0::2], pieces[1::2], strict=False):
-        outputs.append(Printed(tuple(text.strip("\n").splitlines()), int(code)))
+        outputs.append(text.strip("\n").splitlines())
         allowed = VERDICTS if command.startswith("orthonav check") else (0,)
         if int(code) not in allowed:
             raise RuntimeError(f"'{command}' ended with {code}:\n{text.strip()}")
     if len(outputs) < len(commands):
         raise RuntimeError(f"'{commands[len(outputs)]}' ended the shell")
     ordered = iter(outputs)
-    return [_joined([next(ordered) for _ in step.commands]) for step in steps]
-
-
-def _joined(outputs: list[Printed]) -> Printed:
-    return Printed(tuple(line for each in outputs for line in each.lines), outputs[-1].code)
+    return [tuple(line for _ in step.commands for line in next(ordered)) for step in steps]
 
 
 def _environment() -> dict[str, str]:
@@ -177,23 +130,24 @@ def check_page(page: Path, folder: Path, steps: list[Step] | None = None) -> lis
     _link_checkout(folder)
     wanted = [step for step in steps or read_steps(page.read_text("utf-8")) if step.is_run]
     return [
-        f"{page.name}:{step.first + 1}: '{step.command}' printed\n" + "\n".join(printed.lines)
+        "\n".join((f"{page.name}:{step.line}: '{step.commands[-1]}' printed", *printed))
         for step, printed in zip(wanted, run_steps(wanted, folder), strict=True)
-        if not is_as_shown(step.shown, printed.lines)
+        if not is_as_shown(step.shown, printed)
     ]
 
 
 def update_page(page: Path, folder: Path) -> None:
     """Run a tutorial and write what it printed; what is left out stays left out."""
     _link_checkout(folder)
-    lines = page.read_text("utf-8").splitlines()
-    wanted = [step for step in read_steps(page.read_text("utf-8")) if step.is_run]
+    text = page.read_text("utf-8")
+    wanted = [step for step in read_steps(text) if step.is_run]
     for step, printed in reversed(list(zip(wanted, run_steps(wanted, folder), strict=True))):
-        if any(line.endswith(ELIDED) for line in step.shown):
-            lines[step.first : step.end] = _renewed(step.shown, printed.lines)
-        elif step.shown:
-            lines[step.first : step.end] = printed.lines
-    page.write_text("\n".join(lines) + "\n", "utf-8")
+        if step.shown:
+            in_part = any(line.endswith(ELIDED) for line in step.shown)
+            lines = _renewed(step.shown, printed) if in_part else printed
+            shown = "".join(f"{line}\n" for line in lines)
+            text = text[: step.at.start] + shown + text[step.at.stop :]
+    page.write_text(text, "utf-8")
 
 
 def _renewed(shown: tuple[str, ...], lines: tuple[str, ...]) -> Iterator[str]:

@@ -6,6 +6,15 @@
 The stored map and flight lie in `tests/data/golden_flight` beside `fixes.json`; `--make` makes
 them from a generated area. The same bytes go to every machine: imagery and maps made on two
 machines may differ in the last digits. Exit code 1 where a place is farther off than `LIMITS_M`.
+
+Without AVX-512, and without AVX2:
+
+    NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL" OPENBLAS_CORETYPE=Haswell OPENCV_IPP=avx2
+    OPENCV_CPU_DISABLE=AVX512-SKX GLIBC_TUNABLES=glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW
+    ATEN_CPU_CAPABILITY=avx2 ONEDNN_MAX_CPU_ISA=AVX2
+
+    NPY_DISABLE_CPU_FEATURES="X86_V3 X86_V4 AVX512_ICL" OPENBLAS_CORETYPE=Nehalem
+    ORTHONAV_NO_AVX2=1 OPENCV_CPU_DISABLE=AVX512-SKX,AVX2,FP16,AVX OPENCV_IPP=sse42
 """
 
 import argparse
