@@ -298,7 +298,10 @@ def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
         no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
         return {**dict.fromkeys(KEYS[3:11]), **no_fix}
     values = {
-        **{"status": "fix", "confident": outcome.is_confident, "reason": None, "detail": None},
+        "status": "fix",
+        "confident": outcome.is_confident,
+        "reason": None,
+        "detail": None,
         **{key: _or_none(getattr(outcome, key)) for key in (*KEYS[4:6], *KEYS[7:11])},
         "cov_en_m2": _rows(outcome.cov_en_m2),
     }
@@ -308,8 +311,9 @@ def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
         values |= zip(GROUND_KEYS, (lat, lon, None if cov is None else _rows(cov)), strict=True)
     angles, pose_cov = (outcome.pitch_deg, outcome.roll_deg), outcome.pose_cov
     if pose_cov is not None or any(map(math.isfinite, angles)):
-        known = pose_cov is not None and np.isfinite(pose_cov).all()
-        upper = pose_cov[np.triu_indices(6)].tolist() if pose_cov is not None and known else None
+        upper = None
+        if pose_cov is not None and np.isfinite(pose_cov).all():
+            upper = pose_cov[np.triu_indices(6)].tolist()
         values |= zip(POSE_KEYS, (*map(_or_none, angles), upper), strict=True)
     return values
 

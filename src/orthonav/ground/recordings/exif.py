@@ -155,8 +155,8 @@ def _of_plane(optics: Optics, width_px: int, longer_px: int) -> FocalLength | No
     found = FocalLength(px, 0.03, "focal length and sensor resolution of EXIF")
     px = optics.focal_mm / (optics.plane * unit_mm) * width_px
     other = FocalLength(px, 0.03, "EXIF, with the sensor's width instead of its resolution")
-    is_wide, other_is = (each.field_deg(longer_px) > MAX_FIELD_DEG for each in (found, other))
-    return other if is_wide and not other_is else found
+    wide, other_wide = (each.field_deg(longer_px) > MAX_FIELD_DEG for each in (found, other))
+    return other if wide and not other_wide else found
 
 
 _VALUE = re.compile(

@@ -220,8 +220,8 @@ def files_of_run(path: Path) -> list[Path]:
         return list(found)
     run, (name, number) = run_of(path), name_and_number(path)
     files = sorted(path.parent.glob("*.mcap"), key=name_and_number)
-    places = ((file, *name_and_number(file)) for file in files)
-    later = [file for file, its_name, place in places if its_name == name and place > number]
+    parts = ((file, *name_and_number(file)) for file in files)
+    later = [file for file, its_name, part in parts if its_name == name and part > number]
     return [path, *(file for file in later if run and run_of(file) == run)]
 
 
