@@ -111,6 +111,26 @@ def test_columns_of_angles_that_are_not_read_are_named(images):
 
 
 @pytest.mark.parametrize(
+    "name, text",
+    [
+        (
+            "location.txt",
+            "#name latitude/Y longitude/X height/Z yaw pitch roll SAlt\nA.png 46.5 2.5 9 1 2 3 0\n",
+        ),
+        ("geo.csv", "a.png,46.5,2.5,400\n"),
+    ],
+)
+def test_files_that_name_photographs_and_are_not_read_are_named(tmp_path, caplog, name, text):
+    """Of Mission Planner, and of Pix4D without a header."""
+    photo(tmp_path / "p/a.png", gps=place(46.5, 2.5))
+    (tmp_path / "p/notes.txt").write_text("words of b.png and others")
+    (tmp_path / "p" / name).write_text(text)
+    assert len(list(open_source(tmp_path / "p").views)) == 1
+    assert "not read, for want of a header such as file,yaw" in caplog.text
+    assert name in caplog.text and "notes.txt" not in caplog.text
+
+
+@pytest.mark.parametrize(
     "column, text, seconds",
     [
         ("timestamp", "1714557601500", 1_714_557_601.5),

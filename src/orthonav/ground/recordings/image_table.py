@@ -7,7 +7,7 @@ counts it, where -90 looks straight down; any other is in the convention of orth
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -94,6 +94,15 @@ def is_image_table(path: Path) -> bool:
         return False
     found = _columns([name.strip().strip('"') for name in re.split(r"[,;\t]", _header(path))])
     return "file" in found and len(found) > 1
+
+
+def names_images(path: Path, names: Collection[str]) -> bool:
+    """Whether a text file names some of these images (in lower case)."""
+    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        text = stream.read(64_000).decode("utf-8", errors="replace").lower()
+    return not set(re.split(r"[\s,;\"/\\]+", text)).isdisjoint(names)
 
 
 def _header(path: Path) -> str:

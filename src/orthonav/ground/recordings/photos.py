@@ -23,7 +23,12 @@ from orthonav.core.geo.camera import Camera, attitude_of
 from orthonav.core.records import Telemetry
 from orthonav.core.tilt import ASSUMED, AUTOPILOT, GIMBAL, TiltSource
 from orthonav.ground.recordings.exif import FocalLength, Photo, focal_length, read_photo
-from orthonav.ground.recordings.image_table import ImageTable, is_image_table, read_image_table
+from orthonav.ground.recordings.image_table import (
+    ImageTable,
+    is_image_table,
+    names_images,
+    read_image_table,
+)
 from orthonav.ground.recordings.logs import read_log
 from orthonav.ground.recordings.recording import (
     Recording,
@@ -107,7 +112,7 @@ def chosen_photos(sources: Sequence[Path], options: SourceOptions) -> ChosenPhot
 def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
     """The table that lies in a folder and names some of these photographs below it."""
     names = [path.relative_to(folder).as_posix() for path in photos]
-    found = []
+    file_names, found = {path.name.lower() for path in photos}, []
     for path in sorted(folder.iterdir()):
         if is_image_table(path):
             table = read_image_table(path)
@@ -115,6 +120,8 @@ def image_table_in(folder: Path, photos: Sequence[Path]) -> ImageTable | None:
                 found.append(table)
             else:
                 log.warning("table that names none of the photographs is not used: %s", path)
+        elif names_images(path, file_names):
+            log.warning("not read, for want of a header such as file,yaw,pitch,roll,agl: %s", path)
     if len(found) > 1:
         several = ", ".join(table.path.name for table in found[:5])
         raise FlightError(
