@@ -182,7 +182,7 @@ def test_lines_are_picked_by_name(tmp_path):
     with pytest.raises(RouteError, match=r"0 lines are named 'z'; give .*: 1 \(no name\), 2 'x"):
         read_route(Path(f"{path}#z"))
     assert read_route(Path(f"{path}#1")).waypoints == WAYPOINTS
-    assert read_route(Path(f"{path}#2")).waypoints[0] == (9, 9)
+    assert read_route(Path(f"{path}#02")).waypoints[0] == (9, 9)
     for number in ("0", "3", "-1", "1.0"):
         with pytest.raises(RouteError, match=f"0 lines are named '{number}'"):
             read_route(Path(f"{path}#{number}"))
