@@ -99,6 +99,7 @@ def test_rows_of_an_own_table_replace_those_of_the_same_name(tmp_path):
             (f'[a]\nprotocol = "wms"\nurl = "https://a/"\n{line}', words)
             for line, words in (
                 ("url = 1", "cannot be used"),
+                ("gsd = 1", "unexpected keyword argument 'gsd'"),
                 ("style = 1", "a: style must be a text, got 1"),
                 ('gsd_m = "fine"', "a: gsd_m must be a number above 0, got 'fine'"),
                 ("max_zoom = true", "max_zoom must be a whole number from 1, got True"),

@@ -159,7 +159,7 @@ def test_lines_are_picked_by_name(read):
     for selected, message in refused.items():
         with pytest.raises(RouteError, match=message):
             read(both, f"a.geojson{selected}")
-    for selected, first in (("#x#/y", (9, 9)), ("#1", WAYPOINTS[0]), ("#2", (9, 9))):
+    for selected, first in (("#x#/y", (9, 9)), ("#1", WAYPOINTS[0]), ("#02", (9, 9))):
         assert read(both, f"a.geojson{selected}").waypoints[0] == first
     both["features"][0]["properties"] = {"name": "2"}  # a name comes before a number
     assert read(both, "a.geojson#2").waypoints == WAYPOINTS

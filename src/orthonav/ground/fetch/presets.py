@@ -243,9 +243,11 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
 
 def _require_kinds(where: str, values: dict[str, Any]) -> None:
     """Raise `ValueError` for a value of a table that its field cannot have."""
+    classes = Preset, PresetLayer, ImageryOptions
+    known = {"years", *(each.name for cls in classes for each in fields(cls))}
     for name, value in values.items():
         fits, expected = _KINDS.get(name, (lambda x: isinstance(x, str), "a text"))
-        if not fits(value):
+        if name in known and not fits(value):
             raise ValueError(f"{where}: {name} must be {expected}, got {value!r}")
 
 

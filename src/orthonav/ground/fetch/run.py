@@ -183,9 +183,11 @@ def holds_heights(path: Path) -> bool:
 def fetch_heights(
     imagery: FetchRequest, kind: str, spec: SourceSpec, progress: Progress = no_progress
 ) -> tuple[Path, FetchResult]:
-    """Fetch heights of a source beside imagery of another, and the file; `kind` as in `BESIDE`.
+    """The file of heights of a source, fetched beside imagery of another, and the result; `kind` as
+    in `BESIDE`.
 
-    Raises as `fetch`, and `OutputError` where another's file has that name."""
+    Raises as `fetch`, and `OutputError` where a file that was not fetched has that name.
+    """
     end, beyond_m = BESIDE[kind]
     out = imagery.out.with_name(f"{imagery.out.stem}_{end}{imagery.out.suffix}")
     if out.exists():

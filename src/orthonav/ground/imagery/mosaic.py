@@ -394,22 +394,23 @@ class SheetRaster:
         out = np.zeros((*shape, colours), np.uint8)
         valid = np.zeros(shape, np.bool_)
         weight, total = np.zeros(shape, np.float32), np.zeros((*shape, colours), np.float32)
-        for lattice, overlap in self._parts(window):
-            rows, cols = overlap.toslices()
-            part = np.s_[
-                rows.start - off[0] : rows.stop - off[0], cols.start - off[1] : cols.stop - off[1]
-            ]
-            if valid[part].all():
-                continue
-            with quiet(), rasterio.Env(**GDAL_OPTIONS, GDAL_NUM_THREADS=str(self._threads)):
+        with quiet(), rasterio.Env(**GDAL_OPTIONS, GDAL_NUM_THREADS=str(self._threads)):
+            for lattice, overlap in self._parts(window):
+                rows, cols = overlap.toslices()
+                part = np.s_[
+                    rows.start - off[0] : rows.stop - off[0],
+                    cols.start - off[1] : cols.stop - off[1],
+                ]
+                if valid[part].all():
+                    continue
                 values, mask = self._warped(lattice, overlap, colours)
-            new = (mask >= WHOLLY_VALID) & ~valid[part]
-            np.copyto(out[part], values, where=new[..., None])
-            valid[part] |= new
-            partly = np.where(valid[part], 0, mask).astype(np.float32)
-            if partly.any():
-                weight[part] += partly
-                total[part] += values * partly[..., None]
+                new = (mask >= WHOLLY_VALID) & ~valid[part]
+                np.copyto(out[part], values, where=new[..., None])
+                valid[part] |= new
+                partly = np.where(valid[part], 0, mask).astype(np.float32)
+                if partly.any():
+                    weight[part] += partly
+                    total[part] += values * partly[..., None]
         # Covered only together, as along a seam: the mean.
         closed = (weight >= WHOLLY_VALID) & ~valid
         out[closed] = np.rint(total[closed] / weight[closed][:, None])

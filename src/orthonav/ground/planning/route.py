@@ -280,7 +280,7 @@ def read_route(path: Path) -> Route:
 def _chosen(found: list[Route], name: str) -> Route:
     """The line of that name, else of that number, from 1; without a name the only one."""
     fitting = [route for route in found if name in ("", route.name)]
-    if not fitting and re.fullmatch(r"[1-9][0-9]{,8}", name):
+    if not fitting and re.fullmatch(r"0*[1-9][0-9]{,8}", name):
         fitting = found[int(name) - 1 : int(name)]
     if len(fitting) == 1:
         return fitting[0]
