@@ -180,7 +180,7 @@ class Receiver:
 
     def left_m(self, span_s: float) -> float:
         """Distance by which positions left the integrated velocity within `span_s`; NaN where a
-        velocity or the begin of that time is missing."""
+        velocity or the beginning of that time is missing."""
         points = self._points
         if not points or points[0].time_s > points[-1].time_s - span_s:
             return math.nan
