@@ -425,7 +425,7 @@ class GnssMonitor:
         crept_m = MULTIPATH_M + FAULT_SIGMAS * math.sqrt(reference.variance_m2(value.design))
         for off, most_m in ((_residual(recent, others), far_m), (crept, crept_m)):
             east, north = off.tolist()
-            if math.hypot(east, north) > most_m:
+            if not math.hypot(east, north) <= most_m:  # NaN too
                 return Finding(Fault.OFFSET, self._window[0].time_s, (east, north))
         return None
 
