@@ -180,7 +180,7 @@ class Receiver:
 
     def left_m(self, span_s: float) -> float:
         """Distance by which positions left the integrated velocity within `span_s`; NaN where a
-        velocity or the begin of that time is missing."""
+        velocity or the beginning of that time is missing."""
         points = self._points
         if not points or points[0].time_s > points[-1].time_s - span_s:
             return math.nan
@@ -425,7 +425,7 @@ class GnssMonitor:
         crept_m = MULTIPATH_M + FAULT_SIGMAS * math.sqrt(reference.variance_m2(value.design))
         for off, most_m in ((_residual(recent, others), far_m), (crept, crept_m)):
             east, north = off.tolist()
-            if math.hypot(east, north) > most_m:
+            if not math.hypot(east, north) <= most_m:  # NaN too
                 return Finding(Fault.OFFSET, self._window[0].time_s, (east, north))
         return None
 

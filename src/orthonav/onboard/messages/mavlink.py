@@ -45,8 +45,8 @@ AUTOPILOT = Target()
 
 @dataclass(frozen=True)
 class Signing:
-    """Key and state of MAVLink 2 message signing. `timestamp_10us`, since 2015-01-01, must never
-    decrease for a link and a key; it grows by one with every message."""
+    """Key and state of MAVLink 2 message signing. `timestamp_10us`, since 2015-01-01, must
+    increase with every message of a key, also after a restart."""
 
     secret_key: bytes = field(repr=False)
     timestamp_10us: int
