@@ -10,7 +10,7 @@ Height, attitude and vertical velocity of messages in the autopilot's local fram
 
 import math
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, IntFlag
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,19 @@ MAX_TEXT = 50
 """Characters of one STATUSTEXT."""
 LEAP_S, LEAP_UNIX_S = 18, 1_483_228_800
 """GPS time minus UTC, and since when: a new leap second (IERS Bulletin C) changes both."""
+
+
+class _Ignore(IntFlag):
+    """GPS_INPUT_IGNORE_FLAGS (common.xml)."""
+
+    ALT = 1
+    HDOP = 2
+    VDOP = 4
+    VEL_HORIZ = 8
+    VEL_VERT = 16
+    SPEED_ACCURACY = 32
+    HORIZ_ACCURACY = 64
+    VERT_ACCURACY = 128
 
 
 @dataclass(frozen=True)
@@ -145,18 +158,18 @@ def gps_input(estimate: NavigationEstimate, *, gps_id: int = 0) -> Message:
     if estimate.vel_cov_en is not None:
         speed_std_mps = error_ellipse(estimate.vel_cov_en)[0]
     alt_known, moves = math.isfinite(estimate.alt_amsl_m), all(map(math.isfinite, east_north))
-    known = {  # by the bit of GPS_INPUT_IGNORE_FLAGS (common.xml) that marks it as not known
-        1: alt_known,
-        2 | 4 | 16: False,  # dilutions of precision, vertical velocity
-        8: moves,
-        32: moves and math.isfinite(speed_std_mps),
-        64: True,  # horizontal accuracy
-        128: alt_known and math.isfinite(alt_std_m),
+    known = {
+        _Ignore.ALT: alt_known,
+        _Ignore.HDOP | _Ignore.VDOP | _Ignore.VEL_VERT: False,
+        _Ignore.VEL_HORIZ: moves,
+        _Ignore.SPEED_ACCURACY: moves and math.isfinite(speed_std_mps),
+        _Ignore.HORIZ_ACCURACY: True,
+        _Ignore.VERT_ACCURACY: alt_known and math.isfinite(alt_std_m),
     }
     flags = sum(bits for bits, is_known in known.items() if not (confident and is_known))
     week, week_ms = gps_time(estimate.stamp_ns)
 
-    def unless(bit: int, value: float) -> float:
+    def unless(bit: _Ignore, value: float) -> float:
         return 0.0 if flags & bit else value
 
     return _made(
@@ -169,15 +182,15 @@ def gps_input(estimate: NavigationEstimate, *, gps_id: int = 0) -> Message:
         fix_type=3 if confident else 1,
         lat=deg_e7(estimate.lat_deg) if confident else 0,
         lon=deg_e7(estimate.lon_deg) if confident else 0,
-        alt=unless(1, estimate.alt_amsl_m),
+        alt=unless(_Ignore.ALT, estimate.alt_amsl_m),
         hdop=65535.0,
         vdop=65535.0,
-        vn=unless(8, east_north[1]),
-        ve=unless(8, east_north[0]),
+        vn=unless(_Ignore.VEL_HORIZ, east_north[1]),
+        ve=unless(_Ignore.VEL_HORIZ, east_north[0]),
         vd=0.0,
-        speed_accuracy=unless(32, speed_std_mps),
-        horiz_accuracy=unless(64, estimate.horizontal_std_m()),
-        vert_accuracy=unless(128, alt_std_m),
+        speed_accuracy=unless(_Ignore.SPEED_ACCURACY, speed_std_mps),
+        horiz_accuracy=unless(_Ignore.HORIZ_ACCURACY, estimate.horizontal_std_m()),
+        vert_accuracy=unless(_Ignore.VERT_ACCURACY, alt_std_m),
         satellites_visible=0,
         yaw=0,  # the camera need not point forward
     )
