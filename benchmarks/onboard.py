@@ -249,12 +249,15 @@ def flying(arguments: Sequence[str], errors: Path) -> Iterator[subprocess.Popen[
         process.wait(10)
 
 
-def used(pid: int) -> tuple[float, float]:
-    """Processor time (s) and largest resident memory (MB) of a process."""
+def used(pid: int) -> tuple[float, float, float]:
+    """Processor time (s), resident memory and its largest (MB) of a process."""
     stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    peak_kb = Path(f"/proc/{pid}/status").read_text().partition("VmHWM:")[2].split()[0]
+    status = Path(f"/proc/{pid}/status").read_text()
+    rss_kb, peak_kb = (
+        int(status.partition(f"{name}:")[2].split()[0]) for name in ("VmRSS", "VmHWM")
+    )
     cpu_s = (int(stat[11]) + int(stat[12])) / os.sysconf("SC_CLK_TCK")
-    return cpu_s, int(peak_kb) * 1024 / 1e6
+    return cpu_s, rss_kb * 1024 / 1e6, peak_kb * 1024 / 1e6
 
 
 @dataclass(frozen=True)
@@ -312,13 +315,15 @@ def _flights(scene: Scene) -> Table:
         rows.append(_flown(scene, rate_hz))
         say("  ".join(rows[-1]))
     header = (
-        *("camera", "views", "sent", "p50 ms", "p95 ms", "p99 ms", "max ms"),
-        *("of the core", "peak MB", "error p50 m", "p95 m", "max m"),
+        *("camera", "views", "sent", "dropped", "p50 ms", "p95 ms", "p99 ms", "max ms"),
+        *("of the core", "peak MB", "MB per hour", "error p50 m", "p95 m", "max m"),
     )
     notes = (
         f"`orthonav fly` on one core, {CAMERA.width_px} x {CAMERA.height_px} px JPEG, 4 km2 map at "
         "1 m, no prior, heading known; log with thumbnails, state and lines written",
-        "ms: from exposure to the arrival of GLOBAL_POSITION_SENSOR at a process on the other core",
+        "ms: from exposure to the arrival of GLOBAL_POSITION_SENSOR at a process on the other "
+        "core; dropped: a newer image was there or it was too old; MB per hour: growth of the "
+        "resident memory after the first fifth",
     )
     return Table("From exposure to message", header, rows, notes)
 
@@ -338,11 +343,13 @@ def _flown(scene: Scene, rate_hz: int) -> list[str]:
                 process.wait(1.0)
     latency_ms, error_m = autopilot.arrivals()
     begun, ended = samples[len(samples) // 5], samples[-1]
-    busy = (ended[1] - begun[1]) / (ended[0] - begun[0])
+    wall_s, cpu_s, grown_mb = (ended[index] - begun[index] for index in range(3))
+    lines = scene.scratch / f"{name}-lines.jsonl"
+    located = lines.read_text("ascii").count('"age_ms"') if lines.is_file() else 0
     return [
-        *(f"{rate_hz} Hz", str(views), str(latency_ms.size)),
+        *(f"{rate_hz} Hz", str(views), str(latency_ms.size), str(views - located)),
         *quantiles(latency_ms, 50, 95, 99, 100),
-        *(f"{busy:.0%}", number(ended[2])),
+        *(f"{cpu_s / wall_s:.0%}", number(ended[3]), f"{grown_mb / wall_s * 3600:+.1f}"),
         *quantiles(error_m, 50, 95, 100),
     ]
 

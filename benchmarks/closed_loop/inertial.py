@@ -55,6 +55,7 @@ class Tuning:
     gnss_m: float = 0.5
     gnss_mps: float = 0.3
     least_m: float = 0.9
+    least_mps: float = 0.3
     gravity: float | None = 0.316
     reset_s: float = 5.0
     gate: float = 3.0

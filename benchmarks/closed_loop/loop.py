@@ -81,7 +81,8 @@ Array = NDArray[np.float64]
 class Scenario:
     """What happens. GNSS is on for `gnss_s`, then off until `seconds`.
 
-    `sends`: whether the filter gets positions of orthonav, else no views are taken. `fault_s`,
+    `sends`: whether the filter gets positions of orthonav, else no views are taken; `velocity`:
+    and the velocity of its track, as GPS_INPUT and ODOMETRY have it. `fault_s`,
     `lasts_s`: when the pictures are those of the fault that the `name` says.
     """
 
@@ -89,6 +90,7 @@ class Scenario:
     seconds: float
     gnss_s: float = 60.0
     sends: bool = True
+    velocity: bool = False
     fault_s: float = math.inf
     lasts_s: float = 0.0
 
@@ -230,14 +232,21 @@ class Sight:
 
     def message(
         self, admitted: NavigationEstimate, seen: Motion, time_s: float, now: Motion
-    ) -> tuple[Array, float]:
+    ) -> tuple[tuple[Array, float], tuple[Array, float] | None]:
         """Position (2,) north and east of an estimate with the errors that it had when `seen`, at
-        another moment, because the errors of overlapping views are alike, and as stated, m."""
+        another moment, because the errors of overlapping views are alike, and as stated, m; and
+        its velocity likewise, m/s, if it has one and the scenario sends it."""
         place = self.frame.en_from_latlon(admitted.lat_deg, admitted.lon_deg)
         exposed_ns = round(time_s * 1e9)
         std_m = self._covariance.prepare("", admitted, exposed_ns).horizontal_std_m()
         self._covariance.sent("", exposed_ns)
-        return place[::-1] + (now.position - seen.position)[:2], std_m
+        placed = place[::-1] + (now.position - seen.position)[:2], std_m
+        known = admitted.vel_en_mps is not None and admitted.vel_cov_en is not None
+        if not (known and self._scenario.velocity):
+            return placed, None
+        velocity = np.array(admitted.vel_en_mps)[::-1] + (now.velocity - seen.velocity)[:2]
+        largest = float(np.linalg.eigvalsh(np.array(admitted.vel_cov_en))[-1])
+        return placed, (velocity, math.sqrt(largest))
 
     def _telemetry(self, time_s: float, estimate: Motion, gnss: bool) -> Telemetry:
         yaw, pitch, roll = np.degrees(euler_rad(estimate.rotation)).tolist()
@@ -324,10 +333,9 @@ def fly(
                 flown.views.append(located)
                 held = None if admitted is None else (admitted, truth)
         if sight is not None and held is not None and step % MESSAGE_STEPS == 0:
-            place_ne, std_m = sight.message(*held, time_s, aircraft.motion)
-            if not gnss:  # fused at its exposure, which the filter has yet to reach
-                std_m = max(std_m, estimator.tuning.least_m)
-                estimator.measure(partial(estimator.fuse_position, place_ne, std_m))
+            message = sight.message(*held, time_s, aircraft.motion)
+            if not gnss:
+                _give(estimator, *message)
         _sense(step, estimator, instruments, aircraft, wind, sight, gnss=gnss)
         before = aircraft.motion
         aircraft.step(wind.next())
@@ -372,6 +380,18 @@ def _started(
     return made
 
 
+def _give(
+    estimator: Filter, placed: tuple[Array, float], moving: tuple[Array, float] | None
+) -> None:
+    """Give the filter a message, fused at its exposure, which the filter has yet to reach."""
+    (place_ne, std_m), tuning = placed, estimator.tuning
+    estimator.measure(partial(estimator.fuse_position, place_ne, max(std_m, tuning.least_m)))
+    if moving is not None:
+        velocity, std_mps = moving
+        std_mps = max(std_mps, tuning.least_mps)
+        estimator.measure(partial(estimator.fuse_velocity, velocity, std_mps))
+
+
 def _sense(
     step: int,
     estimator: Filter,
@@ -406,14 +426,14 @@ def spans(flown: Flown) -> tuple[Sequence[Sample], Sequence[Located]]:
     """Samples and views that are judged: without GNSS, `SETTLING_S` after it was cut or, where it
     never was on, after the start."""
     gnss_s = flown.scenario.gnss_s
-    begin_s = gnss_s + SETTLING_S[gnss_s > 0]
+    begin_s = 30.0 if gnss_s >= flown.scenario.seconds else gnss_s + SETTLING_S[gnss_s > 0]
     samples = [each for each in flown.samples if each.time_s >= begin_s]
     return samples, [each for each in flown.views if each.time_s >= begin_s]
 
 
 GNSS_S, BEFORE_S, AFTER_S = 60.0, 60.0, 60.0
 """With GNSS, then without it before a disturbance, and after it."""
-SCENARIOS = ("nothing", "fixes", "start", "shifted", "mirrored", "frozen")
+SCENARIOS = ("gnss", "nothing", "fixes", "start", "shifted", "mirrored", "frozen")
 LASTS_S = {"shifted": 40.0, "mirrored": 40.0, "frozen": 10.0}
 HEADER = (
     *("scenario", "position median m", "95 %", "max", "position NEES"),
@@ -422,13 +442,16 @@ HEADER = (
 
 
 def scenario(name: str, minutes: float) -> Scenario:
-    """A scenario of `SCENARIOS`; `minutes` without GNSS, unless it has a disturbance."""
+    """A scenario of `SCENARIOS`; `minutes` without GNSS, unless it has a disturbance or `gnss`."""
+    if name == "gnss":
+        return Scenario(name, GNSS_S + 60 * minutes, gnss_s=GNSS_S + 60 * minutes, sends=False)
     if name == "start":
         return Scenario(name, min(60 * minutes, 240.0), gnss_s=0.0)
     if name not in LASTS_S:
         return Scenario(name, GNSS_S + 60 * minutes, GNSS_S, sends=name == "fixes")
     begin_s, lasts_s = GNSS_S + BEFORE_S, LASTS_S[name]
-    return Scenario(name, begin_s + lasts_s + AFTER_S, GNSS_S, True, begin_s, lasts_s)
+    seconds = begin_s + lasts_s + AFTER_S
+    return Scenario(name, seconds, GNSS_S, fault_s=begin_s, lasts_s=lasts_s)
 
 
 def cells(flown: Flown) -> list[str]:
@@ -454,6 +477,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicle", choices=VEHICLES, default="plane")
     parser.add_argument("--filter", choices=FILTERS, default="px4", help="instruments and tuning")
     parser.add_argument("--only", nargs="+", choices=SCENARIOS, default=SCENARIOS)
+    parser.add_argument("--velocity", action="store_true", help="the filter gets it too")
     parser.add_argument("--minutes", type=float, default=10.0, help="without GNSS (default 10)")
     parser.add_argument("--seed", type=int, nargs="+", default=[1], help="one flight each")
 
@@ -464,7 +488,8 @@ def measure(options: argparse.Namespace) -> Section:
     minutes = 0.5 if options.quick else options.minutes
     for seed, name in product(options.seed, options.only):
         aircraft = {"vehicle": options.vehicle, "autopilot": options.filter}
-        flown = fly(scenario(name, minutes), area, seed=seed, **aircraft)
+        flight = replace(scenario(name, minutes), velocity=options.velocity)
+        flown = fly(flight, area, seed=seed, **aircraft)
         rows.append(cells(flown))
         if len(options.seed) > 1:
             rows[-1][0] += f", seed {seed}"
@@ -474,5 +499,7 @@ def measure(options: argparse.Namespace) -> Section:
         f"{MAP_STD_M:g} m per axis; position: errors of the autopilot; false: sent, and "
         f"more than {FAR_M:g} m and {FAR_STD:g} stated deviations off",
     )
-    title = f"{options.vehicle}, filter like {options.filter}'s"
+    title = (
+        f"{options.vehicle}, filter like {options.filter}'s" + ", velocity too" * options.velocity
+    )
     return Section("Flights in the loop", [Table(title, HEADER, rows, notes)])

@@ -5,6 +5,7 @@ experiments. The paper's own figures are of other imagery: compare the order.
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import groupby, product
@@ -17,7 +18,6 @@ from experiments.paper.methods import CANNY, GREY, SAM, SEGMENTS, SETTINGS, STUD
 from experiments.paper.results import (
     BASELINES,
     ORDER,
-    PROGRAM,
     Result,
     accepted_at,
     best_words,
@@ -25,7 +25,6 @@ from experiments.paper.results import (
     ceiling,
     confident,
     difference,
-    name_of,
     of_methods,
     percent,
     read,
@@ -37,8 +36,8 @@ from orthonav.core.records import CONFIDENT
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "paper-results.md"
 HEAD = """# Results of the paper's experiments
 
-Made by `python -m experiments.paper keep` from `experiments/paper/rows`, which hold commands and
-versions; do not edit. [The paper's experiments](paper.md) has protocol, scenes and discussion.
+Made by `python -m experiments.paper keep` from `experiments/paper/rows`, files with commit, command
+and versions of a row; do not edit. [The paper's experiments](paper.md) has protocol and discussion.
 `python -m experiments.paper report --out experiments/paper/rows` adds tables of thresholds, rules
 of position, rows above the default and other imagery.
 """
@@ -309,17 +308,15 @@ def costs(results: Sequence[Result]) -> list[Table]:
 
 
 def provenance(results: Sequence[Result]) -> Table:
-    """Commit and day of the rows."""
-    made: dict[tuple[str, str], list[str]] = {}
-    for each in sorted(results, key=name_of):
+    """Commit and day of the rows, and how many of them."""
+    made: Counter[tuple[str, str]] = Counter()
+    for each in results:
         about = each.plain["provenance"]
         commit = str(about["commit"])[:10] + (", with changes" if about["dirty"] else "")
-        made.setdefault((str(about["date"])[:10], commit), []).append(name_of(each))
-    rows = [[commit, day, " ".join(names)] for (day, commit), names in sorted(made.items())]
-    setting = str(results[0].plain["setting"]["name"])
+        made[str(about["date"])[:10], commit] += 1
+    rows = [[commit, day, str(count)] for (day, commit), count in sorted(made.items())]
     processors = ", ".join(sorted({str(each.plain["provenance"]["cpu"]) for each in results}))
-    notes = (f"`{PROGRAM} --setting {setting}`", f"processor: {processors}")
-    return Table("Measured at", ("commit", "date", "rows"), rows, notes)
+    return Table("Measured at", ("commit", "date", "rows"), rows, (f"processor: {processors}",))
 
 
 def above_default(results: Sequence[Result]) -> list[Table]:
