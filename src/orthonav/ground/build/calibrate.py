@@ -426,7 +426,7 @@ def _registration_calibration(
 
 
 def _chances(negatives: Sequence[Scores]) -> Chances:
-    """A view judged and finished at one level has the strength of one score, not of two."""
+    """A view whose mid and final level are one has the strength of one score, not of two."""
     mid = _median(negatives, "mid_score")
     both = [each for each in negatives if math.isfinite(each.detail_ratio)]
     total = mid + DEFAULT_CHANCES.total - DEFAULT_CHANCES.mid
