@@ -372,7 +372,7 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
 
 
 def _chances(negatives: Sequence[Scores]) -> Chances:
-    """A view judged and finished at one level has the strength of one score, not of two."""
+    """A view whose mid and final level are one has the strength of one score, not of two."""
     if len(negatives) < CALIBRATION.min_negatives:
         return DEFAULT_CHANCES
     mid = _median(negatives, "mid_score")
