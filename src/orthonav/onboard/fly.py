@@ -280,9 +280,11 @@ class Runner:
 
     def _located(self, taken: _Taken) -> ViewResult:
         image, heights = taken.image, self.options.heights
+        if self._start and taken.problem is not None:  # there is no track to predict
+            return self._refuse(image, taken.problem, taken.vehicle)
         known = self._above_ground(taken.telemetry)
         if self._start and isinstance(known, Telemetry):
-            known = self._above_ground(self._from_start(taken.telemetry))
+            known = self._corrected(self._from_start(taken.telemetry))
         if isinstance(known, NoFix):
             return self._refuse(image, known, taken.vehicle)
         self._track_monitor.moved(known)
@@ -315,6 +317,7 @@ class Runner:
         return result
 
     def _from_start(self, telemetry: Telemetry) -> Telemetry:
+        """With the start position, which is given once: the track must get it."""
         prior, self._start = self.options.start(), False
         self._track_monitor.started(prior, telemetry.time_ns)
         return replace(telemetry, prior=prior or telemetry.prior)
@@ -416,15 +419,22 @@ class Runner:
         vehicle = self._link.state_at(image.exposed_ns)
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
 
-    def _above_ground(self, telemetry: Telemetry) -> Telemetry | NoFix:
-        """With the height above ground, as far as it suffices to locate a view."""
-        heights, least_m = self.options.heights, self.options.min_agl_m
+    def _corrected(self, telemetry: Telemetry) -> Telemetry | NoFix:
+        """With the height above ground; `NoFix` where the terrain cannot be read."""
+        heights = self.options.heights
         try:
-            known = telemetry if heights is None else heights.corrected(telemetry)
+            return telemetry if heights is None else heights.corrected(telemetry)
         except MapChangedError as error:
             return self._counted("internal_error", NoFix(MAP_CHANGED, str(error)))
         except MapFileError as error:  # a crafted part of the map
             return self._counted("internal_error", NoFix(MAP_DAMAGED, str(error)))
+
+    def _above_ground(self, telemetry: Telemetry) -> Telemetry | NoFix:
+        """With the height above ground, where a view can be located by it."""
+        heights, least_m = self.options.heights, self.options.min_agl_m
+        known = self._corrected(telemetry)
+        if isinstance(known, NoFix):
+            return known
         missing = [
             name for name in known.missing() if name != "yaw_deg" or self.options.heading_known
         ]

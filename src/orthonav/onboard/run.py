@@ -127,11 +127,13 @@ def _passed(
     locator: Locator, view: UnusableView, failed: Callable[[], None] = lambda: None
 ) -> Fix | NoFix:
     try:
-        return finite(locator.passed(view.telemetry, view.reason))
+        outcome = finite(locator.passed(view.telemetry, view.reason))
     except Exception as error:
         log.exception("view could not be skipped")
+        outcome = _internal(error)
+    if isinstance(outcome, NoFix) and outcome.reason == INTERNAL_ERROR:
         failed()
-        return _internal(error)
+    return outcome
 
 
 def _internal(error: Exception) -> NoFix:

@@ -307,7 +307,7 @@ MAX_LOG_ODDS = 7.0  # of a single view
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A sighting as a measurement of `model.OBSERVES`: `mean` (6,).
+    """A sighting as a measurement of what is in `OBSERVES`: `mean` (6,).
 
     `noise` (6, 6): tempered. `log_odds`: over the density of what only looks alike. `independent`
     (6, 6): not in common with views of the same ground. `observes` (6, 16): what it measures.

@@ -4,7 +4,8 @@ Where a fix states the covariance of position, height and attitude together (`Fi
 six move the pixel. Errors of other fixes are taken as independent. Registration places the ground
 that a view shows, so errors of heading, height and tilt move a pixel by what they change between
 the middle of the view and the pixel. Fixes of a track, and those that do not say how well the
-middle of their view is known (`middle_std_m`), are positions of the camera: all its errors count.
+middle of their view is known (`Fix.ground_cov_en_m2`), are positions of the camera: all its errors
+count.
 """
 
 import math
