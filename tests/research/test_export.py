@@ -73,6 +73,15 @@ def test_reduced_precisions_are_smaller_and_close_to_float32(kind, precision, mo
     assert least_cosine_between(seen, expected) == pytest.approx(made.cosine[precision], abs=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["float16", "int8"])  # those of float32: test_training.py
+def test_the_same_weights_give_the_same_bytes(precision):
+    encoder, recipe = encoder_and_recipe("triplet", 32, precision=precision)
+    tiles = maps(8, 32)
+    first, second = (export_encoder(encoder, recipe, tiles, tiles) for _ in range(2))
+    np.testing.assert_array_equal(first.embedder.onnx, second.embedder.onnx)
+
+
 def test_a_precision_that_is_too_inaccurate_is_not_used():
     encoder, recipe = encoder_and_recipe("autoencoder", 32, precision="int8")
     tiles = maps(8, 32)

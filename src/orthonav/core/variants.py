@@ -26,7 +26,7 @@ class Variant:
 def within(default: Any, least: float, most: float = math.inf, *, above: bool = False) -> Any:
     """A field of `Checked` of at least `least`, or `above` it, and at most `most`."""
     expected = f"above {least:g}" if above else f"at least {least:g}"
-    expected += f" and at most {most:g}" if most < math.inf else ""
+    expected += f" and at most {most:.9g}" if most < math.inf else ""
 
     def fits(value: Any) -> bool:
         return bool((least < value if above else least <= value) and value <= most)
