@@ -126,12 +126,6 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.{DIGITS}g}") if abs(value) < float("inf") else None
 
 
-def name_of(row: Result) -> str:
-    """Scene and method of a row, as its file is named."""
-    keys = [each for each in (BASELINES, FIELD) if each in row.plain] or [row.method.key]
-    return f"{row.scene}-{keys[0]}"
-
-
 def of_methods(results: Iterable[Result]) -> list[Result]:
     """Those of one method each, not of the baselines or of the field."""
     return [each for each in results if "method" in each.plain]
