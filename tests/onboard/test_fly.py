@@ -386,14 +386,15 @@ def test_over_unusable_images_the_track_is_predicted_and_nothing_is_sent(flight,
     logged = len(flight.log.named("view"))
     flight.views(30, grey=grey)
     lines = [line for line in flight.written() if "frame" in line][-30:]
-    assert {(line["withheld"], *line["sent"]) for line in lines} == {(reason,)}
+    assert {(line["withheld"] or line["reason"], *line["sent"]) for line in lines} == {(reason,)}
     assert flight.port.sent("GLOBAL_POSITION_SENSOR") == flight.port.sent("GPS_INPUT") == []
     bridged = len(flight.locator.bridged) - predicted
+    # Once a second: the noise of a prediction is per view.
     assert (bridged, len(flight.locator.seen) - located) == (
-        (30, 0) if reason in ("bad_image", "frozen_image") else (0, 30)
+        (3, 0) if reason in ("bad_image", "frozen_image") else (0, 3)
     )
     # A replay of the log does as much: it has no picture to locate.
-    assert [each[2] is None for each in flight.log.named("view")[logged:]] == [bridged == 30] * 30
+    assert [each[2] is None for each in flight.log.named("view")[logged:]] == [bridged == 3] * 3
     assert flight.runner.counter.total[counted] >= 30
     assert {"frozen": "frozen_image", "bad_image": "bad_images"}[counted] in flight.reasons()
     assert reason_of(flight.views(2)[1]) == "fix"
@@ -411,7 +412,8 @@ def test_a_view_that_is_blank_beside_the_mask_of_the_camera_is_a_bad_image(begin
     large = np.repeat(np.repeat(grey, 2, axis=0), 2, axis=1)  # the mask is that of its size
     for each in (grey, large):
         flight.view(each)
-        assert flight.written()[-1]["withheld"] == "blank"
+        line = flight.written()[-1]
+        assert (line["withheld"] or line["reason"]) == "blank"
     assert flight.runner.counter.total["bad_image"] == 2
 
 

@@ -70,6 +70,8 @@ class LoopParameters:
     """UTC that moves by more than this against the monotonic clock within a second was set."""
     withheld_s: float = PAIR_INTERVAL.min_s
     """Withheld views are logged at most so often: `orthonav calibrate --latency` compares them."""
+    unusable_s: float = 1.0
+    """Over unusable pictures the track is predicted at most so often: its noise is per view."""
     assumed_mps: float = 20.0
     """Speed, usual for small aircraft, that turns an error of the latency into a distance where
     none is known."""
@@ -280,7 +282,7 @@ class Runner:
 
     def _located(self, taken: _Taken) -> ViewResult:
         image, heights = taken.image, self.options.heights
-        if self._start and taken.problem is not None:  # there is no track to predict
+        if taken.problem is not None and not self._may_predict(image.exposed_ns):
             return self._refuse(image, taken.problem, taken.vehicle)
         known = self._above_ground(taken.telemetry)
         if self._start and isinstance(known, Telemetry):
@@ -315,6 +317,14 @@ class Runner:
                 self.counter.add_latency(now_ns, (now_ns - image.exposed_ns) / 1e9)
             self._note(result, telemetry, image.exposed_ns)
         return result
+
+    def _may_predict(self, exposed_ns: int) -> bool:
+        """Whether the track is predicted to an unusable picture. One that has not begun is not."""
+        if self._start:
+            return False
+        if self.options.recorded or self._tracked_ns is None:
+            return True
+        return exposed_ns - self._tracked_ns >= LOOP.unusable_s * 1e9
 
     def _from_start(self, telemetry: Telemetry) -> Telemetry:
         """With the start position, which is given once: the track must get it."""
