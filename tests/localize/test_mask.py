@@ -11,6 +11,7 @@ from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.camera_files import masked
 from orthonav.core.localize.view import (
     Orientation,
+    check_view,
     downsampled,
     node_px,
     orthorectified,
@@ -46,6 +47,15 @@ def test_what_is_behind_the_mask_does_not_matter(lens, pitch_deg, gsd_m):
     np.testing.assert_allclose(one.grey.astype(int), other.grey, atol=1)
     share = 1 - one.valid.sum() / rectified(TEXTURE, lens).valid.sum()
     assert 0.02 < share < 0.6 and not one.grey[~one.valid].any()
+
+
+@pytest.mark.parametrize(("ground", "airframe"), [(0, 255), (255, 0), (90, 200)])
+def test_what_is_behind_the_mask_makes_no_picture_of_a_dark_bright_or_blank_one(ground, airframe):
+    picture = np.where(GEAR > 0, ground, airframe).astype(np.uint8)
+    reasons = {0: "too_dark", 255: "too_bright", 90: "blank"}
+    assert check_view(View(picture, LENS, DOWN), 0.5, True) is None
+    refused = check_view(View(picture, LENS.masked(GEAR), DOWN), 0.5, True)
+    assert refused.reason == reasons[ground]
 
 
 def test_over_a_terrain():

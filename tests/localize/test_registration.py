@@ -32,6 +32,7 @@ from orthonav.ground.build import BuildRequest, build_map
 from orthonav.onboard.run import SingleViews, locate_view
 
 NEVER_CLEAR = ClearMargin(1e9, 1e9, 1e9)
+NOT_AT_FINAL = ClearMargin(0.0, 0.0, 1e9)
 EVIDENCE = {"score", "strength", "rival", "look", "look_rival", "peak_ratio", "look_ratio"}
 EVIDENCE |= {"gradient_correlation", "grey_correlation", "agreement", "overlap", "candidates"}
 
@@ -189,6 +190,18 @@ def test_a_view_is_found_by_tiles_alone(localizer, plain, monkeypatch):
     assert len(candidates) > 5
 
 
+@pytest.mark.parametrize(("off_m", "found"), [((16.0, -14.0), True), ((72.0, 0.0), False)])
+def test_by_tiles_too_a_view_is_found_within_its_prior_only(
+    localizer, plain, monkeypatch, off_m, found
+):
+    """Of places near the allowed tiles, up to 65 m farther, some are beyond it."""
+    plan = planned(max_search_px=100, tile_candidates=(40, 80))
+    monkeypatch.setattr(localizer.registration, "plan", plan)
+    prior = prior_at(localizer, plain.place + off_m, 10.0)
+    fix = localizer.locate(plain.view, prior=prior)
+    assert (isinstance(fix, Fix) and error_m(localizer, fix, plain.place) < 0.5) == found
+
+
 def test_the_prior_is_that_of_the_aircraft_not_of_the_ground_seen(localizer):
     place = np.array([-20.0, -60.0])
     grey = rendered(GROUND, place, (45.0, 30.0, 0.0))
@@ -281,6 +294,19 @@ def test_a_spent_budget_leaves_the_best_place_so_far(map_path, plain):
     assert fix.evidence["candidates"] < whole.evidence["candidates"]
     assert "cut_short" not in whole.evidence and fix.evidence["cut_short"] == 1
     assert whole.confidence > CONFIDENT > fix.confidence
+
+
+@pytest.mark.parametrize("margin", [NEVER_CLEAR, NOT_AT_FINAL], ids=["mid", "final"])
+def test_a_search_goes_on_until_a_place_stands_out_or_a_trial_proves_it(map_path, plain, margin):
+    """The place of this view stands out at the first stage already."""
+    doubting = planned(clear=margin, clear_at_mid=margin)
+    whole, proven = (
+        Localizer(open_map(map_path), plan=plan).locate(plain.view)
+        for plan in (doubting, replace(doubting, trial_ms=0.0))
+    )
+    first = plain.fix.evidence["candidates"]
+    assert whole.evidence["candidates"] > 3 * first == 3 * proven.evidence["candidates"]
+    assert proven.confidence == pytest.approx(whole.confidence, abs=1e-3)
 
 
 def test_threads_may_share_a_localizer(localizer, map_path):

@@ -15,6 +15,7 @@ from blots import (
     Heights,
     as_grey,
     error_m,
+    planned,
     rendered,
 )
 from lab.terrain import random_relief, seen_view
@@ -24,8 +25,10 @@ from orthonav.core.localize import Localizer
 from orthonav.core.localize.camera import FITTING
 from orthonav.core.localize.confidence import MAX_RATIO
 from orthonav.core.localize.ground import GroundModel, ViewOverGround
+from orthonav.core.localize.place import MidPlace
+from orthonav.core.localize.plan import ClearMargin
 from orthonav.core.localize.resection import ERRORS
-from orthonav.core.localize.search import prepared_view
+from orthonav.core.localize.search import Search, prepared_view
 from orthonav.core.localize.view import Orientation
 from orthonav.core.records import Fix, Telemetry, View
 from orthonav.core.register.window import Pose
@@ -85,6 +88,54 @@ def test_a_view_of_hills_is_placed_as_one_of_level_ground(opened, grey, relief):
     assert error_m(flat, level, PLACE) > 3 * error_m(localizer, fix, PLACE)
     assert fix.evidence["terrain_gain"] > 1.05 and fix.evidence["score"] > level.evidence["score"]
     assert "terrain_gain" not in level.evidence
+
+
+def test_a_view_of_hills_is_placed_although_nothing_ends_its_search(opened, grey, relief):
+    """After all stages candidates are compared on the terrain."""
+    picture, _ = seen_from(grey, relief)
+    localizer = on_terrain(opened, relief)
+    never = ClearMargin(1e9, 1e9, 1e9)
+    localizer.registration.plan = planned(
+        clear=never, clear_at_mid=never, trial_clear=never, trial_doubt=0.0
+    )
+    view = View(picture, CAMERA, telemetry((73.0, 4.0, -3.0), AGL_M * 1.04))
+    fix = localizer.locate(view)
+    assert error_m(localizer, fix, PLACE) < 0.5 and fix.confidence > 0.9
+
+
+@pytest.mark.parametrize("flat_scale", [-0.2, 0.0])
+def test_a_place_is_found_on_the_terrain_at_the_scale_expected_there(
+    opened, grey, relief, flat_scale
+):
+    """Whatever other scale fits flat ground."""
+    picture, position = seen_from(grey, relief)
+    registration = on_terrain(opened, relief).registration
+    right = Search.of(registration, View(picture, CAMERA, telemetry())).best().place.window_pose
+    ground_m = float(position[2]) - AGL_M * math.exp(right.log_scale)  # mean of the window
+    agl_m = AGL_M * math.exp(-0.2)
+    below = Ground(ground_m + AGL_M - agl_m, 1.0, 1.0)
+    refiner = Search.of(
+        registration, View(picture, CAMERA, telemetry(agl_m=agl_m, below=below))
+    ).refiner
+    fit = refiner.refined(replace(right, log_scale=flat_scale), refiner.levels.mid)
+    (found,) = refiner.on_terrain([MidPlace(fit, fit.score)], 1)
+    assert found.pose.distance_px(right) < 0.2
+    assert found.pose.log_scale == pytest.approx(right.log_scale + 0.2, abs=0.01)
+
+
+def test_the_height_is_counted_from_the_ground_below_the_camera(opened, relief):
+    """The camera of a view far off nadir stays where it is."""
+    attitude = (70.0, 30.0, -10.0)
+    registration = on_terrain(opened, relief).registration
+    picture = rendered(GROUND, PLACE, attitude)
+    prepared = prepared_view(registration, View(picture, CAMERA, telemetry(attitude)), True)
+    over_ground = ViewOverGround(registration.ground, prepared, registration.reference)
+    pose = Pose(300.0, 290.0, 0.3, 0.05)
+    below, camera = over_ground.below_camera(pose), over_ground.orientation(pose)
+    np.testing.assert_allclose(over_ground.camera_en_m(below), camera.position_m[:2], atol=1e-6)
+    above_m = camera.position_m[2] - float(relief.at(*camera.position_m[:2, None])[0])
+    assert AGL_M * math.exp(below.log_scale) == pytest.approx(above_m, abs=0.1)
+    assert abs(below.log_scale - pose.log_scale) > 0.01 and below.heading_rad == pose.heading_rad
 
 
 def test_the_ground_seen_is_that_of_the_middle_of_the_picture(opened, grey, relief):

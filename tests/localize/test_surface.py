@@ -218,8 +218,8 @@ def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
     registration = on(opened, cliff, None).registration
     agl_m = AGL_M / 2
 
-    def expected(heading_deg, ahead_deg):
-        telemetry = Telemetry(0, heading_deg, ahead_deg, 0.0, agl_m)
+    def expected(heading_deg, ahead_deg, agl_std_m=None):
+        telemetry = Telemetry(0, heading_deg, ahead_deg, 0.0, agl_m, agl_std_m=agl_std_m)
         picture = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
         prepared = prepared_view(registration, View(picture, CAMERA, telemetry), True)
         return registration.ground.expected(prepared), prepared
@@ -233,6 +233,8 @@ def test_scales_are_expected_by_place_where_the_view_looks_ahead(opened, town):
     assert np.abs(values[:, [0, -1]]).max() < 0.02
     away, _ = expected(270.0, 45.0)
     assert away.scale_map.values.min() < -0.15  # what lies above the ground below the camera
+    stated, _ = expected(90.0, 45.0, 0.04 * agl_m)
+    assert stated.scale_map.std == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize(("share", "finer"), [(0.45, False), (0.55, True)])

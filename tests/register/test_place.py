@@ -97,6 +97,16 @@ def test_a_place_that_is_there_twice_is_not_sure():
     assert found.place.fit.weighted > 0.9  # however well it fits
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_no_more_places_than_asked_for_are_refined_at_the_final_level(count):
+    reference = reference_of(Twin(), SHAPE)
+    candidates = [near(ONE, 3, -2), near(SAME_AGAIN, -2, 3)]
+    refiner = CandidateRefiner(templates_of(GROUND, ONE), LEVELS, prior_of(ONE), reference)
+    found = verified(refiner, candidates, LEVELS.mid, count=count)
+    assert 1 + len(found.rivals) == count
+    assert found.scores.mid_ratio == pytest.approx(1, abs=0.05)  # the other counts all the same
+
+
 @pytest.mark.parametrize("turn_deg", [25.0, -25.0])
 def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
     """The twin is turned: the reported heading decides between them."""

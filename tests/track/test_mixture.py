@@ -225,6 +225,18 @@ def test_a_bias_jump_is_followed():
     assert flight.off_m() < 12 and found.mean[6] > BIAS[2] + 0.05
 
 
+def test_biases_that_changed_to_the_other_side_are_followed_at_once():
+    """After a jump they are no more likely near where they were."""
+    flight = Flight(5, np.array([math.radians(8.0), 0.05, math.radians(12.0), 0.0]))
+    for view in range(13):
+        if view == 12:
+            flight.bias = -flight.bias
+        flight.fly()
+        found = flight.view(flight.sighting(3.0))
+    assert found.belief > 0.99 and flight.off_m() < 10
+    assert np.degrees(found.mean[[4, 6]]) == pytest.approx([-8.0, -12.0], abs=2.0)
+
+
 @pytest.mark.parametrize("off_m", [(10.0, 0.0), (700.0, -600.0)], ids=["right", "wrong"])
 def test_a_reported_start_holds_until_views_contradict_it(off_m):
     flight = Flight(6, start_off_m=off_m, start_std_m=20.0)
@@ -367,6 +379,17 @@ def test_an_estimate_changes_nothing():
     assert found.state is rows[-1][0].state and not found.shown.is_now
     assert flight.mixture.hypotheses == before and vars(flight.mixture.trust) == trust
     assert flight.view().state is State.COASTING
+
+
+def test_a_view_whose_outcome_failed_does_not_show_the_map():
+    """An error after its places were found."""
+    flight, _ = flown(3, views=15)
+    flight.fly()
+    flight.mixture.update(LEVEL, [flight.sighting(4.0)])
+    assert flight.mixture.estimate(RADIUS_M).shown.is_now
+    flight.mixture.unrecognize()
+    found = flight.mixture.conclude(RADIUS_M)
+    assert found.state is State.COASTING and not found.shown.is_now
 
 
 @pytest.mark.parametrize(("confirms", "state"), [(False, State.SEARCHING), (True, TRACKING)])

@@ -16,7 +16,8 @@ from orthonav.core.localize import Localizer
 from orthonav.core.localize.ground import GroundModel
 from orthonav.core.localize.odometry import OdometryView, displacement
 from orthonav.core.mapfile import open_map
-from orthonav.core.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.core.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
+from orthonav.core.track import tracker as tracker_module
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings.localize import localize_flight, smoothed_track
 
@@ -226,14 +227,19 @@ def tracking(localizer):
     return tracker, seen[12:]
 
 
+def copied(localizer, tracking):
+    """That tracker for one test, and the views that follow."""
+    before, ahead = tracking
+    shared = (localizer, localizer.registration, before._past)
+    return copy.deepcopy(before, {id(each): each for each in shared}), ahead
+
+
 @pytest.mark.parametrize(
     "picture", ["mirrored", pytest.param("noise", marks=pytest.mark.slow), "cloud", "turned"]
 )
 def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, tracking, picture):
     """The views overlap, and the reported velocity is reversed."""
-    before, ahead = tracking
-    shared = (localizer, localizer.registration, before._past)
-    tracker = copy.deepcopy(before, {id(each): each for each in shared})
+    tracker, ahead = copied(localizer, tracking)
     rng = np.random.default_rng(5)
     cloud = cv2.GaussianBlur(rng.normal(0, 900, (240, 320)), (0, 0), 12) + 190
     rows = []
@@ -252,6 +258,23 @@ def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, tracking,
         rows += followed(tracker, localizer, [(grey, telemetry, place)])
     assert {row[2] for row in rows} <= {"coasting", "lost"}
     assert max(row[1] for row in rows) <= 0.8
+
+
+def test_a_followed_flight_is_searched_for_around_the_track_only(localizer, tracking, monkeypatch):
+    """With its heading and height as far as they are known."""
+    (tracker, ahead), asked = copied(localizer, tracking), []
+    whole = tracker_module.Search.of
+
+    def noted(registration, view, prior, heading_known):
+        asked.append((prior, view.telemetry))
+        return whole(registration, view, prior, heading_known)
+
+    monkeypatch.setattr(tracker_module.Search, "of", noted)
+    followed(tracker, localizer, ahead[:1])
+    ((prior, known),) = asked
+    middle = localizer.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
+    assert math.dist(middle, ahead[0][2]) < prior.std_m * PRIOR_SIGMAS < 60
+    assert known.yaw_std_deg < 3.0 and known.agl_std_m < 0.03 * AGL_M
 
 
 def test_unknown_heading_is_tracked(localizer):
@@ -349,16 +372,16 @@ def test_gnss_of_a_first_leg_calibrates_the_mount(localizer):
     frame = localizer.sheet.frame
     tracker = Tracker(localizer, every_prior=True)
     seen = []
-    for grey, telemetry, place in views(10, tilt=(5.0, 0.0), year=lit, every_s=10):
+    for grey, telemetry, place in views(10, tilt=(5.0, -3.0), year=lit, every_s=10):
         lat, lon = frame.latlon_from_en(place)
         known = {"prior": Prior(float(lat), float(lon), 2.0), "tilt_std_deg": 1.0}
         seen.append((grey, replace(telemetry, **known), place))
     rows = followed(tracker, localizer, seen)
-    bias = rows[-1][3].bias
-    assert bias.pitch_bias_deg == pytest.approx(5.0, abs=1.5)
-    assert bias.pitch_bias_std_deg < 1.5
-    assert rows[-1][3].pitch_deg == pytest.approx(5.0, abs=1.0)
-    assert rows[2][3].pitch_deg == pytest.approx(5.0, abs=2.0)
+    last, bias = rows[-1][3], rows[-1][3].bias
+    assert (bias.pitch_bias_deg, bias.roll_bias_deg) == pytest.approx((5.0, -3.0), abs=1.5)
+    assert max(bias.pitch_bias_std_deg, bias.roll_bias_std_deg) < 1.5
+    assert (last.pitch_deg, last.roll_deg) == pytest.approx((5.0, -3.0), abs=1.0)
+    assert (rows[2][3].pitch_deg, rows[2][3].roll_deg) == pytest.approx((5.0, -3.0), abs=2.0)
 
 
 @pytest.mark.long
