@@ -122,8 +122,8 @@ class _Taken(NamedTuple):
     def view(self) -> View | UnusableView:
         """What the locator gets: it bridges a picture that is too dark itself."""
         if self.camera is None or self.image.grey is None:
-            reason = self.problem or NoFix("bad_image", "image could not be decoded")
-            return UnusableView(self.telemetry, reason)
+            assert self.problem is not None
+            return UnusableView(self.telemetry, self.problem)
         return View(self.image.grey, self.camera, self.telemetry)
 
 
@@ -219,22 +219,29 @@ class Runner:
         change = self.options.map_change()
         if change is not None:
             return self._refuse(image, NoFix(MAP_CHANGED, f"map file was changed: {change}"))
-        taken = _Taken(image, *self._picture(image), *self._telemetry(image))
-        if latency is None:
-            return self._located(taken)
+        camera, problem = self._picture(image)
+        if latency is not None and problem is not None and problem.reason == "frozen_image":
+            latency.frozen(arrived_ns)
+        if problem is not None and not self._may_predict(image.exposed_ns):
+            return self._refuse(image, problem)  # before it waits for telemetry
+        taken = _Taken(image, camera, problem, *self._telemetry(image))
+        return (
+            self._located(taken) if latency is None else self._watched(taken, arrived_ns, latency)
+        )
+
+    def _watched(self, taken: _Taken, arrived_ns: int, latency: LatencyMonitor) -> ViewResult:
+        """The result of a view that is located only where nothing contradicts the latency."""
         try:
             if latency.may_locate:
                 return self._located(taken)
             if taken.problem is not None:
-                return self._refuse(image, taken.problem, taken.vehicle)
+                return self._refuse(taken.image, taken.problem, taken.vehicle)
             return self._withhold(taken, latency)
         finally:
             view, link = taken.view, self._link
             if taken.problem is None and isinstance(view, View) and link is not None:
                 reported = link.state_at, link.covered_ns
                 latency.observe(arrived_ns, view.grey, view.camera, *reported)
-            elif taken.problem is not None and taken.problem.reason == "frozen_image":
-                latency.frozen(arrived_ns)
 
     def _restart_after_jump(self, time_ns: int) -> None:
         """Begin again where a recorded image is earlier than the one before by over a second: it
@@ -282,8 +289,6 @@ class Runner:
 
     def _located(self, taken: _Taken) -> ViewResult:
         image, heights = taken.image, self.options.heights
-        if taken.problem is not None and not self._may_predict(image.exposed_ns):
-            return self._refuse(image, taken.problem, taken.vehicle)
         known = self._above_ground(taken.telemetry)
         if self._start and isinstance(known, Telemetry):
             known = self._corrected(self._from_start(taken.telemetry))
