@@ -1,9 +1,10 @@
 """`python -m tools.constants core/localize`: which constants move a golden view.
 
 Every number of a module (a constant, a field of a record of parameters) is changed by +30 and by
--30 %, one at a time, and the golden views are located again. A number that moves none of them is
-a candidate to be deleted or derived; the gate and the faults have to agree. Rows are appended to
-the output as they come, and a run that is interrupted goes on there.
+-30 %, one at a time, and the golden flights are located again, one after the other until a view
+moves. A number that moves none is a candidate to be deleted or derived; the gate and the faults
+have to agree. Rows are appended to the output as they come, and a run that is interrupted goes on
+there.
 """
 
 import argparse
@@ -16,9 +17,10 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import CodeType
 from typing import Any
@@ -31,7 +33,6 @@ GOLDEN = ROOT / "tests" / "golden"
 FACTORS = (1.3, 0.7)
 MAX_S = 900
 """A changed constant may make the search endless; such a run counts as moved."""
-USUAL = ("usual", "terrain, with prior", "embedding only", "track, clouds")
 
 
 @dataclass(frozen=True)
@@ -128,18 +129,16 @@ class _Finder:
         )
 
 
-def _located(number: Number | None, factor: float, flights: Sequence[str], work: Path) -> Any:
-    """Rows of the flights, in a process of its own; an error or a late end as text."""
+def _in_child(function: Callable[[], Any]) -> Any:
+    """What a function returns in a process of its own, for this one must not import the package;
+    an error or a late end as text."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
         os.close(read)
         signal.alarm(MAX_S)
         try:
-            if number is not None:
-                sys.meta_path.insert(0, _Finder(number, factor))
-            golden_views = importlib.import_module("golden_views")  # imports the changed module
-            found: Any = {name: golden_views.locate(name, work) for name in flights}
+            found = function()
         except Exception as error:
             found = f"{type(error).__name__}: {error}"
         with os.fdopen(write, "w", encoding="utf-8") as stream:
@@ -152,29 +151,33 @@ def _located(number: Number | None, factor: float, flights: Sequence[str], work:
     return json.loads(text) if text else "ended without a result"
 
 
-def _prepare(flights: Sequence[str], work: Path) -> None:
-    """Maps and flights, made by a process of its own: this one must not import the package."""
-    child = os.fork()
-    if child == 0:
-        for name in flights:
-            importlib.import_module("golden_views").prepare(name, work)
-        os._exit(0)
-    if os.waitpid(child, 0)[1]:
-        raise SystemExit("error: the golden flights could not be made")
+def _located(number: Number | None, factor: float, flight: str, work: Path) -> Any:
+    """Rows of a flight with a changed number."""
+    if number is not None:
+        sys.meta_path.insert(0, _Finder(number, factor))
+    golden_views = importlib.import_module("golden_views")  # imports the changed module
+    return golden_views.locate(flight, work)
+
+
+def _prepared(flights: Sequence[str] | None, work: Path) -> list[str]:
+    """Write maps and flights, all by default; their names."""
+    golden_views = importlib.import_module("golden_views")
+    names = list(flights or golden_views.FLIGHTS)
+    for name in names:
+        golden_views.prepare(name, work)
+    return names
 
 
 def moved(before: Any, after: Any) -> tuple[int, float]:
     """How many views differ at all, and the largest move, m; all of them where it fails."""
-    count = sum(map(len, before.values()))
     if isinstance(after, str):
-        return count, math.inf
+        return len(before), math.inf
     differ, farthest = 0, 0.0
-    for name, rows in before.items():
-        for was, now in zip(rows, after[name], strict=True):
-            differ += was != now
-            if "east_m" in was and "east_m" in now:
-                away = math.hypot(was["east_m"] - now["east_m"], was["north_m"] - now["north_m"])
-                farthest = max(farthest, away)
+    for was, now in zip(before, after, strict=True):
+        differ += was != now
+        if "east_m" in was and "east_m" in now:
+            away = math.hypot(was["east_m"] - now["east_m"], was["north_m"] - now["north_m"])
+            farthest = max(farthest, away)
     return differ, farthest
 
 
@@ -183,22 +186,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tools.constants", description=__doc__)
     add = parser.add_argument
     add("folders", nargs="+", metavar="FOLDER", help="folders or modules below src/orthonav")
-    add("--flights", nargs="+", default=USUAL, help="golden flights that are located")
+    add("--flights", nargs="+", help="golden flights that are located, all by default")
     add("--work", type=Path, default=Path("constants"), metavar="DIR", help="results and maps")
     add("--jobs", type=int, default=len(os.sched_getaffinity(0)))
     options = parser.parse_args()
     sys.path[:0] = [str(GOLDEN), str(ROOT)]
     # Loaded once, before the forks; nothing of the package.
-    for heavy in ("numpy", "cv2", "rasterio", "pydantic"):
+    for heavy in ("numpy", "cv2", "rasterio"):
         importlib.import_module(heavy)
     work = options.work.resolve()
     work.mkdir(parents=True, exist_ok=True)
-    if not (work / "prepared").exists():
-        _prepare(options.flights, work)
-        (work / "prepared").touch()
-    before = _located(None, 1.0, options.flights, work)
-    if isinstance(before, str):
-        raise SystemExit(f"error: {before}")
+    flights = _checked(_in_child(partial(_prepared, options.flights, work)))
+    unchanged = {
+        name: _checked(_in_child(partial(_located, None, 1.0, name, work))) for name in flights
+    }
     out = work / "rows.jsonl"
     rows = (
         [json.loads(line) for line in out.read_text("utf-8").splitlines()] if out.exists() else []
@@ -208,9 +209,14 @@ def main() -> None:
     numbers = [each for path in sources for each in numbers_of(path) if each.title not in done]
 
     def tried(number: Number) -> dict[str, Any]:
-        found = [moved(before, _located(number, each, options.flights, work)) for each in FACTORS]
-        views, metres = (max(each) for each in zip(*found, strict=True))
-        return {"number": number.title, "views": views, "metres": round(min(metres, 1e9), 3)}
+        for name, before in unchanged.items():
+            changed = [partial(_located, number, factor, name, work) for factor in FACTORS]
+            found = [moved(before, _in_child(each)) for each in changed]
+            views, metres = (max(each) for each in zip(*found, strict=True))
+            if views:
+                far_m = round(min(metres, 1e9), 3)
+                return {"number": number.title, "flight": name, "views": views, "metres": far_m}
+        return {"number": number.title, "views": 0}
 
     start = time.perf_counter()
     with ThreadPoolExecutor(options.jobs) as pool, out.open("a", encoding="utf-8") as stream:
@@ -223,6 +229,12 @@ def main() -> None:
     still = [row["number"] for row in rows if not row["views"]]
     print(f"{len(still)} of {len(rows)} numbers move no view:")
     print("\n".join(f"  {name}" for name in sorted(still)))
+
+
+def _checked(found: Any) -> Any:
+    if isinstance(found, str):
+        raise SystemExit(f"error: {found}")
+    return found
 
 
 def _modules(place: Path) -> list[Path]:

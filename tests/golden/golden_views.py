@@ -161,18 +161,19 @@ FLIGHTS = {
 
 
 def located(name: str, folder: Path) -> list[Row]:
-    """Results of the views of a flight; map and flight are written to a folder, the map once."""
+    """Results of the views of a flight; map and flight are written to a folder, both once."""
     prepare(name, folder)
     return locate(name, folder)
 
 
 def prepare(name: str, folder: Path) -> None:
-    """Write the map and the flight of a flight to a folder, the map once."""
+    """Write the map and the flight of a flight to a folder, both once."""
     flight = FLIGHTS[name]
     place = folder / flight.area
     if not place.exists():
         _build(AREAS[flight.area], place)
-    _simulate(flight, place)
+    if not (place / f"flight{flight.seed}").exists():
+        _simulate(flight, place)
 
 
 def locate(name: str, folder: Path) -> list[Row]:
