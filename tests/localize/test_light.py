@@ -76,6 +76,14 @@ def test_near_a_prior_candidates_are_sought_as_they_are_compared(localizer):
     assert fix.is_confident and fix.evidence["grey_correlation"] == 0
 
 
+@pytest.mark.parametrize(("most_ms", "level"), [(300.0, "mid"), (0.0, "coarse")])
+def test_by_gradients_the_mid_level_is_searched_where_it_takes_little(opened, most_ms, level):
+    plan = planned(cheap_ms=0.0, gradients_ms=most_ms)
+    search = Search.of(Localizer(opened, plan=plan).registration, view(infrared, PLACES[1]))
+    stage, _ = search.run().search.tried[-1]
+    assert stage.level == getattr(search.levels, level)
+
+
 def test_a_search_that_was_cut_short_is_not_followed_by_another(opened):
     hasty = Localizer(opened, plan=planned(budget_ms=1e-6))
     search = Search.of(hasty.registration, view(infrared, PLACES[1]))

@@ -83,6 +83,9 @@ class SearchPlan:
     """A second search is left out above: about a second for a view on a large area (README)."""
     last_stage_ms: float = 60.0
     """The last stage, one view in seven, is left out above after the coarse level."""
+    gradients_ms: float = 300.0
+    """Most of the mid level by gradients alone, above it is the coarse one: over a whole sheet the
+    map's channels are made for it, ten times as long, and half a gigabyte over 100 km2."""
     nearby_ms: float = 0.2  # of one candidate from tiles or from above the coarse level
     trial_ms: float = 25.0  # on flat ground,
     terrain_trial_ms: float = 60.0  # and on a terrain

@@ -288,7 +288,7 @@ class Search:
         plan, rated = self.plan, self._rated(self.plan.mid_steps)
         every = [each for each, _ in rated]
         first = every[: max(sum(penalty <= plan.stage_penalties[1] for _, penalty in rated), 1)]
-        for some, most_ms in ((every, plan.cheap_ms), (first, plan.last_ms)):
+        for some, most_ms in ((every, plan.cheap_ms), (first, plan.gradients_ms)):
             stage = self._fft_stage(self.levels.mid, some, plan.candidates)
             if stage.cost_ms <= most_ms:
                 return stage
