@@ -72,9 +72,8 @@ class MountCorrected:
 def model_of(mount: Mount) -> Model:
     """Model whose remaining biases have the standard deviations of a mount's calibration."""
     heading, tilt = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
-    tilt_rad = math.radians(max(tilt, LEAST_TILT_DEG))
-    return replace(
-        Model().with_mount(tilt_rad),
+    return Model(
+        tilt_rad=math.radians(max(tilt, LEAST_TILT_DEG)),
         heading_rad=math.radians(max(heading.std, heading.scatter, 1.0)),
         log_scale=max(mount.log_scale.std, mount.log_scale.scatter, 0.01),
         off_mount=0.0,

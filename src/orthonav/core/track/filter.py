@@ -57,7 +57,6 @@ class Model:
     horizon_rad: float = math.radians(2.0)
     """Of the autopilot's horizon, in pitch and roll, without `tilt_std_deg`."""
     horizon_s: float = 15.0  # its correlation time: 10 to 30 s in real autopilots
-    tilt_walk: float = math.radians(0.01)  # of the misalignment, rad per root of a second
     sighting_noise_m: float = 1.0  # of two dates beyond the covariance of a registration, per axis
     map_m: float = MAP_STD_M  # of the map as a whole, per axis: added to the covariance of a fix
     bias_jump: float = 0.01
@@ -75,10 +74,7 @@ class Model:
     def at_height(self, agl_m: float) -> "Model":
         """With a mount off by `MOUNT_M` on the ground, within `MOUNT_RAD`: high flights need it."""
         low, high = MOUNT_RAD
-        return self.with_mount(min(max(MOUNT_M / max(agl_m, 1e-3), low), high))
-
-    def with_mount(self, tilt_rad: float) -> "Model":
-        return replace(self, tilt_rad=tilt_rad, tilt_walk=TILT_WALK_SHARE * tilt_rad)
+        return replace(self, tilt_rad=min(max(MOUNT_M / max(agl_m, 1e-3), low), high))
 
     def initial_bias(self, tilt_rad: float | None = None) -> Array:
         """Prior variances (4,) of heading, log scale, pitch and roll."""
@@ -92,7 +88,8 @@ class Model:
 
     def drift(self, seconds: float) -> Array:
         """Process noise (4,) of the biases."""
-        walk = [self.heading_walk, self.log_scale_walk, self.tilt_walk, self.tilt_walk]
+        tilt_walk = TILT_WALK_SHARE * self.tilt_rad
+        walk = [self.heading_walk, self.log_scale_walk, tilt_walk, tilt_walk]
         return np.square(walk) * max(seconds, 0.0)
 
 
