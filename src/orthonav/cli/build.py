@@ -42,8 +42,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     imagery.add_argument(
         "--other-date", type=Path, action="append", default=[], metavar="TIF", help=text
     )
-    text = "decimal year of the flights, such as 2026.5, to which orthophotos in NAD83, ETRS89 or "
-    text += "GDA94 are moved with their tectonic plate (default: they are taken as WGS 84)"
+    text = "decimal year of the flights, such as 2026.5, to which orthophotos in NAD83, ETRS89, "
+    text += "GDA94 or GDA2020 are moved with their tectonic plate (default: taken as WGS 84)"
     imagery.add_argument("--epoch", type=float, metavar="YEAR", help=text)
     add_area(parser.add_argument_group("area (default: all imagery)"))
     add_recipe(parser.add_argument_group("map"))

@@ -95,7 +95,7 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "time limit per view (default: none); a search that would exceed it is not "
         "started, and the result is the best position so far",
     ),
-    "--camera": _option(FILE, "camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)"),
+    "--camera": _option(FILE, "camera file: flight.json, or of OpenCV, ROS or Kalibr"),
     "--bands": _option(
         {"type": _bands, "metavar": "N[,N,N]"},
         "bands of the files, one or three, from 1: 4 is often near infrared (default: red, "
@@ -119,8 +119,8 @@ OPTIONS: Mapping[str, Mapping[str, Any]] = {
     ),
     "--dem-datum": _option(
         {"metavar": "NAME"},
-        "vertical datum of --dem and --surface, where the file does not state it: egm96, "
-        "egm2008, msl, ellipsoid or EPSG:NUMBER of a vertical system",
+        "vertical datum of a terrain or surface file that does not state it: egm96, egm2008, "
+        "msl, ellipsoid or EPSG:NUMBER of a vertical system",
     ),
     "--relief": _option(
         {"choices": ("level", "rolling", "hills")},

@@ -164,7 +164,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
     from orthonav.ground.fetch.run import FetchRequest
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
-        raise UsageError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
+        raise UsageError(f"--gsd-m must be above 0, below 1000; got {options.gsd_m:g}")
     named = {"key_env": options.key_env, "own": options.services}
     asked = ImageryOptions(**given(options, ImageryOptions))
     more = {

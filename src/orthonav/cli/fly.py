@@ -11,7 +11,7 @@ from pathlib import Path
 from orthonav.cli.common import add_acceptance, add_options, numbers
 from orthonav.core.errors import StoppedError, VariantError
 
-EXAMPLE = "area.onav /dev/video0 --camera calib.yaml --autopilot udpin:14550"
+EXAMPLE = "area.onav 0 --camera calib.yaml --camera-latency-ms 80 --autopilot udpin:14550"
 EVERYDAY = (
     *("--camera", "--camera-latency-ms", "--mount", "--autopilot", "--recorded-telemetry"),
     *("--ros2", "--send", "--nmea", "--jsonl", "--accept", "--alert-limit-m", "--dry-run"),

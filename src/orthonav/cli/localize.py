@@ -69,9 +69,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     text = "file to write (-: stdout, with the summary on stderr); without it the command prints "
     text += "the positions, if photographs are given one by one"
     add("--out", type=Path, metavar="fixes.jsonl", help=text)
-    text = "write the confident camera positions for other programs too: csv, kml, tum (a "
-    text += "trajectory for evo) or odm-geo (OpenDroneMap's geo.txt); heights above sea need a "
-    text += "terrain; can be repeated"
+    text = "write the confident camera positions for other programs too: csv, geojson, kml, tum "
+    text += "(a trajectory for evo), odm-geo (OpenDroneMap's geo.txt) or exif (a table for "
+    text += "exiftool); heights above sea need a terrain; can be repeated"
     add("--export", action="append", default=[], metavar="FORMAT=PATH", help=text)
     add_options(parser, "--json")
 

@@ -20,10 +20,7 @@ log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "The 95 % ellipse is conservative. It excludes errors of the terrain and the height of "
-        "buildings and trees."
-    )
+    parser.epilog = "the 95 % ellipse excludes errors of the terrain, buildings and trees"
     add = parser.add_argument
     text = "fixes, as written by `orthonav localize`"
     add("fixes", type=Path, metavar="fixes.jsonl", help=text)

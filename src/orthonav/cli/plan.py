@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     if route is None and (options.band_m is not None or options.dem or options.out):
         raise UsageError("--band-m, --dem and --out need a route (--route)")
     if options.speed_mps is not None and not 0 < options.speed_mps < 10_000:
-        raise UsageError(f"speed_mps must be above 0, got {options.speed_mps}")
+        raise UsageError(f"--speed-mps must be above 0, below 10,000; got {options.speed_mps:g}")
     dem = dem_of(options, route)
     view = _view(options, route, dem)
     gsd_m, tile_px = _map_of(options, view)

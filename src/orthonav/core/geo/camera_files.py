@@ -24,7 +24,7 @@ _READ = (
 
 
 def read_camera_file(path: Path) -> Camera:
-    """The camera of a `flight.json`, or of a file of OpenCV (YAML, JSON), ROS or Kalibr (YAML).
+    """The camera of a `flight.json`, or of a file of OpenCV, ROS or Kalibr.
 
     `FILE#cam1` selects one camera of a Kalibr chain. Raises `MissingFileError`, `CameraError` or
     `MissingExtraError`."""
