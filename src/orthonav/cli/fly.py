@@ -45,7 +45,7 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("playback of recordings").add_argument
     text = "use the telemetry of the flight folder; else its times are those of the autopilot"
     add("--recorded-telemetry", action="store_true", help=text)
-    text = "playback speed (default 1: real time)"
+    text = "playback speed (default 1: real time; above 2 some fixes are withheld as jumps)"
     add("--pace", type=float, default=1.0, metavar="FACTOR", help=text)
 
     add = parser.add_argument_group("autopilot").add_argument
