@@ -54,6 +54,10 @@ def number(
     return found
 
 
+def _std(name: str, value: Any) -> float | None:
+    return None if value is None else number(name, value, "0 or more; None: unknown", 0, MAX_STD)
+
+
 class ReadOnly(Mapping[str, float]):
     """Unlike a mapping proxy it can be pickled and copied."""
 
@@ -167,20 +171,28 @@ class Telemetry(ByValue):
     below: Ground | None = None
 
     def __post_init__(self) -> None:
-        if self.time_ns is None or not math.isfinite(self.time_ns):
-            raise ArgumentError(f"time_ns must be whole nanoseconds, got {self.time_ns}")
+        number("time_ns", self.time_ns, "whole nanoseconds", -MAX_TIME_S * 1e9, MAX_TIME_S * 1e9)
+        object.__setattr__(self, "time_ns", int(self.time_ns))
         for name in _NEEDED:
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, math.nan)
-        for name in _OPTIONAL:
             value: Any = getattr(self, name)
-            if isinstance(value, Prior | Ground):
-                value = vars(value).values()
-            parts = value if hasattr(value, "__iter__") else () if value is None else (value,)
-            least = 0.0 if "_std_" in name else -math.inf
-            known = (each is not None and math.isfinite(each) and each >= least for each in parts)
-            if not all(known):
-                object.__setattr__(self, name, None)
+            object.__setattr__(self, name, math.nan if value is None else number(name, value))
+        for name in _OPTIONAL:
+            value, least = getattr(self, name), 0.0 if "_std_" in name else -math.inf
+            if value is None:
+                continue
+            if name in _RECORDS:
+                has_type(name, value, *_RECORDS[name])
+                parts = tuple(vars(value).values())
+            elif name == "vel_en_mps":
+                pair = value if np.shape(value) == (2,) else (str(value), "")
+                parts = value = tuple(
+                    math.nan if each is None else number(name, each, "a pair, east and north, m/s")
+                    for each in pair
+                )
+            else:
+                parts = (value := number(name, value),)
+            known = all(math.isfinite(each) and each >= least for each in parts)
+            object.__setattr__(self, name, value if known else None)
 
     @property
     def horizon_std_deg(self) -> float | None:
@@ -196,14 +208,18 @@ class Telemetry(ByValue):
 
 _, *_NEEDED = tuple(each.name for each in fields(Telemetry))[:5]
 _OPTIONAL = tuple(each.name for each in fields(Telemetry))[5:]
+_RECORDS: dict[str, tuple[type, str]] = {
+    "prior": (Prior, "(lat_deg, lon_deg, std_m)"),
+    "below": (Ground, ""),
+}
 
 
 @dataclass(frozen=True, eq=False)
 class View(ByValue):
     """What the camera saw at one exposure, and the telemetry of that time.
 
-    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified. Images of other
-    kinds are converted by `orthonav.core.records.grey_levels`.
+    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified; copied, and then
+    read-only. Images of other kinds are converted by `orthonav.core.records.grey_levels`.
     `camera`: calibration of the camera. At another size than that of `grey` it is scaled.
     `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.
 
@@ -215,7 +231,11 @@ class View(ByValue):
 
     def __post_init__(self) -> None:
         has_type("camera", self.camera, Camera, ", as of Camera.from_matrix(..)")
+        has_type("telemetry", self.telemetry, Telemetry)
         grey = np.ascontiguousarray(grey_levels(self.grey))  # a flipped picture is a view of it
+        if grey.flags.writeable:  # a caller may use its memory for the next picture
+            grey = grey.copy()
+            grey.flags.writeable = False
         object.__setattr__(self, "grey", grey)
         object.__setattr__(self, "camera", self.camera.fitted(grey.shape[1], grey.shape[0]))
 
@@ -251,28 +271,18 @@ class View(ByValue):
 
         Raises `ArgumentError`, `FlightError` for what is no image, `CameraError` where image and
         camera have different proportions."""
-        stds = heading_std_deg, agl_std_m, tilt_std_deg
-        for name, std in zip(("heading_std_deg", "agl_std_m", "tilt_std_deg"), stds, strict=True):
-            if std is not None:
-                number(name, std, "0 or more; None: unknown", 0, MAX_STD)
-        if vel_en_mps is not None:
-            east, north = vel_en_mps if np.shape(vel_en_mps) == (2,) else ("", "")
-            pair = "a pair, east and north, m/s"
-            vel_en_mps = number("vel_en_mps", east, pair), number("vel_en_mps", north, pair)
-        if prior is not None:
-            has_type("prior", prior, Prior, "(lat_deg, lon_deg, std_m)")
-        number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S)
+        time_s = number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S)
         telemetry = Telemetry(
             round(time_s * 1e9),
             math.nan if heading_deg is None else number("heading_deg", heading_deg),
             number("pitch_deg", pitch_deg),
             number("roll_deg", roll_deg),
             number("agl_m", agl_m),
-            yaw_std_deg=heading_std_deg,
-            agl_std_m=agl_std_m,
+            yaw_std_deg=_std("heading_std_deg", heading_std_deg),
+            agl_std_m=_std("agl_std_m", agl_std_m),
             prior=prior,
             vel_en_mps=vel_en_mps,
-            tilt_std_deg=tilt_std_deg,
+            tilt_std_deg=_std("tilt_std_deg", tilt_std_deg),
         )
         made = cls(grey_levels(image), camera, telemetry)
         made.camera.plausible()

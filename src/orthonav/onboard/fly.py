@@ -238,10 +238,10 @@ class Runner:
                 return self._refuse(taken.image, taken.problem, taken.vehicle)
             return self._withhold(taken, latency)
         finally:
-            view, link = taken.view, self._link
-            if taken.problem is None and isinstance(view, View) and link is not None:
-                reported = link.state_at, link.covered_ns
-                latency.observe(arrived_ns, view.grey, view.camera, *reported)
+            grey, camera, link = taken.image.grey, taken.camera, self._link
+            if taken.problem is None and link is not None and camera is not None:
+                assert grey is not None
+                latency.observe(arrived_ns, grey, camera, link.state_at, link.covered_ns)
 
     def _restart_after_jump(self, time_ns: int) -> None:
         """Begin again where a recorded image is earlier than the one before by over a second: it
