@@ -191,8 +191,8 @@ class Telemetry(ByValue):
                 )
             else:
                 parts = (value := number(name, value),)
-            known = all(math.isfinite(each) and each >= least for each in parts)
-            object.__setattr__(self, name, value if known else None)
+            known = (each is not None and math.isfinite(each) and each >= least for each in parts)
+            object.__setattr__(self, name, value if all(known) else None)
 
     @property
     def horizon_std_deg(self) -> float | None:

@@ -52,12 +52,11 @@ class Udp:
         if not self._fixed:
             self._peer = self._candidate
 
-    def write(self, data: bytes) -> None:
-        if self._peer is not None:
-            try:
-                self._socket.sendto(data, self._peer)
-            except (BlockingIOError, ConnectionRefusedError):
-                return
+    def write(self, data: bytes) -> bool:
+        try:
+            return self._peer is not None and self._socket.sendto(data, self._peer) > 0
+        except (BlockingIOError, ConnectionRefusedError):
+            return False
 
     def close(self) -> None:
         self._socket.close()
@@ -83,24 +82,25 @@ class Descriptor:
 
     def heard(self) -> None: ...
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> bool:
         """Send all or nothing: half a message would damage the next one."""
-        try:
-            sent = os.write(self._fd, data)
-            deadline = time.monotonic() + 0.1
-            while sent < len(data) and time.monotonic() < deadline:
-                select.select([], [self._fd], [], 0.02)
+        sent, deadline = 0, time.monotonic() + 0.1
+        while sent < len(data) and (not sent or time.monotonic() < deadline):
+            try:
                 sent += os.write(self._fd, data[sent:])
-        except BlockingIOError:
-            return  # the buffer is full: a delayed position is of no use
+            except BlockingIOError:
+                if not sent:  # the buffer is full: a delayed position is of no use
+                    return False
+                select.select([], [self._fd], [], 0.02)
+        return sent == len(data)
 
     def close(self) -> None:
         os.close(self._fd)
 
 
 Transport = Udp | Descriptor
-"""Bytes in and out without blocking. `read` gives what is there, `write` sends one message; both
-raise `OSError` on failure."""
+"""Bytes in and out without blocking. `read` gives what is there, `write` sends one message, False
+where the port does not take it; both raise `OSError` on failure."""
 
 
 def open_serial(device: str, baud: int) -> Descriptor:
