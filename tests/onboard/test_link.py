@@ -360,6 +360,8 @@ def test_without_a_fix_of_a_receiver_the_filter_may_rest_on_orthonav():
     ours = Reporting(own_receiver=0)  # what it reports as its first receiver is GPS_INPUT
     assert ours.report(receivers=(3,)) == UNAIDED
     assert ours.report(receivers=(3, 3)) == GNSS_AIDED
+    # Compared with the map it would always agree, and teach that the map is not displaced.
+    assert {each.receiver for each in ours.link.gnss} == {1}
 
 
 def test_a_fix_without_the_state_of_the_filter_is_not_enough():

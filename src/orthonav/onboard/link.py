@@ -65,7 +65,7 @@ class AutopilotLink:
         self._opener, self._clocks = opener, clocks
         self.buffer, self.sync = buffer, ClockSync()
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
-        self.aiding = Aiding(own_receiver)
+        self.aiding, self._own_receiver = Aiding(), own_receiver
         self._lock = threading.RLock()
         self._wanted, self._silent = system_id, silent
         self._signing = signing
@@ -338,8 +338,9 @@ class AutopilotLink:
 
     def _gnss(self, message: Message, now_ns: int) -> None:
         sample = gnss_sample(message, now_ns, self.sync.boot_ns(now_ns))
-        self.aiding.receiver(sample.receiver, sample.fix_type, now_ns)
-        self.gnss.append(sample)
+        if sample.receiver != self._own_receiver:  # which repeats positions by the map
+            self.aiding.receiver(sample.fix_type, now_ns)
+            self.gnss.append(sample)
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request: answer with the clock that stamps our messages
