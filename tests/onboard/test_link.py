@@ -382,7 +382,10 @@ def test_a_large_covariance_of_the_velocity_is_taken_over():
 
 @pytest.mark.parametrize(
     "url",
-    ["", "udpin:", "udpin:x", "udpout:host:99999", "tcp:host", "ttyUSB0", "/dev/ttyS0:fast", "u:1"],
+    [
+        *("", "udpin:", "udpin:x", "udpout:host:99999", "tcp:host", "ttyUSB0", "/dev/ttyS0:fast"),
+        *("u:1", "/dev/ttyS0:12345", "/dev/ttyS0:0"),
+    ],
 )
 def test_invalid_connection_strings_are_refused(url):
     with pytest.raises(VariantError):

@@ -105,9 +105,7 @@ where the port does not take it; both raise `OSError` on failure."""
 
 def open_serial(device: str, baud: int) -> Descriptor:
     """Open a serial port, raw, 8N1. Raises `VariantError` for an unsupported speed."""
-    speed = getattr(termios, f"B{baud}", None)
-    if speed is None:
-        raise VariantError(f"unsupported speed of a serial port, {baud} baud: {device}")
+    speed = _speed(device, baud)
     fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         tty.setraw(fd)
@@ -119,6 +117,13 @@ def open_serial(device: str, baud: int) -> Descriptor:
         os.close(fd)
         raise OSError(errno.EIO, f"not a serial port ({error})", device) from error
     return Descriptor(fd)
+
+
+def _speed(device: str, baud: int) -> int:
+    speed = getattr(termios, f"B{baud}", 0)
+    if not speed:
+        raise VariantError(f"unsupported speed of a serial port, {baud} baud: {device}")
+    return int(speed)
 
 
 def _open_tcp(host: str, port: int) -> Descriptor:
@@ -154,11 +159,13 @@ def host_port(text: str, url: str, usual: int = 14550) -> tuple[str, int]:
 
 
 def device_baud(text: str, url: str) -> tuple[str, int]:
-    """Device and speed of `DEVICE[:BAUD]`."""
+    """Device and speed of `DEVICE[:BAUD]`. Raises `VariantError`."""
     device, _, baud = text.replace(",", ":").partition(":")
     if not device.startswith("/") or not (baud == "" or baud.isdigit()):
         raise VariantError(
             "expected udpin:[HOST:]PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE:BAUD, "
             f"got '{url}'"
         )
-    return device, int(baud) if baud else 57_600
+    found = int(baud) if baud else 57_600
+    _speed(device, found)
+    return device, found
