@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
-from orthonav.core.localize.localizer import Localizer
+from orthonav.core.localize.localizer import HALF_EARTH_M, Localizer
 from orthonav.core.localize.odometry import (
     CameraDisplacement,
     OdometryView,
@@ -374,7 +374,8 @@ class Tracker:
 
     def _position_of(self, prior: Prior) -> tuple[Array, float]:
         frame = self._localizer.sheet.frame
-        return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), max(prior.std_m, 1.0)
+        std_m = min(max(prior.std_m, 1.0), HALF_EARTH_M)
+        return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), std_m
 
     def _telemetry_noise(self, telemetry: Telemetry) -> Array:
         """Variances (3,) of heading (rad) and log scale between views and of the horizon (rad)."""
