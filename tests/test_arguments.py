@@ -186,6 +186,16 @@ def test_every_kind_of_path(map_path, flight_path, tmp_path, kind):
     assert set(map_.dates) >= known and list(map_.dates) == sorted(map_.dates)
 
 
+def test_what_is_no_limit_and_no_risk_is_named():
+    for call, message in (
+        (lambda: FIX.probability_within("35"), "limit_m must be metres, got '35'"),
+        (lambda: FIX.protection_level_m(1.1), "risk must be a probability, 0 to 1, got 1.1"),
+        (lambda: FIX.protection_level_m(None), "risk must be .* got None"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            call()
+
+
 def test_what_is_no_path_is_named():
     calls = orthonav.open_map, orthonav.open_flight, orthonav.read_truth, Camera.from_file
     for call in (*calls, orthonav.read_results):

@@ -390,7 +390,8 @@ class Fix(Outcome):
 
     def probability_within(self, limit_m: float) -> float:
         """Probability that the error is at most `limit_m`; NaN where the confidence is unknown."""
-        return probability_within(self.right_probability, self.cov_en_m2, max(limit_m, 0.0))
+        limit_m = max(number("limit_m", limit_m, "metres"), 0.0)
+        return probability_within(self.right_probability, self.cov_en_m2, limit_m)
 
     def with_covariance(self, cov_en_m2: NDArray[np.float64]) -> "Fix":
         """With another one (2, 2), m2, and the confidence that follows from it."""
@@ -610,15 +611,14 @@ def protection_level_m(place_probability: float, cov_en_m2: Array, risk: float) 
     """Smallest limit that the error exceeds with a probability of at most `risk`.
 
     `place_probability`: that the place is right. Infinite where a wrong place alone is likelier
-    than that, and for an unknown covariance. Raises `ValueError` unless `risk` is 0 to 1."""
+    than that, and for an unknown covariance. Raises `ArgumentError` unless `risk` is 0 to 1."""
     place, covs = np.array([place_probability]), np.asarray(cov_en_m2)[None]
     return float(protection_levels_m(place, covs, risk)[0])
 
 
 def protection_levels_m(place_probability: Array, covs_en_m2: Array, risk: float) -> Array:
     """The same (N,) of many: probabilities (N,) and covariances (N, 2, 2)."""
-    if not 0 <= risk <= 1:
-        raise ValueError(f"a risk is a probability, 0 to 1, got {risk}")
+    number("risk", risk, "a probability, 0 to 1", 0, 1)
     levels = np.full(len(place_probability), math.inf)
     finite = np.isfinite(covs_en_m2).all(axis=(1, 2)) & (risk - (1 - place_probability) > 0)
     place, scales = place_probability[finite], _scales_m2(covs_en_m2[finite])
