@@ -141,6 +141,8 @@ def test_every_kind_of_number(kind):
     assert made == expected and json.dumps(dataclasses.asdict(made))
     moved = dataclasses.replace(made, time_ns=kind(7), vel_en_mps=np.array([kind(1), 2.0]))
     assert (moved.time_ns, moved.vel_en_mps) == (7, (1.0, 2.0))
+    prior = Prior(kind(48), kind(2), kind(30))
+    assert prior == Prior(48.0, 2.0, 30.0) and json.dumps(dataclasses.asdict(prior))
     camera = Camera(kind(64), kind(48), kind(60), kind(60), kind(32), kind(24))
     assert json.dumps(camera.numbers()) and camera.fx_px == 60.0
 

@@ -115,9 +115,14 @@ class Prior:
     std_m: float
 
     def __post_init__(self) -> None:
-        number("lat_deg", self.lat_deg, "-90 to 90, before the longitude", -90, 90)
-        number("lon_deg", self.lon_deg, "-360 to 360", -360, 360)
-        number("std_m", self.std_m, "metres, 0 or more", 0)
+        place = "-90 to 90, before the longitude"
+        numbers = {
+            "lat_deg": number("lat_deg", self.lat_deg, place, -90, 90),
+            "lon_deg": number("lon_deg", self.lon_deg, "-360 to 360", -360, 360),
+            "std_m": number("std_m", self.std_m, "metres, 0 or more", 0),
+        }
+        for name, value in numbers.items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def known(cls, *values: float) -> "Prior | None":
@@ -134,7 +139,7 @@ class Telemetry(ByValue):
 
     NaN and None stand for unknown: an optional field that is not finite becomes None. Angles are
     degrees. A view without heading, pitch, roll or height gives a `NoFix`. Raises `ArgumentError`
-    without a time.
+    without a time and for values of another type.
 
     - `time_ns`: of the exposure, whole nanoseconds of any clock. `agl_m`: height above ground, m.
     - `yaw_deg`: heading of the top of the picture, clockwise from true north: `heading_deg` of
