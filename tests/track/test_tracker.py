@@ -396,6 +396,14 @@ def test_a_prior_of_no_accuracy_changes_nothing(localizer, every_prior, std_m):
         assert off_m < 8 and fix.std_m < 8 and fix.is_confident
 
 
+def test_an_impossible_velocity_is_none(localizer):
+    """As of memory that was never written."""
+    seen = list(views(8))
+    odd = [(a, replace(b, vel_en_mps=(1e300, 1e154)), c) for a, b, c in seen]
+    off_m, *_, fix = followed(Tracker(localizer), localizer, odd)[-1]
+    assert off_m < 8 and fix.is_confident
+
+
 @pytest.mark.long
 def test_a_place_that_contradicts_the_start_is_found_and_not_believed_at_once(localizer):
     tracker, seen = Tracker(localizer), list(views(19))

@@ -30,6 +30,7 @@ from orthonav.core.localize.sighting import Sighting, sightings
 from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import (
+    MAX_STD,
     PRIOR_SIGMAS,
     RADIUS_SHARE,
     Fix,
@@ -576,9 +577,9 @@ class Tracker:
 
 
 def _reported_velocity(past: _Past, telemetry: Telemetry) -> ReportedVelocity | None:
-    """None where none is given."""
+    """None where none is given, or an impossible one."""
     reported, std = telemetry.vel_en_mps, telemetry.vel_std_mps
-    if reported is None or not np.isfinite(reported).all():
+    if reported is None or not np.abs(reported).max() <= MAX_STD:  # NaN too
         return None
     now = np.array(reported)
     if std is None or not std > 0:
