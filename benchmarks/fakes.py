@@ -66,11 +66,12 @@ class Port:
             raise self.broken
         return self.coming.pop(0) if self.coming else b""
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> bool:
         """Take a frame."""
         if self.broken:
             raise self.broken
         self.gone.append(bytes(data))
+        return True
 
     def heard(self) -> None:
         """Nothing to do."""

@@ -7,6 +7,8 @@ import math
 import os
 import pickle
 import sys
+from decimal import Decimal
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -42,6 +44,14 @@ def test_records_with_other_values_differ():
     assert dataclasses.replace(FIX, evidence={"score": 0.5}) != FIX
     assert NoFix("blank", "") != NoFix("dark", "")
     assert View(GREY + 1, CAMERA, TELEMETRY) != View(GREY, CAMERA, TELEMETRY)
+
+
+def test_a_view_keeps_its_picture():
+    """A program may read the next picture into the same memory; a track compares both."""
+    buffer = GREY.copy()
+    view = View.of(buffer, CAMERA, agl_m=100.0)
+    buffer[:] = 0
+    assert (view.grey == GREY).all() and not view.grey.flags.writeable
 
 
 def test_plain_values_are_those_of_the_file(tmp_path):
@@ -97,12 +107,53 @@ def test_impossible_priors(values, message):
         ({"time_s": 1.7e12}, "time_s must be in seconds, not ms or ns, got 17"),
         ({"camera": None}, "camera must be an orthonav.Camera, .* got NoneType"),
         ({"camera": np.eye(3)}, "camera must be an orthonav.Camera, .* got ndarray"),
+        ({"vel_en_mps": 5}, "vel_en_mps must be a pair, east and north, m/s, got '5'"),
     ],
 )
 def test_arguments_of_a_view(change, message):
     with pytest.raises(ArgumentError, match=message):
         View.of(**({"image": GREY, "camera": CAMERA, "agl_m": 100.0} | change))
     assert isinstance(ArgumentError(""), TypeError | ValueError)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"time_ns": "5"}, "time_ns must be whole nanoseconds, got '5'"),
+        ({"time_ns": math.nan}, "time_ns must be whole nanoseconds, got nan"),
+        ({"yaw_deg": "N"}, "yaw_deg must be a number, got 'N'"),
+        ({"yaw_std_deg": "1"}, "yaw_std_deg must be a number, got '1'"),
+        ({"prior": (48.8, 2.3, 5)}, r"prior must be an orthonav.Prior\(lat_deg.*, got tuple"),
+        ({"below": 40.0}, "below must be an orthonav.Ground, got float"),
+        ({"vel_en_mps": (1, 2, 3)}, "vel_en_mps must be a pair, east and north"),
+    ],
+)
+def test_arguments_of_telemetry(change, message):
+    with pytest.raises(ArgumentError, match=message):
+        dataclasses.replace(TELEMETRY, **change)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.array, Fraction, Decimal])
+def test_every_kind_of_number(kind):
+    stds = {"heading_std_deg": kind(5), "agl_std_m": kind(4), "tilt_std_deg": kind(3)}
+    made = View.of(GREY, CAMERA, agl_m=kind(100), time_s=kind(2), **stds).telemetry
+    expected = Telemetry(2 * 10**9, math.nan, 0, 0, 100, 5, 4, tilt_std_deg=3)
+    assert made == expected and json.dumps(dataclasses.asdict(made))
+    moved = dataclasses.replace(made, time_ns=kind(7), vel_en_mps=np.array([kind(1), 2.0]))
+    assert (moved.time_ns, moved.vel_en_mps) == (7, (1.0, 2.0))
+    prior = Prior(kind(48), kind(2), kind(30))
+    assert prior == Prior(48.0, 2.0, 30.0) and json.dumps(dataclasses.asdict(prior))
+    camera = Camera(kind(64), kind(48), kind(60), kind(60), kind(32), kind(24))
+    assert json.dumps(camera.numbers()) and camera.fx_px == 60.0
+
+
+def test_what_is_no_view_is_named(map_path):
+    localizer = Localizer(orthonav.open_map(map_path))
+    for locate in (localizer.locate, Tracker(localizer).locate):
+        with pytest.raises(ArgumentError, match=r"view must be .* View.of\(..\), got ndarray"):
+            locate(GREY)
+    with pytest.raises(ArgumentError, match=r"telemetry must be an orthonav\.Telemetry"):
+        View(GREY, CAMERA, None)
 
 
 def test_a_path_is_no_image(tmp_path):
@@ -135,6 +186,23 @@ def test_every_kind_of_path(map_path, flight_path, tmp_path, kind):
     assert map_.frame.en_from_latlon(map_.frame.lat_deg, map_.frame.lon_deg).tolist() == [0, 0]
     known = {each["date"] for each in map_.manifest.imagery if "date" in each}
     assert set(map_.dates) >= known and list(map_.dates) == sorted(map_.dates)
+
+
+def test_what_is_no_limit_and_no_risk_is_named():
+    for call, message in (
+        (lambda: FIX.probability_within("35"), "limit_m must be metres, got '35'"),
+        (lambda: FIX.protection_level_m(1.1), "risk must be a probability, 0 to 1, got 1.1"),
+        (lambda: FIX.protection_level_m(None), "risk must be .* got None"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            call()
+
+
+def test_what_is_no_path_is_named():
+    calls = orthonav.open_map, orthonav.open_flight, orthonav.read_truth, Camera.from_file
+    for call in (*calls, orthonav.read_results):
+        with pytest.raises(ArgumentError, match=r"must be text or an os\.PathLike, got NoneType"):
+            call(None)
 
 
 def test_what_is_no_map_is_named(map_path):

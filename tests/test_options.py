@@ -77,6 +77,14 @@ def test_only_the_gps_message_has_an_id(sent, capsys):
     assert ended.value.code == 2 and "gps-input:0 to gps-input:255" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("given", ["--log-max-mb=0", "--log-max-mb=nan", "--min-std-m=nan"])
+def test_numbers_of_a_flight_have_ranges(given, capsys):
+    """A log of at most 0 MB would delete all earlier ones."""
+    with pytest.raises(SystemExit) as ended:
+        main(["fly", "a.onav", "video.mp4", given])
+    assert ended.value.code == 2 and "expected " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("first", ["gps-input:1", "gps-input:0"])
 def test_messages_have_one_gps_id(first, run):
     asked = ["--send", first, "--send", "gps-input:2"]

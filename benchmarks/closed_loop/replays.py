@@ -202,7 +202,7 @@ def stated(autopilot: str, telemetry: Telemetry, gnss: bool) -> Telemetry:
     aiding = Aiding()
     aiding.status(ABSOLUTE if gnss else 0, 0, ardupilot=autopilot == "ardupilot")
     if gnss:
-        aiding.receiver(0, FIX_3D, 0)
+        aiding.receiver(FIX_3D, 0)
     vel_std_mps, tilt_std_deg = aiding.stds(0)
     known = math.isfinite(vel_std_mps)
     return replace(telemetry, tilt_std_deg=tilt_std_deg, vel_std_mps=vel_std_mps if known else None)

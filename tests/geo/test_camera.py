@@ -119,10 +119,12 @@ def test_fields_of_view():
     assert across.fx_px == pytest.approx(math.hypot(1280, 960) / 2 / math.tan(math.radians(42)))
     square = Camera.from_fov(90.0, 1280, 960)
     assert square.fx_px == pytest.approx(640) and square.cx_px == 640 and square.focal_std > 0
-    for wrong in (0.0, 180.0, math.nan, 1.13):
+    for wrong in (0.0, 180.0, math.nan, 1.13, None, "65"):
         said = r"64\.7 if these are radians" if wrong == 1.13 else "field of view"
         with pytest.raises(CameraError, match=said):
             Camera.from_fov(wrong, 1280, 960)
+    with pytest.raises(CameraError, match="size must be numbers, got '1280', 960"):
+        Camera.from_fov(65, "1280", 960)
     whole = Camera.from_fov(65, 1280.0, 960.0)
     assert type(whole.width_px) is int and whole == Camera.from_fov(65, 1280, 960)
 
@@ -139,6 +141,11 @@ def test_matrices_that_are_not_those_of_opencv():
     for other, message in refused:
         with pytest.raises(CameraError, match=message):
             Camera.from_matrix(other, None, (640, 480))
+    for size in (640, (640, 480, 3)):
+        with pytest.raises(CameraError, match="size_px must be width and height"):
+            Camera.from_matrix(matrix, None, size)
+    with pytest.raises(CameraError, match="must be numbers"):
+        Camera.from_matrix(matrix, "k1", (640, 480))
 
 
 @given(yaws, tilts, tilts, st.floats(30, 500), st.just(()) | coefficients)

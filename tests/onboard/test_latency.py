@@ -50,14 +50,14 @@ def test_an_undisturbed_flight_keeps_its_messages_and_states_the_latency():
     sent, views = report.lead_in()
     assert sent >= 10 and sent + len(report.during()) >= 0.98 * (views + 60)
     assert report.worst_m() < 4.0
-    assert set(report.withheld) == {"latency_unknown"}  # compared with the first images
+    assert set(report.withheld) == {"no_telemetry", "latency_unknown"}  # of the first images
     plain = flight.runner._latency.plain()
     assert plain == {"latency_ms": 120.0, "latency_std_ms": 30.0, "latency": "stated"}
 
 
 def test_views_are_located_but_not_sent_until_images_agree():
     flight, report = fly(Fault("none", "none", 0.2), lead_s=1.8)
-    assert report.sent == [] and set(report.withheld) == {"latency_unknown"}
+    assert report.sent == [] and set(report.withheld) == {"no_telemetry", "latency_unknown"}
     assert flight.runner.counter.total["processed"] >= 5
 
 

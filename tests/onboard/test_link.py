@@ -1,9 +1,11 @@
 """The link: messages in and out, and failures of the port."""
 
+import contextlib
 import math
 import os
 import pty
 import socket
+import threading
 
 import pytest
 from fake_autopilot import AHEAD_NS, MS, UTC_NS, Autopilot, Linked, S, Time
@@ -185,6 +187,24 @@ def test_damaged_bytes_are_counted_and_skipped(flying):
     assert flying.link.counts["damaged"] > 0
 
 
+def test_a_time_far_ahead_hides_nothing(flying):
+    """One damaged message: later ones would count as out of order until that time."""
+    flying.hear_attitude(yaw_deg=10.0)
+    ahead_ms = flying.boot_ns() // MS + 2_000_000
+    flying.hear(flying.autopilot.attitude(ahead_ms * MS))
+    flying.say("attitude_quaternion", ahead_ms, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    flying.say("global_position_int", ahead_ms, 0, 0, 640_000, 55_000, 0, 0, 0, 0)
+    flying.say("local_position_ned", ahead_ms, 0.0, 0.0, -9.0, 1.0, 2.0, 0.0)
+    flying.say("distance_sensor", ahead_ms, 10, 9000, 777, 0, 0, 25, 0)
+    assert flying.link.sync.jumps == 0
+    flying.time.go(0.05)
+    flying.hear_attitude(yaw_deg=12.0)
+    flying.position(500.0, 50.0)
+    telemetry = flying.telemetry()
+    assert (telemetry.yaw_deg, telemetry.agl_m) == (pytest.approx(12.0, abs=1e-3), 50.0)
+    assert telemetry.vel_en_mps is None and flying.link.covered_ns <= flying.time.now_ns + 30 * MS
+
+
 def test_heartbeat_and_timesync_once_a_second(flying):
     for _ in range(100):
         flying.time.go(0.05)
@@ -340,6 +360,8 @@ def test_without_a_fix_of_a_receiver_the_filter_may_rest_on_orthonav():
     ours = Reporting(own_receiver=0)  # what it reports as its first receiver is GPS_INPUT
     assert ours.report(receivers=(3,)) == UNAIDED
     assert ours.report(receivers=(3, 3)) == GNSS_AIDED
+    # Compared with the map it would always agree, and teach that the map is not displaced.
+    assert {each.receiver for each in ours.link.gnss} == {1}
 
 
 def test_a_fix_without_the_state_of_the_filter_is_not_enough():
@@ -360,7 +382,10 @@ def test_a_large_covariance_of_the_velocity_is_taken_over():
 
 @pytest.mark.parametrize(
     "url",
-    ["", "udpin:", "udpin:x", "udpout:host:99999", "tcp:host", "ttyUSB0", "/dev/ttyS0:fast", "u:1"],
+    [
+        *("", "udpin:", "udpin:x", "udpout:host:99999", "tcp:host", "ttyUSB0", "/dev/ttyS0:fast"),
+        *("u:1", "/dev/ttyS0:12345", "/dev/ttyS0:0"),
+    ],
 )
 def test_invalid_connection_strings_are_refused(url):
     with pytest.raises(VariantError):
@@ -411,6 +436,54 @@ def test_a_serial_port_carries_bytes_as_they_are():
         open_serial("/dev/null", 12345)
     with pytest.raises(OSError, match="not a serial port"):
         open_serial("/dev/null", 57600)
+
+
+def test_a_message_is_sent_whole_or_not_at_all():
+    ours, theirs = os.pipe()
+    port, message = Descriptor(theirs), bytes(range(200)) * 50
+    os.set_blocking(ours, False)
+    with contextlib.suppress(BlockingIOError):
+        while os.write(theirs, bytes(4096)):
+            pass
+    assert port.write(message) is False  # full
+    os.read(ours, 4096)  # room for a part
+    slow = threading.Timer(0.05, os.read, (ours, 2**20))
+    slow.start()
+    assert port.write(message) is True
+    slow.join()
+    left = b""
+    with contextlib.suppress(BlockingIOError):
+        while part := os.read(ours, 2**20):
+            left += part
+    assert left and message.endswith(left)
+    for fd in (ours, theirs):
+        os.close(fd)
+
+
+def test_what_nobody_hears_is_not_sent(flying):
+    beat = dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    assert flying.link.send(beat)
+    listening = AutopilotLink(
+        transport_opener("udpin:127.0.0.1:0"), TelemetryBuffer(), Time().clocks
+    )
+    listening.poll()
+    assert not listening.send(beat)
+    listening.close()
+
+
+def test_a_port_that_another_thread_has_closed_is_not_read(flying, monkeypatch):
+    """Its number may be that of another file by then."""
+    port = flying.port
+
+    def waited(*arguments):
+        port.broken = OSError("unplugged")
+        flying.link.send(dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+        port.broken = None
+
+    monkeypatch.setattr("orthonav.onboard.link.select.select", waited)
+    monkeypatch.setattr(port, "fileno", lambda: 0, raising=False)
+    port.coming.append(flying.autopilot.heartbeat())
+    assert flying.link.poll(0.1) == 0 and port.coming
 
 
 def test_a_tcp_connection_that_ends_is_an_error():

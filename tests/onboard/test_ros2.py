@@ -257,6 +257,13 @@ def test_a_fix_of_a_receiver_aids_the_horizon():
     received = "/gps/fix", MESSAGES.fix(flying.now_ns)
     aided = flying.telemetry(received, (IMU, imu(flying.now_ns)))
     assert aided.horizon_std_deg == pytest.approx(1.0)
+    flying.reader.gnss.clear()  # as with --gnss
+    flying.time.go(0.1)
+    aided = flying.telemetry((IMU, imu(flying.now_ns)))
+    assert aided.horizon_std_deg == pytest.approx(1.0)
+    flying.time.go(4.0)
+    unaided = flying.telemetry((IMU, imu(flying.now_ns)))
+    assert unaided.horizon_std_deg == pytest.approx(3.0)
 
 
 def test_stamps_that_go_back(caplog):

@@ -384,6 +384,26 @@ def test_gnss_of_a_first_leg_calibrates_the_mount(localizer):
     assert (rows[2][3].pitch_deg, rows[2][3].roll_deg) == pytest.approx((5.0, -3.0), abs=2.0)
 
 
+@pytest.mark.parametrize("std_m", [1e5, 1e300])
+@pytest.mark.parametrize("every_prior", [False, True])
+def test_a_prior_of_no_accuracy_changes_nothing(localizer, every_prior, std_m):
+    seen, unknown = list(views(8)), Prior(46.5, 3.0, std_m)
+    rows = [
+        followed(Tracker(localizer, every_prior=every_prior), localizer, each)
+        for each in (seen, [(a, replace(b, prior=unknown), c) for a, b, c in seen])
+    ]
+    for off_m, *_, fix in (each[-1] for each in rows):
+        assert off_m < 8 and fix.std_m < 8 and fix.is_confident
+
+
+def test_an_impossible_velocity_is_none(localizer):
+    """As of memory that was never written."""
+    seen = list(views(8))
+    odd = [(a, replace(b, vel_en_mps=(1e300, 1e154)), c) for a, b, c in seen]
+    off_m, *_, fix = followed(Tracker(localizer), localizer, odd)[-1]
+    assert off_m < 8 and fix.is_confident
+
+
 @pytest.mark.long
 def test_a_place_that_contradicts_the_start_is_found_and_not_believed_at_once(localizer):
     tracker, seen = Tracker(localizer), list(views(19))

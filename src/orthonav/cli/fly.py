@@ -8,7 +8,7 @@ import threading
 from contextlib import ExitStack
 from pathlib import Path
 
-from orthonav.cli.common import add_acceptance, add_options, numbers
+from orthonav.cli.common import add_acceptance, add_options, numbers, within
 from orthonav.core.errors import StoppedError, VariantError
 
 EXAMPLE = "area.onav 0 --camera calib.yaml --camera-latency-ms 80 --autopilot udpin:14550"
@@ -52,7 +52,7 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     text = "udpin:[HOST:]PORT (default HOST: loopback), udpout:HOST:PORT, tcp:HOST:PORT or "
     add("--autopilot", metavar="URL", help=f"MAVLink connection: {text}/dev/DEVICE:BAUD")
     text = "system id of the autopilot (default: the first one heard)"
-    add("--system-id", type=int, metavar="N", help=text)
+    add("--system-id", type=within(1, 255, int), metavar="N", help=text)
     text = "key of MAVLink signing (32 bytes or 64 hexadecimal digits); unsigned ones are ignored"
     add("--signing-key", type=Path, metavar="FILE", help=text)
     text = "source of the height above ground; repeat in order of preference (default: all, so)"
@@ -91,7 +91,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
     add("--send-rate-hz", type=float, metavar="HZ", help=text)
     add_acceptance(group)
     text = "lower bound of the standard deviation that messages state (default 0)"
-    add("--min-std-m", type=float, default=0.0, metavar="M", help=text)
+    add("--min-std-m", type=within(0, 10_000), default=0.0, metavar="M", help=text)
     add("--dry-run", action="store_true", help="send nothing to the autopilot")
 
     add = parser.add_argument_group("fields of messages").add_argument
@@ -121,7 +121,7 @@ def _add_flight(parser: argparse.ArgumentParser) -> None:
     text = "write a flight log that can be replayed"
     add("--log", type=Path, metavar="FILE.mcap", help=text)
     text = "maximum size of the log; its oldest files are deleted (default: no limit)"
-    add("--log-max-mb", type=float, metavar="MB", help=text)
+    add("--log-max-mb", type=within(1, 1e9), metavar="MB", help=text)
     text = "images in the log; a replay needs full ones (default)"
     add("--log-views", choices=("none", "thumbnails", "full"), default="full", help=text)
 

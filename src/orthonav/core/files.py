@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from orthonav.core.errors import MissingFileError, OutputError, lfs_pointer
+from orthonav.core.errors import ArgumentError, MissingFileError, OutputError, lfs_pointer
 
 StrPath = str | os.PathLike[str]
 GivenPath: TypeAlias = Any
@@ -169,9 +169,18 @@ def with_paths(record: object, *names: str) -> None:
             object.__setattr__(record, name, tuple(Path(each) for each in value))
 
 
+def path_of(path: StrPath, what: str) -> Path:
+    """Raises `ArgumentError` that names `what` for what is no path."""
+    try:
+        return Path(path)
+    except TypeError as error:
+        kind = type(path).__name__
+        raise ArgumentError(f"{what} must be text or an os.PathLike, got {kind}") from error
+
+
 def require_file(path: StrPath, what: str) -> Path:
     """`path` if it is a file and no pointer of Git LFS, else `MissingFileError` naming `what`."""
-    path = Path(path)
+    path = path_of(path, what)
     if not path.is_file():
         kind = "is a folder, not a file" if path.is_dir() else "does not exist"
         raise MissingFileError(f"{what} {kind}: {path}")

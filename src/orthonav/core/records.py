@@ -54,6 +54,10 @@ def number(
     return found
 
 
+def _std(name: str, value: Any) -> float | None:
+    return None if value is None else number(name, value, "0 or more; None: unknown", 0, MAX_STD)
+
+
 class ReadOnly(Mapping[str, float]):
     """Unlike a mapping proxy it can be pickled and copied."""
 
@@ -111,9 +115,14 @@ class Prior:
     std_m: float
 
     def __post_init__(self) -> None:
-        number("lat_deg", self.lat_deg, "-90 to 90, before the longitude", -90, 90)
-        number("lon_deg", self.lon_deg, "-360 to 360", -360, 360)
-        number("std_m", self.std_m, "metres, 0 or more", 0)
+        place = "-90 to 90, before the longitude"
+        numbers = {
+            "lat_deg": number("lat_deg", self.lat_deg, place, -90, 90),
+            "lon_deg": number("lon_deg", self.lon_deg, "-360 to 360", -360, 360),
+            "std_m": number("std_m", self.std_m, "metres, 0 or more", 0),
+        }
+        for name, value in numbers.items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def known(cls, *values: float) -> "Prior | None":
@@ -130,7 +139,7 @@ class Telemetry(ByValue):
 
     NaN and None stand for unknown: an optional field that is not finite becomes None. Angles are
     degrees. A view without heading, pitch, roll or height gives a `NoFix`. Raises `ArgumentError`
-    without a time.
+    without a time and for values of another type.
 
     - `time_ns`: of the exposure, whole nanoseconds of any clock. `agl_m`: height above ground, m.
     - `yaw_deg`: heading of the top of the picture, clockwise from true north: `heading_deg` of
@@ -167,20 +176,28 @@ class Telemetry(ByValue):
     below: Ground | None = None
 
     def __post_init__(self) -> None:
-        if self.time_ns is None or not math.isfinite(self.time_ns):
-            raise ArgumentError(f"time_ns must be whole nanoseconds, got {self.time_ns}")
+        number("time_ns", self.time_ns, "whole nanoseconds", -MAX_TIME_S * 1e9, MAX_TIME_S * 1e9)
+        object.__setattr__(self, "time_ns", int(self.time_ns))
         for name in _NEEDED:
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, math.nan)
-        for name in _OPTIONAL:
             value: Any = getattr(self, name)
-            if isinstance(value, Prior | Ground):
-                value = vars(value).values()
-            parts = value if hasattr(value, "__iter__") else () if value is None else (value,)
-            least = 0.0 if "_std_" in name else -math.inf
+            object.__setattr__(self, name, math.nan if value is None else number(name, value))
+        for name in _OPTIONAL:
+            value, least = getattr(self, name), 0.0 if "_std_" in name else -math.inf
+            if value is None:
+                continue
+            if name in _RECORDS:
+                has_type(name, value, *_RECORDS[name])
+                parts = tuple(vars(value).values())
+            elif name == "vel_en_mps":
+                pair = value if np.shape(value) == (2,) else (str(value), "")
+                parts = value = tuple(
+                    math.nan if each is None else number(name, each, "a pair, east and north, m/s")
+                    for each in pair
+                )
+            else:
+                parts = (value := number(name, value),)
             known = (each is not None and math.isfinite(each) and each >= least for each in parts)
-            if not all(known):
-                object.__setattr__(self, name, None)
+            object.__setattr__(self, name, value if all(known) else None)
 
     @property
     def horizon_std_deg(self) -> float | None:
@@ -196,14 +213,18 @@ class Telemetry(ByValue):
 
 _, *_NEEDED = tuple(each.name for each in fields(Telemetry))[:5]
 _OPTIONAL = tuple(each.name for each in fields(Telemetry))[5:]
+_RECORDS: dict[str, tuple[type, str]] = {
+    "prior": (Prior, "(lat_deg, lon_deg, std_m)"),
+    "below": (Ground, ""),
+}
 
 
 @dataclass(frozen=True, eq=False)
 class View(ByValue):
     """What the camera saw at one exposure, and the telemetry of that time.
 
-    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified. Images of other
-    kinds are converted by `orthonav.core.records.grey_levels`.
+    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified; copied, and then
+    read-only. Images of other kinds are converted by `orthonav.core.records.grey_levels`.
     `camera`: calibration of the camera. At another size than that of `grey` it is scaled.
     `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.
 
@@ -215,7 +236,11 @@ class View(ByValue):
 
     def __post_init__(self) -> None:
         has_type("camera", self.camera, Camera, ", as of Camera.from_matrix(..)")
+        has_type("telemetry", self.telemetry, Telemetry)
         grey = np.ascontiguousarray(grey_levels(self.grey))  # a flipped picture is a view of it
+        if grey.flags.writeable:  # a caller may use its memory for the next picture
+            grey = grey.copy()
+            grey.flags.writeable = False
         object.__setattr__(self, "grey", grey)
         object.__setattr__(self, "camera", self.camera.fitted(grey.shape[1], grey.shape[0]))
 
@@ -251,28 +276,18 @@ class View(ByValue):
 
         Raises `ArgumentError`, `FlightError` for what is no image, `CameraError` where image and
         camera have different proportions."""
-        stds = heading_std_deg, agl_std_m, tilt_std_deg
-        for name, std in zip(("heading_std_deg", "agl_std_m", "tilt_std_deg"), stds, strict=True):
-            if std is not None:
-                number(name, std, "0 or more; None: unknown", 0, MAX_STD)
-        if vel_en_mps is not None:
-            east, north = vel_en_mps if np.shape(vel_en_mps) == (2,) else ("", "")
-            pair = "a pair, east and north, m/s"
-            vel_en_mps = number("vel_en_mps", east, pair), number("vel_en_mps", north, pair)
-        if prior is not None:
-            has_type("prior", prior, Prior, "(lat_deg, lon_deg, std_m)")
-        number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S)
+        time_s = number("time_s", time_s, "in seconds, not ms or ns", -MAX_TIME_S, MAX_TIME_S)
         telemetry = Telemetry(
             round(time_s * 1e9),
             math.nan if heading_deg is None else number("heading_deg", heading_deg),
             number("pitch_deg", pitch_deg),
             number("roll_deg", roll_deg),
             number("agl_m", agl_m),
-            yaw_std_deg=heading_std_deg,
-            agl_std_m=agl_std_m,
+            yaw_std_deg=_std("heading_std_deg", heading_std_deg),
+            agl_std_m=_std("agl_std_m", agl_std_m),
             prior=prior,
             vel_en_mps=vel_en_mps,
-            tilt_std_deg=tilt_std_deg,
+            tilt_std_deg=_std("tilt_std_deg", tilt_std_deg),
         )
         made = cls(grey_levels(image), camera, telemetry)
         made.camera.plausible()
@@ -380,7 +395,8 @@ class Fix(Outcome):
 
     def probability_within(self, limit_m: float) -> float:
         """Probability that the error is at most `limit_m`; NaN where the confidence is unknown."""
-        return probability_within(self.right_probability, self.cov_en_m2, max(limit_m, 0.0))
+        limit_m = max(number("limit_m", limit_m, "metres"), 0.0)
+        return probability_within(self.right_probability, self.cov_en_m2, limit_m)
 
     def with_covariance(self, cov_en_m2: NDArray[np.float64]) -> "Fix":
         """With another one (2, 2), m2, and the confidence that follows from it."""
@@ -600,15 +616,14 @@ def protection_level_m(place_probability: float, cov_en_m2: Array, risk: float) 
     """Smallest limit that the error exceeds with a probability of at most `risk`.
 
     `place_probability`: that the place is right. Infinite where a wrong place alone is likelier
-    than that, and for an unknown covariance. Raises `ValueError` unless `risk` is 0 to 1."""
+    than that, and for an unknown covariance. Raises `ArgumentError` unless `risk` is 0 to 1."""
     place, covs = np.array([place_probability]), np.asarray(cov_en_m2)[None]
     return float(protection_levels_m(place, covs, risk)[0])
 
 
 def protection_levels_m(place_probability: Array, covs_en_m2: Array, risk: float) -> Array:
     """The same (N,) of many: probabilities (N,) and covariances (N, 2, 2)."""
-    if not 0 <= risk <= 1:
-        raise ValueError(f"a risk is a probability, 0 to 1, got {risk}")
+    number("risk", risk, "a probability, 0 to 1", 0, 1)
     levels = np.full(len(place_probability), math.inf)
     finite = np.isfinite(covs_en_m2).all(axis=(1, 2)) & (risk - (1 - place_probability) > 0)
     place, scales = place_probability[finite], _scales_m2(covs_en_m2[finite])

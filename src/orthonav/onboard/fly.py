@@ -222,7 +222,7 @@ class Runner:
         camera, problem = self._picture(image)
         if latency is not None and problem is not None and problem.reason == "frozen_image":
             latency.frozen(arrived_ns)
-        if problem is not None and not self._may_predict(image.exposed_ns):
+        if problem is not None and not self._may_predict(image):
             return self._refuse(image, problem)  # before it waits for telemetry
         taken = _Taken(image, camera, problem, *self._telemetry(image))
         return (
@@ -238,10 +238,10 @@ class Runner:
                 return self._refuse(taken.image, taken.problem, taken.vehicle)
             return self._withhold(taken, latency)
         finally:
-            view, link = taken.view, self._link
-            if taken.problem is None and isinstance(view, View) and link is not None:
-                reported = link.state_at, link.covered_ns
-                latency.observe(arrived_ns, view.grey, view.camera, *reported)
+            grey, camera, link = taken.image.grey, taken.camera, self._link
+            if taken.problem is None and link is not None and camera is not None:
+                assert grey is not None
+                latency.observe(arrived_ns, grey, camera, link.state_at, link.covered_ns)
 
     def _restart_after_jump(self, time_ns: int) -> None:
         """Begin again where a recorded image is earlier than the one before by over a second: it
@@ -261,7 +261,9 @@ class Runner:
         """The result of an image of which the locator learns nothing."""
         result = self._result(image, reason, math.nan)
         self._log(lambda sink: sink.result(result))
-        self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
+        self._publisher.publish(
+            result, image.exposed_ns, vehicle, judged=False, withheld=reason.reason
+        )
         return result
 
     def _withhold(self, taken: _Taken, latency: LatencyMonitor) -> ViewResult:
@@ -323,13 +325,14 @@ class Runner:
             self._note(result, telemetry, image.exposed_ns)
         return result
 
-    def _may_predict(self, exposed_ns: int) -> bool:
+    def _may_predict(self, image: CameraImage) -> bool:
         """Whether the track is predicted to an unusable picture. One that has not begun is not."""
         if self._start:
             return False
-        if self.options.recorded or self._tracked_ns is None:
+        is_replay = self.options.recorded and image.vehicle is None
+        if is_replay or self._tracked_ns is None:
             return True
-        return exposed_ns - self._tracked_ns >= LOOP.unusable_s * 1e9
+        return image.exposed_ns - self._tracked_ns >= LOOP.unusable_s * 1e9
 
     def _from_start(self, telemetry: Telemetry) -> Telemetry:
         """With the start position, which is given once: the track must get it."""

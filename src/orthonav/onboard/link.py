@@ -65,7 +65,7 @@ class AutopilotLink:
         self._opener, self._clocks = opener, clocks
         self.buffer, self.sync = buffer, ClockSync()
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
-        self.aiding = Aiding(own_receiver)
+        self.aiding, self._own_receiver = Aiding(), own_receiver
         self._lock = threading.RLock()
         self._wanted, self._silent = system_id, silent
         self._signing = signing
@@ -94,6 +94,8 @@ class AutopilotLink:
             select.select([transport.fileno()], [], [], timeout_s)
         understood = 0
         with self._lock:
+            if transport is not self._transport:  # `send` lost it meanwhile
+                return 0
             try:
                 for _ in range(200):
                     data = transport.read()
@@ -106,14 +108,15 @@ class AutopilotLink:
         return understood
 
     def send(self, message: Message) -> bool:
+        """Whether the port took it."""
         with self._lock:
             if self._silent or self._transport is None:
                 return False
             try:
-                self._transport.write(self._packer.pack(message, self._clocks.utc_ns()))
+                return self._transport.write(self._packer.pack(message, self._clocks.utc_ns()))
             except OSError as error:
                 self._lost(error)
-            return self._transport is not None
+                return False
 
     @property
     def covered_ns(self) -> int | None:
@@ -235,11 +238,14 @@ class AutopilotLink:
             self.counts[message.get_type()] += 1
             handler(self, message, now_ns)
 
-    def _timed(self, boot_ms: int, now_ns: int) -> int:
+    def _timed(self, boot_ms: int, now_ns: int) -> int | None:
+        """Time of a message; None far ahead of the clock, where it would hide those that follow."""
         boot_ns = int(boot_ms) * 1_000_000
         if self.sync.heard(now_ns, boot_ns):
             self._restarted()
-        return boot_ns
+        expected_ns = self.sync.boot_ns(now_ns)
+        is_ahead = expected_ns is not None and boot_ns - expected_ns > self.sync.JUMP_NS
+        return None if is_ahead else boot_ns
 
     def _restarted(self) -> None:
         """Discard what the autopilot reported before its clock jumped: it may have restarted."""
@@ -253,17 +259,20 @@ class AutopilotLink:
     def _attitude(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
         angles = message.yaw, message.pitch, message.roll
-        if all(map(math.isfinite, angles)):
+        if time_ns is not None and all(map(math.isfinite, angles)):
             self.buffer.add_attitude(time_ns, wxyz_of_angles(angles).tolist())
             self._attitude_ns = now_ns
 
     def _quaternion(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
-        self.buffer.add_attitude(time_ns, (message.q1, message.q2, message.q3, message.q4))
-        self._attitude_ns = now_ns
+        if time_ns is not None:
+            self.buffer.add_attitude(time_ns, (message.q1, message.q2, message.q3, message.q4))
+            self._attitude_ns = now_ns
 
     def _global_position(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
+        if time_ns is None:
+            return
         home_m, amsl_m = message.relative_alt * 1e-3, message.alt * 1e-3
         same = repeats_height(message)
         if not same or self.kind is Autopilot.ARDUPILOT:
@@ -274,7 +283,8 @@ class AutopilotLink:
 
     def _local_position(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
-        self.buffer.add_local(time_ns, (message.vx, message.vy, message.vz), message.z)
+        if time_ns is not None:
+            self.buffer.add_local(time_ns, (message.vx, message.vy, message.vz), message.z)
 
     def _altitude(self, message: Message, now_ns: int) -> None:
         """Its timestamp may be UTC instead of time since boot; then the time of arrival is used."""
@@ -298,7 +308,8 @@ class AutopilotLink:
             self._limited_ns = now_ns
         if is_height(message):
             time_ns = self._timed(message.time_boot_ms, now_ns)
-            self.buffer.add_distance(time_ns, message.current_distance * 1e-2)
+            if time_ns is not None:
+                self.buffer.add_distance(time_ns, message.current_distance * 1e-2)
 
     def _rangefinder(self, message: Message, now_ns: int) -> None:
         arrived_ns = self.sync.boot_ns(now_ns)
@@ -327,8 +338,9 @@ class AutopilotLink:
 
     def _gnss(self, message: Message, now_ns: int) -> None:
         sample = gnss_sample(message, now_ns, self.sync.boot_ns(now_ns))
-        self.aiding.receiver(sample.receiver, sample.fix_type, now_ns)
-        self.gnss.append(sample)
+        if sample.receiver != self._own_receiver:  # which repeats positions by the map
+            self.aiding.receiver(sample.fix_type, now_ns)
+            self.gnss.append(sample)
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request: answer with the clock that stamps our messages

@@ -52,12 +52,11 @@ class Udp:
         if not self._fixed:
             self._peer = self._candidate
 
-    def write(self, data: bytes) -> None:
-        if self._peer is not None:
-            try:
-                self._socket.sendto(data, self._peer)
-            except (BlockingIOError, ConnectionRefusedError):
-                return
+    def write(self, data: bytes) -> bool:
+        try:
+            return self._peer is not None and self._socket.sendto(data, self._peer) > 0
+        except (BlockingIOError, ConnectionRefusedError):
+            return False
 
     def close(self) -> None:
         self._socket.close()
@@ -83,31 +82,30 @@ class Descriptor:
 
     def heard(self) -> None: ...
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> bool:
         """Send all or nothing: half a message would damage the next one."""
-        try:
-            sent = os.write(self._fd, data)
-            deadline = time.monotonic() + 0.1
-            while sent < len(data) and time.monotonic() < deadline:
-                select.select([], [self._fd], [], 0.02)
+        sent, deadline = 0, time.monotonic() + 0.1
+        while sent < len(data) and (not sent or time.monotonic() < deadline):
+            try:
                 sent += os.write(self._fd, data[sent:])
-        except BlockingIOError:
-            return  # the buffer is full: a delayed position is of no use
+            except BlockingIOError:
+                if not sent:  # the buffer is full: a delayed position is of no use
+                    return False
+                select.select([], [self._fd], [], 0.02)
+        return sent == len(data)
 
     def close(self) -> None:
         os.close(self._fd)
 
 
 Transport = Udp | Descriptor
-"""Bytes in and out without blocking. `read` gives what is there, `write` sends one message; both
-raise `OSError` on failure."""
+"""Bytes in and out without blocking. `read` gives what is there, `write` sends one message, False
+where the port does not take it; both raise `OSError` on failure."""
 
 
 def open_serial(device: str, baud: int) -> Descriptor:
     """Open a serial port, raw, 8N1. Raises `VariantError` for an unsupported speed."""
-    speed = getattr(termios, f"B{baud}", None)
-    if speed is None:
-        raise VariantError(f"unsupported speed of a serial port, {baud} baud: {device}")
+    speed = _speed(device, baud)
     fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         tty.setraw(fd)
@@ -119,6 +117,13 @@ def open_serial(device: str, baud: int) -> Descriptor:
         os.close(fd)
         raise OSError(errno.EIO, f"not a serial port ({error})", device) from error
     return Descriptor(fd)
+
+
+def _speed(device: str, baud: int) -> int:
+    speed = getattr(termios, f"B{baud}", 0)
+    if not speed:
+        raise VariantError(f"unsupported speed of a serial port, {baud} baud: {device}")
+    return int(speed)
 
 
 def _open_tcp(host: str, port: int) -> Descriptor:
@@ -154,11 +159,13 @@ def host_port(text: str, url: str, usual: int = 14550) -> tuple[str, int]:
 
 
 def device_baud(text: str, url: str) -> tuple[str, int]:
-    """Device and speed of `DEVICE[:BAUD]`."""
+    """Device and speed of `DEVICE[:BAUD]`. Raises `VariantError`."""
     device, _, baud = text.replace(",", ":").partition(":")
     if not device.startswith("/") or not (baud == "" or baud.isdigit()):
         raise VariantError(
             "expected udpin:[HOST:]PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE:BAUD, "
             f"got '{url}'"
         )
-    return device, int(baud) if baud else 57_600
+    found = int(baud) if baud else 57_600
+    _speed(device, found)
+    return device, found

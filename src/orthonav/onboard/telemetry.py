@@ -380,9 +380,7 @@ class _Exchange(NamedTuple):
 class Aiding:
     """What the autopilot reported about its filter and receivers, by our clock. Mutable."""
 
-    def __init__(self, own_receiver: int | None = None) -> None:
-        """`own_receiver`: number of the receiver in whose place orthonav sends GPS_INPUT."""
-        self._own = own_receiver
+    def __init__(self) -> None:
         self._source = AUTOPILOT
         self._absolute_ns: int | None = None
         self._fixed_ns: int | None = None
@@ -396,9 +394,9 @@ class Aiding:
         aided = flags & ABSOLUTE and not flags & _IN_DOUBT
         self._absolute_ns = now_ns if aided else None
 
-    def receiver(self, number: int, fix_type: int, now_ns: int) -> None:
-        """Take the fix type of a receiver: 0 of GPS_RAW_INT, 1 of GPS2_RAW."""
-        if number != self._own and fix_type >= FIX_3D:
+    def receiver(self, fix_type: int, now_ns: int) -> None:
+        """Take the fix type of a receiver other than orthonav."""
+        if fix_type >= FIX_3D:
             self._fixed_ns = now_ns
 
     def velocity(self, std_mps: float, now_ns: int) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError, FlightError, MissingFileError, OutputError
-from orthonav.core.files import StrPath, require_file
+from orthonav.core.files import StrPath, path_of, require_file
 from orthonav.core.flight.recording import RecordedView, fitted
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.swapped import swapped_hint
@@ -67,7 +67,7 @@ def open_flight(path: StrPath, *, images_needed: bool = True) -> FlightFolder:
     `MissingFileError`, `FlightError` or `CameraError` with file and line. Values that are not
     numbers become NaN: a missing heading or height concerns one view only.
     """
-    path = Path(path)
+    path = path_of(path, "flight folder")
     if not path.is_dir():
         kind = "is a file, not a folder" if path.exists() else "does not exist"
         raise MissingFileError(f"flight folder {kind}: {path}")

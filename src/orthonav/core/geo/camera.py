@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.core.errors import CameraError
-from orthonav.core.files import StrPath
+from orthonav.core.files import StrPath, path_of
 
 Array = NDArray[np.float64]
 FOV_STD = 0.05  # of the focal length by a stated field of view, relative
@@ -64,6 +63,8 @@ class Camera:
             raise CameraError(f"camera {wrong}: {self}")
         for name in ("width_px", "height_px"):
             object.__setattr__(self, name, int(getattr(self, name)))
+        for name in ("fx_px", "fy_px", "cx_px", "cy_px", "focal_std"):  # those of NumPy are no JSON
+            object.__setattr__(self, name, float(getattr(self, name)))
 
     def _impossible(self) -> str:
         mask, size = self.mask, (self.width_px, self.height_px)
@@ -122,9 +123,12 @@ class Camera:
         makers of cameras often state it. Stated fields of view are often those of the lens or of
         another mode: good to 5 %. Raises `CameraError`."""
         # 2.9 deg is that of a focal length of 20 widths; 2.9 radians are 166 deg.
-        if isinstance(fov_deg, str) or fov_deg is None or not 2.9 <= fov_deg < 180:
-            turned = f"; {math.degrees(fov_deg):.1f} if these are radians" if fov_deg > 0 else ""
-            raise CameraError(f"field of view must be 2.9 to 180 deg, got {fov_deg:g}{turned}")
+        if not all(map(_is_finite, (width_px, height_px))):
+            raise CameraError(f"size must be numbers, got {width_px!r:.40}, {height_px!r:.40}")
+        if not (_is_finite(fov_deg) and 2.9 <= fov_deg < 180):
+            is_angle = _is_finite(fov_deg) and fov_deg > 0
+            turned = f"; {math.degrees(fov_deg):.1f} if these are radians" if is_angle else ""
+            raise CameraError(f"field of view must be 2.9 to 180 deg, got {fov_deg!r:.40}{turned}")
         across_px = math.hypot(width_px, height_px) if diagonal else width_px
         focal_px = across_px / 2 / math.tan(math.radians(fov_deg) / 2)
         middle_px = width_px / 2, height_px / 2
@@ -147,9 +151,15 @@ class Camera:
         and `cy_px` count from its corner. `distortion`: k1, k2, p1, p2[, k3], of a "fisheye"
         `model` k1 to k4; None: none. `size_px`: width and height of the images that it was
         calibrated with. `unusual`: see `Camera`. Raises `CameraError`."""
-        k = np.asarray(matrix, np.float64)
+        try:
+            k = np.asarray(matrix, np.float64)
+            more = () if distortion is None else np.ravel(np.asarray(distortion, np.float64))
+        except (TypeError, ValueError) as error:
+            raise CameraError(f"camera matrix and distortion must be numbers: {error}") from error
         if k.shape != (3, 3):
             raise CameraError(f"camera matrix must be (3, 3), got {k.shape}")
+        if np.shape(size_px) != (2,):
+            raise CameraError(f"size_px must be width and height, got {size_px!r:.40}")
         if k[0, 2] == k[1, 2] == 0 and k[2, :2].any():
             raise CameraError(
                 "camera matrix is transposed (its last row is "
@@ -162,7 +172,6 @@ class Camera:
             )
         # OpenCV counts from the centre of the first pixel.
         numbers = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
-        more = () if distortion is None else np.ravel(np.asarray(distortion, np.float64)).tolist()
         return cls(*size_px, *numbers, tuple(more), model, unusual=unusual).plausible()
 
     @classmethod
@@ -173,7 +182,7 @@ class Camera:
         Raises `MissingFileError`, `CameraError` or `MissingExtraError`."""
         from orthonav.core.geo.camera_files import read_camera_file  # the readers make cameras
 
-        return read_camera_file(Path(path))
+        return read_camera_file(path_of(path, "camera file"))
 
     def masked(self, mask: NDArray[Any]) -> "Camera":
         """The camera whose pixels never show ground where `mask` (H, W) is 0, as behind landing

@@ -20,6 +20,9 @@ from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import Fix, NoFix, Prior, View, has_type
 from orthonav.core.tiles.position import PositionRule
 
+HALF_EARTH_M = 2e7
+"""A prior with a larger deviation excludes nothing."""
+
 
 class Localizer:
     """Places views on one map; threads may share it once warm.
@@ -90,8 +93,7 @@ class Localizer:
         if refused is not None:
             return refused
         if prior is not None:
-            half_earth_m = 2e7
-            prior = replace(prior, std_m=min(prior.std_m, half_earth_m))
+            prior = replace(prior, std_m=min(prior.std_m, HALF_EARTH_M))
         if self.registration is None:
             found = self.tiles.locate(view, prior, heading_known)
         else:

@@ -30,6 +30,7 @@ from orthonav.core.records import (
     NoFix,
     Telemetry,
     View,
+    has_type,
 )
 from orthonav.core.register.kernel import KERNEL
 from orthonav.core.register.template import Levels, ViewTemplates
@@ -458,6 +459,7 @@ LIMITS = ViewLimits()
 
 
 def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
+    has_type("view", view, View, ", as of View.of(..)")
     refused = check_telemetry(view.telemetry, view.camera, gsd_m, heading_known)
     return refused or check_picture(view.grey, view.camera.mask)
 

@@ -152,8 +152,8 @@ class Mixture:
             return
         self._measured = mean_en_m, np.eye(2) * std_m**2
         made = [at_position(each, *self._measured) for each in self.hypotheses]
-        # Belief elsewhere is spread over the map: its density at this position remains.
-        elsewhere = self.elsewhere / self.area_m2
+        # Belief elsewhere is spread over the map, or over a wider measurement: its density remains.
+        elsewhere = self.elsewhere / max(self.area_m2, 2 * math.pi * std_m**2)
         made += self._born_at(mean_en_m, std_m, START_SHARE * elsewhere)
         made = [replace(each, shown=each.shown.confirmed()) for each in made]
         self._merge(made, elsewhere * (1 - START_SHARE))

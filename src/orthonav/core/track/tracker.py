@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from orthonav.core.errors import MapFileError
 from orthonav.core.geo.camera import Camera
 from orthonav.core.geo.ground import Ground
-from orthonav.core.localize.localizer import Localizer
+from orthonav.core.localize.localizer import HALF_EARTH_M, Localizer
 from orthonav.core.localize.odometry import (
     CameraDisplacement,
     OdometryView,
@@ -30,6 +30,7 @@ from orthonav.core.localize.sighting import Sighting, sightings
 from orthonav.core.localize.view import check_view
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import (
+    MAX_STD,
     PRIOR_SIGMAS,
     RADIUS_SHARE,
     Fix,
@@ -374,7 +375,8 @@ class Tracker:
 
     def _position_of(self, prior: Prior) -> tuple[Array, float]:
         frame = self._localizer.sheet.frame
-        return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), max(prior.std_m, 1.0)
+        std_m = min(max(prior.std_m, 1.0), HALF_EARTH_M)
+        return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), std_m
 
     def _telemetry_noise(self, telemetry: Telemetry) -> Array:
         """Variances (3,) of heading (rad) and log scale between views and of the horizon (rad)."""
@@ -575,9 +577,9 @@ class Tracker:
 
 
 def _reported_velocity(past: _Past, telemetry: Telemetry) -> ReportedVelocity | None:
-    """None where none is given."""
+    """None where none is given, or an impossible one."""
     reported, std = telemetry.vel_en_mps, telemetry.vel_std_mps
-    if reported is None or not np.isfinite(reported).all():
+    if reported is None or not np.abs(reported).max() <= MAX_STD:  # NaN too
         return None
     now = np.array(reported)
     if std is None or not std > 0:

@@ -107,6 +107,7 @@ class Ros2Reader:
         self._number, self._image_ns, self._attitude_ns = 0, 0, 0
         self._checked_ns = self._reminded_ns = clocks.mono_ns()
         self._stated_horizon_deg: float | None = None
+        self._fixed_ns = -math.inf  # `gnss` is emptied by who compares it
         self._said: set[str] = set()
         self._subscribe()
 
@@ -257,7 +258,8 @@ class Ros2Reader:
     def _take_gnss(self, message: Any, cdr: bytes) -> None:
         time_ns = self._stamp(message)
         if time_ns is not None:
-            known = int(message.position_covariance_type) > 0
+            known, has_fix = int(message.position_covariance_type) > 0, message.status.status >= 0
+            self._fixed_ns = self._clocks.mono_ns() if has_fix else -math.inf
             variance_m2 = max(float(message.position_covariance[i]) for i in (0, 4))
             self.gnss.append(
                 GnssSample(
@@ -265,7 +267,7 @@ class Ros2Reader:
                     arrived_ns=self._clocks.mono_ns(),
                     lat_deg=float(message.latitude),
                     lon_deg=float(message.longitude),
-                    fix_type=FIX_3D if int(message.status.status) >= 0 else 1,
+                    fix_type=FIX_3D if has_fix else 1,
                     std_m=math.sqrt(variance_m2) if known and variance_m2 > 0 else math.nan,
                     stamp_ns=time_ns,
                 )
@@ -310,12 +312,8 @@ class Ros2Reader:
         """As stated, else by whether a receiver has a fix."""
         if self._stated_horizon_deg is not None:
             return self._stated_horizon_deg
-        now_ns = self._clocks.mono_ns()
-        aided = any(
-            each.fix_type >= FIX_3D and now_ns - each.arrived_ns <= FIX_NS
-            for each in list(self.gnss)[-1:]
-        )
-        return AUTOPILOT.aided_deg if aided else AUTOPILOT.unaided_deg
+        is_aided = self._clocks.mono_ns() - self._fixed_ns <= FIX_NS
+        return AUTOPILOT.aided_deg if is_aided else AUTOPILOT.unaided_deg
 
     def _restart(self, what: str, back_ns: int) -> None:
         """Discard telemetry and images: time went back, they belong to an earlier run."""
