@@ -270,7 +270,7 @@ def csv_rows(
             for row in rows:
                 if not short and any(row[name] is None for name in needed):
                     raise FlightError(f"line {rows.line} has too few fields: {path}")
-                yield rows.line, {k: v or "" for k, v in row.items() if isinstance(k, str)}
+                yield rows.line, {k: v or "" for k, v in row.items()}
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
 
