@@ -45,7 +45,6 @@ def test_an_orthophoto_and_a_flight_become_a_page(run, area, few, tmp_path, name
     again = run("run", few, "--map", out / "area.onav", "--out", out)
     assert again.code == 1 and "what no run wrote (notes.txt)" in again.err
     (out / "notes.txt").unlink()
-    (out / "area.onav.work").mkdir()  # of an older version
     again = run("run", few, "--map", out / "area.onav", "--out", out)  # resumed
     assert again.code == 0 and "building the map" not in again.err and page.is_file()
 

@@ -507,6 +507,17 @@ def test_a_folder_is_no_place_for_a_file(run, map_path, short_flight, out):
     refused(done, "cannot write over a folder or a device", str(out))
 
 
+def test_no_output_replaces_an_input_or_another_output(run, map_path, short_flight, out):
+    made = out / "fixes.jsonl"
+    command = ("localize", map_path, short_flight)
+    for more in (("--out", map_path), ("--out", made, "--export", f"csv={made}")):
+        refused(run(*command, *more), "would replace an input or another output")
+    route = out / "route.csv"
+    route.write_text("lat,lon\n46.5,2.5\n")
+    refused(run("plan", "--route", route, "--agl-m", 300, "--out", route), "would replace an input")
+    assert route.read_text().startswith("lat,lon") and not made.exists()
+
+
 def test_a_reader_that_has_gone_is_no_traceback(fixes_path, truth_path):
     with process("evaluate", fixes_path, "--truth", truth_path) as popen:
         popen.stdout.close()

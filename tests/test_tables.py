@@ -43,6 +43,16 @@ def test_a_line_of_many_fields_is_refused(tmp_path, at, name, head, row, read, e
         read(path)
 
 
+def test_decimal_commas_are_not_taken_for_fields(tmp_path):
+    route, truth = tmp_path / "route.csv", tmp_path / "truth.csv"
+    route.write_text("lat,lon\n47.1,-99.2,,a note\n47,018,-99,162\n")
+    with pytest.raises(RouteError, match="line 3 has more numbers than the header"):
+        read_route(route)
+    truth.write_text(TRUTH + "0.jpg,47,018,-99,162\n")
+    with pytest.raises(FlightError, match="line 2 has more numbers than the header"):
+        read_truth(truth)
+
+
 def test_a_table_may_end_within_its_last_row(tmp_path):
     path = tmp_path / "table.csv"
     rows = ["0,1,2,46.5,2.5", "1,1,2,46.5,2.5", "2,1"]

@@ -44,7 +44,12 @@ def test_a_uniform_map_has_the_usual_confidence(small):
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "other, warns", [(np.full((200, 200), 99, np.uint8), True), (textured((200, 200), 7), False)]
+    "other, warns",
+    [
+        (np.full((200, 200), 99, np.uint8), True),
+        (GREY[20:220, 20:220], True),  # the map's own imagery
+        (textured((200, 200), 7), False),
+    ],
 )
 def test_a_second_date_without_the_ground_sets_no_floor(small, caplog, other, warns):
     with caplog.at_level(logging.WARNING):

@@ -171,7 +171,7 @@ def test_build_names_what_is_wrong_before_the_work(run, area, dem, tmp_path):
     assert "is a picture" in run(*build, area.past, "--dem-datum", "msl").err
     assert "does not exist: no.tif" in run(*build, "no.tif").err
     done = run("build", "--ortho", area.past, "--dem", dem, "--dem-datum", "msl", "--out", dem)
-    assert "would replace an orthophoto or terrain" in done.err
+    assert "would replace an input" in done.err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -327,6 +327,12 @@ def test_bad_input_is_one_line(run, half_blank, tmp_path, names_in, options, sai
     assert names_in(tmp_path) == []
 
 
+def test_the_imagery_of_the_map_is_no_other_date(run, half_blank, tmp_path):
+    past = half_blank.past
+    done = run("check", half_blank.map, "--other-date", past, "--out", tmp_path / "report")
+    assert done.code == 1 and "the map was built from this orthophoto; name one" in done.err
+
+
 def test_an_interrupt_writes_nothing(run, half_blank, tmp_path, names_in, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt

@@ -9,6 +9,7 @@ from erring_flights import flown
 
 from orthonav.core.errors import FlightError
 from orthonav.core.flight.fixes import write_results
+from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.records import NoFix, ViewResult
 from orthonav.ground.evaluate.metrics import CRITERIA, compare, measure, worst_views
 from orthonav.ground.evaluate.statistics import standard_figures, upper_bound
@@ -60,6 +61,14 @@ def test_all_is_defined_without_any_fix():
     assert all(map(math.isnan, undefined))
     assert metrics.reasons == {"blank": 1, "too_dark": 1, "no_result": 2}
     assert worst_views(compare(truth, results[:1])) == []
+
+
+@pytest.mark.parametrize("local", [None, LocalFrame(0.0, 0.0)])
+def test_errors_do_not_depend_on_a_place_far_away(local):
+    """A first view before the receiver knew its position, or a map of another country."""
+    truth, results = views((3.0, 4.0), (0.0, 5.0), (0.0, 10.0), (8.0, 6.0))
+    found = compare(truth | {"0000.jpg": (0.0, 0.0)}, results, local).errors_m
+    assert found[1:] == pytest.approx([5.0, 10.0, 10.0], abs=0.01) and found[0] > 1e6
 
 
 def test_what_has_no_partner_is_counted_and_left_out():

@@ -88,6 +88,15 @@ def test_one_level_everywhere_is_no_division_by_zero(ortho, dtype):
     assert pixels.valid[4:-4, 4:-4].all() and not pixels.rgb.any()
 
 
+@pytest.mark.parametrize("missing, said", [(-9999, True), (-3.4e38, True), (np.nan, False)])
+def test_an_unstated_value_of_missing_pixels_is_said(ortho, caplog, missing, said):
+    bands = (noise(SIZE) / 255).astype(np.float32)
+    bands[:, :20] = missing
+    write(ortho, bands)
+    Mosaic.open([ortho])
+    assert ("one grey level" in caplog.text) == said
+
+
 def noise(size=512):
     return np.random.default_rng(0).integers(0, 256, (3, size, size)).astype(np.uint8)
 

@@ -393,6 +393,9 @@ def test_a_recording_that_was_cut_short_is_read_as_far_as_it_goes(tmp_path, comp
     views = list(recording.views)
     assert 1 <= len(views) < 20 and np.array_equal(views[0].grey(), picture(5))
     assert "cut short" in open_source(file).warnings[0]
+    file.write_bytes(data[:300])
+    with pytest.raises(FlightError, match=r"cut short.* recording holds no whole message"):
+        open_source(file)
 
 
 def rewritten(path, compression):

@@ -14,15 +14,16 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, NoReturn
 
 from orthonav.cli.version import require_extras, show_version
-from orthonav.core.errors import OrthonavError, UsageError
+from orthonav.core.errors import OrthonavError, OutputError, UsageError
 from orthonav.core.files import is_stdout, require_writable
 
 GROUPS = {
@@ -109,15 +110,29 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _require_outputs(options: argparse.Namespace) -> None:
-    """Raise `OutputError` where a result could not be written, before the work for it."""
+    """Raise `OutputError` where a result could not be written, or would replace an input or another
+    result, before the work for it."""
     out_is_folder = options.command in ("check", "demo", "import", "run", "simulate")
-    for name, folder in {"out": out_is_folder, "report": True, "work": True}.items():
-        path = getattr(options, name, None)
-        if isinstance(path, Path) and not is_stdout(path):
-            require_writable(path, folder=folder)
-    for path in _exported(options):
-        if path.name and not is_stdout(path):
-            require_writable(path)
+    folders = {"out": out_is_folder, "report": True, "work": True}
+    named = {name: getattr(options, name, None) for name in folders}
+    outputs = [(path, folders[name]) for name, path in named.items() if isinstance(path, Path)]
+    outputs += [(path, False) for path in _exported(options) if path.name]
+    taken = _inputs(options, folders.keys())
+    for path, is_folder in outputs:
+        if is_stdout(path):
+            continue
+        require_writable(path, folder=is_folder)
+        if not is_folder and path.resolve() in taken:
+            raise OutputError(f"would replace an input or another output; name another: {path}")
+        taken.add(path.resolve())
+
+
+def _inputs(options: argparse.Namespace, outputs: Collection[str]) -> set[Path]:
+    """The paths among the options, other than `outputs`; a map may be text, as it may be a URL."""
+    named = {**vars(options), "map": Path(getattr(options, "map", None) or "-")}
+    values = [value for name, value in named.items() if name not in outputs]
+    several = chain(*(value if isinstance(value, list) else [value] for value in values))
+    return {path.resolve() for path in several if isinstance(path, Path)}
 
 
 def _exported(options: argparse.Namespace) -> list[Path]:

@@ -1,6 +1,7 @@
 """`orthonav evaluate`: accuracy of fixes against the ground truth."""
 
 import argparse
+import logging
 import math
 import shlex
 import sys
@@ -24,6 +25,7 @@ EVERYDAY = (
     *("--flight", "--truth", "--map", "--report", "--radius-m", "--alert-limit-m", "--risk"),
     "--json",
 )
+log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -105,6 +107,9 @@ def _measured(
         results = orthonav.read_results(fixes)
         known = orthonav.read_truth(truth) if options.truth else known
         comparison = compare(known, results, local, options.risk)
+        on_map = (comparison.lat_deg, comparison.lon_deg) == place
+        if opened and not on_map:
+            log.warning("the map is of another place than the true positions: %s", options.map)
         check_truth(known, results, place, truth)
         warn_of_another_run(fixes, opened, flight, sha256)
         flights.append(
@@ -112,7 +117,7 @@ def _measured(
                 names[i],
                 comparison,
                 measure(comparison, options.radius_m, options.alert_limit_m or math.nan),
-                background,
+                background if on_map else None,
                 measure_track(comparison, results, options.radius_m),
                 measure_gnss(comparison, results),
                 _view_command(options, i),

@@ -35,7 +35,6 @@ def run(options: argparse.Namespace) -> None:
     out, area, source = options.out, options.map, vars(source_options(options))
     fixes, positions, report = out / "fixes.jsonl", out / "truth.csv", out / "report"
     ours = {"area.onav", fixes.name, positions.name, report.name}
-    ours.add("area.onav.work")  # of older versions
     if foreign := {each.name for each in out.glob("[!.]*")} - ours:
         raise OutputError(f"output folder holds what no run wrote ({min(foreign)}): {out}")
     if not area.exists():

@@ -1,6 +1,7 @@
 """Reading untrusted tables line by line: lengths and counts are bounded, and errors name lines."""
 
 import csv
+import re
 from collections.abc import Iterator
 from typing import IO
 
@@ -45,6 +46,12 @@ class TableRows:
                 if count > self._most_rows:
                     raise TableError(
                         f"line {self.line}: table has more than {self._most_rows:,} rows; divide it"
+                    )
+                unnamed = row.pop(None, None) or ()
+                if any(re.fullmatch(r"\s*[-+.\d]*\d[.\d]*\s*", text) for text in unnamed):
+                    raise TableError(
+                        f"line {self.line} has more numbers than the header has columns; where "
+                        "commas separate fields, numbers need a point"
                     )
                 yield row
         except (UnicodeDecodeError, csv.Error) as error:

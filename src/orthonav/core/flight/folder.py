@@ -266,11 +266,12 @@ def csv_rows(
             rows = TableRows(stream, most_rows=most_rows or MAX_VIEWS)
             missing = [name for name in needed if name not in rows.columns]
             if missing:
-                raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
+                held = f"{','.join(rows.columns)!r:.80}"
+                raise FlightError(f"columns are missing: {', '.join(missing)}; got {held}: {path}")
             for row in rows:
                 if not short and any(row[name] is None for name in needed):
                     raise FlightError(f"line {rows.line} has too few fields: {path}")
-                yield rows.line, {k: v or "" for k, v in row.items() if isinstance(k, str)}
+                yield rows.line, {k: v or "" for k, v in row.items()}
     except TableError as error:
         raise FlightError(f"{error}: {path}") from error
 

@@ -337,7 +337,10 @@ def _registration(
     crops = sheet.crops
     later = [crop for date in inputs.other_dates for crop in _crops_of(date, sheet, crops)]
     if inputs.other_dates and not later:
-        log.warning("the other dates do not cover the area: nothing can be learned from them")
+        log.warning(
+            "the other dates do not cover the area, or are the map's own imagery: nothing can be "
+            "learned from them"
+        )
     found = calibrate_registration(
         prepared, crops, later, request.calibration_views, request.seed, progress
     )
@@ -348,12 +351,14 @@ def _registration(
 
 
 def _crops_of(mosaic: Mosaic, sheet: SheetReader, crops: Sequence[Crop]) -> list[Crop]:
+    """The same ground in other imagery; places that were not flown again are left out."""
     found = []
     with mosaic.grid_sheet(sheet.area.frame, sheet.grid) as raster:
         for crop in crops:
             size = crop.grey.shape[0]
             col, row = round(crop.col_px - size / 2), round(crop.row_px - size / 2)
             pixels = raster.read_grey(col, row, size, size)
-            if pixels.valid.all() and pixels.grey.std() > 1:
+            again = not np.allclose(pixels.grey, crop.grey, rtol=0, atol=1)  # but for rounding
+            if pixels.valid.all() and pixels.grey.std() > 1 and again:
                 found.append(Crop(pixels.grey, crop.row_px, crop.col_px))
     return found

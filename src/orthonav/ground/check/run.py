@@ -46,7 +46,7 @@ from orthonav.ground.check.trials import (
     MIN_VALID,
     Trial,
     registration_of,
-    require_overlap,
+    require_other_date,
     run_trials,
 )
 from orthonav.ground.planning.area import Area
@@ -113,7 +113,7 @@ class _Check:
         self._require_views()
         self.area = self._area()
         if request.other_date is not None:
-            require_overlap(request.other_date, self.sheet)
+            require_other_date(request.other_date, opened)
         self.extent = self.coverage.extent_en_m if self.area is None else self.area.extent_en_m
         self.checked_m2 = checked_m2(self.coverage, self.area)
         self.wanted = max(self._limited(0.0), 2 * TRIALS.batch)  # the verdict has to hold

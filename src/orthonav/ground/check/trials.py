@@ -25,7 +25,6 @@ from orthonav.core.localize.localizer import registered
 from orthonav.core.localize.prepared import PreparedMap
 from orthonav.core.mapfile import open_map
 from orthonav.core.mapfile.layer import level_shape
-from orthonav.core.mapfile.manifest import SheetInfo
 from orthonav.core.mapfile.reader import MapFile
 from orthonav.core.records import NoFix, Prior, Telemetry, View
 from orthonav.core.register.template import Levels
@@ -79,8 +78,12 @@ def mirrored_donor(rng: np.random.Generator, layer: GreyPyramid, size: int, leve
     return np.ascontiguousarray(grey[:, ::-1])
 
 
-def require_overlap(path: Path, sheet: SheetInfo) -> None:
-    lat_lon = Mosaic.open([path]).outline_latlon_deg
+def require_other_date(path: Path, opened: MapFile) -> None:
+    """Raise `AreaError` for an orthophoto of other ground, or that the map was built from."""
+    mosaic, sheet = Mosaic.open([path]), opened.manifest.sheets[0]
+    if any(each["date"] and each in opened.manifest.imagery for each in mosaic.describe()):
+        raise AreaError(f"the map was built from this orthophoto; name one of another date: {path}")
+    lat_lon = mosaic.outline_latlon_deg
     points = sheet.frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
     west_m, south_m, east_m, north_m = sheet.grid.extent_en_m
     (west, south), (east, north) = points.min(axis=0), points.max(axis=0)

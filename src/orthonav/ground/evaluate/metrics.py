@@ -21,7 +21,7 @@ from orthonav.core.errors import FlightError
 from orthonav.core.files import StrPath
 from orthonav.core.flight import read_truth
 from orthonav.core.flight.fixes import Identity, read_identity, read_results
-from orthonav.core.geo.frames import LocalFrame, distances_m
+from orthonav.core.geo.frames import MAX_SHEET_M, LocalFrame, distances_m
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.limits import DEFAULT_RISK
 from orthonav.core.mapfile.reader import MapFile
@@ -296,8 +296,9 @@ def compare(
 ) -> Comparison:
     """Results matched with ground truth by frame name.
 
-    `local` is the plane of the positions, by default centred on the first true position; `risk` is
-    that of the protection levels. A true position that is not finite counts as missing. Raises
+    `local` is the plane of the positions; without one, or where it is that of another place, it is
+    centred on the median of the true positions, as the first may be 0, 0. `risk` is that of the
+    protection levels. A true position that is not finite counts as missing. Raises
     `FlightError` where no result has a truth or a frame has two results, and `ValueError` for a
     risk that is not 0 to 1.
     """
@@ -316,13 +317,16 @@ def compare(
             f"{len(results)} results (first {first_result}), {len(known)} true positions "
             f"(first {first_known}); are these of the same flight?"
         )
-    local = local or LocalFrame(*known[matched[0].frame])
+    true = [known[result.frame] for result in matched]
+    centre = np.percentile(true, 50, axis=0, method="nearest").tolist()
+    if local is None or distances_m(centre, (local.lat_deg, local.lon_deg))[0] > MAX_SHEET_M:
+        local = LocalFrame(*centre)
     frames = {result.frame for result in matched}
     missing = dict(zip(known, np.cumsum([name not in frames for name in known]), strict=True))
     before = [missing[result.frame] for result in matched]  # true positions without a result
     is_whole = before[0] == 0 and before[-1] == len(known) - len(matched)
     outcomes = [result.outcome for result in matched]
-    truth_en_m = places_en_m(local, [known[result.frame] for result in matched])
+    truth_en_m = places_en_m(local, true)
     fix_en_m = places_en_m(local, [place_of(outcome) for outcome in outcomes])
 
     def stated(value: Callable[[Fix], Any], unknown: Any = math.nan) -> FloatArray:

@@ -4,6 +4,7 @@ GDAL's VRT joins files on one pixel lattice, such as the tiles of a producer, on
 first. Resampled one by one, they would leave a line of invalid pixels between neighbours.
 """
 
+import logging
 import math
 import threading
 from collections.abc import Iterator, Sequence
@@ -43,6 +44,7 @@ from orthonav.ground.planning.area import outline
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
 WHOLLY_VALID = 250
 """Interpolated mask (0..255) from which a pixel is valid: no invalid neighbour."""
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +230,13 @@ def sample_stretches(sources: Sequence[Source]) -> tuple[ContrastStretch | None,
         values = np.concatenate([_valid_values(sources[index]) for index in some])
         if values.size == 0:
             raise ImageryError("orthophotos have no valid pixel (all nodata)")
-        low, high = (float(value) for value in np.percentile(values, [0.5, 99.5]))
+        low, quarter, three_quarters, high = np.percentile(values, [0.5, 25, 75, 99.5]).tolist()
+        if three_quarters - quarter < (high - low) / 256:
+            log.warning(
+                "most pixels have one grey level, as values reach from %g to %g: state the value "
+                "of missing pixels (gdal_edit.py -a_nodata): %s",
+                *(low, high, sources[members[0]].path),
+            )
         for index in members:
             found[index] = ContrastStretch(low, high if high > low else low + 1.0)
     return tuple(found)

@@ -338,6 +338,8 @@ def all_on(reader: Any, connection: Any) -> list[Any]:
 
 def find_topics(reader: Any, sources: Sources) -> Topics:
     counted = {one.topic: one for one in reader.connections if one.msgcount}
+    if not counted:
+        raise FlightError(f"recording holds no whole message: {sources.path}")
     found: dict[str, dict[str, Any]] = {}
     for role, types in TYPES.items():
         named = role in sources.named
@@ -348,8 +350,7 @@ def find_topics(reader: Any, sources: Sources) -> Topics:
         found[role] = {one.topic: one for one in of_type}
     images, infos = found["image"], found["camera_info"]
     if len(images) != 1 and "image" not in sources.named:
-        known = ", ".join(sorted(counted)) or "no topic"
-        names = ", ".join(sorted(images)) or f"none among {known}"
+        names = ", ".join(sorted(images)) or f"none among {', '.join(sorted(counted))}"
         raise FlightError(
             f"expected one topic of images, found {names}; give --topic: {sources.path}"
         )
