@@ -327,7 +327,7 @@ def test_a_map_that_replaces_the_checked_one_is_not_used(command, path, keys, ru
     done = run(
         *{
             "verify": ("verify", path, "--key", public),
-            "localize": ("localize", path, path, "--out", path, "--require-signed", public),
+            "localize": ("localize", path, path, "--out", other, "--require-signed", public),
             "fly": ("fly", path, path, "--recorded-telemetry", "--require-signed", public),
         }[command]
     )

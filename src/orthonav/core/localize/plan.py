@@ -56,7 +56,6 @@ class SearchPlan:
     """Added to the log scale of candidates from tiles and above the coarse level, hardly known."""
     view_tiles: tuple[float, float] = (0.6, 2.5)
     """Side of a view, in tiles, for which tiles are asked."""
-    min_candidates: int = 6  # always accepted, for the scores need rivals
     candidate_share: float = 0.5  # weaker candidates than this fraction of the best are dropped
     apart: float = 1 / 8  # closer candidates from tiles, over the side of the view, are one place
 
@@ -70,9 +69,6 @@ class SearchPlan:
     """in a trial, whose rivals were not all searched, above one minus this."""
     trial_clear: ClearMargin = ClearMargin(1.8, 1.25, 1.25)
     """Where a trial compares only a part of all places, the place must also stand out so far."""
-    trials: int = 3
-    """Best places refined at the final level before a search that costs more than this trial;
-    a proven one ends the search."""
     finer: tuple[tuple[int, float], ...] = ((3, 25.0), (48, 90.0))
     """Places compared at the final level and one finer until one is proven, and the cost (ms)."""
     terrain_candidates: int = 48  # placed on the terrain, at most

@@ -458,7 +458,7 @@ class Search:
         """Without those far weaker than the best."""
         least = self.plan.candidate_share
         enough = sum(each.score >= least * found[0].score for each in found)
-        return found[: max(enough, self.plan.min_candidates)]
+        return found[: max(enough, REFINEMENT.min_hopeful)]
 
     # When it ends
 
@@ -497,10 +497,10 @@ class Search:
         return found if proven and self._is_clear(found, margin) else None
 
     def _proven_by_trial(self, stage: Stage, following: Stage) -> BestPlace | None:
-        """The best few are refined on the terrain; where that proves none, they are compared one
-        level finer. Where only a part of all places was compared, the best must stand out too. No
-        trial before a stage that costs less, except the final level, before which all directions
-        were tried."""
+        """The best few are refined on the terrain, in a trial before a stage that costs more, or
+        before the final level, as all directions were tried; where that proves none, they are
+        compared one level finer. Where only a part of all places was compared, the best must stand
+        out too."""
         plan, levels, is_flat = self.plan, self.levels, self.refiner.is_flat
         at_final = following.level < levels.mid
         trial_ms = plan.trial_ms if is_flat else plan.terrain_trial_ms
@@ -511,11 +511,11 @@ class Search:
             self.budget.fits(trial_ms) and self.budget.allows(trial_ms)
         ):
             return None
-        places = self.refiner.on_terrain(self.places, plan.trials)
+        places = self.refiner.on_terrain(self.places, REFINEMENT.to_final_level)
         compared_all = is_flat and stage.level == levels.mid and not stage.from_tiles
         doubt = plan.doubt if at_final else plan.trial_doubt
         for closer in (False, True):
-            found = self._refined(places, plan.trials, closer=closer)
+            found = self._refined(places, closer=closer)
             if not compared_all and not self._is_clear(found, plan.trial_clear):
                 return None
             if self._is_proven(found, doubt):
