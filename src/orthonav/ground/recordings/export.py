@@ -89,10 +89,17 @@ def export_all(
     results: Sequence[ViewResult],
     terrain: TerrainHeights | None,
 ) -> None:
-    """Write the camera positions of a flight in formats and to paths of `export_of`."""
+    """Write the camera positions of a flight in formats and to paths of `export_of`. Raises
+    `VariantError` where a format cannot hold them, after the others are written."""
     positions = camera_positions(results, terrain) if exports else []
+    refused: list[VariantError] = []
     for name, path in exports:
-        write_text(path, "\n".join(FORMATS[name](positions)) + "\n")
+        try:
+            write_text(path, "\n".join(FORMATS[name](positions)) + "\n")
+        except VariantError as error:
+            refused.append(error)
+    if refused:
+        raise refused[0]
 
 
 def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -155,7 +162,10 @@ def _odm_geo(positions: Positions) -> list[str]:
     lines = ["EPSG:4326"]
     for each in positions:
         if any(character.isspace() for character in each.view.frame):
-            raise VariantError(f"OpenDroneMap takes no file names with spaces: {each.view.frame!r}")
+            raise VariantError(
+                f"OpenDroneMap takes no file names with spaces: {each.view.frame!r}; all other "
+                "results are written"
+            )
         height = "" if math.isnan(each.height_m) else f" {each.height_m:.3f} 0 0 0 {each.std_m:.3f}"
         lines.append(f"{each.view.frame} {each.fix.lon_deg:.8f} {each.fix.lat_deg:.8f}{height}")
     return lines
