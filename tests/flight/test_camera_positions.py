@@ -86,7 +86,7 @@ def test_opendronemap_takes_accuracy_only_after_a_height(tmp_path):
 def test_where_opendronemap_takes_no_name_the_other_formats_are_written(tmp_path):
     spaced = [replace(RESULTS[0], frame="a b.jpg")]
     paths = {name: tmp_path / name for name in ("odm-geo", "csv")}
-    with pytest.raises(VariantError, match="no file names with spaces: 'a b.jpg'; all other"):
+    with pytest.raises(VariantError, match="all other results are written"):
         export_all([export_of(f"{name}={path}") for name, path in paths.items()], spaced, None)
     assert "a b.jpg" in paths["csv"].read_text("utf-8") and not paths["odm-geo"].exists()
 
