@@ -56,6 +56,7 @@ class SearchPlan:
     """Added to the log scale of candidates from tiles and above the coarse level, hardly known."""
     view_tiles: tuple[float, float] = (0.6, 2.5)
     """Side of a view, in tiles, for which tiles are asked."""
+    min_candidates: int = 6  # always accepted, for the scores need rivals
     candidate_share: float = 0.5  # weaker candidates than this fraction of the best are dropped
     apart: float = 1 / 8  # closer candidates from tiles, over the side of the view, are one place
 

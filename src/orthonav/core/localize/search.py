@@ -458,7 +458,7 @@ class Search:
         """Without those far weaker than the best."""
         least = self.plan.candidate_share
         enough = sum(each.score >= least * found[0].score for each in found)
-        return found[: max(enough, REFINEMENT.min_hopeful)]
+        return found[: max(enough, self.plan.min_candidates)]
 
     # When it ends
 
