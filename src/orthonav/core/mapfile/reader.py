@@ -152,8 +152,8 @@ class MapFile:
         """West, south, east and north of the first sheet, degrees; across the antimeridian west is
         greater than east."""
         west_m, south_m, east_m, north_m = self.manifest.sheets[0].grid.extent_en_m
-        # Parallels are curved: the middle of a side may lie farther out than its corners.
-        across_m = west_m, (west_m + east_m) / 2, east_m
+        # Parallels are curved: on the meridian of the centre a side may lie farthest out.
+        across_m = west_m, min(max(west_m, 0.0), east_m), east_m
         lat, lon = self.frame.latlon_from_en([(x, y) for x in across_m for y in (south_m, north_m)])
         off = (lon - self.frame.lon_deg + 180) % 360 - 180
         west, east = (self.frame.lon_deg + np.array([off.min(), off.max()]) + 180) % 360 - 180
