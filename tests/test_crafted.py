@@ -136,6 +136,14 @@ def test_headings_that_are_too_many(tmp_path, step):
         open_map(changed(tmp_path / "a.onav", view=view))
 
 
+@pytest.mark.parametrize("name", ["radius_m", "position_floor_px"])
+def test_numbers_whose_squares_overflow(tmp_path, name):
+    registration = open_map(GOLDEN).manifest.registration | {name: 1e300}
+    path = changed(tmp_path / "large.onav", registration=registration)
+    with pytest.raises(MapFileError, match="impossible registration"):
+        Localizer(open_map(path))
+
+
 def test_a_map_of_what_does_not_fly(tmp_path, flight_path, monkeypatch):
     """Refused before anything of it is loaded, weights least of all."""
     monkeypatch.setitem(sys.modules, "orthonav.research.sam", None)

@@ -235,6 +235,14 @@ def test_what_cannot_be_built(ortho, tmp_path, frame, names_in, request_, messag
     assert names_in(tmp_path) == []
 
 
+def test_bounds_may_begin_at_the_antimeridian_in_the_imagery(make_ortho, tmp_path):
+    centred = "+proj=aeqd +lat_0=-17 +lon_0=180 +x_0=700203 +y_0=6599800 +datum=WGS84"
+    ortho = make_ortho(tmp_path / "fiji.tif", textured((400, 400)), crs=centred)
+    for west, east in ((-180.0, -179.9985), (179.9985, 180.0)):
+        opened = built(ortho, tmp_path, bounds_deg=(west, -17.001, east, -16.999))
+        assert 0.03 < opened.manifest.area_km2 < 0.06
+
+
 def test_a_uniform_orthophoto_is_no_crash(make_ortho, tmp_path):
     """Nothing to learn from: the usual confidence, which without a margin is low."""
     flat = make_ortho(tmp_path / "flat.tif", np.full((300, 300), 99, np.uint8))

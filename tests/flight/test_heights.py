@@ -72,6 +72,15 @@ def test_each_height_becomes_one_above_ground(heights, expected_m):
         assert math.isnan(flown().corrected(telemetry).agl_m)
 
 
+def test_an_unknown_place_has_the_geoid_of_the_area_also_across_the_antimeridian():
+    fiji = LocalFrame(-17.0, 180.0)
+    east, north = np.meshgrid(*[np.linspace(-2000, 2000, 21)] * 2)
+    around = fiji.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
+    options = {"geoid": lambda lat, lon: np.where(np.abs(lon) > 170, 56.0, 15.0)}
+    heights = FlownHeights(lambda lat, lon: 0 * lat + 300.0, around, **options)
+    assert heights.corrected(reported(hae_m=656.0)).agl_m == pytest.approx(300.0)
+
+
 def test_over_an_unknown_datum_only_heights_above_take_off_are_converted():
     over = flown(take_off=(*place(0, 200), 0.0), datum_known=False)  # took off at 320 m
     both = over.corrected(reported(amsl_m=1.0, home_m=250.0, hae_m=1.0))

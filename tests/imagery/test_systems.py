@@ -46,6 +46,7 @@ def test_a_system_that_proj_cannot_convert_is_refused(tmp_path, crs, lat, lon, w
         ("EPSG:26716", 40, -87, 10, "of 10 m only; install the grid .*sync --file us_noaa_conus"),
         ("EPSG:27700", 52, -1, 2, None),
         ("EPSG:32631", 48, 2, None, None),
+        ("EPSG:2193", -40, 180, 1, None),
         (LAMBERT, 46, 3, None, None),  # its plate says how far off it is
         ("EPSG:26917", 35, -79, None, None),
         ("EPSG:4490", 40, 116, None, "'China Geodetic .* taken as WGS 84, .* by 1 to 2 m"),
@@ -112,6 +113,15 @@ def test_an_epoch_moves_the_imagery(tmp_path):
     other = write(tmp_path / "b.tif", smooth_scene(), crs="EPSG:32631")
     with pytest.raises(ImageryError, match="not for EPSG:32631"):
         Mosaic.open([other], 2026.9)
+
+
+def test_an_epoch_moves_imagery_across_the_antimeridian_alike(tmp_path):
+    def moves_m(lon_deg):
+        path = made(tmp_path / f"{lon_deg}.tif", "EPSG:26901", 52.0, lon_deg)
+        there, before = (Mosaic.open([path], *epoch).sources[0] for epoch in ((2026.9,), ()))
+        return there.transform.c - before.transform.c, there.transform.f - before.transform.f
+
+    assert moves_m(180.0) == pytest.approx(moves_m(-179.99), abs=0.01)
 
 
 def test_a_conversion_that_fails_is_an_error_and_no_hole(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import safetensors.numpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from maps import (
+    GRID,
     altered,
     altered_sheet,
     arrays,
@@ -23,7 +25,8 @@ from maps import (
 
 from helpers import memory_below
 from orthonav.core.errors import MapFileError, MapVersionError, MissingFileError, OutputError
-from orthonav.core.mapfile import open_map, write_map
+from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.mapfile import MapFile, SheetInfo, open_map, write_map
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +69,20 @@ def test_round_trip(path, content):
     again = path.with_name("again.onav")
     assert write_map(again, opened.manifest, opened.arrays) == opened.manifest
     assert again.read_bytes() == content
+
+
+@pytest.mark.parametrize("lat_deg, lon_deg", [(-17.0, 179.9999), (70.0, 20.0), (-60.0, -180.0)])
+def test_bounds_hold_the_sheet_also_across_the_antimeridian(path, lat_deg, lon_deg):
+    grid = replace(GRID, west_m=-20_000.0, north_m=20_000.0, gsd_m=200.0)
+    sheet = SheetInfo(LocalFrame(lat_deg, lon_deg), grid, 12, 0.0123)
+    map_ = MapFile(path, 1, replace(manifest(), sheets=(sheet,)), {})
+    west, south, east, north = map_.bounds_deg
+    west_m, south_m, east_m, north_m = grid.extent_en_m
+    x, y = np.meshgrid(np.linspace(west_m, east_m, 101), np.linspace(south_m, north_m, 101))
+    lat, lon = map_.frame.latlon_from_en(np.stack([x, y], axis=-1))
+    assert (lat.min(), lat.max()) == pytest.approx((south, north), abs=2e-6)
+    across = (east - west) % 360
+    assert ((lon - west + 1) % 360 - 1).max() == pytest.approx(across, abs=1e-9) and across < 2
 
 
 def test_arrays_are_read_only(path):

@@ -1,16 +1,18 @@
 """Simulated flights: the picture shows the ground at the truth, the telemetry errs as stated."""
 
 import errno
+import itertools
 import math
 
 import cv2
 import numpy as np
 import pytest
-from simulated import FISH, LENS, SEEN, frame_of, route_of
+from simulated import FISH, LENS, SEEN, WIDE, frame_of, route_of
 
 from helpers import content
 from orthonav.core.errors import AreaError, OutputError, UsageError
 from orthonav.core.flight import FlightWriter
+from orthonav.core.geo.camera import ground_en_m
 from orthonav.core.geo.swapped import HINT
 from orthonav.core.localize import downsampled, rectify
 from orthonav.core.records import View
@@ -51,6 +53,23 @@ def test_the_picture_shows_the_ground_at_the_truth(area, fly, camera, attitude_s
         translation = cv2.MOTION_TRANSLATION, stop
         alike, found = cv2.findTransformECC(ground, rectified.grey, found, *translation)
         assert np.hypot(*found[:, 2]) < 0.1 and alike > 0.9
+
+
+def test_a_wide_lens_shows_the_ground_up_to_its_corners(area, fly):
+    frame = frame_of(area.past)
+    flight, truth, _ = fly(over=area.past, random=3, camera=WIDE, agl_m=150.0, seed=4)
+    corner = np.stack(np.meshgrid(np.arange(20) + 0.5, np.arange(20) + 0.5), axis=-1)
+    for view, (col, row) in itertools.product(flight.views, [(0, 0), (300, 0), (0, 220)]):
+        px = corner.reshape(-1, 2) + np.array([col, row])
+        yaw_deg = view.telemetry.yaw_deg
+        there = frame.en_from_latlon(*truth[view.frame])
+        there = there + ground_en_m(WIDE, px, yaw_deg, 0.0, 0.0, 150.0)
+        middle = there.mean(axis=0)
+        at = (there - middle) * [1, -1] + SIZE_PX / 2 - 0.5
+        maps = at.astype(np.float32).reshape(20, 20, 2)
+        ground = cv2.remap(ground_at(area.past, frame, middle), maps, None, cv2.INTER_LINEAR)
+        seen = view.grey()[row : row + 20, col : col + 20]
+        assert np.abs(seen.astype(float) - ground).mean() < 3.0
 
 
 def test_errors_have_the_stated_size(frame, fly):

@@ -8,9 +8,9 @@ import pytest
 from lab.landscape import generate_area, generate_heights
 from lab.landscape.epoch import DEFAULT_DATES
 from lab.terrain import seen_view
-from simulated import FISH, LENS, PLAIN, SEEN
+from simulated import FISH, LENS, PLAIN, SEEN, WIDE
 
-from orthonav.core.geo.camera import Camera
+from orthonav.core.geo.camera import Camera, enu_from_camera, seen_px
 from orthonav.ground.imagery.terrain import open_dem
 from orthonav.ground.simulate.render import Raster, met, rays_enu, render_view
 
@@ -35,6 +35,14 @@ def test_level_ground_is_seen_as_by_its_homography(imagery, camera):
     rng = np.random.default_rng(1)
     flat = render_view(camera, (*attitude, agl_m), imagery.values, corner, 1.0, PLAIN, rng)
     assert np.abs(seen.astype(float) - flat).mean() < 1.0
+
+
+@pytest.mark.parametrize("camera", [SEEN, LENS, WIDE, FISH])
+def test_rays_are_those_of_the_lens(camera):
+    attitude = 40.0, 12.0, -7.0
+    rays = rays_enu(camera, attitude, 1) @ enu_from_camera(*attitude)
+    middles = np.stack(np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5), axis=-1)
+    assert np.abs(seen_px(camera, rays) - middles).max() < 0.001
 
 
 def test_a_roof_stands_out_and_hides_the_ground_behind():

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from orthonav.core.geo.frames import LocalFrame
 from orthonav.core.geo.ground import Ground, TerrainHeights, ground_around, ground_over
@@ -131,8 +131,7 @@ class FlownHeights:
         place, place_std_m = self._place(telemetry)
         below = None if place is None else ground_around(self._terrain, place, place_std_m)
         below = below or self._whole
-        lat, lon = self._area_deg
-        found = self._above_sea(telemetry, place or (float(lat.mean()), float(lon.mean())))
+        found = self._above_sea(telemetry, *(place or self._area_deg))
         if below is None or found is None:
             return replace(telemetry, agl_m=math.nan)
         above_sea_m, std_m = found
@@ -159,15 +158,18 @@ class FlownHeights:
                 off_m,
             )
 
-    def _above_sea(self, telemetry: Telemetry, place: Place) -> tuple[float, float] | None:
-        """Height above the datum of the terrain and its standard deviation; None where unknown."""
+    def _above_sea(
+        self, telemetry: Telemetry, lat_deg: ArrayLike, lon_deg: ArrayLike
+    ) -> tuple[float, float] | None:
+        """Height above the datum of the terrain and its standard deviation, at a place or on
+        average over some; None where unknown."""
         if self.datum_known and telemetry.amsl_m is not None:
             return telemetry.amsl_m, 0.0
         if telemetry.home_m is not None and self._take_off is not None:
             return telemetry.home_m + self._take_off.height_m, self._take_off.std_m
         if self.datum_known and telemetry.hae_m is not None and self._geoid is not None:
-            lat, lon = np.array([place[0]]), np.array([place[1]])
-            return telemetry.hae_m - float(self._geoid(lat, lon)[0]), 0.0
+            undulations_m = self._geoid(np.atleast_1d(lat_deg), np.atleast_1d(lon_deg))
+            return telemetry.hae_m - float(undulations_m.mean()), 0.0
         return None
 
     def observe(self, time_ns: int, outcome: Fix | NoFix, state: str | None) -> None:
@@ -182,7 +184,7 @@ class FlownHeights:
         if state in (None, "tracking"):
             std_m = math.sqrt(float(np.trace(outcome.cov_en_m2)) / 2)
             self._last = time_ns, (outcome.lat_deg, outcome.lon_deg), std_m
-            reported = self._above_sea(self._newest, self._last[1])
+            reported = self._above_sea(self._newest, *self._last[1])
             if self._newest.time_ns == time_ns and reported is not None:
                 self._fit.take(outcome, reported[0])
 

@@ -1,6 +1,5 @@
 """A map made ready for registration: what every search on it shares."""
 
-import math
 from concurrent.futures import ThreadPoolExecutor
 
 from orthonav.core.errors import MapFileError, VariantError
@@ -74,7 +73,7 @@ class PreparedMap:
             radius_m, floor_px = float(plain["radius_m"]), float(plain["position_floor_px"])
         except (VariantError, KeyError, TypeError, ValueError) as error:
             raise MapFileError(f"map cannot be flown ({error}): {opened.path}") from error
-        if not (0 < radius_m < math.inf and 0 <= floor_px < math.inf):
+        if not (0 < radius_m < 1e9 and 0 <= floor_px < 1e9):  # squares of larger ones may overflow
             raise MapFileError(f"map has impossible registration parameters: {opened.path}")
         made = cls(
             opened.manifest.sheets[0],

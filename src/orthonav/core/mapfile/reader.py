@@ -149,11 +149,15 @@ class MapFile:
 
     @property
     def bounds_deg(self) -> tuple[float, float, float, float]:
-        """West, south, east and north of the first sheet, degrees."""
+        """West, south, east and north of the first sheet, degrees; across the antimeridian west is
+        greater than east."""
         west_m, south_m, east_m, north_m = self.manifest.sheets[0].grid.extent_en_m
-        corners_en_m = [(x, y) for x in (west_m, east_m) for y in (south_m, north_m)]
-        lat, lon = self.frame.latlon_from_en(corners_en_m)
-        return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
+        # Parallels are curved: on the meridian of the centre a side may lie farthest out.
+        across_m = west_m, min(max(west_m, 0.0), east_m), east_m
+        lat, lon = self.frame.latlon_from_en([(x, y) for x in across_m for y in (south_m, north_m)])
+        off = (lon - self.frame.lon_deg + 180) % 360 - 180
+        west, east = (self.frame.lon_deg + np.array([off.min(), off.max()]) + 180) % 360 - 180
+        return float(west), float(lat.min()), float(east), float(lat.max())
 
     def contains(self, lat_deg: float, lon_deg: float) -> bool:
         """Whether a position is on the first sheet."""

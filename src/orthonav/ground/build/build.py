@@ -202,6 +202,8 @@ def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
 
 def _check_near(area: Area, outline_deg: NDArray[np.float64]) -> None:
     """Refuse an area outside the box around the imagery (outline (N, 2))."""
+    turns = np.round((outline_deg[:, 1] - outline_deg[0, 1]) / 360)  # across the antimeridian
+    outline_deg = outline_deg - turns[:, None] * [0, 360]
     (south, west), (north, east) = outline_deg.min(axis=0), outline_deg.max(axis=0)
 
     def is_within(lat_deg: float, lon_deg: float) -> bool:
@@ -209,7 +211,7 @@ def _check_near(area: Area, outline_deg: NDArray[np.float64]) -> None:
 
     centre = area.frame.lat_deg, area.frame.lon_deg
     lat, lon = area.frame.latlon_from_en(np.array(area.extent_en_m).reshape(2, 2))
-    lon += 360 * np.round(((west + east) / 2 - centre[1]) / 360)
+    lon += 360 * np.round(((west + east) / 2 - lon) / 360)
     if lat[1] < south or lat[0] > north or lon[1] < west or lon[0] > east:
         raise AreaError(
             f"the area, at {centre[0]:.4f}, {centre[1]:.4f}, has no imagery: the orthophotos cover "

@@ -69,11 +69,18 @@ def accuracy_of(
 
     None where PROJ states nothing, and for systems of plates, whose motion is known instead. Raises
     `ImageryError` for a system that PROJ would take as WGS 84 although it is another."""
-    lat, lon = outline_latlon_deg.mean(axis=0).round(1).tolist()
-    accuracy_m, caution = _accuracy(system.to_wkt(), lat, lon)
+    lat, lon = _middle_deg(outline_latlon_deg)
+    accuracy_m, caution = _accuracy(system.to_wkt(), round(lat, 1), round(lon, 1))
     if accuracy_m == math.inf:
         raise ImageryError(f"{caution}: {path}")
     return accuracy_m, caution
+
+
+def _middle_deg(outline_latlon_deg: NDArray[np.float64]) -> tuple[float, float]:
+    """Mean latitude and longitude (-180..180) of points (N, 2), also across the antimeridian."""
+    lat, lon = outline_latlon_deg.T
+    off = (lon - lon[0] + 180) % 360 - 180
+    return float(lat.mean()), float((lon[0] + off.mean() + 180) % 360 - 180)
 
 
 @functools.lru_cache(1024)
@@ -146,7 +153,7 @@ def at_epoch(sources: "Sequence[Source]", year: float) -> "list[Source]":
     """The sources, those of one system moved by one distance to where WGS 84 has them."""
     if not 1980 <= year <= 2100:
         raise UsageError(f"epoch must be a year from 1980 to 2100, got {year}")
-    lat, lon = np.concatenate([each.outline_latlon_deg for each in sources]).mean(axis=0).tolist()
+    lat, lon = _middle_deg(np.concatenate([each.outline_latlon_deg for each in sources]))
     shifts = {each.crs: plate_shift_deg(each.crs, lat, lon, year) for each in sources}
     if not any(shifts.values()):
         raise ImageryError(

@@ -141,9 +141,10 @@ class SimulateRequest:
 
     @property
     def in_perspective(self) -> bool:
-        """Whether views are rendered ray by ray; else as level ground seen without the horizon."""
+        """Whether views are rendered ray by ray; else as level ground seen without the horizon by a
+        lens without distortion."""
         has_heights = self.terrain is not None or bool(self.surface)
-        return has_heights or self.camera_pitch_deg > 0
+        return has_heights or self.camera_pitch_deg > 0 or not self.camera.is_pinhole
 
 
 @dataclass(frozen=True)
@@ -364,7 +365,7 @@ class _Scene:
 
     def _sees_ground(self, pose: _Pose) -> bool:
         camera, angles_deg = self.request.camera, pose.attitude[:3]
-        if self.request.camera_pitch_deg > 0:
+        if self.request.camera_pitch_deg > 0 or not camera.is_pinhole:
             outline = near_ground_en_m(camera, angles_deg, pose.agl_m)
             return outline is not None and self.coverage.whole(pose.position_en_m + outline)
         try:

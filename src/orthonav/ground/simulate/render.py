@@ -160,9 +160,13 @@ def rays_enu(camera: Camera, attitude_deg: tuple[float, float, float], finer: in
     seen = np.stack(np.meshgrid(cols, rows), axis=-1).reshape(-1, 1, 2)
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
     lens = np.array(camera.distortion or (0.0, 0, 0, 0))
-    fisheye = camera.model == "fisheye"
-    undistort = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
-    right, down = undistort(seen, matrix, lens)[:, 0].T
+    if camera.model == "fisheye":
+        plane = cv2.fisheye.undistortPoints(seen, matrix, lens)
+    else:  # of the default five steps corners of wide lenses err by pixels
+        most = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-4  # steps, pixels
+        ideal = cv2.undistortImagePoints(seen, matrix, lens, None, most)
+        plane = cv2.undistortPoints(ideal, matrix, None)
+    right, down = plane[:, 0].T
     body = np.stack([-down, right, np.ones_like(right)], axis=-1)
     ned = Rotation.from_euler("ZYX", attitude_deg, degrees=True).apply(body)
     return np.asarray(ned[:, [1, 0, 2]] * [1, 1, -1]).reshape(len(rows), len(cols), 3)
