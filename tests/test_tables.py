@@ -48,6 +48,8 @@ def test_decimal_commas_are_not_taken_for_fields(tmp_path):
     route.write_text("lat,lon\n47.1,-99.2,,a note\n47,018,-99,162\n")
     with pytest.raises(RouteError, match="line 3 has more numbers than the header"):
         read_route(route)
+    route.write_text("lat,lon,note\n47,2,turn left, 3\n47.1,2,b,2024-05-01\n")
+    read_route(route)
     truth.write_text(TRUTH + "0.jpg,47,018,-99,162\n")
     with pytest.raises(FlightError, match="line 2 has more numbers than the header"):
         read_truth(truth)

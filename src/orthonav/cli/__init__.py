@@ -122,17 +122,18 @@ def _require_outputs(options: argparse.Namespace) -> None:
         if is_stdout(path):
             continue
         require_writable(path, folder=is_folder)
-        if not is_folder and path.resolve() in taken:
+        real = os.path.realpath(path)
+        if not is_folder and real in taken:
             raise OutputError(f"would replace an input or another output; name another: {path}")
-        taken.add(path.resolve())
+        taken.add(real)
 
 
-def _inputs(options: argparse.Namespace, outputs: Collection[str]) -> set[Path]:
-    """The paths among the options, other than `outputs`; a map may be text, as it may be a URL."""
+def _inputs(options: argparse.Namespace, outputs: Collection[str]) -> set[str]:
+    """Real paths among the options, other than `outputs`; a map may be text, as it may be a URL."""
     named = {**vars(options), "map": Path(getattr(options, "map", None) or "-")}
     values = [value for name, value in named.items() if name not in outputs]
     several = chain(*(value if isinstance(value, list) else [value] for value in values))
-    return {path.resolve() for path in several if isinstance(path, Path)}
+    return {os.path.realpath(path) for path in several if isinstance(path, Path)}
 
 
 def _exported(options: argparse.Namespace) -> list[Path]:

@@ -183,7 +183,8 @@ class Telemetry(ByValue):
             object.__setattr__(self, name, math.nan if value is None else number(name, value))
         for name in _OPTIONAL:
             value, least = getattr(self, name), 0.0 if "_std_" in name else -math.inf
-            if value is None:
+            if value is None or (isinstance(value, float) and math.isnan(value)):
+                object.__setattr__(self, name, None)
                 continue
             if name in _RECORDS:
                 has_type(name, value, *_RECORDS[name])
@@ -223,7 +224,7 @@ _RECORDS: dict[str, tuple[type, str]] = {
 class View(ByValue):
     """What the camera saw at one exposure, and the telemetry of that time.
 
-    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified; copied, and then
+    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified; copied unless
     read-only. Images of other kinds are converted by `orthonav.core.records.grey_levels`.
     `camera`: calibration of the camera. At another size than that of `grey` it is scaled.
     `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.

@@ -23,6 +23,10 @@ def bounded_lines(stream: IO[str], most_chars: int = MAX_LINE_CHARS) -> Iterator
         yield line
 
 
+def _is_number(text: str) -> bool:
+    return re.fullmatch(r"[-+]?\d+(\.\d+)?", text.strip()[:40]) is not None
+
+
 class TableRows:
     """Rows as of `csv.DictReader`, with `columns` of the header; raises `TableError`, there too."""
 
@@ -30,7 +34,7 @@ class TableRows:
         self._reader = csv.DictReader(
             bounded_lines(stream), delimiter=delimiter, skipinitialspace=True
         )
-        self._most_rows = most_rows
+        self._most_rows, self._commas = most_rows, delimiter == ","
         try:
             self.columns = list(self._reader.fieldnames or ())
         except (UnicodeDecodeError, csv.Error) as error:
@@ -48,7 +52,8 @@ class TableRows:
                         f"line {self.line}: table has more than {self._most_rows:,} rows; divide it"
                     )
                 unnamed = row.pop(None, None) or ()
-                if any(re.fullmatch(r"\s*[-+.\d]*\d[.\d]*\s*", text) for text in unnamed):
+                last = next(reversed(row.values()), None) or ""
+                if self._commas and _is_number(last) and any(map(_is_number, unnamed)):
                     raise TableError(
                         f"line {self.line} has more numbers than the header has columns; where "
                         "commas separate fields, numbers need a point"

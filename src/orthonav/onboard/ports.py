@@ -85,7 +85,7 @@ class Descriptor:
     def write(self, data: bytes) -> bool:
         """Send all or nothing: half a message would damage the next one."""
         sent, deadline = 0, time.monotonic() + 0.1
-        while sent < len(data) and (not sent or time.monotonic() < deadline):
+        while sent < len(data) and time.monotonic() < deadline:
             try:
                 sent += os.write(self._fd, data[sent:])
             except BlockingIOError:
