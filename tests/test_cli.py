@@ -240,7 +240,7 @@ def test_calibrate_and_fly_with_it(run, map_path, flown, out, monkeypatch):
     assert run("localize", map_path, few, *to, "--json").code == 0
     found = [result.outcome for result in read_results(fixes)]
     assert not any(isinstance(each, Fix) and each.confidence > 0.9 for each in found)
-    refused(run("localize", map_path, few, "--out", fixes, "--mount", fixes), "mount file")
+    refused(run("localize", map_path, few, "--out", mount, "--mount", fixes), "mount file")
 
 
 def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in, undrawn):
