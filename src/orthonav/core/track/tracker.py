@@ -532,7 +532,8 @@ class Tracker:
         if 4 * reach_m**2 > self.mixture.area_m2 / 4:
             return WHOLE_MAP
         # Dead reckoning from a confirmed place that is still exact is as good as tracking.
-        exact = expected.state is not State.SEARCHING and reach_m <= MIN_LOCAL_M
+        confirmed = expected.state is not State.SEARCHING and expected.shown.is_confirmed
+        exact = confirmed and reach_m <= MIN_LOCAL_M
         return SearchArea((expected.mean[:2], reach_m), exact or not competes)
 
     def _prior(self, area: SearchArea) -> Prior | None:
