@@ -18,6 +18,9 @@ from orthonav.core.localize.odometry import OdometryView, displacement
 from orthonav.core.mapfile import open_map
 from orthonav.core.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
 from orthonav.core.track import tracker as tracker_module
+from orthonav.core.track.filter import STATE
+from orthonav.core.track.hypothesis import Shown, State
+from orthonav.core.track.mixture import Estimate
 from orthonav.core.track.tracker import Tracker
 from orthonav.ground.recordings.localize import localize_flight, smoothed_track
 
@@ -275,6 +278,15 @@ def test_a_followed_flight_is_searched_for_around_the_track_only(localizer, trac
     middle = localizer.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
     assert math.dist(middle, ahead[0][2]) < prior.std_m * PRIOR_SIGMAS < 60
     assert known.yaw_std_deg < 3.0 and known.agl_std_m < 0.03 * AGL_M
+
+
+@pytest.mark.parametrize(("ground", "confirms"), [(1.0, False), (2.0, True)])
+def test_near_a_lost_track_views_confirm_only_a_confirmed_place(localizer, ground, confirms):
+    """After 10 s without telemetry a place 317 m off was confirmed by views around itself."""
+    exact, shown = 25.0 * np.eye(STATE), Shown(ground, followed=True)
+    lost = Estimate(np.zeros(STATE), exact, 0.8, 0.8, State.LOST, 0.99, shown)
+    area = Tracker(localizer)._search_area(lost, whole_map=False)
+    assert area.circle is not None and area.confirms is confirms
 
 
 def test_unknown_heading_is_tracked(localizer):
