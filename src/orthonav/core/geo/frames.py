@@ -7,6 +7,7 @@ geographical coordinates" (inverse)."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,7 @@ WGS84_E2 = WGS84_F * (2 - WGS84_F)
 MAX_SHEET_M = 50_000.0  # largest extent of a sheet: accurate to millimetres
 
 Array = NDArray[np.float64]
+Degrees = TypeVar("Degrees", float, NDArray[np.float64])
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,11 @@ class LocalFrame:
                 [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
             ]
         )
+
+
+def wrapped_deg(longitude_deg: Degrees) -> Degrees:
+    """The same longitudes, or differences of them, from -180 to 180."""
+    return (longitude_deg + 180) % 360 - 180
 
 
 def distances_m(from_latlon_deg: ArrayLike, to_latlon_deg: ArrayLike) -> Array:

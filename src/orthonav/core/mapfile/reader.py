@@ -24,7 +24,7 @@ from safetensors.numpy import save_file
 
 from orthonav.core.errors import MapChangedError, MapFileError, MissingFileError, OutputError
 from orthonav.core.files import StrPath, replacing, require_file
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame, wrapped_deg
 from orthonav.core.mapfile.manifest import Manifest
 
 METADATA_KEY = "orthonav"
@@ -155,9 +155,10 @@ class MapFile:
         # Parallels are curved: on the meridian of the centre a side may lie farthest out.
         across_m = west_m, min(max(west_m, 0.0), east_m), east_m
         lat, lon = self.frame.latlon_from_en([(x, y) for x in across_m for y in (south_m, north_m)])
-        off = (lon - self.frame.lon_deg + 180) % 360 - 180
-        west, east = (self.frame.lon_deg + np.array([off.min(), off.max()]) + 180) % 360 - 180
-        return float(west), float(lat.min()), float(east), float(lat.max())
+        off = wrapped_deg(lon - self.frame.lon_deg)
+        ends = self.frame.lon_deg + np.array([off.min(), off.max()])
+        west, east = wrapped_deg(ends).tolist()
+        return west, float(lat.min()), east, float(lat.max())
 
     def contains(self, lat_deg: float, lon_deg: float) -> bool:
         """Whether a position is on the first sheet."""

@@ -24,11 +24,12 @@ import rasterio
 from orthonav import __version__
 from orthonav.core.errors import AreaError, AtlasError, WorkerError
 from orthonav.core.files import Progress, no_progress, with_paths
+from orthonav.core.geo.frames import wrapped_deg
 from orthonav.core.tiles.whitened import CellLayout
 from orthonav.ground.atlas.catalog import CATALOG, Atlas, AtlasRecipe, CoarseRecipe, Sheet
 from orthonav.ground.atlas.cluster import TaskRunner
 from orthonav.ground.atlas.coarse import coarse_grid, write_coarse
-from orthonav.ground.atlas.cut import box_around, box_deg, turned
+from orthonav.ground.atlas.cut import box_around, box_deg
 from orthonav.ground.atlas.store import Store
 from orthonav.ground.build.build import BuildRequest, build_map, require_relief, require_surface
 from orthonav.ground.build.layer import rounded_gsd_m
@@ -175,7 +176,7 @@ class Imagery:
     def sheets(self, recipe: AtlasRecipe) -> set[str]:
         found: set[str] = set()
         for west, south, east, north in self._boxes.tolist():
-            around = turned(west) if east - west < 360 else -180.0
+            around = wrapped_deg(west) if east - west < 360 else -180.0
             found.update(recipe.sheets.over((around, south, around + east - west, north)))
         return found
 

@@ -25,7 +25,7 @@ from orthonav import __version__
 from orthonav.core.cores import usable_cores
 from orthonav.core.errors import AreaError, AtlasError, VariantError
 from orthonav.core.files import Progress, no_progress
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame, wrapped_deg
 from orthonav.core.geo.grid import TileGrid
 from orthonav.core.geo.ground import relief_slope
 from orthonav.core.localize.confidence import CHANCES, Chances, RegisteredConfidence
@@ -213,11 +213,7 @@ def box_around(area: Area, margin_m: float) -> Extent:
 def box_deg(area: Area, margin_m: float) -> Extent:
     """The same with west and east from -180 to 180; across the antimeridian west is greater."""
     west, south, east, north = box_around(area, margin_m)
-    return turned(west), south, turned(east), north
-
-
-def turned(lon_deg: float) -> float:
-    return (lon_deg + 180) % 360 - 180
+    return wrapped_deg(west), south, wrapped_deg(east), north
 
 
 def check_shown(

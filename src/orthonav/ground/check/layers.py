@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.core.geo.frames import LocalFrame
+from orthonav.core.geo.frames import LocalFrame, wrapped_deg
 from orthonav.core.records import CONFIDENT
 from orthonav.ground.check.records import (
     CELL_VALUES,
@@ -143,7 +143,7 @@ def _feature(
     frame: LocalFrame, layer: str, kind: str, points_en_m: Array, properties: Plain
 ) -> Plain:
     lat, lon = frame.latlon_from_en(points_en_m)
-    lon = frame.lon_deg + (lon - frame.lon_deg + 180) % 360 - 180  # no jump at the date line
+    lon = frame.lon_deg + wrapped_deg(lon - frame.lon_deg)  # no jump at the date line
     points = np.round(np.stack([lon, lat], axis=-1), 7).tolist()
     geometry = {"type": kind, "coordinates": points[0] if kind == "Point" else points}
     named = {"layer": layer, **to_plain(properties, BY_UNIT)}

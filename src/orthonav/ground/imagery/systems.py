@@ -26,7 +26,7 @@ from rasterio.transform import Affine
 from rasterio.warp import transform as transform_coordinates
 
 from orthonav.core.errors import ImageryError, UsageError
-from orthonav.core.geo.frames import WGS84_A_M, distances_m
+from orthonav.core.geo.frames import WGS84_A_M, distances_m, wrapped_deg
 
 if TYPE_CHECKING:
     from orthonav.ground.imagery.source import Source
@@ -79,8 +79,8 @@ def accuracy_of(
 def _middle_deg(outline_latlon_deg: NDArray[np.float64]) -> tuple[float, float]:
     """Mean latitude and longitude (-180..180) of points (N, 2), also across the antimeridian."""
     lat, lon = outline_latlon_deg.T
-    off = (lon - lon[0] + 180) % 360 - 180
-    return float(lat.mean()), float((lon[0] + off.mean() + 180) % 360 - 180)
+    off = wrapped_deg(lon - lon[0])
+    return float(lat.mean()), wrapped_deg(float(lon[0] + off.mean()))
 
 
 @functools.lru_cache(1024)

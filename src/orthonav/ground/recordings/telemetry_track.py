@@ -15,6 +15,7 @@ from orthonav.core.errors import FlightError
 from orthonav.core.flight.recording import NO_SOURCE, chosen
 from orthonav.core.geo.attitude import matrices_of_wxyz, slerp, wxyz_of_matrices
 from orthonav.core.geo.camera import attitude_of
+from orthonav.core.geo.frames import wrapped_deg
 from orthonav.core.records import Prior, Telemetry
 from orthonav.core.tilt import AUTOPILOT, TiltSource
 
@@ -235,7 +236,7 @@ class RecordedTrack:
     def latlon_deg(self, time_ns: int) -> tuple[float, float] | None:
         """Position by the aircraft's own GNSS receiver, or None."""
         lat, lon, _ = _at(self.position, time_ns, 3)
-        return _known_pair((lat, (lon + 180) % 360 - 180))
+        return _known_pair((lat, wrapped_deg(lon)))
 
     def _tilt_stds(self, time_ns: int) -> dict[str, Any]:
         """Fields of the telemetry. A position says that GNSS aids the horizon."""
